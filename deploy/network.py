@@ -206,22 +206,14 @@ def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter's own: what it writes is checked below
         try:
-            torch.onnx.export(
-                module.eval(),
-                (torch.zeros(tuple(example)),),
-                stream,
-                opset_version=OPSET,
-                input_names=["image"],
-                output_names=["restored"],
-                dynamic_axes=free,
-                dynamo=False,
-            )
+            names = {"input_names": ["image"], "output_names": ["restored"], "dynamic_axes": free}
+            image = torch.zeros(tuple(example))
+            torch.onnx.export(module.eval(), (image,), stream, opset_version=OPSET, dynamo=False, **names)
         except Exception as error:  # whatever a module's own code raises
             got = " ".join(str(error).split())[:160]
             remedy = f"check that it takes an image {times(example)}, or give example=(N, C, H, W)"
-            raise ModelError(
-                type(module).__name__, expected="a module that torch exports", got=got, remedy=remedy
-            ) from error
+            expected = "a module that torch exports"
+            raise ModelError(type(module).__name__, expected=expected, got=got, remedy=remedy) from error
         finally:
             module.train(training)
     return read_onnx(stream.getvalue(), type(module).__name__)
@@ -388,10 +380,8 @@ def told_by_delta(model: onnx.ModelProto, delta: Path) -> onnx.ModelProto:
     try:
         packed = delta.read_bytes()
     except OSError as error:
-        remedy = "give a file that 'export --delta' wrote"
-        raise ModelError(
-            str(delta), expected="a delta", got=unreadable(delta) or str(error), remedy=remedy
-        ) from error
+        got, remedy = unreadable(delta) or str(error), "give a file that 'export --delta' wrote"
+        raise ModelError(str(delta), expected="a delta", got=got, remedy=remedy) from error
     core, name = with_delta(required_family(model).core, packed)
     return host_model(core, {**metadata(model), "sensor": name}, fixed_tile_px(model))
 

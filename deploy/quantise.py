@@ -12,15 +12,7 @@ from beers_deploy.dpu.board import BoardLike
 from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.model.progress import progress as begun
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.network import (
-    Conditioned,
-    Network,
-    NetworkLike,
-    SensorLike,
-    conditioned,
-    family_model,
-    told_int8,
-)
+from beers_deploy.network import Conditioned, Network, NetworkLike, SensorLike, conditioned, family_model, told_int8
 from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor

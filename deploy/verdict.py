@@ -225,13 +225,7 @@ def _pair(int8: NetworkLike, against: NetworkLike | None, sensor: Sensor) -> tup
 
 
 def _unseen(
-    int8: Network,
-    floating: Network,
-    sensor: Sensor,
-    samples: object,
-    images: Path | None,
-    patches: int,
-    seed: int,
+    int8: Network, floating: Network, sensor: Sensor, samples: object, images: Path | None, patches: int, seed: int
 ) -> "tuple[Patches, bool, tuple[str, ...]]":
     """What the two are compared on, whether it is simulated, and what a reader must know of it."""
     own = samples_of(floating.model, samples)

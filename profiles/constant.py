@@ -100,10 +100,7 @@ def check_keys(
     for key in raw:
         if key not in allowed:
             raise ProfileError(
-                where,
-                expected=f"the keys {', '.join(sorted(allowed))}",
-                got=f"{key!r}",
-                remedy=_rename(key, allowed),
+                where, expected=f"the keys {', '.join(sorted(allowed))}", got=f"{key!r}", remedy=_rename(key, allowed)
             )
     for key in sorted(required - set(raw)):
         raise ProfileError(

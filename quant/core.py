@@ -235,7 +235,4 @@ def op_shifts(
     if not isinstance(op, IntConv):
         return []
     product = op.weight_frac_bits + inputs[0]
-    return [
-        ("shift_cut", product - output, shifts.cut),
-        ("shift_bias", product - op.bias_frac_bits, shifts.bias),
-    ]
+    return [("shift_cut", product - output, shifts.cut), ("shift_bias", product - op.bias_frac_bits, shifts.bias)]

@@ -46,10 +46,7 @@ SHARES = np.linspace(0.3, 1.0, 71)
 
 
 def tensor_scales(
-    graph: Graph,
-    levels: Mapping[str, int],
-    images: Iterable[np.ndarray],
-    ends: Ends = ONE_CHANNEL,
+    graph: Graph, levels: Mapping[str, int], images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL
 ) -> dict[str, float]:
     """The least-squares scale of each named tensor of a plane-reading graph.
 

@@ -22,10 +22,7 @@ from beers_deploy.quant.untrusted import contradictions, times
 
 
 def open_session(
-    model: Path | onnx.ModelProto,
-    threads: int = 0,
-    optimise: bool = True,
-    exact: bool | None = None,
+    model: Path | onnx.ModelProto, threads: int = 0, optimise: bool = True, exact: bool | None = None
 ) -> ort.InferenceSession:
     """Open a model on the CPU, such that its integers are added exactly whatever the processor (`quant.kernels`).
 

@@ -91,8 +91,7 @@ def bench(
         Path | None, typer.Option(help="JSON list of your board's runs: the cost model is corrected by them first.")
     ] = None,
     no_traditional: Annotated[
-        bool,
-        typer.Option("--no-traditional", help="Do not measure the traditional pipeline on this processor."),
+        bool, typer.Option("--no-traditional", help="Do not measure the traditional pipeline on this processor.")
     ] = False,
     within: Annotated[
         float | None,

@@ -15,8 +15,7 @@ def check(
     model: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[MODEL]",
-            help="ONNX network: float, INT8 or board core, anyone's; the shipped INT8 one if none.",
+            metavar="[MODEL]", help="ONNX network: float, INT8 or board core, anyone's; the shipped INT8 one if none."
         ),
     ] = None,
     target: Annotated[str, typer.Option(help=f"Profile of a board with a DPU: {BOARDS}.")] = DEFAULT_TARGET,

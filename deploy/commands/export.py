@@ -35,8 +35,7 @@ def export(
         Path | None, typer.Option(help="Of an INT8 file: also write its integers in the board's encoding.")
     ] = None,
     delta: Annotated[
-        Path | None,
-        typer.Option(help="Of an INT8 file: also write what the sensor changes in it, 1 to 3 kB."),
+        Path | None, typer.Option(help="Of an INT8 file: also write what the sensor changes in it, 1 to 3 kB.")
     ] = None,
     apply: Annotated[
         Path | None, typer.Option(help="Of an INT8 file: tell it the sensor of this delta, in place of --sensor.")

@@ -47,8 +47,7 @@ def stress(
         int, typer.Option(min=1, max=10_000, help="Injections into each memory at each rate, with --bit-flips.")
     ] = 6,
     sensor: Annotated[
-        str,
-        typer.Option(help="What a shipped network is told; with --bit-flips also what sees the patches."),
+        str, typer.Option(help="What a shipped network is told; with --bit-flips also what sees the patches.")
     ] = SENSOR,
     images: Annotated[
         Path | None,
@@ -58,8 +57,7 @@ def stress(
         str, typer.Option(help=f"Board that prices the guards, with --bit-flips: {BOARDS}.")
     ] = DEFAULT_TARGET,
     out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", help="Tables as Markdown; with --bit-flips the curves beside it."),
+        Path | None, typer.Option("-o", "--out", help="Tables as Markdown; with --bit-flips the curves beside it.")
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:

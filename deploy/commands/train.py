@@ -39,8 +39,7 @@ def train(
         typer.Option("--conditioned", help="Draw sensors of a wide range with that gain, and condition on each."),
     ] = False,
     reference: Annotated[
-        str | None,
-        typer.Option(help="Profile of the wanted output, in the sensor's DN; pleiades-reference if none."),
+        str | None, typer.Option(help="Profile of the wanted output, in the sensor's DN; pleiades-reference if none.")
     ] = None,
     drawn: Annotated[int, typer.Option(min=0, max=1000, help="Drawn scenes to add to the images.")] = 0,
     rough: Annotated[

@@ -140,7 +140,5 @@ def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
 
 def _require(where: str, constant: Constant | None, least: float) -> None:
     if constant is None or not least <= constant.low <= constant.high < LARGEST:
-        got = "none" if constant is None else str(constant)
-        raise ProfileError(
-            where, expected=f"a number of at least {least:g} that a board can have", got=got, remedy="correct it"
-        )
+        got, expected = str(constant or "none"), f"a number of at least {least:g} that a board can have"
+        raise ProfileError(where, expected=expected, got=got, remedy="correct it")

@@ -12,23 +12,9 @@ from onnx import TensorProto, helper, shape_inference
 from beers_deploy.profiles.errors import ModelError
 
 Kind = Literal[
-    "conv",
-    "grouped conv",
-    "depthwise",
-    "transposed",
-    "add",
-    "mul",
-    "pool",
-    "activation",
-    "concat",
-    "pad",
-    "resize",
-    "pixel shuffle",
-    "argmax",
-    "quantise",
-    "dequantise",
-    "other",
-]
+    "conv", "grouped conv", "depthwise", "transposed", "add", "mul", "pool", "activation", "concat", "pad", "resize",
+    "pixel shuffle", "argmax", "quantise", "dequantise", "other",
+]  # fmt: skip
 Shape = tuple[int, int, int]
 """Channels, height, width."""
 
@@ -104,9 +90,8 @@ class Operation:
         """int8 operations for one image: 2 kh kw ic oc h w, per group; 0 where no product is summed."""
         if self.kind not in CONVOLUTIONS:
             return 0
-        weights_per_output = self.weight_bytes  # one byte each, and each is used once a pixel
         shape = self.in_shapes[0] if self.kind == "transposed" else self.out_shape
-        return 2 * weights_per_output * _pixels(self.name, shape)
+        return 2 * self.weight_bytes * _pixels(self.name, shape)  # a weight has one byte, and is used once a pixel
 
     @property
     def out_bytes(self) -> int:
@@ -126,12 +111,8 @@ class Network:
 
 def _pixels(name: str, shape: Shape | None) -> int:
     if shape is None:
-        raise ModelError(
-            name,
-            expected="a shape that can be computed from the input's",
-            got="none",
-            remedy="replace the node before it that hides the shape",
-        )
+        remedy = "replace the node before it that hides the shape"
+        raise ModelError(name, expected="a shape that can be computed from the input's", got="none", remedy=remedy)
     return shape[1] * shape[2]
 
 
@@ -162,7 +143,8 @@ def out_shape(
     if kind == "transposed":
         return _grow(first, window, channels)
     if kind == "pool":
-        return (first[0], 1, 1) if "Global" in node.op_type else _slide(first, window, first[0], _ceil_mode(node))
+        up = any(a.name == "ceil_mode" and a.i for a in node.attribute)
+        return (first[0], 1, 1) if "Global" in node.op_type else _slide(first, window, first[0], up)
     if node.op_type in ("QLinearConcat", "Concat") and len(known) > 1:
         return (sum(shape[0] for shape in known), first[1], first[2])
     if kind in ("add", "mul") or node.op_type == "Where":
@@ -208,10 +190,6 @@ def _grow(shape: Shape, window: Window, channels: int) -> Shape | None:
         for axis in (0, 1)
     )
     return (channels, height, width) if min(height, width) > 0 else None
-
-
-def _ceil_mode(node: onnx.NodeProto) -> bool:
-    return any(a.name == "ceil_mode" and a.i for a in node.attribute)
 
 
 def _infer(node: onnx.NodeProto, known: list[Shape], constants: dict[str, TensorProto]) -> Shape | None:

@@ -17,13 +17,11 @@ from onnx import TensorProto, numpy_helper
 
 from beers_deploy.dpu.graph import Scale
 
+ONE = {0: (1, 2), -1: (3, 4)}
+TWO = {0: (1, 2), 3: (4, 5), -1: (6, 7)}
 FORMATS: dict[str, dict[int, tuple[int, int]]] = {
-    "QLinearConv": {0: (1, 2), 3: (4, 5), -1: (6, 7)},
-    "QLinearAdd": {0: (1, 2), 3: (4, 5), -1: (6, 7)},
-    "QLinearMul": {0: (1, 2), 3: (4, 5), -1: (6, 7)},
-    "QLinearAveragePool": {0: (1, 2), -1: (3, 4)},
-    "QLinearGlobalAveragePool": {0: (1, 2), -1: (3, 4)},
-    "QLinearLeakyRelu": {0: (1, 2), -1: (3, 4)},
+    **dict.fromkeys(("QLinearConv", "QLinearAdd", "QLinearMul"), TWO),
+    **dict.fromkeys(("QLinearAveragePool", "QLinearGlobalAveragePool", "QLinearLeakyRelu"), ONE),
     "QuantizeLinear": {-1: (1, 2)},
     "DequantizeLinear": {0: (1, 2)},
 }
@@ -60,10 +58,8 @@ ACTIVATIONS = {"Relu", "LeakyRelu", "PRelu", "HardSigmoid", "HardSwish", "Clip"}
 ACTIVATIONS_MAX = 8
 """Of one after the other, looked past for the QuantizeLinear behind: a chain of thousands is nobody's network."""
 OPERANDS = {
-    "QuantizeLinear": slice(0, 1),
-    "DequantizeLinear": slice(0, 1),
-    "QLinearAdd": slice(0, 4, 3),
-    "QLinearMul": slice(0, 4, 3),
+    **dict.fromkeys(("QuantizeLinear", "DequantizeLinear"), slice(0, 1)),
+    **dict.fromkeys(("QLinearAdd", "QLinearMul"), slice(0, 4, 3)),
     "QLinearConcat": slice(2, None, 3),
 }
 """Which inputs are tensors of the network; the rest are scales and zero points."""
@@ -150,10 +146,9 @@ class Integers:
         names: dict[str, str] = {}
         if not self.is_integer(node):
             return names
-        if node.op_type in ("Conv", "ConvTranspose"):
-            names = dict(zip(("weight", "bias"), node.input[1:], strict=False))
-        elif node.op_type == "QLinearConv":
-            names = dict(zip(("weight", "bias"), (node.input[3], *node.input[8:]), strict=False))
+        if node.op_type in ("Conv", "ConvTranspose", "QLinearConv"):
+            behind = node.input[1:] if node.op_type != "QLinearConv" else (node.input[3], *node.input[8:])
+            names = dict(zip(("weight", "bias"), behind, strict=False))
         elif node.op_type in ELEMENTWISE:
             operands = enumerate(node.input[OPERANDS.get(node.op_type, slice(None))])
             names = {f"constant {i}": name for i, name in operands if self.resolve(name) in self._constants}

@@ -6,8 +6,8 @@
    only those at the border, which really convert, stay as operations.
 """
 
-from collections.abc import Iterator
-from dataclasses import replace
+import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,28 +23,23 @@ from beers_deploy.quant.graph.trials import with_shuffles
 from beers_deploy.quant.onnx_file import load_onnx, metadata
 from beers_deploy.quant.untrusted import contradictions
 
-KINDS: dict[str, Kind] = {
-    "Conv": "conv",
-    "QLinearConv": "conv",
-    "ConvTranspose": "transposed",
-    "Add": "add",
-    "QLinearAdd": "add",
-    "Mul": "mul",
-    "QLinearMul": "mul",
-    "Concat": "concat",
-    "QLinearConcat": "concat",
-    "Pad": "pad",
-    "Resize": "resize",
-    "Upsample": "resize",
-    "DepthToSpace": "pixel shuffle",
-    "SpaceToDepth": "pixel shuffle",
-    "ArgMax": "argmax",
-    "QuantizeLinear": "quantise",
-    "DequantizeLinear": "dequantise",
+POOLS = ("AveragePool", "GlobalAveragePool")
+OPERATORS: dict[Kind, tuple[str, ...]] = {
+    "conv": ("Conv", "QLinearConv"),
+    "transposed": ("ConvTranspose",),
+    "add": ("Add", "QLinearAdd"),
+    "mul": ("Mul", "QLinearMul"),
+    "concat": ("Concat", "QLinearConcat"),
+    "pad": ("Pad",),
+    "resize": ("Resize", "Upsample"),
+    "pixel shuffle": ("DepthToSpace", "SpaceToDepth"),
+    "argmax": ("ArgMax",),
+    "quantise": ("QuantizeLinear",),
+    "dequantise": ("DequantizeLinear",),
+    "activation": ("Relu", "LeakyRelu", "QLinearLeakyRelu", "PRelu", "HardSigmoid", "HardSwish"),
+    "pool": ("MaxPool", *POOLS, *(f"QLinear{pool}" for pool in POOLS), "GlobalMaxPool"),
 }
-KINDS |= dict.fromkeys(("Relu", "LeakyRelu", "QLinearLeakyRelu", "PRelu", "HardSigmoid", "HardSwish"), "activation")
-KINDS |= dict.fromkeys(("MaxPool", "AveragePool", "GlobalAveragePool", "GlobalMaxPool"), "pool")
-KINDS |= dict.fromkeys(("QLinearAveragePool", "QLinearGlobalAveragePool"), "pool")
+KINDS: dict[str, Kind] = {op_type: kind for kind, op_types in OPERATORS.items() for op_type in op_types}
 
 
 BANK_ENDS = [float(np.float32(-LARGEST)), float(np.float32(LARGEST))]
@@ -66,25 +61,20 @@ def own_tile_px(model: onnx.ModelProto) -> int | None:
     """The side of the tile that a network is fixed to, in pixels of the image; None where it takes any."""
     dims = model.graph.input[0].type.tensor_type.shape.dim
     side = max((d.dim_value for d in dims[2:]), default=0)
-    return side * _place_px(model) - 2 * _border_px(model) if side else None
+    if not side:
+        return None
+    place_px, border_px = _places(model)
+    return side * place_px - 2 * border_px
 
 
-def _place_px(model: onnx.ModelProto) -> int:
-    """The side in pixels of what one place of the input stands for: more than 1 of a board's file alone."""
-    return _said_px(model, PLACE_PX, 1)
-
-
-def _border_px(model: onnx.ModelProto) -> int:
-    """By how many pixels a board's planes reach beyond the image on each side."""
-    return _said_px(model, BORDER_PX, 0)
-
-
-def _said_px(model: onnx.ModelProto, key: str, least: int) -> int:
-    """What a board's file says of its planes, in pixels; the least where it says nothing."""
-    said_px = int(metadata(model).get(key, str(least)))
-    if not least <= said_px <= PLACE_MAX_PX:
-        raise ValueError(f"{key} {said_px}")
-    return said_px
+def _places(model: onnx.ModelProto) -> tuple[int, int]:
+    """What a board's file says of its planes: a place's side in pixels, and how far they reach beyond the image."""
+    found = []
+    for key, least in ((PLACE_PX, 1), (BORDER_PX, 0)):
+        found.append(int(metadata(model).get(key, least)))
+        if not least <= found[-1] <= PLACE_MAX_PX:
+            raise ValueError(f"{key} {found[-1]}")
+    return found[0], found[1]
 
 
 def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model") -> Network:
@@ -100,7 +90,7 @@ def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX m
 def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model") -> dict[str, Shape]:
     """The inputs of a file as it stands, by name: (C, H, W) in places, for a tile or as the file states them."""
     held = {t.name for t in model.graph.initializer} | {n.output[0] for n in model.graph.node if _constant(n)}
-    places = _place_px(model), _border_px(model)
+    places = _places(model)
     return {i.name: _input_shape(i, tile_px, places, where) for i in model.graph.input if i.name not in held}
 
 
@@ -136,7 +126,7 @@ class _Reader:
         outputs = tuple(self.integers.resolve(name) for name in node.output if name)
         self.shapes |= dict.fromkeys(outputs, shape)
         self.kinds |= dict.fromkeys(outputs, kind)
-        operation = Operation(
+        yield Operation(
             name=node.name or node.output[0],
             op_type=node.op_type,
             kind=kind,
@@ -146,7 +136,8 @@ class _Reader:
             out_shape=shape,
             window=window,
             channels=channels,
-            weight_bytes=_count(weight) if weight is not None else 0,
+            weight_bytes=math.prod(weight.dims) if weight is not None else 0,
+            constant_shape=self._constant_shape(node, kind, activations),
             attributes=_attributes(node),
             follows=self.kinds.get(activations[0]) if activations else None,
             integer=self.integers.is_integer(node),
@@ -154,7 +145,6 @@ class _Reader:
             disputed=self.integers.disputed(node),
             constants=self.integers.constants(node),
         )
-        yield replace(operation, constant_shape=self._constant_shape(node, operation))
 
     def _weight(self, node: onnx.NodeProto) -> TensorProto | None:
         place = {"Conv": 1, "ConvTranspose": 1, "QLinearConv": 3}.get(node.op_type)
@@ -166,17 +156,16 @@ class _Reader:
         constants = [self.constants[name] for name in node.input[1:] if name in self.constants]
         if node.op_type == "Max":
             return self.integers.is_integer(node) and len(constants) == len(node.input) - 1 == 1
-        limits = [float(numpy_helper.to_array(t).ravel()[0]) for t in constants if _count(t) == 1]
+        limits = [float(numpy_helper.to_array(t).ravel()[0]) for t in constants if math.prod(t.dims) == 1]
         return node.op_type == "Clip" and limits in ([0.0, 6.0], BANK_ENDS)
 
-    def _constant_shape(self, node: onnx.NodeProto, op: Operation) -> tuple[int, ...] | None:
+    def _constant_shape(self, node: onnx.NodeProto, kind: Kind, inputs: Sequence[str]) -> tuple[int, ...] | None:
         """Shape of the constant operand of an element-wise operator."""
-        if op.kind not in ("add", "mul") and op.op_type not in ("Sub", "Div"):
+        if len(inputs) != 1 or (kind not in ("add", "mul") and node.op_type not in ("Sub", "Div")):
             return None
-        behind = (self.integers.resolve(name) for name in node.input[: 2 if "QLinear" not in op.op_type else 4])
+        behind = (self.integers.resolve(name) for name in node.input[: 2 if "QLinear" not in node.op_type else 4])
         found = [self.constants[name] for name in behind if name in self.constants]
-        first = next((t for t in found if len(op.inputs) == 1), None)
-        return tuple(first.dims) if first is not None else None
+        return tuple(found[0].dims) if found else None
 
 
 def _kind(node: onnx.NodeProto, weight: TensorProto | None) -> Kind:
@@ -194,14 +183,10 @@ def _window(node: onnx.NodeProto, weight: TensorProto | None, shapes: tuple[Shap
     whole = shapes[0][1:] if "Global" in node.op_type and shapes and shapes[0] else (1, 1)
     kernel = _pair(given, "kernel_shape", weight.dims[2:4] if weight is not None else whole)
     pads = given.get("pads", (0, 0, 0, 0)) if node.op_type != "Pad" else (0, 0, 0, 0)
-    top, left, bottom, right = pads if isinstance(pads, list | tuple) and len(pads) == 4 else (0, 0, 0, 0)
-    window = Window(
-        kernel,
-        _pair(given, "strides", (1, 1)),
-        (int(top), int(left), int(bottom), int(right)),
-        _pair(given, "dilations", (1, 1)),
-        _pair(given, "output_padding", (0, 0)),
-    )
+    top, left, bottom, right = map(int, pads) if isinstance(pads, list | tuple) and len(pads) == 4 else (0, 0, 0, 0)
+    stride, dilation = _pair(given, "strides", (1, 1)), _pair(given, "dilations", (1, 1))
+    beyond = _pair(given, "output_padding", (0, 0))
+    window = Window(kernel, stride, (top, left, bottom, right), dilation, beyond)
     return padding(given, shapes[0] if shapes else None, window)
 
 
@@ -234,20 +219,12 @@ def _pair(attributes: dict[str, object], key: str, default: object) -> tuple[int
     return (values[0], values[1]) if len(values) == 2 else (1, 1)
 
 
-def _count(tensor: TensorProto) -> int:
-    count = 1
-    for size in tensor.dims:
-        count *= size
-    return count
-
-
 def _input_shape(info: onnx.ValueInfoProto, tile_px: int | None, places: tuple[int, int], where: str) -> Shape:
     """(C, tile, tile) of an input (N, C, H, W), in places; without a tile (C, H, W) as the file states them."""
     sizes = [d.dim_value for d in info.type.tensor_type.shape.dim]
     if len(sizes) != 4 or sizes[1] < 1:
-        raise ModelError(
-            where, expected="inputs (N, C, H, W)", got=f"{info.name} {sizes}", remedy="export the network as such"
-        )
+        got, remedy = f"{info.name} {sizes}", "export the network as such"
+        raise ModelError(where, expected="inputs (N, C, H, W)", got=got, remedy=remedy)
     if tile_px is None:
         if not all(sizes[2:]):
             raise ModelError(where, expected="an input of a stated size", got="any size", remedy="give `tile`")
@@ -259,12 +236,10 @@ def _input_shape(info: onnx.ValueInfoProto, tile_px: int | None, places: tuple[i
         raise ModelError(where, expected=expected, got=f"{tile_px} px", remedy=remedy)
     fixed = {size for size in sizes[2:] if size} - {side}
     if fixed:
-        raise ModelError(
-            where,
-            expected=f"an input that takes {tile_px} x {tile_px} pixels",
-            got=f"one fixed to {_side_px(sizes[3], places)} x {_side_px(sizes[2], places)}",
-            remedy=f"give `tile` {_side_px(min(fixed), places)}, or export it with free sizes",
-        )
+        expected = f"an input that takes {tile_px} x {tile_px} pixels"
+        got = f"one fixed to {_side_px(sizes[3], places)} x {_side_px(sizes[2], places)}"
+        remedy = f"give `tile` {_side_px(min(fixed), places)}, or export it with free sizes"
+        raise ModelError(where, expected=expected, got=got, remedy=remedy)
     return (sizes[1], side, side)
 
 

@@ -254,8 +254,7 @@ def histogram_url(spread: "Spread") -> str:
         figure = new_figure(*HISTOGRAM_PX)
         axes = figure.add_axes(HISTOGRAM_FRAME)
         axes.set(yscale="log", ylim=(least, 1), xlabel="INT8 - float, DN")
-        heights = np.maximum(shares - least, 0)
-        axes.bar(centres, heights, 0.8 * wide, least, color=LIGHT["mark2"])
+        axes.bar(centres, np.maximum(shares - least, 0), 0.8 * wide, least, color=LIGHT["mark2"])
         inside = gauss > least
         axes.plot(centres[inside], np.minimum(gauss[inside], 1), color=LIGHT["mark1"], lw=2)
         set_ticks(axes.xaxis, LABELS)
@@ -270,16 +269,9 @@ def bins(spread: "Spread") -> tuple[np.ndarray, np.ndarray, int]:
     """Centres in DN, shares of the pixels, and the width in DN of at most MOST_BARS bins that hold every error."""
     farthest = int(np.abs(np.flatnonzero(spread.counts) - MAX_DN).max())
     wide = 1
-    while 2 * _reach(farthest, wide) + 1 > MOST_BARS:
+    while 2 * (reach := -(-max(farthest - wide // 2, 0) // wide)) + 1 > MOST_BARS:
         wide += 2  # odd, so that zero lies in the middle of a bin
-    reach = _reach(farthest, wide)
-    half = reach * wide + wide // 2
+    half, middle = reach * wide + wide // 2, MAX_DN + wide
     padded = np.pad(spread.counts, wide)
-    middle = MAX_DN + wide
     shares = padded[middle - half : middle + half + 1].reshape(-1, wide).sum(1) / spread.counts.sum()
     return np.arange(-reach, reach + 1) * wide, shares, wide
-
-
-def _reach(farthest: int, wide: int) -> int:
-    """Bins on each side of the middle one."""
-    return -(-max(farthest - wide // 2, 0) // wide)

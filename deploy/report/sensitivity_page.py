@@ -14,18 +14,15 @@ from beers_deploy.quant.session import run
 from beers_deploy.report.page import Picture, Report, Section
 from beers_deploy.report.plots import histogram_url
 
+Sessions = tuple[ort.InferenceSession, ort.InferenceSession]
+
 ZOOM = 2
 WHITE_SHARE = 0.999
 """The size of error shown white is the one that this share of all pixels stays below."""
 
 
 def sensitivity_page(
-    headline: str,
-    rows: Sequence[Row],
-    spread: Spread,
-    patches: Patches,
-    sessions: tuple[ort.InferenceSession, ort.InferenceSession],
-    worst: Sequence[int],
+    headline: str, rows: Sequence[Row], spread: Spread, patches: Patches, sessions: Sessions, worst: Sequence[int]
 ) -> Report:
     """The histogram, the worst patches, and every table.
 
@@ -46,16 +43,10 @@ def sensitivity_page(
 
 def error_shown_white(spread: Spread) -> int:
     """In DN, one for all patches, so that they compare."""
-    beyond = (dn for dn in range(1, MAX_DN + 1) if spread.share_beyond(dn) <= 1 - WHITE_SHARE)
-    return next(beyond)
+    return next(dn for dn in range(1, MAX_DN + 1) if spread.share_beyond(dn) <= 1 - WHITE_SHARE)
 
 
-def worst_picture(
-    number: int,
-    degraded: np.ndarray,
-    sessions: tuple[ort.InferenceSession, ort.InferenceSession],
-    white_dn: float,
-) -> Picture:
+def worst_picture(number: int, degraded: np.ndarray, sessions: Sessions, white_dn: float) -> Picture:
     """A patch as it is given, in float, in INT8, and the size of the difference."""
     in_float, in_int8 = (np.clip(run(session, degraded), 0, 1)[0, 0] * MAX_DN for session in sessions)
     images = {"degraded": degraded[0, 0] * MAX_DN, "float": in_float, "INT8": in_int8}

@@ -25,8 +25,8 @@ def parse_sensors(text: str) -> dict[str, str]:
     pairs = [part.partition("=") for part in text.split(",")]
     found = {name.strip(): profile.strip() for name, _, profile in pairs}
     if not all((*found, *found.values())) or len(found) < len(pairs):
-        remedy = "name each band once"
-        raise OptionError("sensor", expected="BAND=PROFILE,BAND=PROFILE", got=repr(text), remedy=remedy)
+        expected = "BAND=PROFILE,BAND=PROFILE"
+        raise OptionError("sensor", expected=expected, got=repr(text), remedy="name each band once")
     return found
 
 

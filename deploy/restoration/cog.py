@@ -13,29 +13,19 @@ from typing import Any
 
 import onnx
 
-from beers_deploy.profiles.errors import MissingExtraError
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.restoration.gdal_source import ENVIRONMENT, LEAST_CACHE_BYTES, OFFLINE
+from beers_deploy.restoration.gdal_source import ENVIRONMENT, LEAST_CACHE_BYTES, OFFLINE, require_package
 from beers_deploy.restoration.options import Compression
 from beers_deploy.restoration.output import padded_px
 from beers_deploy.restoration.radiometry import FullScale
 
-CODECS = {
-    Compression.none: "NONE",
-    Compression.zlib: "DEFLATE",
-    Compression.zstd: "ZSTD",
-    Compression.lzw: "LZW",
-}
+CODECS = {Compression.none: "NONE", Compression.zlib: "DEFLATE", Compression.zstd: "ZSTD", Compression.lzw: "LZW"}
 BLOCK_PX = 512
 
 
 def require_cog() -> None:
     """Find out before the run that rasterio is missing."""
-    try:
-        import_module("rasterio")
-    except ImportError as error:
-        got, remedy = "no package rasterio", "pip install 'beers-deploy[gdal]'"
-        raise MissingExtraError("cog", expected="GDAL to write it", got=got, remedy=remedy) from error
+    require_package("rasterio", "cog", "GDAL to write it")
 
 
 def what_was_done(networks: Sequence[onnx.ModelProto], digests: str, scale: FullScale) -> dict[str, str]:
@@ -46,7 +36,7 @@ def what_was_done(networks: Sequence[onnx.ModelProto], digests: str, scale: Full
         "RESTORED_NETWORK_SHA256": digests,
         "RESTORED_NETWORK": ", ".join(each.get("variant", "not stated") for each in said),
         "RESTORED_SENSOR": ", ".join(each.get("sensor", "not stated") for each in said),
-        "RESTORED_FULL_SCALE": f"{scale.value:g} ({scale.source})",
+        "RESTORED_FULL_SCALE": scale.words,
     }
 
 

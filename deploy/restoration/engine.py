@@ -47,6 +47,11 @@ class Strip:
     missing: np.ndarray | None
     above: bool = False
 
+    def kept(self, bands: slice, rows: Span, columns: Span) -> tuple[slice, slice, slice]:
+        """Where in these arrays lies what is kept of a tile."""
+        down = slice(rows.keep_start - self.top, rows.keep_stop - self.top)
+        return bands, down, slice(columns.keep_start, columns.keep_stop)
+
 
 class RestoredRow(NamedTuple):
     """A row of tiles: its `span` in the image, restored `pixels` (bands, rows, width), and how many are `known`.
@@ -112,8 +117,7 @@ class Restorer:
         """How many known pixels of what is kept of a tile are above full scale."""
         if not strip.above:
             return 0
-        down = slice(rows.keep_start - strip.top, rows.keep_stop - strip.top)
-        kept = (bands, down, slice(columns.keep_start, columns.keep_stop))
+        kept = strip.kept(bands, rows, columns)
         above = strip.pixels[kept] > self.full_scale
         return int((above if strip.missing is None else above & ~strip.missing[kept]).sum())
 
@@ -124,8 +128,7 @@ class Restorer:
         """
         if strip.missing is None:
             return None
-        down = slice(rows.keep_start - strip.top, rows.keep_stop - strip.top)
-        kept = (bands, down, slice(columns.keep_start, columns.keep_stop))
+        kept = strip.kept(bands, rows, columns)
         stored, missing = strip.pixels[kept].astype(self.raster.out_dtype), strip.missing[kept]
         tiling, scale = self.tiling, int(self.tiling.scale)
         if tiling.channels_in != tiling.channels_out:
@@ -161,7 +164,6 @@ class Restorer:
         return filled[:, above : above + rows.stop - rows.start, aside : aside + columns.stop - columns.start]
 
     def _within(self, span: Span) -> slice:
-        """What is kept of a restored window."""
         scale = int(self.tiling.scale)
         return slice((span.keep_start - span.start) * scale, (span.keep_stop - span.start) * scale)
 
@@ -184,13 +186,10 @@ def checked_strip(
     # Where nothing is known, 0 is taken for both, which is inside.
     low, high = (float(extreme(pixels, where=known, initial=0)) for extreme in (np.min, np.max))
     if low < 0 or (high > full_scale and not (clips and np.isfinite(high))):
+        where = f"{name}, rows {top} to {top + pixels.shape[1] - 1}"
         remedy = "give the sensor's highest number as `full_scale`, or mark missing pixels as nodata"
-        raise ImageError(
-            f"{name}, rows {top} to {top + pixels.shape[1] - 1}",
-            expected=f"digital numbers of 0 to {full_scale:g}",
-            got=f"values from {low:g} to {high:g}",
-            remedy=remedy_outside(low, high, remedy),
-        )
+        got, remedy = f"values from {low:g} to {high:g}", remedy_outside(low, high, remedy)
+        raise ImageError(where, expected=f"digital numbers of 0 to {full_scale:g}", got=got, remedy=remedy)
     return Strip(top, pixels, missing, high > full_scale)
 
 
@@ -290,7 +289,6 @@ def _tiles(strip: Strip, row: Span, plan: Plan, restorer: Restorer, pool: Execut
 def _joined(
     row: Span, tiles: Iterable[Tile], plan: Plan, restorer: Restorer, tick: Callable[[], None]
 ) -> RestoredRow:
-    """One row of its tiles."""
     bands, _, width_px = plan.out_shape
     shape = (bands, (row.keep_stop - row.keep_start) * plan.scale, width_px)
     result, known, clipped = np.empty(shape, restorer.raster.out_dtype), 0, 0

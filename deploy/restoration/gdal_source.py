@@ -43,12 +43,13 @@ OFFLINE = {"CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "{none}"}
 logging.getLogger("rasterio").addHandler(logging.NullHandler())  # who asks for its remarks still has them
 
 
-def _rasterio(path: Path) -> Any:  # an optional package
+def require_package(name: str, where: str, expected: str, instead: str = "") -> Any:
+    """An optional package of the extra gdal."""
     try:
-        return import_module("rasterio")
+        return import_module(name)
     except ImportError as error:
-        got, remedy = "no package rasterio", "pip install 'beers-deploy[gdal]', or convert it to TIFF"
-        raise MissingExtraError(str(path), expected="GDAL to read it", got=got, remedy=remedy) from error
+        got, remedy = f"no package {name}", f"pip install 'beers-deploy[gdal]'{instead}"
+        raise MissingExtraError(where, expected=expected, got=got, remedy=remedy) from error
 
 
 @contextmanager
@@ -59,7 +60,7 @@ def open_gdal(path: Path, trusted: bool = False) -> Iterator["GdalSource"]:
         path: of the file or the index.
         trusted: as in `index_files`.
     """
-    rasterio = _rasterio(path)
+    rasterio = require_package("rasterio", str(path), "GDAL to read it", ", or convert it to TIFF")
     files = path, *index_files(path, trusted)
     tiles = [file for file in files[1:] if not is_index(file)]
     environment = ENVIRONMENT if trusted else ENVIRONMENT | OFFLINE
@@ -80,7 +81,6 @@ def _block_px(dataset: Any) -> int:
 
 @contextmanager
 def _damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
-    """One sentence for whatever GDAL finds wrong."""
     try:
         with warnings.catch_warnings(action="ignore"), _log_in_any_bytes():  # an image need not lie on Earth
             yield
@@ -119,7 +119,7 @@ def _log_in_any_bytes() -> Iterator[None]:
 class GdalSource:
     """An image that GDAL has opened; one thread reads at a time."""
 
-    def __init__(self, files: tuple[Path, ...], dataset: Any, block_px: int, environment: dict[str, str]) -> None:
+    def __init__(self, files: tuple[Path, ...], dataset: Any, block_px: int, environment: dict[str, Any]) -> None:
         self.files, self._path, self._dataset, self._environment = files, files[0], dataset, environment
         with _damage_in_a_sentence(self._path):
             self.raster = _raster(self._path, dataset)
@@ -127,19 +127,16 @@ class GdalSource:
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored."""
-        rasterio = _rasterio(self._path)
-        with (
-            _damage_in_a_sentence(self._path, f"rows {start} to {stop - 1}"),
-            rasterio.Env(GDAL_CACHEMAX=self.held_bytes(stop - start), **self._environment),
-        ):
+        rasterio: Any = import_module("rasterio")
+        environment = self._environment | {"GDAL_CACHEMAX": self.held_bytes(stop - start)}
+        with _damage_in_a_sentence(self._path, f"rows {start} to {stop - 1}"), rasterio.Env(**environment):
             window = rasterio.windows.Window(0, start, self.raster.width_px, stop - start)
             return np.asarray(self._dataset.read(window=window))
 
     def held_bytes(self, rows_px: int) -> int:
         """GDAL's cache: the blocks around the rows, so that none is decoded for two strips."""
-        rows = rows_px + 2 * self._block_px
         row_bytes = self.raster.bands * self.raster.width_px * self.raster.dtype.itemsize
-        return int(max(LEAST_CACHE_BYTES, rows * row_bytes))
+        return int(max(LEAST_CACHE_BYTES, (rows_px + 2 * self._block_px) * row_bytes))
 
 
 def _raster(path: Path, dataset: Any) -> Raster:

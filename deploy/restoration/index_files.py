@@ -20,18 +20,11 @@ INDEX_BYTES = 1 << 23
 ELEMENTS, LEVELS, HEAD_BYTES = 200_000, 4, 1000
 """Of one index, of indexes that name indexes, and of what GDAL tells a file's kind from."""
 
-MAGIC = {
-    b"II*\0": "TIFF",
-    b"MM\0*": "TIFF",
-    b"II+\0": "BigTIFF",
-    b"MM\0+": "BigTIFF",
-    b"\0\0\0\x0cjP  \r\n\x87\n": "JPEG 2000",
-    b"\xff\x4f\xff\x51": "JPEG 2000",
-    b"NITF": "NITF",
-    b"NSIF": "NITF",
-    b"\x89PNG\r\n\x1a\n": "PNG",
-    b"\xff\xd8\xff": "JPEG",
-}
+MAGIC = (
+    *(b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"),  # TIFF and BigTIFF
+    *(b"\0\0\0\x0cjP  \r\n\x87\n", b"\xff\x4f\xff\x51"),  # JPEG 2000
+    *(b"NITF", b"NSIF", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"),  # NITF, PNG, JPEG
+)
 """How the files begin that an index may name: none of them names others."""
 
 VRT_ELEMENTS = {
@@ -106,7 +99,7 @@ def _require_pixels(index: Path, text: str, file: Path) -> None:
     if not (text and file.is_file()):
         raise _refused(index, f"the tile {text or '(no name)'}", "no such file", "fetch it or make the index anew")
     with file.open("rb") as stream:
-        known = stream.read(16).startswith(tuple(MAGIC))
+        known = stream.read(16).startswith(MAGIC)
     if not known and file.suffix.lower() != ".vrt":
         expected = "tiles that are TIFF, JPEG 2000, NITF, PNG or JPEG"
         raise _refused(index, expected, f"another file, {text}", "convert it to TIFF")
@@ -149,8 +142,7 @@ def _of_dimap(path: Path, root: ET.Element) -> Named:
     for element in root.iter():
         name = element.tag.rpartition("}")[2].lower()
         if name in DIMAP_PATHS:
-            given = [*element.attrib.items(), *((child.tag, child.text or "") for child in element)]
-            for key, text in given:
+            for key, text in (*element.attrib.items(), *((child.tag, child.text or "") for child in element)):
                 if key.rpartition("}")[2].lower() == "href":
                     yield text.strip(), path.parent, name == PIXELS
 

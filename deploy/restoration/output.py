@@ -22,7 +22,7 @@ from filelock import BaseFileLock, FileLock, Timeout
 from isal import isal_zlib
 
 from beers_deploy.model.io.files import TIFF_SUFFIXES
-from beers_deploy.profiles.errors import MachineError, MissingExtraError, OptionError, sizes
+from beers_deploy.profiles.errors import ImageError, MachineError, MissingExtraError, OptionError, sizes
 from beers_deploy.profiles.toml import read_json
 from beers_deploy.restoration.engine import RestoredRow
 from beers_deploy.restoration.options import Compression
@@ -91,8 +91,14 @@ class Checkpoint:
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
         """Finished rows `start` to `stop` (excluded) of one band, (rows, width) as they will be written."""
         count = (stop - start) * self.shape[2]
-        path, offset = self.folder / "rows.raw", self._offset(band, start)
-        return np.fromfile(path, self.dtype, count, offset=offset).reshape(-1, self.shape[2])
+        pixels = np.fromfile(self.folder / "rows.raw", self.dtype, count, offset=self._offset(band, start))
+        return pixels.reshape(-1, self.shape[2])
+
+    def require_known(self, name: str) -> None:
+        """Refuse an image, `name` in messages, that has no pixels with values."""
+        if not self.known:
+            got, remedy = "NaN or nodata everywhere", "check that it is the right file"
+            raise ImageError(name, expected="some pixels with values", got=got, remedy=remedy)
 
     def remove(self) -> None:
         """Throw the rows away; the journal first, so that nothing is left that counts on them."""
@@ -120,18 +126,14 @@ class Checkpoint:
             sound = 0 <= rows <= self.shape[1] and 0 <= known <= math.prod(self.shape) and clipped >= 0
             if journal["job"] == self._job and sound:
                 return rows, known, clipped
-        raise OptionError(
-            "resume",
-            expected="the image, the model and the options of the run that was stopped",
-            got=f"others, or a damaged {path}",
-            remedy="run it as before, or start afresh without `resume`",
-        )
+        expected = "the image, the model and the options of the run that was stopped"
+        got, remedy = f"others, or a damaged {path}", "run it as before, or start afresh without `resume`"
+        raise OptionError("resume", expected=expected, got=got, remedy=remedy)
 
     def _write_journal(self) -> None:
         path, fresh = self.folder / "journal.json", self.folder / "journal.new"
         with fresh.open("w", encoding="utf-8") as stream:
-            counts = {"rows": self.rows, "known": self.known, "clipped": self.clipped}
-            json.dump({"job": self._job, **counts}, stream)
+            json.dump({"job": self._job, "rows": self.rows, "known": self.known, "clipped": self.clipped}, stream)
             stream.flush()
             os.fsync(stream.fileno())
         fresh.replace(path)
@@ -152,9 +154,8 @@ class Checkpoint:
         free = shutil.disk_usage(self.out.parent).free
         if needed > free:
             (wanted, left), remedy = sizes(needed, free), "free some space or write elsewhere"
-            raise MachineError(
-                str(self.out), expected=f"{wanted} of disk (nothing packed)", got=f"{left} free", remedy=remedy
-            )
+            expected = f"{wanted} of disk (nothing packed)"
+            raise MachineError(str(self.out), expected=expected, got=f"{left} free", remedy=remedy)
 
 
 def sync_folder(folder: Path) -> None:
@@ -296,12 +297,13 @@ NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, ENOTSUP
 
 
 @contextmanager
-def only_run(out: Path, folder: Path) -> Iterator[None]:
-    """Hold `folder`, where a run keeps what it needs for `out`; in the end it is gone, unless rows were left in it.
+def only_run(out: Path, folder: Path | None = None) -> Iterator[None]:
+    """Hold the folder where a run keeps what it needs for `out`; in the end it is gone, unless rows were left in it.
 
     Folders above it that were made for it are gone then, too, unless something was written there. It locks nothing on
     a disk that has no locks, as some of networks.
     """
+    folder = folder or part_folder(out)
     new = [parent for parent in folder.parents if not parent.exists()]
     lock = _take(out, folder)
     try:

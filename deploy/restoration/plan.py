@@ -43,18 +43,13 @@ def plan_side(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1, lea
     """
     if tile_px < 2 * halo_px + lattice_px or halo_px < 0:
         least = f", {2 * halo_px + lattice_px} px at least" if lattice_px > 1 else ""
-        raise OptionError(
-            "tile",
-            expected=f"more than twice the halo of {halo_px} px{least}",
-            got=f"{tile_px} px",
-            remedy="take larger tiles or a smaller halo",
-        )
+        expected, remedy = f"more than twice the halo of {halo_px} px{least}", "take larger tiles or a smaller halo"
+        raise OptionError("tile", expected=expected, got=f"{tile_px} px", remedy=remedy)
     whole_px = _up(max(size_px, least_px), lattice_px)
     return list(_spans(size_px, whole_px, min(tile_px // lattice_px * lattice_px, whole_px), halo_px))
 
 
 def _up(size_px: int, lattice_px: int) -> int:
-    """The next multiple of the lattice."""
     return -(-size_px // lattice_px) * lattice_px
 
 
@@ -123,8 +118,7 @@ class Plan:
     @property
     def tile_shape(self) -> tuple[int, int]:
         """Rows and columns of pixels of every tile."""
-        row, column = self.rows[0], self.columns[0]
-        return row.stop - row.start, column.stop - column.start
+        return self.rows[0].stop - self.rows[0].start, self.columns[0].stop - self.columns[0].start
 
     @property
     def row_tiles(self) -> int:
@@ -179,12 +173,9 @@ def plan_for(network: onnx.ModelProto, shape: tuple[int, int, int], options: Opt
 def require_fixed_tile(fixed_px: int, tile_px: int, size: tuple[int, int]) -> None:
     """A network fixed to one tile size takes only windows of that size, in an image of `size` (H, W)."""
     if fixed_px != tile_px or min(size) < fixed_px:
-        raise OptionError(
-            "tile",
-            expected=f"{fixed_px}, the size the model is fixed to, and an image at least as large",
-            got=f"tile {tile_px}, image {size[1]} x {size[0]}",
-            remedy="take a network of free sizes",
-        )
+        expected = f"{fixed_px}, the size the model is fixed to, and an image at least as large"
+        got, remedy = f"tile {tile_px}, image {size[1]} x {size[0]}", "take a network of free sizes"
+        raise OptionError("tile", expected=expected, got=got, remedy=remedy)
 
 
 def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling) -> Plan:
@@ -251,13 +242,10 @@ def check_memory(rows: int, budget_bytes: int | None, bulky: bool) -> int:
     if held + rows <= allowed:
         return held + rows
     limit, before, rows_size = sizes(allowed, held, rows)
-    remedy = "rewrite the image in tiles (gdal_translate -co TILED=YES)" if bulky else "take a smaller `tile`"
-    raise MachineError(
-        "memory",
-        expected=f"a run within {limit}",
-        got=f"{before} before and {rows_size} for rows of the image",
-        remedy=f"{remedy} or give it more" if held < allowed else f"give it more than {before}",
-    )
+    smaller = "rewrite the image in tiles (gdal_translate -co TILED=YES)" if bulky else "take a smaller `tile`"
+    remedy = f"{smaller} or give it more" if held < allowed else f"give it more than {before}"
+    got = f"{before} before and {rows_size} for rows of the image"
+    raise MachineError("memory", expected=f"a run within {limit}", got=got, remedy=remedy)
 
 
 def is_bulky(source: Source, plan: Plan) -> bool:

@@ -6,7 +6,6 @@ an assumed one they show that the assumption is wrong, and are refused.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -22,6 +21,16 @@ class FullScale:
     value: float
     source: str
     assumed: bool = False
+
+    @property
+    def words(self) -> str:
+        """The value, and where it is from."""
+        return f"{self.value:g} ({self.source})"
+
+    @property
+    def text(self) -> dict[str, str]:
+        """Both as the text of a row of results."""
+        return {"full scale": f"{self.value:g}", "full scale from": self.source}
 
 
 def full_scale_of(
@@ -42,16 +51,11 @@ def full_scale_of(
         return FullScale(asked, "asked for")
     if raster.bits is not None:
         return FullScale(2**raster.bits - 1, f"{raster.bits} bits, as the file states")
-    if bits is None or not _holds(raster.dtype, bits):
+    if bits is None or (raster.dtype.kind != "f" and 2**bits - 1 > np.iinfo(raster.dtype).max):
         return FullScale(settled_scale(name, raster.dtype, largest), f"assumed: {MAX_DN.bit_length()} bits", True)
     usual = 2**bits - 1
     value = settled_scale(name, raster.dtype, largest, usual=usual) if raster.dtype.kind == "f" else usual
     return FullScale(value, f"{bits} bits, of the sensor")
-
-
-def _holds(dtype: np.dtype[Any], bits: int) -> bool:
-    """Whether pixels of this type can have so many bits."""
-    return dtype.kind == "f" or 2**bits - 1 <= np.iinfo(dtype).max
 
 
 def require_room(raster: Raster, full_scale: float) -> None:

@@ -24,7 +24,7 @@ from beers_deploy.model.io.files import require_writable
 from beers_deploy.model.io.images import require_image_file
 from beers_deploy.model.processor import require_cores
 from beers_deploy.model.progress import Log, held_back, steps
-from beers_deploy.profiles.errors import BeersError, ImageError, MachineError
+from beers_deploy.profiles.errors import BeersError, MachineError
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.reading.external import network_sha256
@@ -33,14 +33,7 @@ from beers_deploy.restoration.cog import disk_bytes, require_cog, what_was_done,
 from beers_deploy.restoration.engine import RestoredRow, Restorer, restore_rows
 from beers_deploy.restoration.georeference import enlarged_tags
 from beers_deploy.restoration.options import Compression, Options
-from beers_deploy.restoration.output import (
-    Checkpoint,
-    only_run,
-    part_folder,
-    require_codec,
-    require_tiff_name,
-    write_output,
-)
+from beers_deploy.restoration.output import Checkpoint, only_run, require_codec, require_tiff_name, write_output
 from beers_deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
 from beers_deploy.restoration.runtime import Infer, infer_on, open_runtime, pack, tiles_at_once
@@ -73,7 +66,7 @@ def restore_file(image: Path, out: Path, options: Options, log: Log, beside: Seq
         require_cog()
     else:
         require_codec(options.compression)
-    with only_run(out, part_folder(out)):
+    with only_run(out):
         return _restore(image, out, options, log, beside)
 
 
@@ -98,7 +91,7 @@ def _restore(image: Path, out: Path, options: Options, log: Log, beside: Sequenc
         cog_bytes = disk_bytes(plan.out_shape, raster.out_dtype.itemsize) if options.cog else 0
         checkpoint = Checkpoint(out, plan.out_shape, raster.out_dtype, job, options.resume, cog_bytes)
         done_rows = checkpoint.rows // plan.scale
-        _finish_rows(checkpoint, source, plan, restorer, at_once, options.memory_bytes, log)
+        _finish_rows(checkpoint, source, plan, restorer, at_once, options, log)
     with held_back():  # a stop now would save nothing
         tags = enlarged_tags(raster.tags, plan.scale)
         if options.cog:
@@ -109,10 +102,9 @@ def _restore(image: Path, out: Path, options: Options, log: Log, beside: Sequenc
             write_output(checkpoint, tags, options.compression)
     time_s = time.perf_counter() - started
     if checkpoint.clipped:
-        above = f"{checkpoint.clipped} pixels above full scale"
         share = checkpoint.clipped / prod(raster.shape)
         doubt = f": {share:.0%} of the image; is that its full scale?" if share > MANY else ""
-        log(f"{above}, {scale.value:g} ({scale.source}), were clipped to it{doubt}")
+        log(f"{checkpoint.clipped} pixels above full scale, {scale.words}, were clipped to it{doubt}")
     figures["clipped pixels"] = measured(checkpoint.clipped, "1", "pixels of the image above its full scale")
     return run_row(image.name, plan, done_rows, time_s, runtime, options, figures, scale)
 
@@ -154,34 +146,19 @@ def _job(image: Path, source: Source, model: str, plan: Plan, runtime: str, full
 
 
 def _finish_rows(
-    checkpoint: Checkpoint,
-    source: Source,
-    plan: Plan,
-    restorer: Restorer,
-    at_once: int,
-    budget_bytes: int | None,
-    log: Log,
+    checkpoint: Checkpoint, source: Source, plan: Plan, restorer: Restorer, at_once: int, options: Options, log: Log
 ) -> None:
-    """Restore the rows that a checkpoint lacks, and keep each in it while the next is made.
-
-    Args:
-        checkpoint: with the rows that are finished.
-        source: the image.
-        plan: of its tiles.
-        restorer: of them.
-        at_once: tiles in work at a time.
-        budget_bytes: of memory; None allows what is free.
-        log: is told the memory, and how to go on after a stop.
-    """
+    """Restore the rows that a checkpoint lacks, and keep each in it while the next is made."""
     rows = [row for row in plan.rows if row.keep_start * plan.scale >= checkpoint.rows]
-    tiles, steady = len(rows) * plan.row_tiles, min(RUNS_UNTIL_STEADY * at_once, len(rows) * plan.row_tiles)
+    tiles = len(rows) * plan.row_tiles
+    steady = min(RUNS_UNTIL_STEADY * at_once, tiles)
     with _kept_for_resuming(checkpoint, log), steps("restoring", tiles) as bar, held_back() as interrupt:
 
         def tick() -> None:
             bar.advance()
             if bar.done == steady:
                 needed = rows_bytes(source, plan, begun=True)
-                most = check_memory(needed, budget_bytes, is_bulky(source, plan))
+                most = check_memory(needed, options.memory_bytes, is_bulky(source, plan))
                 log(f"memory: about {most / 1e9:.2f} GB (measured after the first tiles, and the rows to come)")
             if interrupt.asked:
                 raise KeyboardInterrupt
@@ -189,9 +166,7 @@ def _finish_rows(
         if rows:
             with closing(restore_rows(source, plan, restorer, rows, tick, at_once)) as finished:
                 _write_behind(finished, checkpoint)
-        if not checkpoint.known:
-            got, remedy = "NaN or nodata everywhere", "check that it is the right file"
-            raise ImageError(restorer.name, expected="some pixels with values", got=got, remedy=remedy)
+        checkpoint.require_known(restorer.name)
 
 
 @contextmanager
@@ -243,8 +218,7 @@ def seam_error_dn(source: Source, plan: Plan, restorer: Restorer) -> tuple[float
     rows, columns = plan.rows[len(plan.rows) // 2], plan.columns[len(plan.columns) // 2]
     ends_px = plan.rows[-1].stop, plan.columns[-1].stop
     wide = [_widened(span, plan.radius_px, end_px) for span, end_px in zip((rows, columns), ends_px, strict=True)]
-    start, stop = min(rows.start, wide[0].start), max(rows.stop, wide[0].stop)
-    strip = restorer.read(source, start, stop)
+    strip = restorer.read(source, min(rows.start, wide[0].start), max(rows.stop, wide[0].stop))
     cheap, exact = (restorer.tile(strip, 0, *spans).pixels.astype(np.float64) for spans in ((rows, columns), wide))
     error = np.abs(np.nan_to_num(cheap) - np.nan_to_num(exact))
     return float(error.max()), float(error.mean())
@@ -282,6 +256,4 @@ def run_row(
         **more,
     }
     workers = {"workers": options.scheduler} if options.scheduler else {}
-    scales = {"full scale": f"{scale.value:g}", "full scale from": scale.source}
-    text = {"halo": plan.halo_words, **scales, "runtime": runtime, **workers}
-    return Row("restore", name, figures, text)
+    return Row("restore", name, figures, {"halo": plan.halo_words, **scale.text, "runtime": runtime, **workers})

@@ -41,7 +41,8 @@ def open_openvino(
     # Said aloud: where the processor has bfloat16 units, OpenVINO would round to it unasked.
     options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": str(at_once), "ENABLE_CPU_PINNING": False}
     options |= {"INFERENCE_NUM_THREADS": str(threads)} if threads else {}
-    content = saturating_adds(_exact(model, core)).SerializeToString()
+    exact = model if not is_integer(model) or _adds_exactly(core) else made_exact(model)[0]
+    content = saturating_adds(exact).SerializeToString()
 
     @lru_cache(maxsize=2)
     def compiled(shape: tuple[int, ...]) -> Any:
@@ -64,11 +65,6 @@ def open_openvino(
         return np.asarray(request(image.shape, get_ident()).infer([image], share_inputs=True)[0])
 
     return infer, f"openvino {version('openvino')}"
-
-
-def _exact(model: onnx.ModelProto, core: Any) -> onnx.ModelProto:
-    """The model as this processor's kernels add it exactly."""
-    return model if not is_integer(model) or _adds_exactly(core) else made_exact(model)[0]
 
 
 @lru_cache(maxsize=1)

@@ -137,14 +137,9 @@ def usable_nodata(path: str, value: float | None, dtype: np.dtype[Any]) -> float
 
 BIG_TIFF_SUFFIXES = {".btf", ".tf8"}
 GDAL_DRIVERS = {
-    ".jp2": "JP2OpenJPEG",
-    ".j2k": "JP2OpenJPEG",
-    ".ntf": "NITF",
-    ".nitf": "NITF",
-    ".img": "HFA",
-    ".vrt": "VRT",
+    ".jp2": "JP2OpenJPEG", ".j2k": "JP2OpenJPEG", ".ntf": "NITF", ".nitf": "NITF", ".img": "HFA", ".vrt": "VRT",
     ".xml": "DIMAP",
-}
+}  # fmt: skip
 """By a file's suffix: others of GDAL's drivers open further files, or the network."""
 DIGEST_BYTES = 1 << 16
 """Of each end of a file."""
@@ -170,18 +165,15 @@ class Source(Protocol):
 
 def fingerprint(files: Iterable[Path]) -> tuple[int, str]:
     """The files' size in bytes, and the SHA-256 of the two ends of each: quick at any size."""
-    digest, size_bytes = hashlib.sha256(), 0
+    digest, total_bytes = hashlib.sha256(), 0
     for file in files:
-        size_bytes += file.stat().st_size
-        digest.update(_ends(file))
-    return size_bytes, digest.hexdigest()
-
-
-def _ends(file: Path) -> bytes:
-    with file.open("rb") as stream:
-        ends = stream.read(DIGEST_BYTES)
-        stream.seek(max(file.stat().st_size - DIGEST_BYTES, 0))
-        return ends + stream.read(DIGEST_BYTES)
+        size_bytes = file.stat().st_size
+        total_bytes += size_bytes
+        with file.open("rb") as stream:
+            digest.update(stream.read(DIGEST_BYTES))
+            stream.seek(max(size_bytes - DIGEST_BYTES, 0))
+            digest.update(stream.read(DIGEST_BYTES))
+    return total_bytes, digest.hexdigest()
 
 
 @contextmanager
@@ -290,8 +282,7 @@ class TiffSource:
         self._held = {row: pixels for row, pixels in self._held.items() if first <= row < last}
         out = np.empty((self.raster.bands, stop - start, self.raster.width_px), self.raster.dtype)
         for row in range(first, last):
-            pixels = self._held[row] if row in self._held else self._decode(row)
-            self._held[row] = pixels
+            pixels = self._held[row] = self._held[row] if row in self._held else self._decode(row)
             top = row * size
             low, high = max(start, top), min(stop, top + size)
             out[:, low - start : high - start] = pixels[:, low - top : high - top]

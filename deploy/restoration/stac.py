@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from beers_deploy.model.io.files import write_text
-from beers_deploy.profiles.errors import MissingExtraError
-from beers_deploy.restoration.gdal_source import ENVIRONMENT, OFFLINE
+from beers_deploy.restoration.gdal_source import ENVIRONMENT, OFFLINE, require_package
 
 LONGITUDE_LATITUDE = "EPSG:4326"
 WHEN = "datetime is the time of the restoration: the image states no time of acquisition that is known here"
@@ -23,11 +22,7 @@ WHEN = "datetime is the time of the restoration: the image states no time of acq
 def require_stac() -> None:
     """Find out before the run that a package is missing."""
     for package in ("rasterio", "pystac"):
-        try:
-            import_module(package)
-        except ImportError as error:
-            got, remedy = f"no package {package}", "pip install 'beers-deploy[gdal]'"
-            raise MissingExtraError("stac", expected="a package that writes it", got=got, remedy=remedy) from error
+        require_package(package, "stac", "a package that writes it")
 
 
 def write_item(image: Path, path: Path) -> None:
@@ -53,8 +48,8 @@ def write_item(image: Path, path: Path) -> None:
         properties={"description": f"restored by beers-deploy; {WHEN}", **done},
     )
     href = Path(os.path.relpath(image, path.parent)).as_posix()
-    kind = pystac.MediaType.COG
-    item.add_asset("restored", pystac.Asset(href, media_type=kind, roles=["data"], extra_fields={"bands": bands}))
+    asset = pystac.Asset(href, media_type=pystac.MediaType.COG, roles=["data"], extra_fields={"bands": bands})
+    item.add_asset("restored", asset)
     write_text(path, json.dumps(item.to_dict(include_self_link=False, transform_hrefs=False), indent=1) + "\n")
 
 

@@ -24,14 +24,7 @@ from beers_deploy.profiles.figures import Row, measured
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.engine import RestoredRow, as_stored, checked_strip
 from beers_deploy.restoration.options import Compression
-from beers_deploy.restoration.output import (
-    Checkpoint,
-    only_run,
-    part_folder,
-    require_codec,
-    require_tiff_name,
-    write_output,
-)
+from beers_deploy.restoration.output import Checkpoint, only_run, require_codec, require_tiff_name, write_output
 from beers_deploy.restoration.plan import Span, check_memory
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
 from beers_deploy.restoration.source import Raster, Source, fingerprint, open_source
@@ -75,7 +68,7 @@ def restore_file_traditionally(image: Path, out: Path, request: Request, beside:
     require_writable(out, inputs=(image,))
     require_tiff_name(out)
     require_codec(request.compression)
-    with only_run(out, part_folder(out)):
+    with only_run(out):
         return _restore(image, out, request, beside)
 
 
@@ -84,7 +77,9 @@ def _restore(image: Path, out: Path, request: Request, beside: Sequence[Path | N
     with open_source(image, request.trust_index) as source:
         require_writable(out, *beside, inputs=source.files)
         raster = source.raster
-        _require_one_band(raster, image)
+        if raster.bands > 1:
+            remedy = "extract the band that the profile describes"
+            raise ImageError(str(image), expected="one band", got=f"{raster.bands} bands", remedy=remedy)
         needed = FIXED_BYTES + BYTES_PER_COLUMN * raster.width_px + source.held_bytes(STRIP_PX)
         check_memory(needed, request.memory_bytes, bulky=False)
         largest = (raster.largest(source.read(*rows)) for rows in _strips(raster.height_px))
@@ -102,7 +97,6 @@ def _restore(image: Path, out: Path, request: Request, beside: Sequence[Path | N
 
 
 def _fill(checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: float, name: str) -> None:
-    """Restore every row."""
     raster, to_dn, top = source.raster, chain.degraded.max_dn / full_scale, 0
     with steps("restoring rows", raster.height_px) as bar:
         for strip in restore_strips(_read(source, to_dn, full_scale, name), raster.height_px, chain):
@@ -114,9 +108,7 @@ def _fill(checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: floa
             checkpoint.append(RestoredRow(Span(top, stop, top, stop), kept, int((~missing).sum())))
             bar.advance(stop - top)
             top = stop
-    if not checkpoint.known:
-        got, remedy = "NaN or nodata everywhere", "check that it is the right file"
-        raise ImageError(name, expected="some pixels with values", got=got, remedy=remedy)
+    checkpoint.require_known(name)
 
 
 def _read(source: Source, to_dn: float, full_scale: float, name: str) -> Iterator[Tensor]:
@@ -135,20 +127,11 @@ def _strips(height_px: int) -> Iterator[tuple[int, int]]:
         yield start, min(start + STRIP_PX, height_px)
 
 
-def _require_one_band(raster: Raster, image: Path) -> None:
-    if raster.bands > 1:
-        remedy = "extract the band that the profile describes"
-        raise ImageError(str(image), expected="one band", got=f"{raster.bands} bands", remedy=remedy)
-
-
 def _row(name: str, raster: Raster, time_s: float, request: Request, scale: FullScale) -> Row:
     source = f"from opening the image to the finished file, {torch.get_num_threads()} threads"
-    pixels = raster.height_px * raster.width_px
     figures = {
         "time": measured(time_s, "s", source),
-        "throughput": measured(pixels / time_s / 1e6, "Mpx/s", source),
+        "throughput": measured(raster.height_px * raster.width_px / time_s / 1e6, "Mpx/s", source),
         "peak memory": peak_memory(),
     }
-    scales = {"full scale": f"{scale.value:g}", "full scale from": scale.source}
-    text = {"method": "traditional", "sensor": request.sensor.name, **scales}
-    return Row("restore", name, figures, text)
+    return Row("restore", name, figures, {"method": "traditional", "sensor": request.sensor.name, **scale.text})

@@ -18,16 +18,8 @@ import numpy as np
 
 from beers_deploy.model.io.images import read_pixels
 from beers_deploy.model.io.tiff import write_tiff
-from beers_deploy.model.metrics.edge_blur import (
-    HALF_PX,
-    MIN_FOUND,
-    POINTED_AT,
-    AxisMtf,
-    EdgeBlur,
-    combine,
-    find_blurs,
-    fit_blur,
-)
+from beers_deploy.model.metrics import edge_blur
+from beers_deploy.model.metrics.edge_blur import AxisMtf, EdgeBlur
 from beers_deploy.model.metrics.noise_line import NoiseModel, cut_blocks, fit_noise_model, join
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.progress import Progress, reporting
@@ -43,7 +35,7 @@ PARTS = (16, 4)
 """Of full scale: the radiances at which SNRs are stated, as those that a network is told of."""
 GSD_M, OVERSAMPLING, SEED = 0.5, 4, 0
 AXES = ("across", "along")
-TILE_PX, BOX_PX = 1024, 2 * HALF_PX + 1
+TILE_PX, BOX_PX = 1024, 2 * edge_blur.HALF_PX + 1
 MAX_DN = 65535
 CLIPPED_PIXELS, PILE = 10, 4
 """Pixels at one value, 2^n - 1, and how many times as many as just below: what shows that it is full scale."""
@@ -212,15 +204,13 @@ def characterize(
 
 
 def _as_file(image: Any, path: Path) -> Path:
-    """The path of an image file; an array is written to one."""
     if isinstance(image, str | os.PathLike):
         return Path(image)
     pixels = np.asarray(getattr(image, "values", image))
     if pixels.ndim == 3 and len(pixels) == 1:
         pixels = pixels[0]
     if pixels.ndim != 2 or pixels.dtype.kind not in "ui":
-        got = f"{pixels.dtype} of shape {pixels.shape}"
-        remedy = "give raw pixels of one band"
+        got, remedy = f"{pixels.dtype} of shape {pixels.shape}", "give raw pixels of one band"
         raise ImageError("images", expected="whole digital numbers (H, W)", got=got, remedy=remedy)
     write_tiff(path, pixels.astype(np.uint16))
     return path
@@ -240,7 +230,6 @@ def read_raw(path: Path) -> np.ndarray:
 
 
 def _tiles(images: Sequence[Path]) -> Iterator[np.ndarray]:
-    """Parts of images of up to 1024 x 1024 pixels, float64."""
     for pixels in map(read_raw, images):
         for top in range(0, pixels.shape[0], TILE_PX):
             for left in range(0, pixels.shape[1], TILE_PX):
@@ -303,17 +292,17 @@ def _axes(images: Sequence[Path], boxes: Sequence[Box], noise: NoiseModel, clipp
     """MTF across (edges near the vertical) and along the track, at least one of them."""
     upright, lying = _pointed_at(boxes, noise, clipped_at)
     for tile in () if boxes else _tiles(images):
-        upright += find_blurs(tile, noise.total, clipped_at)
-        lying += find_blurs(tile.T, noise.total, clipped_at)
-    least, edges = 1 if boxes else MIN_FOUND, zip(AXES, (upright, lying), (lying, upright), strict=True)
-    axes = {name: combine(own, others) for name, own, others in edges if len(own) >= least}
+        upright += edge_blur.find_blurs(tile, noise.total, clipped_at)
+        lying += edge_blur.find_blurs(tile.T, noise.total, clipped_at)
+    least, edges = 1 if boxes else edge_blur.MIN_FOUND, zip(AXES, (upright, lying), (lying, upright), strict=True)
+    axes = {name: edge_blur.combine(own, others) for name, own, others in edges if len(own) >= least}
     if not axes:
-        raise ImageError(
-            f"edges of {_named(images)}",
-            expected=f"{MIN_FOUND} straight edges between even areas, 17 pixels long and 8 to both sides, or more",
-            got=f"{len(upright)} near the vertical and {len(lying)} near the horizontal",
-            remedy="point at one as `edge` FILE:X,Y,WIDTH,HEIGHT, or image a target, a large roof or an apron",
+        expected = (
+            f"{edge_blur.MIN_FOUND} straight edges between even areas, 17 pixels long and 8 to both sides, or more"
         )
+        got = f"{len(upright)} near the vertical and {len(lying)} near the horizontal"
+        remedy = "point at one as `edge` FILE:X,Y,WIDTH,HEIGHT, or image a target, a large roof or an apron"
+        raise ImageError(f"edges of {_named(images)}", expected=expected, got=got, remedy=remedy)
     return axes
 
 
@@ -323,7 +312,7 @@ def _pointed_at(boxes: Sequence[Box], noise: NoiseModel, clipped_at: float) -> t
     for box in boxes:
         region = box.cut(read_raw(box.image)).astype(np.float64)
         lies = _rise(region.T) > _rise(region)
-        edge = fit_blur(region.T if lies else region, noise.total, POINTED_AT)
+        edge = edge_blur.fit_blur(region.T if lies else region, noise.total, edge_blur.POINTED_AT)
         if region.min() <= 0 or region.max() >= clipped_at:
             edge = Refusal("clipped pixels")
         if isinstance(edge, Refusal):
@@ -370,16 +359,12 @@ def _mtf_lines(found: Characterised, images: str) -> Iterator[str]:
         seen, missing = sorted(AXES, key=lambda name: name not in found.axes)
         yield f"# measured {seen} the track alone: no edge shows the MTF {missing} it"
     for key, axis in zip(("mtf_nyquist", "mtf_nyquist_along"), found.axes.values(), strict=False):
-        yield from _axis_lines(key, axis, images)
-
-
-def _axis_lines(key: str, axis: AxisMtf, images: str) -> Iterator[str]:
-    low, high = axis.interval
-    edges = f"{axis.edges} edge{'' if axis.edges == 1 else 's'}"
-    yield f"# 95 % interval {low:.3g} to {high:.3g}, {edges}"
-    if not low <= axis.nearest <= high:
-        yield f"# the curve is not the profile's, whose nearest one has {axis.nearest:.3g}"
-    yield _constant(key, f"{axis.mtf_nyquist:.4g}", "measured", f"{edges} in {images}")
+        low, high = axis.interval
+        edges = f"{axis.edges} edge{'' if axis.edges == 1 else 's'}"
+        yield f"# 95 % interval {low:.3g} to {high:.3g}, {edges}"
+        if not low <= axis.nearest <= high:
+            yield f"# the curve is not the profile's, whose nearest one has {axis.nearest:.3g}"
+        yield _constant(key, f"{axis.mtf_nyquist:.4g}", "measured", f"{edges} in {images}")
 
 
 def _noise_lines(found: Characterised, images: str) -> Iterator[str]:

@@ -9,15 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.bench.tables import (
-    Swath,
-    predict_file,
-    predicted_rows,
-    processor_row,
-    published_rows,
-    sweep_rows,
-    within_words,
-)
+from beers_deploy.bench import tables
 from beers_deploy.bench.traditional import measure_chain
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import Placement
@@ -110,10 +102,10 @@ def run_demo(
         images[REFERENCE] = reference
     say("measuring the traditional pipeline, predicting the board")
     bench = bench_tables(int8_file, degraded, sensors)
-    tables = [*bench, *([Section("Quality on this image, over 4095 DN", quality)] if quality else [])]
-    tables.append(Section("What quantisation changes", verdict.rows, GATE_CAPTION))
+    sections = [*bench, *([Section("Quality on this image, over 4095 DN", quality)] if quality else [])]
+    sections.append(Section("What quantisation changes", verdict.rows, GATE_CAPTION))
     sentence = headline(bench[0].rows, quality, placement)
-    return Report("From training to board, on one image", sentence, tables, pictures_of(images, out), NOTES)
+    return Report("From training to board, on one image", sentence, sections, pictures_of(images, out), NOTES)
 
 
 def load_sensors(name: str = SENSOR) -> Sensors:
@@ -156,31 +148,28 @@ def write_networks(out: Path, sensor: Sensor) -> None:
 
 
 def _fidelity(name: str, dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray) -> Row:
-    source = "simulated pair"
-    figures = {
-        "PSNR": measured(fidelity_db(dn, reference, degraded), "dB", source),
-        "SSIM": measured(ssim(dn, reference, MAX_DN), "ratio", source),
-    }
-    return Row("quality", name, figures)
+    psnr = measured(fidelity_db(dn, reference, degraded), "dB", "simulated pair")
+    similarity = measured(ssim(dn, reference, MAX_DN), "ratio", "simulated pair")
+    return Row("quality", name, {"PSNR": psnr, "SSIM": similarity})
 
 
 def bench_tables(model: Path, dn: np.ndarray, sensors: Sensors) -> list[Section]:
     """Speed for this image, for the swath of the paper beside its rows, and for that swath on every board."""
     dpu, halo_px = load_dpu(DEFAULT_TARGET), tiling_of(load_onnx(model)).halo_px
     chain = measure_chain(dn, *sensors)
-    prediction, rows = predict_file(model, dpu), []
+    prediction, rows = tables.predict_file(model, dpu), []
     for width, height in ((dn.shape[1], dn.shape[0]), SWATH_PX):
-        swath = Swath(width, height, TILE_PX, halo_px)
-        network = predicted_rows(VARIANT, prediction, swath, dpu)
-        rows.append([chain.row(swath), processor_row(swath, dpu.target), *network])
+        swath = tables.Swath(width, height, TILE_PX, halo_px)
+        network = tables.predicted_rows(VARIANT, prediction, swath, dpu)
+        rows.append([chain.row(swath), tables.processor_row(swath, dpu.target), *network])
     dpus = [load_dpu(name) for name in board_names()]
-    boards = sweep_rows(model, swath, dpus, [TILE_PX])
-    within = within_words(boards, dpus, WITHIN_S)
+    boards = tables.sweep_rows(model, swath, dpus, [TILE_PX])
+    within = tables.within_words(boards, dpus, WITHIN_S)
     words = f"The same INT8 file on each board's default configuration. Of these, {within}."
     title = "A swath of {} x {}, beside the paper's figures".format(*SWATH_PX)
     return [
         Section(f"Time and power for this image, {dn.shape[1]} x {dn.shape[0]}", rows[0]),
-        Section(title, [replace(row, table="swath") for row in (*rows[1], *published_rows())], SWATH_CAPTION),
+        Section(title, [replace(row, table="swath") for row in (*rows[1], *tables.published_rows())], SWATH_CAPTION),
         Section("The same swath on each board, predicted", [replace(row, table="boards") for row in boards], words),
     ]
 
@@ -204,11 +193,9 @@ def pictures_of(images: dict[str, np.ndarray], out: Path) -> list[Picture]:
 def headline(bench: Sequence[Row], quality: Sequence[Row], placement: Placement) -> str:
     """One sentence: does it fit, how fast, at what quality."""
     latency = next(row for row in bench if "whole tiles" in row.name).figures["latency"]
-    cpu, whole = bench[0].figures["latency"], placement.dpu_subgraphs == 1 and not placement.failed
-    fits = "fits" if whole else "does not fit"
-    text = (
-        f"{VARIANT} in INT8 {fits} the DPU whole: predicted {latency} s for this image on a {DEFAULT_TARGET.upper()}"
-    )
+    cpu, board = bench[0].figures["latency"], DEFAULT_TARGET.upper()
+    fits = "fits" if placement.dpu_subgraphs == 1 and not placement.failed else "does not fit"
+    text = f"{VARIANT} in INT8 {fits} the DPU whole: predicted {latency} s for this image on a {board}"
     text += f", against {cpu} s {cpu.mode} for the traditional pipeline on this CPU"
     if quality:
         before, after = quality[0].figures["PSNR"], quality[-1].figures["PSNR"]

@@ -91,11 +91,7 @@ def write_checkpoint(
 
 
 def read_checkpoint(
-    path: Path,
-    network: Network,
-    average: dict[str, Tensor],
-    optimiser: torch.optim.Optimizer,
-    recipe: TrainingRecipe,
+    path: Path, network: Network, average: dict[str, Tensor], optimiser: torch.optim.Optimizer, recipe: TrainingRecipe
 ) -> tuple[int, Guards]:
     """Fill network, average (any shape each) and optimiser from a checkpoint; return its step and guards."""
     found, header = read_tensors(path)

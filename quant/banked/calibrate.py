@@ -144,11 +144,7 @@ def bank_results(image: np.ndarray, bank: Bank, vector: Sequence[float], scale: 
 
 
 def quantise_family(
-    weights: Weights,
-    bank: Bank,
-    images: Remade[np.ndarray],
-    shifts: Shifts = SHIFTS,
-    log: Log = no_log,
+    weights: Weights, bank: Bank, images: Remade[np.ndarray], shifts: Shifts = SHIFTS, log: Log = no_log
 ) -> Family:
     """A network behind a bank in whole numbers, for the middle of the family.
 

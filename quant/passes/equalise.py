@@ -73,11 +73,7 @@ def channel_ranges(
 
 
 def channel_sizes(
-    graph: Graph,
-    names: list[str],
-    images: Iterable[np.ndarray],
-    ends: Ends = ONE_CHANNEL,
-    quantile: float = QUANTILE,
+    graph: Graph, names: list[str], images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL, quantile: float = QUANTILE
 ) -> Iterator[list[np.ndarray]]:
     """A quantile of each channel's sizes, (C,) of each of the named tensors, for every tile of the images."""
     for results in values_of(graph, names, images, ends):

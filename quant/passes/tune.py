@@ -75,12 +75,7 @@ class Sample:
 
 
 def tune(
-    core: IntCore,
-    rounded: Graph,
-    full: Graph,
-    tuning: Tuning,
-    still: Collection[str] = (),
-    log: Log = no_log,
+    core: IntCore, rounded: Graph, full: Graph, tuning: Tuning, still: Collection[str] = (), log: Log = no_log
 ) -> IntCore:
     """The core with the numbers that erred least on pairs that they were not trained on.
 

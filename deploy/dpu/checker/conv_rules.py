@@ -3,7 +3,7 @@
 import math
 
 from beers_deploy.dpu.board import Dpu
-from beers_deploy.dpu.checker.finding import Finding, groups_of, outside, shown
+from beers_deploy.dpu.checker.finding import Finding, beyond_range, groups_of, outside, shown
 from beers_deploy.dpu.graph import Operation
 
 # ruff: noqa: ARG001 - every rule takes the operation and the DPU
@@ -11,20 +11,16 @@ from beers_deploy.dpu.graph import Operation
 
 def conv_kernel(op: Operation, dpu: Dpu) -> Finding | None:
     """Kernel height and width are {conv[kernel]} ({conv[kernel].source})."""
-    limit, kernel = dpu.limit("conv", "kernel"), op.window.kernel
-    if not outside(kernel, limit):
-        return None
+    limit = dpu.limit("conv", "kernel")
     remedy = f"use a kernel of at most {limit.high:g}, or stack small ones: two 3 x 3 see as far as one 5 x 5"
-    return Finding(f"kernel ({shown(kernel)}) is not in the DPU's range {limit}", remedy)
+    return beyond_range("kernel", op.window.kernel, limit, remedy)
 
 
 def conv_stride(op: Operation, dpu: Dpu) -> Finding | None:
     """Strides are {conv[stride]} ({conv[stride].source})."""
-    limit, stride = dpu.limit("conv", "stride"), op.window.stride
-    if not outside(stride, limit):
-        return None
+    limit = dpu.limit("conv", "stride")
     remedy = f"use a stride of at most {limit.high:g}, or two convolutions whose strides multiply to it"
-    return Finding(f"stride ({shown(stride)}) is not in the DPU's range {limit}", remedy)
+    return beyond_range("stride", op.window.stride, limit, remedy)
 
 
 def conv_channels(op: Operation, dpu: Dpu) -> Finding | None:
@@ -111,11 +107,8 @@ def depthwise_kernel(op: Operation, dpu: Dpu) -> Finding | None:
 
 def depthwise_stride(op: Operation, dpu: Dpu) -> Finding | None:
     """Strides are {depthwise[stride]} ({depthwise[stride].source})."""
-    limit, stride = dpu.limit("depthwise", "stride"), op.window.stride
-    if not outside(stride, limit):
-        return None
-    reason = f"stride ({shown(stride)}) is not in the DPU's range {limit}"
-    return Finding(reason, f"use a stride of at most {limit.high:g}")
+    limit = dpu.limit("depthwise", "stride")
+    return beyond_range("stride", op.window.stride, limit, f"use a stride of at most {limit.high:g}")
 
 
 def depthwise_padding(op: Operation, dpu: Dpu) -> Finding | None:
@@ -137,10 +130,9 @@ def transposed_kernel(op: Operation, dpu: Dpu) -> Finding | None:
     pairs = list(zip(op.window.kernel, op.window.stride, strict=True))
     if not outside(tuple(n for k, s in pairs for n in (k // s, groups_of(k, s))), limit):
         return None
-    reason = (
-        f"kernel ({shown(op.window.kernel)}) / stride ({shown(op.window.stride)}) is not in the DPU's range {limit}"
-    )
-    return Finding(reason, "use a kernel at least as large as the stride, such as 4 x 4 with stride 2")
+    sides = f"kernel ({shown(op.window.kernel)}) / stride ({shown(op.window.stride)})"
+    remedy = "use a kernel at least as large as the stride, such as 4 x 4 with stride 2"
+    return Finding(f"{sides} is not in the DPU's range {limit}", remedy)
 
 
 def transposed_output_padding(op: Operation, dpu: Dpu) -> Finding | None:

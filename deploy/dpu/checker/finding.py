@@ -30,6 +30,12 @@ def shown(sides: tuple[int, int]) -> str:
     return f"{sides[1]} x {sides[0]}"
 
 
+def beyond_range(what: str, sides: tuple[int, int], limit: Constant, remedy: str) -> Finding | None:
+    """What to say of a kernel or a stride of which a side lies beyond the limit."""
+    found = Finding(f"{what} ({shown(sides)}) is not in the DPU's range {limit}", remedy)
+    return found if outside(sides, limit) else None
+
+
 def groups_of(count: int, size: int) -> int:
     """How many groups of `size` hold `count` things."""
     return -(-count // size)

@@ -18,10 +18,9 @@ from beers_deploy.dpu.graph import Operation, Window
 def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:
     """The operation as it is written, then what else it may be taken as, each to be held against the rules."""
     yield op
-    if not fully_connected(op):
-        return
-    yield _in_parts(op, dpu)
-    yield _in_parts(_flat(op), dpu)
+    if fully_connected(op):
+        yield _in_parts(op, dpu)
+        yield _in_parts(_flat(op), dpu)
 
 
 def fully_connected(op: Operation) -> bool:

@@ -17,9 +17,8 @@ MOVE = "move the output's scale until it fits: 'beers-deploy quantize --regime l
 
 def on_integers(op: Operation, dpu: Dpu) -> Finding | None:
     """A node on the DPU computes on int8 tensors ({documents[numbers]})."""
-    return (
-        None if op.integer else Finding("the file computes it in floating point", f"quantise this node too; {AGAIN}")
-    )
+    remedy = f"quantise this node too; {AGAIN}"
+    return None if op.integer else Finding("the file computes it in floating point", remedy)
 
 
 def symmetric(op: Operation, dpu: Dpu) -> Finding | None:
@@ -42,11 +41,8 @@ def power_of_two(op: Operation, dpu: Dpu) -> Finding | None:
     """Scales are powers of two ({documents[numbers]})."""
     single = {role: scale for role, scale in op.scales.items() if len(scale.scales) == 1}
     faults = [f"{role} scale {scale.scales[0]:.4g}" for role, scale in single.items() if scale.frac_bits is None]
-    return (
-        Finding("; ".join(faults), f"round each scale to 2^-n; {AGAIN}, and so does AMD Quark's XINT8")
-        if faults
-        else None
-    )
+    remedy = f"round each scale to 2^-n; {AGAIN}, and so does AMD Quark's XINT8"
+    return Finding("; ".join(faults), remedy) if faults else None
 
 
 def one_format(op: Operation, dpu: Dpu) -> Finding | None:
@@ -94,10 +90,8 @@ def same_scale(op: Operation, dpu: Dpu) -> Finding | None:
     frac_bits = {role: p for role in op.scales if (p := _frac_bits(op, role)) is not None}
     if len(set(frac_bits.values())) < 2:
         return None
-    return Finding(
-        ", ".join(f"{role} {p} fractional bits" for role, p in frac_bits.items()),
-        f"give them the smallest one; {AGAIN}",
-    )
+    reason = ", ".join(f"{role} {p} fractional bits" for role, p in frac_bits.items())
+    return Finding(reason, f"give them the smallest one; {AGAIN}")
 
 
 def product_frac_bits(op: Operation) -> int | None:

@@ -30,8 +30,7 @@ CONV: tuple[Rule, ...] = (
     conv_rules.conv_groups,
 )
 RULES: Mapping[Kind, tuple[Rule, ...]] = {
-    "conv": CONV,
-    "grouped conv": CONV,
+    **dict.fromkeys(("conv", "grouped conv"), CONV),
     "depthwise": (
         conv_rules.depthwise_kernel,
         conv_rules.depthwise_stride,
@@ -53,9 +52,7 @@ RULES: Mapping[Kind, tuple[Rule, ...]] = {
     "resize": (other_rules.resize_mode, other_rules.resize_scale, other_rules.resize_channels),
     "pixel shuffle": (other_rules.shuffle_place, other_rules.shuffle_channels),
     "argmax": (other_rules.argmax_channels,),
-    "quantise": (other_rules.known_operator,),
-    "dequantise": (other_rules.known_operator,),
-    "other": (other_rules.known_operator,),
+    **dict.fromkeys(("quantise", "dequantise", "other"), (other_rules.known_operator,)),
 }
 """What a node of each kind has to keep, float or quantised."""
 
@@ -70,14 +67,11 @@ NUMBERS: tuple[Rule, ...] = (
     number_rules.one_format,
     number_rules.int8_constants,
 )
+SUMS = (number_rules.int8_bias, number_rules.int32_bias, number_rules.shift_cut, number_rules.shift_bias)
 SHIFTS: Mapping[Kind, tuple[Rule, ...]] = {
-    "conv": (number_rules.int8_bias, number_rules.int32_bias, number_rules.shift_cut, number_rules.shift_bias),
-    "depthwise": (number_rules.int8_bias, number_rules.int32_bias, number_rules.shift_cut, number_rules.shift_bias),
-    "transposed": (number_rules.int8_bias, number_rules.int32_bias, number_rules.shift_cut, number_rules.shift_bias),
+    **dict.fromkeys(("conv", "depthwise", "transposed"), SUMS),
     "add": (number_rules.shift_read, number_rules.shift_write),
-    "mul": (),
-    "concat": (number_rules.same_scale,),
-    "pool": (number_rules.same_scale,),
+    **dict.fromkeys(("concat", "pool"), (number_rules.same_scale,)),
 }
 """What a quantised node has to keep besides."""
 

@@ -4,7 +4,7 @@ import math
 
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.conv_rules import alu_padding
-from beers_deploy.dpu.checker.finding import Finding, outside, shown
+from beers_deploy.dpu.checker.finding import Finding, beyond_range, shown
 from beers_deploy.dpu.graph import CONVOLUTIONS, Operation
 from beers_deploy.profiles.errors import sizes
 
@@ -92,20 +92,13 @@ def _too_many(channels: int, most: int, remedy: str) -> Finding | None:
 
 def pool_kernel(op: Operation, dpu: Dpu) -> Finding | None:
     """Pool kernel sides are {pool[kernel]} ({pool[kernel].source})."""
-    kernel, limit = op.window.kernel, dpu.limit("pool", "kernel")
-    if not outside(kernel, limit):
-        return None
-    reason = f"kernel ({shown(kernel)}) is not in the DPU's range {limit}"
-    return Finding(reason, "pool in two steps, or a smaller tile where the pool is global")
+    remedy = "pool in two steps, or a smaller tile where the pool is global"
+    return beyond_range("kernel", op.window.kernel, dpu.limit("pool", "kernel"), remedy)
 
 
 def pool_stride(op: Operation, dpu: Dpu) -> Finding | None:
     """Pool strides are {pool[stride]} ({pool[stride].source})."""
-    stride, limit = op.window.stride, dpu.limit("pool", "stride")
-    if not outside(stride, limit):
-        return None
-    reason = f"stride ({shown(stride)}) is not in the DPU's range {limit}"
-    return Finding(reason, "pool in two steps")
+    return beyond_range("stride", op.window.stride, dpu.limit("pool", "stride"), "pool in two steps")
 
 
 def pool_padding(op: Operation, dpu: Dpu) -> Finding | None:
@@ -148,9 +141,8 @@ def leaky_relu_alpha(op: Operation, dpu: Dpu) -> Finding | None:
     is_leaky = op.op_type in ("LeakyRelu", "QLinearLeakyRelu")
     if not is_leaky or (isinstance(given, int | float) and abs(given - wanted) < 1e-6):
         return None
-    return Finding(
-        f"its alpha is {given}, but the DPU supports only {wanted}", f"train with alpha = {wanted}, or ReLU"
-    )
+    reason = f"its alpha is {given}, but the DPU supports only {wanted}"
+    return Finding(reason, f"train with alpha = {wanted}, or ReLU")
 
 
 def mul_constant(op: Operation, dpu: Dpu) -> Finding | None:
@@ -223,10 +215,8 @@ def maps_aligned(op: Operation, dpu: Dpu) -> Finding | None:
     sizes = {(shape[1], shape[2]) for shape in op.in_shapes if shape is not None}
     if op.kind not in ("add", "mul", "concat") or len(sizes - {(1, 1)}) < 2:
         return None
-    reason = " and ".join(shown(size) for size in sorted(sizes)) + " meet"
-    return Finding(
-        reason, "use a tile whose side is a multiple of the network's total stride, or pad the smaller map"
-    )
+    remedy = "use a tile whose side is a multiple of the network's total stride, or pad the smaller map"
+    return Finding(" and ".join(map(shown, sorted(sizes))) + " meet", remedy)
 
 
 def map_in_memory(op: Operation, dpu: Dpu) -> Finding | None:

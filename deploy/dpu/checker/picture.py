@@ -48,7 +48,8 @@ def draw(placement: Placement, title: str) -> Markup:
     """The picture as an SVG file; a node's whole name appears when the pointer rests on its box."""
     nodes, heading = placement.nodes, textwrap.wrap(title, TITLE_LETTERS)
     legend_y = 12 + LINE_PX * len(heading)
-    *tops, height = accumulate(map(_height, nodes), initial=legend_y + BOX_PX + GAP_PX)
+    heights = (BOX_PX + LINE_PX * len(_lines(node)) + GAP_PX for node in nodes)
+    *tops, height = accumulate(heights, initial=legend_y + BOX_PX + GAP_PX)
     with look():
         figure = new_figure(WIDTH_PX, height)
         axes = figure.add_axes((0, 0, 1, 1), xlim=(0, WIDTH_PX), ylim=(height, 0))
@@ -69,20 +70,13 @@ def _name(node: PlacedNode) -> str:
 
 def _lines(node: PlacedNode) -> list[str]:
     """Below a node's box: its result's shape, or what is wrong."""
-    shape = _maps(*node.op.out_shape) if node.op.out_shape else "shape unknown"
+    channels, height_px, width_px = node.op.out_shape or (0, 0, 0)
+    maps = f"{channels} map{'s' if channels > 1 else ''} of {width_px} x {height_px}"
+    shape = maps if node.op.out_shape else "shape unknown"
     return textwrap.wrap("; ".join(f"{b.rule}: {b.finding.reason}" for b in node.broken) or shape, LINE_LETTERS)
 
 
-def _maps(channels: int, height_px: int, width_px: int) -> str:
-    return f"{channels} map{'s' if channels > 1 else ''} of {width_px} x {height_px}"
-
-
-def _height(node: PlacedNode) -> int:
-    return BOX_PX + LINE_PX * len(_lines(node)) + GAP_PX
-
-
 def _node(axes: "Axes", y: int, node: PlacedNode, anchor: str) -> None:
-    """A node's device, operator and name, and the lines below."""
     _box(axes, (LEFT_PX, y), NAME_PX, node.device, anchor)
     name = _name(node)
     short = name if len(name) <= NAME_LETTERS else f"{name[: NAME_LETTERS - 1]}\u2026"
@@ -116,6 +110,5 @@ def _path(start_y: int, end_y: int, rows: int) -> "Outline":
     if rows == 1:
         return Outline([(LEFT_PX + 12, start_y + BOX_PX), (LEFT_PX + 12, end_y)])
     reach, middle, end = LEFT_PX - 5 * min(rows, 12), start_y + BOX_PX // 2, end_y + 14
-    return Outline(
-        [(LEFT_PX, middle), (reach, middle), (reach, end), (LEFT_PX, end)], [Outline.MOVETO, *[Outline.CURVE4] * 3]
-    )
+    points = [(LEFT_PX, middle), (reach, middle), (reach, end), (LEFT_PX, end)]
+    return Outline(points, [Outline.MOVETO, *[Outline.CURVE4] * 3])

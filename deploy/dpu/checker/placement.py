@@ -95,18 +95,15 @@ def place(network: Network, dpu: Dpu) -> Placement:
     """Judge every node of a network against the rules of a DPU."""
     require_known(dpu)
     parts = _parts(network)
-    broken = [
-        judge(op, dpu, network.quantised) if part == "dpu-core" else ()
-        for op, part in zip(network.operations, parts, strict=True)
-    ]
+    pairs = zip(network.operations, parts, strict=True)
+    broken = [judge(op, dpu, network.quantised) if part == "dpu-core" else () for op, part in pairs]
     if not network.quantised:
         parts = _left_to_the_host(network, parts, broken)
     devices: list[Device] = [
         "host" if part != "dpu-core" else "CPU" if found else "DPU" for part, found in zip(parts, broken, strict=True)
     ]
     subgraphs = _subgraphs(network.operations, devices)
-    rows = zip(network.operations, parts, devices, broken, subgraphs, strict=True)
-    nodes = tuple(PlacedNode(*row) for row in rows)
+    nodes = tuple(map(PlacedNode, network.operations, parts, devices, broken, subgraphs))
     return Placement(nodes, tuple(_cuts(network, nodes)), "" if network.quantised else FLOAT_NOTE)
 
 
@@ -143,7 +140,6 @@ def _left_to_the_host(network: Network, parts: list[Part], broken: list[tuple[Br
 
 
 def _convolved(network: Network) -> set[str]:
-    """The results of convolutions."""
     return {name for op in network.operations if op.kind in CONVOLUTIONS for name in op.outputs}
 
 
@@ -178,36 +174,23 @@ def _is_host_back(op: Operation, network: Network, *, leads: bool) -> bool:
 def _subgraphs(operations: tuple[Operation, ...], devices: list[Device]) -> list[int]:
     """Pieces that run in one go: neighbours on one device that no other device's node stands between."""
     depth: dict[str, tuple[bool, int]] = {}
-    joined = _Groups()
-    result = []
+    parents: dict[str, str] = {}
     for op, device in zip(operations, devices, strict=True):
         on_dpu = device == "DPU"
         steps = [d + (was != on_dpu) for was, d in (depth[i] for i in op.inputs if i in depth)]
         level = (on_dpu, max(steps, default=0))
         depth |= dict.fromkeys(op.outputs, level)
-        for name in op.inputs:
-            if depth.get(name) == level:
-                joined.join(name, op.output)
-        for name in op.outputs:
-            joined.join(name, op.output)
-        result.append(op.output)
+        for name in (*(name for name in op.inputs if depth.get(name) == level), *op.outputs):
+            parents[_root(parents, name)] = _root(parents, op.output)
     numbers: dict[str, int] = {}
-    return [numbers.setdefault(joined.root(name), len(numbers)) for name in result]
+    return [numbers.setdefault(_root(parents, op.output), len(numbers)) for op in operations]
 
 
-class _Groups:
-    """Sets that merge: which tensors belong to one piece."""
-
-    def __init__(self) -> None:
-        self._parent: dict[str, str] = {}
-
-    def root(self, name: str) -> str:
-        while self._parent.get(name, name) != name:
-            name = self._parent[name]
-        return name
-
-    def join(self, one: str, other: str) -> None:
-        self._parent[self.root(one)] = self.root(other)
+def _root(parents: dict[str, str], name: str) -> str:
+    """The tensor that stands for all of a piece."""
+    while parents.get(name, name) != name:
+        name = parents[name]
+    return name
 
 
 def _cuts(network: Network, nodes: Iterable[PlacedNode]) -> Iterable[Cut]:

@@ -126,30 +126,19 @@ def check(
     tile_px = tile or own_tile_px(read.model) or TILE_PX
     placement = place(network_of(read.model, tile_px, read.label), asked)
     arguments = {"target": asked.target.name, "dpu": asked.name, "tile": tile_px}
+    rows, checks = tuple(network_rows(placement, asked, tile_px)), (legality(placement),)
     return Checked(
-        "check",
-        arguments,
-        (read.input,),
-        tuple(network_rows(placement, asked, tile_px)),
-        (legality(placement),),
-        placement=placement,
-        dpu=asked,
-        tile_px=tile_px,
-        network=read,
+        "check", arguments, (read.input,), rows, checks, placement=placement, dpu=asked, tile_px=tile_px, network=read
     )
 
 
 def network_rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
     """Every node, then the subgraphs, the tensors that cross, what else to know, and the counts."""
     nodes = [row for node in placement.nodes for row in _node_rows(node)]
-    remarks = [
-        Row("remarks", name, {}, {"remark": text}) for name, text in remarks_on(placement, dpu, tile_px).items()
-    ]
-    counts = {
-        "DPU subgraphs": _count(placement.dpu_subgraphs, "subgraph"),
-        "nodes refused": _count(len(placement.failed), "node"),
-    }
-    summary = Row("summary", "placement", counts)
+    found = remarks_on(placement, dpu, tile_px).items()
+    remarks = [Row("remarks", name, {}, {"remark": text}) for name, text in found]
+    parts, refused = _count(placement.dpu_subgraphs, "subgraph"), _count(len(placement.failed), "node")
+    summary = Row("summary", "placement", {"DPU subgraphs": parts, "nodes refused": refused})
     return [*nodes, *_subgraph_rows(placement), *map(_cut_row, placement.cuts), *remarks, summary]
 
 
@@ -170,19 +159,15 @@ def summary(placement: Placement, dpu: Dpu, tile_px: int, refusal: str = "") -> 
         refusal: why `quantize` does not take a float file; empty where it does.
     """
     lines = [f"device subgraphs: {len(_subgraphs_of(placement))}, DPU subgraphs: {placement.dpu_subgraphs}"]
-    lines += [
-        f"{'to' if cut.onto_dpu else 'from'} the DPU: {cut.tensor}, {_megabytes(cut)} an image as int8"
-        for cut in placement.cuts
-    ]
+    for cut in placement.cuts:
+        size = "a size unknown" if cut.size_bytes is None else f"{cut.size_bytes / 1e6:.2f} MB"
+        lines.append(f"{'to' if cut.onto_dpu else 'from'} the DPU: {cut.tensor}, {size} an image as int8")
     lines += [f"{name}: {text}" for name, text in remarks_on(placement, dpu, tile_px).items()]
     if placement.note:
         lines.append(placement.note)
         lines.append(f"'quantize' does not take it: {refusal}" if refusal else "'quantize' takes it")
-    if placement.failed:
-        lines.append(f"check FAILED: {legality(placement)}")
-    else:
-        lines.append("check passed: the core runs whole on the DPU")
-    return lines
+    verdict = f"FAILED: {legality(placement)}" if placement.failed else "passed: the core runs whole on the DPU"
+    return [*lines, f"check {verdict}"]
 
 
 def _node_rows(node: PlacedNode) -> list[Row]:
@@ -202,7 +187,6 @@ def _subgraph_rows(placement: Placement) -> list[Row]:
 
 
 def _subgraphs_of(placement: Placement) -> dict[int, list[PlacedNode]]:
-    """The nodes of each subgraph."""
     members: dict[int, list[PlacedNode]] = {}
     for node in placement.nodes:
         members.setdefault(node.subgraph, []).append(node)
@@ -213,10 +197,6 @@ def _cut_row(cut: Cut) -> Row:
     unit = "byte/image"
     size = unavailable(unit, "its shape is unknown") if cut.size_bytes is None else _count(cut.size_bytes, unit)
     return Row("cuts", cut.tensor, {"size": size}, {"direction": "onto the DPU" if cut.onto_dpu else "off the DPU"})
-
-
-def _megabytes(cut: Cut) -> str:
-    return "a size unknown" if cut.size_bytes is None else f"{cut.size_bytes / 1e6:.2f} MB"
 
 
 def _count(value: int, unit: str) -> Figure:

@@ -158,7 +158,7 @@ class Prediction:
     @property
     def streamed_bytes(self) -> int:
         """Feature-map bytes that one image moves through memory."""
-        return sum(layer.work.load_map_bytes + layer.work.store_map_bytes for layer in self.layers)
+        return sum(layer.work.map_bytes for layer in self.layers)
 
 
 def predict(placement: Placement, dpu: Dpu, task: Task | None = None) -> Prediction:
@@ -212,15 +212,8 @@ def predict(placement: Placement, dpu: Dpu, task: Task | None = None) -> Predict
     )
 
 
-WIDTHS = {
-    "host": "width_host",
-    "small maps": "width_small_maps",
-    "large maps": "width_large_maps",
-    "outside": "width_outside",
-}
+WIDTHS = {kind: f"width_{kind.replace(' ', '_')}" for kind in ("host", "small maps", "large maps", "outside")}
 """Where [cost] keeps half the width of an interval, in ln(FPS)."""
-
-
 ROUNDED = 1e-3
 """How far [cost] rounds the ends of the fitted range: the largest fitted network is not beyond it."""
 
@@ -249,7 +242,7 @@ def dpu_power(dpu: Dpu) -> Figure:
 def layer_energy_j(layer: LayerCost, dpu: Dpu) -> Interval:
     """Least and most energy of a layer for one image, its share of the batch's weights included."""
     work = layer.work
-    moved = work.load_map_bytes + work.store_map_bytes + work.weight_bytes / dpu.batch
+    moved = work.map_bytes + work.weight_bytes / dpu.batch
     product, byte = dpu.limit("power", "product_j"), dpu.limit("power", "memory_byte_j")
     products = work.operations / 2
     return products * product.low + moved * byte.low, products * product.high + moved * byte.high

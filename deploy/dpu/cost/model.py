@@ -68,10 +68,8 @@ class Constants:
     def faster(self, dpu: float, host: float) -> Self:
         """The constants of a board whose DPU and host are that many times as fast."""
         factors = DPU_CONSTANTS * [dpu] + (len(NAMES) - DPU_CONSTANTS) * [host]
-        values = [getattr(self, name) for name in NAMES]
-        return type(self)(
-            *(v / f if name in TIMES else v * f for name, v, f in zip(NAMES, values, factors, strict=True))
-        )
+        values = ((name, getattr(self, name), factor) for name, factor in zip(NAMES, factors, strict=True))
+        return type(self)(*(value / by if name in TIMES else value * by for name, value, by in values))
 
 
 DPU_CONSTANTS = 6
@@ -114,15 +112,9 @@ class Layers:
     @classmethod
     def of(cls, works: Sequence[Work], dpu: Dpu) -> Self:
         """The layers of one network."""
+        array, lanes = dpu.engine_ops_per_s, dpu.lane_steps_per_s
         columns = [
-            (
-                w.array_operations / dpu.engine_ops_per_s,
-                w.lane_steps / dpu.lane_steps_per_s,
-                w.weight_bytes,
-                w.load_map_bytes + w.store_map_bytes,
-                w.launched,
-            )
-            for w in works
+            (w.array_operations / array, w.lane_steps / lanes, w.weight_bytes, w.map_bytes, w.launched) for w in works
         ]
         clock_hz, memory = dpu.value("array", "pl_clock_hz"), dpu.limit("memory", "ddr_bytes_per_s").high
         board = (clock_hz, memory, dpu.batch // dpu.cores, dpu.cores)
@@ -170,12 +162,7 @@ Task = Literal["copy", "argmax", "softmax", "sort", "image"]
 ranks boxes or key points (sort); makes pixels of them (image)."""
 TASKS = get_args(Task)
 
-OPERATORS: dict[str, Task] = {
-    "ArgMax": "argmax",
-    "Softmax": "softmax",
-    "NonMaxSuppression": "sort",
-    "TopK": "sort",
-}
+OPERATORS: dict[str, Task] = {"ArgMax": "argmax", "Softmax": "softmax", "NonMaxSuppression": "sort", "TopK": "sort"}
 """What tells the task in a file."""
 
 BANDS = 4
@@ -243,11 +230,8 @@ def between(interval: Interval) -> float:
 
 
 def _core_s(op: Operation, dpu: Dpu) -> Interval:
-    """One operation on one core."""
-    clock, products, moved, decoding = (
-        dpu.limit("cpu", key)
-        for key in ("clock_ghz", "product_flops_per_cycle", "moved_bytes_per_s", "decoding_mips_per_ghz")
-    )
+    keys = ("clock_ghz", "product_flops_per_cycle", "moved_bytes_per_s", "decoding_mips_per_ghz")
+    clock, products, moved, decoding = (dpu.limit("cpu", key) for key in keys)
     values = op.out_bytes + sum(math.prod(shape) for shape in op.in_shapes if shape is not None)
     floats = FLOAT_BYTES * (values + op.weight_bytes)
     least_s = max(op.operations / (1e9 * clock.high * products.high), floats / moved.high)

@@ -55,11 +55,9 @@ class OwnRuns:
 
     def factor_rows(self) -> list[Row]:
         """The two factors."""
-        factors = {"DPU": self.dpu_factor, "host": self.host_factor}
-        return [
-            Row("correction", name, {"given / predicted": predicted(value, "x", (value, value), self.source)})
-            for name, value in factors.items()
-        ]
+        factors = (("DPU", self.dpu_factor), ("host", self.host_factor))
+        found = {name: predicted(value, "x", (value, value), self.source) for name, value in factors}
+        return [Row("correction", name, {"given / predicted": figure}) for name, figure in found.items()]
 
     def run_rows(self) -> list[Row]:
         """The rate given for each run, and what was predicted before and after the correction."""
@@ -77,11 +75,10 @@ class OwnRuns:
 
 def read_own_runs(path: Path, dpu: Dpu) -> OwnRuns:
     """Compare the runs in a file with what is predicted of them on `dpu`'s board."""
-    runs = [_run(entry, path, f"{path.name}, run {index + 1}", dpu) for index, entry in enumerate(_read(path))]
-    ratios: dict[bool, list[float]] = {True: [], False: []}
-    for run in runs:
-        ratios[run.predicted.regime == "host"].append(run.fps / run.predicted.fps)
-    host, on_dpu = (geometric_mean(ratios[kind]) if ratios[kind] else 1.0 for kind in (True, False))
+    runs = [_run(entry, path, f"{path.name}, run {number}", dpu) for number, entry in enumerate(_read(path), 1)]
+    ratios = [(run.predicted.regime == "host", run.fps / run.predicted.fps) for run in runs]
+    by_part = ([ratio for bound, ratio in ratios if bound is on_host] for on_host in (True, False))
+    host, on_dpu = (geometric_mean(found) if found else 1.0 for found in by_part)
     return OwnRuns(f"geometric mean of {len(runs)} runs in {path.name}", runs, on_dpu, host)
 
 

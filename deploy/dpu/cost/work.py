@@ -38,6 +38,11 @@ class Work:
         return self.operations / self.array_operations if self.array_operations else 1.0
 
     @property
+    def map_bytes(self) -> int:
+        """Of feature maps, loaded and stored."""
+        return self.load_map_bytes + self.store_map_bytes
+
+    @property
     def launched(self) -> bool:
         """Whether it has a start of its own."""
         return self.kind not in UNSTARTED
@@ -45,13 +50,12 @@ class Work:
 
 def count_work(operations: Sequence[Operation], dpu: Dpu) -> tuple[Work, ...]:
     """The work of operations that run one behind the other on the DPU."""
-    flow = _Flow(operations, dpu)
-    return tuple(_count(op, flow, dpu) for op in operations if op.kind not in FUSED)
-
-
-def _count(op: Operation, flow: "_Flow", dpu: Dpu) -> Work:
-    array, lanes = _array_operations(op, dpu), _lane_steps(op, dpu)
-    return Work(op.name, op.kind, op.operations, array, lanes, op.weight_bytes, flow.load(op), flow.store(op))
+    flow, found = _Flow(operations, dpu), []
+    for op in operations:
+        if op.kind not in FUSED:
+            counts = op.operations, _array_operations(op, dpu), _lane_steps(op, dpu)
+            found.append(Work(op.name, op.kind, *counts, op.weight_bytes, flow.load(op), flow.store(op)))
+    return tuple(found)
 
 
 def _array_operations(op: Operation, dpu: Dpu) -> int:

@@ -72,9 +72,8 @@ def find_hits(truths: Sequence[Boxes], found: Sequence[Boxes], classes: int) -> 
     """
     boxes, image = joined(found)
     order = np.argsort(-boxes.scores, kind="stable")
-    hits, ignored = (
-        np.concatenate(parts, axis=-1)[..., order] for parts in zip(*map(_matched, truths, found), strict=True)
-    )
+    matched = zip(*map(_matched, truths, found), strict=True)
+    hits, ignored = (np.concatenate(parts, axis=-1)[..., order] for parts in matched)
     objects = np.zeros((len(SIZES_PX), classes, len(truths)), np.int64)
     for number, truth in enumerate(truths):
         for size, passed in enumerate(truth.ignored | _of_other_size(truth)):
@@ -83,7 +82,6 @@ def find_hits(truths: Sequence[Boxes], found: Sequence[Boxes], classes: int) -> 
 
 
 def _of_other_size(boxes: Boxes) -> np.ndarray:
-    """(S, N) whether boxes lie outside each of `SIZES_PX`."""
     sides = np.sqrt(areas(boxes.corners))
     return np.array([(sides < low) | (sides >= high) for low, high in SIZES_PX.values()])
 
@@ -167,7 +165,8 @@ def score(hits: Hits, names: Sequence[str], weights: np.ndarray, confidence: flo
         confidence: where `precision` and `recall` are read; `own precision` and `own recall` are read at
             `own confidence`, that of the row's best F1.
     """
-    by_class = np.array([_average_precisions(hits, kind, weights) for kind in range(len(names))])
+    every = len(OVERLAPS)
+    by_class = np.array([precisions(hits, kind, weights, ALL, every).mean(axis=-1) for kind in range(len(names))])
     curves = _confidence_curves(hits, weights)
     own = _best(curves)
     fixed = np.full(len(weights), confidence)
@@ -187,7 +186,7 @@ def score(hits: Hits, names: Sequence[str], weights: np.ndarray, confidence: flo
 def map50(hits: Hits, weights: np.ndarray, size: int = ALL) -> np.ndarray:
     """Average precision at an overlap of one half alone, mean over classes, (W,); arguments as of `score`."""
     kinds = range(hits.objects.shape[1])
-    return mean_known(np.array([_average_precisions(hits, kind, weights, size, levels=1)[:, 0] for kind in kinds]))
+    return mean_known(np.array([precisions(hits, kind, weights, size)[:, 0].mean(axis=-1) for kind in kinds]))
 
 
 def mean_known(values: np.ndarray) -> np.ndarray:
@@ -196,13 +195,6 @@ def mean_known(values: np.ndarray) -> np.ndarray:
     count = known.sum(axis=0)
     total = np.where(known, values, 0.0).sum(axis=0)
     return np.asarray(np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0))
-
-
-def _average_precisions(
-    hits: Hits, kind: int, weights: np.ndarray, size: int = ALL, levels: int = len(OVERLAPS)
-) -> np.ndarray:
-    """(W, levels) of a class at the first of `OVERLAPS`, NaN where it has no object."""
-    return np.asarray(precisions(hits, kind, weights, size, levels).mean(axis=-1))
 
 
 def precisions(hits: Hits, kind: int, weights: np.ndarray, size: int = ALL, levels: int = 1) -> np.ndarray:

@@ -133,10 +133,9 @@ class Letterbox:
         share = min(size_px / height_px, size_px / width_px)
         self._size_px, self._inner = size_px, (round(height_px * share), round(width_px * share))
         if min(self._inner) < 1:
+            got = f"{height_px} x {width_px} px"
             expected = f"an image that keeps a pixel in a detector's input of {size_px} px"
-            raise OptionError(
-                "image", expected=expected, got=f"{height_px} x {width_px} px", remedy="cut it into squares"
-            )
+            raise OptionError("image", expected=expected, got=got, remedy="cut it into squares")
         height, width = self._inner
         self._top, self._left = (size_px - height) // 2, (size_px - width) // 2
         # By axis, for the sides are rounded to whole pixels: one gain for both would be off by up to half a pixel.

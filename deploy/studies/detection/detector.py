@@ -122,7 +122,6 @@ def _literal(text: str) -> Any:
 
 
 def _layout(model: onnx.ModelProto, about: dict[str, Any], classes: int, path: Path) -> Layout:
-    """Which of the two layouts, by task and shapes."""
     task, channels = about.get("task", "detect"), _sizes(model.graph.input[0])[1:2]
     outputs = [_sizes(value) for value in model.graph.output]
     shape = outputs[0] if len(outputs) == 1 and len(outputs[0]) == 3 else [-1]

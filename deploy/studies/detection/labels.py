@@ -38,14 +38,8 @@ HORIZONTAL = "Horizontal Bounding Boxes"
 CORNERS = ("xmin", "ymin", "xmax", "ymax")
 
 
-@dataclass(frozen=True)
-class LabelledImage:
-    """An image file with what is labelled on it.
-
-    Attributes:
-        path: of the image.
-        truth: labelled boxes, in px of the image; classes are numbers into the set's names.
-    """
+class LabelledImage(NamedTuple):
+    """An image file with the boxes labelled on it, in its px; their classes are numbers into the set's names."""
 
     path: Path
     truth: Boxes
@@ -128,12 +122,10 @@ def _labels_near(top: Path, folder: Path) -> Path:
 
 
 def _holds(folder: Path, suffixes: Iterable[str], but: str = "") -> bool:
-    """Whether a folder holds a file of one of these kinds."""
     return folder.is_dir() and any(p.suffix.lower() in suffixes and p.name != but for p in folder.iterdir())
 
 
 def _read_each(images: Sequence[Path], where: Path, named_in: Sequence[Path]) -> list[_File]:
-    """Labels of a file an image, XML or text."""
     if not where.is_dir():
         raise _faulty(where, LAYOUTS, "another file" if where.exists() else "no such folder", "give a folder")
     there = {path.name for path in where.iterdir()}
@@ -152,7 +144,6 @@ def _read_each(images: Sequence[Path], where: Path, named_in: Sequence[Path]) ->
 
 
 def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> LabelledSet:
-    """The set of what was read, its boxes inside their images."""
     spelled = {letters(box.name): box.name for one in reversed(files) for box in reversed(one.boxes)}
     number = {key: i for i, key in enumerate(sorted(spelled))}
     images, lost = [], list[str]()
@@ -278,7 +269,6 @@ def _text(value: Any) -> str:
 
 
 def _read_yolo(image: Path, labels: Path, names: Sequence[str]) -> _File:
-    """The labels of one image; no object where there is no file."""
     size_px = image_size_px(image)
     lines = _lines(labels) if labels.exists() else []
     return _File(image, [_yolo_box(line, labels, names, size_px) for line in lines], labels)
@@ -320,14 +310,11 @@ def _yaml_names(path: Path) -> tuple[str, ...]:
     try:
         import yaml  # type: ignore[import-untyped]  # its stubs are one more package, for one function
     except ImportError as error:
-        remedy = "pip install 'beers-deploy[detect]', or write classes.txt"
-        raise MissingExtraError(
-            str(path), expected="PyYAML to read it", got="no such package", remedy=remedy
-        ) from error
+        got, remedy = "no such package", "pip install 'beers-deploy[detect]', or write classes.txt"
+        raise MissingExtraError(str(path), expected="PyYAML to read it", got=got, remedy=remedy) from error
+    text = _read_bytes(path, NAMES_BYTES)
     try:
-        content: Any = yaml.safe_load(_read_bytes(path, NAMES_BYTES))
-    except BeersError:
-        raise
+        content: Any = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise _faulty(path, "YAML", " ".join(str(error).split())[:100]) from error
     if not isinstance(content, dict) or "names" not in content:
@@ -339,7 +326,6 @@ def _yaml_names(path: Path) -> tuple[str, ...]:
 
 
 def _lines(path: Path) -> list[str]:
-    """Lines that hold something."""
     return [line for line in _read_bytes(path).decode("utf-8-sig", "replace").splitlines() if line.strip()]
 
 
@@ -351,7 +337,6 @@ def _read_bytes(path: Path, limit_bytes: int = LABEL_BYTES) -> bytes:
 
 
 def _numbers(texts: Sequence[str], path: Path, what: str) -> list[float]:
-    """Finite numbers of their texts."""
     try:
         found = [float(text) for text in texts]
     except ValueError:

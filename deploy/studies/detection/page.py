@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from beers_deploy.model.io.pictures import grid, picture_url
-from beers_deploy.profiles.figures import Row, by_table
+from beers_deploy.profiles.figures import by_table
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.report.plots import SERIES, Curve, Panel, curves_svg, data_url
 from beers_deploy.studies.detection.average_precision import RECALLS, Hits, mean_known, precisions
@@ -36,39 +36,32 @@ NOTES = (
 
 def write_page(compared: Sequence[Comparison], notes: Sequence[str], path: Path) -> None:
     """Write the page of a study, whole or not at all; the comparisons are of one set of scenes."""
-    rows: list[Row] = [*(row for found in compared for row in detection_rows(found)), *paper_rows()]
+    rows = [*(row for found in compared for row in detection_rows(found)), *paper_rows()]
     tables = [Section(name, each, CAPTIONS.get(name.split(",")[0], "")) for name, each in by_table(rows).items()]
     truths = [each.scene.truth for each in compared[0].scenes]
     objects = sum(int((~truth.ignored).sum()) for truth in truths)
     title = f"What restoration buys a detector: {objects} objects on {len(truths)} images"
-    pictures = [curves(compared), *crops(compared)]
-    said = (*notes, *NOTES, *PAPER_NOTES)
+    pictures, said = [curves(compared), *crops(compared)], (*notes, *NOTES, *PAPER_NOTES)
     write_report(Report(title, headline(compared), tables, pictures, said), path)
 
 
 def curves(compared: Sequence[Comparison]) -> Picture:
     """Precision by recall at an overlap of one half, means over classes: a panel a sensor."""
     panels = [
-        Panel(
-            found.name,
-            [
-                Curve(row, number % len(SERIES), row == REFERENCE, _points(hits))
-                for number, (row, hits) in enumerate(found.hits.items())
-            ],
-        )
+        Panel(found.name, [_curve(number, *each) for number, each in enumerate(found.hits.items())])
         for found in compared
     ]
     svg = curves_svg(panels, "recall", "precision", logarithmic=False)
-    return Picture(
-        "Precision by recall", data_url(svg), "At an overlap of 0.5, mean over the classes that are labelled."
-    )
+    caption = "At an overlap of 0.5, mean over the classes that are labelled."
+    return Picture("Precision by recall", data_url(svg), caption)
 
 
-def _points(hits: Hits) -> tuple[tuple[float, float], ...]:
+def _curve(number: int, row: str, hits: Hits) -> Curve:
     _, classes, images = hits.objects.shape
     once = np.ones((1, images), np.int64)
     values = mean_known(np.array([precisions(hits, kind, once)[0, 0] for kind in range(classes)]))
-    return tuple(zip(RECALLS.tolist(), values.tolist(), strict=True))
+    points = tuple(zip(RECALLS.tolist(), values.tolist(), strict=True))
+    return Curve(row, number % len(SERIES), row == REFERENCE, points)
 
 
 def crops(compared: Sequence[Comparison]) -> list[Picture]:

@@ -14,21 +14,8 @@ from itertools import pairwise
 import numpy as np
 from PIL import Image, ImageDraw
 
-from beers_deploy.model.simulator.drawing import (
-    ASPHALT,
-    CONCRETE,
-    GRASS,
-    SHADOW,
-    SOIL,
-    WATER,
-    WHITE,
-    Point,
-    rectangle,
-    shift,
-    texture,
-    tree,
-    turn,
-)
+from beers_deploy.model.simulator import drawing
+from beers_deploy.model.simulator.drawing import Point
 from beers_deploy.studies.detection.boxes import Boxes
 
 CLASSES = ("vehicle", "ship", "aircraft", "tank")
@@ -58,12 +45,11 @@ def synthetic_scene(generator: np.random.Generator, height_px: int, width_px: in
     canvas = Canvas(height_px, width_px, generator)
     angle, (x, y) = generator.uniform(-0.5, 0.5), generator.uniform(-0.5, 0.5, 2) * PLOT_M
     # Half the diagonal: how far from the centre there is something to draw.
-    world, reach = turn(x, y, angle), math.hypot(width_px, height_px) * SCENE_GSD_M / 2 + PLOT_M
+    world, reach = drawing.turn(x, y, angle), math.hypot(width_px, height_px) * SCENE_GSD_M / 2 + PLOT_M
     places = (np.arange(math.ceil(2 * reach / PLOT_M)) + 0.5) * PLOT_M - reach
     plots = [Plot(canvas, *world(u, v), angle, (PLOT_M - STREET_M) / 2 - KERB_M) for v in places for u in places]
-    streets = [(world(p + PLOT_M / 2, 0), angle + math.pi / 2) for p in places]
-    streets += [(world(0, p + PLOT_M / 2), angle) for p in places]
-    strips = [Plot(canvas, *centre, turned, reach) for centre, turned in streets]
+    strips = [Plot(canvas, *world(p + PLOT_M / 2, 0), angle + math.pi / 2, reach) for p in places]
+    strips += [Plot(canvas, *world(0, p + PLOT_M / 2), angle, reach) for p in places]
     for strip in strips:
         _street(strip)
     for plot in plots:
@@ -81,13 +67,13 @@ class Canvas:
         self.corners: list[tuple[int, int, int, int]] = []
         self.classes: list[int] = []
         self._size = width_px, height_px
-        self._image, self._shown = Image.new("F", self._size, GRASS), Image.new("I", self._size, 0)
+        self._image, self._shown = Image.new("F", self._size, drawing.GRASS), Image.new("I", self._size, 0)
         self._draw, self._draw_shown = ImageDraw.Draw(self._image), ImageDraw.Draw(self._shown)
 
     def textured(self) -> np.ndarray:
         """The radiance (H, W) float32 with the ground's texture."""
         width, height = self._size
-        return np.asarray(np.asarray(self._image) * texture(height, width, self.generator), np.float32)
+        return np.asarray(np.asarray(self._image) * drawing.texture(height, width, self.generator), np.float32)
 
     def area(self, points: Sequence[Point], radiance: float) -> None:
         """Fill a polygon of the ground."""
@@ -103,7 +89,7 @@ class Canvas:
         x, y = self._pixel(point)
         radius = radius_m / SCENE_GSD_M
         if self._is_free((x - 2 * radius, y - 2 * radius, x + 2 * radius, y + 2 * radius)):
-            tree(self._draw, x, y, radius, self.generator)
+            drawing.tree(self._draw, x, y, radius, self.generator)
 
     def put(self, kind: int, parts: list[Part], place: Callable[[float, float], Point], height_m: float) -> bool:
         """Put an object where it lies whole within the scene and clear of others; says whether it found room.
@@ -121,7 +107,7 @@ class Canvas:
         if not inside or not self._is_free(area):
             return False
         for polygon, _ in polygons:
-            self._draw.polygon([shift(point, shadow_px) for point in polygon], fill=SHADOW)
+            self._draw.polygon([drawing.shift(point, shadow_px) for point in polygon], fill=drawing.SHADOW)
         self.classes.append(kind)
         for polygon, paint in polygons:
             self._draw.polygon(polygon, fill=paint)
@@ -182,7 +168,7 @@ class Plot:
 
     def put(self, kind: int, parts: list[Part], x: float, y: float, turned: float, height_m: float) -> bool:
         """Put an object at (x, y), turned against the plot; one that does not fit into the plot is left out."""
-        own = turn(x, y, turned)
+        own = drawing.turn(x, y, turned)
         points = np.array([own(*point) for polygon, _ in parts for point in polygon])
         if np.abs(points).max() > self.half_m:
             return False
@@ -195,15 +181,15 @@ class Plot:
 
     def place(self, x: float, y: float) -> Point:
         """Metres of the plot to metres of the canvas."""
-        return turn(self.x, self.y, self.angle)(x, y)
+        return drawing.turn(self.x, self.y, self.angle)(x, y)
 
 
 def vehicle(generator: np.random.Generator) -> list[Part]:
     """A car, or with 1 in 5 a lorry or bus: the body and, of cars, the windscreen."""
     paint = generator.choice(PAINTS)
     if generator.random() < 0.2:
-        return [(rectangle(generator.uniform(4, 7), 1.25), paint), (_band(3.0, 3.5, 1.2), 0.5 * paint)]
-    body = rectangle(generator.uniform(1.9, 2.6), generator.uniform(0.85, 1.0))
+        return [(drawing.rectangle(generator.uniform(4, 7), 1.25), paint), (_band(3.0, 3.5, 1.2), 0.5 * paint)]
+    body = drawing.rectangle(generator.uniform(1.9, 2.6), generator.uniform(0.85, 1.0))
     return [(body, paint), (_band(0.4, 1.1, 0.8), 20.0)]
 
 
@@ -211,16 +197,9 @@ def ship(generator: np.random.Generator) -> list[Part]:
     """A hull with a bow, its hatches or a long deck, and the bridge astern."""
     half = 0.5 * math.exp(generator.uniform(math.log(9), math.log(70)))
     wide, hull = half / generator.uniform(3, 5), generator.uniform(50, 160)
-    outline = [
-        (-half, -0.8 * wide),
-        (-0.9 * half, -wide),
-        (0.5 * half, -wide),
-        (0.8 * half, -0.6 * wide),
-        (half, 0.0),
-    ]
+    outline = [(x * half, y * wide) for x, y in ((-1, -0.8), (-0.9, -1), (0.5, -1), (0.8, -0.6), (1, 0))]
     parts = [(outline + [(x, -y) for x, y in reversed(outline[:-1])], hull)]
-    edges = np.linspace(-0.45, 0.55, int(generator.integers(2, 6))) * half
-    for start, end in pairwise(edges):
+    for start, end in pairwise(np.linspace(-0.45, 0.55, int(generator.integers(2, 6))) * half):
         parts.append((_band(start + 0.04 * half, end, 0.7 * wide), hull * generator.uniform(0.4, 1.6)))
     return [*parts, (_band(-0.85 * half, -0.55 * half, 0.75 * wide), generator.uniform(170, 260))]
 
@@ -271,12 +250,11 @@ def _disc(x: float, y: float, radius: float, corners: int = 32) -> list[Point]:
 
 
 def _street(strip: Plot) -> None:
-    """Asphalt between pavements, dashes in the middle."""
     reach = strip.half_m
-    strip.rectangle(-reach, -STREET_M / 2 - KERB_M, 2 * reach, STREET_M + 2 * KERB_M, CONCRETE * 0.8)
-    strip.rectangle(-reach, -STREET_M / 2, 2 * reach, STREET_M, ASPHALT)
+    strip.rectangle(-reach, -STREET_M / 2 - KERB_M, 2 * reach, STREET_M + 2 * KERB_M, drawing.CONCRETE * 0.8)
+    strip.rectangle(-reach, -STREET_M / 2, 2 * reach, STREET_M, drawing.ASPHALT)
     for u in np.arange(-reach, reach, 8.0):
-        strip.line((u, 0.0), (u + 3.4, 0.0), WHITE * 0.7, 0.3)
+        strip.line((u, 0.0), (u + 3.4, 0.0), drawing.WHITE * 0.7, 0.3)
 
 
 def _traffic(strip: Plot) -> None:
@@ -288,18 +266,18 @@ def _traffic(strip: Plot) -> None:
 
 def _harbour(plot: Plot) -> None:
     """Water, a quay along one side, a pier, and ships beside them or under way."""
-    plot.pad(WATER)
+    plot.pad(drawing.WATER)
     half = plot.half_m
-    plot.rectangle(-half, -half, 2 * half, 7.0, CONCRETE)
+    plot.rectangle(-half, -half, 2 * half, 7.0, drawing.CONCRETE)
     pier = plot.random.uniform(-0.4, 0.4) * half
-    plot.rectangle(pier, -half, 4.0, plot.random.uniform(0.4, 1.3) * half, CONCRETE * 0.8)
+    plot.rectangle(pier, -half, 4.0, plot.random.uniform(0.4, 1.3) * half, drawing.CONCRETE * 0.8)
     for _ in range(int(plot.random.integers(0, 6))):
         plot.put(VEHICLE, vehicle(plot.random), plot.random.uniform(-half, half), 3.5 - half, 0.0, 0.8)
 
     def sail(x: float, y: float) -> bool:
         moored, anywhere = plot.random.choice([0, math.pi / 2]), plot.random.uniform(0, math.tau)
         parts, turned = ship(plot.random), plot.random.choice([moored, anywhere])
-        hull = np.array([turn(x, y, turned)(*point) for point in parts[0][0]])
+        hull = np.array([drawing.turn(x, y, turned)(*point) for point in parts[0][0]])
         clear_of_pier = hull[:, 0].max() < pier or hull[:, 0].min() > pier + 4
         clear = clear_of_pier and hull[:, 1].min() > 7 - plot.half_m
         return bool(clear) and plot.put(SHIP, parts, x, y, turned, 1.5)
@@ -309,20 +287,20 @@ def _harbour(plot: Plot) -> None:
 
 def _apron(plot: Plot) -> None:
     """Concrete slabs, a taxi line, aircraft parked at any angle, and what serves them."""
-    plot.pad(CONCRETE * plot.random.uniform(0.6, 1.0))
+    plot.pad(drawing.CONCRETE * plot.random.uniform(0.6, 1.0))
     half = plot.half_m
     for position in np.arange(-half, half, 7.5):
-        plot.line((position, -half), (position, half), CONCRETE * 0.65, 0.25)
-        plot.line((-half, position), (half, position), CONCRETE * 0.65, 0.25)
+        plot.line((position, -half), (position, half), drawing.CONCRETE * 0.65, 0.25)
+        plot.line((-half, position), (half, position), drawing.CONCRETE * 0.65, 0.25)
     bend = plot.random.uniform(-0.5, 0.5) * half
-    plot.line((-half, bend), (half, bend), WHITE * 0.8, 0.3)
+    plot.line((-half, bend), (half, bend), drawing.WHITE * 0.8, 0.3)
     _scatter(plot, AIRCRAFT, aircraft, (1, 7), 2.5)
     _scatter(plot, VEHICLE, vehicle, (0, 5), 0.8)
 
 
 def _tank_farm(plot: Plot) -> None:
     """Gravel, bunds around each tank, and tanks of one or two sizes."""
-    plot.pad(SOIL * plot.random.uniform(0.8, 1.3))
+    plot.pad(drawing.SOIL * plot.random.uniform(0.8, 1.3))
     radius = plot.random.uniform(5, 15)
     step = 2.9 * radius + 3
     count = int(2 * plot.half_m / step)
@@ -331,8 +309,8 @@ def _tank_farm(plot: Plot) -> None:
         for column in range(count):
             x, y = start + step * column, start + step * row
             for side in (-0.48 * step, 0.48 * step):
-                plot.line((x + side, y - 0.48 * step), (x + side, y + 0.48 * step), CONCRETE, 0.8)
-                plot.line((x - 0.48 * step, y + side), (x + 0.48 * step, y + side), CONCRETE, 0.8)
+                plot.line((x + side, y - 0.48 * step), (x + side, y + 0.48 * step), drawing.CONCRETE, 0.8)
+                plot.line((x - 0.48 * step, y + side), (x + 0.48 * step, y + side), drawing.CONCRETE, 0.8)
             if plot.random.random() < 0.75:
                 own = radius * plot.random.choice([1.0, 1.0, 0.6])
                 plot.put(TANK, tank(own, plot.random), x, y, 0.0, 0.35 * own)
@@ -341,11 +319,11 @@ def _tank_farm(plot: Plot) -> None:
 
 def _car_park(plot: Plot) -> None:
     """Rows of stalls between lanes, some 60 % taken, a few trees in between."""
-    plot.pad(ASPHALT * plot.random.uniform(0.9, 1.6))
+    plot.pad(drawing.ASPHALT * plot.random.uniform(0.9, 1.6))
     half, taken = plot.half_m, plot.random.uniform(0.2, 0.9)
     for y in np.arange(6.0 - half, half - 4, 13.0):
         for x in np.arange(3.0 - half, half - 3, 2.9):
-            plot.line((x - 1.45, y - 2.6), (x - 1.45, y + 2.6), WHITE * 0.6, 0.25)
+            plot.line((x - 1.45, y - 2.6), (x - 1.45, y + 2.6), drawing.WHITE * 0.6, 0.25)
             if plot.random.random() < taken:
                 turned = math.pi / 2 * plot.random.choice([-1, 1]) + plot.random.normal(0, 0.03)
                 plot.put(VEHICLE, vehicle(plot.random), x, y, turned, 0.8)
@@ -363,15 +341,14 @@ def _houses(plot: Plot) -> None:
             plot.tree(x + plot.random.uniform(-9, 9), y + 11)
     for y in np.arange(26.0 - half, half - 4, 24.0):
         for x in plot.random.uniform(-half, half, 3):
-            plot.rectangle(x - 3.5, y - 1.6, 7.0, 3.2, CONCRETE * 0.7)
+            plot.rectangle(x - 3.5, y - 1.6, 7.0, 3.2, drawing.CONCRETE * 0.7)
             plot.put(VEHICLE, vehicle(plot.random), x, y, 0.0, 0.8)
 
 
 def _house(plot: Plot, x: float, y: float, long: float, wide: float) -> None:
-    """A roof, one slope in the sun, and its shadow."""
     bright, shade = plot.random.uniform(60, 200), 2.2
     corners = [(x, y), (x + long, y), (x + long, y + wide), (x, y + wide)]
-    plot.canvas.area([(px + shade, py + shade) for px, py in (plot.place(*c) for c in corners)], SHADOW)
+    plot.canvas.area([(px + shade, py + shade) for px, py in (plot.place(*c) for c in corners)], drawing.SHADOW)
     plot.rectangle(x, y, long, wide / 2, bright)
     plot.rectangle(x, y + wide / 2, long, wide / 2, bright * plot.random.choice([0.55, 1.0]))
 
@@ -387,7 +364,6 @@ def _scatter(
 
 
 def _field(plot: Plot) -> None:
-    """Crop rows, and the trees of a hedge."""
     base, half = plot.random.choice([38, 55, 70, 88]), plot.half_m
     plot.pad(base)
     for x in np.arange(-half, half, plot.random.uniform(0.8, 2.5)):
@@ -397,7 +373,6 @@ def _field(plot: Plot) -> None:
 
 
 def _forest(plot: Plot) -> None:
-    """Trees, crown at crown."""
     for x, y in plot.random.uniform(-plot.half_m, plot.half_m, (260, 2)):
         plot.tree(x, y)
 

@@ -6,7 +6,7 @@ boxes back on the scene -> average precision.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -175,7 +175,6 @@ def run_study(
 def _compared(
     detector: Detector, scenes: Sequence[LabelledScene], sensors: SensorPair, methods: Mapping[str, Method], seed: int
 ) -> Comparison:
-    """Show a detector every scene in every row, the reference first, and score what it finds."""
     rows = {REFERENCE: None, **methods}
     boxes: dict[str, list[Boxes]] = {row: [] for row in rows}
     with steps(f"detecting, {sensors.degraded.name}", len(scenes) * len(rows)) as bar:
@@ -242,10 +241,7 @@ def labelled_scenes(
     """
     labelled = read_labelled(images, labels, split)
     numbers = class_numbers(labelled.names, names, given)
-    paths = [(each.path, each.truth.renamed(numbers)) for each in labelled.images]
-    scenes = [
-        LabelledScene(path.name, site_of(path.name), boxes, path, partial(_read, path)) for path, boxes in paths
-    ]
+    scenes = [_of_file(each.path, each.truth.renamed(numbers)) for each in labelled.images]
     return scenes, [*labelled.notes, *left_out(labelled.names, numbers)]
 
 
@@ -255,5 +251,5 @@ def left_out(labelled: Sequence[str], numbers: np.ndarray) -> list[str]:
     return [f"Not known to the detector and left out: {names}. What it finds there counts as false."] if names else []
 
 
-def _read(path: Path, sensor: Instrument) -> Tensor:
-    return read_scene(path, sensor).radiance
+def _of_file(path: Path, truth: Boxes) -> LabelledScene:
+    return LabelledScene(path.name, site_of(path.name), truth, path, lambda sensor: read_scene(path, sensor).radiance)

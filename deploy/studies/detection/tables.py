@@ -83,7 +83,6 @@ def _own_row(found: Comparison, row: str) -> Row:
 
 
 def _values(found: Comparison, row: str, keys: Mapping[str, str]) -> dict[str, Figure]:
-    """Figures of a row by the names that are shown."""
     return {shown: _figure(found, found.figures[row][key]) for shown, key in keys.items()}
 
 
@@ -114,15 +113,9 @@ PAPER = {
 def paper_rows() -> list[Row]:
     """The paper's table as printed, with what differs."""
     keys = ("mAP50", "mAP90 (sic)", "precision", "recall")
-    return [
-        Row(
-            PAPER_TABLE,
-            name,
-            {key: published(value, PERCENT, SOURCE) for key, value in zip(keys, values, strict=True)},
-            {"what differs": DIFFERS},
-        )
-        for name, values in PAPER.items()
-    ]
+    printed = {name: [published(value, PERCENT, SOURCE) for value in values] for name, values in PAPER.items()}
+    words = {"what differs": DIFFERS}
+    return [Row(PAPER_TABLE, name, dict(zip(keys, each, strict=True)), words) for name, each in printed.items()]
 
 
 PAPER_NOTES = (

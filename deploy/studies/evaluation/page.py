@@ -73,9 +73,8 @@ def evaluation_report(found: Evaluation, strips: Sequence[Picture]) -> Report:
 
 
 MEAN_CAPTION = (
-    "Intervals: 95 % bootstrap over sites for image figures, none below five sites; 90 % for the MTF. "
-    "What a method knows of the sensor "
-    "stands beside it: one that knows it has an advantage that it may not have in orbit."
+    "Intervals: 95 % bootstrap over sites for image figures, none below five sites; 90 % for the MTF. What a "
+    "method knows of the sensor stands beside it: one that knows it has an advantage that it may not have in orbit."
 )
 SITES_CAPTION = "Over full scale; from PSNR, pixels that clipped in the input or the reference are left out."
 SWEEP_CAPTION = (

@@ -9,13 +9,7 @@ import numpy as np
 
 from beers_deploy.model.io.images import MAX_DN, read_acquisition, site_of
 from beers_deploy.model.recipe import PairsRecipe
-from beers_deploy.model.simulator.acquire import (
-    LEAST_SIDE_PX,
-    MARGIN_PX,
-    acquire_three,
-    fitting_oversampling,
-    prepare_scene,
-)
+from beers_deploy.model.simulator import acquire
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene
@@ -87,7 +81,7 @@ def simulate_pairs(
     """
     pairs, small = [], []
     for number, scene in enumerate(scenes):
-        ratio = fitting_oversampling(scene.radiance, oversamplings, LEAST_SIDE_PX)
+        ratio = acquire.fitting_oversampling(scene.radiance, oversamplings, acquire.LEAST_SIDE_PX)
         if ratio is None:
             small.append(scene.name)
             continue
@@ -98,19 +92,15 @@ def simulate_pairs(
         )
         pairs.append(_simulated(scene, seen, meant, ratio, draw))
     if not pairs:
-        least = oversamplings[-1] * (2 * MARGIN_PX + LEAST_SIDE_PX)
-        raise ImageError(
-            "images",
-            expected=f"scenes of {least} pixels a side or more",
-            got=f"{len(small)} smaller ones",
-            remedy="give larger images",
-        )
+        least = oversamplings[-1] * (2 * acquire.MARGIN_PX + acquire.LEAST_SIDE_PX)
+        expected, got = f"scenes of {least} pixels a side or more", f"{len(small)} smaller ones"
+        raise ImageError("images", expected=expected, got=got, remedy="give larger images")
     return pairs, small
 
 
 def _simulated(scene: Scene, degraded: Instrument, reference: Instrument, ratio: int, draw: Draw) -> NamedPair:
     """Three acquisitions of one scene: the pair, and the reference once more without its noise."""
-    made = acquire_three(prepare_scene(scene.radiance, ratio), degraded, reference, draw)
+    made = acquire.acquire_three(acquire.prepare_scene(scene.radiance, ratio), degraded, reference, draw)
     seen, meant, clean = (image.numpy() for image in made)
     return NamedPair(scene.name, seen, meant, oversampling=ratio, noise_free=clean)
 

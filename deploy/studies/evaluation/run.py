@@ -143,7 +143,6 @@ def _pairs(
     recipe: PairsRecipe | None,
     seed: int,
 ) -> tuple[list[NamedPair], list[str]]:
-    """The pairs given, those of a folder, or simulated ones; and what a reader must know of them."""
     if made is not None:
         return [_named(number, pair) for number, pair in enumerate(made)], []
     if folder is not None:
@@ -159,7 +158,6 @@ def _named(number: int, pair: Pair) -> NamedPair:
 def _scored(
     methods: Sequence[Method], pairs: Sequence[NamedPair], instruments: Instruments, targets: Targets, seed: int
 ) -> tuple[list[Row], list[Row]]:
-    """A row a method, the paper's behind; and a row a method and image."""
     mean, rows = list[Row](), list[Row]()
     for method in methods:
         scored, *each = score(method, pairs, instruments, seed)

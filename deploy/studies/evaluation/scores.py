@@ -129,10 +129,9 @@ def site_rows(rows: Sequence[Row]) -> list[Row]:
     """PSNR, SSIM and what other scores there are, by site: a row a site, a column a method."""
     images = [row for row in rows if row.table == "images"]
     keys = [key for key in images[0].figures if key != "PSNR gain" and any(row.figures[key].value for row in images)]
-    sites = list(dict.fromkeys(row.text["site"] for row in images))
-    return [
-        _site_row(key, site, [row for row in images if row.text["site"] == site]) for key in keys for site in sites
-    ]
+    sites = dict.fromkeys(row.text["site"] for row in images)
+    by_site = {site: [row for row in images if row.text["site"] == site] for site in sites}
+    return [_site_row(key, site, here) for key in keys for site, here in by_site.items()]
 
 
 def _site_row(key: str, site: str, images: Sequence[Row]) -> Row:

@@ -28,13 +28,11 @@ SHARPNESS = (0.10, 0.07, 0.05, 0.03, 0.02)
 NOISE = ((15.0, 50.0), (25.0, 55.0), (30.0, 80.0), (70.0, 150.0), (90.0, 190.0))
 """SNR at 25 and 100 W/m2/sr/um; the nominal 50 / 110 is in every sweep."""
 
-Sensors = dict[str, Instrument]
-"""By the name of their row."""
 
-
-def conditions(nominal: Instrument, profile: Sensor) -> Sensors:
+def conditions(nominal: Instrument, profile: Sensor) -> dict[str, Instrument]:
     """The nominal sensor; other MTFs, both axes alike or not; other SNRs; both at once; and one with another gain."""
     low, worst = _noisy(nominal, profile, 25, 55), _noisy(nominal, profile, 15, 50)
+    weak = replace(nominal, gain_dn_per_radiance=0.7 * nominal.gain_dn_per_radiance)
     return {
         NOMINAL: nominal,
         **{f"MTF {mtf:.0%}": _sharp(nominal, mtf) for mtf in SHARPNESS},
@@ -42,13 +40,11 @@ def conditions(nominal: Instrument, profile: Sensor) -> Sensors:
         **{f"SNR {a:g} / {b:g}": _noisy(nominal, profile, a, b) for a, b in NOISE},
         **{f"MTF {mtf:.0%}, SNR 25 / 55": _sharp(low, mtf) for mtf in (0.05, 0.03)},
         "MTF 3%, SNR 15 / 50": _sharp(worst, 0.03),
-        "MTF 10%, gain x 0.7": replace(
-            _sharp(nominal, 0.10), gain_dn_per_radiance=0.7 * nominal.gain_dn_per_radiance
-        ),
+        "MTF 10%, gain x 0.7": _sharp(weak, 0.10),
     }
 
 
-def suppositions(nominal: Instrument, profile: Sensor) -> dict[str, Sensors]:
+def suppositions(nominal: Instrument, profile: Sensor) -> dict[str, dict[str, Instrument]]:
     """Sensors known wrongly: by the name of the condition that holds, what is supposed in its place."""
     mtf = {value: {f"MTF {value:.0%}": _sharp(nominal, value)} for value in (0.05, 0.07, 0.10)}
     # SNR is radiance over sigma: with k times as much of it, the variance is k^2 times smaller.
@@ -73,10 +69,6 @@ def _sharp(sensor: Instrument, mtf: float) -> Instrument:
 def _noisy(sensor: Instrument, profile: Sensor, snr_0: float, snr_1: float) -> Instrument:
     alpha, beta = noise_from_snr(profile.radiance_0.low, snr_0, profile.radiance_1.low, snr_1)
     return replace(sensor, alpha=alpha, beta=beta)
-
-
-Trial = tuple[str, Instrument, Method]
-"""The name of the sensor that is supposed, that sensor, and the method that supposes it."""
 
 
 def run_sweep(
@@ -109,8 +101,10 @@ def run_sweep(
     return Found(psnr, mtf, [pair.site for pair in pairs], seed)
 
 
-def _trials(name: str, sensor: Instrument, methods: Sequence[Method], profile: Sensor) -> list[Trial]:
-    """What is run under a condition; the second of the methods is the chain."""
+def _trials(
+    name: str, sensor: Instrument, methods: Sequence[Method], profile: Sensor
+) -> list[tuple[str, Instrument, Method]]:
+    """Under a condition the sensors supposed, by name, each with a method; the second of the methods is the chain."""
     nominal = profile.nominal()
     units = replace(nominal, gain_dn_per_radiance=sensor.gain_dn_per_radiance)
     drifted = [] if name == NOMINAL else [(NOMINAL, units, methods[1])]

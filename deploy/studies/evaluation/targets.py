@@ -61,8 +61,7 @@ def acquire_targets(sensor: Instrument, seed: int) -> Targets:
 
 
 def _acquire(scene: Tensor, sensor: Instrument, draw: Draw, ratio: int = OVERSAMPLING) -> np.ndarray:
-    dn = acquire(scene_spectrum(scene), scene.shape[1], sensor, ratio, draw, "degraded", margin_px=0)
-    return dn.numpy()
+    return acquire(scene_spectrum(scene), scene.shape[1], sensor, ratio, draw, "degraded", margin_px=0).numpy()
 
 
 def snr_name(radiance: float) -> str:

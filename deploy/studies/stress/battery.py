@@ -161,15 +161,12 @@ def limitation_rows(results: Iterable[StageResult]) -> list[Row]:
 
 def finding_rows(results: Iterable[StageResult]) -> list[Row]:
     """Every figure of every case at every stage, for the document."""
-    return [
-        Row(
-            "findings",
-            f"{result.case.name}, {result.stage}",
-            {measure.check: _figure(measure) for measure in result.measures},
-            {"verdict": result.verdict, **({"why": result.reason} if result.reason else {})},
-        )
-        for result in results
-    ]
+    rows = []
+    for result in results:
+        figures = {measure.check: _figure(measure) for measure in result.measures}
+        words = {"verdict": result.verdict} | ({"why": result.reason} if result.reason else {})
+        rows.append(Row("findings", f"{result.case.name}, {result.stage}", figures, words))
+    return rows
 
 
 def _figure(measure: Measure) -> Figure:

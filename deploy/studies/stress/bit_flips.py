@@ -19,26 +19,14 @@ from beers_deploy.dpu.cost.model import Constants
 from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.model.progress import steps
 from beers_deploy.profiles import load_sensor
-from beers_deploy.profiles.figures import Figure, Row, measured, predicted
+from beers_deploy.profiles.figures import Row, measured, predicted
 from beers_deploy.quant.calibration import HELD_OUT_SEED, Calibration
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.graph import Activation
 from beers_deploy.quant.integer import SOUND
 from beers_deploy.report.plots import Curve, Panel, curves_svg
 from beers_deploy.restoration.options import TILE_PX
-from beers_deploy.studies.stress.faults import (
-    INT8_BITS,
-    MEMORIES,
-    Guards,
-    Injected,
-    as_stored,
-    corrected,
-    is_sound,
-    learn_guards,
-    restored,
-    shifts_of,
-    weight_bits,
-)
+from beers_deploy.studies.stress import faults
 from beers_deploy.studies.stress.networks import Subject
 
 CALIBRATION_PATCHES = 16
@@ -86,23 +74,23 @@ class FaultTarget:
     """
 
     core: IntCore
-    guards: Guards
+    guards: faults.Guards
     pairs: Sequence[tuple[np.ndarray, np.ndarray]]
 
 
 def make_target(subject: Subject, request: FlipRequest) -> FaultTarget:
     """The core as the board stores it, guards that calibration patches teach, and other patches to try it on."""
-    core = as_stored(subject.core)
+    core = faults.as_stored(subject.core)
     taught, tried = (
         Calibration(load_sensor(request.sensor), request.images, count, request.size_px, seed).drawn
         for seed, count in ((request.seed, CALIBRATION_PATCHES), (request.seed + HELD_OUT_SEED, request.draws))
     )
-    guards = learn_guards(core, (core.ends.split(image) for image in taught.degraded))
+    guards = faults.learn_guards(core, (core.ends.split(image) for image in taught.degraded))
     return FaultTarget(core, guards, list(tried.pairs))
 
 
-def _quality_db(target: FaultTarget, injected: Injected, reference: np.ndarray, clamped: bool) -> float:
-    return psnr_db(restored(injected, target.guards if clamped else None), reference, 1.0)
+def _quality_db(target: FaultTarget, injected: faults.Injected, reference: np.ndarray, clamped: bool) -> float:
+    return psnr_db(faults.restored(injected, target.guards if clamped else None), reference, 1.0)
 
 
 SETS = ("no guard", "clamped", "all guards")
@@ -121,8 +109,8 @@ def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
     """A row without flips, and one for every kind of memory and rate."""
     clean = [_clean_db(target, number) for number in range(len(target.pairs))]
     rows = [_curve_row("none", [(0, quality) for quality in clean], "patches")]
-    with steps("turning bits over", sum(len(m.rates) * m.times * draws for m in MEMORIES.values())) as bar:
-        for name, memory in MEMORIES.items():
+    with steps("turning bits over", sum(len(m.rates) * m.times * draws for m in faults.MEMORIES.values())) as bar:
+        for name, memory in faults.MEMORIES.items():
             for rate in memory.rates:
                 found = []
                 for draw in range(memory.times * draws):
@@ -133,17 +121,17 @@ def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
 
 
 def _clean_db(target: FaultTarget, number: int) -> Quality:
-    """Of a pair without flips."""
     image, reference = target.pairs[number]
-    bare, clamped = (_quality_db(target, Injected(target.core, SOUND, image, 0), reference, c) for c in (False, True))
+    sound = faults.Injected(target.core, SOUND, image, 0)
+    bare, clamped = (_quality_db(target, sound, reference, c) for c in (False, True))
     return bare, clamped, clamped
 
 
 def _drawn(target: FaultTarget, name: str, rate: float, draw: int, seed: int, clean: Quality) -> tuple[int, Quality]:
     """The bits that one injection into a memory flipped, and what is left of the quality."""
-    (image, reference), memory = target.pairs[draw % len(target.pairs)], MEMORIES[name]
+    (image, reference), memory = target.pairs[draw % len(target.pairs)], faults.MEMORIES[name]
     # Keyed by what is drawn, so that a draw is the same whatever else runs.
-    generator = np.random.default_rng([seed, draw, list(MEMORIES).index(name), memory.rates.index(rate)])
+    generator = np.random.default_rng([seed, draw, list(faults.MEMORIES).index(name), memory.rates.index(rate)])
     injected = memory.inject(target.core, image, rate, generator)
     # No flip, no change: the fault-free figures stand, at no cost.
     if injected.flips == 0:
@@ -151,8 +139,8 @@ def _drawn(target: FaultTarget, name: str, rate: float, draw: int, seed: int, cl
     bare, clamped = (_quality_db(target, injected, reference, c) for c in (False, True))
     if not memory.kept:
         return injected.flips, (bare, clamped, clamped)
-    left = corrected(injected, target.core, target.guards, rate, generator)
-    sound = is_sound(left, target.core, target.guards)
+    left = faults.corrected(injected, target.core, target.guards, rate, generator)
+    sound = faults.is_sound(left, target.core, target.guards)
     whole = clean[1] if sound else _quality_db(target, left, reference, clamped=True)
     return injected.flips, (bare, clamped, whole)
 
@@ -160,13 +148,11 @@ def _drawn(target: FaultTarget, name: str, rate: float, draw: int, seed: int, cl
 def _curve_row(name: str, draws: Sequence[tuple[int, Quality]], kind: str) -> Row:
     source = f"integer reference, mean and range of {len(draws)} {kind}"
     flips = measured(float(np.mean([count for count, _ in draws])), "bits", source)
-    figures = {each: _mean([quality[k] for _, quality in draws], source) for k, each in enumerate(SETS)}
-    return Row("bit flips", name, {"flips": flips, **figures})
-
-
-def _mean(values: Sequence[float], source: str) -> Figure:
-    # Exact before it is rounded once: the mean of the same values is the same, however often each stands there.
-    return measured(statistics.mean(values), "dB", source, (min(values), max(values)))
+    figures = {"flips": flips}
+    for guards, values in zip(SETS, zip(*(quality for _, quality in draws), strict=True), strict=True):
+        # Exact before it is rounded once: the mean of the same values is the same, however often each stands there.
+        figures[guards] = measured(statistics.mean(values), "dB", source, (min(values), max(values)))
+    return Row("bit flips", name, figures)
 
 
 FUSED = "fused into the convolution (UG1414 3.5)"
@@ -184,8 +170,8 @@ def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Ro
     rate = Constants.of(dpu).host_in_bytes_per_s * dpu.whole("cpu", "cores")  # fitted for one core
     clock_hz = 1e9 * dpu.limit("cpu", "clock_ghz").low
     limit_s = INSTRUCTIONS * target.core.ends.gains * TILE_PX**2 / AT_ONCE / clock_hz
-    scrubbing_s = weight_bits(target.core) / INT8_BITS / rate
-    copies_s = 3 * len(shifts_of(target.core)) / rate
+    scrubbing_s = faults.weight_bits(target.core) / faults.INT8_BITS / rate
+    copies_s = 3 * len(faults.shifts_of(target.core)) / rate
     spread = exp(dpu.value("cost", "width_outside"))
     guards = {
         f"ReLU6 at {len(target.guards.relu6)} of {relus} ReLUs": (0.0, FUSED),
@@ -213,7 +199,7 @@ def _price_row(name: str, time_s: float, source: str, prediction: Prediction, sp
 
 def flip_curves_svg(networks: Mapping[str, Sequence[Row]]) -> str:
     """PSNR against bit flips, with all guards and with none; rows by the network's name."""
-    panels = [Panel(memory, _curves(networks, memory)) for memory in MEMORIES]
+    panels = [Panel(memory, _curves(networks, memory)) for memory in faults.MEMORIES]
     return curves_svg(panels, "bit flips in a megabit", "PSNR, dB (measured)")
 
 
@@ -222,7 +208,7 @@ def _curves(networks: Mapping[str, Sequence[Row]], memory: str) -> list[Curve]:
     for colour, (name, rows) in enumerate(networks.items()):
         by_name = {row.name: row.figures for row in rows if row.table == "bit flips"}
         for guards in ("all guards", "no guard"):
-            rates = MEMORIES[memory].rates
+            rates = faults.MEMORIES[memory].rates
             values = ((rate, by_name[name_of(memory, rate)][guards].value) for rate in rates)
             points = tuple((rate, value) for rate, value in values if value is not None)
             curves.append(Curve(f"{name}, {guards}", colour, guards == "no guard", points))

@@ -154,11 +154,8 @@ def learn_guards(core: IntCore, planes: Iterable[np.ndarray]) -> Guards:
         tensors, _ = run_core(core, each)
         relus = {name: max(peak, int(tensors[name].max())) for name, peak in relus.items()}
         largest_dn = max(largest_dn, MAX_DN * float(np.abs(merged_correction(core, tensors)).max()))
-    bounds = {
-        name: min(bound for bound in RELU6_UNITS if bound >= peak)
-        for name, peak in relus.items()
-        if peak <= RELU6_UNITS[0]
-    }
+    fitting = {name: [bound for bound in RELU6_UNITS if bound >= peak] for name, peak in relus.items()}
+    bounds = {name: min(each) for name, each in fitting.items() if each}
     return Guards(bounds, 2.0 ** math.ceil(math.log2(max(largest_dn, 1.0))), checksums(core))
 
 
@@ -181,11 +178,7 @@ def voted(copies: tuple[Shifts, Shifts, Shifts]) -> Shifts:
 
 def guarded(faults: Faults, guards: Guards) -> Faults:
     """The same faults in a clamped network: a result is bounded before memory can spoil it."""
-
-    def touch(name: str, tensor: np.ndarray) -> np.ndarray:
-        return faults.touch(name, guards.clamp(name, tensor))
-
-    return Faults(faults.shifts, touch)
+    return Faults(faults.shifts, lambda name, tensor: faults.touch(name, guards.clamp(name, tensor)))
 
 
 @dataclass(frozen=True)

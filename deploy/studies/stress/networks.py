@@ -23,25 +23,15 @@ from beers_deploy.quant.bounds import saturable
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import CORRECTION, IMAGE, Activation, Add, Conv, Graph, correction_graph, image_channels
-from beers_deploy.quant.integer import LayerReport, merged_correction, run_core
+from beers_deploy.quant.integer import merged_correction, run_core
 from beers_deploy.quant.onnx_file import any_size, load_onnx, require_quantised
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.walk import Tiling, tiling_of
 from beers_deploy.restoration.engine import restore_floats
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.runtime import Infer
+from beers_deploy.studies.stress import checks
 from beers_deploy.studies.stress.cases import FULL_DN, Case
-from beers_deploy.studies.stress.checks import (
-    FLAT_DN,
-    Measure,
-    change,
-    differing,
-    fidelity,
-    gain,
-    not_finite,
-    out_of_range,
-    refused,
-)
 
 WHOLE_PX = 4096
 """A tile that no case fills."""
@@ -162,7 +152,7 @@ CORES_PX, LARGE_CORE_PX = (16, 29), 250
 """What a tile keeps beside its two halos."""
 
 
-def float32(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
+def float32(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
     """The float network in float32, and against float64 where it is plain convolutions, on an image (H, W) in DN."""
     network, graph = subject.float32, subject.graph
     measures = restoration(network, case, image, GAIN_DN)
@@ -171,41 +161,41 @@ def float32(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
         exact = in_torch(graph, torch.from_numpy(whole).double()).numpy()
         error = FULL_DN * float(np.abs(network.infer()(whole) - exact).max())
         signs = steepest_signs(graph, whole[0, 0])[: image.shape[0], : image.shape[1]]
-        steepest = change(network.restore, image, network.restore(image), signs)
-        measures.append(Measure("error against float64", error, FLOAT32_DN))
-        measures.append(Measure("gain, steepest", steepest, STEEPEST_DN, "DN per DN"))
+        steepest = checks.change(network.restore, image, network.restore(image), signs)
+        measures.append(checks.Measure("error against float64", error, FLOAT32_DN))
+        measures.append(checks.Measure("gain, steepest", steepest, STEEPEST_DN, "DN per DN"))
     return measures
 
 
-def int8(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
+def int8(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
     """The INT8 network by onnxruntime's integer kernels, on an image (H, W) in DN."""
     network = subject.quantised
     measures = restoration(network, case, image, INT8_GAIN_DN)
     if case.pixels == "sound" and not case.large:
         apart = np.abs(network.restore(image) - subject.float32.restore(image))
-        measures.append(Measure("mean error against float", float(apart.mean()), FLAT_DN))
+        measures.append(checks.Measure("mean error against float", float(apart.mean()), checks.FLAT_DN))
     return measures
 
 
-def restoration(network: Network, case: Case, image: np.ndarray, gain_dn: float) -> list[Measure]:
+def restoration(network: Network, case: Case, image: np.ndarray, gain_dn: float) -> list[checks.Measure]:
     """What must hold of any network on an image (H, W) in DN, by whatever it is run."""
     if case.pixels in ("infinite", "beyond"):
-        return [refused(lambda: network.restore(image))]
+        return [checks.refused(lambda: network.restore(image))]
     result = network.restore(image)
     known = ~np.isnan(image)
-    measures = [not_finite(result[known]), out_of_range(result)]
+    measures = [checks.not_finite(result[known]), checks.out_of_range(result)]
     if case.large:
         return measures
-    measures.append(differing("runs differ", result, network.restore(image)))
-    measures.append(differing("threads differ", result, network.restore(image, MORE_THREADS)))
+    measures.append(checks.differing("runs differ", result, network.restore(image)))
+    measures.append(checks.differing("threads differ", result, network.restore(image, MORE_THREADS)))
     if case.pixels == "missing":
-        return [*measures, differing("missing moved", result[~known], image[~known])]
-    largest = gain(network.restore, image, result, np.random.default_rng(0))
-    measures += fidelity(image, result, network.tiling.halo_px, case.flat)
-    return [*measures, Measure("gain", largest, gain_dn, "DN per DN")]
+        return [*measures, checks.differing("missing moved", result[~known], image[~known])]
+    largest = checks.gain(network.restore, image, result, np.random.default_rng(0))
+    measures += checks.fidelity(image, result, network.tiling.halo_px, case.flat)
+    return [*measures, checks.Measure("gain", largest, gain_dn, "DN per DN")]
 
 
-def reference(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
+def reference(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
     """The INT8 network in whole numbers alone, on 48 x 48 pixels of larger images (H, W)."""
     core, network = subject.core, subject.quantised
     if case.pixels != "sound":
@@ -213,48 +203,38 @@ def reference(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
     crop = network.extended(_fractions(image[:CROP_PX, :CROP_PX]))
     planes = core.ends.split(crop)
     (even, reports), (up, _) = run_core(core, planes, half_even=True), run_core(core, planes)
-    by_rule, on_board = (_restored(core, crop, tensors) for tensors in (even, up))
+    by_rule, on_board = (core.ends.finished(crop, merged_correction(core, each))[0, 0] for each in (even, up))
     # A peak above its proof would mean that the proof is wrong, not the network.
-    over = max(report.peak_bits - report.proven_bits for report in reports)
+    over, can = max(report.peak_bits - report.proven_bits for report in reports), saturable(core)
+    unproven = [report.name for report in reports if report.saturated > 0 and not can[report.name]]
     return [
-        not_finite(by_rule),
-        differing("runtime differs", by_rule, network.infer()(crop)[0, 0]),
-        Measure("DPU's tie rounding", FULL_DN * float(np.abs(on_board - by_rule).max()), ROUNDING_DN),
-        Measure("accumulator beyond its proof", over, 0, "bits"),
-        _unproven(core, reports),
+        checks.not_finite(by_rule),
+        checks.differing("runtime differs", by_rule, network.infer()(crop)[0, 0]),
+        checks.Measure("DPU's tie rounding", FULL_DN * float(np.abs(on_board - by_rule).max()), ROUNDING_DN),
+        checks.Measure("accumulator beyond its proof", over, 0, "bits"),
+        checks.Measure("saturation not reported", len(unproven), 0, "layers"),
     ]
-
-
-def _restored(core: IntCore, image: np.ndarray, tensors: dict[str, np.ndarray]) -> np.ndarray:
-    return np.asarray(core.ends.finished(image, merged_correction(core, tensors))[0, 0])
-
-
-def _unproven(core: IntCore, reports: list[LayerReport]) -> Measure:
-    """Layers that saturate although the proof says they cannot."""
-    can = saturable(core)
-    ends = [report.name for report in reports if report.saturated > 0 and not can[report.name]]
-    return Measure("saturation not reported", len(ends), 0, "layers")
 
 
 def _fractions(image: np.ndarray) -> np.ndarray:
     return (np.asarray(image, np.float32) / np.float32(FULL_DN))[None, None]
 
 
-def tiling(subject: Subject, case: Case, image: np.ndarray) -> list[Measure]:
+def tiling(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
     """Both networks, tiled by several plans, against the whole image (H, W); plans refuse unsound pixels."""
     networks = [("float32", subject.float32), ("INT8", subject.int8)]
     return [m for name, network in networks if network for m in _plans(network, name, case, image)]
 
 
-def _plans(network: Network, name: str, case: Case, image: np.ndarray) -> list[Measure]:
+def _plans(network: Network, name: str, case: Case, image: np.ndarray) -> list[checks.Measure]:
     cores = (LARGE_CORE_PX,) if case.large else CORES_PX
     tiles = [2 * network.tiling.halo_px + core for core in cores]
     if case.pixels in ("infinite", "beyond"):
-        return [refused(partial(network.restore, image, tile_px=tile)) for tile in tiles]
+        return [checks.refused(partial(network.restore, image, tile_px=tile)) for tile in tiles]
     whole = network.restore(image)
-    return [differing(f"{name} plans differ", network.restore(image, tile_px=tile), whole) for tile in tiles]
+    return [checks.differing(f"{name} plans differ", network.restore(image, tile_px=tile), whole) for tile in tiles]
 
 
-Stage = Callable[[Subject, Case, np.ndarray], list[Measure]]
+Stage = Callable[[Subject, Case, np.ndarray], list[checks.Measure]]
 
 STAGES: dict[str, Stage] = {"float32": float32, "INT8": int8, "INT8 reference": reference, "tiling": tiling}

@@ -10,7 +10,7 @@ from beers_deploy.profiles.figures import Figure, Row
 from beers_deploy.studies.tradeoff.pareto import COSTS, PSNR, Comparison, Measured, ends, placed
 
 MAP50 = "mAP50"
-NAMES = {
+NAMES: dict[str, tuple[str, str]] = {
     "psnr": ("PSNR", "dB"),
     "ssim": ("SSIM", "ratio"),
     "lpips": ("LPIPS-squeeze", "distance"),

@@ -5,15 +5,10 @@ import math
 from beers_deploy.bench.tables import Swath, chain_rate, efficiency, energy, processor_row, swath_latency
 from beers_deploy.dpu.cost.latency import dpu_power
 from beers_deploy.profiles.figures import Figure, predicted, unavailable
+from beers_deploy.studies.tradeoff.advice import NAMES
 from beers_deploy.studies.tradeoff.points import Point, predict_tile
 
-UNITS = {
-    "board latency": "s",
-    "board throughput": "frame/s",
-    "board power": "W",
-    "board energy": "J",
-    "board efficiency": "px/s/W",
-}
+UNITS = {key: unit for key, unit in NAMES.values() if key.startswith("board")}
 NOT_ON_A_BOARD = "no time of this method on the board's processor is stated"
 CHAIN = "traditional-standard"
 """The chain whose time on a board's processor a target states."""

@@ -75,8 +75,7 @@ class Measurements:
         if not path.exists():
             return cls(path)
         try:
-            kept = json.loads(path.read_text(encoding="utf-8"))["measurements"]
-            return cls(path, dict(kept))
+            return cls(path, dict(json.loads(path.read_text(encoding="utf-8"))["measurements"]))
         except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
             expected, remedy = "measurements that this command kept", "remove it: they are made anew"
             raise OptionError(str(path), expected=expected, got="another file", remedy=remedy) from error

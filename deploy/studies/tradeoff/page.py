@@ -1,6 +1,7 @@
 """The page of a study: the recommended line, the plot with its front, and every point in a table that sorts."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,6 @@ from markupsafe import Markup
 
 from beers_deploy.model.io.files import write_text
 from beers_deploy.model.traditional.peers import PEERS
-from beers_deploy.profiles.figures import Row
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.report.plots import LIGHT, SERIES, data_url, look, new_figure, set_ticks, svg_of
 from beers_deploy.studies.tradeoff.pareto import PSNR, Measured, ends, placed
@@ -55,19 +55,13 @@ def write_study(study: Tradeoff, out: Path) -> None:
 def report_of(study: Tradeoff, svg: str) -> Report:
     """The page in reading order."""
     picture = Picture(f"{PSNR} against {study.cost}", data_url(svg), PLOT_CAPTION)
+    shown = [replace(each.row, text={key: each.text.get(key, "") for key in SHOWN_WORDS}) for each in study.points]
     tables = [
         Section("The front, from cheap to dear", study.front_rows, FRONT_CAPTION),
-        Section(f"All {len(study.points)} points", [_shown(point) for point in study.points], POINTS_CAPTION),
+        Section(f"All {len(study.points)} points", shown, POINTS_CAPTION),
     ]
-    line = study.recommendation.line
-    return Report(
-        "What accuracy costs in time", f"{line[0].upper()}{line[1:]}.", tables, [picture], study.notes, sorts=True
-    )
-
-
-def _shown(point: Measured) -> Row:
-    """A point's row with the words that a reader sorts by."""
-    return Row("points", point.name, point.figures, {key: point.text.get(key, "") for key in SHOWN_WORDS})
+    title, line = "What accuracy costs in time", study.recommendation.line
+    return Report(title, f"{line[0].upper()}{line[1:]}.", tables, [picture], study.notes, sorts=True)
 
 
 def plot_svg(study: Tradeoff) -> Markup:
@@ -128,7 +122,6 @@ def _scatter(
 
 
 def _draw_front(axes: "Axes", study: Tradeoff, front: Sequence[Measured]) -> None:
-    """The line of the front, and the intervals of its members."""
     x, y = [point.cost(study.cost) for point in front], [point.psnr_db for point in front]
     axes.step(x, y, where="post", color=LIGHT["soft"], lw=1, zorder=1)
     for point, row in zip(front, study.front_rows, strict=True):

@@ -31,14 +31,7 @@ from beers_deploy.results import Input, Table, input_of
 from beers_deploy.studies.evaluation.methods import Method, method_named
 from beers_deploy.studies.evaluation.pairs import pairs_of_scenes
 from beers_deploy.studies.evaluation.scores import Instruments, perceptual_distances
-from beers_deploy.studies.tradeoff.advice import (
-    MAP50,
-    Constraint,
-    Recommendation,
-    chosen_cost,
-    parse_constraints,
-    recommend,
-)
+from beers_deploy.studies.tradeoff import advice
 from beers_deploy.studies.tradeoff.boards import CHAIN, board_figures
 from beers_deploy.studies.tradeoff.labelled import Labelled
 from beers_deploy.studies.tradeoff.measure import Benchmark, Measurements, Scores, key_of, make_int8, measure_host
@@ -76,7 +69,7 @@ class Tradeoff(Table):
     front: Sequence[Measured]
     front_rows: Sequence[Row]
     cost: str
-    recommendation: Recommendation
+    recommendation: advice.Recommendation
 
     @property
     def best(self) -> Measured | None:
@@ -156,7 +149,7 @@ def tradeoff(
     boards, width_height = boards_of(board), parse_size(size) if isinstance(size, str) else size
     for each in boards:
         Constants.of(configurations(each)[0])  # a board without them is refused before anything is measured
-    limits = parse_constraints("budget", budget), parse_constraints("need", need)
+    limits = advice.parse_constraints("budget", budget), advice.parse_constraints("need", need)
     scenes, weights, calibrated = (None if path is None else Path(path) for path in (images, lpips, calibration))
     degraded = Sensor.load(sensor)
     aim = Sensor.load(reference or REFERENCE).in_units_of(degraded)
@@ -171,20 +164,17 @@ def tradeoff(
         pictures = Labelled.open(Path(labelled), detector, classes, benchmark) if labelled else None
         measured = _measured([*points, *_others(boards)], benchmark, pictures, kept, swath, log)
     if boards[0].name == PAPER_TARGET and width_height == parse_size(PAPER_SIZE):
-        measured += _published()
+        for row in published_rows():  # as printed; the paper's images are others
+            figures = {f"board {key}": figure for key, figure in row.figures.items()}
+            measured.append(Measured(row.name, figures, {"board": PAPER_TARGET}))
     notes = (*_notes(benchmark, boards[0].name), *(pictures.notes if pictures else ()), *said)
     files = [path for path in map(Path, names) if path.is_file()]
     files += [path for folder in (scenes, calibrated) if folder for path in list_images(folder)]
     files += [path for path in (find_backbone("squeeze", weights), detector) if path]
     files += [scene.path for scene in pictures.scenes if scene.path] if pictures else []
     arguments: dict[str, object] = {"images": images, "sensor": degraded.name, "reference": aim.name, "need": need}
-    arguments |= {
-        "size": "x".join(map(str, width_height)),
-        "budget": budget,
-        "calibration": calibration,
-        "seed": seed,
-    }
-    arguments |= {"target": ",".join(each.name for each in boards), "network": ",".join(names), "seed": seed}
+    arguments |= {"size": "x".join(map(str, width_height)), "budget": budget, "calibration": calibration}
+    arguments |= {"seed": seed, "target": ",".join(each.name for each in boards), "network": ",".join(names)}
     arguments |= {"labelled": labelled, "detector": detector, "classes": classes} if labelled else {}
     about = arguments, tuple(map(input_of, files)), notes
     return _weighed(measured, boards[0], Comparison(benchmark.sites, seed), limits, about)
@@ -194,15 +184,15 @@ def _weighed(
     points: Sequence[Measured],
     board: TargetProfile,
     compare: Comparison,
-    limits: tuple[Sequence[Constraint], Sequence[Constraint]],
+    limits: tuple[Sequence[advice.Constraint], Sequence[advice.Constraint]],
     about: tuple[Mapping[str, object], tuple[Input, ...], tuple[str, ...]],
 ) -> Tradeoff:
     """The front and the recommendation, of the points of one board."""
     here = [each for each in points if each.point and each.point.board in (None, board)]
-    cost, (arguments, inputs, notes) = chosen_cost(here, limits[0]), about
+    cost, (arguments, inputs, notes) = advice.chosen_cost(here, limits[0]), about
     front = pareto_front(here, cost)
-    numbered, advice = front_rows(front, cost, compare), recommend(here, limits[0], limits[1], compare)
-    rows = (advice.row, *numbered, *(point.row for point in points))
+    numbered, recommended = front_rows(front, cost, compare), advice.recommend(here, limits[0], limits[1], compare)
+    rows = (recommended.row, *numbered, *(point.row for point in points))
     return Tradeoff(
         "tradeoff",
         arguments,
@@ -214,14 +204,13 @@ def _weighed(
         front=front,
         front_rows=numbered,
         cost=cost,
-        recommendation=advice,
+        recommendation=recommended,
     )
 
 
 def _benchmark(
     images: Path | None, degraded: Sensor, reference: Sensor, lpips: Path | None, seed: int
 ) -> tuple[Benchmark, list[str]]:
-    """What all variants are measured on, and what a reader must know of the images."""
     pairs, said = pairs_of_scenes(images, degraded, reference, seed)
     distances = {LPIPS: perceptual_distances(lpips)[LPIPS]}
     backbone, instruments = find_backbone("squeeze", lpips), Instruments(distances, degraded.nominal().max_dn)
@@ -230,7 +219,6 @@ def _benchmark(
 
 
 def _others(boards: Sequence[TargetProfile]) -> list[Point]:
-    """The traditional chains on each board's processor, and other libraries' methods on this machine."""
     chains = [Variant(f"traditional-{quality}", FLOAT, f"traditional-{quality}") for quality in QUALITIES]
     points = [Point(chain, board) for chain in chains for board in boards]
     return points + [Point(Variant(peer, FLOAT, peer)) for peer in PEERS]
@@ -272,11 +260,10 @@ def _point(
     host: Mapping[Variant, Mapping[str, Figure]],
     swath: Swath,
 ) -> Measured:
-    """A point with all its figures, in the order in which tables show them."""
     figures = benchmark.means(images)
     if found:  # how often a seam cuts an object is not known
         with_seams = unavailable("%", "measured with exact halos alone")
-        figures[MAP50] = found[point.variant] if point.halo_px is None else with_seams
+        figures[advice.MAP50] = found[point.variant] if point.halo_px is None else with_seams
     figures |= {**host[point.variant], **board_figures(point, swath, _slower(point, host))}
     return Measured(point.name, figures, _text(point, method), point, images)
 
@@ -309,12 +296,6 @@ def _text(point: Point, method: Method) -> dict[str, str]:
         "precision": point.variant.precision,
         "sensor": method.sensor_known,
     }
-
-
-def _published() -> list[Measured]:
-    """The paper's two runs as printed; its images are others."""
-    words = {"board": PAPER_TARGET}
-    return [Measured(r.name, {f"board {key}": f for key, f in r.figures.items()}, words) for r in published_rows()]
 
 
 def _notes(benchmark: Benchmark, board: str) -> Iterator[str]:
