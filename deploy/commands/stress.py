@@ -1,5 +1,6 @@
 """`beers-deploy stress`: hard cases and bit flips against a network. Exit code 1 when something fails."""
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,13 +10,12 @@ import typer
 from beers_deploy.commands.shared import BOARDS, arguments, refuse, save, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.figures import by_table
+from beers_deploy.profiles.figures import Row, by_table
+from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET
 
 if TYPE_CHECKING:
-    from beers_deploy.studies.stress.bit_flips import FlipRequest
-    from beers_deploy.studies.stress.networks import Subject
+    from beers_deploy.studies.stress.battery import StageResult
 
 EXAMPLE = "stress float.onnx int8.onnx --out stability.md"
 
@@ -68,48 +68,44 @@ def stress(
     these cost on the board.
     """
     from beers_deploy.model.io.files import require_writable, write_text
+    from beers_deploy.quant.calibration import Calibration
     from beers_deploy.results import Table, print_rows
-    from beers_deploy.studies.stress.battery import (
-        battery_rows,
-        chosen,
-        finding_rows,
-        layer_rows,
-        limitation_rows,
-        overflow_proven,
-        run_battery,
-        worst_rows,
-    )
-    from beers_deploy.studies.stress.bit_flips import FlipRequest
+    from beers_deploy.studies.stress.battery import TITLES, chosen, finding_rows, markdown, run_battery, shown_rows
+    from beers_deploy.studies.stress.bit_flips import flip_curves_svg, flip_rows
     from beers_deploy.studies.stress.cases import CASES
     from beers_deploy.studies.stress.networks import STAGES, open_subject
-    from beers_deploy.studies.stress.tables import markdown, title
 
     _refuse_unused(context, bit_flips)
-    picture = _picture_beside(out, json) if bit_flips else None
+    picture = out.with_name(f"{out.stem}.svg") if bit_flips and out else None
     read = (float_model, int8_model, images, *map(Path, (sensor, target)))
     require_writable(out, json, picture, inputs=read)
-    files, tell = (float_model, int8_model), partial(say, err=True)
-    if bit_flips:
-        request = FlipRequest(sensor, images, target, draws, side, seed)
-        _flip_bits(open_subject(*files, sensor, tell), request, (out, picture, json))
-        return
     names = chosen(cases, [case.name for case in CASES], "--cases")
     wanted = chosen(stages, STAGES, "--stages")
-    subject = open_subject(*files, sensor, tell)
-    selected = [case for case in CASES if case.name in names]
-    results = run_battery(subject, selected, wanted, seed, side)
-    shown = [*battery_rows(results), *worst_rows(results), *limitation_rows(results), *layer_rows(subject)]
+    subject = open_subject(float_model, int8_model, sensor, partial(say, err=True))
+    if bit_flips:
+        results, shown = [], flip_rows(subject, Calibration(load_sensor(sensor), images, draws, side, seed), target)
+    else:
+        results = run_battery(subject, [case for case in CASES if case.name in names], wanted, seed, side)
+        shown = shown_rows(subject, results)
     for table, rows in by_table(shown).items():
-        print_rows(title(table), rows)
+        print_rows(TITLES[table], rows)
     save(Table("stress", arguments(), subject.paths, (*shown, *finding_rows(results))), json)
     if out is not None:
         write_text(out, markdown(shown))
+    if picture is not None:
+        write_text(picture, flip_curves_svg({subject.paths[-1].stem: shown}))
+    if not bit_flips:
+        _judge(shown, results)
+
+
+def _judge(shown: Sequence[Row], results: "Sequence[StageResult]") -> None:
+    """Say what was not looked at and what failed; exit code 1 where anything did."""
     for reason in dict.fromkeys(result.reason for result in results if result.reason):
         say(f"not looked at: {reason}")
     failed = [result for result in results if result.failed]
     for result in failed:
         say(f"FAILED {result.case.name}, {result.stage}: {result.verdict.removeprefix('FAILED: ')}")
-    safe = overflow_proven(subject)
+    safe = all(row.text["can it overflow int32"] == "no" for row in shown if row.table == "integer layers")
     if not safe:
         say("FAILED: an int32 accumulator might overflow, see the integer layers")
     say(f"stress {'passed' if not failed and safe else 'FAILED'}: {len(results)} looks, {len(failed)} failed")
@@ -125,33 +121,3 @@ def _refuse_unused(context: typer.Context, bit_flips: bool) -> None:
     else:
         expected, remedy = "--bit-flips beside it", "add --bit-flips, or leave it out"
         refuse(context, BIT_FLIPS_ONLY, expected=expected, got="hard cases", remedy=remedy)
-
-
-def _flip_bits(
-    subject: "Subject", request: "FlipRequest", wanted: tuple[Path | None, Path | None, Path | None]
-) -> None:
-    """Inject, print, and write what was asked for: tables, curves, figures."""
-    from beers_deploy.model.io.files import write_text
-    from beers_deploy.results import Table, print_rows
-    from beers_deploy.studies.stress.bit_flips import flip_curves_svg, flip_rows
-    from beers_deploy.studies.stress.tables import markdown, title
-
-    out, picture, json = wanted
-    rows = flip_rows(subject, request)
-    for table, found in by_table(rows).items():
-        print_rows(title(table), found)
-    save(Table("stress", arguments(), subject.paths, tuple(rows)), json)
-    if out is not None and picture is not None:
-        write_text(out, markdown(rows))
-        write_text(picture, flip_curves_svg({subject.paths[-1].stem: rows}))
-
-
-def _picture_beside(out: Path | None, json: Path | None) -> Path | None:
-    """Where the curves go: beside the tables, over nothing else that is written."""
-    if out is None:
-        return None
-    picture = out.with_name(f"{out.stem}.svg")
-    if picture in (out, json):
-        expected, remedy = f"a name other than that of the curves, {picture.name}", "give it the suffix .md"
-        raise OptionError("--out", expected=expected, got=out.name, remedy=remedy)
-    return picture

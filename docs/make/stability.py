@@ -10,11 +10,18 @@ from pathlib import Path
 
 from beers_deploy.model.io.files import write_text
 from beers_deploy.model.shipped import VARIANT
-from beers_deploy.studies.stress.battery import StageResult, battery_rows, layer_rows, run_battery, worst_rows
+from beers_deploy.studies.stress.battery import (
+    NOTES,
+    StageResult,
+    battery_rows,
+    layer_rows,
+    run_battery,
+    table_lines,
+    worst_rows,
+)
 from beers_deploy.studies.stress.cases import CASES
 from beers_deploy.studies.stress.checks import LIMITATIONS
 from beers_deploy.studies.stress.networks import STAGES, Subject, open_subject
-from beers_deploy.studies.stress.tables import NOTES, table_lines
 
 TARGET = Path(__file__).parents[1] / "explanation" / "stability.md"
 OPENING = f"""# Stability

@@ -11,14 +11,15 @@ import pytest
 from beers_deploy.bench.tables import predict_file
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.network import shipped_pair
+from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.figures import Row
+from beers_deploy.quant.calibration import Calibration
 from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.graph import Activation
 from beers_deploy.quant.integer import SOUND
 from beers_deploy.restoration.options import TILE_PX
 from beers_deploy.studies.stress.bit_flips import (
     FaultTarget,
-    FlipRequest,
     curve_rows,
     flip_curves_svg,
     make_target,
@@ -42,13 +43,13 @@ pytestmark = pytest.mark.slow
 
 SVG = "{http://www.w3.org/2000/svg}"
 CURVES = f".//{SVG}g[@class='curve']"
-REQUEST = FlipRequest("pleiades-degraded", None, "vck190", draws=2, size_px=48, seed=3)
+SOURCE = Calibration(load_sensor("pleiades-degraded"), None, patches=2, patch_px=48, seed=3)
 
 
 @pytest.fixture(scope="module")
 def target() -> FaultTarget:
     """A trained network: what a new one makes is hardly worse with bits flipped."""
-    return make_target(open_subject(Path("convbeers-xs"), None), REQUEST)
+    return make_target(open_subject(Path("convbeers-xs"), None), SOURCE)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +98,7 @@ def test_an_injection_leaves_the_target_alone(memory: str, target: FaultTarget) 
 
 
 def test_at_half_resolution_maps_have_a_bit_for_each_channel_of_each_place(coarse: Subject) -> None:
-    target = make_target(coarse, REQUEST)
+    target = make_target(coarse, SOURCE)
     image, _ = target.pairs[0]
     sound = restored(Injected(target.core, SOUND, target.pairs[0][0], 0))
     assert sound.shape == image.shape
@@ -159,7 +160,7 @@ def test_the_page_is_fresh() -> None:
     assert page.startswith(maker.OPENING + maker.FINDINGS)
     dpu = load_dpu("vck190", None)
     for variant in maker.VARIANTS:
-        target = make_target(open_subject(Path(variant), None), maker.REQUEST)
+        target = make_target(open_subject(Path(variant), None), maker.SOURCE)
         rows = price_rows(target, predict_file(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
         assert all(line in page for line in maker.price_lines({variant: rows}))
     for name, memory in MEMORIES.items():

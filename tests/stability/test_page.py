@@ -1,9 +1,9 @@
 """docs/explanation/stability.md names every case, stage and limitation that the code knows."""
 
 from beers_deploy.profiles.figures import Row, measured, predicted, unavailable
+from beers_deploy.studies.stress.battery import markdown
 from beers_deploy.studies.stress.cases import CASES
 from beers_deploy.studies.stress.networks import STAGES
-from beers_deploy.studies.stress.tables import markdown
 from docs.make import stability as maker
 
 
@@ -18,8 +18,8 @@ def test_the_page_is_fresh() -> None:
 
 def test_columns_say_unit_and_mode() -> None:
     rows = [
-        Row("t", "a|b", {"x": measured(1.5, "DN", "s"), "y": predicted(2, "DN", (1, 3), "s")}),
-        Row("t", "c", {"x": unavailable("DN", "no reason"), "y": measured(3, "px", "s")}),
+        Row("worst", "a|b", {"x": measured(1.5, "DN", "s"), "y": predicted(2, "DN", (1, 3), "s")}),
+        Row("worst", "c", {"x": unavailable("DN", "no reason"), "y": measured(3, "px", "s")}),
     ]
     page = markdown(rows)
     assert "|  | x (DN, measured) | y |" in page

@@ -2,16 +2,17 @@
 
 import math
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from beers_deploy.model.progress import steps
 from beers_deploy.profiles.errors import BeersError, OptionError
-from beers_deploy.profiles.figures import Figure, Row, measured, predicted
+from beers_deploy.profiles.figures import Figure, Row, by_table, measured, predicted
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.integer import INT32_BITS
+from beers_deploy.results import common_mode, missing, unit_of, words_of
 from beers_deploy.studies.stress.cases import CASES, SIDE_PX, Case
 from beers_deploy.studies.stress.checks import Limitation, Measure, limitation_of, torch_threads
 from beers_deploy.studies.stress.networks import STAGES, Subject
@@ -27,15 +28,19 @@ class StageResult:
     reason: str = ""
 
     @property
+    def broken(self) -> list[tuple[Measure, Limitation | None]]:
+        """What does not hold, each with the known limitation that explains it."""
+        return [(m, limitation_of(self.stage, self.case.name, m)) for m in self.measures if not m.holds]
+
+    @property
     def limitations(self) -> list[Limitation]:
-        """The known limitations that explain what does not hold."""
-        found = [limitation_of(self.stage, self.case.name, m) for m in self.measures if not m.holds]
-        return list(dict.fromkeys(limit for limit in found if limit is not None))
+        """The known limitations that were met."""
+        return list(dict.fromkeys(limit for _, limit in self.broken if limit is not None))
 
     @property
     def failed(self) -> list[Measure]:
         """What does not hold, and no limitation explains."""
-        return [m for m in self.measures if not m.holds and limitation_of(self.stage, self.case.name, m) is None]
+        return [measure for measure, limit in self.broken if limit is None]
 
     @property
     def verdict(self) -> str:
@@ -76,14 +81,13 @@ def run_battery(
     return results
 
 
-NEEDED: dict[str, Callable[[Subject], object]] = {"INT8": lambda s: s.quantised, "INT8 reference": lambda s: s.core}
-
-
 def _cannot_be_looked_at(subject: Subject, stage: str) -> str:
     """Why a stage has nothing to look at; empty where it has."""
     try:
-        if stage in NEEDED:
-            NEEDED[stage](subject)
+        if stage == "INT8":
+            _ = subject.quantised
+        elif stage == "INT8 reference":
+            _ = subject.core
     except BeersError as error:
         return str(error)
     return ""
@@ -123,6 +127,11 @@ SOURCE = "stress: worst over the images of the case"
 INTERVALS = "proven for every image: interval arithmetic on the file's own weights"
 
 
+def shown_rows(subject: Subject, results: Sequence[StageResult]) -> list[Row]:
+    """The tables of a battery in reading order, its findings left out."""
+    return [*battery_rows(results), *worst_rows(results), *limitation_rows(results), *layer_rows(subject)]
+
+
 def battery_rows(results: Iterable[StageResult]) -> list[Row]:
     """A row a case, a word a stage."""
     verdicts: dict[str, dict[str, str]] = {}
@@ -150,8 +159,7 @@ def limitation_rows(results: Iterable[StageResult]) -> list[Row]:
     """A row for each known limitation that was met, with its largest size."""
     rows: dict[str, Row] = {}
     for result in results:
-        for measure in result.measures:
-            limit = None if measure.holds else limitation_of(result.stage, result.case.name, measure)
+        for measure, limit in result.broken:
             name = f"{limit.name} ({result.stage}, {measure.check})" if limit else ""
             if limit and (name not in rows or measure.value > (rows[name].figures["largest"].value or 0)):
                 text = {"in": result.case.name, "fails beyond": f"{limit.ceiling:g}", "means": limit.meaning}
@@ -173,11 +181,6 @@ def _figure(measure: Measure) -> Figure:
     return measured(measure.value, measure.unit, SOURCE)
 
 
-def overflow_proven(subject: Subject) -> bool:
-    """Whether no accumulator of the INT8 file can overflow; True where there is no core to look at."""
-    return all(row.text["can it overflow int32"] == "no" for row in layer_rows(subject))
-
-
 def layer_rows(subject: Subject) -> list[Row]:
     """Each integer layer: bits that its accumulator needs at most, and whether it might saturate."""
     if _cannot_be_looked_at(subject, "INT8 reference"):
@@ -189,3 +192,52 @@ def layer_rows(subject: Subject) -> list[Row]:
         text = {"can it overflow int32": overflows, "can it saturate int8": "perhaps" if bound.saturates else "never"}
         rows.append(Row("integer layers", bound.name, {"accumulator": bits}, text))
     return rows
+
+
+TITLES = {  # of the sections that are shown, by the names of their tables in the document
+    "battery": "Cases and stages",
+    "worst": "Worst of each check",
+    "limitations": "Known limitations met",
+    "integer layers": "Integer layers",
+    "bit flips": "Quality against bit flips",
+    "guards": "What guards cost on the board",
+}
+NOTES = {
+    "battery": "`ok`: every check holds; `limit`: only what a known limitation explains does not; `-`: not looked "
+    "at, for whole numbers know no missing pixels and the others are refused before.",
+    "bit flips": "PSNR, mean and range over patches and injections; one kind of memory at a time. `clamped`: ReLU6 "
+    "and the limit of the correction. `all guards`: scrubbing and triple modular redundancy too, before the image; "
+    "what flips in the weights after that stays for this tile.",
+    "guards": "ReLU6 only where calibration stays below 96 units. Three rows are the host's time; the DPU is busy "
+    "meanwhile, so nothing is lost while the host has time left.",
+    "integer layers": "Intervals of whole numbers through the file's weights: true of every image.",
+}
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """A section for each table."""
+    parts = []
+    for table, found in by_table(rows).items():
+        parts += [f"## {TITLES[table]}\n", *([NOTES[table], ""] if table in NOTES else []), *table_lines(found), ""]
+    return "\n".join(parts)
+
+
+def table_lines(rows: Sequence[Row]) -> list[str]:
+    """The lines of one table; unit and mode stand in its head where they are those of a whole column."""
+    found, words = list(rows), words_of(list(rows))
+    common = {key: (unit_of(key, found), common_mode(key, found)) for row in found for key in row.figures}
+    abouts = {key: ", ".join(filter(None, both)) for key, both in common.items()}
+    lines = [["", *(f"{key} ({about})" if about else key for key, about in abouts.items()), *words]]
+    lines.append(["---"] * len(lines[0]))
+    for row in found:
+        figures = [_cell(row.figures.get(key), *both) for key, both in common.items()]
+        lines.append([row.name, *figures, *(row.text.get(word, "") for word in words)])
+    reasons = missing(found)
+    shown = [f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |" for cells in lines]
+    return [*shown, *(["", *reasons] if reasons else [])]
+
+
+def _cell(figure: Figure | None, unit: str, mode: str) -> str:
+    if figure is None or figure.value is None:
+        return "" if figure is None else "-"
+    return " ".join([str(figure), *([] if unit else [figure.unit]), *([] if mode else [figure.mode])])

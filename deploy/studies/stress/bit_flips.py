@@ -6,9 +6,8 @@ then runs in whole numbers.
 
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp
-from pathlib import Path
 
 import numpy as np
 
@@ -18,7 +17,6 @@ from beers_deploy.dpu.cost.latency import Prediction
 from beers_deploy.dpu.cost.model import Constants
 from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.model.progress import steps
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.figures import Row, measured, predicted
 from beers_deploy.quant.calibration import HELD_OUT_SEED, Calibration
 from beers_deploy.quant.core import IntCore
@@ -32,35 +30,20 @@ from beers_deploy.studies.stress.networks import Subject
 CALIBRATION_PATCHES = 16
 
 
-@dataclass(frozen=True)
-class FlipRequest:
-    """What to inject faults into, and how often.
+def flip_rows(subject: Subject, source: Calibration, board: str) -> list[Row]:
+    """The rows of the whole study: quality against flips, and what guards cost.
 
-    Attributes:
-        sensor: profile of the degraded patches.
-        images: folder of scenes; drawn ones where there is none.
-        target: board whose cost model prices the guards.
-        draws: injections into each kind of memory at each rate.
-        size_px: side of a patch.
-        seed: of patches and injections.
+    Args:
+        subject: with an INT8 network.
+        source: of the patches that flips are tried on, one an injection into each kind of memory at each rate.
+        board: whose cost model prices the guards.
     """
-
-    sensor: str
-    images: Path | None
-    target: str
-    draws: int
-    size_px: int
-    seed: int
-
-
-def flip_rows(subject: Subject, request: FlipRequest) -> list[Row]:
-    """The rows of the whole study: quality against flips, and what guards cost."""
     _ = subject.core  # refused before anything is drawn
-    dpu = load_dpu(request.target, None)
+    dpu = load_dpu(board, None)
     prediction = predict_file(subject.paths[-1], dpu, TILE_PX)
     dpu.limit("cpu", "clock_ghz")  # and so is a board that cannot price the guards
-    target = make_target(subject, request)
-    return [*curve_rows(target, request.draws, request.seed), *price_rows(target, prediction, dpu)]
+    target = make_target(subject, source)
+    return [*curve_rows(target, source.patches, source.seed), *price_rows(target, prediction, dpu)]
 
 
 @dataclass(frozen=True)
@@ -78,19 +61,12 @@ class FaultTarget:
     pairs: Sequence[tuple[np.ndarray, np.ndarray]]
 
 
-def make_target(subject: Subject, request: FlipRequest) -> FaultTarget:
+def make_target(subject: Subject, source: Calibration) -> FaultTarget:
     """The core as the board stores it, guards that calibration patches teach, and other patches to try it on."""
     core = faults.as_stored(subject.core)
-    taught, tried = (
-        Calibration(load_sensor(request.sensor), request.images, count, request.size_px, seed).drawn
-        for seed, count in ((request.seed, CALIBRATION_PATCHES), (request.seed + HELD_OUT_SEED, request.draws))
-    )
-    guards = faults.learn_guards(core, (core.ends.split(image) for image in taught.degraded))
-    return FaultTarget(core, guards, list(tried.pairs))
-
-
-def _quality_db(target: FaultTarget, injected: faults.Injected, reference: np.ndarray, clamped: bool) -> float:
-    return psnr_db(faults.restored(injected, target.guards if clamped else None), reference, 1.0)
+    taught, tried = replace(source, patches=CALIBRATION_PATCHES), replace(source, seed=source.seed + HELD_OUT_SEED)
+    guards = faults.learn_guards(core, (core.ends.split(image) for image in taught.drawn.degraded))
+    return FaultTarget(core, guards, list(tried.drawn.pairs))
 
 
 SETS = ("no guard", "clamped", "all guards")
@@ -120,10 +96,14 @@ def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
     return rows
 
 
+def _quality_db(injected: faults.Injected, guards: faults.Guards | None, reference: np.ndarray) -> float:
+    return psnr_db(faults.restored(injected, guards), reference, 1.0)
+
+
 def _clean_db(target: FaultTarget, number: int) -> Quality:
     image, reference = target.pairs[number]
     sound = faults.Injected(target.core, SOUND, image, 0)
-    bare, clamped = (_quality_db(target, sound, reference, c) for c in (False, True))
+    bare, clamped = (_quality_db(sound, guards, reference) for guards in (None, target.guards))
     return bare, clamped, clamped
 
 
@@ -136,13 +116,11 @@ def _drawn(target: FaultTarget, name: str, rate: float, draw: int, seed: int, cl
     # No flip, no change: the fault-free figures stand, at no cost.
     if injected.flips == 0:
         return 0, clean
-    bare, clamped = (_quality_db(target, injected, reference, c) for c in (False, True))
+    bare, clamped = (_quality_db(injected, guards, reference) for guards in (None, target.guards))
     if not memory.kept:
         return injected.flips, (bare, clamped, clamped)
     left = faults.corrected(injected, target.core, target.guards, rate, generator)
-    sound = faults.is_sound(left, target.core, target.guards)
-    whole = clean[1] if sound else _quality_db(target, left, reference, clamped=True)
-    return injected.flips, (bare, clamped, whole)
+    return injected.flips, (bare, clamped, _quality_db(left, target.guards, reference))
 
 
 def _curve_row(name: str, draws: Sequence[tuple[int, Quality]], kind: str) -> Row:

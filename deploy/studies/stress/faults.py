@@ -289,9 +289,3 @@ def corrected(
     second, third = (_flip_copy(sound, per_megabit, generator) for _ in range(2))
     shifts = voted((first, second, third)) if injected.faults.shifts else {}
     return replace(injected, core=core, faults=replace(injected.faults, shifts=shifts))
-
-
-def is_sound(injected: Injected, sound: IntCore, guards: Guards) -> bool:
-    """Whether no fault is left in weights and shifts."""
-    meant = shifts_of(sound)
-    return {**meant, **injected.faults.shifts} == meant and checksums(injected.core) == guards.checksums

@@ -107,16 +107,12 @@ def open_subject(float_path: Path | None, int8_path: Path | None, sensor: str = 
     if int8_path is None and (float_path is None or not (float_path.suffix or float_path.exists())):
         float_path, int8_path = pair_of(float_path, None)
     known = load_sensor(sensor)
-    float_path = float_file(float_path, known, say)
-    int8_path = int8_file(int8_path, known, say) if int8_path else None
-    float32 = Network(float_model(float_path))
-    int8 = None if int8_path is None else Network(load_onnx(int8_path))
-    for path, network, wanted in ((float_path, float32, False), (int8_path, int8, True)):
-        if path is not None and network is not None:
-            require_quantised(network.model, str(path), wanted)
-            _ = network.tiling  # refuses what cannot be tiled before anything runs
-    paths = (float_path,) if int8_path is None else (float_path, int8_path)
-    return Subject(float32, int8, paths)
+    paths = [float_file(float_path, known, say), *([int8_file(int8_path, known, say)] if int8_path else [])]
+    networks = [Network(load(path)) for load, path in zip((float_model, load_onnx), paths, strict=False)]
+    for path, network, wanted in zip(paths, networks, (False, True), strict=False):
+        require_quantised(network.model, str(path), wanted)
+        _ = network.tiling  # refuses what cannot be tiled before anything runs
+    return Subject(networks[0], networks[1] if int8_path else None, tuple(paths))
 
 
 def in_torch(graph: Graph, image: Tensor) -> Tensor:
