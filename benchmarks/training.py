@@ -26,7 +26,7 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.training.checkpoint import TrainingRecipe
 from beers_deploy.model.training.losses import LossWeights, RestorationLoss
 from beers_deploy.model.training.patches import PatchRecipe, PatchSource
-from beers_deploy.model.training.trainer import MixedPrecision, Precision, Trainer
+from beers_deploy.model.training.trainer import Precision, Trainer
 from beers_deploy.model.variants import VARIANTS
 from beers_deploy.profiles import load_sensor
 
@@ -69,11 +69,11 @@ def rate(steps: int, work: Callable[[], None]) -> float:
 
 def bare_loop(trainer: Trainer, batches: list[tuple[Tensor, ...]]) -> None:
     """What anybody would write: forward, loss, backward, step."""
-    forward, loss = MixedPrecision(trainer.network, trainer.precision), RestorationLoss(LOSS)
+    loss = RestorationLoss(LOSS)
     optimiser = torch.optim.Adam(trainer.network.parameters(), lr=1e-4)
     for degraded, reference in batches:
         degraded = degraded.to(memory_format=torch.channels_last)
-        total, _ = loss(forward(degraded), reference)
+        total, _ = loss(trainer.network(degraded, bfloat16=trainer.bfloat16), reference)
         optimiser.zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
         optimiser.step()

@@ -14,9 +14,8 @@ A network that reads x and u and gives `y_0 + g * body` is the same for every se
 network: Dong, Roth and Schiele, NeurIPS 2020.) This is NumPy alone, so that a restoration begins without torch.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import product
 
 import numpy as np
@@ -102,7 +101,8 @@ def network_bank(sensor: Instrument) -> Bank:
     return _bank(sensor, load_sensor(REFERENCE).nominal(), sigma)
 
 
-def bank_of_vector(vector: Sequence[float]) -> Bank:
+@lru_cache(maxsize=4096)
+def bank_of_vector(vector: tuple[float, ...]) -> Bank:
     """As `network_bank`, of the sensor that a sensor vector (4,) tells of."""
     reference = load_sensor(REFERENCE).nominal()
     ends = zip(vector, RANGES.values(), strict=True)

@@ -17,7 +17,6 @@ head, which is linear in the sensor vector.
 """
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -99,7 +98,7 @@ class BankedConvBEERS(Layers):
             banks: of each sensor; None makes them of the vectors.
             bfloat16: for the blocks alone.
         """
-        banks = banks or [_bank(*vector.tolist()) for vector in vectors]
+        banks = banks or [bank_of_vector(tuple(vector.tolist())) for vector in vectors]
         kernels = np.stack([[*bank.planes, bank.analytic / bank.unit] for bank in banks])
         filtered = each_by_its_own(image, torch.from_numpy(kernels).to(image)).clamp(-LARGEST, LARGEST)
         read = pixel_unshuffle(torch.cat([image - 0.5, filtered[:, :FILTERS]], 1), self.variant.scale)
@@ -139,11 +138,6 @@ Network = ConvBEERS | BankedConvBEERS
 def told(network: Network, vector: Tensor) -> ConvBEERS | OfOneSensor:
     """A network that takes images alone: one behind a bank told the sensor of a vector (4,), a plain one as it is."""
     return OfOneSensor(network, vector) if isinstance(network, BankedConvBEERS) else network
-
-
-@lru_cache(maxsize=4096)
-def _bank(*vector: float) -> Bank:
-    return bank_of_vector(vector)
 
 
 def each_by_its_own(image: Tensor, kernels: Tensor) -> Tensor:

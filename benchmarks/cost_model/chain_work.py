@@ -9,10 +9,11 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 
-from beers_deploy.model.traditional.compensate import BLOCK_PX, RADIUS_PX, fast_length
-from beers_deploy.model.traditional.nl_bayes import reference_runs
+from scipy.fft import next_fast_len
+
+from beers_deploy.model.traditional.compensate import BLOCK_PX, RADIUS_PX
+from beers_deploy.model.traditional.nl_bayes import PassSettings, Quality, first_pass, reference_runs, second_pass
 from beers_deploy.model.traditional.pipeline import WORKING_SIGMA
-from beers_deploy.model.traditional.settings import PassSettings, Quality, first_pass, second_pass
 
 UNITS = {
     "box sums": "FLOP",
@@ -154,8 +155,8 @@ def compensation_work(height: int, width: int) -> Work:
 def _blocks(size_px: int) -> Counter[int]:
     """Sides of the transforms along one axis, and how many of each."""
     whole, rest = divmod(size_px, BLOCK_PX)
-    sides = Counter({fast_length(BLOCK_PX + 2 * RADIUS_PX): whole})
-    return sides + Counter({fast_length(rest + 2 * RADIUS_PX): 1 if rest else 0})
+    sides = Counter({next_fast_len(BLOCK_PX + 2 * RADIUS_PX, real=True): whole})
+    return sides + Counter({next_fast_len(rest + 2 * RADIUS_PX, real=True): 1 if rest else 0})
 
 
 def _transform(rows: int, columns: int) -> int:

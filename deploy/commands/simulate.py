@@ -1,7 +1,6 @@
 """`beers-deploy simulate`: what two sensors would see of a scene, as 12-bit TIFF pairs; or why, with --explain."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,29 +15,22 @@ from beers_deploy.profiles.scene_call import calling_for, load_scene_call, origi
 from beers_deploy.profiles.sensor_file import reference_beside
 
 if TYPE_CHECKING:
-    from beers_deploy.model.simulator.plan import Plan
+    from beers_deploy.model.dataset import DatasetRecipe
 
 EXAMPLE = "simulate aerial.png --sensor pleiades-degraded --out pairs"
-
-
-@dataclass(frozen=True)
-class Preset:
-    """One of the paper's datasets (table 1, and the table of DIOR parameters)."""
-
-    sensor: str
-    patch_px: int
 
 
 MIN_RATIO = 2
 """Below it the blur's kernel has negative lobes of its own (0.7 % of its peak at 7 %)."""
 
 PRESETS = {
-    "paper-variable": Preset("pleiades-variable", 128),
-    "paper-fixed": Preset(SENSOR, 128),
-    "paper-test": Preset(SENSOR, 1500),
-    "dior-medium": Preset("dior-medium", 256),
-    "dior-high": Preset("dior-high", 256),
+    "paper-variable": ("pleiades-variable", 128),
+    "paper-fixed": (SENSOR, 128),
+    "paper-test": (SENSOR, 1500),
+    "dior-medium": ("dior-medium", 256),
+    "dior-high": ("dior-high", 256),
 }
+"""The paper's datasets (table 1, and the table of DIOR parameters): sensor, and patch side in pixels."""
 
 
 def simulate(
@@ -98,9 +90,9 @@ def simulate(
         read = (*(scenes or ()), *(Path(name) for name in (sensor, reference, scene) if name))
         folders = [out / name for name in ("degraded", "reference", "parts")]
         require_writable(out / "manifest.jsonl", out / "recipe.json", inputs=read, folders=folders)
-    chosen = _preset(preset)
+    usual, patch_px = _preset(preset)
     call = load_scene_call(scene) if scene else None
-    own = load_sensor(sensor or chosen.sensor)
+    own = load_sensor(sensor or usual)
     degraded = calling_for(own, call, add or (), forbid or ())
     wanted = oversampling or degraded.oversampling.low
     ratio = math.ceil(wanted)
@@ -109,7 +101,7 @@ def simulate(
         degraded,
         reference_beside(degraded, reference, say),
         ratio,
-        patch or (chosen.patch_px if preset else None),
+        patch or patch_px,
         call.radiance_scale.low if call else 1.0,
         seed,
         tolerance,
@@ -131,38 +123,32 @@ def simulate(
     say(f"wrote {pairs} to {out}" + (rejected if summary["rejected_share"] else ""))
 
 
-def _preset(name: str | None) -> Preset:
-
+def _preset(name: str | None) -> tuple[str, int | None]:
+    """The sensor and the patch side of a dataset of the paper; of none the sensor of all commands, and no side."""
     if name is None:
-        return PRESETS["paper-fixed"]
+        return SENSOR, None
     if name not in PRESETS:
         raise OptionError("--preset", expected=f"one of {', '.join(PRESETS)}", got=repr(name), remedy="choose one")
     return PRESETS[name]
 
 
-def _explain(recipe: object, origins: Mapping[str, str]) -> None:
+def _explain(recipe: "DatasetRecipe", origins: Mapping[str, str]) -> None:
     """The plan of the first draw of the degraded sensor, for every scene."""
-    from beers_deploy.model.dataset import DatasetRecipe, load
+    from rich.table import Table
+
+    from beers_deploy.model.dataset import load
     from beers_deploy.model.simulator.acquire import prepare_scene
     from beers_deploy.model.simulator.detector import Draw
     from beers_deploy.model.simulator.plan import make_plan
+    from beers_deploy.results import default_console, plain
 
-    assert isinstance(recipe, DatasetRecipe)  # noqa: S101 - imported late, for a quick --help
     for index in range(len(recipe.scenes)):
         scene = load(recipe, index)
         stats = prepare_scene(scene.radiance, recipe.oversampling).stats
         sensor = recipe.degraded.draw(Draw(recipe.seed, index).generator("sensor-degraded"))
-        title = f"{scene.name}: {stats.low:.1f} to {stats.high:.1f} W/m2/sr/um, {recipe.degraded.name}"
-        _print_plan(title, make_plan(sensor, stats, recipe.tolerance_dn), origins)
-
-
-def _print_plan(title: str, plan: "Plan", origins: Mapping[str, str]) -> None:
-    from rich.table import Table
-
-    from beers_deploy.results import default_console, plain
-
-    table = Table("effect", "from", "decision", "why", "bound DN", "cost", title=plain(title), title_justify="left")
-    for d in plan.decisions:
-        bound = "" if d.bound_dn is None else f"{d.bound_dn:.3g}"
-        table.add_row(*map(plain, (d.effect, origins.get(d.effect, ""), d.choice, d.why, bound, d.cost)))
-    default_console().print(table)
+        title = plain(f"{scene.name}: {stats.low:.1f} to {stats.high:.1f} W/m2/sr/um, {recipe.degraded.name}")
+        table = Table("effect", "from", "decision", "why", "bound DN", "cost", title=title, title_justify="left")
+        for d in make_plan(sensor, stats, recipe.tolerance_dn).decisions:
+            bound = "" if d.bound_dn is None else f"{d.bound_dn:.3g}"
+            table.add_row(*map(plain, (d.effect, origins.get(d.effect, ""), d.choice, d.why, bound, d.cost)))
+        default_console().print(table)

@@ -93,9 +93,9 @@ def train(
     """
     from typing import get_args
 
+    from beers_deploy.model.dataset import profiles_for, read_pairs_recipe
     from beers_deploy.model.family import SensorFamily
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.model.recipe import profiles_for, read_pairs_recipe
     from beers_deploy.model.training.checkpoint import Optimiser, TrainingRecipe
     from beers_deploy.model.training.losses import LossWeights
     from beers_deploy.model.training.patches import PatchRecipe

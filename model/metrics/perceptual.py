@@ -1,19 +1,226 @@
-"""LPIPS and DISTS, differentiable, over a backbone that the user brings.
+"""LPIPS and DISTS, differentiable, over a backbone that the user brings: SqueezeNet 1.1, AlexNet or VGG16.
 
 Both follow the arithmetic of their authors' packages, `lpips` 0.1.4 with the v0.1 weights and `DISTS-pytorch` 0.1,
 whose published channel weights lie in `weights/`. The paper this project reproduces does not say which LPIPS it used,
 so no figure from here compares with its own.
+
+The backbones' feature layers are named as in torchvision, and written here because that does not import beside the
+CPU build of torch. Their weights come from a user's file (`find_backbone`): ImageNet weights are never shipped or
+fetched.
 """
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
+import numpy as np
 import torch
+from numpy.lib.npyio import NpzFile
+from safetensors import safe_open
 from torch import Tensor, nn
+from torch.nn import functional
 
-from beers_deploy.model.metrics.backbones import Backbone, load_backbone, read_tensors
-from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.errors import ImageError, ModelError
+from beers_deploy.profiles.toml import unreadable
+
+
+@dataclass(frozen=True)
+class BackboneSpec:
+    """What is known of a backbone before any weights are there."""
+
+    file_stem: str  # what torchvision calls it, and the start of its file's name
+    taps: tuple[int, ...]  # which feature layers are compared
+    min_side_px: int  # a smaller image leaves nothing for the last pooling
+
+
+BACKBONES: Mapping[str, BackboneSpec] = {
+    "squeeze": BackboneSpec("squeezenet1_1", (1, 4, 7, 9, 10, 11, 12), min_side_px=17),
+    "alex": BackboneSpec("alexnet", (1, 4, 7, 9, 11), min_side_px=31),
+    "vgg": BackboneSpec("vgg16", (3, 8, 15, 22, 29), min_side_px=16),
+}
+
+
+class Fire(nn.Module):
+    """SqueezeNet's block: a narrow 1x1 convolution, then 1x1 and 3x3 ones side by side."""
+
+    def __init__(self, inputs: int, squeezed: int, expanded: int) -> None:
+        super().__init__()
+        self.squeeze = nn.Conv2d(inputs, squeezed, 1)
+        self.expand1x1 = nn.Conv2d(squeezed, expanded, 1)
+        self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, inputs, H, W) to (N, 2 expanded, H, W)."""
+        x = functional.relu(self.squeeze(x))
+        return functional.relu(torch.cat([self.expand1x1(x), self.expand3x3(x)], dim=1))
+
+
+class L2Pool(nn.Module):
+    """DISTS's pooling: root of the Hanning-weighted mean of squares, stride 2 (Hénaff and Simoncelli 2016)."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, C, H, W) to (N, C, ceil(H / 2), ceil(W / 2))."""
+        taps = x.new_tensor([0.25, 0.5, 0.25])
+        kernel = (taps[:, None] * taps[None, :]).expand(x.shape[1], 1, 3, 3)
+        energy = functional.conv2d(x * x, kernel, stride=2, padding=1, groups=x.shape[1])
+        return (energy + 1e-12).sqrt()
+
+
+class Backbone(nn.Module):
+    """The feature layers of one network, with random weights until some are loaded.
+
+    Args:
+        network: "squeeze", "alex" or "vgg".
+        l2_pool: DISTS's pooling in the place of the max pooling.
+    """
+
+    def __init__(self, network: str, *, l2_pool: bool = False) -> None:
+        super().__init__()
+        self.network, self.spec = network, BACKBONES[network]
+        layers = {"squeeze": _squeezenet, "alex": _alexnet, "vgg": _vgg16}[network]()
+        if l2_pool:
+            layers = [L2Pool() if isinstance(layer, nn.MaxPool2d) else layer for layer in layers]
+        self.features = nn.Sequential(*layers)
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """The compared feature maps of (N, 3, H, W), all of them after a ReLU."""
+        found: list[Tensor] = []
+        for index, layer in enumerate(self.features):
+            x = layer(x)
+            if index in self.spec.taps:
+                found.append(x)
+        return found
+
+
+def _squeezenet() -> list[nn.Module]:
+    def pool() -> nn.Module:
+        return nn.MaxPool2d(3, stride=2, ceil_mode=True)
+
+    return [
+        *(nn.Conv2d(3, 64, 3, stride=2), nn.ReLU(), pool()),
+        *(Fire(64, 16, 64), Fire(128, 16, 64), pool()),
+        *(Fire(128, 32, 128), Fire(256, 32, 128), pool()),
+        *(Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256)),
+    ]
+
+
+def _alexnet() -> list[nn.Module]:
+    return [
+        *(nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, stride=2)),
+        *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, stride=2)),
+        *(nn.Conv2d(192, 384, 3, padding=1), nn.ReLU()),
+        *(nn.Conv2d(384, 256, 3, padding=1), nn.ReLU()),
+        *(nn.Conv2d(256, 256, 3, padding=1), nn.ReLU()),
+    ]
+
+
+def _vgg16() -> list[nn.Module]:
+    layers: list[nn.Module] = []
+    channels = 3
+    for width, convolutions in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
+        if layers:
+            layers.append(nn.MaxPool2d(2, stride=2))
+        for _ in range(convolutions):
+            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
+            channels = width
+    return layers
+
+
+WEIGHTS_VARIABLE = "BEERS_LPIPS_WEIGHTS"
+SUFFIXES = (".safetensors", ".npz")
+CONVERT = (
+    "convert it where you trust it: safetensors.torch.save_file(torch.load(FILE, weights_only=True), "
+    "'NAME.safetensors')"
+)
+NAMED = "give the feature layers named as in torchvision (features.0.weight ...)"
+
+
+def find_backbone(network: str, place: Path | None = None) -> Path | None:
+    """The weights file of a backbone, or None: then `not_found(network)` is the reason to show.
+
+    Args:
+        network: "squeeze", "alex" or "vgg" (DISTS uses "vgg").
+        place: a file, which is taken at its word, or a folder. Without it the environment variable
+            BEERS_LPIPS_WEIGHTS is asked; it may name a file or a folder, and a file counts only for the network
+            its name begins with.
+    """
+    stem = BACKBONES[network].file_stem
+    if place is not None and not place.is_dir():
+        return place
+    named = place or os.environ.get(WEIGHTS_VARIABLE)
+    if not named:
+        return None
+    files = [Path(named)] if Path(named).is_file() else sorted(Path(named).glob("*"))
+    return next((file for file in files if file.name.startswith(stem) and file.suffix in SUFFIXES), None)
+
+
+def not_found(network: str) -> str:
+    """Why a metric is unavailable when `find_backbone` found nothing."""
+    names = " or ".join(f"{BACKBONES[network].file_stem}*{suffix}" for suffix in SUFFIXES)
+    return f"weights not found: no {names}; set {WEIGHTS_VARIABLE} to the file or its folder"
+
+
+def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbone:
+    """A backbone with its parameters from a file, by name; whatever else the file holds is left aside.
+
+    Args:
+        network: "squeeze", "alex" or "vgg".
+        path: .safetensors or .npz.
+        l2_pool: DISTS's pooling in the place of the max pooling.
+    """
+    backbone = Backbone(network, l2_pool=l2_pool)
+    wanted = backbone.state_dict()
+    tensors = read_tensors(path, wanted)
+    for name, tensor in tensors.items():
+        if tensor.shape != wanted[name].shape:
+            raise _error(path, f"{name} of shape {tuple(wanted[name].shape)}", f"{tuple(tensor.shape)}", NAMED)
+        if not bool(torch.isfinite(tensor).all()):
+            raise _error(path, f"finite values in {name}", "NaN or infinity", NAMED)
+    backbone.load_state_dict(tensors)
+    return backbone
+
+
+def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
+    """The named tensors, of any shape, of a .safetensors or .npz file, as float32."""
+    if path.suffix not in SUFFIXES:
+        raise _error(path, "a .safetensors or .npz file", f"'{path.suffix}', which is not read", CONVERT)
+    got = unreadable(path)
+    if got is not None:
+        raise _error(path, "a weights file", got, "check the path")
+    read = _read_npz if path.suffix == ".npz" else _read_safetensors
+    try:
+        found = read(path, names)
+        for tensor in found.values():
+            if not tensor.is_floating_point():
+                raise TypeError(f"an array of {tensor.dtype}")
+    except Exception as error:  # whatever the bytes of a damaged archive lead to
+        got = " ".join(str(error).split())[:120]
+        raise _error(path, "arrays of floating-point numbers, none pickled", got, CONVERT) from error
+    for name in names:
+        if name not in found:
+            raise _error(path, f"a tensor named {name}", "none of that name", NAMED)
+    return {name: tensor.float() for name, tensor in found.items()}
+
+
+def _read_safetensors(path: Path, names: Iterable[str]) -> Mapping[str, Tensor]:
+    with safe_open(path, framework="pt") as file:
+        held = set(file.keys())
+        return {n: file.get_tensor(n).clone() for n in names if n in held}  # the library's own lie in the file
+
+
+def _read_npz(path: Path, names: Iterable[str]) -> Mapping[str, Tensor]:
+    with path.open("rb") as raw:  # np.load leaves a file open that turns out to be broken
+        file = np.load(raw, allow_pickle=False)
+        if not isinstance(file, NpzFile):
+            raise TypeError("a single array")
+        return {name: torch.from_numpy(file[name]) for name in names if name in file}
+
+
+def _error(path: Path, expected: str, got: str, remedy: str) -> ModelError:
+    return ModelError(str(path), expected=expected, got=got, remedy=remedy)
+
 
 PUBLISHED = Path(__file__).parent / "weights"
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)

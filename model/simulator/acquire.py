@@ -69,14 +69,11 @@ def simulate_planned(
     Returns:
         Digital numbers (H / r - 2 margin, W / r - 2 margin), float32.
     """
-    height, width = scene.radiance.shape
-    if "mtf" in plan.skipped:
-        # Without any blur a target pixel is the mean of its scene pixels, which needs no transform.
-        pixels = torch.nn.functional.avg_pool2d(scene.radiance[None, None], scene.oversampling)[0, 0]
-    else:
-        kept = without(sensor, plan.skipped)
-        transfer = sensor_transfer(height, width, scene.oversampling, kept, scene.radiance.device)
-        pixels = sample(scene.spectrum, transfer, width, scene.oversampling)
+    if "mtf" not in plan.skipped:
+        kept, width, ratio = without(sensor, plan.skipped), scene.radiance.shape[-1], scene.oversampling
+        return acquire(scene.spectrum, width, kept, ratio, draw, role, margin_px=margin_px, skip=plan.skipped)
+    # Without any blur a target pixel is the mean of its scene pixels, which needs no transform.
+    pixels = torch.nn.functional.avg_pool2d(scene.radiance[None, None], scene.oversampling)[0, 0]
     return detect(crop_margin(pixels, margin_px), sensor, draw, role, plan.skipped)
 
 

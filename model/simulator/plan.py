@@ -84,15 +84,6 @@ def _kernel_sum(height: int, width: int, oversampling: int, blur: Blur, sigma_px
     return float(torch.fft.irfft2(transfer, s=(height, width)).abs().sum())
 
 
-def blurred_range(stats: SceneStats, ringing: float) -> tuple[float, float]:
-    """Radiance after a blur whose kernel sums to 1, in absolute values to `ringing`: the span grows by the excess.
-
-    |k * (L - m)| <= ringing * span / 2 around the middle m.
-    """
-    middle, reach = (stats.low + stats.high) / 2, ringing * stats.span / 2
-    return middle - reach, middle + reach
-
-
 @lru_cache(maxsize=256)
 def smear_moments(height: int, oversampling: int, length_px: float) -> tuple[float, float]:
     """Of the smear's kernel less a unit pulse: half its absolute sum, and its absolute first moment in pixels."""
@@ -106,11 +97,6 @@ def smear_moments(height: int, oversampling: int, length_px: float) -> tuple[flo
 def blur_bound_dn(stats: SceneStats, ringing: float, gain: float) -> float:
     """The blurred pixel and the plain mean of its scene pixels lie in one range: they differ by its width at most."""
     return gain * (1 + ringing) / 2 * stats.span
-
-
-def smear_ringing(smear: Smear, stats: SceneStats) -> float:
-    """Sum of the absolute values of the smear's kernel, at most: a unit pulse and all that differs from it."""
-    return 1 + 2 * smear_moments(stats.height, stats.oversampling, smear.length_px)[0]
 
 
 def smear_bound_dn(smear: Smear, stats: SceneStats, ringing: float, gain: float) -> float:
@@ -139,17 +125,11 @@ def effect_bound_dn(effect: Effect, sensor: Instrument, low: float, high: float)
         case Offset():
             return effect.offset_dn
         case Defects():
-            return _defects_bound_dn(effect, sensor, low, high)
+            # A pixel becomes 0 or full scale, whatever it was before: beyond the converter's range too.
+            rate, ends = effect.dead_per_million + effect.hot_per_million, [gain * v for v in (low, high)]
+            return max(max(abs(dn), abs(sensor.max_dn - dn)) for dn in ends) if rate else 0.0
         case _:
             return 0.0  # anti-alias and smear: the transfer function has bounds of its own
-
-
-def _defects_bound_dn(defects: Defects, sensor: Instrument, low: float, high: float) -> float:
-    """A pixel becomes 0 or full scale, whatever it was before: beyond the converter's range too."""
-    if defects.dead_per_million + defects.hot_per_million == 0:
-        return 0.0
-    ends = [sensor.gain_dn_per_radiance * v for v in (low, high)]
-    return max(max(abs(dn), abs(sensor.max_dn - dn)) for dn in ends)
 
 
 def noise_bound_dn(sensor: Instrument, high: float) -> float:
@@ -157,20 +137,20 @@ def noise_bound_dn(sensor: Instrument, high: float) -> float:
     return sensor.gain_dn_per_radiance * NOISE_LIMIT * sensor.noise_sigma(max(high, 0.0))
 
 
-def behind(change_dn: float, sensor: Instrument, names: tuple[str, ...]) -> float:
-    """What a change of the signal may become through the effects `names` that come after it and are applied.
+def behind(name: str, change_dn: float, sensor: Instrument) -> float:
+    """What a change of the signal by the effect `name` may become through those that come after it.
 
     Spilling adds its share, PRNU its largest gain, and noise changes with the signal under it:
     |sqrt(a) - sqrt(b)| <= min(sqrt|a - b|, |a - b| / (2 sqrt(beta))).
     """
     gain, change = sensor.gain_dn_per_radiance, change_dn
-    for name in names:
-        effect = sensor.effects.get(name)
+    for later in ORDER[ORDER.index(name) + 1 :]:
+        effect = sensor.effects.get(later)
         if isinstance(effect, FullWell):
             change *= 1 + effect.blooming_share
         if isinstance(effect, Prnu):
             change *= 1 + PATTERN_LIMIT * effect.rms
-        if name == "noise" and change > 0:
+        if later == "noise" and change > 0:
             variance = sensor.alpha * change / gain
             slope = variance / (2 * math.sqrt(sensor.beta)) if sensor.beta > 0 else math.inf
             change += gain * NOISE_LIMIT * min(math.sqrt(variance), slope)
@@ -182,17 +162,14 @@ TOLERANCE_DN = 0.25
 
 Choice = Literal["applied", "not called for", "neutral", "cannot show"]
 
-ORDER = (
-    "mtf", "antialias", "smear", "sampling", *RADIANCE_EFFECTS, "noise", *DN_EFFECTS, "digitising",
-)  # fmt: skip
-
 COSTS = {
     "mtf": "2 transforms of the scene", "antialias": "none: part of the MTF", "smear": "none: part of the MTF",
     "sampling": "folding of the spectrum", "veil": "1 pass", "full_well": "1 pass, 1 convolution if it blooms",
     "prnu": "1 draw a column", "noise": "1 draw a pixel", "dsnu": "1 draw a column", "striping": "1 pass",
     "offset": "1 pass", "defects": "1 draw a pixel", "digitising": "1 pass",
 }  # fmt: skip
-
+ORDER = tuple(COSTS)
+"""That of the light."""
 
 UNSEEN = {"mtf": "the scene is constant", "full_well": "the brightest signal stays below the well"}
 """Why an effect whose bound is zero cannot show, where that is the scene's doing."""
@@ -231,29 +208,36 @@ def make_plan(sensor: Instrument, stats: SceneStats, tolerance_dn: float = TOLER
     bounds = effect_bounds(sensor, stats)
     spent, hidden = 0.0, set()
     # Smallest first: as many effects as the tolerance can pay for are left out.
-    for name, bound in sorted(bounds.items(), key=lambda item: item[1]):
-        if bound > 0 and spent + bound <= tolerance_dn:
-            spent += bound
+    for name, change in sorted(bounds.items(), key=lambda item: item[1]):
+        if change > 0 and spent + change <= tolerance_dn:
+            spent += change
             hidden.add(name)
-    decisions = tuple(_decide(name, sensor, bounds, hidden, tolerance_dn) for name in ORDER)
-    return Plan(decisions, tolerance_dn)
+    decisions = []
+    for name, cost in COSTS.items():
+        choice, why, bound = _decide(name, sensor, bounds, hidden, tolerance_dn)
+        decisions.append(Decision(name, choice, why, bound, cost if choice == "applied" else "none"))
+    return Plan(tuple(decisions), tolerance_dn)
 
 
 def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
     """Largest change of any pixel by each effect that can be left out, in DN, through all that comes after it."""
     gain, ringing = sensor.gain_dn_per_radiance, ringing_of(sensor, stats)
-    low, high = blurred_range(stats, ringing)
+    # A blur whose kernel sums to 1, in absolute values to `ringing`: |k * (L - m)| <= ringing * span / 2.
+    middle, reach = (stats.low + stats.high) / 2, ringing * stats.span / 2
+    low, high = middle - reach, middle + reach
     smear, total, bounds = sensor.effects.get("smear"), ringing, {}
     if isinstance(smear, Smear):
         direct = smear_bound_dn(smear, stats, ringing, gain)
-        bounds["smear"] = behind(direct, sensor, _after("smear"))
+        bounds["smear"] = behind("smear", direct, sensor)
         # The smear widens the range that every later effect may meet, whether it is applied or left out.
-        low, high, total = low - direct / gain, high + direct / gain, ringing * smear_ringing(smear, stats)
-    bounds["mtf"] = behind(blur_bound_dn(stats, total, gain), sensor, _after("mtf"))
+        low, high = low - direct / gain, high + direct / gain
+        # Its kernel is a unit pulse and all that differs from it.
+        total *= 1 + 2 * smear_moments(stats.height, stats.oversampling, smear.length_px)[0]
+    bounds["mtf"] = behind("mtf", blur_bound_dn(stats, total, gain), sensor)
     for name in RADIANCE_EFFECTS:
         if name in sensor.effects:
             direct = effect_bound_dn(sensor.effects[name], sensor, low, high)
-            bounds[name] = behind(direct, sensor, _after(name))
+            bounds[name] = behind(name, direct, sensor)
             low, high = low - direct / gain, high + direct / gain  # whether it is applied or not
     bounds["noise"] = noise_bound_dn(sensor, high)
     low, high = low - bounds["noise"] / gain, high + bounds["noise"] / gain
@@ -264,30 +248,22 @@ def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
     return bounds
 
 
-def _after(name: str) -> tuple[str, ...]:
-    return ORDER[ORDER.index(name) + 1 :]
-
-
 def _decide(
     name: str, sensor: Instrument, bounds: dict[str, float], hidden: set[str], tolerance_dn: float
-) -> Decision:
-    cost = COSTS[name]
+) -> tuple[Choice, str, float | None]:
+    """What becomes of an effect, why, and its bound."""
     if name in ("sampling", "digitising"):
-        return Decision(name, "applied", "every sensor has it", None, cost)
+        return "applied", "every sensor has it", None
     if name in TABLES and name not in sensor.effects:
-        return Decision(name, "not called for", "nothing asks for it", None, "none")
+        return "not called for", "nothing asks for it", None
     if name in ("antialias", "smear") and ("mtf" in hidden or bounds["mtf"] == 0):
-        return Decision(name, "cannot show", "the scene is too flat for any blur to show", bounds["mtf"], "none")
+        return "cannot show", "the scene is too flat for any blur to show", bounds["mtf"]
     if name == "antialias":
-        return Decision(name, "applied", "part of the MTF, and of its budget", None, cost)
+        return "applied", "part of the MTF, and of its budget", None
     bound = bounds[name]
     if bound == 0:
         why = UNSEEN.get(name)
-        return Decision(
-            name, "cannot show" if why else "neutral", why or "its parameters change nothing", 0.0, "none"
-        )
+        return "cannot show" if why else "neutral", why or "its parameters change nothing", 0.0
     if name in hidden:
-        return Decision(
-            name, "cannot show", f"no pixel changes by more than the {tolerance_dn:g} DN allowed", bound, "none"
-        )
-    return Decision(name, "applied", "it may change a pixel by up to the bound", bound, cost)
+        return "cannot show", f"no pixel changes by more than the {tolerance_dn:g} DN allowed", bound
+    return "applied", "it may change a pixel by up to the bound", bound

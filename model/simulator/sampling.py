@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from beers_deploy.model.io.images import read_pixels
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument
 
 
@@ -40,7 +40,6 @@ def sample(
         (..., H / r, W / r) float32. The borders wrap: crop a margin of real scene.
     """
     height = spectrum.shape[-2]
-    check_divisible(height, width, oversampling)
     centre = (oversampling - 1) / 2
     ramp_y = _ramp(torch.fft.fftfreq(height, device=spectrum.device), centre + offset_px[0])
     ramp_x = _ramp(torch.fft.rfftfreq(width, device=spectrum.device), centre + offset_px[1])
@@ -71,10 +70,8 @@ def resample(radiance: Tensor, height: int, width: int) -> Tensor:
     """
     old_height, old_width = radiance.shape[-2:]
     spectrum = torch.fft.rfft2(radiance)
-    fy, fx = (
-        torch.fft.fftfreq(old_height, device=radiance.device),
-        torch.fft.rfftfreq(old_width, device=radiance.device),
-    )
+    fy = torch.fft.fftfreq(old_height, device=radiance.device)
+    fx = torch.fft.rfftfreq(old_width, device=radiance.device)
     spectrum = spectrum * _ramp(fy, (old_height / height - 1) / 2)[:, None] * _ramp(fx, (old_width / width - 1) / 2)
     rows, columns = min(old_height, height), min(old_width, width)
     top, bottom, half = (rows + 1) // 2, rows // 2, columns // 2 + 1
@@ -84,17 +81,6 @@ def resample(radiance: Tensor, height: int, width: int) -> Tensor:
     scale = height * width / (old_height * old_width)
     resampled: Tensor = torch.fft.irfft2(cut, s=(height, width)) * scale
     return resampled
-
-
-def check_divisible(height: int, width: int, oversampling: int) -> None:
-    """Refuse a scene that the target grid does not divide."""
-    if oversampling < 1 or height % oversampling or width % oversampling:
-        raise OptionError(
-            "oversampling",
-            expected=f"a whole divisor of the scene's {width} x {height} pixels",
-            got=repr(oversampling),
-            remedy="crop the scene (crop_divisible) or choose another ratio",
-        )
 
 
 def _ramp(frequency: Tensor, shift_px: float) -> Tensor:

@@ -1,7 +1,7 @@
 """The traditional pipeline, on the CPU and without training: what a network has to beat.
 
 1. `noise`: radiance to a scale on which the sensor's noise has variance 1 everywhere, and back again after 2.
-2. `nl_bayes`: two-pass non-local Bayes denoising, with the published numbers of `settings`.
+2. `nl_bayes`: two-pass non-local Bayes denoising, with the published numbers.
 3. `compensate`: regularised inverse filter, from the degraded sensor's MTF to the reference's.
 
 `pipeline` chains them, in this order or with 3 first; `peers` are restorations of scikit-image to compare
@@ -10,10 +10,10 @@ Every step takes and gives strips of rows (`rows`), so a chain of any height run
 NaN marks missing pixels.
 """
 
+from beers_deploy.model.traditional.nl_bayes import QUALITIES
 from beers_deploy.model.traditional.noise import Noise, destabilise, stabilise
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.pipeline import Chain, restore_strips, restore_traditional
-from beers_deploy.model.traditional.settings import QUALITIES
 
 __all__ = [
     "PEERS",

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.fft import next_fast_len
 from torch import Tensor
 
 from beers_deploy.model.bank import restoring_gain
@@ -68,7 +69,7 @@ def _block(rows: Tensor, kernel: Tensor, left: int) -> Tensor:
     known = torch.isfinite(block)
     # Filtered without its mean, which has gain 1: in float32 the FFT of large constant values costs digits.
     mean = block[known].mean() if bool(known.any()) else block.new_zeros(())
-    size = tuple(fast_length(side) for side in block.shape)
+    size = tuple(next_fast_len(side, real=True) for side in block.shape)
     spectrum = torch.fft.rfft2(fill_with_local_means(block, known) - mean, s=size)
     filtered: Tensor = torch.fft.irfft2(spectrum * torch.fft.rfft2(kernel, s=size).to(spectrum), s=size)
     inside = slice(2 * radius, block.shape[0]), slice(2 * radius, block.shape[1])
@@ -114,18 +115,3 @@ def compensation_gain(height: int, width: int, blur_from: Blur, blur_to: Blur, e
     fy, fx = np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :]
     r_squared = (fx**2 + fy**2) / NYQUIST**2
     return restoring_gain(mtf(fx, fy, blur_from), mtf(fx, fy, blur_to), r_squared, epsilon)
-
-
-def fast_length(size: int) -> int:
-    """The next size of factors 2, 3 and 5, on which an FFT is quick."""
-    while _rest(size) > 1:
-        size += 1
-    return size
-
-
-def _rest(size: int) -> int:
-    """What is left of a size once its factors 2, 3 and 5 are divided out."""
-    for factor in (2, 3, 5):
-        while size % factor == 0:
-            size //= factor
-    return size

@@ -3,10 +3,14 @@
 Two passes over a regular grid of reference patches. In each, similar patches form a group, the group a Gaussian
 model, and the model an estimate of every patch of the group; overlapping estimates are averaged. The second pass
 searches, and takes its model, in the result of the first.
+
+The settings are the published ones, for grey levels of 0 to 255 (section on the parameters).
 """
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from itertools import tee
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -14,8 +18,80 @@ from torch import Tensor
 
 from beers_deploy.model.traditional.noise import Noise
 from beers_deploy.model.traditional.rows import Rows, map_tiles, mirrored
-from beers_deploy.model.traditional.settings import QUALITIES, PassSettings, Quality, first_pass, second_pass
 from beers_deploy.profiles.errors import ImageError
+
+T = TypeVar("T", int, float)
+
+ALIKE_RMS = 4.0
+"""Pass 2 takes every patch within this RMS distance, in grey levels (tau = 16 k^2)."""
+
+FLAT_GAMMA = 1.05
+"""A group of pass 1 whose variance stays below gamma sigma^2 holds nothing but noise (homogeneous area criterion)."""
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How dense the references are, and how large a group of pass 2 may grow.
+
+    `stride_px` lies between neighbouring references; `group_cap` counts in multiples of the usual group. The
+    published method has no cap, and visits every second pixel unless an earlier group held it.
+    """
+
+    stride_px: int
+    group_cap: int
+
+
+QUALITIES = {"fast": Quality(4, 2), "standard": Quality(3, 4), "best": Quality(2, 8)}
+
+
+@dataclass(frozen=True)
+class PassSettings:
+    """What one pass works with; sigma and distances in grey levels.
+
+    Attributes:
+        side_px: k, the side of a patch.
+        similar: N, the patches of a group.
+        most_similar: the largest group, where more than N patches lie within ALIKE_RMS.
+        excess: beta, the factor on the noise variance.
+        clean_guide: of pass 2: the guide's covariance is that of the signal alone, noise removed.
+    """
+
+    side_px: int
+    similar: int
+    most_similar: int
+    excess: float
+    clean_guide: bool
+
+    @property
+    def window_px(self) -> int:
+        """Candidates along each axis of the search window: about N / 2, odd so that it has a middle."""
+        return self.similar // 2 | 1
+
+    @property
+    def margin_px(self) -> int:
+        """What a reference centred on a border pixel sees beyond it."""
+        return self.window_px // 2 + self.side_px // 2
+
+
+def first_pass(sigma: float) -> PassSettings:
+    """Pass 1: the noisy image is its own guide."""
+    side_px = 5 if sigma < 30 else 7
+    similar = _below(sigma, {10: 35, 30: 45, 80: 90}, 100)
+    excess = _below(sigma, {15: 1.1, 70: 1.0}, 0.9)
+    return PassSettings(side_px, similar, similar, excess, clean_guide=False)
+
+
+def second_pass(sigma: float, quality: Quality) -> PassSettings:
+    """Pass 2: the result of pass 1 is the guide."""
+    similar = _below(sigma, {20: 15, 40: 25, 80: 30}, 45)
+    excess = _below(sigma, {15: 1.1, 35: 1.0}, 0.9)
+    return PassSettings(5, similar, quality.group_cap * similar, excess, clean_guide=True)
+
+
+def _below(sigma: float, table: dict[int, T], otherwise: T) -> T:
+    """The value of the first bound that sigma stays below."""
+    return next((value for bound, value in table.items() if sigma < bound), otherwise)
+
 
 JITTER = 1e-3
 """Added to the diagonal of a noisy covariance, in units of sigma^2. Up to 1e-2 costs less than 0.01 dB (measured)."""
@@ -44,7 +120,7 @@ def estimate_groups(
     mean, centred, covariance = _moments(noisy, taken)
     if guide is not noisy:
         covariance = _moments(guide, taken)[2]
-    flat = _is_flat(mean, covariance, settings.flat_gamma * noise.sigma**2)
+    flat = _is_flat(mean, covariance, 0.0 if settings.clean_guide else FLAT_GAMMA * noise.sigma**2)
     shrinkage = torch.zeros_like(covariance)
     shrinkage[~flat] = _shrinkage(covariance[~flat], noise, settings)
     estimates = torch.baddbmm(noisy, centred, shrinkage, alpha=-1)
@@ -259,8 +335,9 @@ def similar_groups(
         _rule_out(distances, first + steps, patch_matrix(known, settings.side_px).all(1))
     usual, most = settings.similar, min(settings.most_similar, distances.shape[1])
     candidate, nearest = nearest_first(distances, usual, most)
-    # Beyond the usual number a patch still counts if its pixels differ by alike_rms at most.
-    enough = nearest[:, :usual].amax(1, keepdim=True).clamp(min=settings.alike_rms**2 * settings.side_px**2)
+    # Beyond the usual number a patch of pass 2 still counts if its pixels differ by ALIKE_RMS at most.
+    alike = ALIKE_RMS**2 * settings.side_px**2 if settings.clean_guide else 0.0
+    enough = nearest[:, :usual].amax(1, keepdim=True).clamp(min=alike)
     taken = (nearest <= enough) & nearest.isfinite()
     sizes = taken.sum(1)
     for chosen, size in (((sizes > 0) & (sizes <= usual), usual), (sizes > usual, most)):
@@ -295,13 +372,6 @@ def nl_bayes(image: Tensor, noise: Noise, quality: Quality = QUALITIES["standard
     Limits: sigma = 0 returns a copy; a constant image returns itself, up to rounding; a pixel too near missing ones
     to lie in any whole patch keeps its value. Any H and W from 1 on.
     """
-    if image.ndim != 2 or 0 in image.shape:
-        raise ImageError(
-            "image to denoise",
-            expected="one plane (H, W)",
-            got=f"shape {tuple(image.shape)}",
-            remedy="select one band",
-        )
     return torch.cat(list(nl_bayes_strips([image], image.shape[0], noise, quality)))
 
 

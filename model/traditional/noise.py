@@ -2,12 +2,10 @@
 
 import math
 from dataclasses import dataclass
-from math import isfinite
 
 import torch
 from torch import Tensor
 
-from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Instrument
 
 
@@ -17,29 +15,18 @@ class Noise:
 
     Attributes:
         sigma: standard deviation of a pixel, 0 or more.
-        correlation: (2 L + 1, 2 L + 1) correlation of two pixels by their lag (dy + L, dx + L), 1 in the middle;
-            None for white noise.
+        correlation: (2 L + 1, 2 L + 1) correlation of two pixels by their lag (dy + L, dx + L), 1 in the middle,
+            L at least a patch's side less one; None for white noise.
     """
 
     sigma: float
     correlation: Tensor | None = None
-
-    def __post_init__(self) -> None:
-        if not (self.sigma >= 0 and isfinite(self.sigma)):
-            raise OptionError("sigma", expected="0 or more", got=repr(self.sigma), remedy="give a standard deviation")
 
     def covariance(self, side_px: int) -> Tensor:
         """Covariance of the pixels of a patch of side k: (k * k, k * k) float64, in the image's unit squared."""
         if self.correlation is None:
             return torch.eye(side_px**2, dtype=torch.float64) * self.sigma**2
         middle = self.correlation.shape[0] // 2
-        if middle < side_px - 1:
-            raise OptionError(
-                "noise correlation",
-                expected=f"lags up to {side_px - 1} pixels",
-                got=f"up to {middle}",
-                remedy="give it for more lags",
-            )
         y, x = (grid.reshape(-1) for grid in torch.meshgrid(*2 * [torch.arange(side_px)], indexing="ij"))
         dy, dx = (axis[:, None] - axis + middle for axis in (y, x))
         return self.correlation.double()[dy, dx] * self.sigma**2
@@ -69,7 +56,6 @@ def stabilise(radiance: Tensor, sensor: Instrument) -> Tensor:
         radiance: any shape, W/m2/sr/um.
         sensor: the instrument, alpha and beta at least 0 and not both 0.
     """
-    _check(sensor)
     dark = math.sqrt(sensor.beta)
     denominator = (sensor.alpha * radiance.clamp(min=0) + sensor.beta).sqrt() + dark
     # With beta = 0 the denominator is 0 at L = 0, where f is 0 too.
@@ -81,7 +67,6 @@ def destabilise(stable: Tensor, sensor: Instrument) -> Tensor:
 
     The mean of noisy values t lies below f(mean L), f being concave: see `bias_radiance`.
     """
-    _check(sensor)
     return stable * math.sqrt(sensor.beta) + sensor.alpha / 4 * stable.clamp(min=0).square()
 
 
@@ -92,13 +77,3 @@ def bias_radiance(sensor: Instrument) -> float:
     that. Exact to higher order only where sigma(L) is small beside L + beta / alpha, as on any lit scene.
     """
     return sensor.alpha / 4
-
-
-def _check(sensor: Instrument) -> None:
-    if min(sensor.alpha, sensor.beta) < 0 or sensor.alpha == sensor.beta == 0:
-        raise OptionError(
-            "noise of the sensor",
-            expected="alpha and beta of at least 0 and not both 0 (variance alpha L + beta)",
-            got=f"alpha {sensor.alpha:g}, beta {sensor.beta:g}",
-            remedy="correct its SNR pair, or skip the denoising of a sensor without noise",
-        )

@@ -10,20 +10,13 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from beers_deploy.model.simulator.detector import to_dn, to_radiance
-from beers_deploy.model.traditional.compensate import (
-    EPSILON_PER_PERCENT,
-    compensation_gain,
-    compensation_kernel,
-    filter_strips,
-)
-from beers_deploy.model.traditional.nl_bayes import finite_or_missing, nl_bayes_strips
+from beers_deploy.model.traditional.compensate import EPSILON_PER_PERCENT, compensation_kernel, filter_strips
+from beers_deploy.model.traditional.nl_bayes import QUALITIES, Quality, finite_or_missing, nl_bayes_strips
 from beers_deploy.model.traditional.noise import Noise, bias_radiance, coloured_by, destabilise, stabilise
-from beers_deploy.model.traditional.settings import QUALITIES, Quality
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Instrument
 
@@ -42,7 +35,7 @@ class Chain:
     Attributes:
         degraded: the sensor that acquired the image.
         reference: the sensor to imitate; of its noise nothing is imitated.
-        quality: "fast", "standard" or "best" (see `settings.QUALITIES`).
+        quality: "fast", "standard" or "best" (see `nl_bayes.QUALITIES`).
         order: see above.
         epsilon: regularisation of the MTF compensation; None lets the noise of `degraded` decide.
     """
@@ -124,26 +117,3 @@ def quality_named(name: str) -> Quality:
     if name not in QUALITIES:
         raise OptionError("quality", expected=f"one of {', '.join(QUALITIES)}", got=repr(name), remedy="pick one")
     return QUALITIES[name]
-
-
-def _blur_text(sensor: Instrument) -> str:
-    across, along = sensor.mtf_axes
-    axes = f"{across:.3g}" if across == along else f"{across:.3g} across and {along:.3g} along the track"
-    return axes if sensor.response is None else f"{axes} ({sensor.response})"
-
-
-def describe(chain: Chain) -> list[str]:
-    """The steps that `restore_traditional` would take, one line each, with their numbers."""
-    sensor, chosen, epsilon = with_rounding_noise(chain.degraded), quality_named(chain.quality), chain.regularisation
-    gain = np.abs(compensation_gain(64, 64, chain.degraded.blur, chain.reference.blur, epsilon)).max()
-    coloured = ", its covariance that of the filtered noise" if chain.order == "deconvolve-first" else ""
-    denoise = [
-        f"stabilise noise of variance {sensor.alpha:.4g} L + {sensor.beta:.4g}, L in W/m2/sr/um, rounding counted",
-        f"NL-Bayes at sigma {WORKING_SIGMA:g}: references {chosen.stride_px} px apart, cap {chosen.group_cap} groups"
-        + coloured,
-        f"back to radiance, {bias_radiance(sensor):.2g} W/m2/sr/um of bias restored",
-    ]
-    mtfs = " to ".join(map(_blur_text, (chain.degraded, chain.reference)))
-    sharpen = [f"compensate the MTF at Nyquist from {mtfs}: epsilon {epsilon:.2g}, largest gain {gain:.2f}"]
-    steps = denoise + sharpen if chain.order == "denoise-first" else sharpen + denoise
-    return [*steps, f"clip to 0..{chain.reference.max_dn} DN"]

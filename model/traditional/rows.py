@@ -9,8 +9,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from beers_deploy.profiles.errors import ImageError
-
 
 class Rows:
     """Rows of an image as they come, strip by strip; what lies behind the last window is forgotten."""
@@ -24,18 +22,12 @@ class Rows:
         """The rows of those numbers: (R,) to (R, W); windows must move downwards."""
         top, bottom = int(rows.min()), int(rows.max()) + 1
         while self._top + sum(map(len, self._held)) < bottom:
-            self._held.append(self._next())
+            self._held.append(next(self._strips))
         # Strips above the window are never asked for again: forgetting them bounds the memory.
         while self._top + len(self._held[0]) <= top:
             self._top += len(self._held.pop(0))
         held = self._held[0] if len(self._held) == 1 else torch.cat(self._held)
         return held[rows - self._top]
-
-    def _next(self) -> Tensor:
-        for strip in self._strips:
-            return strip
-        got = f"{self._top + sum(map(len, self._held))}"
-        raise ImageError("strips of an image", expected="as many rows as announced", got=got, remedy="give them all")
 
 
 def mirrored(start: int, stop: int, size: int) -> Tensor:

@@ -1,16 +1,19 @@
-"""A run on disk: safetensors, with all that an exact resume needs; nothing is unpickled."""
+"""What a run is told, what stops one that has gone wrong, and a run on disk.
+
+That is safetensors, with all that an exact resume needs; nothing is unpickled.
+"""
 
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from beers_deploy.model.convbeers import Network, arrays, load_network, save_network
+from beers_deploy.model.convbeers import Network, arrays, save_network, told
+from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.tensors import all_finite, read_tensors, write_tensors
-from beers_deploy.model.training.guards import Guards, require_finite_output
 from beers_deploy.model.training.losses import PAPER, LossWeights
 from beers_deploy.profiles.errors import ModelError, OptionError
 
@@ -66,9 +69,66 @@ class TrainingRecipe:
         return self.learning_rate * 0.5 * (1 + math.cos(math.pi * share))
 
 
-MOMENTS = ("step", "exp_avg", "exp_avg_sq")
-"""What Adam keeps of each parameter."""
-LEAST = {"step": 1.0, "exp_avg_sq": 0.0}
+MAX_BAD_STEPS = 10
+WINDOW_STEPS = 200
+TEST_PLACES = 65
+DIVERGED = 5.0
+"""A mean loss this many times the best one so far is no fluctuation: batches vary by a factor of two."""
+
+
+@dataclass
+class Guards:
+    """Counts skipped steps, and compares the loss of each window of steps with the best window so far.
+
+    Attributes:
+        bad_steps: steps whose gradient was not finite: skipped.
+        best: the lowest mean loss of a window; None before the first.
+        sum: of the losses of the present window.
+        count: of its steps.
+    """
+
+    bad_steps: int = 0
+    best: float | None = None
+    sum: float = 0.0
+    count: int = 0
+
+    def skipped(self, step: int) -> None:
+        """Count a step whose loss or gradient was not finite."""
+        self.bad_steps += 1
+        if self.bad_steps > MAX_BAD_STEPS:
+            raise _error(step, "a finite loss", f"{self.bad_steps} non-finite steps")
+
+    def passed(self, step: int, loss: float) -> None:
+        """Take note of a step's loss."""
+        self.sum, self.count = self.sum + loss, self.count + 1
+        if self.count < WINDOW_STEPS:
+            return
+        mean, self.sum, self.count = self.sum / self.count, 0.0, 0
+        if self.best is not None and mean > DIVERGED * self.best:
+            raise _error(step, f"a loss near {self.best:.4g}", f"{mean:.4g}: it diverged")
+        self.best = mean if self.best is None else min(self.best, mean)
+
+
+def require_finite_output(network: Network, where: str, remedy: str = "lower the learning rate") -> None:
+    """Refuse a network that makes NaN or infinity of an image in [0, 1]: its weights may be finite all the same.
+
+    Args:
+        network: on the CPU; a conditioned one is told the middle of every range.
+        where: what to name in the message.
+        remedy: what to do about it.
+    """
+    side_px = network.variant.scale * TEST_PLACES
+    image = torch.rand((1, 1, side_px, side_px), generator=torch.Generator().manual_seed(0))
+    images = torch.cat([torch.zeros_like(image), image, torch.ones_like(image)])
+    with torch.inference_mode():
+        restored = told(network, torch.zeros(len(RANGES)))(images)
+    if not bool(torch.isfinite(restored).all()):
+        raise ModelError(where, expected="finite pixels of a test image", got="NaN or infinity", remedy=remedy)
+
+
+def _error(step: int, expected: str, got: str) -> ModelError:
+    remedy = "lower the learning rate or check the images"
+    return ModelError(f"training step {step}", expected=expected, got=got, remedy=remedy)
 
 
 def write_checkpoint(
@@ -86,7 +146,7 @@ def write_checkpoint(
     for name, parameter in network.named_parameters():
         for moment, value in optimiser.state.get(parameter, {}).items():
             tensors[f"moment.{name}.{moment}"] = value
-    header = {"step": step, "guards": guards.to_json(), "recipe": asdict(recipe)}
+    header = {"step": step, "guards": asdict(guards), "recipe": asdict(recipe)}
     write_tensors(path, arrays(tensors), header)
 
 
@@ -101,7 +161,9 @@ def read_checkpoint(
         raise ModelError(str(path), expected=f"a checkpoint of {recipe}", got="another recipe", remedy=remedy)
     try:
         _check_parts(tensors, network, recipe.steps)
-        guards = Guards.from_json(header["guards"])  # type: ignore[arg-type]
+        kept: Any = header["guards"]
+        best = None if kept["best"] is None else float(kept["best"])
+        guards = Guards(int(kept["bad_steps"]), best, float(kept["sum"]), int(kept["count"]))
         step = int(str(header["step"]))
         if not 0 <= step <= recipe.steps:
             raise ValueError(f"step {step} of {recipe.steps}")
@@ -118,41 +180,31 @@ def read_checkpoint(
     return step, guards
 
 
-def finish(network: Network, path: Path, recipe: dict[str, object]) -> Network:
-    """Write a network with the recipe that made it, and read it back."""
+def finish(network: Network, path: Path, recipe: dict[str, object]) -> None:
+    """Write a network with the recipe that made it."""
     if not all_finite(arrays(network.state_dict())):
         remedy = "lower the learning rate"
         raise ModelError(str(path), expected="finite weights", got="NaN or infinity", remedy=remedy)
     require_finite_output(network, str(path))
     save_network(path, network, recipe)
-    return load_network(path)[0]
 
 
 def _check_parts(tensors: dict[str, Tensor], network: Network, steps: int) -> None:
     """Nothing is filled in before all of it fits."""
-    wanted = network.state_dict()
-    parameters = dict(network.named_parameters())
-    for name, value in wanted.items():
-        _check_like(tensors[f"network.{name}"], value)
-        _check_like(tensors[f"average.{name}"], value)
-    moments = [name for name in tensors if name.startswith("moment.")]
-    for name in moments:
-        parameter, moment = name.removeprefix("moment.").rsplit(".", 1)
-        like = parameters[parameter]
-        _check_like(tensors[name], like.new_zeros(()) if moment == "step" else like)
-        if not bool((tensors[name] >= LEAST.get(moment, -math.inf)).all()) or (
-            moment == "step" and tensors[name] > steps
-        ):
+    wanted = {f"{part}.{k}": value for k, value in network.state_dict().items() for part in ("network", "average")}
+    if len(tensors) > len(wanted):  # before the first step Adam keeps nothing
+        for name, parameter in network.named_parameters():
+            of_one = {"step": parameter.new_zeros(()), "exp_avg": parameter, "exp_avg_sq": parameter}
+            wanted |= {f"moment.{name}.{moment}": like for moment, like in of_one.items()}
+    for name, like in wanted.items():
+        value, moment = tensors[name], name.rsplit(".", 1)[1]
+        if value.shape != like.shape or value.dtype != like.dtype:
+            raise ValueError(f"a tensor {tuple(value.shape)} of {value.dtype} in place of {tuple(like.shape)}")
+        least, most = {"step": (1, steps), "exp_avg_sq": (0, math.inf)}.get(moment, (-math.inf, math.inf))
+        if not bool(((value >= least) & (value <= most)).all()):
             raise ValueError(f"{name} that Adam cannot have")
-    if len(tensors) != 2 * len(wanted) + len(moments) or len(moments) not in (0, len(MOMENTS) * len(parameters)):
-        raise ValueError(f"{len(tensors)} tensors")
-    if {name.rsplit(".", 1)[1] for name in moments} - set(MOMENTS) or not all_finite(arrays(tensors)):
-        raise ValueError("other moments than Adam's, or values that are not finite")
-
-
-def _check_like(value: Tensor, wanted: Tensor) -> None:
-    if value.shape != wanted.shape or value.dtype != wanted.dtype:
-        raise ValueError(f"a tensor {tuple(value.shape)} of {value.dtype} in place of {tuple(wanted.shape)}")
+    if len(tensors) != len(wanted) or not all_finite(arrays(tensors)):
+        raise ValueError(f"{len(tensors)} tensors in place of {len(wanted)}, or values that are not finite")
 
 
 def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

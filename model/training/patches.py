@@ -6,7 +6,7 @@ and exposure. Visiting whole scenes yields many patches for one transform.
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -249,10 +249,11 @@ def pair_files(folder: Path) -> list[Files]:
     return [(path, reference[name]) for name, path in degraded.items()]
 
 
+@dataclass(frozen=True)
 class StoredPairs:
     """Endless batches of (degraded, reference) patches, (N, 1, P, P) in [0, 1]; the same for the same seed.
 
-    Args:
+    Attributes:
         files: the pairs.
         patch_px: side of a patch.
         max_dn: the largest digital number of the sensor that made the pairs.
@@ -263,20 +264,14 @@ class StoredPairs:
         mirrors: whether they may be mirrored: not those of a sensor whose blur is lopsided.
     """
 
-    def __init__(
-        self,
-        files: Sequence[Files],
-        patch_px: int,
-        max_dn: int,
-        batch: int,
-        seed: int,
-        worker: Worker | None = None,
-        quarters: bool = True,
-        mirrors: bool = True,
-    ) -> None:
-        self.quarters, self.mirrors = quarters, mirrors
-        self.files, self.patch_px, self.max_dn = files, patch_px, max_dn
-        self.batch, self.seed, self.worker = batch, seed, worker or Worker()
+    files: Sequence[Files]
+    patch_px: int
+    max_dn: int
+    batch: int
+    seed: int
+    worker: Worker = field(default_factory=Worker)
+    quarters: bool = True
+    mirrors: bool = True
 
     def batches(self, first: int = 0) -> Iterator[tuple[Tensor, Tensor]]:
         """Batch number `first` and all that follow: (degraded, reference), (N, 1, P, P) in [0, 1] each."""

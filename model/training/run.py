@@ -19,17 +19,15 @@ from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, lo
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.images import list_images
 from beers_deploy.model.io.pictures import busiest_windows, grid, stretch_of, strip_row
-from beers_deploy.model.metrics.backbones import find_backbone, not_found
-from beers_deploy.model.metrics.perceptual import Lpips
+from beers_deploy.model.metrics.perceptual import Lpips, find_backbone, not_found
 from beers_deploy.model.progress import steps
 from beers_deploy.model.simulator.procedural import draw_scenes
 from beers_deploy.model.simulator.sampling import Scene, read_scene
-from beers_deploy.model.training.checkpoint import TrainingRecipe, finish
+from beers_deploy.model.training.checkpoint import TrainingRecipe, finish, require_finite_output
 from beers_deploy.model.training.grow import grow
-from beers_deploy.model.training.guards import require_finite_output
 from beers_deploy.model.training.losses import RestorationLoss
 from beers_deploy.model.training.patches import PatchRecipe, PatchSource, StoredPairs, pair_files
-from beers_deploy.model.training.trainer import Precision, Progress, Schedule, Source, Trainer
+from beers_deploy.model.training.trainer import Precision, Schedule, Source, Trainer
 from beers_deploy.model.training.validation import Validation, split_by_site
 from beers_deploy.model.training.workers import Worker
 from beers_deploy.model.variants import Variant, variant_named
@@ -120,7 +118,7 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
     source, validation, names = data(run, trainer)
     _train(run, trainer, source, validation)
     if worker.first:
-        recipe = about(run, names, validation.names, loss) | {"precision": trainer.precision}
+        recipe = about(run, names, validation.names, loss) | {"precision": run.precision}
         finish(trainer.averaged(), run.weights, recipe)
 
 
@@ -204,15 +202,15 @@ def _train(run: Run, trainer: Trainer, source: Source, validation: Validation) -
     with steps("training", run.recipe.steps) as bar:
         bar.advance(trainer.step)
 
-        def report(now: Progress) -> None:
-            log.write(now.step, {**now.terms, "patches_per_s": now.patches_per_s})
-            _scalars(board, now.step, now.terms)
-            terms = ", ".join(f"{name} {value:.5f}" for name, value in now.terms.items())
-            bar.advance(now.step - bar.done, f"{terms}, {now.patches_per_s:.0f} patches/s in {now.precision}")
+        def report(step: int, terms: Mapping[str, float], patches_per_s: float) -> None:
+            log.write(step, {**terms, "patches_per_s": patches_per_s})
+            _scalars(board, step, terms)
+            shown = ", ".join(f"{name} {value:.5f}" for name, value in terms.items())
+            bar.advance(step - bar.done, f"{shown}, {patches_per_s:.0f} patches/s in {run.precision}")
 
         def validate(step: int, network: Network) -> None:
             require_finite_output(network, f"training step {step}")
-            judged = asdict(validation.judge(network))
+            judged = validation.judge(network)
             scores.write(step, judged)
             _scalars(board, step, judged)
             write_picture(validation, network, run.out / "validation.png")

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, initialise
 from beers_deploy.model.progress import held_back
-from beers_deploy.model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
-from beers_deploy.model.training.guards import Guards
+from beers_deploy.model.training.checkpoint import Guards, TrainingRecipe, read_checkpoint, write_checkpoint
 from beers_deploy.model.training.losses import RestorationLoss
 from beers_deploy.model.training.workers import Worker
 from beers_deploy.model.variants import Variant
@@ -34,44 +33,20 @@ class Source(Protocol):
 
 
 Precision = Literal["float32", "bfloat16"]
-"""The number format of a step's convolutions."""
-
-
-class MixedPrecision(nn.Module):
-    """A network with its blocks in the run's precision; what it takes and gives is the network's own.
-
-    Head, tail and what is added stay float32 in any case: 8 bits of mantissa would round a 12-bit image.
-    """
-
-    def __init__(self, network: Network, precision: Precision) -> None:
-        super().__init__()
-        self.network, self.precision = network, precision
-
-    def forward(self, *given: Tensor) -> Tensor:
-        """Images (N, 1, H, W), and sensor vectors (N, 4) of a network that is told them, to (N, 1, H, W)."""
-        restored: Tensor = self.network(*given, bfloat16=self.precision == "bfloat16")
-        return restored
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a run reports now and then, the means of the loss's terms since the last report among it."""
-
-    step: int
-    steps: int
-    terms: Mapping[str, float]
-    patches_per_s: float
-    precision: Precision
+"""The number format of the blocks. Head, tail and what is added stay float32: 8 bits would round a 12-bit image."""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How often a run reports, looks at the validation images, and saves."""
+    """How often a run reports, looks at the validation images, and saves.
+
+    `report` is told the step, the means of the loss's terms since the last report, and patches a second.
+    """
 
     report_steps: int = 100
     save_s: float = 120.0
     validate_steps: int = 0  # 0: never
-    report: Callable[[Progress], None] = field(default=lambda _: None)
+    report: Callable[[int, Mapping[str, float], float], None] = field(default=lambda *_: None)
     validate: Callable[[int, Network], None] = field(default=lambda *_: None)
 
 
@@ -111,20 +86,20 @@ class Trainer:
         if start is not None:
             self.network.load_state_dict(dict(start))
         self.network.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.precision = precision
-        self.forward = self.worker.wrap(MixedPrecision(self.network, precision))
-        self.teacher = MixedPrecision(teacher.to(self.device), precision) if teacher is not None else None
+        self.bfloat16 = precision == "bfloat16"
+        self.forward = self.worker.wrap(self.network)
+        self.teacher = teacher.to(self.device) if teacher is not None else None
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.optimiser = _optimiser(self.network, recipe)
 
     def run(self, source: Source, checkpoint: Path, schedule: Schedule) -> None:
         """Train to the last step. Ctrl-C leaves a checkpoint of the last whole step."""
-        meter, saved = Meter(self), time.monotonic()
+        meter, saved = Meter(self.step), time.monotonic()
         with held_back() as interrupt:
             batches = source.batches(self.step)
             while self.step < self.recipe.steps and not self.worker.any(interrupt.asked, self.device):
                 meter.add(self.train_step(*next(batches)))
-                self._look(schedule, meter)
+                meter = self._look(schedule, meter)
                 if time.monotonic() - saved > schedule.save_s:
                     self.save(checkpoint)
                     saved = time.monotonic()
@@ -132,16 +107,17 @@ class Trainer:
         if self.step < self.recipe.steps:
             raise KeyboardInterrupt
 
-    def _look(self, schedule: Schedule, meter: "Meter") -> None:
-        """Report and validate when it is time, and at the end."""
+    def _look(self, schedule: Schedule, meter: "Meter") -> "Meter":
+        """Report and validate when it is time, and at the end; the meter to go on with."""
         last = self.step == self.recipe.steps
         if self.step % schedule.report_steps == 0 or last:
-            progress = meter.read()
-            # Every worker reads the meter, which clears it, but one reports.
             if self.worker.first:
-                schedule.report(progress)
+                patches = (self.step - meter.first) * self.recipe.batch * self.worker.count
+                schedule.report(self.step, meter.means(), patches / meter.elapsed_s())
+            meter = Meter(self.step)
         if self.worker.first and schedule.validate_steps and (self.step % schedule.validate_steps == 0 or last):
             schedule.validate(self.step, self.averaged())
+        return meter
 
     def train_step(self, degraded: Tensor, reference: Tensor, *vectors: Tensor) -> Mapping[str, Tensor]:
         """One step on a batch, (N, 1, P, P) each; the loss's terms, none for a step that was skipped.
@@ -168,12 +144,12 @@ class Trainer:
         return terms
 
     def _loss(self, degraded: Tensor, reference: Tensor, *vectors: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-        restored = self.forward(degraded, *vectors)
+        restored = self.forward(degraded, *vectors, bfloat16=self.bfloat16)
         total, terms = self.loss(restored, reference)
         if self.teacher is None:
             return total, terms
         with torch.no_grad():
-            wanted = self.teacher(degraded, *vectors)
+            wanted = self.teacher(degraded, *vectors, bfloat16=self.bfloat16)
         distance = (restored - wanted).abs().mean()
         return total + self.recipe.distil * distance, {**terms, "teacher": distance.detach()}
 
@@ -202,15 +178,11 @@ class Trainer:
 
 
 class Meter:
-    """Means of the terms and the patch rate between two reports."""
+    """The loss's terms and the time since a step."""
 
-    def __init__(self, trainer: Trainer) -> None:
-        self._trainer = trainer
-        self._clear()
-
-    def _clear(self) -> None:
-        self._sums: dict[str, float] = {}
-        self._count, self._step, self._started = 0, self._trainer.step, time.monotonic()
+    def __init__(self, first: int) -> None:
+        self.first, self._started = first, time.monotonic()
+        self._sums, self._count = dict[str, float](), 0
 
     def add(self, terms: Mapping[str, Tensor]) -> None:
         """Add a step's terms of the loss, any shape () each; none for a step that was skipped."""
@@ -218,14 +190,13 @@ class Meter:
             self._sums[name] = self._sums.get(name, 0.0) + float(term)
         self._count += bool(terms)
 
-    def read(self) -> Progress:
-        """The report; the next one begins here."""
-        trainer, elapsed_s = self._trainer, max(time.monotonic() - self._started, 1e-9)
-        patches = (trainer.step - self._step) * trainer.recipe.batch * trainer.worker.count
-        terms = {name: value / max(self._count, 1) for name, value in self._sums.items()}
-        progress = Progress(trainer.step, trainer.recipe.steps, terms, patches / elapsed_s, trainer.precision)
-        self._clear()
-        return progress
+    def means(self) -> dict[str, float]:
+        """The mean of each term."""
+        return {name: value / max(self._count, 1) for name, value in self._sums.items()}
+
+    def elapsed_s(self) -> float:
+        """Seconds since then."""
+        return max(time.monotonic() - self._started, 1e-9)
 
 
 def require_loss(loss: RestorationLoss, distil: float) -> None:

@@ -1,7 +1,6 @@
 """Judging a run on sites that it does not train on."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -39,15 +38,6 @@ def split_by_site(names: Sequence[str]) -> tuple[list[int], list[int]]:
                 break
             held += sites[site]
     return [n for n in range(len(names)) if n not in held], sorted(held)
-
-
-@dataclass(frozen=True)
-class Judged:
-    """Means over the validation pairs, PSNR over full scale."""
-
-    psnr_db: float
-    degraded_psnr_db: float
-    ssim: float
 
 
 class Validation:
@@ -88,14 +78,13 @@ class Validation:
                 restored.append(plain(extended)[0, 0, :height, :width].clamp(0, 1).numpy())
         return restored
 
-    def judge(self, network: Network) -> Judged:
-        """Mean scores of a network on the CPU."""
+    def judge(self, network: Network) -> dict[str, float]:
+        """Means over the pairs of a network on the CPU, PSNR over full scale: by the names of a log's columns."""
         restored = self.restore(network)
         references = [reference[0, 0].numpy() for _, reference in self.pairs]
         inputs = [degraded[0, 0].numpy() for degraded, _ in self.pairs]
-        after, before = (
-            float(np.mean([psnr_db(a, b, 1.0) for a, b in zip(images, references, strict=True)]))
-            for images in (restored, inputs)
-        )
-        similar = float(np.mean([ssim(a, b, 1.0) for a, b in zip(restored, references, strict=True)]))
-        return Judged(after, before, similar)
+        judged = {"psnr_db": (psnr_db, restored), "degraded_psnr_db": (psnr_db, inputs), "ssim": (ssim, restored)}
+        return {
+            name: float(np.mean([score(a, b, 1.0) for a, b in zip(images, references, strict=True)]))
+            for name, (score, images) in judged.items()
+        }

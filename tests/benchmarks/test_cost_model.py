@@ -8,7 +8,7 @@ from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import predict
 from beers_deploy.dpu.cost.model import Constants, Structure
-from beers_deploy.model.traditional.settings import QUALITIES
+from beers_deploy.model.traditional.nl_bayes import QUALITIES
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.target import board_names
 from benchmarks.cost_model.builder import Builder

@@ -14,7 +14,6 @@ from beers_deploy.cli import app
 from beers_deploy.export import float_for
 from beers_deploy.model.shipped import SENSOR, VARIANT, shipped_weights
 from beers_deploy.model.simulator.acquire import crop_margin
-from beers_deploy.model.simulator.sampling import check_divisible
 from beers_deploy.model.training.patches import StoredPairs, pair_files
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import BeersError
@@ -54,7 +53,6 @@ SENTENCES: list[Callable[[Path], str]] = [
     fixed_tile,
     stored_pairs,
     lambda _: said(lambda: crop_margin(torch.zeros(ROWS, COLUMNS), 30)),
-    lambda _: said(lambda: check_divisible(ROWS, COLUMNS, 2)),
 ]
 
 

@@ -19,7 +19,7 @@ from beers_deploy.model.dataset import _read_summary
 from beers_deploy.model.io.images import read_pixels
 from beers_deploy.model.io.tensors import read_tensors as read_weights
 from beers_deploy.model.io.tensors import write_tensors
-from beers_deploy.model.metrics.backbones import read_tensors
+from beers_deploy.model.metrics.perceptual import read_tensors
 from beers_deploy.model.training.run import Log
 from beers_deploy.profiles.errors import BeersError, ModelError, OptionError, ProfileError
 from beers_deploy.profiles.figures import Check, Row, measured

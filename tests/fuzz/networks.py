@@ -12,8 +12,7 @@ from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, save_network
-from beers_deploy.model.training.checkpoint import TrainingRecipe, read_checkpoint, write_checkpoint
-from beers_deploy.model.training.guards import Guards
+from beers_deploy.model.training.checkpoint import Guards, TrainingRecipe, read_checkpoint, write_checkpoint
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import BeersError
 from beers_deploy.quant.encodings import encoding_faults

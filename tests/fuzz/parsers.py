@@ -21,10 +21,9 @@ from beers_deploy.dpu.cost.work import count_work
 from beers_deploy.dpu.graph import Network
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.model.convbeers import load_network
-from beers_deploy.model.dataset import _read_summary
+from beers_deploy.model.dataset import _read_summary, read_pairs_recipe
 from beers_deploy.model.io.images import read_pixels
-from beers_deploy.model.metrics.backbones import read_tensors
-from beers_deploy.model.recipe import read_pairs_recipe
+from beers_deploy.model.metrics.perceptual import read_tensors
 from beers_deploy.model.training.run import Log
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.figures import Check, Row, measured, predicted, unavailable

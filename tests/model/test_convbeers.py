@@ -97,7 +97,7 @@ def test_a_body_that_adds_nothing_leaves_the_analytic_restoration(scale: int) ->
     network = behind_a_bank(Variant(2, 5, scale), 0.3)
     image = 0.4 + 0.002 * torch.rand(1, 1, 26, 22, generator=torch.Generator().manual_seed(0))
     torch.nn.init.zeros_(network.tail.weight)
-    kernel = torch.from_numpy(bank_of_vector(VECTORS[1].tolist()).analytic).float()[None, None]
+    kernel = torch.from_numpy(bank_of_vector(tuple(VECTORS[1].tolist())).analytic).float()[None, None]
     wanted = image + conv2d(pad(image, [3] * 4, mode="reflect"), kernel)
     with torch.inference_mode():
         torch.testing.assert_close(network(image, VECTORS[1:2]), wanted, rtol=0, atol=1e-6)

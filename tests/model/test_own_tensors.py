@@ -8,7 +8,7 @@ import pytest
 from torch import Tensor
 
 from beers_deploy.model.io.tensors import read_tensors, write_tensors
-from beers_deploy.model.metrics import backbones
+from beers_deploy.model.metrics import perceptual
 
 LARGE = np.arange(20_000, dtype=np.float32).reshape(100, 200)
 TENSORS = {"small": np.arange(3, dtype=np.float32), "large": LARGE}
@@ -29,7 +29,7 @@ def is_copy(read: Read, path: Path) -> bool:
 
 
 @pytest.mark.parametrize(
-    "read", [lambda path: read_tensors(path)[0], lambda path: backbones.read_tensors(path, TENSORS)]
+    "read", [lambda path: read_tensors(path)[0], lambda path: perceptual.read_tensors(path, TENSORS)]
 )
 def test_what_was_read_does_not_change_with_its_file(read: Read, tmp_path: Path) -> None:
     assert is_copy(read, tmp_path / "w.safetensors")

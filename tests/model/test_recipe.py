@@ -9,8 +9,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from beers_deploy.model.dataset import DatasetRecipe, write_dataset
-from beers_deploy.model.recipe import profiles_for, read_pairs_recipe
+from beers_deploy.model.dataset import DatasetRecipe, profiles_for, read_pairs_recipe, write_dataset
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError, ProfileError
 from beers_deploy.profiles.sensor import same_instrument

@@ -14,8 +14,8 @@ from itertools import pairwise
 import numpy as np
 from PIL import Image, ImageDraw
 
-from beers_deploy.model.simulator import drawing
-from beers_deploy.model.simulator.drawing import Point
+from beers_deploy.model.simulator import procedural as drawing
+from beers_deploy.model.simulator.procedural import Point
 from beers_deploy.studies.detection.boxes import Boxes
 
 CLASSES = ("vehicle", "ship", "aircraft", "tank")

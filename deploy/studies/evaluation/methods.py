@@ -15,9 +15,9 @@ import torch
 from beers_deploy.export import float_model
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.shipped import INT8, shipped_names
+from beers_deploy.model.traditional.nl_bayes import QUALITIES
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.pipeline import Chain, Order, restore_traditional
-from beers_deploy.model.traditional.settings import QUALITIES
 from beers_deploy.network import conditioned, network_file, warn_outside
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from beers_deploy.model.dataset import PairsRecipe
 from beers_deploy.model.io.images import MAX_DN, read_acquisition, site_of
-from beers_deploy.model.recipe import PairsRecipe
 from beers_deploy.model.simulator import acquire
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import load_scenes

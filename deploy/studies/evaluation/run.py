@@ -8,10 +8,10 @@ from typing import cast
 
 import numpy as np
 
+from beers_deploy.model.dataset import PairsRecipe, profiles_for, read_pairs_recipe
 from beers_deploy.model.io.images import list_images
 from beers_deploy.model.metrics.bootstrap import too_few
 from beers_deploy.model.progress import Log, Progress, no_log, once, reporting
-from beers_deploy.model.recipe import PairsRecipe, profiles_for, read_pairs_recipe
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.pairs import Pair
 from beers_deploy.profiles.figures import Row

@@ -8,10 +8,9 @@ import numpy as np
 import torch
 
 from beers_deploy.model.io.images import MAX_DN
-from beers_deploy.model.metrics.backbones import find_backbone, not_found
 from beers_deploy.model.metrics.bootstrap import site_interval
 from beers_deploy.model.metrics.fidelity import fidelity_db, ssim
-from beers_deploy.model.metrics.perceptual import Dists, Lpips
+from beers_deploy.model.metrics.perceptual import Dists, Lpips, find_backbone, not_found
 from beers_deploy.model.progress import steps
 from beers_deploy.profiles.figures import Figure, Row, measured, published, unavailable
 from beers_deploy.studies.evaluation.methods import Method

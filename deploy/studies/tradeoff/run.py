@@ -14,12 +14,12 @@ from beers_deploy.dpu.board import BoardLike, boards_of
 from beers_deploy.dpu.cost.model import Constants
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.io.images import list_images
-from beers_deploy.model.metrics.backbones import find_backbone
 from beers_deploy.model.metrics.bootstrap import too_few
+from beers_deploy.model.metrics.perceptual import find_backbone
 from beers_deploy.model.progress import Log, Progress, no_log, reporting, steps
 from beers_deploy.model.shipped import SENSOR
+from beers_deploy.model.traditional.nl_bayes import QUALITIES
 from beers_deploy.model.traditional.peers import PEERS
-from beers_deploy.model.traditional.settings import QUALITIES
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.errors import MachineError, optional

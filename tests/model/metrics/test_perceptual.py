@@ -11,8 +11,18 @@ from skimage.filters import gaussian
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, pad
 
-from beers_deploy.model.metrics.backbones import BACKBONES, WEIGHTS_VARIABLE, Backbone, find_backbone, not_found
-from beers_deploy.model.metrics.perceptual import MIN_NORM, PUBLISHED, Dists, Lpips, _unit
+from beers_deploy.model.metrics.perceptual import (
+    BACKBONES,
+    MIN_NORM,
+    PUBLISHED,
+    WEIGHTS_VARIABLE,
+    Backbone,
+    Dists,
+    Lpips,
+    _unit,
+    find_backbone,
+    not_found,
+)
 from beers_deploy.profiles.errors import ImageError, ModelError
 
 Weights = dict[str, np.ndarray]

@@ -19,7 +19,6 @@ from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.pipeline import (
     Chain,
     Order,
-    describe,
     restore_strips,
     restore_traditional,
     with_rounding_noise,
@@ -29,7 +28,7 @@ from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.response import PointSpread
 from beers_deploy.profiles.sensor import Instrument, noise_from_snr
-from tests.model.simulator.stages import formula_point, formula_table, point_spread, with_response
+from tests.model.simulator.stages import formula_point, point_spread, with_response
 
 DEGRADED = load_sensor("pleiades-degraded").nominal()
 REFERENCE = load_sensor("pleiades-reference").nominal()
@@ -159,12 +158,6 @@ def test_rounding_counts_as_noise() -> None:
     assert with_rounding_noise(NOISE_FREE).beta == pytest.approx((1 / 10.2375) ** 2 / 12)
 
 
-def test_it_says_what_it_does() -> None:
-    steps = describe(Chain(DEGRADED, REFERENCE, "fast"))
-    assert len(steps) == 5
-    assert "0.07 to 0.25" in steps[3]
-
-
 def test_the_chain_undoes_each_axis_by_its_own_blur(camera: Tensor) -> None:
     sensor = replace(DEGRADED, mtf_nyquist=0.12, mtf_nyquist_along=0.04)
     turned, one = replace(sensor, mtf_nyquist=0.04, mtf_nyquist_along=0.12), replace(sensor, mtf_nyquist_along=None)
@@ -228,13 +221,6 @@ def test_a_turned_sensor_gives_the_turned_filter() -> None:
     torch.testing.assert_close(kernels[0].T, kernels[1], rtol=0, atol=1e-12)
     same = Chain(replace(DEGRADED, mtf_nyquist_along=0.07), REFERENCE, epsilon=3e-3)
     assert torch.equal(same.kernel(), Chain(DEGRADED, REFERENCE, epsilon=3e-3).kernel())
-
-
-def test_it_names_both_axes_and_a_table() -> None:
-    said = describe(Chain(replace(DEGRADED, mtf_nyquist_along=0.05), REFERENCE))
-    assert any("0.07 across and 0.05 along the track to 0.25" in line for line in said)
-    table = with_response(DEGRADED, formula_table(0.07, 0.07))
-    assert "MTF table of 6 frequencies" in " ".join(describe(Chain(table, REFERENCE)))
 
 
 def test_an_unknown_quality_is_refused() -> None:

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from beers_deploy.model.traditional.noise import bias_radiance, destabilise, stabilise
-from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Instrument, noise_from_snr
 
 NOMINAL = Instrument(0.07, *noise_from_snr(25, 50, 100, 110), gain_dn_per_radiance=10.2375, bits=12)
@@ -66,9 +65,3 @@ def test_the_bias_of_averaging_is_restored() -> None:
     sensor = replace(NOMINAL, alpha=0.2)
     mean = destabilise(stabilise(noisy(25, sensor, 3), sensor).mean(), sensor)
     assert float(mean) - 25 == pytest.approx(-bias_radiance(sensor), rel=0.2)
-
-
-@pytest.mark.parametrize(("alpha", "beta"), [(-0.01, 0.1), (0.01, -0.01), (0.0, 0.0)])
-def test_an_impossible_noise_is_refused(alpha: float, beta: float) -> None:
-    with pytest.raises(OptionError, match="alpha and beta"):
-        stabilise(torch.ones(3), replace(NOMINAL, alpha=alpha, beta=beta))

@@ -208,8 +208,7 @@ def test_stored_pairs_of_another_scale_are_refused(pixels: np.ndarray, words: st
 
 
 def test_stored_pairs_too_small_or_incomplete_are_refused(tmp_path: Path) -> None:
-    pairs = stored(tmp_path)
-    pairs.patch_px = 42
+    pairs = replace(stored(tmp_path), patch_px=42)
     with pytest.raises(ImageError, match="42 pixels"):
         next(pairs.batches())
     (tmp_path / "degraded" / "p1.tif").unlink()

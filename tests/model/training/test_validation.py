@@ -38,7 +38,7 @@ def test_images_of_odd_sides_are_judged_at_half_resolution_too() -> None:
         parameter.data.zero_()
     judged = validation.judge(network)
     assert validation.restore(network)[0].shape == (height, width)
-    assert judged.psnr_db == judged.degraded_psnr_db
+    assert judged["psnr_db"] == judged["degraded_psnr_db"]
 
 
 def test_a_new_network_is_judged_like_its_input() -> None:
@@ -49,7 +49,7 @@ def test_a_new_network_is_judged_like_its_input() -> None:
     for parameter in network.tail.parameters():
         parameter.data.zero_()
     judged = validation.judge(network)
-    assert judged.psnr_db == judged.degraded_psnr_db
-    assert 0.5 < judged.ssim < 1
+    assert judged["psnr_db"] == judged["degraded_psnr_db"]
+    assert 0.5 < judged["ssim"] < 1
     again = Validation(scenes, *EYES).judge(network)
     assert again == judged

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from beers_deploy.model.simulator.drawing import turn
+from beers_deploy.model.simulator.procedural import turn
 from beers_deploy.studies.detection.boxes import Boxes
 from beers_deploy.studies.detection.scenes import (
     CLASSES,
