@@ -78,10 +78,10 @@ class Changes:
 
 def broken(found: Changes, limits: Sequence[Limit]) -> list[str]:
     """What fails a job, a line each: changes beyond a limit, and figures with a limit that are gone."""
-    known = {place[2] for place in (*(change.place for change in found.both), *found.gone, *found.new)}
+    known = {place[2] for place in (*(change.place for change in found.both), *found.gone)}
     for limit in limits:
         if limit.name not in known:
-            expected = f"a figure of the documents: {', '.join(sorted(known))}"
+            expected = f"a figure of the first document: {', '.join(sorted(known)) or 'it shares none'}"
             raise OptionError("fail_on", expected=expected, got=repr(limit.name), remedy="correct the name")
     changed = [change for change in found.both if any(limit.broken_by(change) for limit in limits)]
     names = {limit.name for limit in limits}

@@ -5,6 +5,7 @@ The pixels are those that the command `restore` writes of the same image.
 
 import os
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -22,11 +23,20 @@ from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.tiling.walk import Tiling
 from beers_deploy.restoration.engine import NAME, Restorer, as_stored, checked_strip, restore_array
 from beers_deploy.restoration.options import TILE_PX, Options, Runtime
+from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Plan, Span, plan_for
 from beers_deploy.restoration.radiometry import full_scale_of
 from beers_deploy.restoration.run import restore_file, scale_of
 from beers_deploy.restoration.runtime import Packed, open_packed, open_runtime, pack, tiles_at_once
-from beers_deploy.restoration.source import ArraySource, Raster, require_numbers, usable_nodata
+from beers_deploy.restoration.source import (
+    ArraySource,
+    Raster,
+    Veil,
+    is_restored,
+    require_numbers,
+    require_raw,
+    usable_nodata,
+)
 from beers_deploy.results import Table
 
 NETWORK, TRADITIONAL = "network", "traditional"
@@ -48,6 +58,8 @@ def restore(
     out: str | os.PathLike[str] | None = None,
     resume: bool = False,
     cog: bool = False,
+    again: bool = False,
+    any_result: bool = False,
     progress: Progress = None,
 ) -> Any:
     """Restore an image of raw digital numbers: an array, or a file into another.
@@ -75,6 +87,8 @@ def restore(
         out: the TIFF that a file is restored into; files alone.
         resume: go on with a run into `out` that was stopped.
         cog: write `out` as a Cloud-Optimised GeoTIFF.
+        again: take an image that says it was restored already.
+        any_result: give a result even if it is clipped, constant or far from the image's mean.
         progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
 
     Returns:
@@ -91,7 +105,8 @@ def restore(
         MachineError: a missing package, memory, or a disk that cannot be written.
     """
     known = Sensor.load(sensor)
-    job = Job(method, quality, known, nodata, _options(network, known, tile, halo, full_scale, runtime, threads))
+    options = _options(network, known, tile, halo, full_scale, runtime, threads)
+    job = Job(method, quality, known, nodata, replace(options, again=again, any_result=any_result))
     with reporting(progress):
         if isinstance(image, str | os.PathLike) or hasattr(image, "crs"):  # the latter of rasterio
             path = Path(image if isinstance(image, str | os.PathLike) else image.name)
@@ -148,7 +163,7 @@ def _restore_path(image: Path, options: Options, job: Job, out: str | os.PathLik
     if job.method == TRADITIONAL:
         from beers_deploy.restoration.traditional import Request, restore_file_traditionally  # it takes torch
 
-        request = Request(job.sensor, job.sensor.reference, options.full_scale)
+        request = Request(job.sensor, job.sensor.reference, options.full_scale, again=options.again)
         row = restore_file_traditionally(image, path, request)
     else:
         row = restore_file(image, path, options, no_log)
@@ -175,6 +190,8 @@ def _restore_labelled(image: Any, job: Job) -> Any:
         names = ", ".join(map(str, image.data_vars)) or "none"
         remedy = "choose one of its variables"
         raise ImageError(NAME, expected="an xarray.DataArray", got=f"a Dataset of {names}", remedy=remedy)
+    said = is_restored(str(image.attrs.get("TIFFTAG_SOFTWARE", "")), image.attrs)
+    require_raw(NAME, said, job.options.again)
     own = image.attrs.get("full_scale")
     options = (
         job.options if job.options.full_scale is not None or own is None else replace(job.options, full_scale=own)
@@ -190,18 +207,12 @@ def _restore_labelled(image: Any, job: Job) -> Any:
 
 
 def _restore_masked(image: Any, job: Job) -> Any:
-    """A masked array; under the mask a value stands that no pixel has."""
-    held = np.ma.getdata(image)
-    if held.dtype.kind == "f":
-        marked, nodata = np.where(np.ma.getmaskarray(image), np.nan, held).astype(held.dtype), job.nodata
-    else:
-        top = int(np.iinfo(held.dtype).max)
-        nodata = next(value for value in range(top, -1, -1) if not (held == value).any())
-        marked = np.where(np.ma.getmaskarray(image), held.dtype.type(nodata), held)
-    restored = _restore(marked, replace(job, nodata=nodata))
-    mask = np.ma.getmaskarray(image)
-    if restored.shape != mask.shape:
-        return np.ma.masked_where(np.isnan(restored) if held.dtype.kind == "f" else restored == nodata, restored)
+    """A masked array, whose masked pixels are missing and stay masked, enlarged with the image."""
+    restored, mask = _restore(image, job), np.ma.getmaskarray(image)
+    scale = restored.shape[-1] // mask.shape[-1]
+    mask = mask.repeat(scale, axis=-2).repeat(scale, axis=-1)
+    if mask.shape != restored.shape:  # other bands are made of all that the image has
+        mask = np.broadcast_to(mask if mask.ndim == 2 else mask.any(axis=0), restored.shape)
     return np.ma.array(restored, mask=mask)
 
 
@@ -230,16 +241,17 @@ def _restore_traditionally(bands: np.ndarray, raster: Raster, job: Job) -> np.nd
 
     chain = Chain(job.sensor.nominal(), job.sensor.reference.nominal(), job.quality)
     bits = int(chain.degraded.max_dn).bit_length()
-    largest = (raster.largest(band) for band in bands)
-    full_scale = full_scale_of(NAME, raster, largest, job.options.full_scale, bits).value
+    extents = (raster.extent(band) for band in bands)
+    full_scale = full_scale_of(NAME, raster, extents, job.options.full_scale, bits).value
     to_dn, restored = np.float32(chain.degraded.max_dn / full_scale), []
     for band in bands:
         strip = checked_strip(raster, 0, band[None], full_scale, NAME)
-        dn = band.astype(np.float32) * to_dn
+        dn = np.ma.getdata(band).astype(np.float32) * to_dn
         missing = np.zeros(band.shape, bool) if strip.missing is None else strip.missing[0]
         dn[missing] = np.nan
         found = np.nan_to_num(restore_traditional(torch.from_numpy(dn), chain).numpy()) / to_dn
-        restored.append(np.where(missing, band.astype(raster.out_dtype), as_stored(raster, found, full_scale)))
+        stored = np.ma.getdata(band).astype(raster.out_dtype)
+        restored.append(np.where(missing, stored, as_stored(raster, found, full_scale)))
     return np.stack(restored)
 
 
@@ -275,7 +287,8 @@ def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndar
     infer, _ = open_runtime(options.runtime, network, options.threads, at_once)
     full_scale = scale_of(source, plan, options, NAME).value
     restorer = Restorer(raster, infer, full_scale, plan.tiling, NAME)
-    return restore_array(source, plan, restorer, at_once)
+    look = None if options.any_result else partial(Tally.require, name=NAME)
+    return restore_array(source, plan, restorer, at_once, look)
 
 
 BAND_DIMS = ("band", "bands", "channel", "wavelength")
@@ -303,7 +316,8 @@ def _raster(bands: Any, nodata: float | None) -> Raster:
     count, height_px, width_px = bands.shape
     dtype = require_numbers(NAME, bands.dtype)
     missing = None if nodata is None else float(nodata)
-    return Raster(count, height_px, width_px, dtype, usable_nodata(NAME, missing, dtype))
+    veil: Veil = "mask" if np.ma.isMaskedArray(bands) else ""
+    return Raster(count, height_px, width_px, dtype, usable_nodata(NAME, missing, dtype), veil=veil)
 
 
 def _runtime(name: str) -> Runtime:
@@ -325,8 +339,8 @@ class Task:
 
     def restorer(self, window: np.ndarray) -> Restorer:
         """For this process, at the full scale that was asked for or that the window's pixels tell."""
-        largest = (self.raster.largest(part) for part in (window,))
-        full_scale = settled_scale(NAME, self.raster.dtype, largest, self.full_scale)
+        extent = self.raster.extent(window)._replace(whole=True)  # a tile alone is no proof of radiances
+        full_scale = settled_scale(NAME, self.raster.dtype, [extent], self.full_scale)
         return Restorer(self.raster, open_packed(self.network), full_scale, self.tiling, NAME)
 
 

@@ -33,7 +33,7 @@ from beers_deploy.profiles.toml import read_json, unreadable
 from beers_deploy.quant.gate import GateResult, Limits, judge, judge_saturation, limits_of, verdict_row
 from beers_deploy.quant.gate import compare as differences
 from beers_deploy.quant.onnx_file import fixed_tile_px, metadata, require_quantised
-from beers_deploy.quant.samples import OwnSamples, samples_of
+from beers_deploy.quant.samples import CALIBRATED_ON, OwnSamples, samples_of, without
 from beers_deploy.quant.session import open_any_size
 from beers_deploy.quant.structure import saturated_shares, structure_checks
 from beers_deploy.restoration.options import TILE_PX
@@ -56,10 +56,12 @@ class Comparison(Table):
     Attributes:
         result: the differences.
         shares: of each layer's results the share at the ends of 8 bits.
+        float_sha256: of the float network.
     """
 
     result: GateResult
     shares: Mapping[str, float]
+    float_sha256: str
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -149,7 +151,16 @@ def compare(
     arguments: dict[str, object] = {"float": theirs.name, "int8": ours.name, "sensor": known.name, "images": images}
     arguments |= {"patches": patches, "seed": seed, "samples": samples if isinstance(samples, str | Path) else None}
     rows, inputs = (verdict_row(result, shares),), (theirs.input, ours.input)
-    return Comparison("compare", arguments, inputs, rows, notes=notes, result=result, shares=shares)
+    return Comparison(
+        "compare",
+        arguments,
+        inputs,
+        rows,
+        notes=notes,
+        result=result,
+        shares=shares,
+        float_sha256=theirs.sha256,
+    )
 
 
 def gate(
@@ -200,12 +211,17 @@ def gate(
     arguments |= {"sensor": sensor if isinstance(sensor, str) else known.name, "images": images, "patches": patches}
     arguments |= {"seed": seed, "samples": data}
     before = None if baseline is None else baseline_mae(Path(baseline), arguments)
+    if before is None and allowed.mae_growth is not None:
+        remedy = "give what an earlier 'gate --json' wrote, or leave that limit out"
+        raise OptionError("baseline", expected="one beside the limit mae_growth", got="none", remedy=remedy)
     if allowed.psnr_drop_db is not None and samples is not None:
         _require_references(samples_of(theirs.model, samples))
     found = compare(ours, theirs, samples, sensor=known, images=images, patches=patches, seed=seed, progress=progress)
     if ALL_SEEN in found.notes:
         expected, remedy = "samples that calibration did not see", "give others, or quantise with four or more"
         raise OptionError("samples", expected=expected, got="those of the calibration", remedy=remedy)
+    if baseline is not None:
+        require_same_float(Path(baseline), found)
     checks = judge(found.result, allowed, before) + judge_saturation(found.shares, allowed)
     checks += file_checks(theirs.model, ours, target)
     return Verdict("gate", arguments, found.inputs, found.rows, tuple(checks), notes=found.notes, comparison=found)
@@ -234,14 +250,13 @@ def _unseen(
         from beers_deploy.quant.calibration import unseen_patches
 
         return unseen_patches(sensor, images, patches, seed), True, ()
-    calibrated = metadata(int8.model).get("calibration_sha256")
-    if own.all.digest == calibrated:
+    calibrated = set(metadata(int8.model).get(CALIBRATED_ON, "").split())
+    found, count = without(own.all, calibrated), len(own.all.pairs)
+    if len(found.pairs) == count:
+        return found, False, ()
+    if not found.pairs:
         return own.all, False, (ALL_SEEN,)
-    if own.drawn.digest == calibrated:
-        held_out = own.unseen
-        note = f"{len(held_out.pairs)} of {len(own.all.pairs)} samples: the others were calibrated on"
-        return held_out, False, (note,)
-    return own.all, False, ()
+    return found, False, (f"{len(found.pairs)} of {count} samples: the others were calibrated on",)
 
 
 def _require_references(own: OwnSamples | None) -> None:
@@ -271,6 +286,20 @@ def baseline_mae(path: Path, arguments: Mapping[str, Any]) -> float:
             expected, got = f"a baseline of the same patches ({name} {now})", f"{name} {before[name]}"
             raise OptionError(str(path), expected=expected, got=got, remedy="make it anew with these")
     return mae
+
+
+SAME_DB = 0.01
+"""Between the PSNRs of one float network on two processors: most differ by less than a thousandth."""
+
+
+def require_same_float(path: Path, found: Comparison) -> None:
+    """Refuse the baseline of another float network: by its file, or else by its PSNR on the same patches."""
+    document: Any = read_json(path)
+    before = next(row["figures"].get("PSNR float", {}) for row in document["rows"] if row["table"] == "gate")
+    same_psnr = abs(found.result.psnr_float_db - float(before.get("value") or math.nan)) < SAME_DB
+    if not same_psnr and found.float_sha256 not in [each["sha256"] for each in document["inputs"]]:
+        remedy = "make it anew with 'gate --json'"
+        raise OptionError(str(path), expected="a baseline of this float network", got="another's", remedy=remedy)
 
 
 def _plain(name: str, value: object) -> str:

@@ -2,7 +2,6 @@
 
 import math
 import os
-import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -112,7 +111,7 @@ class Limits:
         psnr_drop_db: PSNR lost against the reference.
         min_psnr_float_int8_db: smallest PSNR of INT8 against float.
         saturated: share of a layer's results at the ends of 8 bits, of the layer with most.
-        mae_growth: how many times a stored baseline's MAE.
+        mae_growth: how many times a stored baseline's MAE; 1.05 where there is a baseline and no such limit.
     """
 
     mae: float | None = 0.0007
@@ -121,22 +120,49 @@ class Limits:
     psnr_drop_db: float | None = None
     min_psnr_float_int8_db: float | None = None
     saturated: float | None = None
-    mae_growth: float | None = 1.05
+    mae_growth: float | None = None
+
+
+MAE_GROWTH = 1.05
+BREAKABLE = {
+    "mae": (0.0, 0.5),
+    "p999": (0.0, 0.99),
+    "std_over_mae": (0.0, 1000.0),
+    "psnr_drop_db": (0.0, 100.0),
+    "min_psnr_float_int8_db": (10.0, 1000.0),
+    "saturated": (0.0, 0.99),
+    "mae_growth": (0.0, 100.0),
+}
+"""The limits that some network breaks and a gate may so have: differences of images in [0, 1] are no larger."""
 
 
 def limits_of(given: "Limits | Mapping[str, float] | str | os.PathLike[str] | None") -> Limits:
-    """Limits by their names, of a TOML file such as `mae = 0.0007`, or the defaults for None."""
+    """Limits by their names, of a TOML file such as `mae = 0.0007`, or the defaults for None.
+
+    Raises:
+        OptionError: no limits, unknown ones, or some that no network breaks.
+    """
     if given is None:
         return Limits()
     if isinstance(given, Limits):
-        return given
+        return _breakable("limits", given)
     return _named("limits", given) if isinstance(given, Mapping) else _parse(Path(given))
 
 
 def read_limits(path: Path | None, mae: float | None) -> Limits:
     """As `limits_of`; `mae` overrides."""
     limits = limits_of(path)
-    return limits if mae is None else replace(limits, mae=mae)
+    return limits if mae is None else _breakable("max_mae", replace(limits, mae=mae))
+
+
+def _breakable(where: str, limits: Limits) -> Limits:
+    """Limits that a network can break: a gate that cannot fail is none."""
+    for name, (low, high) in BREAKABLE.items():
+        value = getattr(limits, name)
+        if value is not None and not low <= value <= high:
+            expected, remedy = f"{name} of {low:g} to {high:g}", "set one that a broken network would not keep"
+            raise OptionError(where, expected=expected, got=f"{value:g}", remedy=remedy)
+    return limits
 
 
 def _parse(path: Path) -> Limits:
@@ -159,15 +185,14 @@ def _named(where: str, raw: Mapping[str, object]) -> Limits:
         if name not in names or not _is_limit(value):
             expected = f"numbers above 0 named {', '.join(names)}"
             raise OptionError(where, expected=expected, got=f"{name} = {value!r}", remedy="correct that line")
-    given: dict[str, Any] = {**dict.fromkeys(names), "mae_growth": Limits.mae_growth, **raw}
-    return Limits(**given)
+    given: dict[str, Any] = {**dict.fromkeys(names), **raw}
+    return _breakable(where, Limits(**given))
 
 
 def _is_limit(value: object) -> bool:
-    """A number above 0 that float64 holds, or infinity."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return value == math.inf or 0 < value <= sys.float_info.max
+    """A number above 0, of no more digits than are compared with others."""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number and value > 0 and (isinstance(value, float) or value < 1 << 64)
 
 
 def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None) -> list[Check]:
@@ -182,8 +207,9 @@ def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None)
     if limits.min_psnr_float_int8_db is not None:
         least = limits.min_psnr_float_int8_db
         checks.append([Check("PSNR float-INT8", result.psnr_between_db, least, "dB", "at least")])
-    if baseline_mae is not None and limits.mae_growth is not None:
-        allowed, detail = limits.mae_growth * baseline_mae, f"the baseline has {baseline_mae:.4g}"
+    if baseline_mae is not None:
+        growth = MAE_GROWTH if limits.mae_growth is None else limits.mae_growth
+        allowed, detail = growth * baseline_mae, f"the baseline has {baseline_mae:.4g}"
         checks.append(_at_most("MAE against the baseline", result.mae, allowed, scale, detail))
     return [check for found in checks for check in found]
 

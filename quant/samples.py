@@ -8,7 +8,7 @@ should give beside what it reads, as `image` and `reference`.
 import hashlib
 import os
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -80,6 +80,7 @@ class Patches:
 HELD_OUT_EVERY = 4
 """One sample of so many is kept from calibration, to look at what INT8 changes."""
 LARGEST = 1 + 1e-6
+LEAST_CONTRAST = 1 / MAX_DN
 FULL_SCALE_8 = 255
 REMEDY = "see docs/reference/any-network.md for how samples are given"
 
@@ -154,6 +155,21 @@ NO_REFERENCE = np.empty(0, np.float32)
 
 def _patches(pairs: Sequence[Pair]) -> Patches:
     return Patches([], Remade(lambda k: pairs[k], len(pairs)), Remade(lambda k: pairs[k][0], len(pairs)))
+
+
+CALIBRATED_ON = "calibration_samples"
+"""What an INT8 file calls the digests of the samples that it was calibrated on."""
+DIGEST_DIGITS = 16
+
+
+def digest_of(sample: np.ndarray) -> str:
+    """A sample (1, C, h, w), told from any other."""
+    return hashlib.sha256(np.ascontiguousarray(sample, np.float32).tobytes()).hexdigest()[:DIGEST_DIGITS]
+
+
+def without(samples: Patches, calibrated: Collection[str]) -> Patches:
+    """The samples whose digests are not among these."""
+    return _patches([pair for pair in samples.pairs if digest_of(pair[0]) not in calibrated])
 
 
 def split_samples(samples: Patches) -> tuple[Patches, Patches]:
@@ -279,8 +295,13 @@ class OwnSamples:
 
     @cached_property
     def all(self) -> Patches:
-        """Every sample."""
-        return read_samples(self.given, self.channels, self.fixed_px, self.multiple_px)
+        """Every sample with contrast: any network keeps what is constant, and a mean over such hides errors."""
+        found = read_samples(self.given, self.channels, self.fixed_px, self.multiple_px)
+        kept = [pair for pair in found.pairs if np.ptp(pair[0]) >= LEAST_CONTRAST]
+        if not kept:
+            name = str(self.given) if isinstance(self.given, Path) else IN_MEMORY
+            raise ImageError(name, expected="samples with contrast", got="constant ones", remedy="give real images")
+        return _patches(kept)
 
     @property
     def drawn(self) -> Patches:
@@ -305,7 +326,11 @@ class OwnSamples:
     @property
     def about(self) -> dict[str, str]:
         """What the file says of it."""
-        return {"calibration_data": self.given.name if isinstance(self.given, Path) else IN_MEMORY}
+        digests = " ".join(digest_of(image) for image in self.drawn.degraded)
+        return {
+            "calibration_data": self.given.name if isinstance(self.given, Path) else IN_MEMORY,
+            CALIBRATED_ON: digests,
+        }
 
 
 def samples_of(model: onnx.ModelProto, given: object) -> OwnSamples | None:

@@ -28,12 +28,16 @@ def diff(
     """
     from beers_deploy.differences import broken, change_rows, changes, parse_limit, read_document
     from beers_deploy.model.io.files import require_writable
+    from beers_deploy.profiles.errors import OptionError
     from beers_deploy.results import Table, print_rows
 
     require_writable(json, inputs=(before, after))
     limits = [parse_limit(text) for text in fail_on or ()]
     documents = read_document(before), read_document(after)
     found = changes(*documents)
+    if not found.both:
+        expected, remedy = "documents that share a figure", "give two results of one command"
+        raise OptionError(str(after), expected=expected, got="none in both", remedy=remedy)
     rows = change_rows(found.changed)
     if rows:
         print_rows(f"{before.name} -> {after.name}", rows)

@@ -14,7 +14,7 @@ from beers_deploy.profiles.sensor_file import BLIND, reference_for
 from beers_deploy.restoration.options import TILE_PX, Compression, Options, Runtime
 
 EXAMPLE = "restore raw.tif restored.tif"
-NETWORK_ONLY = ("network", "tile", "halo", "resume", "runtime", "threads", "scheduler", "cog", "stac")
+NETWORK_ONLY = ("network", "tile", "halo", "resume", "runtime", "threads", "scheduler", "cog", "stac", "any_result")
 """Options of which the traditional chain takes none."""
 
 
@@ -67,6 +67,10 @@ def restore(
     trust_index: Annotated[
         bool, typer.Option("--trust-index", help="Let a VRT or DIMAP name tiles outside its folder and at URLs.")
     ] = False,
+    again: Annotated[bool, typer.Option("--again", help="Restore an image that 'restore' has written.")] = False,
+    any_result: Annotated[
+        bool, typer.Option("--any-result", help="Write OUT even if it is clipped, constant or far from IN's mean.")
+    ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped or killed.")] = False,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
@@ -98,7 +102,7 @@ def restore(
     if method is Method.traditional:
         expected, remedy = "none with --method traditional", "leave it out"
         refuse(context, NETWORK_ONLY, expected=expected, got="one", remedy=remedy)
-        _by_the_chain(image, out, sensor, full_scale, compression, budget_bytes, trust_index, json)
+        _by_the_chain(image, out, sensor, full_scale, compression, budget_bytes, trust_index, again, json)
         return
     if stac is not None:
         if not cog:
@@ -131,6 +135,8 @@ def restore(
         trust_index,
         min(bits) if sensor else None,
         cog,
+        again,
+        any_result,
         {} if "" in paths else paths,
     )
     row = restore_file(image, out, options, say, (json, stac))
@@ -148,6 +154,7 @@ def _by_the_chain(
     compression: Compression,
     memory_bytes: int | None,
     trust_index: bool,
+    again: bool,
     json: Path | None,
 ) -> None:
     from beers_deploy.restoration.traditional import Request, restore_file_traditionally
@@ -157,7 +164,7 @@ def _by_the_chain(
         remedy = "name a profile ('beers-deploy profiles' lists them) or give your .toml file"
         raise OptionError("--sensor", expected="the sensor that acquired IN", got="none", remedy=remedy)
     degraded = load_sensor(sensor)
-    request = Request(degraded, reference_for(degraded), full_scale, compression, memory_bytes, trust_index)
+    request = Request(degraded, reference_for(degraded), full_scale, compression, memory_bytes, trust_index, again)
     row = restore_file_traditionally(image, out, request, (json,))
     print_rows(f"wrote {out}", [row])
     save(Table("restore", arguments(), (image,), (row,)), json)

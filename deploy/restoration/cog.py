@@ -18,6 +18,7 @@ from beers_deploy.restoration.gdal_source import ENVIRONMENT, LEAST_CACHE_BYTES,
 from beers_deploy.restoration.options import Compression
 from beers_deploy.restoration.output import padded_px
 from beers_deploy.restoration.radiometry import FullScale
+from beers_deploy.restoration.source import RESTORED_BY
 
 CODECS = {Compression.none: "NONE", Compression.zlib: "DEFLATE", Compression.zstd: "ZSTD", Compression.lzw: "LZW"}
 BLOCK_PX = 512
@@ -32,7 +33,7 @@ def what_was_done(networks: Sequence[onnx.ModelProto], digests: str, scale: Full
     """The run as an image's metadata: tool, networks in the order of the bands, their sensors and full scale."""
     said = [metadata(network) for network in networks]
     return {
-        "RESTORED_BY": f"beers-deploy {version('beers-deploy')}",
+        RESTORED_BY: f"beers-deploy {version('beers-deploy')}",
         "RESTORED_NETWORK_SHA256": digests,
         "RESTORED_NETWORK": ", ".join(each.get("variant", "not stated") for each in said),
         "RESTORED_SENSOR": ", ".join(each.get("sensor", "not stated") for each in said),

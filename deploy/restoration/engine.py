@@ -17,6 +17,7 @@ from beers_deploy.model.io.images import MAX_DN, remedy_outside
 from beers_deploy.profiles.errors import ImageError, ModelError
 from beers_deploy.quant.tiling.walk import Tiling
 from beers_deploy.quant.untrusted import times
+from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Plan, Span
 from beers_deploy.restoration.radiometry import require_room
 from beers_deploy.restoration.runtime import Infer
@@ -26,12 +27,15 @@ NAME = "image"
 """What messages call an image that came without a file."""
 
 
+Window = tuple[slice, slice, slice]
+"""Bands, rows and columns of an array."""
+
+
 class Tile(NamedTuple):
-    """The kept pixels of a tile, (bands, h, w) restored and as stored, how many are known, how many were clipped."""
+    """The kept pixels of a tile, (bands, h, w) restored and as stored, and what was seen of them."""
 
     pixels: np.ndarray
-    known: int
-    clipped: int
+    tally: Tally
 
 
 @dataclass(frozen=True)
@@ -47,22 +51,18 @@ class Strip:
     missing: np.ndarray | None
     above: bool = False
 
-    def kept(self, bands: slice, rows: Span, columns: Span) -> tuple[slice, slice, slice]:
+    def kept(self, bands: slice, rows: Span, columns: Span) -> Window:
         """Where in these arrays lies what is kept of a tile."""
         down = slice(rows.keep_start - self.top, rows.keep_stop - self.top)
         return bands, down, slice(columns.keep_start, columns.keep_stop)
 
 
 class RestoredRow(NamedTuple):
-    """A row of tiles: its `span` in the image, restored `pixels` (bands, rows, width), and how many are `known`.
-
-    `clipped` is how many of the image's pixels were above full scale.
-    """
+    """A row of tiles: its `span` in the image, restored `pixels` (bands, rows, width), and what was seen of them."""
 
     span: Span
     pixels: np.ndarray
-    known: int
-    clipped: int = 0
+    tally: Tally
 
 
 @dataclass(frozen=True)
@@ -102,24 +102,23 @@ class Restorer:
         bands = slice(group * self.tiling.channels_in, (group + 1) * self.tiling.channels_in)
         unknown = self._unknown(strip, bands, rows, columns)
         if unknown is not None and unknown[1].all():
-            return Tile(unknown[0], 0, 0)
+            return Tile(unknown[0], Tally())
         infer = self.others[group - 1] if self.others and group else self.infer
         window = restore_window(self._window(strip, bands, rows, columns), infer, self.full_scale)
         self._require_shape(window, rows, columns)
-        result = as_stored(self.raster, window[:, self._within(rows), self._within(columns)], self.full_scale)
-        clipped = self._above(strip, bands, rows, columns)
-        if unknown is None:
-            return Tile(result, result.size, clipped)
-        stored, missing = unknown
-        return Tile(np.where(missing, stored, result), int((~missing).sum()), clipped)
+        restored = window[:, self._within(rows), self._within(columns)]
+        result = as_stored(self.raster, restored, self.full_scale)
+        missing = np.zeros(result.shape, bool) if unknown is None else unknown[1]
+        tally = self._tally(strip, strip.kept(bands, rows, columns), restored, ~missing)
+        return Tile(result if unknown is None else np.where(missing, unknown[0], result), tally)
 
-    def _above(self, strip: Strip, bands: slice, rows: Span, columns: Span) -> int:
-        """How many known pixels of what is kept of a tile are above full scale."""
-        if not strip.above:
-            return 0
-        kept = strip.kept(bands, rows, columns)
-        above = strip.pixels[kept] > self.full_scale
-        return int((above if strip.missing is None else above & ~strip.missing[kept]).sum())
+    def _tally(
+        self, strip: Strip, kept: tuple[slice, slice, slice], restored: np.ndarray, known: np.ndarray
+    ) -> Tally:
+        """What is seen of a tile's kept pixels, and of their results where `known`."""
+        seen = None if strip.missing is None else ~strip.missing[kept]
+        stored = strip.pixels[kept].astype(np.float64) / self.full_scale
+        return Tally.of(stored, restored.astype(np.float64) / self.full_scale, seen, known)
 
     def _unknown(self, strip: Strip, bands: slice, rows: Span, columns: Span) -> tuple[np.ndarray, np.ndarray] | None:
         """What the kept pixels of a tile stay where they are missing, and where; of the restored shape, as stored.
@@ -132,7 +131,8 @@ class Restorer:
         stored, missing = strip.pixels[kept].astype(self.raster.out_dtype), strip.missing[kept]
         tiling, scale = self.tiling, int(self.tiling.scale)
         if tiling.channels_in != tiling.channels_out:
-            blank = np.nan if self.raster.nodata is None else self.raster.nodata
+            none = np.nan if stored.dtype.kind == "f" else 0
+            blank = none if self.raster.nodata is None else self.raster.nodata
             missing = np.repeat(missing.any(axis=0, keepdims=True), tiling.channels_out, axis=0)
             stored = np.full(missing.shape, blank, stored.dtype)
         if scale > 1:
@@ -180,7 +180,7 @@ def checked_strip(
     raster: Raster, top: int, pixels: np.ndarray, full_scale: float, name: str, clips: bool = False
 ) -> Strip:
     """Rows from `top` on, (bands, rows, width) as stored, and which of their pixels are missing."""
-    missing = raster.missing(pixels) if raster.may_miss else None
+    missing, pixels = raster.missing(pixels) if raster.may_miss else None, np.ma.getdata(pixels)
     missing = missing if missing is not None and missing.any() else None
     known = True if missing is None else ~missing
     # Where nothing is known, 0 is taken for both, which is inside.
@@ -291,25 +291,38 @@ def _joined(
 ) -> RestoredRow:
     bands, _, width_px = plan.out_shape
     shape = (bands, (row.keep_stop - row.keep_start) * plan.scale, width_px)
-    result, known, clipped = np.empty(shape, restorer.raster.out_dtype), 0, 0
+    result, tally = np.empty(shape, restorer.raster.out_dtype), Tally()
     count = plan.tiling.channels_out
     for (group, columns), tile in zip(_places(plan), tiles, strict=True):
         at = slice(columns.keep_start * plan.scale, columns.keep_stop * plan.scale)
         result[group * count : (group + 1) * count, :, at] = tile.pixels
-        known, clipped = known + tile.known, clipped + tile.clipped
+        tally += tile.tally
         tick()
-    return RestoredRow(row, result, known, clipped)
+    return RestoredRow(row, result, tally)
 
 
 def _places(plan: Plan) -> list[tuple[int, Span]]:
     return [(group, columns) for group in range(plan.groups) for columns in plan.columns]
 
 
-def restore_array(source: Source, plan: Plan, restorer: Restorer, at_once: int = 1) -> np.ndarray:
-    """Restore all rows of an image, `at_once` tiles at a time: the plan's `out_shape` of the raster's `out_dtype`."""
-    result = np.empty(plan.out_shape, restorer.raster.out_dtype)
+def restore_array(
+    source: Source, plan: Plan, restorer: Restorer, at_once: int = 1, look: Callable[[Tally], object] | None = None
+) -> np.ndarray:
+    """Restore all rows of an image: the plan's `out_shape` of the raster's `out_dtype`.
+
+    Args:
+        source: the image.
+        plan: its tiles.
+        restorer: its network.
+        at_once: tiles in work at a time.
+        look: is shown what was seen of all of it, and may refuse it.
+    """
+    result, tally = np.empty(plan.out_shape, restorer.raster.out_dtype), Tally()
     for row in restore_rows(source, plan, restorer, plan.rows, lambda: None, at_once):
         result[:, row.span.keep_start * plan.scale : row.span.keep_stop * plan.scale] = row.pixels
+        tally += row.tally
+    if look is not None:
+        look(tally)
     return result
 
 

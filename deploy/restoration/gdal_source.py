@@ -9,8 +9,9 @@ import logging
 import os
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import TracebackType
@@ -19,13 +20,19 @@ from typing import Any
 import numpy as np
 import tifffile
 
+from beers_deploy.model.io.tiff import require_small_offset
 from beers_deploy.profiles.errors import BeersError, ImageError, MissingExtraError
 from beers_deploy.restoration.index_files import dimap_bits, index_files, is_index
 from beers_deploy.restoration.source import (
     GDAL_DRIVERS,
+    RGB_BANDS,
+    Plane,
     Raster,
+    Source,
     Tag,
+    VeiledSource,
     carried_tags,
+    is_restored,
     require_numbers,
     require_size,
     usable_nodata,
@@ -53,7 +60,7 @@ def require_package(name: str, where: str, expected: str, instead: str = "") -> 
 
 
 @contextmanager
-def open_gdal(path: Path, trusted: bool = False) -> Iterator["GdalSource"]:
+def open_gdal(path: Path, trusted: bool = False) -> Iterator[Source]:
     """Open an image of a suffix in `GDAL_DRIVERS` for reading by rows.
 
     Args:
@@ -71,7 +78,14 @@ def open_gdal(path: Path, trusted: bool = False) -> Iterator["GdalSource"]:
             with rasterio.open(tiles[0]) as tile:
                 block_px = max(block_px, _block_px(tile))
     with dataset:
-        yield GdalSource(files, dataset, block_px, environment)
+        source = GdalSource(files, dataset, block_px, environment)
+        flags = {flag.name for flag in dataset.mask_flag_enums[0]}
+        if "alpha" in flags:
+            yield VeiledSource(source, "unassalpha")
+        elif "per_dataset" in flags:
+            yield VeiledSource(source, "mask", GdalMask(source))
+        else:
+            yield source
 
 
 def _block_px(dataset: Any) -> int:
@@ -119,6 +133,8 @@ def _log_in_any_bytes() -> Iterator[None]:
 class GdalSource:
     """An image that GDAL has opened; one thread reads at a time."""
 
+    veil: Plane | None = None
+
     def __init__(self, files: tuple[Path, ...], dataset: Any, block_px: int, environment: dict[str, Any]) -> None:
         self.files, self._path, self._dataset, self._environment = files, files[0], dataset, environment
         with _damage_in_a_sentence(self._path):
@@ -127,16 +143,37 @@ class GdalSource:
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored."""
+        return self._read(self._dataset.read, start, stop)
+
+    def read_mask(self, start: int, stop: int) -> np.ndarray:
+        """The same rows of the image's mask, (1, rows, width) uint8."""
+        return self._read(self._dataset.dataset_mask, start, stop)[None]
+
+    def _read(self, read: Callable[..., Any], start: int, stop: int) -> np.ndarray:
         rasterio: Any = import_module("rasterio")
         environment = self._environment | {"GDAL_CACHEMAX": self.held_bytes(stop - start)}
         with _damage_in_a_sentence(self._path, f"rows {start} to {stop - 1}"), rasterio.Env(**environment):
-            window = rasterio.windows.Window(0, start, self.raster.width_px, stop - start)
-            return np.asarray(self._dataset.read(window=window))
+            return np.asarray(read(window=rasterio.windows.Window(0, start, self.raster.width_px, stop - start)))
 
     def held_bytes(self, rows_px: int) -> int:
         """GDAL's cache: the blocks around the rows, so that none is decoded for two strips."""
         row_bytes = self.raster.bands * self.raster.width_px * self.raster.dtype.itemsize
         return int(max(LEAST_CACHE_BYTES, (rows_px + 2 * self._block_px) * row_bytes))
+
+
+@dataclass(frozen=True)
+class GdalMask:
+    """The mask of an image, as rows."""
+
+    source: GdalSource
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """Rows `start` to `stop` (excluded), (1, rows, width) uint8."""
+        return self.source.read_mask(start, stop)
+
+    def held_bytes(self, rows_px: int) -> int:  # noqa: ARG002
+        """Nothing beside GDAL's cache, which the image counts."""
+        return 0
 
 
 def _raster(path: Path, dataset: Any) -> Raster:
@@ -150,9 +187,18 @@ def _raster(path: Path, dataset: Any) -> Raster:
             raise ImageError(str(path), expected=f"bands of equal {kind}", got=got, remedy="split the bands")
     name, dtype = str(path), require_numbers(str(path), np.dtype(dataset.dtypes[0]))
     require_size(name, dataset.count, dataset.height, dataset.width)
+    colours = [each.name for each in dataset.colorinterp]
+    if "palette" in colours:
+        remedy = "convert it with 'gdal_translate -expand'"
+        raise ImageError(name, expected="pixels where more is brighter", got="a palette", remedy=remedy)
+    for offset, scale in zip(dataset.offsets, dataset.scales, strict=True):
+        require_small_offset(name, offset, scale)
     nodata = usable_nodata(name, dataset.nodatavals[0], dtype)
-    tags, bits = _tags(dataset, nodata), _bits(path, dataset)
-    return Raster(dataset.count, dataset.height, dataset.width, dtype, nodata, tags, bits)
+    about = nodata, _tags(dataset, nodata), _bits(path, dataset)
+    colour = colours[: len(RGB_BANDS)] == list(RGB_BANDS)
+    restored = is_restored(dataset.tags().get("TIFFTAG_SOFTWARE", ""), dataset.tags())
+    size = dataset.count, dataset.height, dataset.width
+    return Raster(*size, dtype, *about, colour=colour, restored=restored)
 
 
 def _bits(path: Path, dataset: Any) -> int | None:

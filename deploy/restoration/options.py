@@ -47,6 +47,8 @@ class Options:
         memory_bytes: budget of this process; None is what is free.
         resume: go on with a stopped run.
         scheduler: address of a Dask scheduler whose workers run the network; None runs it here.
+        again: whether an image may be one that was restored already.
+        any_result: whether a result is written that no restoration has.
         bands: networks of single bands by their names, each for its own sensor; empty where `model` is for all.
         cog: whether the output is a Cloud-Optimised GeoTIFF.
         sensor_bits: bits per pixel of the sensor, where the user named its profile.
@@ -66,6 +68,8 @@ class Options:
     trust_index: bool = False
     sensor_bits: int | None = None
     cog: bool = False
+    again: bool = False
+    any_result: bool = False
     bands: Mapping[str, Path] = field(default_factory=dict)
 
 

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import asdict, astuple, fields
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +23,13 @@ from filelock import BaseFileLock, FileLock, Timeout
 from isal import isal_zlib
 
 from beers_deploy.model.io.files import TIFF_SUFFIXES
+from beers_deploy.model.io.tiff import MASK
 from beers_deploy.profiles.errors import ImageError, MachineError, MissingExtraError, OptionError, sizes
 from beers_deploy.profiles.toml import read_json
 from beers_deploy.restoration.engine import RestoredRow
 from beers_deploy.restoration.options import Compression
-from beers_deploy.restoration.source import BIG_TIFF_SUFFIXES, Tag
+from beers_deploy.restoration.outcome import Tally
+from beers_deploy.restoration.source import BIG_TIFF_SUFFIXES, RESTORED, RGB_BANDS, Source, Tag
 
 
 def part_folder(out: Path) -> Path:
@@ -39,8 +42,7 @@ class Checkpoint:
 
     Attributes:
         rows: how many are finished.
-        known: how many of their pixels are not missing.
-        clipped: how many pixels of the image were above full scale.
+        tally: what was seen of them.
     """
 
     def __init__(
@@ -65,7 +67,7 @@ class Checkpoint:
         self.out, self.shape, self.dtype = out, shape, dtype
         self.folder = part_folder(out)
         self._job = dict(job)
-        self.rows, self.known, self.clipped = self._left() if resume else (0, 0, 0)
+        self.rows, self.tally = self._left() if resume else (0, Tally())
         with self.disk():
             if not self.rows:
                 self.remove()
@@ -84,8 +86,7 @@ class Checkpoint:
                     stream.write(np.ascontiguousarray(row.pixels[band]).data)
                 stream.flush()
                 os.fsync(stream.fileno())
-            self.rows, self.known = self.rows + row.pixels.shape[1], self.known + row.known
-            self.clipped += row.clipped
+            self.rows, self.tally = self.rows + row.pixels.shape[1], self.tally + row.tally
             self._write_journal()
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
@@ -96,7 +97,7 @@ class Checkpoint:
 
     def require_known(self, name: str) -> None:
         """Refuse an image, `name` in messages, that has no pixels with values."""
-        if not self.known:
+        if not self.tally.known:
             got, remedy = "NaN or nodata everywhere", "check that it is the right file"
             raise ImageError(name, expected="some pixels with values", got=got, remedy=remedy)
 
@@ -116,16 +117,17 @@ class Checkpoint:
             got = error.strerror or str(error)
             raise MachineError(str(self.out), expected="a disk to write to", got=got, remedy=remedy) from error
 
-    def _left(self) -> tuple[int, int, int]:
+    def _left(self) -> tuple[int, Tally]:
         path = self.folder / "journal.json"
         if not path.is_file():
-            return 0, 0, 0
+            return 0, Tally()
         with suppress(ValueError, KeyError, TypeError, OSError):
             journal: Any = read_json(path)
-            rows, known, clipped = int(journal["rows"]), int(journal["known"]), int(journal.get("clipped", 0))
-            sound = 0 <= rows <= self.shape[1] and 0 <= known <= math.prod(self.shape) and clipped >= 0
-            if journal["job"] == self._job and sound:
-                return rows, known, clipped
+            rows = int(journal["rows"])
+            tally = Tally(**{each.name: journal[each.name] for each in fields(Tally) if each.name in journal})
+            sound = 0 <= rows <= self.shape[1] and 0 <= tally.known <= math.prod(self.shape)
+            if journal["job"] == self._job and sound and min(astuple(tally)) >= 0:
+                return rows, tally
         expected = "the image, the model and the options of the run that was stopped"
         got, remedy = f"others, or a damaged {path}", "run it as before, or start afresh without `resume`"
         raise OptionError("resume", expected=expected, got=got, remedy=remedy)
@@ -133,7 +135,7 @@ class Checkpoint:
     def _write_journal(self) -> None:
         path, fresh = self.folder / "journal.json", self.folder / "journal.new"
         with fresh.open("w", encoding="utf-8") as stream:
-            json.dump({"job": self._job, "rows": self.rows, "known": self.known, "clipped": self.clipped}, stream)
+            json.dump({"job": self._job, "rows": self.rows, **asdict(self.tally)}, stream)
             stream.flush()
             os.fsync(stream.fileno())
         fresh.replace(path)
@@ -199,37 +201,38 @@ ToCog = Callable[[Path, Path], None]
 
 
 def write_output(
-    checkpoint: Checkpoint, tags: tuple[Tag, ...], compression: Compression, to_cog: ToCog | None = None
+    checkpoint: Checkpoint,
+    source: Source,
+    tags: tuple[Tag, ...],
+    compression: Compression,
+    to_cog: ToCog | None = None,
 ) -> None:
-    """Write the checkpoint's rows and an image's `tags` to the output, rename it into place, remove the checkpoint.
+    """Write the checkpoint's rows to the output, rename it into place, remove the checkpoint.
 
     Args:
         checkpoint: with every row.
+        source: the image, whose alpha or mask is written beside its bands as it is.
         tags: of the image.
         compression: of the TIFF; none where it is on its way to be cloud-optimised.
-        to_cog: None leaves the TIFF as it is.
+        to_cog: writes the TIFF again, cloud-optimised; None leaves it as it is.
     """
     fresh, bands = checkpoint.folder / PLAIN, checkpoint.shape[0]
-    plain_bytes = padded_px(checkpoint.shape, TILE_PX) * checkpoint.dtype.itemsize
-    by_zlib = compression is Compression.zlib
+    planes = bands + source.raster.has_alpha
+    plain_bytes = padded_px((planes, *checkpoint.shape[1:]), TILE_PX) * checkpoint.dtype.itemsize
     with checkpoint.disk():
-        tifffile.imwrite(
-            fresh,
-            _packed(checkpoint) if by_zlib else _tiles(checkpoint),
-            shape=checkpoint.shape if bands > 1 else checkpoint.shape[1:],
-            dtype=checkpoint.dtype,
-            tile=(TILE_PX, TILE_PX),
-            compression=compression.codec,
-            predictor=HORIZONTAL if by_zlib and checkpoint.dtype.kind == "u" else None,
-            maxworkers=os.cpu_count(),  # its own choice is half of them
-            bigtiff=plain_bytes > PLAIN_LIMIT_BYTES,
-            photometric="minisblack",
-            planarconfig="separate" if bands > 1 else None,
-            software="beers-deploy",
-            metadata=None,
-            extratags=tags,
-            buffersize=BUFFER_BYTES,
-        )
+        with tifffile.TiffWriter(fresh, bigtiff=plain_bytes > PLAIN_LIMIT_BYTES) as file:
+            file.write(
+                shape=(planes, *checkpoint.shape[1:]) if planes > 1 else checkpoint.shape[1:],
+                photometric="rgb" if source.raster.colour and bands == len(RGB_BANDS) else "minisblack",
+                planarconfig="separate" if planes > 1 else None,
+                extrasamples=(source.raster.veil,) if source.raster.has_alpha else None,
+                software=RESTORED,
+                extratags=tags,
+                **_squares_of(_strips(checkpoint, source), checkpoint.dtype, compression),
+            )
+            if source.raster.veil == "mask":
+                mask = _squares_of(_veil(checkpoint, source), np.dtype(bool), compression)
+                file.write(shape=checkpoint.shape[1:], photometric="mask", subfiletype=MASK, **mask)
         if to_cog is not None:
             plain, fresh = fresh, checkpoint.folder / COG
             to_cog(plain, fresh)
@@ -240,10 +243,25 @@ def write_output(
         checkpoint.remove()
 
 
-def _packed(checkpoint: Checkpoint) -> Iterator[bytes]:
+def _squares_of(strips: Iterator[np.ndarray], dtype: np.dtype[Any], compression: Compression) -> dict[str, Any]:
+    """What tifffile is told of a page's pixels, given as rows of squares."""
+    by_zlib = compression is Compression.zlib and dtype.kind != "b"  # whose bits tifffile packs
+    return {
+        "data": _packed(strips) if by_zlib else _tiles(strips),
+        "dtype": dtype,
+        "tile": (TILE_PX, TILE_PX),
+        "compression": compression.codec,
+        "predictor": HORIZONTAL if by_zlib and dtype.kind == "u" else None,
+        "maxworkers": os.cpu_count(),  # its own choice is half of them
+        "metadata": None,
+        "buffersize": BUFFER_BYTES,
+    }
+
+
+def _packed(strips: Iterator[np.ndarray]) -> Iterator[bytes]:
     """The squares of `_tiles` as zlib's streams, those of a strip packed side by side."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for strip in _strips(checkpoint):
+        for strip in strips:
             yield from pool.map(_pack, _squares(strip))
 
 
@@ -257,9 +275,9 @@ def _pack(square: np.ndarray) -> bytes:
     return isal_zlib.compress(square.tobytes(), FAST_LEVEL)
 
 
-def _tiles(checkpoint: Checkpoint) -> Iterator[np.ndarray]:
+def _tiles(strips: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
     """Squares in the order of the file, zeros beyond the image."""
-    for strip in _strips(checkpoint):
+    for strip in strips:
         yield from _squares(strip)
 
 
@@ -267,15 +285,36 @@ def _squares(strip: np.ndarray) -> list[np.ndarray]:
     return np.hsplit(strip, strip.shape[1] // TILE_PX)
 
 
-def _strips(checkpoint: Checkpoint) -> Iterator[np.ndarray]:
-    """Rows of squares, (TILE_PX, whole squares) of every band."""
-    bands, height, width = checkpoint.shape
-    for band in range(bands):
-        for top in range(0, height, TILE_PX):
-            rows = checkpoint.read(band, top, min(top + TILE_PX, height))
-            strip = np.zeros((TILE_PX, _padded(width)), checkpoint.dtype)
-            strip[: len(rows), :width] = rows
-            yield strip
+def _strips(checkpoint: Checkpoint, source: Source) -> Iterator[np.ndarray]:
+    """Rows of squares, (TILE_PX, whole squares) of every band, and of the image's alpha."""
+    for band in range(checkpoint.shape[0]):
+        for top, bottom in _heights(checkpoint):
+            yield _whole_squares(checkpoint.read(band, top, bottom))
+    if source.raster.has_alpha:
+        yield from _veil(checkpoint, source)
+
+
+def _veil(checkpoint: Checkpoint, source: Source) -> Iterator[np.ndarray]:
+    """Rows of squares of the image's alpha as stored, or of its mask as bool, enlarged with the image."""
+    scale, read = checkpoint.shape[2] // source.raster.width_px, source.veil
+    if read is None:
+        raise ValueError("no veil")
+    for top, bottom in _heights(checkpoint):
+        plane = read(top // scale, -(-bottom // scale))
+        plane = plane.repeat(scale, axis=0)[top % scale :][: bottom - top].repeat(scale, axis=1)
+        yield _whole_squares(plane != 0 if source.raster.veil == "mask" else plane.astype(checkpoint.dtype))
+
+
+def _heights(checkpoint: Checkpoint) -> Iterator[tuple[int, int]]:
+    """First row and the one behind the last of each strip."""
+    for top in range(0, checkpoint.shape[1], TILE_PX):
+        yield top, min(top + TILE_PX, checkpoint.shape[1])
+
+
+def _whole_squares(rows: np.ndarray) -> np.ndarray:
+    strip = np.zeros((TILE_PX, _padded(rows.shape[1])), rows.dtype)
+    strip[: len(rows), : rows.shape[1]] = rows
+    return strip
 
 
 def _padded(size_px: int, tile_px: int = TILE_PX) -> int:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beers_deploy.model.io.images import MAX_DN, settled_scale
+from beers_deploy.model.io.images import MAX_DN, Extent, settled_scale
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.restoration.source import Raster
 
@@ -34,27 +34,27 @@ class FullScale:
 
 
 def full_scale_of(
-    name: str, raster: Raster, largest: Iterable[float], asked: float | None = None, bits: int | None = None
+    name: str, raster: Raster, extents: Iterable[Extent], asked: float | None = None, bits: int | None = None
 ) -> FullScale:
     """The full scale of an image.
 
     Args:
         name: of the image, for messages.
         raster: what its file states.
-        largest: as for `model.io.images.settled_scale`, drawn for floats only.
+        extents: as for `model.io.images.settled_scale`, drawn for floats only.
         asked: by the user.
         bits: of the sensor, where the user names its profile.
     """
     if asked is not None:
-        settled_scale(name, raster.dtype, largest, asked)
+        settled_scale(name, raster.dtype, extents, asked)
         require_room(raster, asked)
         return FullScale(asked, "asked for")
     if raster.bits is not None:
         return FullScale(2**raster.bits - 1, f"{raster.bits} bits, as the file states")
     if bits is None or (raster.dtype.kind != "f" and 2**bits - 1 > np.iinfo(raster.dtype).max):
-        return FullScale(settled_scale(name, raster.dtype, largest), f"assumed: {MAX_DN.bit_length()} bits", True)
+        return FullScale(settled_scale(name, raster.dtype, extents), f"assumed: {MAX_DN.bit_length()} bits", True)
     usual = 2**bits - 1
-    value = settled_scale(name, raster.dtype, largest, usual=usual) if raster.dtype.kind == "f" else usual
+    value = settled_scale(name, raster.dtype, extents, usual=usual) if raster.dtype.kind == "f" else usual
     return FullScale(value, f"{bits} bits, of the sensor")
 
 

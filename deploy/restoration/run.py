@@ -37,7 +37,7 @@ from beers_deploy.restoration.output import Checkpoint, only_run, require_codec,
 from beers_deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
 from beers_deploy.restoration.runtime import Infer, infer_on, open_runtime, pack, tiles_at_once
-from beers_deploy.restoration.source import Source, fingerprint, open_source
+from beers_deploy.restoration.source import Source, fingerprint, open_source, require_raw
 
 RUNS_UNTIL_STEADY = 2
 """Of each tile in work at a time: then a runtime takes no more memory."""
@@ -75,6 +75,7 @@ def _restore(image: Path, out: Path, options: Options, log: Log, beside: Sequenc
     with open_source(image, options.trust_index) as source, open_cluster(options.scheduler) as cluster:
         require_writable(out, *beside, inputs=source.files)
         raster = source.raster
+        require_raw(str(image), raster.restored, options.again)
         paths = in_order(options.bands, raster) if options.bands else [options.model]
         networks = [load_onnx(path) for path in paths]
         require_alike(networks)
@@ -92,20 +93,20 @@ def _restore(image: Path, out: Path, options: Options, log: Log, beside: Sequenc
         checkpoint = Checkpoint(out, plan.out_shape, raster.out_dtype, job, options.resume, cog_bytes)
         done_rows = checkpoint.rows // plan.scale
         _finish_rows(checkpoint, source, plan, restorer, at_once, options, log)
-    with held_back():  # a stop now would save nothing
-        tags = enlarged_tags(raster.tags, plan.scale)
-        if options.cog:
-            about = what_was_done(networks, digests, scale)
-            to_cog = partial(write_cog, compression=options.compression, about=about)
-            write_output(checkpoint, tags, Compression.none, to_cog)
-        else:
-            write_output(checkpoint, tags, options.compression)
-    time_s = time.perf_counter() - started
-    if checkpoint.clipped:
-        share = checkpoint.clipped / prod(raster.shape)
+        with held_back():  # a stop now would save nothing
+            tags = enlarged_tags(raster.tags, plan.scale)
+            if options.cog:
+                about = what_was_done(networks, digests, scale)
+                to_cog = partial(write_cog, compression=options.compression, about=about)
+                write_output(checkpoint, source, tags, Compression.none, to_cog)
+            else:
+                write_output(checkpoint, source, tags, options.compression)
+    time_s, tally = time.perf_counter() - started, checkpoint.tally
+    if tally.clipped:
+        share = tally.clipped / prod(raster.shape)
         doubt = f": {share:.0%} of the image; is that its full scale?" if share > MANY else ""
-        log(f"{checkpoint.clipped} pixels above full scale, {scale.words}, were clipped to it{doubt}")
-    figures["clipped pixels"] = measured(checkpoint.clipped, "1", "pixels of the image above its full scale")
+        log(f"{tally.clipped} pixels above full scale, {scale.words}, were clipped to it{doubt}")
+    figures |= tally.figures
     return run_row(image.name, plan, done_rows, time_s, runtime, options, figures, scale)
 
 
@@ -129,8 +130,8 @@ def _opened(
 
 def scale_of(source: Source, plan: Plan, options: Options, name: str) -> FullScale:
     """The pixel value that is full scale; float images are read to their first bright row of tiles to know it."""
-    largest = (source.raster.largest(source.read(row.keep_start, row.keep_stop)) for row in plan.rows)
-    return full_scale_of(name, source.raster, largest, options.full_scale, options.sensor_bits)
+    extents = (source.raster.extent(source.read(row.keep_start, row.keep_stop)) for row in plan.rows)
+    return full_scale_of(name, source.raster, extents, options.full_scale, options.sensor_bits)
 
 
 def _job(image: Path, source: Source, model: str, plan: Plan, runtime: str, full_scale: float) -> dict[str, object]:
@@ -167,6 +168,10 @@ def _finish_rows(
             with closing(restore_rows(source, plan, restorer, rows, tick, at_once)) as finished:
                 _write_behind(finished, checkpoint)
         checkpoint.require_known(restorer.name)
+        if not options.any_result:
+            checkpoint.tally.require(restorer.name)
+    for doubt in checkpoint.tally.doubts:
+        log(f"look at the result: {doubt}")
 
 
 @contextmanager

@@ -5,23 +5,36 @@ whatever else, and arrays, lie in memory.
 """
 
 import hashlib
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import tifffile
 
 from beers_deploy.model.io.files import TIFF_SUFFIXES
-from beers_deploy.model.io.images import damage_in_a_sentence, read_pixels, require_image_file
-from beers_deploy.model.io.tiff import check_page, open_tiff
+from beers_deploy.model.io.images import (
+    Extent,
+    damage_in_a_sentence,
+    extent_of,
+    read_alpha,
+    read_pixels,
+    require_image_file,
+)
+from beers_deploy.model.io.tiff import check_page, image_pages, open_tiff
 from beers_deploy.profiles.errors import ImageError
+from beers_deploy.quant.untrusted import times
 
 NODATA_TAG = 42113
 CARRIED_TAGS = (33550, 33922, 34264, 34735, 34736, 34737, 42112, NODATA_TAG, 50844)
 """GeoTIFF's scale, tie points, transformation and keys; GDAL's metadata and nodata; rational polynomials."""
+
+RESTORED, RESTORED_BY = "beers-deploy restore", "RESTORED_BY"
+"""What a restored image names as its software, and the item of its metadata where it is cloud-optimised."""
+RGB, RGB_BANDS = 2, ("red", "green", "blue")
+"""TIFF's photometric interpretation of bands of these colours."""
 
 SIDE_PX, BANDS = 1 << 22, 1 << 12
 """An image has a plan of its tiles before any pixel is read: a header alone must not make that large."""
@@ -30,9 +43,19 @@ Tag = tuple[int, int, int, Any, bool]
 """Code, type, count, value, once: what tifffile takes as an extra tag."""
 
 
+Veil = Literal["", "mask", "unassalpha", "assocalpha"]
+"""What hides pixels beside the bands: nothing, a mask, or alpha, which a colour may have been multiplied by."""
+ALPHAS: dict[int, Veil] = {1: "assocalpha", 2: "unassalpha"}
+"""By TIFF's ExtraSamples."""
+
+
 @dataclass(frozen=True)
 class Raster:
-    """An image as stored: `bands` planes of (height_px, width_px), of so many `bits` where the file says it."""
+    """An image as stored: `bands` planes of (height_px, width_px), of so many `bits` where the file says it.
+
+    `veil` is what hides pixels besides NaN and the nodata value: where its plane is 0 they are missing. `colour` says
+    that the bands are red, green and blue, `restored` that `restore` has written them.
+    """
 
     bands: int
     height_px: int
@@ -41,6 +64,9 @@ class Raster:
     nodata: float | None = None
     tags: tuple[Tag, ...] = ()
     bits: int | None = None
+    veil: Veil = ""
+    colour: bool = False
+    restored: bool = False
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -55,38 +81,66 @@ class Raster:
         return np.dtype(np.uint8 if self.dtype == np.uint8 else np.uint16)
 
     def missing(self, pixels: np.ndarray) -> np.ndarray:
-        """Where stored pixels hold no measurement: NaN or the nodata value; bool of the same shape."""
-        flags = np.isnan(pixels) if self.dtype.kind == "f" else np.zeros(pixels.shape, bool)
+        """Where stored pixels hold no measurement: NaN, the nodata value, or masked; bool of the same shape."""
+        flags, held = np.ma.getmaskarray(pixels).copy(), np.ma.getdata(pixels)
+        if self.dtype.kind == "f":
+            flags |= np.isnan(held)
         if self.nodata is not None:
-            flags |= pixels == pixels.dtype.type(self.nodata)
+            flags |= held == held.dtype.type(self.nodata)
         return flags
 
-    def largest(self, pixels: np.ndarray) -> float:
-        """The largest size of a known pixel among these, 0 where none is known."""
-        known = ~self.missing(pixels)
-        low, high = (float(extreme(pixels, where=known, initial=0)) for extreme in (np.min, np.max))
-        return max(-low, high)
+    def extent(self, pixels: np.ndarray) -> Extent:
+        """The extent of the known ones among stored pixels."""
+        return extent_of(np.ma.getdata(pixels), ~self.missing(pixels))
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether alpha is what hides pixels."""
+        return self.veil not in ("", "mask")
 
     @property
     def may_miss(self) -> bool:
         """Whether any pixel could be missing at all."""
-        return self.dtype.kind == "f" or self.nodata is not None
+        return self.dtype.kind == "f" or self.nodata is not None or bool(self.veil)
 
     def fill_margin_px(self, radius_px: int) -> int:
         """How far around a window pixels are read that missing ones of it may be filled from."""
         return radius_px if self.may_miss else 0
 
 
-def page_raster(path: str, page: tifffile.TiffPage) -> Raster:
-    """What a TIFF page says of its image, before any pixel is read."""
+def raster_of(path: str, pages: Sequence[tifffile.TiffPage]) -> Raster:
+    """What the pages of an image say of it, before any pixel is read."""
+    page = pages[0]
     planes, _, height_px, width_px, samples = page.shaped
-    require_size(path, planes * samples, height_px, width_px)
+    bands = len(pages) * planes * samples
+    require_size(path, bands, height_px, width_px)
     dtype = require_numbers(path, page.dtype)
     nodata = _nodata(path, page, dtype)
     tags = tuple(tag for tag in carried_tags(page) if tag[0] != NODATA_TAG or nodata is not None)
     # A container of whole bytes says nothing of the sensor; packed bits were counted by somebody.
     bits = page.bitspersample if dtype.kind == "u" and page.bitspersample < 8 * dtype.itemsize else None
-    return Raster(planes * samples, height_px, width_px, dtype, nodata, tags, bits)
+    about = bits, _alpha(path, page), page.photometric == RGB, is_restored(page.software, tags)
+    return Raster(bands, height_px, width_px, dtype, nodata, tags, *about)
+
+
+def is_restored(software: str, said: object) -> bool:
+    """Whether an image was written by `restore`, by the software that it names or by its metadata."""
+    return software.startswith(RESTORED) or RESTORED_BY in str(said)
+
+
+def require_raw(name: str, restored: bool, again: bool) -> None:
+    """Refuse to restore twice what is `restored`: the second time sharpens what is sharp."""
+    if restored and not again:
+        remedy = "give the raw one, or restore it once more with `again`"
+        raise ImageError(name, expected="a raw image", got="one that 'restore' has written", remedy=remedy)
+
+
+def _alpha(path: str, page: tifffile.TiffPage) -> Veil:
+    """The kind of alpha that the last sample of a page is, if any."""
+    alphas = [ALPHAS.get(int(code), "") for code in page.extrasamples]
+    if any(alphas[:-1]):
+        raise ImageError(path, expected="alpha as the last band", got="one before others", remedy="move it there")
+    return alphas[-1] if alphas else ""
 
 
 def carried_tags(page: tifffile.TiffPage) -> tuple[Tag, ...]:
@@ -145,22 +199,70 @@ DIGEST_BYTES = 1 << 16
 """Of each end of a file."""
 
 
+Plane = Callable[[int, int], np.ndarray]
+"""Gives rows `start` to `stop` (excluded) of one plane, (rows, width)."""
+
+
 class Source(Protocol):
     """An image that gives its rows: a `raster` of facts, and pixels as they are asked for.
 
     Attributes:
         raster: the facts.
         files: that it is read from: its own, and the tiles that an index names; none for an array.
+        veil: the plane of its mask or alpha, 0 where pixels are missing; None without one.
     """
 
     raster: Raster
     files: tuple[Path, ...]
+    veil: Plane | None
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored."""
+        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored; masked where veiled."""
 
     def held_bytes(self, rows_px: int) -> int:
         """Memory that reading so many rows at a time takes, besides the rows themselves."""
+
+
+class Rows(Protocol):
+    """What gives rows (bands, rows, width) of a mask."""
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """Rows `start` to `stop` (excluded)."""
+
+    def held_bytes(self, rows_px: int) -> int:
+        """Memory that reading so many rows at a time takes."""
+
+
+class VeiledSource:
+    """An image whose pixels are missing where a plane beside its bands is 0."""
+
+    def __init__(self, source: Source, kind: Veil, mask: "Rows | None" = None, files: tuple[Path, ...] = ()) -> None:
+        """Of a source whose last band is its alpha, or of one with the page of a mask.
+
+        Args:
+            source: the image.
+            kind: of the veil.
+            mask: rows of its mask.
+            files: that the mask lies in, where they are others.
+        """
+        self._source, self._mask, self.files = source, mask, (*source.files, *files)
+        bands = source.raster.bands - (mask is None)
+        self.raster = replace(source.raster, bands=bands, veil=kind)
+        self.veil: Plane | None = self._rows_of_veil
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """Rows `start` to `stop` (excluded) of every band, masked where the veil is 0."""
+        pixels = self._source.read(start, stop)
+        hidden = (pixels[-1] if self._mask is None else self._mask.read(start, stop)[0]) == 0
+        pixels = pixels[: self.raster.bands]
+        return np.asanyarray(np.ma.array(pixels, mask=np.broadcast_to(hidden, pixels.shape)))
+
+    def held_bytes(self, rows_px: int) -> int:
+        """As the image's own, and the mask's."""
+        return self._source.held_bytes(rows_px) + (self._mask.held_bytes(rows_px) if self._mask else 0)
+
+    def _rows_of_veil(self, start: int, stop: int) -> np.ndarray:
+        return self._source.read(start, stop)[-1] if self._mask is None else self._mask.read(start, stop)[0]
 
 
 def fingerprint(files: Iterable[Path]) -> tuple[int, str]:
@@ -178,7 +280,7 @@ def fingerprint(files: Iterable[Path]) -> tuple[int, str]:
 
 @contextmanager
 def open_source(path: Path, trusted: bool = False) -> Iterator[Source]:
-    """Open an image for reading by rows: a TIFF page as a stream, PNG and JPEG whole, others by windows of GDAL.
+    """Open an image for reading by rows: pages of a TIFF as streams, PNG and JPEG whole, others by windows of GDAL.
 
     Args:
         path: of the file, or of the index of its tiles.
@@ -186,44 +288,76 @@ def open_source(path: Path, trusted: bool = False) -> Iterator[Source]:
     """
     require_image_file(path)
     suffix = path.suffix.lower()
-    if suffix in GDAL_DRIVERS:
-        from beers_deploy.restoration.gdal_source import open_gdal  # of an optional package
+    with ExitStack() as stack:
+        if suffix in GDAL_DRIVERS:
+            from beers_deploy.restoration.gdal_source import open_gdal  # of an optional package
 
-        with open_gdal(path, trusted) as source:
-            yield source
-    elif suffix in TIFF_SUFFIXES | BIG_TIFF_SUFFIXES:
-        with open_page(path) as source:
-            yield source
-    else:
-        yield whole_source(path)
+            source = stack.enter_context(open_gdal(path, trusted))
+        elif suffix in TIFF_SUFFIXES | BIG_TIFF_SUFFIXES:
+            source = stack.enter_context(open_pages(path))
+        else:
+            source = whole_source(path)
+        beside = path.with_name(f"{path.name}.msk")
+        yield stack.enter_context(_masked(source, beside)) if beside.is_file() else source
 
 
 @contextmanager
-def open_page(path: Path) -> Iterator[Source]:
-    """A TIFF of one page as a stream, of several whole."""
+def open_pages(path: Path) -> Iterator[Source]:
+    """A TIFF's bands, in one page or in a page each, and its mask or alpha."""
     with damage_in_a_sentence(path):
         file = open_tiff(path)
     with file:
         with damage_in_a_sentence(path):
-            series = file.series[0]
-            page = series.keyframe
-            one_page = page.shaped[1] == 1 and page.size == series.size
-            check_page(path, page)
-            source = TiffSource(path, page) if one_page else whole_source(path)
+            pages, mask = image_pages(path, file)
+            for page in [*pages, *([mask] if mask else [])]:
+                check_page(path, page)
+            source: Source = TiffSource(path, pages)
+            alpha = source.raster.veil
+            if alpha:
+                source = VeiledSource(source, alpha)
+            if mask:
+                source = _with_mask(source, PageRows(path, mask), ())
         yield source
 
 
-def whole_source(path: Path) -> "ArraySource":
-    """An image read whole: PNG, JPEG, and TIFFs of several pages."""
-    pixels = read_pixels(path)
+@contextmanager
+def _masked(source: Source, path: Path) -> Iterator[Source]:
+    """An image with the mask of a file beside it, as GDAL writes one (IMAGE.msk)."""
+    with damage_in_a_sentence(path):
+        file = open_tiff(path)
+    with file:
+        with damage_in_a_sentence(path):
+            page = file.pages.first
+            check_page(path, page)
+            source = _with_mask(source, PageRows(path, page), (path,))
+        yield source
+
+
+def _with_mask(source: Source, mask: "PageRows", files: tuple[Path, ...]) -> Source:
+    raster, name = source.raster, str(mask.path)
+    if mask.shape != (1, raster.height_px, raster.width_px) or raster.veil:
+        got = "alpha or another mask beside it" if raster.veil else f"one of {times(mask.shape)}"
+        raise ImageError(name, expected=f"one mask of {times(raster.shape[1:])}", got=got, remedy="keep one of them")
+    return VeiledSource(source, "mask", mask, files)
+
+
+def whole_source(path: Path) -> Source:
+    """An image read whole: PNG or JPEG."""
+    pixels, alpha = read_pixels(path), read_alpha(path)
     dtype = require_numbers(str(path), pixels.dtype)
     bands = pixels[None] if pixels.ndim == 2 else np.moveaxis(pixels, 2, 0)
-    count, height_px, width_px = bands.shape
-    return ArraySource(bands, Raster(count, height_px, width_px, dtype), (path,))
+    planes = bands if alpha is None else np.concatenate([bands, alpha[None]])
+    count, height_px, width_px = planes.shape
+    source = ArraySource(
+        planes, Raster(count, height_px, width_px, dtype, colour=len(bands) == len(RGB_BANDS)), (path,)
+    )
+    return source if alpha is None else VeiledSource(source, "unassalpha")
 
 
 class ArraySource:
     """An image in memory: `pixels` (bands, height, width), of which rows are views."""
+
+    veil: Plane | None = None
 
     def __init__(self, pixels: np.ndarray, raster: Raster, files: tuple[Path, ...] = ()) -> None:
         self._pixels, self.raster, self.files = pixels, raster, files
@@ -238,13 +372,38 @@ class ArraySource:
 
 
 class TiffSource:
-    """One page of a TIFF, plain or BigTIFF, in strips or tiles, samples interleaved or in planes."""
+    """The bands of a TIFF, plain or BigTIFF, in one page or in a page each."""
+
+    veil: Plane | None = None
+
+    def __init__(self, path: Path, pages: Sequence[tifffile.TiffPage]) -> None:
+        self.files: tuple[Path, ...] = (path,)
+        self.raster = raster_of(str(path), pages)
+        self._pages = [PageRows(path, page) for page in pages]
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored."""
+        bands = [page.read(start, stop) for page in self._pages]
+        return bands[0] if len(bands) == 1 else np.concatenate(bands)
+
+    def held_bytes(self, rows_px: int) -> int:
+        """What each of the pages holds."""
+        return sum(page.held_bytes(rows_px) for page in self._pages)
+
+
+class PageRows:
+    """The rows of one page of a TIFF, in strips or tiles, samples interleaved or in planes.
+
+    Attributes:
+        path: of the file.
+        shape: bands, height and width.
+    """
 
     def __init__(self, path: Path, page: tifffile.TiffPage) -> None:
-        self._path, self._page = path, page
-        self.files: tuple[Path, ...] = (path,)
-        self.raster = page_raster(str(path), page)
+        self.path, self._page = path, page
         self._planes, _, height_px, width_px, self._samples = page.shaped
+        self.shape = self._planes * self._samples, height_px, width_px
+        self._dtype = np.dtype(page.dtype)
         self._segment_px = min(page.tilelength if page.is_tiled else page.rowsperstrip, height_px)
         self._down = -(-height_px // self._segment_px)
         self._across = -(-width_px // page.tilewidth) if page.is_tiled else 1
@@ -254,7 +413,7 @@ class TiffSource:
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored."""
-        with damage_in_a_sentence(self._path, f"rows {start} to {stop - 1}"):
+        with damage_in_a_sentence(self.path, f"rows {start} to {stop - 1}"):
             return self._read_flat(start, stop) if self._flat else self._read_segments(start, stop)
 
     def held_bytes(self, rows_px: int) -> int:
@@ -262,25 +421,25 @@ class TiffSource:
         if self._flat:
             return 0
         covered = min(rows_px + 2 * self._segment_px, self._down * self._segment_px)
-        row_bytes = self.raster.bands * self.raster.width_px * self.raster.dtype.itemsize
+        row_bytes = self.shape[0] * self.shape[2] * self._dtype.itemsize
         return (covered + 2 * self._segment_px) * row_bytes
 
     def _read_flat(self, start: int, stop: int) -> np.ndarray:
-        width, samples, rows = self.raster.width_px, self._samples, stop - start
-        kind = self.raster.dtype.newbyteorder(self._page.parent.byteorder)
-        out = np.empty((self._planes, samples, rows, width), self.raster.dtype)
+        (_, height, width), samples, rows = self.shape, self._samples, stop - start
+        kind = self._dtype.newbyteorder(self._page.parent.byteorder)
+        out = np.empty((self._planes, samples, rows, width), self._dtype)
         for plane in range(self._planes):
-            first = (plane * self.raster.height_px + start) * width * samples
+            first = (plane * height + start) * width * samples
             offset = self._page.dataoffsets[0] + first * kind.itemsize
-            pixels = np.fromfile(self._path, kind, rows * width * samples, offset=offset)
+            pixels = np.fromfile(self.path, kind, rows * width * samples, offset=offset)
             out[plane] = np.moveaxis(pixels.reshape(rows, width, samples), 2, 0)
-        return out.reshape(self.raster.bands, rows, width)
+        return out.reshape(-1, rows, width)
 
     def _read_segments(self, start: int, stop: int) -> np.ndarray:
         size = self._segment_px
         first, last = start // size, -(-stop // size)
         self._held = {row: pixels for row, pixels in self._held.items() if first <= row < last}
-        out = np.empty((self.raster.bands, stop - start, self.raster.width_px), self.raster.dtype)
+        out = np.empty((self.shape[0], stop - start, self.shape[2]), self._dtype)
         for row in range(first, last):
             pixels = self._held[row] = self._held[row] if row in self._held else self._decode(row)
             top = row * size
@@ -290,14 +449,14 @@ class TiffSource:
 
     def _decode(self, row: int) -> np.ndarray:
         """The strips or tiles at one height, (bands, segment rows, width)."""
-        page, raster = self._page, self.raster
-        block = np.empty((self._planes, self._samples, self._segment_px, raster.width_px), raster.dtype)
+        page, (bands, _, width) = self._page, self.shape
+        block = np.empty((self._planes, self._samples, self._segment_px, width), self._dtype)
         wanted = [(p * self._down + row) * self._across + c for p in range(self._planes) for c in range(self._across)]
         offsets, counts = [page.dataoffsets[i] for i in wanted], [page.databytecounts[i] for i in wanted]
         jpeg = {"jpegtables": page.jpegtables, "jpegheader": page.jpegheader}
         for data, index in page.parent.filehandle.read_segments(offsets, counts, wanted):
             pixels, (plane, _, _, left, _), (_, rows, columns, _) = page.decode(data, index, **jpeg)
-            rows, columns = min(rows, self._segment_px), min(columns, raster.width_px - left)
+            rows, columns = min(rows, self._segment_px), min(columns, width - left)
             target = block[plane, :, :rows, left : left + columns]
             target[:] = page.nodata if pixels is None else np.moveaxis(pixels[0, :rows, :columns], 2, 0)
-        return block.reshape(raster.bands, self._segment_px, raster.width_px)
+        return block.reshape(bands, self._segment_px, width)

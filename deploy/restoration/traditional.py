@@ -24,10 +24,11 @@ from beers_deploy.profiles.figures import Row, measured
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.engine import RestoredRow, as_stored, checked_strip
 from beers_deploy.restoration.options import Compression
+from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.output import Checkpoint, only_run, require_codec, require_tiff_name, write_output
 from beers_deploy.restoration.plan import Span, check_memory
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
-from beers_deploy.restoration.source import Raster, Source, fingerprint, open_source
+from beers_deploy.restoration.source import Raster, Source, fingerprint, open_source, require_raw
 
 STRIP_PX = 128
 """Rows read at a time."""
@@ -48,6 +49,7 @@ class Request:
         compression: of the output.
         memory_bytes: budget of the process; None is what is free.
         trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
+        again: whether the image may be one that was restored already.
     """
 
     sensor: Sensor
@@ -56,6 +58,7 @@ class Request:
     compression: Compression = Compression.zlib
     memory_bytes: int | None = None
     trust_index: bool = False
+    again: bool = False
 
     def chain(self) -> Chain:
         """The chain from the sensor to the reference, both in the sensor's digital numbers."""
@@ -77,19 +80,20 @@ def _restore(image: Path, out: Path, request: Request, beside: Sequence[Path | N
     with open_source(image, request.trust_index) as source:
         require_writable(out, *beside, inputs=source.files)
         raster = source.raster
+        require_raw(str(image), raster.restored, request.again)
         if raster.bands > 1:
             remedy = "extract the band that the profile describes"
             raise ImageError(str(image), expected="one band", got=f"{raster.bands} bands", remedy=remedy)
         needed = FIXED_BYTES + BYTES_PER_COLUMN * raster.width_px + source.held_bytes(STRIP_PX)
         check_memory(needed, request.memory_bytes, bulky=False)
-        largest = (raster.largest(source.read(*rows)) for rows in _strips(raster.height_px))
+        extents = (raster.extent(source.read(*rows)) for rows in _strips(raster.height_px))
         bits = int(chain.degraded.max_dn).bit_length()
-        scale = full_scale_of(str(image), raster, largest, request.full_scale, bits)
+        scale = full_scale_of(str(image), raster, extents, request.full_scale, bits)
         job = {"image": list(fingerprint(source.files)), "method": "traditional"}
         checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, resume=False)
         try:
             _fill(checkpoint, source, chain, scale.value, str(image))
-            write_output(checkpoint, raster.tags, request.compression)
+            write_output(checkpoint, source, raster.tags, request.compression)
         except BaseException:  # a strip is no place to go on from: the chain looks hundreds of rows back
             checkpoint.remove()
             raise
@@ -104,8 +108,10 @@ def _fill(checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: floa
             missing = torch.isnan(strip).numpy()[None]
             kept = as_stored(raster, np.nan_to_num(strip.numpy()[None] / np.float32(to_dn)), full_scale)
             if missing.any():
-                kept = np.where(missing, source.read(top, stop).astype(raster.out_dtype), kept)
-            checkpoint.append(RestoredRow(Span(top, stop, top, stop), kept, int((~missing).sum())))
+                stored = np.ma.getdata(source.read(top, stop))
+                kept = np.where(missing, stored.astype(raster.out_dtype), kept)
+            tally = Tally(int((~missing).sum()))
+            checkpoint.append(RestoredRow(Span(top, stop, top, stop), kept, tally))
             bar.advance(stop - top)
             top = stop
     checkpoint.require_known(name)

@@ -7,13 +7,14 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import psutil
 from PIL import Image
 
 from beers_deploy.model.io.files import IMAGE_SUFFIXES, TIFF_SUFFIXES
-from beers_deploy.model.io.tiff import check_page, open_tiff
+from beers_deploy.model.io.tiff import check_page, image_pages, open_tiff
 from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, OptionError, sizes
 from beers_deploy.profiles.toml import read_whole, unreadable
 
@@ -111,16 +112,22 @@ def site_of(name: str) -> str:
     return FRAME_NUMBERS.sub("", Path(name).stem) or name
 
 
+PLANAR = 2
+"""TIFF's planar configuration of bands that lie one behind the other."""
+
+
 def _read_tiff(path: Path) -> np.ndarray:
     with damage_in_a_sentence(path), open_tiff(path) as file:
-        series = file.series[0]
-        _check_memory(path, math.prod(series.shape))
-        for page in series.pages:
-            check_page(path, page)  # type: ignore[arg-type]  # frames have what pages have; none is damage
-        pixels = np.asarray(series.asarray())
-    # A last axis of 1, 3 or 4 may be bands as well; then nothing says otherwise and it stays.
-    if pixels.ndim == 3 and pixels.shape[0] in (1, 3, 4) and pixels.shape[2] not in (1, 3, 4):
-        pixels = np.moveaxis(pixels, 0, 2)  # planar storage: bands first
+        pages, mask = image_pages(path, file)
+        if mask is not None or any(page.extrasamples and max(page.extrasamples) for page in pages):
+            remedy = "cut it to known pixels; 'restore' alone takes missing ones"
+            raise ImageError(str(path), expected="an image that is whole", got="a mask or alpha", remedy=remedy)
+        _check_memory(path, math.prod(file.series[0].shape))
+        for page in pages:
+            check_page(path, page)
+        pixels = np.asarray(file.series[0].asarray())
+    if pixels.ndim == 3 and (len(pages) > 1 or pages[0].planarconfig == PLANAR):
+        pixels = np.moveaxis(pixels, 0, 2)
     return pixels[..., 0] if pixels.ndim == 3 and pixels.shape[2] == 1 else pixels
 
 
@@ -134,11 +141,35 @@ def _read_other(path: Path) -> np.ndarray:
             # run further programs, as for EPS.
             Image.open(io.BytesIO(read_whole(path, PACKED_BYTES)), formats=("PNG", "JPEG")) as image,
         ):
-            bands = 4 if image.mode == "RGBA" else len(image.getbands())
-            _check_memory(path, image.width * image.height * bands)
-            return np.asarray(image if image.mode in ("L", "I;16", "I", "F") else image.convert("RGB"))
+            _check_memory(path, image.width * image.height * len(image.getbands()))
+            mode = image.mode if image.mode in ("L", "I;16", "I", "F") else "L" if image.mode == "LA" else "RGB"
+            return np.asarray(image if mode == image.mode else image.convert(mode))
     finally:
         Image.MAX_IMAGE_PIXELS = limit
+
+
+def read_alpha(path: Path) -> np.ndarray | None:
+    """The alpha (H, W) uint8 of a PNG; None where all of it is opaque.
+
+    Raises:
+        ImageError: a palette, whose numbers are no light, or colours of 16 bits, of which half would be lost.
+    """
+    quiet = warnings.catch_warnings(action="ignore")
+    with damage_in_a_sentence(path), quiet, Image.open(path, formats=("PNG", "JPEG")) as image:
+        if image.mode in ("P", "PA"):
+            remedy = "convert it to grey or RGB"
+            raise ImageError(str(path), expected="pixels that are light", got="a palette", remedy=remedy)
+        if image.mode != "I;16" and _png_bits(path) == 16:
+            remedy = "convert it to TIFF"
+            raise ImageError(str(path), expected="a PNG of 8 bits, or grey", got="16-bit colour", remedy=remedy)
+        return np.asarray(image.convert("RGBA").getchannel("A")) if image.has_transparency_data else None
+
+
+def _png_bits(path: Path) -> int | None:
+    """Bits of a sample, as the head of a PNG has them; None of other files."""
+    with path.open("rb") as stream:
+        head = stream.read(25)
+    return head[24] if head.startswith(b"\x89PNG") else None
 
 
 def _check_memory(path: Path, samples: int) -> None:
@@ -155,14 +186,31 @@ def _check_memory(path: Path, samples: int) -> None:
 UNIT_MAX = 2.0
 """Floats no larger may be shares of full scale, or reflectances, which pass 1 on snow and glint. A raw image has a
 pixel above 2 DN wherever it sees anything at all."""
+RADIANCE_SHARE = 0.2
+"""Floats that are no whole numbers and no larger than this share of full scale may be radiances: those of a bright
+scene, in W/m2/sr/um, stay below some 700."""
 
 REMEDY = "give the pixel value that is full scale as `full_scale`"
+
+
+class Extent(NamedTuple):
+    """Of some pixels: the largest size of a known one, and whether all are whole numbers, as digital numbers are."""
+
+    largest: float
+    whole: bool
+
+
+def extent_of(pixels: np.ndarray, known: np.ndarray | bool = True) -> Extent:
+    """The extent of pixels of any shape, of those that are `known`."""
+    low, high = (float(extreme(pixels, where=known, initial=0)) for extreme in (np.min, np.max))
+    whole = pixels.dtype.kind != "f" or bool((np.rint(pixels) == pixels).all(where=known))
+    return Extent(max(-low, high), whole)
 
 
 def settled_scale(
     name: str,
     dtype: np.dtype[np.generic],
-    largest: Iterable[float],
+    extents: Iterable[Extent],
     asked: float | None = None,
     usual: float = MAX_DN,
     remedy: str | None = None,
@@ -172,8 +220,7 @@ def settled_scale(
     Args:
         name: of the image, for the message.
         dtype: of the pixels.
-        largest: the largest size of a known pixel in each part of the image, drawn for floats only and no further
-            than to the first that decides; 0 says nothing.
+        extents: of each part of the image, drawn for floats only and no further than to the first that decides.
         asked: as the user gave it; None lets type and values decide.
         usual: the full scale of digital numbers.
         remedy: what to do about pixels that leave it open, where the caller has no --full-scale.
@@ -190,14 +237,17 @@ def settled_scale(
     if dtype.kind != "f":
         return usual
     brightest = 0.0
-    for value in largest:
-        brightest = max(brightest, value)
-        if brightest > UNIT_MAX:
+    for extent in extents:
+        brightest = max(brightest, extent.largest)
+        if brightest > UNIT_MAX and (extent.whole or brightest > RADIANCE_SHARE * usual):
             return usual
     if brightest == 0:  # black, or missing everywhere
         return usual
-    got = f"floats of at most {brightest:.3g}"
-    raise _open(name, got, remedy or f"{REMEDY} (1 for 0..1, {usual:g} for digital numbers)")
+    if brightest > UNIT_MAX:
+        got, choices = "no whole numbers, as radiances are", f"{usual:g} for digital numbers, else your own"
+    else:
+        got, choices = "which may be shares of it", f"1 for 0..1, {usual:g} for digital numbers"
+    raise _open(name, f"floats of at most {brightest:.3g}, {got}", remedy or f"{REMEDY} ({choices})")
 
 
 def check_scale(full_scale: float, kind: str) -> None:
@@ -239,7 +289,7 @@ def read_acquisition(
             str(path), expected="one band", got=f"{pixels.shape[2]} bands", remedy="extract the panchromatic band"
         )
     low, high = float(pixels.min()), float(pixels.max())
-    settled = settled_scale(str(path), pixels.dtype, [max(-low, high)], full_scale, max_dn, remedy)
+    settled = settled_scale(str(path), pixels.dtype, [extent_of(pixels)], full_scale, max_dn, remedy)
     if low < 0 or high > settled:
         expected = (
             f"{max_dn.bit_length()}-bit digital numbers, 0 to {max_dn}"

@@ -5,11 +5,12 @@ Formats for microscopes name further files to be opened.
 
 import logging
 import math
+import re
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from importlib.util import find_spec
-from itertools import accumulate
+from itertools import accumulate, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,60 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())  # who asks for 
 def open_tiff(path: Path) -> tifffile.TiffFile:
     """A TIFF as plain pages; raises what tifffile raises."""
     return tifffile.TiffFile(path, **PLAIN)
+
+
+REDUCED, MASK = 1, 4
+"""Bits of TIFF's NewSubfileType."""
+MASK_PHOTOMETRIC = 4
+LIGHT = {1, 2, 6}
+"""PhotometricInterpretation of pixels where more is brighter: MinIsBlack, RGB, and JPEG's YCbCr, which is decoded."""
+GDAL_METADATA = 42112
+OFFSET_DN = 40
+"""Of the number that stands for no light: 1 % of 12 bits."""
+
+
+def image_pages(path: Path, file: tifffile.TiffFile) -> tuple[list[tifffile.TiffPage], tifffile.TiffPage | None]:
+    """The pages of the one image of a file, each of which holds bands of it, and the page of its mask, if any.
+
+    Raises:
+        ImageError: several images, or pixels that are no measure of light.
+    """
+    pages = [page for page in file.pages if isinstance(page, tifffile.TiffPage) and not page.subfiletype & REDUCED]
+    masks = [page for page in pages if page.subfiletype & MASK or page.photometric == MASK_PHOTOMETRIC]
+    images = [page for page in pages if page not in masks]
+    if not images or len(images) != len(file.series[0].pages) or len(masks) > 1:
+        got = f"{len(images)} pages and {len(masks)} masks"
+        raise ImageError(str(path), expected="one image", got=got, remedy="save the page that you mean by itself")
+    for page in images:
+        if page.photometric not in LIGHT:
+            got = getattr(page.photometric, "name", str(page.photometric))
+            remedy = "convert it to MinIsBlack or RGB: 'gdal_translate -expand' does it for palettes"
+            raise ImageError(str(path), expected="pixels where more is brighter", got=got, remedy=remedy)
+    _require_no_offset(path, images[0])
+    return images, masks[0] if masks else None
+
+
+def _require_no_offset(path: Path, page: tifffile.TiffPage) -> None:
+    """That 0 stands for no light in every band, by GDAL's metadata."""
+    said = str(page.tags[GDAL_METADATA].value) if GDAL_METADATA in page.tags else ""
+    found = [re.findall(rf'<Item [^>]*role="{role}"[^>]*>([^<]*)<', said) for role in ("offset", "scale")]
+    for offset, scale in zip_longest(*found, fillvalue="1"):
+        require_small_offset(str(path), _number(offset, 0), _number(scale, 1))
+
+
+def _number(text: str, otherwise: float) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return otherwise
+
+
+def require_small_offset(path: str, offset: float, scale: float) -> None:
+    """Refuse pixels whose 0 is far from no light: value = scale x pixel + offset."""
+    if abs(offset) > OFFSET_DN * abs(scale):
+        got = f"{-offset / (scale or 1):g} DN for it, by its offset of {offset:g} and scale of {scale:g}"
+        remedy = "take it off the pixels, or remove the offset with 'gdal_edit.py -offset 0' if it is none of them"
+        raise ImageError(path, expected="pixels whose 0 is no light", got=got, remedy=remedy)
 
 
 NONE, LZW, JPEG, DEFLATE, PACKBITS, ZSTD = 1, 5, 7, (8, 32946), 32773, 50000

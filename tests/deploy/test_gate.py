@@ -3,6 +3,7 @@
 import json
 import runpy
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -12,15 +13,16 @@ import onnx
 import pytest
 from onnx import numpy_helper
 
+import beers_deploy as bd
 from beers_deploy.export import float_model
 from beers_deploy.network import Network, shipped_pair
 from beers_deploy.profiles import load_target
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Bound, Check, Row, measured
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.free import quantise_free
-from beers_deploy.quant.gate import Limits, compare, judge, judge_saturation, read_limits
+from beers_deploy.quant.gate import Limits, compare, judge, judge_saturation, limits_of, read_limits
 from beers_deploy.quant.onnx_file import image_info, load_onnx, save_onnx
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session
@@ -140,8 +142,23 @@ def test_limits_come_from_a_file(tmp_path: Path) -> None:
     assert (limits.mae, limits.psnr_drop_db, limits.p999) == (0.0007, 0.25, None)
     assert read_limits(path, 0.001).mae == 0.001
     assert read_limits(None, None) == Limits()
-    path.write_text("mae_growth = inf")
-    assert read_limits(path, None).mae_growth == float("inf")
+    path.write_text("mae_growth = 1.2")
+    assert read_limits(path, None) == Limits(mae=None, mae_growth=1.2)
+
+
+UNBREAKABLE = ["mae = inf", "mae = 1e9", "p999 = 1", "saturated = 1.0", "mae_growth = inf", "std_over_mae = 1e300"]
+UNBREAKABLE += ["psnr_drop_db = inf", "min_psnr_float_int8_db = 1e-9"]
+
+
+@pytest.mark.parametrize("text", UNBREAKABLE)
+def test_a_limit_that_no_network_breaks_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "gate.toml").write_text(text)
+    name, value = text.split(" = ")
+    for given in (tmp_path / "gate.toml", {name: float(value)}, replace(Limits(), **{name: float(value)})):
+        with pytest.raises(OptionError, match="broken network"):
+            limits_of(given)
+    with pytest.raises(OptionError, match="max_mae"):
+        read_limits(None, float("inf"))
 
 
 NO_LIMITS = ["mae = 'small'", "mae = true", "mea = 0.1", "mae = -1", "mae = nan", "= 3", "[mae]", "", "# none"]
@@ -272,6 +289,36 @@ def test_a_baseline_of_other_patches_is_refused(other: dict[str, object], tmp_pa
     (name,) = other
     with pytest.raises(OptionError, match=f"same patches \\({name}"):
         baseline_mae(tmp_path / "before.json", {**ASKED, **other})
+
+
+def test_growth_is_not_judged_without_a_baseline(tmp_path: Path) -> None:
+    (tmp_path / "gate.toml").write_text("mae = 0.01\nmae_growth = 1.0001\n")
+    assert "--baseline: expected one" in refused("gate", "--limits", tmp_path / "gate.toml")
+
+
+def test_the_baseline_of_another_float_network_is_refused(scenes: Path, tmp_path: Path) -> None:
+    command = ["--images", scenes, "--patches", 2]
+    done("gate", "convbeers-s", *command, "--json", tmp_path / "s.json")
+    assert "another's" in refused("gate", "convbeers-xs", *command, "--baseline", tmp_path / "s.json")
+
+
+def test_samples_that_calibration_saw_are_left_out_one_by_one(model: Path) -> None:
+    samples = np.random.default_rng(0).random((12, 1, 32, 40), np.float32)
+    int8 = bd.quantize(model, samples[:8])
+    mixed = np.concatenate([samples[10:], samples[2:7]])
+    found = bd.compare(int8, samples=mixed)
+    assert found.result.patches == 3  # of the eight, two were held out, and one of them is here
+    assert "3 of 7 samples" in found.notes[0]
+    with pytest.raises(OptionError, match="calibration did not see"):
+        bd.gate(int8, samples=samples[:3])
+
+
+def test_samples_without_contrast_judge_nothing() -> None:
+    samples = np.zeros((5, 1, 32, 40), np.float32)
+    with pytest.raises(ImageError, match="contrast"):
+        bd.compare("convbeers-xs-int8", "convbeers-xs", samples)
+    samples[3] = np.random.default_rng(0).random((1, 32, 40))
+    assert bd.compare("convbeers-xs-int8", "convbeers-xs", samples).result.patches == 1
 
 
 def test_a_folder_of_images_may_lie_elsewhere(tmp_path: Path) -> None:

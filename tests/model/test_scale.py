@@ -5,12 +5,12 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from beers_deploy.model.io.images import MAX_DN, UNIT_MAX, settled_scale
+from beers_deploy.model.io.images import MAX_DN, UNIT_MAX, Extent, extent_of, settled_scale
 from beers_deploy.profiles.errors import BeersError, ImageError, OptionError
 
 
 def settled(kind: str, *largest: float, asked: float | None = None) -> float:
-    return settled_scale("x.tif", np.dtype(kind), largest, asked)
+    return settled_scale("x.tif", np.dtype(kind), (Extent(each, whole=True) for each in largest), asked)
 
 
 @pytest.mark.parametrize("kind", ["uint16", "int16", "uint32", "int32"])
@@ -59,15 +59,25 @@ def test_integers_have_a_whole_full_scale() -> None:
 def test_no_more_is_looked_at_than_decides() -> None:
     looked: list[float] = []
 
-    def parts() -> Iterator[float]:
+    def parts() -> Iterator[Extent]:
         for value in (0.0, 0.9, 3000.0, 4000.0):
             looked.append(value)
-            yield value
+            yield Extent(value, whole=False)
 
     assert settled_scale("x", np.dtype("float32"), parts()) == MAX_DN
     assert looked == [0.0, 0.9, 3000.0]
     assert settled_scale("x", np.dtype("uint16"), parts()) == MAX_DN
     assert looked == [0.0, 0.9, 3000.0]
+
+
+def test_floats_that_may_be_radiances_leave_it_open() -> None:
+    digital = np.random.default_rng(0).integers(0, 1700, (40, 40)).astype(np.float32)
+    for pixels, open_ in ((digital, False), (digital / 10.2375, True), (digital * 2.1, False), (digital / 4.0, True)):
+        if open_:
+            with pytest.raises(ImageError, match=r"radiances.*full_scale"):
+                settled_scale("x", pixels.dtype, [extent_of(pixels)])
+        else:
+            assert settled_scale("x", pixels.dtype, [extent_of(pixels)]) == MAX_DN
 
 
 def test_who_has_no_such_option_says_what_else_to_do() -> None:

@@ -28,8 +28,8 @@ def running(infer: Infer, at_once: int, tick: Callable[[], None] = lambda: None)
     restorer = Restorer(raster, infer, 4095.0, Tiling(RADIUS_PX))
     result = np.empty(SHAPE, np.uint16)
     source = ArraySource(pixels, raster)
-    for row, kept, known, clipped in restore_rows(source, plan, restorer, plan.rows, tick, at_once):
-        assert (known, clipped) == (kept.size, 0)
+    for row, kept, tally in restore_rows(source, plan, restorer, plan.rows, tick, at_once):
+        assert (tally.known, tally.clipped) == (kept.size, 0)
         result[:, row.keep_start : row.keep_stop] = kept
     return result
 

@@ -1,6 +1,7 @@
 """What GDAL reads: the same pixels and the same place on Earth as of a TIFF, whatever the format."""
 
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -195,3 +196,34 @@ def test_bytes_that_are_no_text_print_no_traceback(
     assert unraisable == []
     assert capfd.readouterr().err == ""
     assert sys.unraisablehook == unraisable.append
+
+
+def test_alpha_and_masks_of_gdal_s_formats_are_missing_pixels(tmp_path: Path) -> None:
+    pixels, hidden = images.digital_numbers(bands=2), np.zeros((images.HEIGHT, images.WIDTH), bool)
+    hidden[30:50, 40:] = True
+    pixels[1] = np.where(hidden, 0, 4095)
+    images.write_jp2(tmp_path / "alpha.jp2", pixels, NBITS=12, PHOTOMETRIC="MINISBLACK", ALPHA="YES")
+    images.write_jp2(tmp_path / "beside.jp2", pixels[:1], NBITS=12)
+    tifffile.imwrite(tmp_path / "beside.jp2.msk", np.where(hidden, 0, 255).astype(np.uint8))
+    for name, veil in (("alpha.jp2", "unassalpha"), ("beside.jp2", "mask")):
+        with open_source(tmp_path / name) as source:
+            rows = source.read(20, 60)
+            assert (source.raster.bands, source.raster.veil) == (1, veil)
+            np.testing.assert_array_equal(np.ma.getdata(rows)[0], pixels[0, 20:60])
+            np.testing.assert_array_equal(source.raster.missing(rows)[0], hidden[20:60])
+
+
+def test_a_cog_keeps_mask_and_alpha(model: Path, tmp_path: Path) -> None:
+    pixels, hidden = images.digital_numbers(bands=1)[0], np.zeros((images.HEIGHT, images.WIDTH), bool)
+    hidden[30:50, 40:] = True
+    tifffile.imwrite(tmp_path / "mask.tif", pixels)
+    both = np.stack([pixels, ~hidden * 4095]).astype(np.uint16)
+    tifffile.imwrite(
+        tmp_path / "alpha.tif", both, photometric="minisblack", planarconfig="separate", extrasamples=[2]
+    )
+    tifffile.imwrite(tmp_path / "mask.tif.msk", np.where(hidden, 0, 255).astype(np.uint8))
+    for name in ("mask", "alpha"):
+        restore_file(tmp_path / f"{name}.tif", tmp_path / "out.tif", Options(model, cog=True), lambda _: None)
+        with warnings.catch_warnings(action="ignore"), rasterio.open(tmp_path / "out.tif") as file:
+            np.testing.assert_array_equal(file.dataset_mask() == 0, hidden)
+            np.testing.assert_array_equal(file.read(1)[hidden], pixels[hidden])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from beers_deploy.model.io.images import Extent
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.restoration.options import Options
@@ -55,9 +56,9 @@ def test_8_bit_pixels_need_it_stated_and_cannot_be_of_more() -> None:
 
 def test_floats_of_digital_numbers_have_the_sensor_s_full_scale_and_shares_none() -> None:
     floats = Raster(1, 9, 9, np.dtype(np.float32))
-    assert full_scale_of("x", floats, [900.0], bits=10).value == 1023
+    assert full_scale_of("x", floats, [Extent(900.0, whole=False)], bits=10).value == 1023
     with pytest.raises(ImageError, match="full_scale"):
-        full_scale_of("x", floats, [0.9], bits=10)
+        full_scale_of("x", floats, [Extent(0.9, whole=False)], bits=10)
 
 
 @pytest.mark.parametrize("bits", [10, 14, 16])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from beers_deploy.profiles.errors import BeersError, ImageError, MachineError
-from beers_deploy.restoration.source import TiffSource, open_source
+from beers_deploy.restoration.source import PageRows, open_source
 
 STORAGES: dict[str, dict[str, Any]] = {
     "one strip": {},
@@ -86,13 +86,13 @@ def test_reading_downwards_decodes_each_segment_once(
     tifffile.imwrite(path, pixels_of("uint16"), tile=(16, 16), compression="zlib")
     decoded: list[int] = []
 
-    class Counting(TiffSource):
+    class Counting(PageRows):
         def _decode(self, row: int) -> np.ndarray:
             decoded.append(row)
             return super()._decode(row)
 
     with tifffile.TiffFile(path) as file:
-        source, top = Counting(path, file.series[0].keyframe), 0
+        source, top = Counting(path, file.pages.first), 0
         for height in heights:
             bottom = min(top + height, HEIGHT)
             rows = source.read(max(top - overlap, 0), bottom)
@@ -148,5 +148,5 @@ def test_a_missing_codec_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     def without(*_: object) -> None:
         raise ValueError("<COMPRESSION.LZW: 5> requires the 'imagecodecs' package")
 
-    monkeypatch.setattr(TiffSource, "_decode", without)
+    monkeypatch.setattr(PageRows, "_decode", without)
     refused(tmp_path / "a.tif", MachineError, "codecs")

@@ -1,0 +1,135 @@
+"""What comes out of a restoration, held against what went in: a network of another scale writes no white image.
+
+A restoration keeps the mean, most of the contrast, and leaves few pixels at an end of full scale. Small departures
+are told, those that no restoration has are refused.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import astuple, dataclass
+from operator import add
+
+import numpy as np
+
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.figures import Figure, measured
+
+MANY_AT_ENDS, FAR, FLAT, FEW = 0.9, 0.5, 0.001, 1000
+"""Refused: more of the results at an end of full scale, a mean moved by more of it, less contrast left; of fewer
+pixels nothing is."""
+SOME_AT_ENDS, MEAN_KEPT, DARK = 0.05, 0.02, 0.005
+"""Told: more of the results at an end; a mean moved by more than this share of itself and this one of full scale."""
+LEAST_SPREAD = 1e-6
+"""Of an image that is constant but for rounding, in shares of full scale."""
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What was seen of an image and of its result where both are known: counts, and sums in shares of full scale.
+
+    Attributes:
+        known: results that are no missing pixels.
+        clipped: pixels of the image above full scale.
+        at_ends: results that came to 0 or to full scale where the image lay between.
+        compared: pixels of the image that the sums count; none where the network makes other bands of them.
+        before: sum of these pixels.
+        before_squared: of their squares.
+        after: sum of the results.
+        after_squared: of their squares.
+    """
+
+    known: int = 0
+    clipped: int = 0
+    at_ends: int = 0
+    compared: int = 0
+    before: float = 0.0
+    before_squared: float = 0.0
+    after: float = 0.0
+    after_squared: float = 0.0
+
+    @classmethod
+    def of(cls, stored: np.ndarray, restored: np.ndarray, seen: np.ndarray | None, known: np.ndarray) -> "Tally":
+        """Of a part of an image.
+
+        Args:
+            stored: its pixels (bands, h, w), in shares of full scale.
+            restored: its results, of as many or other bands, of so many times as many rows and columns.
+            seen: which pixels are known; None for all.
+            known: which results are.
+        """
+        alike = len(stored) == len(restored)
+        between, scale = (stored > 0) & (stored < 1), restored.shape[1] // stored.shape[1]
+        within = between.repeat(scale, axis=1).repeat(scale, axis=2) if alike else True
+        at_ends = ((restored <= 0) | (restored >= 1)) & within & known
+        before = stored if seen is None else stored[seen]
+        counts = int(known.sum()), int((before > 1).sum()), int(at_ends.sum())
+        if not alike:
+            return cls(*counts)
+        before, after = np.minimum(before, 1), restored[known]
+        sums = before.sum(), (before**2).sum(), after.sum(), (after**2).sum()
+        return cls(*counts, before.size, *map(float, sums))
+
+    def __add__(self, other: "Tally") -> "Tally":
+        return Tally(*map(add, astuple(self), astuple(other)))
+
+    @property
+    def share_at_ends(self) -> float:
+        """Of the results, those at an end of full scale where the image lay between."""
+        return self.at_ends / max(self.known, 1)
+
+    @property
+    def means(self) -> tuple[float, float]:
+        """Before and after, in shares of full scale; 0 where they cannot be compared."""
+        return self.before / max(self.compared, 1), self.after / max(self.known, 1)
+
+    @property
+    def moved(self) -> float:
+        """By how much the mean moved."""
+        return self.means[1] - self.means[0]
+
+    @property
+    def flat(self) -> bool:
+        """Whether the results are constant and the image is not."""
+        squares = self.before_squared / max(self.compared, 1), self.after_squared / max(self.known, 1)
+        before, after = (
+            math.sqrt(max(square - mean**2, 0)) for square, mean in zip(squares, self.means, strict=True)
+        )
+        return before > LEAST_SPREAD and after < FLAT * before
+
+    @property
+    def figures(self) -> Mapping[str, Figure]:
+        """For the results of a run."""
+        ends, mean = (
+            "results at 0 or full scale where the image is not",
+            "mean of the known pixels, after less before",
+        )
+        return {
+            "clipped pixels": measured(self.clipped, "1", "pixels of the image above its full scale"),
+            "results at ends": measured(100 * self.share_at_ends, "%", ends),
+            "mean moved": measured(100 * self.moved, "% of full scale", mean),
+        }
+
+    @property
+    def doubts(self) -> list[str]:
+        """What a user should look at, a clause each."""
+        found = []
+        if self.share_at_ends > SOME_AT_ENDS:
+            found.append(f"{self.share_at_ends:.0%} of the results are 0 or full scale where the image is not")
+        if abs(self.moved) > MEAN_KEPT * self.means[0] + DARK:
+            found.append("the mean went from {:.3g} to {:.3g} of full scale".format(*self.means))
+        if self.flat:
+            found.append("the results are constant and the image is not")
+        return found
+
+    def require(self, name: str) -> None:
+        """Refuse what no restoration gives of an image, `name` in messages.
+
+        Raises:
+            ImageError: most results at an end of full scale, a mean far from the image's, or a constant result.
+        """
+        if self.known >= FEW and (self.share_at_ends > MANY_AT_ENDS or abs(self.moved) > FAR or self.flat):
+            expected, got = "a network that restores this image", "; ".join(self.doubts)
+            remedy = (
+                "check its scale with 'gate' and the image's `full_scale`, or write it all the same: `any_result`"
+            )
+            raise ImageError(name, expected=expected, got=got, remedy=remedy)

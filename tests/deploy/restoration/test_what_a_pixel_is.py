@@ -1,0 +1,222 @@
+"""Masks and alpha are missing pixels and stay what they are; what is no plain light is refused in a sentence."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import tifffile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from onnx import numpy_helper
+from PIL import Image
+
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.restoration.options import Compression, Options
+from beers_deploy.restoration.run import restore_file
+from beers_deploy.restoration.source import open_source
+from tests.deploy.restoration.runs import noise
+
+NODATA = 7
+HIDDEN = np.zeros((61, 83), bool)
+HIDDEN[:9], HIDDEN[20:33, 40:], HIDDEN[50, 3] = True, True, True
+
+
+def restored(path: Path, model: Path, **options: Any) -> tuple[np.ndarray, np.ndarray | None]:
+    """The pages of a restored file: its pixels, and its mask."""
+    restore_file(path, path.with_name("out.tif"), Options(model, tile_px=23, **options), lambda _: None)
+    with tifffile.TiffFile(path.with_name("out.tif")) as file:
+        pages = [page.asarray() for page in file.pages]
+        kinds = [page.tags[254].value if 254 in page.tags else 0 for page in file.pages]
+        assert kinds == [0, 4][: len(pages)]
+    return pages[0], pages[1] if len(pages) > 1 else None
+
+
+def by_nodata(folder: Path, pixels: np.ndarray, model: Path) -> np.ndarray:
+    """The same image restored, its hidden pixels told by a nodata value that no other has."""
+    seen = np.where(HIDDEN, NODATA, np.where(pixels == NODATA, NODATA + 1, pixels)).astype(pixels.dtype)
+    path = folder / "nodata.tif"
+    tifffile.imwrite(path, seen, extratags=[(42113, "s", 0, str(NODATA), True)])
+    return restored(path, model)[0]
+
+
+def pixels_of_test() -> np.ndarray:
+    pixels = noise(61, 83)
+    pixels[pixels == NODATA] += 1
+    return pixels
+
+
+@pytest.mark.parametrize(("bits", "beside"), [(1, False), (1, True), (8, True)])
+@pytest.mark.parametrize("compression", Compression)
+def test_a_mask_is_missing_pixels_and_is_kept(
+    bits: int, beside: bool, compression: Compression, model: Path, tmp_path: Path
+) -> None:
+    if compression in (Compression.zstd, Compression.lzw):
+        pytest.importorskip("imagecodecs")
+    pixels, mask = pixels_of_test(), ~HIDDEN if bits == 1 else np.where(HIDDEN, 0, 255).astype(np.uint8)
+    with tifffile.TiffWriter(tmp_path / "in.tif") as file:
+        file.write(pixels, metadata=None)
+        if not beside:
+            file.write(mask, metadata=None, subfiletype=4, photometric="mask", tile=(16, 32), compression="zlib")
+    if beside:
+        tifffile.imwrite(tmp_path / "in.tif.msk", mask)
+    found, kept = restored(tmp_path / "in.tif", model, compression=compression)
+    np.testing.assert_array_equal(found[HIDDEN], pixels[HIDDEN])
+    np.testing.assert_array_equal(found[~HIDDEN], by_nodata(tmp_path, pixels, model)[~HIDDEN])
+    assert kept is not None
+    np.testing.assert_array_equal(kept == 0, HIDDEN)
+
+
+@pytest.mark.parametrize("kind", ["unassalpha", "assocalpha"])
+@pytest.mark.parametrize("planes", ["contig", "separate"])
+@pytest.mark.parametrize("bands", [1, 3])
+def test_alpha_goes_through_untouched(kind: str, planes: Any, bands: int, model: Path, tmp_path: Path) -> None:
+    pixels = pixels_of_test()
+    alpha = np.where(HIDDEN, 0, noise(61, 83, seed=3)).astype(np.uint16)
+    whole = np.stack([pixels] * bands + [alpha], axis=0 if planes == "separate" else 2)
+    photometric: Any = "rgb" if bands == 3 else "minisblack"
+    tifffile.imwrite(
+        tmp_path / "in.tif", whole, photometric=photometric, planarconfig=planes, extrasamples=[kind], metadata=None
+    )
+    restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=23), lambda _: None)
+    with tifffile.TiffFile(tmp_path / "out.tif") as file:
+        page = file.pages.first
+        found, said = page.asarray(), (page.photometric, page.extrasamples)
+    assert said == ({"rgb": 2, "minisblack": 1}[photometric], ({"assocalpha": 1, "unassalpha": 2}[kind],))
+    np.testing.assert_array_equal(found[-1], alpha)
+    for band in found[:-1]:
+        np.testing.assert_array_equal(band[HIDDEN], pixels[HIDDEN])
+        np.testing.assert_array_equal(band[~HIDDEN], by_nodata(tmp_path, pixels, model)[~HIDDEN])
+
+
+@pytest.mark.parametrize("mode", ["LA", "RGBA"])
+def test_alpha_of_a_png_is_no_light(mode: str, model: Path, tmp_path: Path) -> None:
+    light = np.random.default_rng(0).integers(1, 255, (31, 29, len(mode) - 1)).astype(np.uint8)
+    alpha = np.random.default_rng(1).integers(0, 3, (31, 29, 1)).astype(np.uint8) * 100
+    Image.fromarray(np.concatenate([light, alpha], axis=2), mode).save(tmp_path / "in.png")
+    with open_source(tmp_path / "in.png") as source:
+        assert source.raster.shape == (len(mode) - 1, 31, 29)
+        np.testing.assert_array_equal(source.raster.missing(source.read(3, 9))[0], alpha[3:9, :, 0] == 0)
+    found, _ = restored(tmp_path / "in.png", model, full_scale=255)
+    np.testing.assert_array_equal(found[-1], alpha[..., 0])
+
+
+def two_pages(path: Path, pixels: np.ndarray) -> None:
+    with tifffile.TiffWriter(path) as file:
+        file.write(pixels)
+        file.write(pixels)
+
+
+def two_sizes(path: Path, pixels: np.ndarray) -> None:
+    with tifffile.TiffWriter(path) as file:
+        file.write(pixels, metadata=None)
+        file.write(pixels[:20], metadata=None)
+
+
+def with_offset(path: Path, pixels: np.ndarray) -> None:
+    said = '<GDALMetadata><Item name="OFFSET" sample="0" role="offset">-1000</Item></GDALMetadata>'
+    tifffile.imwrite(path, pixels, extratags=[(42112, "s", 0, said, True)])
+
+
+def palette(path: Path, pixels: np.ndarray) -> None:
+    table = np.zeros((3, 256), np.uint16)
+    tifffile.imwrite(path, (pixels % 256).astype(np.uint8), photometric="palette", colormap=table)
+
+
+REFUSED: dict[str, tuple[Callable[[Path, np.ndarray], object], str]] = {
+    "two pages": (two_pages, "2 pages"),
+    "two sizes": (two_sizes, "2 pages"),
+    "white is zero": (lambda path, pixels: tifffile.imwrite(path, pixels, photometric="miniswhite"), "MINISWHITE"),
+    "palette": (palette, "PALETTE"),
+    "offset": (with_offset, "offset of -1000"),
+    "radiances": (lambda path, pixels: tifffile.imwrite(path, (pixels / 10.2375).astype(np.float32)), "full_scale"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_no_plain_light_is_refused_with_a_remedy(case: str, model: Path, tmp_path: Path) -> None:
+    write, word = REFUSED[case]
+    write(tmp_path / "in.tif", noise(61, 83))
+    with pytest.raises(ImageError, match=word):
+        restored(tmp_path / "in.tif", model)
+    assert [path.name for path in tmp_path.iterdir()] == ["in.tif"]
+
+
+def test_a_palette_and_colours_of_16_bits_in_a_png_are_refused(tmp_path: Path) -> None:
+    Image.fromarray(noise(9, 9).astype(np.uint8)).convert("P").save(tmp_path / "palette.png")
+    with pytest.raises(ImageError, match="palette"), open_source(tmp_path / "palette.png"):
+        pass
+    rows = b"".join(b"\0" + noise(9, 3).byteswap().tobytes() for _ in range(9))
+    write_png(tmp_path / "deep.png", 9, 9, 16, rows)
+    with pytest.raises(ImageError, match="16-bit"), open_source(tmp_path / "deep.png"):
+        pass
+
+
+def write_png(path: Path, width: int, height: int, bits: int, rows: bytes) -> None:
+    """RGB, which Pillow writes in 8 bits alone."""
+    import struct
+    import zlib
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", width, height, bits, 2, 0, 0, 0)
+    parts = (chunk(b"IHDR", head), chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b""))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+
+
+def test_an_image_is_restored_once_unless_asked_again(model: Path, tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", noise(61, 83))
+    once, _ = restored(tmp_path / "in.tif", model)
+    (tmp_path / "out.tif").rename(tmp_path / "once.tif")
+    with pytest.raises(ImageError, match="again"):
+        restored(tmp_path / "once.tif", model)
+    again, _ = restored(tmp_path / "once.tif", model, again=True)
+    assert (again != once).any()
+
+
+@pytest.fixture(scope="module")
+def scaled(model: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[float, float], Path]:
+    """The network with another scale and offset of its output."""
+
+    def make(factor: float, offset: float) -> Path:
+        found = onnx.load(model)
+        graph, last = found.graph, found.graph.output[0].name
+        for node in graph.node:
+            node.output[:] = [name if name != last else "plain" for name in node.output]
+        for name, value in (("factor", factor), ("offset", offset)):
+            graph.initializer.append(numpy_helper.from_array(np.array(value, np.float32), name))
+        graph.node.append(onnx.helper.make_node("Mul", ["plain", "factor"], ["scaled"]))
+        graph.node.append(onnx.helper.make_node("Add", ["scaled", "offset"], [last]))
+        path = tmp_path_factory.mktemp("scaled") / "scaled.onnx"
+        onnx.save(found, path)
+        return path
+
+    return make
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.sampled_from([(255.0, 0.0), (0.0, 0.3), (1.0, 0.6), (-1.0, 0.0), (40.0, -20.0)]))
+def test_a_result_that_no_restoration_has_is_refused(
+    scaled: Callable[[float, float], Path], tmp_path_factory: pytest.TempPathFactory, how: tuple[float, float]
+) -> None:
+    folder = tmp_path_factory.mktemp("refused")
+    rows, columns = np.mgrid[:61, :83]
+    tifffile.imwrite(folder / "in.tif", (900 + 10 * rows + 5 * columns).astype(np.uint16))
+    with pytest.raises(ImageError, match="any_result"):
+        restored(folder / "in.tif", scaled(*how))
+    assert [path.name for path in folder.iterdir()] == ["in.tif"]
+    restored(folder / "in.tif", scaled(*how), any_result=True)
+
+
+def test_a_small_departure_is_told(scaled: Callable[[float, float], Path], tmp_path: Path) -> None:
+    said: list[str] = []
+    tifffile.imwrite(tmp_path / "in.tif", np.full((61, 83), 1500, np.uint16) + (noise(61, 83) >> 6))
+    moved = []
+    for offset in (0.0, 0.05):
+        row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(scaled(1.0, offset)), said.append)
+        moved.append(row.figures["mean moved"].value or 0.0)
+    assert moved[1] - moved[0] == pytest.approx(5, abs=0.1)
+    assert any("the mean went from" in each for each in said)
