@@ -17,7 +17,7 @@ import skimage.data
 import torch
 
 from beers_deploy.model.metrics.fidelity import psnr_db
-from beers_deploy.model.traditional.nl_bayes import QUALITIES, nl_bayes
+from beers_deploy.model.traditional.nl_bayes import QUALITIES, nl_bayes_strips
 from beers_deploy.model.traditional.noise import Noise
 
 CPP = {
@@ -61,7 +61,7 @@ def cell(name: str, clean: np.ndarray, sigma: int, quality: str, repeats: int) -
     noisy, times_s = torch.from_numpy((clean + noise).astype(np.float32)), []
     for _ in range(repeats):
         started = time.perf_counter()
-        denoised = nl_bayes(noisy, Noise(sigma), QUALITIES[quality])
+        denoised = torch.cat(list(nl_bayes_strips([noisy], len(noisy), Noise(sigma), QUALITIES[quality])))
         times_s.append(time.perf_counter() - started)
     level_db, time_s, (cpp_db, cpp_s) = psnr_db(denoised.numpy(), clean, 255), min(times_s), CPP[name, sigma]
     gain, ratio = level_db - cpp_db, time_s / cpp_s

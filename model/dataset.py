@@ -60,10 +60,7 @@ class DatasetRecipe:
     def to_json(self) -> dict[str, object]:
         """The recipe as a file keeps it; scenes by name and digest."""
         scenes = [{"name": p.name, "sha256": sha256(p)} if p else {"name": "drawn"} for p in self.scenes]
-        profiles = {role: asdict(p) for role, p in (("degraded", self.degraded), ("reference", self.reference))}
-        keys = ("oversampling", "scene_scale", "patch_px", "radiance_scale", "seed", "tolerance_dn")
-        rest = {key: getattr(self, key) for key in keys}
-        return {"scenes": scenes, **profiles, **rest}
+        return asdict(self) | {"scenes": scenes}
 
 
 @dataclass(frozen=True)
@@ -86,9 +83,8 @@ def plan_windows(recipe: DatasetRecipe) -> list[Window]:
         found = list(_scene_windows(recipe, index, len(windows)))
         if not found:
             side = ((recipe.patch_px or 1) + 2 * MARGIN_PX) * recipe.oversampling
-            raise ImageError(
-                str(path), expected=f"at least {side} scene pixels a side", got="less", remedy="leave it out"
-            )
+            expected = f"at least {side} scene pixels a side"
+            raise ImageError(str(path), expected=expected, got="less", remedy="leave it out")
         windows += found
     return windows
 

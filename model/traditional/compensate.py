@@ -34,20 +34,11 @@ BLOCK_PX = 384
 """Side of the blocks that are filtered at once: with the radius around it, an FFT of 512."""
 
 
-def compensate(image: Tensor, blur_from: Blur, blur_to: Blur, epsilon: float) -> Tensor:
-    """Filter (H, W) by `compensation_kernel`, on mirrored borders; unit and mean are kept, NaN stays NaN.
-
-    Limits: a constant image is unchanged, up to rounding. With equal MTFs only the regularisation acts.
-    """
-    kernel = compensation_kernel(blur_from, blur_to, epsilon)
-    return torch.cat(list(filter_strips([image], image.shape[0], kernel)))
-
-
 def filter_strips(strips: Iterable[Tensor], height: int, kernel: Tensor) -> Iterator[Tensor]:
     """Filter an image (H, W) that comes in strips (any, W), by a kernel (K, K); it goes in strips of BLOCK_PX rows.
 
-    Blocks lie on a grid of their own, so the strips that came change no bit. NaN pixels are filled from their
-    neighbours first, and NaN again in the end.
+    Unit and mean are kept, and borders mirrored. Blocks lie on a grid of their own, so the strips that came change no
+    bit. NaN pixels are filled from their neighbours first, and NaN again in the end.
     """
     # The grid of blocks is fixed from row 0: the result may not depend on how the strips were cut.
     rows, radius = Rows(strips), kernel.shape[0] // 2

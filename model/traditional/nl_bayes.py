@@ -365,20 +365,19 @@ def nearest_first(distances: Tensor, usual: int, most: int) -> tuple[Tensor, Ten
     return columns, distances.gather(1, columns)
 
 
-def nl_bayes(image: Tensor, noise: Noise, quality: Quality = QUALITIES["standard"]) -> Tensor:
-    """Remove Gaussian noise from (H, W) float32. NaN marks missing pixels; they stay so, and no other sees them.
-
-    The settings were published for 8-bit images: bring the data to a scale where sigma lies within some 5 to 40.
-    Limits: sigma = 0 returns a copy; a constant image returns itself, up to rounding; a pixel too near missing ones
-    to lie in any whole patch keeps its value. Any H and W from 1 on.
-    """
-    return torch.cat(list(nl_bayes_strips([image], image.shape[0], noise, quality)))
-
-
 def nl_bayes_strips(strips: Iterable[Tensor], height: int, noise: Noise, quality: Quality) -> Iterator[Tensor]:
-    """Denoise as `nl_bayes`, bit for bit, an image that comes and goes in strips of rows, (any, W) each.
+    """Remove Gaussian noise from an image that comes and goes in strips of rows, (any, W) float32 each.
 
-    Holds some 150 rows of it, and the tallest strip.
+    NaN marks missing pixels; they stay so, and no other sees them. The settings were published for 8-bit images:
+    bring the data to a scale where sigma lies within some 5 to 40. Limits: sigma = 0 returns a copy; a constant image
+    returns itself, up to rounding; a pixel too near missing ones to lie in any whole patch keeps its value. Any H and
+    W from 1 on; how the strips are cut changes no bit. Holds some 150 rows, and the tallest strip.
+
+    Args:
+        strips: of the image.
+        height: its rows, all strips together.
+        noise: to remove.
+        quality: how dense and how large groups are.
     """
     if noise.sigma == 0:
         yield from (strip.clone() for strip in strips)

@@ -175,8 +175,11 @@ def read_checkpoint(
     for name, value in _part(tensors, "average.").items():
         average[name].copy_(value)
     for name, parameter in network.named_parameters():
-        moments = _part(tensors, f"moment.{name}.")
-        optimiser.state[parameter] = {k: _placed(k, v, parameter) for k, v in moments.items()}
+        # Adam keeps its step count on the CPU and its moments with (and laid out as) the parameter.
+        optimiser.state[parameter] = {
+            moment: value if moment == "step" else torch.empty_like(parameter).copy_(value)
+            for moment, value in _part(tensors, f"moment.{name}.").items()
+        }
     return step, guards
 
 
@@ -209,8 +212,3 @@ def _check_parts(tensors: dict[str, Tensor], network: Network, steps: int) -> No
 
 def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
-
-
-def _placed(moment: str, value: Tensor, parameter: Tensor) -> Tensor:
-    """Adam keeps its step count on the CPU and its moments with (and laid out as) the parameter."""
-    return value if moment == "step" else torch.empty_like(parameter).copy_(value)

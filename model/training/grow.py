@@ -1,6 +1,6 @@
 """A larger network that begins where a smaller one stands: wider, deeper or coarser, with the same outputs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import product
 from typing import TypeVar
 
@@ -27,12 +27,16 @@ def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
     sources = _sources(network.variant, variant)
     large = type(network)(variant)
     initialise(large, generator)
-    weights = large.state_dict()
+    weights, small, factor = large.state_dict(), network.state_dict(), variant.scale // network.variant.scale
     for name, source in sources.items():
-        if source is None and name.endswith("second"):
-            weights[f"{name}.weight"].zero_()
-    scales = variant.scale // network.variant.scale
-    large.load_state_dict(weights | _copied(network.state_dict(), weights, sources, scales, generator))
+        weight, bias = weights[f"{name}.weight"], weights[f"{name}.bias"]
+        if source is not None:
+            weight.copy_(_widened(_coarser(small[f"{source}.weight"], factor), weight.shape, generator))
+            bias.copy_(_repeated(small[f"{source}.bias"], bias.shape, factor))
+        elif name.endswith("second"):
+            weight.zero_()
+    if TOLD in weights:
+        weights[TOLD].copy_(_repeated(small[TOLD], weights[TOLD].shape, factor))
     return large
 
 
@@ -51,25 +55,6 @@ def _sources(small: Variant, large: Variant) -> dict[str, str | None]:
         stem, _, last = name.rpartition(".")
         prefix = kept.get(f"{stem}.")
         found[name] = name if not stem else prefix and prefix + last
-    return found
-
-
-def _copied(
-    small: Mapping[str, Tensor],
-    large: Mapping[str, Tensor],
-    sources: Mapping[str, str | None],
-    factor: int,
-    generator: torch.Generator,
-) -> dict[str, Tensor]:
-    """The weights and biases that come from the small network's, by the large one's names and of its shapes."""
-    found = dict[str, Tensor]()
-    for name, source in sources.items():
-        if source is not None:
-            weight, bias = f"{name}.weight", f"{name}.bias"
-            found[weight] = _widened(_coarser(small[f"{source}.weight"], factor), large[weight].shape, generator)
-            found[bias] = _repeated(small[f"{source}.bias"], large[bias].shape, factor)
-    if TOLD in large:
-        found[TOLD] = _repeated(small[TOLD], large[TOLD].shape, factor)
     return found
 
 

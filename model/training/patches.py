@@ -117,12 +117,9 @@ class PatchSource:
                 patches = roughened(patches, self.recipe.rough, generator)
                 pair = patches[:, :1].contiguous(), patches[:, 1:].contiguous()
                 return (*pair, torch.cat(vectors)[order]) if self.recipe.family else pair
-        raise ImageError(
-            "training images",
-            expected=f"scenes that hold a patch of {self.recipe.patch_px} target pixels",
-            got="none large enough",
-            remedy="give larger images or a smaller patch",
-        )
+        expected = f"scenes that hold a patch of {self.recipe.patch_px} target pixels"
+        remedy = "give larger images or a smaller patch"
+        raise ImageError("training images", expected=expected, got="none large enough", remedy=remedy)
 
 
 def prepare(scene: Scene, multiple: int, device: torch.device | None = None) -> Visited:
@@ -142,16 +139,11 @@ def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -
         return scene.spectrum.real.new_empty(0, 2, recipe.patch_px, recipe.patch_px), torch.empty(4)
     images, sensor = _acquire_pair(scene, recipe, ratio, generator)
     patches = cut(images, recipe.patch_px, generator)
-    # A conditioned network learns that a sensor's axes changed places; a plain one cannot.
+    # A conditioned network learns that a sensor's axes changed places, and is told so; a plain one cannot.
     mirrors, quarters = sensor.symmetry
     quarter, mirrored = draw_turn(generator, quarters or recipe.family is not None, mirrors)
     vector = vector_tensor(sensor)
-    return turned(patches, quarter, mirrored), transposed(vector) if quarter % 2 else vector
-
-
-def transposed(vector: Tensor) -> Tensor:
-    """The sensor vector (..., 4) of an image whose rows and columns have changed places: (..., 4)."""
-    return vector[..., [1, 0, 2, 3]]
+    return turned(patches, quarter, mirrored), vector[[1, 0, 2, 3]] if quarter % 2 else vector
 
 
 def _acquire_pair(
@@ -240,12 +232,9 @@ def pair_files(folder: Path) -> list[Files]:
     degraded, reference = ({p.stem: p for p in list_images(folder / role)} for role in ("degraded", "reference"))
     alone = sorted(degraded.keys() ^ reference.keys())
     if alone:
-        raise ImageError(
-            str(folder),
-            expected="each name in degraded/ and in reference/",
-            got=f"{alone[0]!r} in one of them only",
-            remedy="complete the pairs; 'beers-deploy simulate' writes such folders",
-        )
+        expected, got = "each name in degraded/ and in reference/", f"{alone[0]!r} in one of them only"
+        remedy = "complete the pairs; 'beers-deploy simulate' writes such folders"
+        raise ImageError(str(folder), expected=expected, got=got, remedy=remedy)
     return [(path, reference[name]) for name, path in degraded.items()]
 
 
@@ -289,12 +278,10 @@ class StoredPairs:
         images = [read_acquisition(file, remedy=RESCALE, max_dn=self.max_dn) for file in files]
         height, width = images[0].shape
         if images[0].shape != images[1].shape or min(height, width) < self.patch_px:
-            raise ImageError(
-                str(files[0]),
-                expected=f"a mono pair of one size, {self.patch_px} pixels a side or more",
-                got=" and ".join(f"{image.shape[1]} x {image.shape[0]} pixels" for image in images),
-                remedy="choose a smaller `patch`, or simulate larger patches",
-            )
+            expected = f"a mono pair of one size, {self.patch_px} pixels a side or more"
+            got = " and ".join(f"{image.shape[1]} x {image.shape[0]} pixels" for image in images)
+            remedy = "choose a smaller `patch`, or simulate larger patches"
+            raise ImageError(str(files[0]), expected=expected, got=got, remedy=remedy)
         top, left = (int(generator.integers(size - self.patch_px + 1)) for size in (height, width))
         window = slice(top, top + self.patch_px), slice(left, left + self.patch_px)
         both = torch.stack([torch.from_numpy(image[window]) for image in images])

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, load_network
 from beers_deploy.model.io.files import whole_file
@@ -27,7 +26,7 @@ from beers_deploy.model.training.checkpoint import TrainingRecipe, finish, requi
 from beers_deploy.model.training.grow import grow
 from beers_deploy.model.training.losses import RestorationLoss
 from beers_deploy.model.training.patches import PatchRecipe, PatchSource, StoredPairs, pair_files
-from beers_deploy.model.training.trainer import Precision, Schedule, Source, Trainer
+from beers_deploy.model.training.trainer import Batches, Precision, Schedule, Trainer
 from beers_deploy.model.training.validation import Validation, split_by_site
 from beers_deploy.model.training.workers import Worker
 from beers_deploy.model.variants import Variant, variant_named
@@ -92,22 +91,15 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
             that are no multiple of the network's scale.
         KeyboardInterrupt: stopped; a checkpoint was written.
     """
-    teacher = _given(run, run.teacher) if run.teacher else None
-    require_whole_places(run, [variant_named(run.variant), *([teacher.variant] if teacher else [])])
+    teacher, variant = _given(run, run.teacher) if run.teacher else None, variant_named(run.variant)
+    require_whole_places(run, [variant, *([teacher.variant] if teacher else [])])
     loss, said = loss_of(run)
     if said and worker.first:
         say(said)
-    trainer = Trainer(
-        variant_named(run.variant),
-        run.recipe,
-        loss,
-        worker,
-        run.device,
-        start_weights(run),
-        teacher,
-        run.precision,
-        run.patches.family is not None,
-    )
+    generator = torch.Generator().manual_seed(run.recipe.seed)
+    start = grow(_given(run, run.start), variant, generator) if run.start else None
+    conditioned = run.patches.family is not None
+    trainer = Trainer(variant, run.recipe, loss, worker, run.device, start, teacher, run.precision, conditioned)
     if loss.perceptual is not None:
         loss.perceptual.to(trainer.device)
     if resume:
@@ -115,8 +107,8 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
     elif run.checkpoint.exists():
         remedy = "add `resume` or choose another"
         raise OptionError("out", expected="a folder without a run", got=str(run.checkpoint), remedy=remedy)
-    source, validation, names = data(run, trainer)
-    _train(run, trainer, source, validation)
+    batches, validation, names = data(run, trainer)
+    _train(run, trainer, batches, validation)
     if worker.first:
         recipe = about(run, names, validation.names, loss) | {"precision": run.precision}
         finish(trainer.averaged(), run.weights, recipe)
@@ -128,14 +120,6 @@ def require_whole_places(run: Run, variants: Sequence[Variant]) -> None:
     if run.patches.patch_px % scale:
         expected = f"a multiple of {scale} px, for a network at 1/{scale} resolution"
         raise OptionError("patch", expected=expected, got=f"{run.patches.patch_px} px", remedy="choose another")
-
-
-def start_weights(run: Run) -> Mapping[str, Tensor] | None:
-    """The weights to go on from, grown to the run's variant; None draws new ones."""
-    if run.start is None:
-        return None
-    variant, generator = variant_named(run.variant), torch.Generator().manual_seed(run.recipe.seed)
-    return grow(_given(run, run.start), variant, generator).state_dict()
 
 
 def _given(run: Run, path: Path) -> Network:
@@ -161,7 +145,7 @@ def loss_of(run: Run) -> tuple[RestorationLoss, str]:
     return RestorationLoss(run.recipe.loss, perceptual), f"LPIPS term over {found.name}"
 
 
-def data(run: Run, trainer: Trainer) -> tuple[Source, Validation, list[str]]:
+def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
     """Where batches come from, the images held out, and the names of those trained on."""
     recipe, sensors = run.recipe, (run.patches.family or run.patches.degraded, run.patches.reference)
     if run.pairs is not None:
@@ -170,7 +154,7 @@ def data(run: Run, trainer: Trainer) -> tuple[Source, Validation, list[str]]:
         given = (run.patches.patch_px, degraded.nominal().max_dn, recipe.batch, recipe.seed, trainer.worker)
         mirrors, alike = degraded.nominal().symmetry
         source = StoredPairs(files, *given, alike and degraded.mtf_nyquist_along is None, mirrors)
-        return source, Validation([], *sensors), [degraded.name for degraded, _ in files]
+        return source.batches, Validation([], *sensors), [degraded.name for degraded, _ in files]
     scenes = read_scenes(run)
     kept, held = split_by_site([scene.name for scene in scenes])
     views = SENSOR_VIEWS if run.patches.family else 1
@@ -180,7 +164,7 @@ def data(run: Run, trainer: Trainer) -> tuple[Source, Validation, list[str]]:
         remedy = "give `images`, `pairs` or `drawn`"
         raise OptionError("training data", expected="images, pairs or drawn scenes", got="none", remedy=remedy)
     patches = PatchSource(train_on, run.patches, recipe.batch, recipe.seed, trainer.worker, trainer.device)
-    return patches, validation, [scene.name for scene in train_on]
+    return patches.batches, validation, [scene.name for scene in train_on]
 
 
 def read_scenes(run: Run) -> list[Scene]:
@@ -195,7 +179,7 @@ def read_scenes(run: Run) -> list[Scene]:
     return scenes
 
 
-def _train(run: Run, trainer: Trainer, source: Source, validation: Validation) -> None:
+def _train(run: Run, trainer: Trainer, batches: Batches, validation: Validation) -> None:
     log = Log(run.out / "log.csv", trainer.step)
     scores = Log(run.out / "validation.csv", trainer.step)
     board = tensorboard(run.out) if run.tensorboard and trainer.worker.first else None
@@ -216,7 +200,7 @@ def _train(run: Run, trainer: Trainer, source: Source, validation: Validation) -
             write_picture(validation, network, run.out / "validation.png")
 
         every = run.validate_steps if validation.pairs else 0
-        trainer.run(source, run.checkpoint, Schedule(validate_steps=every, report=report, validate=validate))
+        trainer.run(batches, run.checkpoint, Schedule(validate_steps=every, report=report, validate=validate))
 
 
 class Log:

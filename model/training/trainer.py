@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -20,17 +20,9 @@ from beers_deploy.model.training.workers import Worker
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import OptionError
 
-
-class Source(Protocol):
-    """Where the trainer's batches come from: patches made on the fly, or stored pairs."""
-
-    def batches(self, first: int = 0) -> Iterator[tuple[Tensor, ...]]:
-        """Batch number `first` and all that follow: (degraded, reference), (N, 1, P, P) in [0, 1] each.
-
-        For a conditioned network, (degraded, reference, sensor vectors (N, 4)).
-        """
-        ...
-
+Batches = Callable[[int], Iterator[tuple[Tensor, ...]]]
+"""The batches from a number on: (degraded, reference), (N, 1, P, P) in [0, 1] each, of patches made on the fly or of
+stored pairs; for a conditioned network (degraded, reference, sensor vectors (N, 4))."""
 
 Precision = Literal["float32", "bfloat16"]
 """The number format of the blocks. Head, tail and what is added stay float32: 8 bits would round a 12-bit image."""
@@ -59,7 +51,7 @@ class Trainer:
         loss: the loss that the recipe weighs.
         worker: this process among those of the run.
         device: where the steps are computed.
-        start: weights to go on from, as `state_dict`; None draws new ones.
+        start: a network of the same kind and size to go on from; None draws new weights.
         teacher: a network of the same kind whose outputs the recipe's `distil` weighs.
         precision: what the body is computed in; it is the machine's, and a resumed run may take another.
         conditioned: whether the network is given the sensor of each patch.
@@ -72,7 +64,7 @@ class Trainer:
         loss: RestorationLoss | None = None,
         worker: Worker | None = None,
         device: str = "cpu",
-        start: Mapping[str, Tensor] | None = None,
+        start: Network | None = None,
         teacher: Network | None = None,
         precision: Precision = "float32",
         conditioned: bool = False,
@@ -84,7 +76,7 @@ class Trainer:
         self.network: Network = (BankedConvBEERS if conditioned else ConvBEERS)(variant)
         initialise(self.network, torch.Generator().manual_seed(recipe.seed))
         if start is not None:
-            self.network.load_state_dict(dict(start))
+            self.network.load_state_dict(start.state_dict())
         self.network.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.bfloat16 = precision == "bfloat16"
         self.forward = self.worker.wrap(self.network)
@@ -92,13 +84,19 @@ class Trainer:
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.optimiser = _optimiser(self.network, recipe)
 
-    def run(self, source: Source, checkpoint: Path, schedule: Schedule) -> None:
-        """Train to the last step. Ctrl-C leaves a checkpoint of the last whole step."""
+    def run(self, batches: Batches, checkpoint: Path, schedule: Schedule) -> None:
+        """Train to the last step. Ctrl-C leaves a checkpoint of the last whole step.
+
+        Args:
+            batches: from a number on, all that follow.
+            checkpoint: the file.
+            schedule: see there.
+        """
         meter, saved = Meter(self.step), time.monotonic()
         with held_back() as interrupt:
-            batches = source.batches(self.step)
+            following = batches(self.step)
             while self.step < self.recipe.steps and not self.worker.any(interrupt.asked, self.device):
-                meter.add(self.train_step(*next(batches)))
+                meter.add(self.train_step(*next(following)))
                 meter = self._look(schedule, meter)
                 if time.monotonic() - saved > schedule.save_s:
                     self.save(checkpoint)

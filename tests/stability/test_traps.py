@@ -12,12 +12,12 @@ from torch import Tensor
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.mtf import gamma_from_mtf, mtf
-from beers_deploy.model.traditional.compensate import compensate
 from beers_deploy.model.traditional.nl_bayes import QUALITIES, estimate_groups, first_pass, second_pass
 from beers_deploy.model.traditional.noise import Noise
 from beers_deploy.model.traditional.pipeline import Chain, Order, restore_traditional
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
+from tests.model.traditional.whole import compensate
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAPS = 18

@@ -8,7 +8,6 @@ from beers_deploy.model.simulator.mtf import mtf, transfer_function
 from beers_deploy.model.simulator.sampling import sample, scene_spectrum
 from beers_deploy.model.traditional import compensate as module
 from beers_deploy.model.traditional.compensate import (
-    compensate,
     compensation_gain,
     compensation_kernel,
     filter_strips,
@@ -16,6 +15,7 @@ from beers_deploy.model.traditional.compensate import (
 from beers_deploy.model.traditional.rows import fill_with_local_means, mirrored
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.response import PointSpread, packed
+from tests.model.traditional.whole import compensate
 
 EPSILON = 3e-3
 

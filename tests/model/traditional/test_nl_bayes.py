@@ -13,12 +13,12 @@ from beers_deploy.model.traditional.nl_bayes import (
     QUALITIES,
     estimate_groups,
     first_pass,
-    nl_bayes,
     nl_bayes_strips,
     second_pass,
 )
 from beers_deploy.model.traditional.noise import Noise, coloured_by
 from beers_deploy.profiles.errors import ImageError
+from tests.model.traditional.whole import nl_bayes
 
 SIGMA = 12.0
 WHITE = Noise(SIGMA)

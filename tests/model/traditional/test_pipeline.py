@@ -13,7 +13,6 @@ from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.mtf import transfer_function
 from beers_deploy.model.simulator.sampling import sample, scene_spectrum
 from beers_deploy.model.traditional import pipeline
-from beers_deploy.model.traditional.compensate import compensate
 from beers_deploy.model.traditional.noise import Noise, coloured_by
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.pipeline import (
@@ -29,6 +28,7 @@ from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.response import PointSpread
 from beers_deploy.profiles.sensor import Instrument, noise_from_snr
 from tests.model.simulator.stages import formula_point, point_spread, with_response
+from tests.model.traditional.whole import compensate
 
 DEGRADED = load_sensor("pleiades-degraded").nominal()
 REFERENCE = load_sensor("pleiades-reference").nominal()

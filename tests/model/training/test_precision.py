@@ -37,9 +37,9 @@ def test_a_run_goes_on_in_the_other_format_and_the_loss_with_it(first: Precision
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        Trainer(VARIANT, recipe, precision=first).run(source(), checkpoint, Schedule(10, 0.0, report=note))
+        Trainer(VARIANT, recipe, precision=first).run(source().batches, checkpoint, Schedule(10, 0.0, report=note))
     resumed = Trainer(VARIANT, recipe, precision=other)
     resumed.resume(checkpoint)
-    resumed.run(source(), checkpoint, Schedule(10, 0.0, report=note))
+    resumed.run(source().batches, checkpoint, Schedule(10, 0.0, report=note))
     assert [step for step, _ in seen[1:]] == [20, 20, 30, 40]
     assert seen[-1][1] < seen[0][1]

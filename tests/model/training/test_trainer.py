@@ -48,7 +48,7 @@ def train(
     checkpoint = folder / "checkpoint.safetensors"
     if resume:
         trainer.resume(checkpoint)
-    trainer.run(source(conditioned=conditioned), checkpoint, Schedule(1, 0.0, report=report))
+    trainer.run(source(conditioned=conditioned).batches, checkpoint, Schedule(1, 0.0, report=report))
     return trainer
 
 
@@ -103,7 +103,7 @@ def test_training_lowers_the_loss(tmp_path: Path) -> None:
     losses: list[float] = []
     recipe = TrainingRecipe(steps=60, batch=3, warm_up_steps=5)
     schedule = Schedule(20, report=lambda _, terms, __: losses.append(terms["l1"]))
-    Trainer(VARIANT, recipe).run(source(), tmp_path / "c", schedule)
+    Trainer(VARIANT, recipe).run(source().batches, tmp_path / "c", schedule)
     assert losses[-1] < 0.8 * losses[0]
 
 
@@ -131,13 +131,14 @@ def test_nan_batches_stop_the_run_and_touch_no_weight(tmp_path: Path) -> None:
     trainer = Trainer(VARIANT, TrainingRecipe(steps=50, batch=3))
     before = copies(trainer)
     with pytest.raises(ModelError, match=str(MAX_BAD_STEPS + 1)):
-        trainer.run(poisoned(), tmp_path / "c", Schedule())
+        trainer.run(poisoned().batches, tmp_path / "c", Schedule())
     assert all(torch.equal(*both) for both in zip(copies(trainer), before, strict=True))
 
 
 def test_one_nan_batch_is_skipped_and_the_run_goes_on(tmp_path: Path) -> None:
     trainer, seen = Trainer(VARIANT, TrainingRecipe(steps=6, batch=3)), []
-    trainer.run(poisoned(frozenset({2})), tmp_path / "c", Schedule(1, report=lambda *_: seen.append(copies(trainer))))
+    schedule = Schedule(1, report=lambda *_: seen.append(copies(trainer)))
+    trainer.run(poisoned(frozenset({2})).batches, tmp_path / "c", schedule)
     moved = [not all(map(torch.equal, one, other)) for one, other in pairwise(seen)]
     assert moved == [True, False, True, True, True]
     assert trainer.guards.bad_steps == 1
@@ -150,7 +151,7 @@ def test_one_nan_batch_is_skipped_and_the_run_goes_on(tmp_path: Path) -> None:
 def test_a_constant_scene_trains_without_nan(level: float, tmp_path: Path) -> None:
     scene = Scene("flat", torch.full((420, 480), level))
     trainer = Trainer(VARIANT, TrainingRecipe(steps=4, batch=3))
-    trainer.run(source(scene), tmp_path / "c", Schedule())
+    trainer.run(source(scene).batches, tmp_path / "c", Schedule())
     assert trainer.guards.bad_steps == 0
     assert all(torch.isfinite(value).all() for value in trainer.network.state_dict().values())
 
@@ -171,7 +172,7 @@ def test_ctrl_c_finishes_the_step_and_leaves_a_checkpoint_of_it(number: int, tmp
 
     trainer = Trainer(VARIANT, TrainingRecipe(steps=8, batch=3, warm_up_steps=2))
     with pytest.raises(KeyboardInterrupt):
-        trainer.run(source(), tmp_path / "checkpoint.safetensors", Schedule(1, report=report))
+        trainer.run(source().batches, tmp_path / "checkpoint.safetensors", Schedule(1, report=report))
     assert trainer.step == 4
     resumed, unbroken = train(tmp_path, resume=True), train(tmp_path / "b")
     assert all(map(torch.equal, copies(resumed), copies(unbroken)))
@@ -223,7 +224,7 @@ def test_a_student_is_pulled_towards_its_teacher(tmp_path: Path) -> None:
             steps=60, batch=3, loss=LossWeights(lpips=0.0, fft=0.0), distil=distil, warm_up_steps=5
         )
         student = Trainer(VARIANT, recipe, teacher=teacher if distil else None)
-        student.run(source(), tmp_path / f"{distil}", Schedule())
+        student.run(source().batches, tmp_path / f"{distil}", Schedule())
         image = next(source(seed=3).batches())[0]
         return float((student.averaged()(image) - teacher(image)).detach().abs().mean())
 
@@ -232,7 +233,7 @@ def test_a_student_is_pulled_towards_its_teacher(tmp_path: Path) -> None:
 
 def test_fine_tuning_starts_from_the_weights_given(tmp_path: Path) -> None:
     first = train(tmp_path, 4).averaged()
-    again = Trainer(VARIANT, TrainingRecipe(steps=4), start=first.state_dict())
+    again = Trainer(VARIANT, TrainingRecipe(steps=4), start=first)
     assert all(torch.equal(a, b) for a, b in zip(first.parameters(), again.network.parameters(), strict=True))
 
 
@@ -242,7 +243,7 @@ def test_adamw_pulls_weights_towards_zero(tmp_path: Path) -> None:
     for name in optimisers:
         recipe = TrainingRecipe(steps=12, batch=3, optimiser=name, weight_decay=20.0, warm_up_steps=1)
         trainer = Trainer(VARIANT, recipe)
-        trainer.run(source(), tmp_path / name, Schedule())
+        trainer.run(source().batches, tmp_path / name, Schedule())
         assert isinstance(trainer.network, ConvBEERS)
         norms[name] = float(trainer.network.head.weight.detach().norm())
     assert norms["adamw"] < 0.95 * norms["adam"]
@@ -261,7 +262,7 @@ torch.set_num_threads(1)
 with joined("cpu") as worker:
     recipe = TrainingRecipe(steps=3, batch=3, warm_up_steps=1)
     trainer = Trainer(Variant(blocks=1, features=4), recipe, worker=worker, precision="float32")
-    trainer.run(source(worker=worker), Path(sys.argv[1]), Schedule())
+    trainer.run(source(worker=worker).batches, Path(sys.argv[1]), Schedule())
 """
 
 
@@ -286,7 +287,7 @@ def test_two_workers_do_the_steps_of_one_with_a_batch_twice_as_large(tmp_path: P
     assert result.returncode == 0, result.stderr[-2000:]
     recipe = TrainingRecipe(steps=3, batch=3, warm_up_steps=1)
     alone, two = (Trainer(VARIANT, recipe, precision="float32") for _ in range(2))
-    alone.run(Together(), tmp_path / "one", Schedule())
+    alone.run(Together().batches, tmp_path / "one", Schedule())
     two.resume(tmp_path / "two")
     start = Trainer(VARIANT, recipe)
     for name, value in alone.network.state_dict().items():

@@ -1,0 +1,19 @@
+"""The steps of the chain on whole images."""
+
+import torch
+from torch import Tensor
+
+from beers_deploy.model.simulator.mtf import Blur
+from beers_deploy.model.traditional.compensate import compensation_kernel, filter_strips
+from beers_deploy.model.traditional.nl_bayes import QUALITIES, Quality, nl_bayes_strips
+from beers_deploy.model.traditional.noise import Noise
+
+
+def nl_bayes(image: Tensor, noise: Noise, quality: Quality = QUALITIES["standard"]) -> Tensor:
+    """Denoise (H, W)."""
+    return torch.cat(list(nl_bayes_strips([image], len(image), noise, quality)))
+
+
+def compensate(image: Tensor, blur_from: Blur, blur_to: Blur, epsilon: float) -> Tensor:
+    """Filter (H, W) by `compensation_kernel`; with equal MTFs only the regularisation acts."""
+    return torch.cat(list(filter_strips([image], len(image), compensation_kernel(blur_from, blur_to, epsilon))))
