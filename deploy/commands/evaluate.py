@@ -9,7 +9,6 @@ from beers_deploy.commands.shared import save, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.figures import by_table
 
 EXAMPLE = "evaluate --images aerial/ --methods degraded,traditional,convbeers-s,convbeers-s-int8 --out report/"
 
@@ -62,9 +61,8 @@ def evaluate(
     require_writable(out / "report.html" if out else None, json, inputs=read, folders=(out,))
     about: dict[str, Any] = {"sensor": sensor, "reference": reference, "lpips": lpips}
     found = compared(names, pairs, images=images, sweep=sweep, seed=seed, log=say, **about)
-    print_rows(found.title, found.mean)
-    for table, rows in by_table((*found.sites, *found.swept)).items():
-        print_rows(table, rows)
+    for title, rows in {found.title: found.mean, **found.more}.items():
+        print_rows(title, rows)
     for note in found.notes:
         say(note)
     if out is not None:

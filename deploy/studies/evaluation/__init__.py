@@ -1,6 +1,6 @@
 """Methods compared on the same pairs and targets: scores with intervals, by image and by site.
 
 - `methods`: what a method is, and the one of a name; `pairs`: degraded and reference images, simulated or read;
-- `targets`: edges and flat fields whose truth is known; `scores`: figures of one method;
-- `run`: an evaluation of several; `sweep`: the same under other sensors, known as they are or wrongly; `page`.
+- `scores`: figures of one method, on pairs and on edges and flat fields whose truth is known;
+- `run`: an evaluation of several, and its page; `sweep`: the same under other sensors, known as they are or wrongly.
 """

@@ -41,6 +41,8 @@ CHAINS: dict[str, tuple[str, Order]] = {
     **{name: (STANDARD, order) for name, order in ORDERS.items()},
 }
 """Quality and order of each traditional chain, by name."""
+WITHOUT_NETWORK = (DEGRADED, *CHAINS, *PEERS)
+"""The input itself, and the traditional chains and their peers."""
 
 KNOWN, BLIND = "known", "blind"
 """What a method knows of the sensor."""
@@ -69,12 +71,10 @@ class Method:
         return replace(self, restore=self.specialise(sensor), sensor_known=KNOWN)
 
 
-def method_without_network(name: str, degraded: Instrument, reference: Instrument) -> Method | None:
-    """The input itself, or a traditional chain or a peer of it, which know both sensors; None for any other name."""
+def method_without_network(name: str, degraded: Instrument, reference: Instrument) -> Method:
+    """The input itself, or a traditional chain or a peer of it, which know both sensors: one of WITHOUT_NETWORK."""
     if name == DEGRADED:
         return Method(name, lambda dn: dn, "the input itself")
-    if name not in (*CHAINS, *PEERS):
-        return None
     quality, order = CHAINS.get(name, (STANDARD, "denoise-first"))
     run = PEERS.get(name, restore_traditional)
 
@@ -101,9 +101,8 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, log: Log = no_l
         reference: the one that is aimed at.
         log: is told what of the sensor lies outside the range that a network was trained for.
     """
-    plain = method_without_network(name, degraded.nominal(), reference.nominal())
-    if plain is not None:
-        return plain
+    if name in WITHOUT_NETWORK:
+        return method_without_network(name, degraded.nominal(), reference.nominal())
     network, _, other = name.partition("@")
     shipped = network.removesuffix(INT8) in shipped_names()
     if not shipped and Path(network).suffix not in (".onnx", ".safetensors"):

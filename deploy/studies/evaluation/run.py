@@ -1,4 +1,7 @@
-"""`evaluate`: restorations compared on the same pairs, from names, networks and functions to rows and a report."""
+"""`evaluate`: restorations compared on the same pairs, from names, networks and functions to rows and a page.
+
+The page has the tables, and the same crops of every method with their errors beside the reference.
+"""
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -7,22 +10,33 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
+from PIL import Image
 
 from beers_deploy.model.dataset import PairsRecipe, profiles_for, read_pairs_recipe
+from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.images import list_images
+from beers_deploy.model.io.pictures import busiest_windows, error_row, grid, picture_url, stretch_of, strip_row
 from beers_deploy.model.metrics.bootstrap import too_few
 from beers_deploy.model.progress import Log, Progress, no_log, once, reporting
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.pairs import Pair
-from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.restoration.function import Restore, network_method
 from beers_deploy.results import Table
 from beers_deploy.studies.evaluation.methods import DEGRADED, Method, knowledge_of, method_named
 from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes, read_pairs
-from beers_deploy.studies.evaluation.scores import Instruments, paper_rows, perceptual_distances, score, site_rows
-from beers_deploy.studies.evaluation.sweep import sweep_tables
-from beers_deploy.studies.evaluation.targets import Targets, acquire_targets, target_figures
+from beers_deploy.studies.evaluation.scores import (
+    Instruments,
+    acquire_targets,
+    paper_rows,
+    perceptual_distances,
+    score,
+    site_rows,
+    target_figures,
+)
+from beers_deploy.studies.evaluation.sweep import run_sweep
 
 Methods = Mapping[str, NetworkLike | Restore] | Sequence[str]
 """Names of methods, or what restores by the name that it is listed under."""
@@ -36,17 +50,11 @@ class Evaluation(Table):
         sensors: of the degraded and of the reference images.
         methods: as they were run.
         pairs: that they were run on.
-        mean: a row a method, and the paper's.
-        sites: a row a site.
-        swept: rows of the sweep.
     """
 
     sensors: tuple[Sensor, Sensor]
     methods: Sequence[Method]
     pairs: Sequence[NamedPair]
-    mean: Sequence[Row]
-    sites: Sequence[Row]
-    swept: Sequence[Row]
 
     @property
     def title(self) -> str:
@@ -54,11 +62,21 @@ class Evaluation(Table):
         degraded, reference = self.sensors
         return f"{degraded.name} -> {reference.name}, {len(self.pairs)} image{'' if len(self.pairs) == 1 else 's'}"
 
+    @property
+    def mean(self) -> list[Row]:
+        """A row a method, and the paper's."""
+        return [row for row in self.rows if row.table == "mean"]
+
+    @property
+    def more(self) -> dict[str, list[Row]]:
+        """The tables by site and of other sensors; those of single images are for the document alone."""
+        return {name: rows for name, rows in by_table(self.rows).items() if name not in ("mean", "images")}
+
     def report(self, folder: str | os.PathLike[str]) -> Path:
         """Write report.html and pictures into a folder; returns the page's path."""
-        from beers_deploy.studies.evaluation.page import write_page  # which imports this module
-
-        return write_page(self, Path(folder))
+        page = Path(folder) / "report.html"
+        write_report(evaluation_report(self, pictures(self.pairs, self.methods, page.parent)), page)
+        return page
 
 
 def evaluate(
@@ -107,24 +125,24 @@ def evaluate(
         ways = [_method(name, each, sensors, told) for name, each in asked.items()]
         instruments = Instruments(perceptual_distances(weights), sensors[0].nominal().max_dn)
         loaded, said = _pairs(made, folder, scenes, sensors, recipe, seed)
-        mean, rows = _scored(ways, loaded, instruments, acquire_targets(sensors[0].nominal(), seed), seed)
-        swept = sweep_tables(ways, scenes, *sensors, seed) if sweep else ()
+        targets, rows = acquire_targets(sensors[0].nominal(), seed), list[Row]()
+        for way in ways:
+            mean, *each = score(way, loaded, instruments, seed)
+            rows += [replace(mean, figures={**mean.figures, **target_figures(way, targets)}), *each]
+        swept = run_sweep(ways, scenes, *sensors, seed).rows if sweep else []
     few = too_few(len({pair.site for pair in loaded}))
     arguments: dict[str, object] = {"images": images, "pairs": folder, "sensor": sensors[0].name, "lpips": lpips}
     arguments |= {"reference": sensors[1].name, "methods": ",".join(asked), "sweep": sweep, "seed": seed}
-    sites = site_rows(rows)
+    tables = by_table([*rows, *paper_rows()])
     return Evaluation(
         "evaluate",
         arguments,
         tuple(_inputs(asked, weights, scenes, folder)),
-        (*mean, *sites, *rows, *swept),
+        (*tables["mean"], *site_rows(tables["images"]), *tables["images"], *swept),
         notes=tuple([few, *said] if few else said),
         sensors=sensors,
         methods=ways,
         pairs=loaded,
-        mean=mean,
-        sites=sites,
-        swept=swept,
     )
 
 
@@ -155,17 +173,6 @@ def _named(number: int, pair: Pair) -> NamedPair:
     return NamedPair(f"pair{number}", seen, meant, noise_free=pair.clean)
 
 
-def _scored(
-    methods: Sequence[Method], pairs: Sequence[NamedPair], instruments: Instruments, targets: Targets, seed: int
-) -> tuple[list[Row], list[Row]]:
-    mean, rows = list[Row](), list[Row]()
-    for method in methods:
-        scored, *each = score(method, pairs, instruments, seed)
-        mean.append(replace(scored, figures={**scored.figures, **target_figures(method, targets)}))
-        rows += each
-    return [*mean, *paper_rows()], rows
-
-
 def _method(name: str, given: NetworkLike | Restore, sensors: tuple[Sensor, Sensor], log: Log) -> Method:
     if isinstance(given, str):
         return replace(method_named(given, *sensors, log), name=name)
@@ -174,3 +181,79 @@ def _method(name: str, given: NetworkLike | Restore, sensors: tuple[Sensor, Sens
     network = Network.load(cast("NetworkLike", given), sensor=sensors[0])
     known = knowledge_of(network.model, sensors[0].name)
     return Method(name, network_method(network.model, sensors[0].nominal().max_dn), known)
+
+
+SITES, CROP_PX, ZOOM = 4, 96, 2
+
+
+def chosen_pairs(pairs: Sequence[NamedPair]) -> list[NamedPair]:
+    """The first pair of each of the first few sites."""
+    first = {pair.site: pair for pair in reversed(pairs)}
+    sites = dict.fromkeys(pair.site for pair in pairs)
+    return [first[site] for site in sites][:SITES]
+
+
+def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, float]:
+    """Crops of every method and the reference, and below them the size of the errors.
+
+    Returns:
+        The picture (h, w) uint8, and the error in DN that is shown white.
+    """
+    images = {method.name: method.restore(pair.degraded) for method in methods}
+    side = min(CROP_PX, *pair.degraded.shape)
+    top, left = busiest_windows(pair.reference, side)[0]
+    whole = {**images, "reference": pair.reference}
+    crops = {name: image[top : top + side, left : left + side] for name, image in whole.items()}
+    errors = {name: np.abs(crop - crops["reference"]) for name, crop in crops.items()}
+    white = max(float(np.percentile(errors[methods[0].name], 99)), 1.0)
+    rows = [strip_row(crops.values(), stretch_of(crops["reference"])), error_row(errors.values(), white)]
+    return np.asarray(grid(list(crops), rows, ZOOM)), white
+
+
+def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -> list[Picture]:
+    """A strip for each of a few sites, also written to OUT/SITE.png."""
+    made = []
+    for pair in chosen_pairs(pairs):
+        strip, white = strip_of(pair, methods)
+        with whole_file(out / f"{pair.site}.png") as temporary:
+            Image.fromarray(strip).save(temporary, "PNG", optimize=True)
+        caption = (
+            f"{CROP_PX} pixels a side, enlarged {ZOOM} times, one grey scale for all. Below: size of the error "
+            f"against the reference, black none, white {white:.0f} DN and more."
+        )
+        made.append(Picture(pair.site, picture_url(strip), caption))
+    return made
+
+
+def evaluation_report(found: Evaluation, strips: Sequence[Picture]) -> Report:
+    """The page: pictures, means, sites, and the sweep where there was one."""
+    tables = [Section("Means over all pairs", found.mean, MEAN_CAPTION)]
+    for name, rows in found.more.items():
+        caption = SWEEP_CAPTION if name.startswith("sweep") else SITES_CAPTION
+        tables.append(Section(f"{name[0].upper()}{name[1:]}", rows, caption))
+    return Report(found.title, headline(found.mean), tables, strips, (*NOTES, *found.notes))
+
+
+MEAN_CAPTION = (
+    "Intervals: 95 % bootstrap over sites for image figures, none below five sites; 90 % for the MTF. What a "
+    "method knows of the sensor stands beside it: one that knows it has an advantage that it may not have in orbit."
+)
+SITES_CAPTION = "Over full scale; from PSNR, pixels that clipped in the input or the reference are left out."
+SWEEP_CAPTION = (
+    "One image of each site. The chain and every network that can know a sensor know that of the row, unless it says "
+    "that another one is supposed. Of gains and losses the interval is that of differences on the same images."
+)
+NOTES = (
+    "MTF at Nyquist is measured on restored slanted edges.",
+    "SNR is measured in restored flat fields, where nothing is to be seen: a denoiser may reach any SNR there.",
+    "The paper's rows were printed for another test set; its LPIPS network is not stated. They do not compare.",
+    "LPIPS-squeeze treats the panchromatic image as grey, values over full scale.",
+)
+
+
+def headline(mean: Sequence[Row]) -> str:
+    """The best method by mean PSNR, in one sentence."""
+    ours = [row for row in mean if row.figures["PSNR"].mode == "measured"]
+    best = max(ours, key=lambda row: row.figures["PSNR"].value or 0.0)
+    degraded = ours[0].figures["PSNR"]
+    return f"Best by PSNR: {best.name}, {best.figures['PSNR']} dB; the degraded input has {degraded} dB (measured)."

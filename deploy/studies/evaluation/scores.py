@@ -1,4 +1,9 @@
-"""Scores of one method on the pairs, as rows: an image each, and the mean with its interval."""
+"""Figures of one method: scores on pairs, by image and their mean, and MTF and SNR on targets whose truth is known.
+
+Targets are slanted edges and flat fields, acquired by the degraded sensor as scenes are, restored by the method, and
+measured as if found in an image. The MTF is that of edges of a step of 160 W/m2/sr/um; a method that adapts to its
+input may treat fine texture otherwise. The noise in flat fields is what is left where nothing is to be seen.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -6,16 +11,23 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.special import stdtrit
+from torch import Tensor
 
 from beers_deploy.model.io.images import MAX_DN
 from beers_deploy.model.metrics.bootstrap import site_interval
 from beers_deploy.model.metrics.fidelity import fidelity_db, ssim
 from beers_deploy.model.metrics.perceptual import Dists, Lpips, find_backbone, not_found
+from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.model.metrics.slanted_edge import edge_mtf, slanted_edge
 from beers_deploy.model.progress import steps
+from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.profiles.figures import Figure, Row, measured, published, unavailable
+from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.studies.evaluation.methods import Method
 from beers_deploy.studies.evaluation.pairs import NamedPair
-from beers_deploy.studies.evaluation.targets import RADIANCES, snr_name
 
 Perceptual = Callable[[np.ndarray, np.ndarray], float]
 """Distance of two images (H, W) in [0, 1] of full scale."""
@@ -87,6 +99,23 @@ class Instruments:
             return unavailable(unit, READ if key == NOISE_FREE else str(self.perceptual[key]))
         return measured(value, unit, source, interval) if np.isfinite(value) else unavailable(unit, IDENTICAL)
 
+    def means(
+        self, scores: Sequence[Mapping[str, float | None]], sites: Sequence[str], seed: int
+    ) -> dict[str, Figure]:
+        """The mean of each score over the images that have it, with the bootstrap interval over their sites."""
+        figures = {}
+        for key, first in scores[0].items():
+            both = ((each[key], site) for each, site in zip(scores, sites, strict=True))
+            usable = [(value, site) for value, site in both if value is not None and np.isfinite(value)]
+            if not usable:
+                figures[key] = self.figure(key, first, "")
+                continue
+            values, places = zip(*usable, strict=True)
+            interval, words = site_interval(values, places, np.random.default_rng(seed))
+            source = f"mean of {len(values)} pairs from {len(set(places))} sites, {words}"
+            figures[key] = self.figure(key, float(np.mean(values)), source, interval)
+        return figures
+
 
 def score(method: Method, pairs: Sequence[NamedPair], instruments: Instruments, seed: int) -> list[Row]:
     """The mean row of a method, then one row an image."""
@@ -98,30 +127,8 @@ def score(method: Method, pairs: Sequence[NamedPair], instruments: Instruments, 
             rows.append(Row("images", f"{method.name}: {pair.name}", figures, {"site": pair.site}))
             scores.append(values)
             bar.advance()
-    return [mean_row(method, scores, [pair.site for pair in pairs], instruments, seed), *rows]
-
-
-def mean_row(
-    method: Method,
-    scores: Sequence[dict[str, float | None]],
-    sites: Sequence[str],
-    instruments: Instruments,
-    seed: int,
-) -> Row:
-    """The mean of each score over the images that have it, with the bootstrap interval."""
-    figures = {}
-    for key in scores[0]:
-        usable = [
-            (v, site) for s, site in zip(scores, sites, strict=True) if (v := s[key]) is not None and np.isfinite(v)
-        ]
-        if not usable:
-            figures[key] = instruments.figure(key, scores[0][key], "")
-            continue
-        values, places = zip(*usable, strict=True)
-        interval, words = site_interval(values, places, np.random.default_rng(seed))
-        source = f"mean of {len(values)} pairs from {len(set(places))} sites, {words}"
-        figures[key] = instruments.figure(key, float(np.mean(values)), source, interval)
-    return Row("mean", method.name, figures, {"sensor": method.sensor_known})
+    means = instruments.means(scores, [pair.site for pair in pairs], seed)
+    return [Row("mean", method.name, means, {"sensor": method.sensor_known}), *rows]
 
 
 def site_rows(rows: Sequence[Row]) -> list[Row]:
@@ -141,6 +148,89 @@ def _site_row(key: str, site: str, images: Sequence[Row]) -> Row:
         source = f"mean {key} of {len(values)} pairs"
         figures[method] = measured(float(np.mean(values)), here[0].unit, source) if values else here[0]
     return Row(f"{key} by site", site, figures, {"images": str(len(here))})
+
+
+ANGLES_DEG = (3.0, 5.0, 8.0, 11.0)
+REPEATS = 3
+OVERSAMPLING, SIDE_PX, EDGE_PX, FLAT_PX = 5, 240, 80, 128
+RADIANCES = (25.0, 100.0)
+"""Of the flat fields, W/m2/sr/um."""
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Acquired targets, (H, W) digital numbers.
+
+    Attributes:
+        sensor: that acquired them.
+        edges: angle in degrees, and the edge; each with independent noise.
+        flats: radiance in W/m2/sr/um, and the field.
+    """
+
+    sensor: Instrument
+    edges: Sequence[tuple[float, np.ndarray]]
+    flats: Sequence[tuple[float, np.ndarray]]
+
+
+def acquire_targets(sensor: Instrument, seed: int) -> Targets:
+    """Edges at several angles with independent noise, and flat fields at 25 and 100 W/m2/sr/um."""
+    edges = []
+    for number, angle_deg in enumerate(ANGLES_DEG * REPEATS):
+        scene = slanted_edge(SIDE_PX, OVERSAMPLING, angle_deg)
+        edges.append((angle_deg, _acquire(scene, sensor, Draw(seed, number))))
+    flats = []
+    for number, radiance in enumerate(RADIANCES, len(edges)):
+        scene = torch.full((FLAT_PX, FLAT_PX), radiance)
+        flats.append((radiance, _acquire(scene, sensor, Draw(seed, number), ratio=1)))
+    return Targets(sensor, edges, flats)
+
+
+def _acquire(scene: Tensor, sensor: Instrument, draw: Draw, ratio: int = OVERSAMPLING) -> np.ndarray:
+    return acquire(scene_spectrum(scene), scene.shape[1], sensor, ratio, draw, "degraded", margin_px=0).numpy()
+
+
+def snr_name(radiance: float) -> str:
+    """The name of the SNR in a flat field of a radiance in W/m2/sr/um."""
+    return f"SNR at {radiance:g} W/m2/sr/um"
+
+
+def target_figures(method: Method, targets: Targets) -> dict[str, Figure]:
+    """MTF at Nyquist in %, and SNR in flat fields, of what the method makes of the targets."""
+    figures = {"MTF at Nyquist": restored_mtf(method, targets)}
+    for radiance, flat in targets.flats:
+        figures[snr_name(radiance)] = flat_figure(_middle(method.restore(flat)) - targets.sensor.offset_dn)
+    return figures
+
+
+def restored_mtf(method: Method, targets: Targets) -> Figure:
+    """MTF at Nyquist in % of the edges that the method restored."""
+    max_dn = targets.sensor.max_dn
+    return mtf_figure([edge_mtf(_middle(method.restore(edge)), angle, max_dn) for angle, edge in targets.edges])
+
+
+def _middle(image: np.ndarray) -> np.ndarray:
+    top, left = ((side - EDGE_PX) // 2 for side in image.shape)
+    return image[top : top + EDGE_PX, left : left + EDGE_PX]
+
+
+def mtf_figure(found: Sequence[float | Refusal]) -> Figure:
+    """The mean over the edges with its 90 % interval; unavailable where most edges were refused."""
+    values = [100 * each for each in found if not isinstance(each, Refusal)]
+    refused = [each for each in found if isinstance(each, Refusal)]
+    if len(values) < max(len(refused), 2):
+        return unavailable("%", f"{len(refused)} of {len(found)} edges refused: {refused[0].reason}")
+    reach = float(stdtrit(len(values) - 1, 0.95)) * float(np.std(values, ddof=1)) / len(values) ** 0.5
+    mean = float(np.mean(values))
+    source = f"{len(values)} of {len(found)} simulated slanted edges, 90 % interval of the mean"
+    return measured(mean, "%", source, (mean - reach, mean + reach))
+
+
+def flat_figure(flat: np.ndarray) -> Figure:
+    """Mean over standard deviation of a flat field (h, w), about its mean: the linear SNR there."""
+    mean, deviation = float(flat.mean(dtype=np.float64)), float(flat.std(dtype=np.float64, ddof=1))
+    if deviation <= 1e-6 * mean:
+        return unavailable("ratio", "nothing is left of the noise in a flat field")
+    return measured(mean / deviation, "ratio", f"one flat field of {flat.shape[1]} x {flat.shape[0]}, L / sigma")
 
 
 SOURCE = "ConvBEERS paper, table on its simulated test set"

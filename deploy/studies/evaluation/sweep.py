@@ -14,16 +14,14 @@ from beers_deploy.model.metrics.bootstrap import site_interval
 from beers_deploy.model.metrics.fidelity import fidelity_db
 from beers_deploy.model.progress import steps
 from beers_deploy.model.simulator.procedural import load_scenes
-from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.profiles.figures import Figure, Row, measured
 from beers_deploy.profiles.sensor import Instrument, Sensor, noise_from_snr
-from beers_deploy.studies.evaluation.methods import DEGRADED, TRADITIONAL, Method, method_without_network
+from beers_deploy.studies.evaluation.methods import DEGRADED, TRADITIONAL, WITHOUT_NETWORK, Method, method_named
 from beers_deploy.studies.evaluation.pairs import NamedPair, oversamplings_of, simulate_pairs
-from beers_deploy.studies.evaluation.scores import NOISE_FREE
-from beers_deploy.studies.evaluation.targets import acquire_targets, mtf_figure, restored_mtfs
+from beers_deploy.studies.evaluation.scores import NOISE_FREE, acquire_targets, restored_mtf
 
-NOMINAL, PLAIN = "nominal", (DEGRADED, TRADITIONAL)
-"""The condition that the others depart from, and the methods besides networks."""
+NOMINAL = "nominal"
+"""The condition that the others depart from."""
 SHARPNESS = (0.10, 0.07, 0.05, 0.03, 0.02)
 NOISE = ((15.0, 50.0), (25.0, 55.0), (30.0, 80.0), (70.0, 150.0), (90.0, 190.0))
 """SNR at 25 and 100 W/m2/sr/um; the nominal 50 / 110 is in every sweep."""
@@ -72,31 +70,33 @@ def _noisy(sensor: Instrument, profile: Sensor, snr_0: float, snr_1: float) -> I
 
 
 def run_sweep(
-    networks: Sequence[Method], scenes: Sequence[Scene], profile: Sensor, reference: Sensor, seed: int
+    methods: Sequence[Method], images: Path | None, profile: Sensor, reference: Sensor, seed: int
 ) -> "Found":
-    """Try every method under every condition.
+    """Try the input, the chain and every network under every condition, on one scene of each site.
 
     Args:
-        networks: run with each condition's sensor known where they can know it, else as they are.
-        scenes: that every sensor acquires.
+        methods: of which the networks are run, each condition's sensor known where they can know it.
+        images: folder of the scenes; drawn ones if None.
         profile: of the sensor that the conditions depart from.
         reference: profile of the sensor that is aimed at.
         seed: of every random draw.
     """
     psnr, mtf, pairs = dict[Key, np.ndarray](), dict[Key, Figure](), list[NamedPair]()
     nominal, aim, ratios = profile.nominal(), reference.nominal(), oversamplings_of(profile)
-    sensors, plain = conditions(nominal, profile), [method_without_network(n, nominal, aim) for n in PLAIN]
-    methods = [*(method for method in plain if method is not None), *networks]
-    trials = {name: _trials(name, sensor, methods, profile) for name, sensor in sensors.items()}
+    scenes = {site_of(scene.name): scene for scene in reversed(load_scenes(images, aim, seed))}
+    tried = [method_named(name, profile, reference) for name in (DEGRADED, TRADITIONAL)]
+    tried += [method for method in methods if method.name not in WITHOUT_NETWORK]
+    sensors = conditions(nominal, profile)
+    trials = {name: _trials(name, sensor, tried, profile) for name, sensor in sensors.items()}
     with steps("sweep", sum(map(len, trials.values()))) as bar:
         for name, sensor in sensors.items():
-            pairs, _ = simulate_pairs(list(scenes), sensor, aim.in_units_of(sensor), seed, ratios)
+            pairs, _ = simulate_pairs(list(scenes.values()), sensor, aim.in_units_of(sensor), seed, ratios)
             targets = acquire_targets(sensor, seed)
             for supposed, other, method in trials[name]:
                 key, knowing = (name, supposed, method.name), method.knowing(other)
                 psnr[key] = _psnr_db(knowing, pairs, sensor.max_dn)
                 if supposed in (name, NOMINAL):
-                    mtf[key] = mtf_figure(restored_mtfs(knowing, targets))
+                    mtf[key] = restored_mtf(knowing, targets)
                 bar.advance(1, f"{name}: {method.name}")
     return Found(psnr, mtf, [pair.site for pair in pairs], seed)
 
@@ -160,8 +160,7 @@ class Found:
     @property
     def rows(self) -> list[Row]:
         """Every table, a row a condition; and of the gains a row a network over all conditions."""
-        psnr = {key: self._mean(values[0]) for key, values in self.psnr.items()}
-        clean = {key: self._mean(values[1]) for key, values in self.psnr.items()}
+        psnr, clean = ({key: self._mean(both[k]) for key, both in self.psnr.items()} for k in (0, 1))
         tables = (("sweep, PSNR", psnr), (f"sweep, {NOISE_FREE}", clean), ("sweep, MTF at Nyquist", self.mtf))
         conditions = [
             Row(table, truth, {shown: figures[key] for shown, key in self._columns(truth).items()})
@@ -178,13 +177,14 @@ class Found:
 
     def _gains(self) -> list[Row]:
         """How far each network is ahead of the chain that knows the truth: by condition, then over all of them."""
-        gains = {truth: {name: self._gain(truth, name) for name in self.networks} for truth in self.conditions}
+        psnr = {(truth, name): both[0] for (truth, supposed, name), both in self.psnr.items() if truth == supposed}
+        gains = {
+            truth: {name: psnr[truth, name] - psnr[truth, TRADITIONAL] for name in self.networks}
+            for truth in self.conditions
+        }
         rows = [Row("sweep, gain over the chain", truth, self._means(each)) for truth, each in gains.items()]
         over_all = [self._over_all(n, {truth: each[n] for truth, each in gains.items()}) for n in self.networks]
         return [*rows, *over_all] if over_all else []
-
-    def _gain(self, truth: str, network: str) -> np.ndarray:
-        return np.asarray(self.psnr[truth, truth, network][0] - self.psnr[truth, truth, TRADITIONAL][0])
 
     def _over_all(self, network: str, gains: Mapping[str, np.ndarray]) -> Row:
         least = min(gains, key=lambda truth: float(gains[truth].mean()))
@@ -211,14 +211,3 @@ class Found:
         """The mean of (N,) dB, an image each: of differences on the same images the interval is a paired one."""
         interval, words = site_interval(values.tolist(), self.sites, np.random.default_rng(self.seed))
         return measured(float(values.mean()), "dB", f"mean of {len(values)} pairs, {words}", interval)
-
-
-def sweep_tables(
-    methods: Sequence[Method], images: Path | None, degraded: Sensor, reference: Sensor, seed: int
-) -> tuple[Row, ...]:
-    """The tables of a sweep of the networks among the methods, on one scene of each site."""
-    scenes = load_scenes(images, reference.nominal(), seed)
-    first = {site_of(scene.name): scene for scene in reversed(scenes)}
-    sensors = degraded.nominal(), reference.nominal()
-    networks = [method for method in methods if method_without_network(method.name, *sensors) is None]
-    return tuple(run_sweep(networks, list(first.values()), degraded, reference, seed).rows)

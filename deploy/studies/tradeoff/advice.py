@@ -1,17 +1,27 @@
-"""Which point to take: what a user can afford and needs (`latency<=20s`, `psnr>=44`), and one recommended line."""
+"""Which point to take: the front of quality against cost, limits such as `latency<=20s`, and one recommended line.
+
+Two points are compared on the same images: by the bootstrap interval, over whole sites, of the mean difference of
+their scores. Their own intervals show how images differ, which the points share.
+"""
 
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
+import numpy as np
+
+from beers_deploy.model.metrics.bootstrap import site_interval
+from beers_deploy.network import Network
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.figures import Figure, Row
-from beers_deploy.studies.tradeoff.pareto import COSTS, PSNR, Comparison, Measured, ends, placed
+from beers_deploy.profiles.figures import Figure, Row, measured, predicted
+from beers_deploy.studies.tradeoff.measure import Scores
+from beers_deploy.studies.tradeoff.points import Point
 
-MAP50 = "mAP50"
+COSTS = ("board latency", "board energy", "host p50")
+PSNR, MAP50 = "PSNR", "mAP50"
 NAMES: dict[str, tuple[str, str]] = {
-    "psnr": ("PSNR", "dB"),
+    "psnr": (PSNR, "dB"),
     "ssim": ("SSIM", "ratio"),
     "lpips": ("LPIPS-squeeze", "distance"),
     "map50": (MAP50, "%"),
@@ -24,6 +34,147 @@ NAMES: dict[str, tuple[str, str]] = {
     "efficiency": ("board efficiency", "px/s/W"),
 }
 """What a user writes: the figure that it stands for, and its unit."""
+BARE_UNITS = ("ratio", "distance")
+"""Units that are not written behind a number."""
+
+ALIKE_DB = 0.05
+"""Where the sites are too few for an interval, PSNR within this is not told apart."""
+WORTH_A_WORD_DB = 0.002
+"""Gains below it that are not significant are not mentioned."""
+
+SIGNIFICANT, NOT_SIGNIFICANT, TOO_FEW = "significant", "not significant", "too few sites to tell"
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A point with all its figures.
+
+    Attributes:
+        name: of the point; of a published run, as it is printed.
+        figures: by name; unavailable ones with the reason.
+        text: words beside them.
+        point: None of a published run.
+        images: scores of each image, in the order of the pairs; empty where there are none.
+    """
+
+    name: str
+    figures: dict[str, Figure]
+    text: Mapping[str, str]
+    point: Point | None = None
+    images: Sequence[Scores] = field(default=(), repr=False)
+
+    def value(self, key: str) -> float:
+        """A figure's value; NaN where there is none to compare: a published one was found on other images."""
+        figure = self.figures.get(key)
+        if figure is None or figure.value is None or figure.mode == "published":
+            return math.nan
+        return figure.value
+
+    @property
+    def network(self) -> Network:
+        """The network that restores here."""
+        if self.point is None or self.point.variant.file is None:
+            remedy = "take a point of a network"
+            raise OptionError("point", expected="one with a network", got=self.name, remedy=remedy)
+        return Network.load(self.point.variant.file)
+
+
+def placed(points: Iterable[Measured], cost: str) -> list[Measured]:
+    """The points that have both a cost and a PSNR to compare."""
+    return [point for point in points if not math.isnan(point.value(cost) + point.value(PSNR))]
+
+
+def pareto_front(points: Sequence[Measured], cost: str) -> list[Measured]:
+    """The points than which none is both cheaper and of better PSNR, by value, from cheap to dear."""
+    front: list[Measured] = []
+    for point in sorted(placed(points, cost), key=lambda p: (p.value(cost), -p.value(PSNR))):
+        if not front or point.value(PSNR) > front[-1].value(PSNR):
+            front.append(point)
+    return front
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Compares points by their scores on the same images.
+
+    Attributes:
+        sites: of the images, in their order.
+        seed: of the bootstrap.
+    """
+
+    sites: Sequence[str]
+    seed: int
+
+    def difference(self, a: Measured, b: Measured) -> Figure:
+        """The PSNR of `a` less that of `b`, with the interval of the paired difference; none below five sites."""
+        pairs = zip(a.images, b.images, strict=True)
+        differences = [(x[PSNR] or 0.0) - (y[PSNR] or 0.0) for x, y in pairs]
+        if not any(differences):  # the same pictures, on however few sites
+            return measured(0.0, "dB", "the same pictures", (0.0, 0.0))
+        interval, words = site_interval(differences, self.sites, np.random.default_rng(self.seed))
+        source = f"PSNR less that of {b.name} on the same images, {words}"
+        return measured(a.value(PSNR) - b.value(PSNR), "dB", source, interval)
+
+
+def significant(difference: Figure) -> bool:
+    """Whether the whole interval is above 0; by value, beyond ALIKE_DB, where there is none."""
+    if difference.interval is None:
+        return (difference.value or 0.0) > ALIKE_DB
+    return difference.interval[0] > 0
+
+
+def verdict(difference: Figure) -> str:
+    """In words: not significant where the interval holds 0."""
+    if difference.interval is None:
+        return TOO_FEW
+    low, high = difference.interval
+    return NOT_SIGNIFICANT if low <= 0 <= high else SIGNIFICANT
+
+
+def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
+    """How many times the cost of `b` that `a` has on the same board, with an interval.
+
+    Two predictions of one board share most of their error: the interval of a ratio of latencies is the board's
+    `pair_width`, and nothing where only the count of tiles differs.
+    """
+    value, source = a.value(cost) / b.value(cost), f"{cost} over that of {b.name}"
+    if cost.startswith("host"):
+        return measured(value, "x", f"{source}, medians of interleaved runs")
+    return predicted(value, "x", _ratio_interval(a, b, cost, value), source)
+
+
+def _ratio_interval(a: Measured, b: Measured, cost: str, value: float) -> tuple[float, float]:
+    first, second = a.point, b.point
+    if first and second and first.dpu and second.dpu:
+        if replace(first, halo_px=second.halo_px) == second:
+            return value, value
+        width = first.dpu.target.tables["cost"].get("pair_width")
+        if cost == "board latency" and width is not None:
+            return value * math.exp(-width.low), value * math.exp(width.low)
+    (a_low, a_high), (b_low, b_high) = (ends(each.figures[cost]) for each in (a, b))
+    return a_low / b_high, a_high / b_low
+
+
+def ends(figure: Figure) -> tuple[float, float]:
+    """The interval, or the value twice where it has none."""
+    return figure.interval or (figure.value or 0.0, figure.value or 0.0)
+
+
+def front_rows(front: Sequence[Measured], cost: str, compare: Comparison) -> list[Row]:
+    """A front's members by number, each with its difference from the next cheaper one."""
+    keys = dict.fromkeys((PSNR, cost, *(["board energy"] if cost.startswith("board") else [])))
+    rows: list[Row] = []
+    for number, each in enumerate(front, 1):
+        figures, word = {key: each.figures[key] for key in keys if key in each.figures}, "cheapest"
+        if rows:
+            cheaper = front[number - 2]
+            gain = compare.difference(each, cheaper)
+            figures |= {"PSNR gain": gain, f"{cost} ratio": cost_ratio(each, cheaper, cost)}
+            word = verdict(gain)
+        text = {"gain over the next cheaper": word}
+        rows.append(Row(f"front of PSNR against {cost}", f"{number}. {each.name}", figures, text))
+    return rows
+
 
 CONSTRAINT = re.compile(
     r"(?P<name>[a-z0-9-]+)\s*(?P<side><=|>=)\s*(?P<limit>[+-]?\d+(\.\d+)?([eE][+-]?\d+)?)\s*(?P<unit>\S*)"
@@ -40,15 +191,14 @@ class Constraint:
     unit: str
 
     def __str__(self) -> str:
-        unit = "" if self.unit in ("ratio", "distance") else f" {self.unit}"
+        unit = "" if self.unit in BARE_UNITS else f" {self.unit}"
         return f"{self.key} {'<=' if self.at_most else '>='} {self.limit:g}{unit}"
 
-    def violation(self, figure: Figure | None) -> float:
-        """By what share of the limit a figure misses it: 0 where it keeps it, endless where there is none."""
-        if figure is None or figure.value is None or figure.mode == "published":
-            return math.inf
-        miss = figure.value - self.limit if self.at_most else self.limit - figure.value
-        return max(miss, 0.0) / (abs(self.limit) or 1.0)
+    def violation(self, point: Measured) -> float:
+        """By what share of the limit a point misses it: 0 where it keeps it, endless without such a figure."""
+        over = point.value(self.key) - self.limit
+        miss = over if self.at_most else -over
+        return math.inf if math.isnan(miss) else max(miss, 0.0) / (abs(self.limit) or 1.0)
 
     def holds_throughout(self, figure: Figure) -> bool:
         """Whether the figure's whole interval keeps it."""
@@ -76,34 +226,16 @@ def _parse(option: str, text: str) -> Constraint:
     return Constraint(key, found["side"] == "<=", float(found["limit"]), unit)
 
 
-WORTH_A_WORD_DB = 0.002
-"""Gains below it that are not significant are not mentioned."""
-
-
-@dataclass(frozen=True)
-class Recommendation:
-    """The point to take, None where none keeps the constraints; and a line that says so."""
-
-    point: Measured | None
-    line: str
-
-    @property
-    def row(self) -> Row:
-        """For the document."""
-        name, figures = (self.point.name, self.point.figures) if self.point else ("none", {})
-        return Row("recommended", name, figures, {"line": self.line})
-
-
 def chosen_cost(points: Sequence[Measured], budget: Sequence[Constraint]) -> str:
     """The cost that the budget names; else the first that any point has, the board's latency before all."""
     named = (constraint.key for constraint in budget if constraint.key in COSTS)
-    had = (key for key in COSTS if any(point.value(key) is not None for point in points))
+    had = (key for key in COSTS if any(not math.isnan(point.value(key)) for point in points))
     return next(named, next(had, COSTS[0]))
 
 
 def recommend(
     points: Sequence[Measured], budget: Sequence[Constraint], need: Sequence[Constraint], compare: Comparison
-) -> Recommendation:
+) -> tuple[Measured | None, str]:
     """Within a budget the best PSNR, or the cheapest point that is not significantly worse; for a need the cheapest.
 
     Args:
@@ -111,25 +243,31 @@ def recommend(
         budget: what can be afforded.
         need: what must be reached.
         compare: tells which point is better.
+
+    Returns:
+        The point to take, None where none keeps the constraints; and a line that says so.
     """
     constraints, cost = [*budget, *need], chosen_cost(points, budget)
     ranked = placed(points, cost)
-    kept = [point for point in ranked if not _violation(point, constraints)]
+    kept = sorted((p for p in ranked if not _violation(p, constraints)), key=lambda point: point.value(cost))
     limits = f" for {' and '.join(map(str, constraints))}" if constraints else ""
     if not kept:
-        return Recommendation(None, _nearest(ranked, constraints, limits))
-    cheapest_first = sorted(kept, key=lambda point: point.cost(cost))
-    best = max(cheapest_first, key=lambda point: point.psnr_db)
-    taken = cheapest_first[0]
+        return None, _nearest(ranked, constraints, limits)
+    best = max(kept, key=lambda point: point.value(PSNR))
+    taken = kept[0]
     if budget or not need:
-        taken = next(point for point in cheapest_first if not compare.significantly_better(best, point))
+        taken = next(point for point in kept if not significant(compare.difference(best, point)))
     line = f"recommended{limits}: {_words(taken, [PSNR, cost, *(each.key for each in constraints)])}"
-    return Recommendation(taken, line + _remarks(taken, best, constraints, compare, by_psnr=bool(budget or not need)))
+    gain = compare.difference(best, taken)
+    if (budget or not need) and best is not taken and (gain.value or 0.0) >= WORTH_A_WORD_DB:
+        line += f"; {best.name} has {gain} dB more, {verdict(gain)}"
+    unsure = [str(each) for each in constraints if not each.holds_throughout(taken.figures[each.key])]
+    return taken, line + (f"; {' and '.join(unsure)} holds by value, not over the whole interval" if unsure else "")
 
 
 def _violation(point: Measured, constraints: Sequence[Constraint]) -> float:
     """Of the constraint that a point misses most."""
-    return max((each.violation(point.figures.get(each.key)) for each in constraints), default=0.0)
+    return max((each.violation(point) for each in constraints), default=0.0)
 
 
 def _nearest(points: Sequence[Measured], constraints: Sequence[Constraint], limits: str) -> str:
@@ -141,25 +279,9 @@ def _nearest(points: Sequence[Measured], constraints: Sequence[Constraint], limi
 
 
 def _words(point: Measured, keys: Sequence[str]) -> str:
-    figures = [f"{key} {_figure(point.figures[key])}" for key in dict.fromkeys(keys)]
-    return f"{point.name}: {', '.join(figures)}"
+    return f"{point.name}: {', '.join(f'{key} {_figure(point.figures[key])}' for key in dict.fromkeys(keys))}"
 
 
 def _figure(figure: Figure) -> str:
-    if figure.value is None:
-        return "unavailable"
-    unit = "" if figure.unit in ("ratio", "distance") else f" {figure.unit}"
+    unit = "" if figure.unit in BARE_UNITS else f" {figure.unit}"
     return f"{figure}{unit} ({figure.mode})"
-
-
-def _remarks(
-    taken: Measured, best: Measured, constraints: Sequence[Constraint], compare: Comparison, *, by_psnr: bool
-) -> str:
-    """That a better value is not significant, and that an interval reaches beyond a limit."""
-    remarks = ""
-    if by_psnr and best is not taken:
-        gain = compare.difference(best, taken)
-        if (gain.value or 0.0) >= WORTH_A_WORD_DB:
-            remarks += f"; {best.name} has {gain} dB more, {compare.verdict(best, taken)}"
-    unsure = [str(each) for each in constraints if not each.holds_throughout(taken.figures[each.key])]
-    return remarks + (f"; {' and '.join(unsure)} holds by value, not over the whole interval" if unsure else "")

@@ -23,13 +23,12 @@ from beers_deploy.export import float_model
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.io.images import list_images
 from beers_deploy.model.processor import processor_name
-from beers_deploy.model.simulator.procedural import load_scenes
+from beers_deploy.model.shipped import DETECTOR
 from beers_deploy.profiles import load_sensor, sensor_names
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.figures import Figure, measured
+from beers_deploy.profiles.figures import Figure, measured, unavailable
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import reference_for
-from beers_deploy.quant.calibration import draw_patches
+from beers_deploy.quant.calibration import Calibration
 from beers_deploy.quant.onnx_file import metadata, save_onnx
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.reading.external import network_sha256
@@ -38,9 +37,12 @@ from beers_deploy.restoration.function import Restore
 from beers_deploy.restoration.options import Runtime
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.runtime import open_runtime
+from beers_deploy.studies.detection.average_precision import find_hits, interval, map50, site_weights
+from beers_deploy.studies.detection.detector import Detector, open_detector, parse_classes
+from beers_deploy.studies.detection.study import LabelledScene, SensorPair, acquired, labelled_scenes
 from beers_deploy.studies.evaluation.methods import Method
 from beers_deploy.studies.evaluation.pairs import NamedPair
-from beers_deploy.studies.evaluation.scores import NOISE_FREE, Instruments, mean_row
+from beers_deploy.studies.evaluation.scores import NOISE_FREE, Instruments
 from beers_deploy.studies.tradeoff.points import HALO_STEP_PX, Point, Variant, model_of, tiling_of_file
 
 Scores = Mapping[str, float | None]
@@ -53,8 +55,14 @@ NOT_SHOWN = ("PSNR gain", NOISE_FREE, SEAM_ERROR)
 
 def key_of(**about: object) -> str:
     """SHA-256 of what a measurement depends on, this tool's version among it."""
-    text = json.dumps({"version": __version__, **about}, sort_keys=True, default=str)
+    text = json.dumps({"version": __version__, **about}, sort_keys=True, default=_as_text)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _as_text(value: object) -> str:
+    if isinstance(value, np.ndarray):
+        return f"{value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
+    return str(value)
 
 
 @dataclass
@@ -111,9 +119,8 @@ class Benchmark:
     @cached_property
     def digest(self) -> str:
         """Of everything that scores depend on besides the method."""
-        images = [image for pair in self.pairs for image in (pair.degraded, pair.reference)]
-        names = [(pair.name, pair.site) for pair in self.pairs]
-        return key_of(pixels=[pixels_sha256(image) for image in images], names=names, weights=self.weights)
+        pairs = [(pair.name, pair.site, pair.degraded, pair.reference) for pair in self.pairs]
+        return key_of(pairs=pairs, weights=self.weights)
 
     @property
     def sites(self) -> list[str]:
@@ -124,34 +131,32 @@ class Benchmark:
         """Digest of what a variant's pictures depend on."""
         if variant.file is not None:
             return network_sha256(variant.file)
-        return key_of(method=variant.source, sensors=[self.degraded, self.reference])
+        return key_of(method=variant.method, sensors=[self.degraded, self.reference])
 
     def scores(self, point: Point, exact: Restore, kept: Measurements) -> list[dict[str, float | None]]:
         """Scores of each image: those of the variant, or with seams where the halo is too small for exact ones."""
-        about = {"scores": self.depends(point.variant), "images": self.digest}
+        about: dict[str, object] = {"scores": self.depends(point.variant), "images": self.digest}
         if point.halo_px is None:
             return list(kept.make(key_of(**about), lambda: self.score(exact)))
-        key = key_of(**about, tile_px=point.tile_px, halo_px=point.halo_px)
-        return list(kept.make(key, lambda: self.score_in_tiles(point, exact)))
+        about |= {"tile_px": point.tile_px, "halo_px": point.halo_px}
+        max_dn = self.degraded.nominal().max_dn
+        return list(kept.make(key_of(**about), lambda: self.score(restore_in_tiles(point, max_dn), exact)))
 
-    def score(self, restore: Restore) -> list[dict[str, float | None]]:
-        """Scores of every pair."""
-        return [self.instruments.score(restore(pair.degraded), pair) for pair in self.pairs]
-
-    def score_in_tiles(self, point: Point, exact: Restore) -> list[dict[str, float | None]]:
-        """Scores of every pair restored in a point's tiles, and how far its seams are from exact ones, in DN."""
-        cut, found = restore_in_tiles(point, self.degraded.nominal().max_dn), []
+    def score(self, restore: Restore, exact: Restore | None = None) -> list[dict[str, float | None]]:
+        """Scores of every pair; and how far, in DN, a restoration with seams is from the exact one given."""
+        found = []
         for pair in self.pairs:
-            restored = cut(pair.degraded)
-            error = np.abs(np.asarray(restored, np.float64) - exact(pair.degraded)).mean()
-            found.append({**self.instruments.score(restored, pair), SEAM_ERROR: float(error)})
+            restored = restore(pair.degraded)
+            found.append(self.instruments.score(restored, pair))
+            if exact is not None:
+                error = np.abs(np.asarray(restored, np.float64) - exact(pair.degraded)).mean()
+                found[-1][SEAM_ERROR] = float(error)
         return found
 
     def means(self, images: Sequence[Scores]) -> dict[str, Figure]:
         """Means over the images, with bootstrap intervals over whole sites."""
         plain = [{key: each[key] for key in each if key not in NOT_SHOWN} for each in images]
-        unnamed = Method("", lambda dn: dn, "")
-        found = dict(mean_row(unnamed, plain, self.sites, self.instruments, self.seed).figures)
+        found = self.instruments.means(plain, self.sites, self.seed)
         if SEAM_ERROR in images[0]:
             errors = [each[SEAM_ERROR] or 0.0 for each in images]
             source = f"mean difference from exact seams, {len(errors)} images in these tiles"
@@ -172,11 +177,60 @@ def restore_in_tiles(point: Point, max_dn: int) -> Restore:
     return restore
 
 
-def pixels_sha256(image: np.ndarray) -> str:
-    """SHA-256 of an image's shape, type and pixels."""
-    digest = hashlib.sha256(f"{image.shape} {image.dtype}".encode())
-    digest.update(np.ascontiguousarray(image).tobytes())
-    return digest.hexdigest()
+@dataclass(frozen=True)
+class Labelled:
+    """Labelled scenes and the detector that looks at them.
+
+    Attributes:
+        detector: that is shown the restored images.
+        scenes: labelled.
+        benchmark: whose sensors acquire them, and whose seed draws.
+        digest: of detector, scenes, labels and sensors.
+        notes: what a reader must know of labels and detector.
+    """
+
+    detector: Detector
+    scenes: Sequence[LabelledScene]
+    benchmark: Benchmark
+    digest: str
+    notes: Sequence[str]
+
+    @classmethod
+    def open(cls, images: Path, detector: Path | None, classes: str | None, benchmark: Benchmark) -> "Labelled":
+        """Read the labels and open the detector; no image is read yet.
+
+        Args:
+            images: folder of labelled images.
+            detector: ONNX file; the embedded one if None.
+            classes: labelled classes under the detector's names, as the user writes them.
+            benchmark: as the attribute.
+        """
+        file = detector or DETECTOR
+        opened = open_detector(file)
+        scenes, notes = labelled_scenes(opened.names, parse_classes(classes) if classes else {}, images)
+        files = [sha256(each.path) for each in scenes if each.path]
+        seen = [files, *((each.site, each.truth.corners, each.truth.classes) for each in scenes)]
+        sensors = benchmark.degraded, benchmark.reference
+        digest = key_of(detector=sha256(file), scenes=seen, seed=benchmark.seed, sensors=sensors)
+        return cls(opened, scenes, benchmark, digest, [each for each in (opened.flag, *notes) if each])
+
+    def measure(self, method: Method) -> dict[str, object]:
+        """mAP50 of the detector on every scene as a method restores it, and its interval over sites."""
+        sensors, seed = SensorPair(self.benchmark.degraded, self.benchmark.reference), self.benchmark.seed
+        found = [each.boxes(self.detector, method) for each in acquired(self.scenes, sensors, seed)]
+        hits = find_hits([scene.truth for scene in self.scenes], found, len(self.detector.names))
+        sites = [scene.site for scene in self.scenes]
+        values = map50(hits, site_weights(sites, seed))
+        value = None if np.isnan(values[0]) else float(values[0])
+        return {"value": value, "interval": interval(values, len(set(sites)))}
+
+    def figure(self, stored: Mapping[str, Any]) -> Figure:
+        """What `measure` gave, in %."""
+        if stored["value"] is None:
+            return unavailable("%", "no labelled object")
+        sites, ends = len({each.site for each in self.scenes}), stored["interval"]
+        source = f"{len(self.scenes)} labelled images of {sites} sites, interval by bootstrap over sites"
+        return measured(100 * stored["value"], "%", source, (100 * ends[0], 100 * ends[1]) if ends else None)
 
 
 TILE_PX, ROUNDS = 256, 9
@@ -186,11 +240,10 @@ def measure_host(
     methods: Mapping[Variant, Method], benchmark: Benchmark, kept: Measurements
 ) -> dict[Variant, dict[str, Figure]]:
     """What each variant takes on this machine, all timed together on a drawn scene as the sensor sees it."""
-    swath = Swath(TILE_PX, TILE_PX)
-    tile = drawn_acquisition(swath, benchmark.degraded, benchmark.reference, benchmark.seed)
+    tile = drawn_acquisition(Swath(TILE_PX, TILE_PX), benchmark.degraded, benchmark.reference, benchmark.seed)
     names = [benchmark.depends(variant) for variant in methods]
     machine = f"{platform.machine()} {processor_name() or platform.processor()} x {psutil.cpu_count()}"
-    key = key_of(times=names, tile=pixels_sha256(tile), side=TILE_PX, machine=machine)
+    key = key_of(times=names, tile=tile, machine=machine)
     times = kept.make(key, lambda: host_times([method.restore for method in methods.values()], tile))
     return {variant: host_figures(each, tile.size) for variant, each in zip(methods, times, strict=True)}
 
@@ -232,9 +285,6 @@ def make_int8(file: Path, folder: Path, scenes: Path | None, sensor: Sensor, see
     key = key_of(network=network_sha256(file), scenes=seen, sensor=known, seed=seed, size=[PATCHES, PATCH_PX])
     path = folder / f"{file.stem}-int8-{key[:16]}.onnx"
     if not path.is_file():
-        reference = reference_for(known)
-        loaded = load_scenes(scenes, reference.nominal(), seed)
-        patches = draw_patches(loaded, known, reference, PATCHES, seed, PATCH_PX)
-        about = {"calibration_sensor": known.name, "calibration_seed": str(seed)}
-        save_onnx(quantise_model(model, patches, about).host, path)
+        patches = Calibration(known, scenes, PATCHES, PATCH_PX, seed)
+        save_onnx(quantise_model(model, patches.drawn, patches.about).host, path)
     return path

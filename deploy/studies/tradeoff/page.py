@@ -1,19 +1,22 @@
-"""The page of a study: the recommended line, the plot with its front, and every point in a table that sorts."""
+"""What a study found, and its page: the recommended line, the plot with its front, and a table of all points."""
 
+import os
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from markupsafe import Markup
 
 from beers_deploy.model.io.files import write_text
 from beers_deploy.model.traditional.peers import PEERS
+from beers_deploy.profiles.errors import optional
+from beers_deploy.profiles.figures import Row
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.report.plots import LIGHT, SERIES, data_url, look, new_figure, set_ticks, svg_of
-from beers_deploy.studies.tradeoff.pareto import PSNR, Measured, ends, placed
-from beers_deploy.studies.tradeoff.run import Tradeoff
+from beers_deploy.results import Table
+from beers_deploy.studies.tradeoff.advice import PSNR, Measured, ends, placed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,23 +48,66 @@ PLOT_CAPTION = (
 )
 
 
-def write_study(study: Tradeoff, out: Path) -> None:
-    """Write the page and its plot into a folder."""
-    svg = plot_svg(study)
-    write_text(out / "tradeoff.svg", svg)
-    write_report(report_of(study, svg), out / "tradeoff.html")
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Tradeoff(Table):
+    """What accuracy costs in time: the recommended point, the Pareto front, and every point with its figures.
+
+    Attributes:
+        board: the first one, which the front and the recommendation are about.
+        points: all of them, in the order networks, chains, other libraries, the paper's runs.
+        front: those of the first board on the Pareto front, from cheap to dear.
+        front_rows: the same by number, each with its difference from the next cheaper one.
+        cost: the figure that the front is against.
+        best: the recommended point; None where none keeps the budget and the need.
+        line: that recommends it.
+    """
+
+    board: str
+    points: Sequence[Measured]
+    front: Sequence[Measured]
+    front_rows: Sequence[Row]
+    cost: str
+    best: Measured | None
+    line: str
+
+    def plot(self, figure: str | None = None, ax: "Axes | None" = None) -> "Axes":
+        """PSNR of every point of the first board against its cost, the front's numbered.
+
+        Args:
+            figure: given, bars of that figure instead, as of any table.
+            ax: axes of matplotlib to draw on; new ones if None.
+        """
+        if figure is not None:
+            return super().plot(figure, ax)
+        axes = ax if ax is not None else optional("matplotlib.pyplot", "plot").subplots()[1]
+        draw_study(axes, self)
+        return cast("Axes", axes)
+
+    def report(self, folder: str | os.PathLike[str]) -> Path:
+        """Write the page and its plot into a folder; returns the page's path."""
+        svg = plot_svg(self)
+        page, plot = (Path(folder) / name for name in FILES)
+        write_text(plot, svg)
+        write_report(report_of(self, svg), page)
+        return page
+
+    def __str__(self) -> str:
+        return self.line
 
 
 def report_of(study: Tradeoff, svg: str) -> Report:
     """The page in reading order."""
     picture = Picture(f"{PSNR} against {study.cost}", data_url(svg), PLOT_CAPTION)
-    shown = [replace(each.row, text={key: each.text.get(key, "") for key in SHOWN_WORDS}) for each in study.points]
+    points = [
+        Row("points", each.name, each.figures, {word: each.text.get(word, "") for word in SHOWN_WORDS})
+        for each in study.points
+    ]
     tables = [
         Section("The front, from cheap to dear", study.front_rows, FRONT_CAPTION),
-        Section(f"All {len(study.points)} points", shown, POINTS_CAPTION),
+        Section(f"All {len(points)} points", points, POINTS_CAPTION),
     ]
-    title, line = "What accuracy costs in time", study.recommendation.line
-    return Report(title, f"{line[0].upper()}{line[1:]}.", tables, [picture], study.notes, sorts=True)
+    headline = f"{study.line[0].upper()}{study.line[1:]}."
+    return Report("What accuracy costs in time", headline, tables, [picture], study.notes, sorts=True)
 
 
 def plot_svg(study: Tradeoff) -> Markup:
@@ -86,58 +132,49 @@ def draw_study(axes: "Axes", study: Tradeoff) -> None:
     points = [point for point in placed(study.points, study.cost) if point.text["board"] in boards]
     axes.set(xscale="log", xlabel=_label(study, study.cost), ylabel=_label(study, PSNR))
     for name, colour, marker, members in series(points):
-        _scatter(axes, study.cost, members, list(study.front), name=name, colour=colour, marker=marker)
-    _draw_front(axes, study, study.front)
+        for large in (False, True):  # the front's last, so that they lie on top
+            x, y = _places([point for point in members if (point in study.front) == large], study.cost)
+            size, alpha, label = (FRONT_PX2, 1.0, name) if large else (OTHERS_PX2, PALE, None)
+            style: dict[str, Any] = {"c": colour, "marker": marker, "alpha": alpha, "zorder": 2 + large}
+            axes.scatter(x, y, s=size, label=label, linewidths=0, **style)
+    _draw_front(axes, study)
     axes.margins(0.1)
     if points:
         set_ticks(axes.xaxis, 6)
         set_ticks(axes.yaxis, 8)
 
 
+def _places(points: Sequence[Measured], cost: str) -> tuple[list[float], list[float]]:
+    return [point.value(cost) for point in points], [point.value(PSNR) for point in points]
+
+
 def series(points: Sequence[Measured]) -> Iterator[tuple[str, str, str, list[Measured]]]:
     """Points that look alike: name, colour and marker of each network, of the chains, and of other libraries."""
     groups: dict[str, list[Measured]] = {}
     for point in points:
-        groups.setdefault(_group(point), []).append(point)
+        network = point.point is not None and point.point.variant.file is not None
+        others = LIBRARIES if point.text["method"] in PEERS else CHAINS
+        groups.setdefault(point.text["method"] if network else others, []).append(point)
     for number, (name, members) in enumerate(groups.items()):
         yield name, LIGHT[SERIES[number % len(SERIES)]], MARKERS[number % len(MARKERS)], members
 
 
-def _group(point: Measured) -> str:
-    if point.point is not None and point.point.variant.file is not None:
-        return point.text["method"]
-    return LIBRARIES if point.text["method"] in PEERS else CHAINS
-
-
-def _scatter(
-    axes: "Axes", cost: str, members: list[Measured], front: list[Measured], *, name: str, colour: str, marker: str
-) -> None:
-    """One series, its points of the front last so that they lie on top."""
-    for large in (False, True):
-        shown = [point for point in members if (point in front) == large]
-        size, alpha = (FRONT_PX2, 1.0) if large else (OTHERS_PX2, PALE)
-        x, y = [point.cost(cost) for point in shown], [point.psnr_db for point in shown]
-        axes.scatter(x, y, s=size, c=colour, marker=marker, alpha=alpha, linewidths=0, zorder=2 + large)
-    axes.scatter([], [], s=FRONT_PX2, c=colour, marker=marker, label=name, linewidths=0)
-
-
-def _draw_front(axes: "Axes", study: Tradeoff, front: Sequence[Measured]) -> None:
-    x, y = [point.cost(study.cost) for point in front], [point.psnr_db for point in front]
-    axes.step(x, y, where="post", color=LIGHT["soft"], lw=1, zorder=1)
-    for point, row in zip(front, study.front_rows, strict=True):
-        at = point.cost(study.cost), point.psnr_db
-        axes.plot(ends(point.figures[study.cost]), [at[1]] * 2, color=LIGHT["line"], lw=2, zorder=0)
+def _draw_front(axes: "Axes", study: Tradeoff) -> None:
+    axes.step(*_places(study.front, study.cost), where="post", color=LIGHT["soft"], lw=1, zorder=1)
+    for point, row in zip(study.front, study.front_rows, strict=True):
+        x, y = point.value(study.cost), point.value(PSNR)
+        axes.plot(ends(point.figures[study.cost]), [y, y], color=LIGHT["line"], lw=2, zorder=0)
         gain = row.figures.get("PSNR gain")
         if gain is not None and gain.interval is not None:
-            before = at[1] - (gain.value or 0.0)
-            axes.plot([at[0]] * 2, [before + end for end in gain.interval], color=LIGHT["soft"], lw=1.5, zorder=1)
+            before = y - (gain.value or 0.0)
+            axes.plot([x, x], [before + end for end in gain.interval], color=LIGHT["soft"], lw=1.5, zorder=1)
 
 
 def _draw_numbers(axes: "Axes", study: Tradeoff) -> None:
     """The members' numbers beside their marks; one label for neighbours whose marks lie on one another."""
     groups: list[tuple[int, int, np.ndarray]] = []
     for number, point in enumerate(study.front, 1):
-        at = axes.transData.transform((point.cost(study.cost), point.psnr_db))
+        at = axes.transData.transform((point.value(study.cost), point.value(PSNR)))
         if groups and np.hypot(*(at - groups[-1][2])) < NEAR_PX:
             groups[-1] = (groups[-1][0], number, groups[-1][2])
         else:

@@ -1,4 +1,4 @@
-"""Operating points: which networks are compared, and in which tiles, halos and configurations.
+"""Operating points: which networks are compared, in which tiles, halos and configurations, and what a board takes.
 
 A variant is a method in one precision, measured once. A point is a variant where it runs: an INT8 network on one
 configuration of a board's DPU, in tiles with a halo; a traditional pipeline on a board's processor; or anything on
@@ -13,10 +13,18 @@ from pathlib import Path
 
 import onnx
 
-from beers_deploy.bench.tables import PAPER_TILE_PX, Swath, swath_latency
+from beers_deploy.bench.tables import (
+    PAPER_TILE_PX,
+    Swath,
+    chain_rate,
+    efficiency,
+    energy,
+    processor_row,
+    swath_latency,
+)
 from beers_deploy.dpu.board import Dpu, dpu_of
 from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.cost.latency import Prediction, predict
+from beers_deploy.dpu.cost.latency import dpu_power, predict
 from beers_deploy.dpu.graph import Network
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.export import float_model
@@ -24,6 +32,7 @@ from beers_deploy.model.shipped import shipped_names
 from beers_deploy.network import float_file, int8_file
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.figures import Figure, predicted, unavailable
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
 from beers_deploy.quant.onnx_file import is_quantised, load_onnx
@@ -45,13 +54,11 @@ class Variant:
     Attributes:
         method: its name without the precision.
         precision: float32 or INT8.
-        source: what `deploy.studies.evaluation.methods.method_named` takes: a name, or the file of a network.
         file: the network's file; None of a method without a network.
     """
 
     method: str
-    precision: str
-    source: str
+    precision: str = FLOAT
     file: Path | None = None
 
     @property
@@ -89,11 +96,6 @@ class Point:
             return f"{self.variant.name}, processor of {self.board.name}"
         halo = "exact" if self.halo_px is None else self.halo_px
         return f"{self.variant.name}, {self.board.name} {self.dpu.name}, tile {self.tile_px}, halo {halo}"
-
-    def swath(self, whole: Swath) -> Swath:
-        """The swath as this point cuts it."""
-        halo_px = radius_px(self.variant) if self.halo_px is None else self.halo_px
-        return replace(whole, tile_px=self.tile_px, halo_px=halo_px)
 
 
 def parse_targets(text: str) -> tuple[str, ...]:
@@ -138,15 +140,15 @@ def _variants(
     model, method = float_model(given), name if name in shipped_names() else path.stem
     _require_tiles(name, tiling_of(model))
     if is_quantised(model):
-        yield Variant(method, INT8, str(given), given)
+        yield Variant(method, INT8, given)
         return
-    yield Variant(method, FLOAT, str(given), given)
+    yield Variant(method, FLOAT, given)
     try:
         made = int8_file(path, sensor) if name in shipped_names() else make_int8(given)
     except ModelError as error:
         log(f"{name} is compared in float32 alone: {error}")
         return
-    yield Variant(method, INT8, str(made), made)
+    yield Variant(method, INT8, made)
 
 
 def _require_tiles(name: str, tiling: Tiling) -> None:
@@ -200,17 +202,21 @@ def fastest_tile_px(variant: Variant, dpu: Dpu, whole: Swath) -> int:
     """The tile with exact seams, no larger than the paper's, in which the swath is predicted to take least time."""
     radius = radius_px(variant)
     sides = range(TILE_STEP_PX * (2 * radius // TILE_STEP_PX + 1), PAPER_TILE_PX + 1, TILE_STEP_PX)
-
-    def latency_s(side_px: int) -> float:
-        swath, prediction = replace(whole, tile_px=side_px, halo_px=radius), predict_tile(variant, side_px, dpu)
-        return swath_latency(prediction, math.ceil(swath.tiles / prediction.batch)).value or math.inf
-
-    return min(sides, key=latency_s, default=PAPER_TILE_PX)
+    swaths = [replace(whole, tile_px=side_px, halo_px=radius) for side_px in sides]
+    times = {swath.tile_px: dpu_latency(variant, dpu, swath).value or math.inf for swath in swaths}
+    return min(times, key=lambda side_px: times[side_px], default=PAPER_TILE_PX)
 
 
-def predict_tile(variant: Variant, tile_px: int, dpu: Dpu) -> Prediction:
-    """What the cost model says of an INT8 network in such tiles."""
-    return predict(place(_graph(variant.file or Path(), tile_px), dpu), dpu)
+def dpu_latency(variant: Variant, dpu: Dpu, swath: Swath) -> Figure:
+    """What the cost model says of an INT8 network and a swath in whole tiles.
+
+    Args:
+        variant: the network.
+        dpu: that it runs on.
+        swath: with its tiles and their halo.
+    """
+    prediction = predict(place(_graph(variant.file or Path(), swath.tile_px), dpu), dpu)
+    return swath_latency(prediction, math.ceil(swath.tiles / prediction.batch))
 
 
 def radius_px(variant: Variant) -> int:
@@ -233,3 +239,47 @@ def model_of(file: Path) -> onnx.ModelProto:
 @cache
 def _graph(file: Path, tile_px: int) -> Network:
     return network_of(model_of(file), tile_px)
+
+
+UNITS = {
+    "board latency": "s",
+    "board throughput": "frame/s",
+    "board power": "W",
+    "board energy": "J",
+    "board efficiency": "px/s/W",
+}
+"""Of the figures of a point on its board."""
+CHAIN = "traditional-standard"
+"""The chain whose time on a board's processor a target states."""
+
+
+def board_figures(point: Point, whole: Swath, slower: float | None = None) -> dict[str, Figure]:
+    """The figures of a point's board; unavailable, with the reason, where it has none.
+
+    Args:
+        point: a network on a DPU, or a traditional chain on the board's processor.
+        whole: the swath.
+        slower: how many times as long a chain takes as CHAIN, measured on this machine.
+    """
+    if point.dpu is not None:
+        halo_px = radius_px(point.variant) if point.halo_px is None else point.halo_px
+        swath = replace(whole, tile_px=point.tile_px, halo_px=halo_px)
+        latency, power = dpu_latency(point.variant, point.dpu, swath), dpu_power(point.dpu)
+    elif point.board is not None and slower is not None:
+        row = processor_row(whole, point.board)
+        latency, power = _slower(row.figures["latency"], slower), row.figures["power"]
+    else:
+        latency = unavailable("s", point.reason or "no time of this method on the board's processor is stated")
+    if latency.value is None:
+        return {key: unavailable(unit, latency.reason) for key, unit in UNITS.items()}
+    work = energy(latency, power), efficiency(whole.pixels, latency, power)
+    return dict(zip(UNITS, (latency, chain_rate(whole, latency), power, *work), strict=True))
+
+
+def _slower(latency: Figure, times: float) -> Figure:
+    """Of another chain than CHAIN, by the ratio measured here."""
+    if latency.value is None or latency.interval is None:
+        return latency
+    low_s, high_s = (end * times for end in latency.interval)
+    source = f"{latency.source}; times of the chains here: {times:.2f} of {CHAIN}"
+    return predicted(latency.value * times, "s", (low_s, high_s), source)

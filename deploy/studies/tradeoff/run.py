@@ -1,13 +1,12 @@
 """One study: variants, what is measured of each, points with their figures, a front and a recommendation."""
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, cast
+from typing import Any
 
 from beers_deploy.bench.tables import PAPER_SIZE, PAPER_TARGET, Swath, parse_size, published_rows
 from beers_deploy.dpu.board import BoardLike, boards_of
@@ -22,84 +21,39 @@ from beers_deploy.model.traditional.nl_bayes import QUALITIES
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.profiles import TargetProfile
-from beers_deploy.profiles.errors import MachineError, optional
+from beers_deploy.profiles.errors import MachineError
 from beers_deploy.profiles.figures import Figure, Row, unavailable
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import REFERENCE
 from beers_deploy.profiles.target import DEFAULT_TARGET
-from beers_deploy.results import Input, Table, input_of
+from beers_deploy.results import input_of
 from beers_deploy.studies.evaluation.methods import Method, method_named
 from beers_deploy.studies.evaluation.pairs import pairs_of_scenes
 from beers_deploy.studies.evaluation.scores import Instruments, perceptual_distances
-from beers_deploy.studies.tradeoff import advice
-from beers_deploy.studies.tradeoff.boards import CHAIN, board_figures
-from beers_deploy.studies.tradeoff.labelled import Labelled
-from beers_deploy.studies.tradeoff.measure import Benchmark, Measurements, Scores, key_of, make_int8, measure_host
-from beers_deploy.studies.tradeoff.pareto import Comparison, Measured, front_rows, pareto_front
+from beers_deploy.studies.tradeoff.advice import (
+    MAP50,
+    Comparison,
+    Constraint,
+    Measured,
+    chosen_cost,
+    front_rows,
+    pareto_front,
+    parse_constraints,
+    recommend,
+)
+from beers_deploy.studies.tradeoff.measure import Benchmark, Labelled, Measurements, key_of, make_int8, measure_host
+from beers_deploy.studies.tradeoff.page import Tradeoff
 from beers_deploy.studies.tradeoff.points import (
-    FLOAT,
+    CHAIN,
     Point,
     Variant,
+    board_figures,
     configurations,
     network_points,
     network_variants,
 )
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 LPIPS = "LPIPS-squeeze"
-
-
-@dataclass(frozen=True, repr=False, kw_only=True)
-class Tradeoff(Table):
-    """What accuracy costs in time: the recommended point, the Pareto front, and every point with its figures.
-
-    Attributes:
-        board: the first one, which the front and the recommendation are about.
-        points: all of them, in the order networks, chains, other libraries, the paper's runs.
-        front: those of the first board on the Pareto front, from cheap to dear.
-        front_rows: the same by number, each with its difference from the next cheaper one.
-        cost: the figure that the front is against.
-        recommendation: what to take.
-    """
-
-    board: str
-    points: Sequence[Measured]
-    front: Sequence[Measured]
-    front_rows: Sequence[Row]
-    cost: str
-    recommendation: advice.Recommendation
-
-    @property
-    def best(self) -> Measured | None:
-        """The recommended point; None where none keeps the budget and the need."""
-        return self.recommendation.point
-
-    def plot(self, figure: str | None = None, ax: "Axes | None" = None) -> "Axes":
-        """PSNR of every point of the first board against its cost, the front's numbered.
-
-        Args:
-            figure: given, bars of that figure instead, as of any table.
-            ax: axes of matplotlib to draw on; new ones if None.
-        """
-        if figure is not None:
-            return super().plot(figure, ax)
-        from beers_deploy.studies.tradeoff.page import draw_study  # which imports this module
-
-        axes = ax if ax is not None else optional("matplotlib.pyplot", "plot").subplots()[1]
-        draw_study(axes, self)
-        return cast("Axes", axes)
-
-    def report(self, folder: str | os.PathLike[str]) -> Path:
-        """Write the page and its plot into a folder; returns the page's path."""
-        from beers_deploy.studies.tradeoff.page import FILES, write_study  # which imports this module
-
-        write_study(self, Path(folder))
-        return Path(folder) / FILES[0]
-
-    def __str__(self) -> str:
-        return self.recommendation.line
 
 
 def tradeoff(
@@ -149,7 +103,7 @@ def tradeoff(
     boards, width_height = boards_of(board), parse_size(size) if isinstance(size, str) else size
     for each in boards:
         Constants.of(configurations(each)[0])  # a board without them is refused before anything is measured
-    limits = advice.parse_constraints("budget", budget), advice.parse_constraints("need", need)
+    limits = parse_constraints("budget", budget), parse_constraints("need", need)
     scenes, weights, calibrated = (None if path is None else Path(path) for path in (images, lpips, calibration))
     degraded = Sensor.load(sensor)
     aim = Sensor.load(reference or REFERENCE).in_units_of(degraded)
@@ -176,36 +130,28 @@ def tradeoff(
     arguments |= {"size": "x".join(map(str, width_height)), "budget": budget, "calibration": calibration}
     arguments |= {"seed": seed, "target": ",".join(each.name for each in boards), "network": ",".join(names)}
     arguments |= {"labelled": labelled, "detector": detector, "classes": classes} if labelled else {}
-    about = arguments, tuple(map(input_of, files)), notes
-    return _weighed(measured, boards[0], Comparison(benchmark.sites, seed), limits, about)
+    about: dict[str, Any] = {"arguments": arguments, "inputs": tuple(map(input_of, files)), "notes": notes}
+    return _weighed(measured, boards[0], Comparison(benchmark.sites, seed), *limits, **about)
 
 
 def _weighed(
     points: Sequence[Measured],
     board: TargetProfile,
     compare: Comparison,
-    limits: tuple[Sequence[advice.Constraint], Sequence[advice.Constraint]],
-    about: tuple[Mapping[str, object], tuple[Input, ...], tuple[str, ...]],
+    budget: Sequence[Constraint],
+    need: Sequence[Constraint],
+    **about: Any,
 ) -> Tradeoff:
     """The front and the recommendation, of the points of one board."""
     here = [each for each in points if each.point and each.point.board in (None, board)]
-    cost, (arguments, inputs, notes) = advice.chosen_cost(here, limits[0]), about
+    cost = chosen_cost(here, budget)
     front = pareto_front(here, cost)
-    numbered, recommended = front_rows(front, cost, compare), advice.recommend(here, limits[0], limits[1], compare)
-    rows = (recommended.row, *numbered, *(point.row for point in points))
-    return Tradeoff(
-        "tradeoff",
-        arguments,
-        inputs,
-        rows,
-        notes=notes,
-        board=board.name,
-        points=points,
-        front=front,
-        front_rows=numbered,
-        cost=cost,
-        recommendation=recommended,
-    )
+    numbered, (best, line) = front_rows(front, cost, compare), recommend(here, budget, need, compare)
+    name, figures = (best.name, best.figures) if best else ("none", {})
+    every = (Row("points", point.name, point.figures, point.text) for point in points)
+    rows = (Row("recommended", name, figures, {"line": line}), *numbered, *every)
+    about |= {"points": points, "front": front, "front_rows": numbered, "cost": cost, "best": best, "line": line}
+    return Tradeoff("tradeoff", rows=rows, board=board.name, **about)
 
 
 def _benchmark(
@@ -219,9 +165,8 @@ def _benchmark(
 
 
 def _others(boards: Sequence[TargetProfile]) -> list[Point]:
-    chains = [Variant(f"traditional-{quality}", FLOAT, f"traditional-{quality}") for quality in QUALITIES]
-    points = [Point(chain, board) for chain in chains for board in boards]
-    return points + [Point(Variant(peer, FLOAT, peer)) for peer in PEERS]
+    chains = [Variant(f"traditional-{quality}") for quality in QUALITIES]
+    return [*(Point(chain, board) for chain in chains for board in boards), *(Point(Variant(peer)) for peer in PEERS)]
 
 
 def _measured(
@@ -230,60 +175,49 @@ def _measured(
     labelled: Labelled | None,
     kept: Measurements,
     swath: Swath,
-    log: Callable[[str], None],
+    log: Log,
 ) -> list[Measured]:
     """Every point with its figures; a method whose library is not installed is left out."""
     methods = _methods([point.variant for point in points], benchmark, log)
     there = [point for point in points if point.variant in methods]
-    images: dict[str, list[dict[str, float | None]]] = {}
-    found: dict[Variant, Figure] = {}
+    found = list[Measured]()
     with steps("tradeoff", len(there) + 1) as bar:
         for point in there:
-            method = methods[point.variant]
             bar.advance(0, f"measuring {point.name}")
-            images[point.name] = benchmark.scores(point, method.restore, kept)
-            if labelled is not None and point.variant not in found:
-                key = key_of(map50=benchmark.depends(point.variant), labelled=labelled.digest)
-                found[point.variant] = labelled.figure(kept.make(key, partial(labelled.measure, method)))
+            method = methods[point.variant]
+            scores = benchmark.scores(point, method.restore, kept)
+            figures = benchmark.means(scores)
+            if labelled is not None:
+                figures[MAP50] = _map50(point, method, labelled, kept, benchmark)
+            found.append(Measured(point.name, figures, _text(point, method), point, scores))
             bar.advance(1, point.name)
         host = measure_host(methods, benchmark, kept)
         bar.advance(1, "timed on this machine")
-    return [_point(each, methods[each.variant], images[each.name], benchmark, found, host, swath) for each in there]
+    medians_s = {variant: each["host p50"].value or 1.0 for variant, each in host.items()}
+    for point, measured in zip(there, found, strict=True):
+        here_s = medians_s[point.variant]
+        slower = here_s / medians_s.get(Variant(CHAIN), here_s)
+        measured.figures.update(host[point.variant] | board_figures(point, swath, slower))
+    return found
 
 
-def _point(
-    point: Point,
-    method: Method,
-    images: Sequence[Scores],
-    benchmark: Benchmark,
-    found: Mapping[Variant, Figure],
-    host: Mapping[Variant, Mapping[str, Figure]],
-    swath: Swath,
-) -> Measured:
-    figures = benchmark.means(images)
-    if found:  # how often a seam cuts an object is not known
-        with_seams = unavailable("%", "measured with exact halos alone")
-        figures[advice.MAP50] = found[point.variant] if point.halo_px is None else with_seams
-    figures |= {**host[point.variant], **board_figures(point, swath, _slower(point, host))}
-    return Measured(point.name, figures, _text(point, method), point, images)
-
-
-def _methods(variants: Sequence[Variant], benchmark: Benchmark, log: Callable[[str], None]) -> dict[Variant, Method]:
+def _methods(variants: Sequence[Variant], benchmark: Benchmark, log: Log) -> dict[Variant, Method]:
     found: dict[Variant, Method] = {}
     for variant in dict.fromkeys(variants):
         try:
-            found[variant] = method_named(variant.source, benchmark.degraded, benchmark.reference)
+            name = str(variant.file or variant.method)
+            found[variant] = method_named(name, benchmark.degraded, benchmark.reference)
         except MachineError as error:
             log(f"{variant.name} is left out: {error}")
     return found
 
 
-def _slower(point: Point, host: Mapping[Variant, Mapping[str, Figure]]) -> float | None:
-    """How many times as long a chain takes here as the one whose time on a board is stated; None of other methods."""
-    if point.board is None or point.dpu is not None:
-        return None
-    medians = {variant.method: figures["host p50"].value or 1.0 for variant, figures in host.items()}
-    return medians[point.variant.method] / medians.get(CHAIN, medians[point.variant.method])
+def _map50(point: Point, method: Method, labelled: Labelled, kept: Measurements, benchmark: Benchmark) -> Figure:
+    """What a detector finds; how often a seam cuts an object is not known."""
+    if point.halo_px is not None:
+        return unavailable("%", "measured with exact halos alone")
+    key = key_of(map50=benchmark.depends(point.variant), labelled=labelled.digest)
+    return labelled.figure(kept.make(key, lambda: labelled.measure(method)))
 
 
 def _text(point: Point, method: Method) -> dict[str, str]:

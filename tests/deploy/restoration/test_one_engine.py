@@ -66,7 +66,7 @@ def by_engine(dn: np.ndarray, options: Options) -> np.ndarray:
 
 def by_tradeoff(path: Path, precision: str, halo_px: int) -> Restored:
     """As a study scores an operating point whose halo is smaller than the network's radius."""
-    variant = Variant(path.stem, FLOAT if precision == "float" else INT8, str(path), path)
+    variant = Variant(path.stem, FLOAT if precision == "float" else INT8, path)
     return restore_in_tiles(Point(variant, tile_px=TILES_PX[precision], halo_px=halo_px), 4095)
 
 

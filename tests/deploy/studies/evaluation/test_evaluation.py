@@ -22,9 +22,8 @@ from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row, by_table, measured
 from beers_deploy.results import SCHEMA_PATH, missing
-from beers_deploy.studies.evaluation import targets as targets_module
+from beers_deploy.studies.evaluation import scores as scores_module
 from beers_deploy.studies.evaluation.methods import Method, method_named
-from beers_deploy.studies.evaluation.page import chosen_pairs, evaluation_report, strip_of
 from beers_deploy.studies.evaluation.pairs import (
     NamedPair,
     oversampling_note,
@@ -32,9 +31,19 @@ from beers_deploy.studies.evaluation.pairs import (
     read_pairs,
     simulate_pairs,
 )
-from beers_deploy.studies.evaluation.run import Evaluation
-from beers_deploy.studies.evaluation.scores import NOISE_FREE, READ, Instruments, score, site_rows
-from beers_deploy.studies.evaluation.targets import acquire_targets, flat_figure, mtf_figure, snr_name, target_figures
+from beers_deploy.studies.evaluation.run import Evaluation, chosen_pairs, evaluation_report, strip_of
+from beers_deploy.studies.evaluation.scores import (
+    NOISE_FREE,
+    READ,
+    Instruments,
+    acquire_targets,
+    flat_figure,
+    mtf_figure,
+    score,
+    site_rows,
+    snr_name,
+    target_figures,
+)
 
 DEGRADED, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
 SENSORS = DEGRADED.nominal(), REFERENCE.nominal()
@@ -233,7 +242,7 @@ def test_sites_are_means_of_their_images() -> None:
 
 
 def test_targets_measure_the_sensor_and_what_a_chain_makes_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(targets_module, "REPEATS", 1)
+    monkeypatch.setattr(scores_module, "REPEATS", 1)
     targets = acquire_targets(SENSORS[0], 0)
     assert len(targets.edges) == 4
     before = target_figures(IDENTITY, targets)
@@ -271,13 +280,13 @@ def test_one_pair_a_site_is_shown() -> None:
 def test_tables_of_a_sweep_keep_their_words_on_the_page() -> None:
     mean, *_ = score(IDENTITY, [pair()], PLAIN, 0)
     swept = Row("sweep, MTF at Nyquist", "nominal", {"degraded": measured(7, "%", "edges")})
-    lists: dict[str, Any] = {"methods": [], "pairs": [], "sites": [], "mean": [mean], "swept": [swept]}
-    report = evaluation_report(Evaluation("evaluate", {}, (), (), sensors=(DEGRADED, REFERENCE), **lists), [])
+    about: dict[str, Any] = {"sensors": (DEGRADED, REFERENCE), "methods": [], "pairs": []}
+    report = evaluation_report(Evaluation("evaluate", {}, (), (mean, swept), **about), [])
     assert [table.title for table in report.tables] == ["Means over all pairs", "Sweep, MTF at Nyquist"]
 
 
 def test_the_command_on_a_folder_of_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(targets_module, "REPEATS", 1)
+    monkeypatch.setattr(scores_module, "REPEATS", 1)
     folder = write_pairs(tmp_path / "pairs", [pair("a_1.tif", 1), pair("b_1.tif", 2)])
     command = f"evaluate --pairs {folder} --methods traditional-fast --json {tmp_path}/e.json --out {tmp_path}/out"
     result = CliRunner().invoke(app, command.split())

@@ -18,8 +18,6 @@ def test_a_chain_that_gets_to_know_a_sensor_is_the_one_made_for_it(name: str) ->
     dn = np.random.default_rng(0).integers(200, 1800, (40, 47)).astype(np.float32)
     method = method_without_network(name, DEGRADED, REFERENCE)
     made = method_without_network(name, OTHER, REFERENCE.in_units_of(OTHER))
-    assert method is not None
-    assert made is not None
     found = method.knowing(OTHER).restore(dn)
     assert np.array_equal(found, made.restore(dn))
     assert not np.array_equal(found, method.restore(dn))
@@ -27,7 +25,6 @@ def test_a_chain_that_gets_to_know_a_sensor_is_the_one_made_for_it(name: str) ->
 
 def test_what_depends_on_no_sensor_stays_as_it_is() -> None:
     degraded = method_without_network("degraded", DEGRADED, REFERENCE)
-    assert degraded is not None
     for method in (degraded, Method("blind", np.sqrt, BLIND)):
         assert method.knowing(OTHER) is method
 

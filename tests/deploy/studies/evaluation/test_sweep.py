@@ -16,8 +16,8 @@ from beers_deploy.profiles import Sensor, load_sensor
 from beers_deploy.profiles.figures import Row, by_table, unavailable
 from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.restoration.function import Restore
+from beers_deploy.studies.evaluation import scores as scores_module
 from beers_deploy.studies.evaluation import sweep as module
-from beers_deploy.studies.evaluation import targets as targets_module
 from beers_deploy.studies.evaluation.methods import BLIND, Method
 from beers_deploy.studies.evaluation.sweep import (
     NOMINAL_KNOWN,
@@ -70,15 +70,15 @@ def half(dn: np.ndarray) -> np.ndarray:
 def quick() -> Iterator[None]:
     """Three conditions, on targets that are small and seen once."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(targets_module, "REPEATS", 1)
-        patch.setattr(targets_module, "ANGLES_DEG", (5.0, 8.0))
-        patch.setattr(targets_module, "SIDE_PX", 100)
+        patch.setattr(scores_module, "REPEATS", 1)
+        patch.setattr(scores_module, "ANGLES_DEG", (5.0, 8.0))
+        patch.setattr(scores_module, "SIDE_PX", 100)
         patch.setattr(module, "conditions", few)
         yield
 
 
 @pytest.fixture(scope="module")
-def swept() -> Swept:
+def swept(tmp_path_factory: pytest.TempPathFactory) -> Swept:
     """One sweep under three conditions: its rows, and the sensors that the able network was given."""
     given: list[Instrument] = []
 
@@ -87,8 +87,9 @@ def swept() -> Swept:
         return lambda dn: dn + np.float32(1000 * sensor.mtf_nyquist)
 
     able = Method("able", half, BLIND, specialise)
-    scene = procedural_scene(500, 560, np.random.default_rng(5))
-    rows = run_sweep([Method("half", half, BLIND), able], [scene], PROFILE, REFERENCE, 0).rows
+    folder, scene = tmp_path_factory.mktemp("scenes"), procedural_scene(500, 560, np.random.default_rng(5))
+    tifffile.imwrite(folder / "scene.tif", scene.radiance.numpy())
+    rows = run_sweep([Method("half", half, BLIND), able], folder, PROFILE, REFERENCE, 0).rows
     return {table: {row.name: row for row in rows} for table, rows in by_table(rows).items()}, given
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.profiles.figures import measured, predicted
-from beers_deploy.studies.tradeoff.pareto import Comparison, Measured
+from beers_deploy.studies.tradeoff.advice import Comparison, Measured
 from beers_deploy.studies.tradeoff.points import INT8, Point, Variant
 
 SITES = ("a", "a", "b", "c", "d", "e")
@@ -23,7 +23,7 @@ def made(
     """An INT8 network of that name: its scores differ from the mean as sites do, and by some scatter."""
     noise = np.random.default_rng(sum(map(ord, name))).normal(size=len(SITES))
     values = psnr_db + DIFFICULTY_DB - DIFFICULTY_DB.mean() + scatter_db * (noise - noise.mean())
-    variant = Variant(method or name, INT8, method or name, Path(f"{method or name}.onnx"))
+    variant = Variant(method or name, INT8, Path(f"{method or name}.onnx"))
     return Measured(
         name,
         {

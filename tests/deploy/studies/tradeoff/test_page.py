@@ -9,10 +9,8 @@ import pytest
 
 from beers_deploy.report.page import render
 from beers_deploy.report.plots import DARK, LIGHT
-from beers_deploy.studies.tradeoff.advice import recommend
-from beers_deploy.studies.tradeoff.page import SIZE_PX, plot_svg, report_of, series, write_study
-from beers_deploy.studies.tradeoff.pareto import Measured, front_rows, pareto_front
-from beers_deploy.studies.tradeoff.run import Tradeoff
+from beers_deploy.studies.tradeoff.advice import Measured, front_rows, pareto_front, recommend
+from beers_deploy.studies.tradeoff.page import SIZE_PX, Tradeoff, plot_svg, report_of, series
 from tests.deploy.browser import seen
 from tests.deploy.studies.tradeoff.made import COMPARE, family
 
@@ -23,7 +21,7 @@ COST = "board latency"
 def study(points: list[Measured] | None = None) -> Tradeoff:
     found = list(family()) if points is None else points
     front = pareto_front(found, COST)
-    advice = recommend(found, [], [], COMPARE)
+    best, line = recommend(found, [], [], COMPARE)
     return Tradeoff(
         "tradeoff",
         {},
@@ -35,7 +33,8 @@ def study(points: list[Measured] | None = None) -> Tradeoff:
         front=front,
         front_rows=front_rows(front, COST, COMPARE),
         cost=COST,
-        recommendation=advice,
+        best=best,
+        line=line,
     )
 
 
@@ -58,12 +57,12 @@ def test_every_series_has_a_look_of_its_own() -> None:
 
 
 def test_a_study_without_points_has_a_page(tmp_path: Path) -> None:
-    write_study(study([]), tmp_path)
+    study([]).report(tmp_path)
     assert "no point has every figure" in (tmp_path / "tradeoff.html").read_text()
 
 
 def test_the_pages_plot_is_the_file_beside_it(tmp_path: Path) -> None:
-    write_study(study(), tmp_path)
+    study().report(tmp_path)
     html = (tmp_path / "tradeoff.html").read_text()
     (shown,) = re.findall(r"data:image/svg\+xml;base64,([^\"]+)", html)
     assert base64.b64decode(shown).decode() == (tmp_path / "tradeoff.svg").read_text()

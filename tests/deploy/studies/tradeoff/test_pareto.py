@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import measured, predicted, published, unavailable
-from beers_deploy.studies.tradeoff.pareto import (
+from beers_deploy.studies.tradeoff.advice import (
     NOT_SIGNIFICANT,
     SIGNIFICANT,
     TOO_FEW,
@@ -18,6 +18,8 @@ from beers_deploy.studies.tradeoff.pareto import (
     cost_ratio,
     front_rows,
     pareto_front,
+    significant,
+    verdict,
 )
 from tests.deploy.studies.tradeoff.made import COMPARE, DPU, family, made
 
@@ -56,9 +58,9 @@ def test_differences_are_paired_and_reach_less_far_than_the_sites_differ() -> No
     assert found.interval is not None
     assert found.value == pytest.approx(0.5)
     assert 0.4 < found.interval[0] < 0.5 < found.interval[1] < 0.6
-    assert COMPARE.verdict(medium, small) == SIGNIFICANT
-    assert COMPARE.significantly_better(medium, small)
-    assert not COMPARE.significantly_better(small, medium)
+    assert verdict(found) == SIGNIFICANT
+    assert significant(found)
+    assert not significant(COMPARE.difference(small, medium))
 
 
 def test_the_same_pictures_do_not_differ_on_however_few_sites() -> None:
@@ -70,10 +72,11 @@ def test_the_same_pictures_do_not_differ_on_however_few_sites() -> None:
 def test_below_five_sites_values_decide_beyond_a_margin() -> None:
     few = Comparison(("a", "a", "b", "b", "c", "c"), 0)
     one, better, alike = made("one", 45.0, 2.0), made("better", 45.2, 3.0), made("alike", 45.02, 3.0)
-    assert few.difference(better, one).interval is None
-    assert few.verdict(better, one) == TOO_FEW
-    assert few.significantly_better(better, one)
-    assert not few.significantly_better(alike, one)
+    found = few.difference(better, one)
+    assert found.interval is None
+    assert verdict(found) == TOO_FEW
+    assert significant(found)
+    assert not significant(few.difference(alike, one))
 
 
 def test_a_ratio_of_latencies_on_a_board_has_the_width_of_pairs() -> None:

@@ -1,6 +1,5 @@
 """Which operating points a study looks at."""
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +7,7 @@ import onnx
 import pytest
 import torch
 
-from beers_deploy.bench.tables import PAPER_TILE_PX, Swath, swath_latency
+from beers_deploy.bench.tables import PAPER_TILE_PX, Swath
 from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import Variant as Shape
@@ -17,19 +16,20 @@ from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.target import board_names
 from beers_deploy.quant.onnx_file import save_onnx
-from beers_deploy.studies.tradeoff.boards import UNITS, board_figures
 from beers_deploy.studies.tradeoff.points import (
     FLOAT,
     HALOS_PX,
     INT8,
     TILE_STEP_PX,
+    UNITS,
     Point,
     Variant,
+    board_figures,
+    dpu_latency,
     fastest_tile_px,
     network_points,
     network_variants,
     parse_targets,
-    predict_tile,
     radius_px,
 )
 from tests.deploy.dpu.graphs import integer_convbeers
@@ -43,7 +43,7 @@ SENSOR = load_sensor("pleiades-degraded")
 def variant(tmp_path_factory: pytest.TempPathFactory) -> Variant:
     """An INT8 network of four blocks of 16."""
     path = integer_convbeers(tmp_path_factory.mktemp("net") / "net.onnx", 4, 16)
-    return Variant("net", INT8, str(path), path)
+    return Variant("net", INT8, path)
 
 
 def refused(_: Path) -> Path:
@@ -82,7 +82,7 @@ def test_an_own_network_is_quantised_and_one_that_cannot_be_stays_float(tmp_path
 
 
 def test_an_int8_file_is_taken_as_it_is(variant: Variant) -> None:
-    found = network_variants([variant.source], SENSOR, refused, lambda _: None)
+    found = network_variants([str(variant.file)], SENSOR, refused, lambda _: None)
     assert [each.precision for each in found] == [INT8]
 
 
@@ -110,8 +110,7 @@ def test_the_fastest_tile_is_a_multiple_of_the_step_and_no_other_is_faster(varia
     assert 2 * radius < found <= PAPER_TILE_PX
 
     def seconds(side: int) -> float:
-        swath, prediction = replace(WHOLE, tile_px=side, halo_px=radius), predict_tile(variant, side, DPU)
-        return swath_latency(prediction, math.ceil(swath.tiles / prediction.batch)).value or 0.0
+        return dpu_latency(variant, DPU, replace(WHOLE, tile_px=side, halo_px=radius)).value or 0.0
 
     assert seconds(found) == min(seconds(side) for side in range(2 * radius + TILE_STEP_PX, 641, 1) if side % 16 == 0)
 
@@ -151,7 +150,7 @@ def test_a_smaller_halo_takes_less_time_and_figures_follow_from_the_latency(vari
 
 
 def test_a_chain_on_a_boards_processor_takes_what_the_target_states_by_the_ratio_measured_here() -> None:
-    chain = Variant("traditional-best", FLOAT, "traditional-best")
+    chain = Variant("traditional-best")
     stated = Constant((10.0, 40.0), "inferred", "a test")
     tables = {**DPU.target.tables, "cpu": {**DPU.target.tables["cpu"], "chain_s_per_mpx": stated}}
     board, swath = replace(DPU.target, tables=tables), Swath(1000, 2000)
