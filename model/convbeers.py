@@ -31,18 +31,13 @@ from beers_deploy.model.variants import BANK_PLANES, SENSOR_VALUES, Variant
 from beers_deploy.profiles.sensor import Instrument
 
 
-def conv3x3(inputs: int, outputs: int) -> nn.Conv2d:
-    """A 3 x 3 convolution, stride 1, padding 1: (N, inputs, H, W) to (N, outputs, H, W)."""
-    return nn.Conv2d(inputs, outputs, kernel_size=3, padding=1)
-
-
 class ResidualBlock(nn.Module):
     """x + conv(relu(conv(x))), (N, F, H, W) to the same shape."""
 
     def __init__(self, features: int) -> None:
         super().__init__()
-        self.first = conv3x3(features, features)
-        self.second = conv3x3(features, features)
+        self.first = nn.Conv2d(features, features, kernel_size=3, padding=1)
+        self.second = nn.Conv2d(features, features, kernel_size=3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
         """Add the block's correction to x (N, F, H, W); the shape is kept."""
@@ -56,10 +51,10 @@ class Layers(nn.Module):
     def __init__(self, variant: Variant, planes: int) -> None:
         super().__init__()
         self.variant = variant
-        self.head = conv3x3(planes * variant.pixels, variant.features)
+        self.head = nn.Conv2d(planes * variant.pixels, variant.features, kernel_size=3, padding=1)
         self.body = nn.Sequential(*(ResidualBlock(variant.features) for _ in range(variant.blocks)))
-        self.body_end = conv3x3(variant.features, variant.features)
-        self.tail = conv3x3(variant.features, variant.pixels)
+        self.body_end = nn.Conv2d(variant.features, variant.features, kernel_size=3, padding=1)
+        self.tail = nn.Conv2d(variant.features, variant.pixels, kernel_size=3, padding=1)
 
     def corrected(self, shallow: Tensor, bfloat16: bool) -> Tensor:
         """What the head gave, (N, F, H / S, W / S), to the correction (N, 1, H, W)."""

@@ -28,11 +28,6 @@ class Variant:
     scale: int = 1
 
     @property
-    def radius_px(self) -> int:
-        """How far an output pixel sees around its place: one per convolution (head, two a block, body end, tail)."""
-        return self.scale * (2 * self.blocks + 3)
-
-    @property
     def pixels(self) -> int:
         """Pixels of one place of the maps, each a channel of the network's ends."""
         return self.scale**2
@@ -72,7 +67,6 @@ VARIANTS = {
 def variant_named(name: str) -> Variant:
     """The variant of that name."""
     if name not in VARIANTS:
-        raise OptionError(
-            "variant", expected=f"one of {', '.join(VARIANTS)}", got=repr(name), remedy="choose one of them"
-        )
+        expected = f"one of {', '.join(VARIANTS)}"
+        raise OptionError("variant", expected=expected, got=repr(name), remedy="choose one of them")
     return VARIANTS[name]

@@ -99,9 +99,9 @@ def train(
     from beers_deploy.model.training.checkpoint import Optimiser, TrainingRecipe
     from beers_deploy.model.training.losses import LossWeights
     from beers_deploy.model.training.patches import PatchRecipe
-    from beers_deploy.model.training.run import FILES, Run, weights_name
+    from beers_deploy.model.training.run import FILES, Run
     from beers_deploy.model.training.run import train as run_training
-    from beers_deploy.model.training.workers import joined
+    from beers_deploy.model.training.trainer import joined
     from beers_deploy.network import weights_file
 
     if optimiser not in get_args(Optimiser):
@@ -116,7 +116,7 @@ def train(
     stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
     start, teacher = (weights_file(path) if path else None for path in (start, teacher))
     read = (*stored, lpips, start, teacher, *(Path(name) for name in (sensor, reference) if name))
-    require_writable(*(out / name for name in (*FILES, weights_name(variant))), inputs=read)
+    require_writable(*(out / name for name in (*FILES, f"{variant}.safetensors")), inputs=read)
     recipe = TrainingRecipe(
         steps=steps,
         batch=batch,

@@ -189,9 +189,8 @@ def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
     got = unreadable(path)
     if got is not None:
         raise _error(path, "a weights file", got, "check the path")
-    read = _read_npz if path.suffix == ".npz" else _read_safetensors
     try:
-        found = read(path, names)
+        found = _read(path, names)
         for tensor in found.values():
             if not tensor.is_floating_point():
                 raise TypeError(f"an array of {tensor.dtype}")
@@ -204,18 +203,19 @@ def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
     return {name: tensor.float() for name, tensor in found.items()}
 
 
-def _read_safetensors(path: Path, names: Iterable[str]) -> Mapping[str, Tensor]:
+def _read(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
+    """Those of the named tensors that a file holds."""
+    if path.suffix == ".npz":
+        with path.open("rb") as raw:  # np.load leaves a file open that turns out to be broken
+            file = np.load(raw, allow_pickle=False)
+            if not isinstance(file, NpzFile):
+                raise TypeError("a single array")
+            return {name: torch.from_numpy(file[name]) for name in names if name in file}
     with safe_open(path, framework="pt") as file:
         held = set(file.keys())
-        return {n: file.get_tensor(n).clone() for n in names if n in held}  # the library's own lie in the file
-
-
-def _read_npz(path: Path, names: Iterable[str]) -> Mapping[str, Tensor]:
-    with path.open("rb") as raw:  # np.load leaves a file open that turns out to be broken
-        file = np.load(raw, allow_pickle=False)
-        if not isinstance(file, NpzFile):
-            raise TypeError("a single array")
-        return {name: torch.from_numpy(file[name]) for name in names if name in file}
+        return {
+            name: file.get_tensor(name).clone() for name in names if name in held
+        }  # the library's lie in the file
 
 
 def _error(path: Path, expected: str, got: str, remedy: str) -> ModelError:

@@ -174,10 +174,7 @@ def crop_margin(image: Tensor, margin_px: int) -> Tensor:
     """Cut `margin_px` from every side of (..., H, W)."""
     height, width = image.shape[-2:]
     if min(height, width) <= 2 * margin_px:
-        raise ImageError(
-            "scene",
-            expected=f"more than {2 * margin_px} target pixels a side, the margin that the blur needs",
-            got=f"{width} x {height} target pixels",
-            remedy="give a larger scene or a smaller oversampling",
-        )
+        expected = f"more than {2 * margin_px} target pixels a side, the margin that the blur needs"
+        got, remedy = f"{width} x {height} target pixels", "give a larger scene or a smaller oversampling"
+        raise ImageError("scene", expected=expected, got=got, remedy=remedy)
     return image[..., margin_px : height - margin_px, margin_px : width - margin_px]

@@ -94,11 +94,6 @@ def smear_moments(height: int, oversampling: int, length_px: float) -> tuple[flo
     return float(np.abs(kernel).sum()) / 2, float((np.abs(kernel) * distance).sum())
 
 
-def blur_bound_dn(stats: SceneStats, ringing: float, gain: float) -> float:
-    """The blurred pixel and the plain mean of its scene pixels lie in one range: they differ by its width at most."""
-    return gain * (1 + ringing) / 2 * stats.span
-
-
 def smear_bound_dn(smear: Smear, stats: SceneStats, ringing: float, gain: float) -> float:
     """The smear's kernel less a pulse sums to 0: it sees at most half its size times the span, or steps times moment.
 
@@ -130,11 +125,6 @@ def effect_bound_dn(effect: Effect, sensor: Instrument, low: float, high: float)
             return max(max(abs(dn), abs(sensor.max_dn - dn)) for dn in ends) if rate else 0.0
         case _:
             return 0.0  # anti-alias and smear: the transfer function has bounds of its own
-
-
-def noise_bound_dn(sensor: Instrument, high: float) -> float:
-    """Six standard deviations at the brightest pixel."""
-    return sensor.gain_dn_per_radiance * NOISE_LIMIT * sensor.noise_sigma(max(high, 0.0))
 
 
 def behind(name: str, change_dn: float, sensor: Instrument) -> float:
@@ -233,13 +223,14 @@ def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
         low, high = low - direct / gain, high + direct / gain
         # Its kernel is a unit pulse and all that differs from it.
         total *= 1 + 2 * smear_moments(stats.height, stats.oversampling, smear.length_px)[0]
-    bounds["mtf"] = behind("mtf", blur_bound_dn(stats, total, gain), sensor)
+    # The blurred pixel and the plain mean of its scene pixels lie in one range: they differ by its width at most.
+    bounds["mtf"] = behind("mtf", gain * (1 + total) / 2 * stats.span, sensor)
     for name in RADIANCE_EFFECTS:
         if name in sensor.effects:
             direct = effect_bound_dn(sensor.effects[name], sensor, low, high)
             bounds[name] = behind(name, direct, sensor)
             low, high = low - direct / gain, high + direct / gain  # whether it is applied or not
-    bounds["noise"] = noise_bound_dn(sensor, high)
+    bounds["noise"] = gain * NOISE_LIMIT * sensor.noise_sigma(max(high, 0.0))
     low, high = low - bounds["noise"] / gain, high + bounds["noise"] / gain
     for name in DN_EFFECTS:
         if name in sensor.effects:

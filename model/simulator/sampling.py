@@ -120,12 +120,9 @@ def scene_of(name: str, pixels: np.ndarray, sensor: Instrument) -> Scene:
     elif pixels.ndim == 2 and np.issubdtype(pixels.dtype, np.floating):
         radiance = pixels.astype(np.float32)
     else:
-        raise ImageError(
-            name,
-            expected="8-bit RGB or mono, 16-bit mono, or float mono pixels",
-            got=f"{pixels.dtype} of shape {pixels.shape}",
-            remedy="convert it to one of these",
-        )
+        expected = "8-bit RGB or mono, 16-bit mono, or float mono pixels"
+        got = f"{pixels.dtype} of shape {pixels.shape}"
+        raise ImageError(name, expected=expected, got=got, remedy="convert it to one of these")
     return Scene(name, torch.from_numpy(np.ascontiguousarray(radiance, dtype=np.float32)))
 
 

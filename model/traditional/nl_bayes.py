@@ -369,7 +369,7 @@ def nl_bayes_strips(strips: Iterable[Tensor], height: int, noise: Noise, quality
     """Remove Gaussian noise from an image that comes and goes in strips of rows, (any, W) float32 each.
 
     NaN marks missing pixels; they stay so, and no other sees them. The settings were published for 8-bit images:
-    bring the data to a scale where sigma lies within some 5 to 40. Limits: sigma = 0 returns a copy; a constant image
+    bring the data to a scale where sigma lies within some 5 to 40. Limits: a constant image
     returns itself, up to rounding; a pixel too near missing ones to lie in any whole patch keeps its value. Any H and
     W from 1 on; how the strips are cut changes no bit. Holds some 150 rows, and the tallest strip.
 
@@ -379,9 +379,6 @@ def nl_bayes_strips(strips: Iterable[Tensor], height: int, noise: Noise, quality
         noise: to remove.
         quality: how dense and how large groups are.
     """
-    if noise.sigma == 0:
-        yield from (strip.clone() for strip in strips)
-        return
     # The second pass reads the noisy rows again, behind the first: tee keeps those between.
     as_guide, for_first, for_second = tee(finite_or_missing(strips), 3)
     basic = denoise_pass(Rows(for_first), Rows(as_guide), height, noise, first_pass(noise.sigma), quality.stride_px)

@@ -2,10 +2,9 @@
 
 - `patches` simulates pairs on the fly or takes stored ones; both are keyed by (seed, step), so any batch can be made
   again;
-- `losses` holds the terms;
-- `trainer` runs the steps, `checkpoint` keeps them with the recipe and stops what has gone wrong, `run` is a whole
-  run from options to a folder;
-- `workers` shares a run out to processes, `validation` judges on sites held out.
+- `losses` holds the terms, `validation` judges on sites held out;
+- `trainer` runs the steps, on one process or several; `checkpoint` keeps them with the recipe, and holds what stops a
+  run gone wrong; `run` is a whole run from options to a folder.
 
 What is offered here is loaded when it is asked for.
 """

@@ -19,7 +19,7 @@ from beers_deploy.model.io.images import list_images, read_acquisition
 from beers_deploy.model.simulator.acquire import acquire
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import Scene, crop_divisible, scene_spectrum
-from beers_deploy.model.training.workers import Worker
+from beers_deploy.model.training.trainer import Worker
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument, Sensor, require_same_units
 

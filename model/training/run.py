@@ -26,9 +26,8 @@ from beers_deploy.model.training.checkpoint import TrainingRecipe, finish, requi
 from beers_deploy.model.training.grow import grow
 from beers_deploy.model.training.losses import RestorationLoss
 from beers_deploy.model.training.patches import PatchRecipe, PatchSource, StoredPairs, pair_files
-from beers_deploy.model.training.trainer import Batches, Precision, Schedule, Trainer
+from beers_deploy.model.training.trainer import Batches, Precision, Schedule, Trainer, Worker
 from beers_deploy.model.training.validation import Validation, split_by_site
-from beers_deploy.model.training.workers import Worker
 from beers_deploy.model.variants import Variant, variant_named
 from beers_deploy.profiles.errors import MissingExtraError, ModelError, OptionError
 
@@ -71,16 +70,11 @@ class Run:
     @property
     def weights(self) -> Path:
         """Where the averaged weights go in the end."""
-        return self.out / weights_name(self.variant)
+        return self.out / f"{self.variant}.safetensors"
 
 
 FILES = ("checkpoint.safetensors", "log.csv", "validation.csv", "validation.png")
 """What a run leaves in its folder besides the weights."""
-
-
-def weights_name(variant: str) -> str:
-    """The file of the averaged weights."""
-    return f"{variant}.safetensors"
 
 
 def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) -> None:

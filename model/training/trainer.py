@@ -1,24 +1,73 @@
-"""The steps of a run: Adam or AdamW, warm-up and cosine, clipped gradients, averaged weights.
+"""The steps of a run: Adam or AdamW, warm-up and cosine, clipped gradients, averaged weights, on several processes.
 
 Batches are keyed by (seed, step): a run that was killed and resumed ends with the same weights as one that was not.
 """
 
+import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 
 from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, initialise
 from beers_deploy.model.progress import held_back
 from beers_deploy.model.training.checkpoint import Guards, TrainingRecipe, read_checkpoint, write_checkpoint
 from beers_deploy.model.training.losses import RestorationLoss
-from beers_deploy.model.training.workers import Worker
 from beers_deploy.model.variants import Variant
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import MachineError, OptionError
+
+
+@dataclass(frozen=True)
+class Worker:
+    """This process among those of the run: torchrun starts them, and says so in the environment."""
+
+    rank: int = 0
+    count: int = 1
+    local_rank: int = 0
+
+    @property
+    def first(self) -> bool:
+        """Whether this one writes and reports."""
+        return self.rank == 0
+
+    def device(self, name: str) -> torch.device:
+        """The device of that name; of several GPUs, this worker's own."""
+        device = torch.device(name)
+        if device.type == "cuda" and not torch.cuda.is_available():
+            remedy = "choose the device cpu, or install a build of PyTorch for it"
+            raise MachineError("device", expected="a CUDA device", got="none that PyTorch can see", remedy=remedy)
+        if name == "cuda":
+            return torch.device("cuda", self.local_rank)
+        return device
+
+    def any(self, flag: bool, device: torch.device) -> bool:
+        """Whether any worker raises the flag; all get the same answer."""
+        if self.count == 1:
+            return flag
+        raised: Tensor = torch.tensor(float(flag), device=device)
+        torch.distributed.all_reduce(raised, torch.distributed.ReduceOp.MAX)
+        return bool(raised > 0)
+
+
+@contextmanager
+def joined(device: str) -> Iterator[Worker]:
+    """Join the run that torchrun started, or be the only one."""
+    count = int(os.environ.get("WORLD_SIZE", "1"))
+    if count == 1:
+        yield Worker()
+        return
+    torch.distributed.init_process_group("nccl" if device.startswith("cuda") else "gloo")
+    try:
+        yield Worker(torch.distributed.get_rank(), count, int(os.environ.get("LOCAL_RANK", "0")))
+    finally:
+        torch.distributed.destroy_process_group()
+
 
 Batches = Callable[[int], Iterator[tuple[Tensor, ...]]]
 """The batches from a number on: (degraded, reference), (N, 1, P, P) in [0, 1] each, of patches made on the fly or of
@@ -79,7 +128,8 @@ class Trainer:
             self.network.load_state_dict(start.state_dict())
         self.network.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.bfloat16 = precision == "bfloat16"
-        self.forward = self.worker.wrap(self.network)
+        # Gradients are averaged over the workers.
+        self.forward: nn.Module = self.network if self.worker.count == 1 else DistributedDataParallel(self.network)
         self.teacher = teacher.to(self.device) if teacher is not None else None
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.optimiser = _optimiser(self.network, recipe)
@@ -90,14 +140,19 @@ class Trainer:
         Args:
             batches: from a number on, all that follow.
             checkpoint: the file.
-            schedule: see there.
+            schedule: see there; of several workers, the first keeps to it.
         """
-        meter, saved = Meter(self.step), time.monotonic()
+        schedule = schedule if self.worker.first else Schedule()
+        seen, begun, saved = list[Mapping[str, Tensor]](), time.monotonic(), time.monotonic()
         with held_back() as interrupt:
             following = batches(self.step)
             while self.step < self.recipe.steps and not self.worker.any(interrupt.asked, self.device):
-                meter.add(self.train_step(*next(following)))
-                meter = self._look(schedule, meter)
+                seen.append(self.train_step(*next(following)))
+                if self._due(schedule.report_steps):
+                    schedule.report(self.step, *self._summary(seen, time.monotonic() - begun))
+                    seen, begun = [], time.monotonic()
+                if self._due(schedule.validate_steps):
+                    schedule.validate(self.step, self.averaged())
                 if time.monotonic() - saved > schedule.save_s:
                     self.save(checkpoint)
                     saved = time.monotonic()
@@ -105,17 +160,15 @@ class Trainer:
         if self.step < self.recipe.steps:
             raise KeyboardInterrupt
 
-    def _look(self, schedule: Schedule, meter: "Meter") -> "Meter":
-        """Report and validate when it is time, and at the end; the meter to go on with."""
-        last = self.step == self.recipe.steps
-        if self.step % schedule.report_steps == 0 or last:
-            if self.worker.first:
-                patches = (self.step - meter.first) * self.recipe.batch * self.worker.count
-                schedule.report(self.step, meter.means(), patches / meter.elapsed_s())
-            meter = Meter(self.step)
-        if self.worker.first and schedule.validate_steps and (self.step % schedule.validate_steps == 0 or last):
-            schedule.validate(self.step, self.averaged())
-        return meter
+    def _due(self, every: int) -> bool:
+        """Whether so many steps have passed again, or it is the end; of 0 it never is."""
+        return every > 0 and (self.step % every == 0 or self.step == self.recipe.steps)
+
+    def _summary(self, seen: Sequence[Mapping[str, Tensor]], elapsed_s: float) -> tuple[dict[str, float], float]:
+        """Of the steps since the last report: the means of their terms, but of those skipped; patches a second."""
+        kept = [terms for terms in seen if terms]
+        means = {name: sum(float(terms[name]) for terms in kept) / len(kept) for name in (kept or [{}])[0]}
+        return means, len(seen) * self.recipe.batch * self.worker.count / max(elapsed_s, 1e-9)
 
     def train_step(self, degraded: Tensor, reference: Tensor, *vectors: Tensor) -> Mapping[str, Tensor]:
         """One step on a batch, (N, 1, P, P) each; the loss's terms, none for a step that was skipped.
@@ -173,28 +226,6 @@ class Trainer:
         """Go on from a checkpoint of the same recipe, begun on this processor or another."""
         parts = self.network, self.average, self.optimiser, self.recipe
         self.step, self.guards = read_checkpoint(path, *parts)
-
-
-class Meter:
-    """The loss's terms and the time since a step."""
-
-    def __init__(self, first: int) -> None:
-        self.first, self._started = first, time.monotonic()
-        self._sums, self._count = dict[str, float](), 0
-
-    def add(self, terms: Mapping[str, Tensor]) -> None:
-        """Add a step's terms of the loss, any shape () each; none for a step that was skipped."""
-        for name, term in terms.items():
-            self._sums[name] = self._sums.get(name, 0.0) + float(term)
-        self._count += bool(terms)
-
-    def means(self) -> dict[str, float]:
-        """The mean of each term."""
-        return {name: value / max(self._count, 1) for name, value in self._sums.items()}
-
-    def elapsed_s(self) -> float:
-        """Seconds since then."""
-        return max(time.monotonic() - self._started, 1e-9)
 
 
 def require_loss(loss: RestorationLoss, distil: float) -> None:

@@ -20,7 +20,7 @@ from beers_deploy.quant.onnx_file import fixed_tile_px, metadata, save_onnx
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.walk import tiling_of
 from tests.deploy.command_line import done, refused
-from tests.model.networks import behind_a_bank, plain
+from tests.model.networks import behind_a_bank, plain, radius_px
 from tests.profiles.own_sensor import own_sensor
 
 
@@ -60,7 +60,7 @@ def test_a_network_behind_a_bank_is_exported_for_one_sensor(scale: int, rows: in
     assert [node.op.name for node in placed.nodes if node.broken] == []
     tiling = tiling_of(model)
     assert tiling.lattice_px == scale
-    assert tiling.halo_px == banked.variant.radius_px + (3 if scale == 1 else 4)
+    assert tiling.halo_px == radius_px(banked.variant) + (3 if scale == 1 else 4)
 
 
 def test_the_shipped_network_at_half_resolution_restores_the_same_image() -> None:

@@ -18,3 +18,8 @@ def behind_a_bank(variant: Variant, spread: float) -> BankedConvBEERS:
     initialise(network, generator)
     torch.nn.init.normal_(network.bias.weight, 0.0, spread, generator)
     return network.eval()
+
+
+def radius_px(variant: Variant) -> int:
+    """How far an output pixel sees around its place: one per convolution (head, two a block, body end, tail)."""
+    return variant.scale * (2 * variant.blocks + 3)

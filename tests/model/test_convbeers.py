@@ -5,7 +5,7 @@ from torch.nn.functional import conv2d, pad
 from beers_deploy.model.bank import bank_of_vector
 from beers_deploy.model.convbeers import ConvBEERS, told
 from beers_deploy.model.variants import VARIANTS, Variant
-from tests.model.networks import behind_a_bank, plain
+from tests.model.networks import behind_a_bank, plain, radius_px
 
 
 @pytest.mark.parametrize(("name", "parameters"), [("convbeers", 1_219_841), ("convbeers-s", 157_825)])
@@ -17,7 +17,7 @@ def test_the_parameters_are_those_of_the_paper(name: str, parameters: int) -> No
 def test_the_radius_is_how_far_a_gradient_reaches(blocks: int, scale: int) -> None:
     """Of the first pixel of a place, whose other pixels are below it."""
     variant = Variant(blocks=blocks, features=4, scale=scale)
-    side, middle = 4 * scale * variant.radius_px + scale, 2 * scale * variant.radius_px
+    side, middle = 4 * scale * radius_px(variant) + scale, 2 * scale * radius_px(variant)
     image = torch.rand(1, 1, side, side, generator=torch.Generator().manual_seed(1)).requires_grad_()
     network = plain(variant)
     for module in network.modules():
@@ -27,7 +27,7 @@ def test_the_radius_is_how_far_a_gradient_reaches(blocks: int, scale: int) -> No
     assert image.grad is not None
     rows = image.grad[0, 0].abs().sum(1).nonzero().flatten()
     reached = (middle - int(rows.min()), int(rows.max()) - middle)
-    assert reached == (variant.radius_px, variant.radius_px + scale - 1)
+    assert reached == (radius_px(variant), radius_px(variant) + scale - 1)
 
 
 @pytest.mark.parametrize("name", VARIANTS)

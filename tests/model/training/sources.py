@@ -9,7 +9,7 @@ from beers_deploy.model.family import SensorFamily
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.patches import PatchRecipe, PatchSource
-from beers_deploy.model.training.workers import Worker
+from beers_deploy.model.training.trainer import Worker
 from beers_deploy.profiles import load_sensor
 
 

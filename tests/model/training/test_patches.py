@@ -13,7 +13,7 @@ from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.patches import PatchSource, StoredPairs, cut, draw_turn, pair_files, turn
-from beers_deploy.model.training.workers import Worker
+from beers_deploy.model.training.trainer import Worker
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.response import MtfTable, PointSpread, packed

@@ -26,8 +26,7 @@ from beers_deploy.model.training.checkpoint import (
 )
 from beers_deploy.model.training.losses import LossWeights
 from beers_deploy.model.training.patches import PatchSource
-from beers_deploy.model.training.trainer import Schedule, Trainer
-from beers_deploy.model.training.workers import Worker
+from beers_deploy.model.training.trainer import Schedule, Trainer, Worker
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
 from tests.model.training.sources import small_scene, source
@@ -257,7 +256,7 @@ from tests.model.training.sources import source
 from beers_deploy.model.training.checkpoint import TrainingRecipe
 from beers_deploy.model.training.trainer import Schedule, Trainer
 from beers_deploy.model.variants import Variant
-from beers_deploy.model.training.workers import joined
+from beers_deploy.model.training.trainer import joined
 torch.set_num_threads(1)
 with joined("cpu") as worker:
     recipe = TrainingRecipe(steps=3, batch=3, warm_up_steps=1)
