@@ -1,18 +1,14 @@
 """`beers-deploy detect`: what restoration buys a detector."""
 
-from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from beers_deploy.commands.shared import arguments, refuse, save, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.profiles.figures import by_table
-
-if TYPE_CHECKING:
-    from beers_deploy.studies.detection.study import Comparison
 
 EXAMPLE = "detect --images DIOR/ --split test --detector yolo11n.onnx --sensor dior-medium --out detection/"
 SENSORS = "dior-medium,dior-high"
@@ -60,14 +56,17 @@ def detect(
     """
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.shipped import DETECTOR
-    from beers_deploy.results import Table
+    from beers_deploy.results import Table, print_rows
     from beers_deploy.studies.detection.average_precision import sites_note
     from beers_deploy.studies.detection.detector import open_detector, parse_classes
     from beers_deploy.studies.detection.page import write_page
     from beers_deploy.studies.detection.study import labelled_scenes, run_study, synthetic_scenes
-    from beers_deploy.studies.detection.tables import detection_rows, headline, paper_rows
+    from beers_deploy.studies.detection.tables import MAIN, PAPER_TABLE, detection_rows, headline, paper_rows
 
-    _refuse_unused(context)
+    if images is None:
+        refuse(context, ["labels", "split"], expected="--images beside it", got="none", remedy="leave it out")
+    else:
+        refuse(context, ["drawn"], expected="synthetic scenes", got="--images beside it", remedy="leave it out")
     names = list(dict.fromkeys(["degraded", *(name.strip() for name in methods.split(","))]))
     sensors = list(dict.fromkeys(name.strip() for name in sensor.split(",")))
     trees = [tree.rglob("*") for tree in (images, labels) if tree is not None and tree.is_dir()]
@@ -82,29 +81,13 @@ def detect(
         scenes, notes = labelled_scenes(opened.names, known, images, labels, split)
     compared = run_study(opened, scenes, sensors, names, reference=reference, seed=seed, say=say)
     notes = [note for note in (opened.flag, sites_note(compared[0].sites), *notes) if note]
-    show(compared)
+    rows = [*(row for found in compared for row in detection_rows(found)), *paper_rows()]
+    for table, each in by_table(rows).items():
+        if table.startswith((MAIN, PAPER_TABLE)):
+            print_rows(table, each)
     for sentence in (*notes, headline(compared)):
         say(sentence)
-    write_page(compared, notes, out / REPORT)
+    write_page(compared, rows, notes, out / REPORT)
     say(f"wrote {out / REPORT}")
-    rows = (*(row for found in compared for row in detection_rows(found)), *paper_rows())
     pictures = [scene.path for scene in scenes if scene.path is not None]
-    save(Table("detect", arguments(), (detector or DETECTOR, *pictures), rows), json)
-
-
-def _refuse_unused(context: typer.Context) -> None:
-    """Refuse what only pictures have, or only synthetic scenes."""
-    if context.params["images"] is None:
-        refuse(context, ["labels", "split"], expected="--images beside it", got="none", remedy="leave it out")
-    else:
-        refuse(context, ["drawn"], expected="synthetic scenes", got="--images beside it", remedy="leave it out")
-
-
-def show(compared: "Sequence[Comparison]") -> None:
-    """The tables that answer the question, and the paper's."""
-    from beers_deploy.results import print_rows
-    from beers_deploy.studies.detection.tables import main_rows, paper_rows
-
-    mains = [row for each in compared for row in main_rows(each)]
-    for table, rows in by_table([*mains, *paper_rows()]).items():
-        print_rows(table, rows)
+    save(Table("detect", arguments(), (detector or DETECTOR, *pictures), tuple(rows)), json)

@@ -11,9 +11,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from beers_deploy.model.metrics.bootstrap import LEAST_SITES, percentiles, too_few
-from beers_deploy.studies.detection.boxes import Boxes, areas, joined, shared_areas
+from beers_deploy.studies.detection.boxes import Boxes, areas, iou
 
 OVERLAPS = np.linspace(0.5, 0.95, 10)
 """Intersection over union from which a box counts as found: ten levels, as COCO has them."""
@@ -70,15 +71,16 @@ def find_hits(truths: Sequence[Boxes], found: Sequence[Boxes], classes: int) -> 
         found: what was found on each image, in the same px, of the same classes.
         classes: how many there are.
     """
-    boxes, image = joined(found)
-    order = np.argsort(-boxes.scores, kind="stable")
-    matched = zip(*map(_matched, truths, found), strict=True)
-    hits, ignored = (np.concatenate(parts, axis=-1)[..., order] for parts in matched)
-    objects = np.zeros((len(SIZES_PX), classes, len(truths)), np.int64)
-    for number, truth in enumerate(truths):
-        for size, passed in enumerate(truth.ignored | _of_other_size(truth)):
-            objects[size, :, number] = np.bincount(truth.classes[~passed], minlength=classes)
-    return Hits(image[order], boxes.classes[order], boxes.scores[order], hits, ignored, objects)
+    scores, kinds = (np.concatenate([getattr(one, part) for one in found]) for part in ("scores", "classes"))
+    order = np.argsort(-scores, kind="stable")
+    image = np.repeat(np.arange(len(found)), [len(one) for one in found])
+    matches = [match(*each)[:2] for each in zip(truths, found, strict=True)]
+    hits, ignored = (np.concatenate(parts, axis=-1)[..., order] for parts in zip(*matches, strict=True))
+    counts = [
+        [np.bincount(truth.classes[~passed], minlength=classes) for passed in truth.ignored | _of_other_size(truth)]
+        for truth in truths
+    ]
+    return Hits(image[order], kinds[order], scores[order], hits, ignored, np.stack(counts, axis=-1))
 
 
 def _of_other_size(boxes: Boxes) -> np.ndarray:
@@ -86,11 +88,16 @@ def _of_other_size(boxes: Boxes) -> np.ndarray:
     return np.array([(sides < low) | (sides >= high) for low, high in SIZES_PX.values()])
 
 
-def _matched(truth: Boxes, found: Boxes) -> tuple[np.ndarray, np.ndarray]:
-    """Which detections of an image found an object, and which count neither way, (S, 10, N) each."""
+def match(truth: Boxes, found: Boxes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Match the N boxes found on an image with its M labelled ones, by `SIZES_PX` and `OVERLAPS`.
+
+    Returns:
+        Which of those found are hits, and which count neither way, (S, 10, N); which objects are taken, (S, 10, M).
+    """
     passed = np.repeat((truth.ignored | _of_other_size(truth))[:, None], len(OVERLAPS), axis=1)
     ignored = np.repeat(_of_other_size(found)[:, None], len(OVERLAPS), axis=1)
-    hits, taken, overlaps = np.zeros_like(ignored), np.zeros_like(passed), _overlaps(found, truth)
+    hits, taken = np.zeros_like(ignored), np.zeros_like(passed)
+    overlaps = iou(found.corners, truth.corners, truth.ignored) * (found.classes[:, None] == truth.classes)
     for one in np.argsort(-found.scores, kind="stable"):
         if overlaps[one].max(initial=0) < OVERLAPS[0]:
             continue
@@ -102,16 +109,7 @@ def _matched(truth: Boxes, found: Boxes) -> tuple[np.ndarray, np.ndarray]:
         hits[..., one] = any_free & ~passed_over
         ignored[..., one] = np.where(any_free, passed_over, ignored[..., one])
         np.put_along_axis(taken, best, np.take_along_axis(taken, best, axis=-1) | any_free[..., None], axis=-1)
-    return hits, ignored
-
-
-def _overlaps(found: Boxes, truth: Boxes) -> np.ndarray:
-    """(N, M) overlaps with objects of the same class; with an ignored one, the share of the detection in it."""
-    shared = shared_areas(found.corners, truth.corners)
-    own, other = areas(found.corners)[:, None], areas(truth.corners)[None, :]
-    whole = np.where(truth.ignored[None, :], own, own + other - shared)
-    same = (found.classes[:, None] == truth.classes[None, :]) & (whole > 0)
-    return np.asarray(np.divide(shared, whole, out=np.zeros_like(shared), where=same))
+    return hits, ignored, taken
 
 
 def site_weights(sites: Sequence[str], seed: int, draws: int = DRAWS) -> np.ndarray:
@@ -123,11 +121,9 @@ def site_weights(sites: Sequence[str], seed: int, draws: int = DRAWS) -> np.ndar
 
 
 def interval(values: np.ndarray, sites: int) -> tuple[float, float] | None:
-    """The interval at 95 % of a figure, or of a difference of two: percentiles of its draws.
+    """The interval at 95 % of a figure, or of a difference of two, (1 + draws,): percentiles of its draws.
 
-    Args:
-        values: (1 + draws,) on all images, then on each draw.
-        sites: how many different ones; of fewer than `LEAST_SITES` none could be trusted.
+    Of fewer than `LEAST_SITES` different sites there is none: it could not be trusted.
     """
     known = values[1:][~np.isnan(values[1:])]
     if np.isnan(values[0]) or sites < LEAST_SITES or not len(known):
@@ -151,11 +147,11 @@ def score_rows(
         names: of the classes.
         weights: (W, I), how often each image counts, as `site_weights` gives it.
     """
-    confidence = float(_best(_confidence_curves(next(iter(rows.values())), weights[:1]))[0])
+    confidence = float(score(next(iter(rows.values())), names, weights[:1])["own confidence"][0])
     return {row: score(hits, names, weights, confidence) for row, hits in rows.items()}, confidence
 
 
-def score(hits: Hits, names: Sequence[str], weights: np.ndarray, confidence: float = math.nan) -> Figures:
+def score(hits: Hits, names: Sequence[str], weights: np.ndarray, confidence: float = 0.0) -> Figures:
     """Every figure of a row, (W,) each.
 
     Args:
@@ -168,16 +164,17 @@ def score(hits: Hits, names: Sequence[str], weights: np.ndarray, confidence: flo
     every = len(OVERLAPS)
     by_class = np.array([precisions(hits, kind, weights, ALL, every).mean(axis=-1) for kind in range(len(names))])
     curves = _confidence_curves(hits, weights)
-    own = _best(curves)
-    fixed = np.full(len(weights), confidence)
+    fixed = np.searchsorted(CONFIDENCES, np.nan_to_num(confidence) - 1e-9)
+    own = np.argmax(curves[2], axis=-1)  # 0 where nothing is labelled, and there the curves are NaN
+    own_precision, own_recall, own_f1 = curves[:, np.arange(len(weights)), own]
     return {
         "mAP50": mean_known(by_class[..., 0]),
         "mAP50-95": mean_known(by_class.mean(axis=-1)),
-        "precision": _read_at(curves[0], fixed),
-        "recall": _read_at(curves[1], fixed),
-        "own confidence": own,
-        "own precision": _read_at(curves[0], own),
-        "own recall": _read_at(curves[1], own),
+        "precision": curves[0, :, fixed],
+        "recall": curves[1, :, fixed],
+        "own confidence": np.where(np.isnan(own_f1), np.nan, CONFIDENCES[own]),
+        "own precision": own_precision,
+        "own recall": own_recall,
         **{f"mAP50 of {name}": values for name, values in zip(names, by_class[..., 0], strict=True)},
         **{f"mAP50 {name}": map50(hits, weights, size) for size, name in enumerate(SIZES_PX) if size != ALL},
     }
@@ -191,10 +188,7 @@ def map50(hits: Hits, weights: np.ndarray, size: int = ALL) -> np.ndarray:
 
 def mean_known(values: np.ndarray) -> np.ndarray:
     """Mean over the first axis of those that are there; NaN of none."""
-    known = ~np.isnan(values)
-    count = known.sum(axis=0)
-    total = np.where(known, values, 0.0).sum(axis=0)
-    return np.asarray(np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0))
+    return np.asarray(np.ma.filled(np.ma.masked_invalid(values).mean(axis=0), np.nan))
 
 
 def precisions(hits: Hits, kind: int, weights: np.ndarray, size: int = ALL, levels: int = 1) -> np.ndarray:
@@ -235,34 +229,19 @@ def _confidence_curves(hits: Hits, weights: np.ndarray) -> np.ndarray:
 
     Precision is 1 of a class of which nothing is found, as Ultralytics has it.
     """
-    total, known = np.zeros((3, len(weights), len(CONFIDENCES))), np.zeros(len(weights))
+    total, known = np.zeros((3, len(weights), len(CONFIDENCES))), np.zeros((len(weights), 1))
     levels = np.searchsorted(CONFIDENCES, hits.scores, side="right") - 1
+
+    def reaching(which: np.ndarray) -> np.ndarray:
+        places, shape = (hits.images[which], levels[which]), (weights.shape[1], len(CONFIDENCES))
+        by_level = weights @ csr_array((np.ones(len(places[0])), places), shape)
+        return np.asarray(by_level[:, ::-1].cumsum(axis=1)[:, ::-1])
+
     for kind, objects in enumerate(hits.objects[ALL]):
-        counts = weights @ objects
-        mine = hits.classes == kind
-        hit, counted = (np.flatnonzero(flags & mine) for flags in (hits.hits[ALL, 0], ~hits.ignored[ALL, 0]))
-        steps = [(levels[which], hits.images[which]) for which in (hit, counted)]
-        for draw in np.flatnonzero(counts):
-            true, found = (
-                np.bincount(level, weights[draw, image], len(CONFIDENCES))[::-1].cumsum()[::-1]
-                for level, image in steps
-            )
-            precision = np.divide(true, found, out=np.ones(len(CONFIDENCES)), where=found > 0)
-            recall = true / counts[draw]
-            both = precision + recall
-            f1 = np.divide(2 * precision * recall, both, out=np.zeros_like(both), where=both > 0)
-            total[:, draw] += precision, recall, f1
+        counts, mine = (weights @ objects)[:, None], hits.classes == kind
+        true, found = reaching(mine & hits.hits[ALL, 0]), reaching(mine & ~hits.ignored[ALL, 0])
+        precision, recall = np.where(found > 0, true / np.maximum(found, 1), 1.0), true / np.maximum(counts, 1)
+        f1 = 2 * precision * recall / np.where(recall > 0, precision + recall, 1.0)
+        total += np.where(counts > 0, [precision, recall, f1], 0.0)
         known += counts > 0
-    none = np.full(total.shape, np.nan)
-    return np.asarray(np.divide(total, known[:, None], out=none, where=known[:, None] > 0))
-
-
-def _best(curves: np.ndarray) -> np.ndarray:
-    """(W,) the confidence of the largest F1, the lowest one of several; NaN where nothing is labelled."""
-    return np.where(np.isnan(curves[2]).any(axis=-1), np.nan, CONFIDENCES[np.argmax(curves[2], axis=-1)])
-
-
-def _read_at(curve: np.ndarray, confidences: np.ndarray) -> np.ndarray:
-    """(W,) what stands in each row of a curve (W, 1001) at its confidence; NaN at a NaN."""
-    level = np.searchsorted(CONFIDENCES, np.nan_to_num(confidences) - 1e-9)
-    return np.where(np.isnan(confidences), np.nan, curve[np.arange(len(curve)), level])
+    return np.where(known > 0, total / np.maximum(known, 1), np.nan)

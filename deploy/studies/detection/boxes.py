@@ -4,7 +4,6 @@ Coordinates are continuous pixels: pixel i covers [i, i + 1), so a box around th
 bring every other convention to this one (`labels`).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -71,49 +70,33 @@ class Boxes:
         return replace(self, corners=inside, ignored=ignored)[known > 0]
 
 
-def joined(several: Sequence[Boxes]) -> tuple[Boxes, np.ndarray]:
-    """Boxes of several images in one, and the number of each one's image, (N,) int64."""
-    parts = ("corners", "classes", "scores", "ignored")
-    whole = Boxes(*(np.concatenate([getattr(one, part) for one in (Boxes.of([], []), *several)]) for part in parts))
-    return whole, np.repeat(np.arange(len(several)), [len(one) for one in several])
-
-
 def areas(corners: np.ndarray) -> np.ndarray:
     """(N,) areas in px2 of (N, 4) corners; 0 where a right or lower edge lies before its opposite."""
     return np.asarray(np.prod(np.maximum(corners[:, 2:] - corners[:, :2], 0), axis=1))
 
 
-def shared_areas(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(N, M) px2 that each of (N, 4) boxes has in common with each of (M, 4)."""
-    low = np.maximum(one[:, None, :2], other[None, :, :2])
-    high = np.minimum(one[:, None, 2:], other[None, :, 2:])
-    return np.asarray(np.prod(np.maximum(high - low, 0), axis=2))
-
-
-def iou(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(N, M) intersections over unions, 0 to 1, of (N, 4) and (M, 4) corners; 0 of two boxes without area."""
-    shared = shared_areas(one, other)
-    union = areas(one)[:, None] + areas(other)[None, :] - shared
-    return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0))
-
-
-def suppress(found: Boxes, overlap: float = OVERLAP, most: int = MOST) -> Boxes:
-    """Non-maximum suppression within each class: of boxes that overlap more than `overlap` the best scored stays.
+def iou(one: np.ndarray, other: np.ndarray, ignored: np.ndarray | bool = False) -> np.ndarray:
+    """(N, M) overlaps, 0 to 1, of (N, 4) and (M, 4) corners: intersection over union; 0 of two boxes without area.
 
     Args:
-        found: as a detector gives them.
-        overlap: intersection over union, 0 to 1.
-        most: boxes kept of the image, the best scored.
-
-    Returns:
-        What stays, best score first.
+        one: corners.
+        other: corners.
+        ignored: (M,) of which of `other` the overlap is the share of `one` inside it.
     """
+    low, high = np.maximum(one[:, None, :2], other[None, :, :2]), np.minimum(one[:, None, 2:], other[None, :, 2:])
+    shared, own = np.prod(np.maximum(high - low, 0), axis=2), areas(one)[:, None]
+    whole = np.where(ignored, own, own + areas(other) - shared)
+    return np.asarray(np.divide(shared, whole, out=np.zeros_like(shared), where=whole > 0))
+
+
+def suppress(found: Boxes) -> Boxes:
+    """Non-maximum suppression within each class: what stays of boxes as a detector gives them, best score first."""
     left, kept = np.argsort(-found.scores, kind="stable")[:CANDIDATES], list[int]()
-    while len(left) and len(kept) < most:
+    while len(left) and len(kept) < MOST:
         best, left = int(left[0]), left[1:]
         kept.append(best)
         crowded = found.classes[left] == found.classes[best]
-        crowded[crowded] = iou(found.corners[best][None], found.corners[left[crowded]])[0] > overlap
+        crowded[crowded] = iou(found.corners[best][None], found.corners[left[crowded]])[0] > OVERLAP
         left = left[~crowded]
     return found[np.array(kept, np.int64)]
 
@@ -131,24 +114,21 @@ class Letterbox:
 
     def __init__(self, height_px: int, width_px: int, size_px: int) -> None:
         share = min(size_px / height_px, size_px / width_px)
-        self._size_px, self._inner = size_px, (round(height_px * share), round(width_px * share))
+        self._inner = height, width = round(height_px * share), round(width_px * share)
         if min(self._inner) < 1:
             got = f"{height_px} x {width_px} px"
             expected = f"an image that keeps a pixel in a detector's input of {size_px} px"
             raise OptionError("image", expected=expected, got=got, remedy="cut it into squares")
-        height, width = self._inner
-        self._top, self._left = (size_px - height) // 2, (size_px - width) // 2
+        top, left = (size_px - height) // 2, (size_px - width) // 2
+        self._border = (top, size_px - height - top), (left, size_px - width - left), (0, 0)
         # By axis, for the sides are rounded to whole pixels: one gain for both would be off by up to half a pixel.
-        self._gain = np.tile([width / width_px, height / height_px], 2)
-        self._shift = np.tile([self._left, self._top], 2)
+        self._gain, self._shift = np.tile([width / width_px, height / height_px], 2), np.tile([left, top], 2)
 
     def image(self, rgb: np.ndarray) -> np.ndarray:
         """The input, (3, size_px, size_px) float32, of an image (height_px, width_px, 3) in 0 to 1."""
         same = self._inner == rgb.shape[:2]
         fitted = rgb if same else resize(rgb, self._inner, order=1, mode="edge", anti_aliasing=False)
-        padded = np.full((self._size_px, self._size_px, 3), PADDING, np.float32)
-        height, width = self._inner
-        padded[self._top : self._top + height, self._left : self._left + width] = fitted
+        padded = np.pad(fitted.astype(np.float32), self._border, constant_values=PADDING)
         return np.ascontiguousarray(padded.transpose(2, 0, 1))
 
     def to_input(self, corners: np.ndarray) -> np.ndarray:

@@ -6,10 +6,10 @@ network that needs no suppression. Both take RGB in 0 to 1 on a grey letterbox, 
 """
 
 import ast
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import onnx
@@ -31,8 +31,6 @@ ROUNDING = 1e-3
 REMEDY = "export it by Ultralytics for detection, with format='onnx'"
 OPTION = "classes"
 
-Layout = Literal["raw", "final"]
-
 
 @dataclass(frozen=True)
 class Detector:
@@ -41,13 +39,11 @@ class Detector:
     Attributes:
         names: of its classes, in its order.
         size_px: side of its square input.
-        layout: of its output: raw, or final boxes.
         flag: why its average precision comes out too low, in a sentence; empty where nothing is cut.
     """
 
     names: tuple[str, ...]
     size_px: int
-    layout: Layout
     flag: str
     _run: Callable[[np.ndarray], np.ndarray]
 
@@ -65,18 +61,15 @@ class Detector:
 
     def decoded(self, output: np.ndarray) -> Boxes:
         """Boxes in px of the input, suppressed, of an answer (1, 4 + classes, anchors) raw, or (1, N, 6) final."""
-        axis, size = (1, 4 + len(self.names)) if self.layout == "raw" else (2, 6)
-        if output.ndim != 3 or len(output) != 1 or output.shape[axis] != size:
+        if not _is_read(output.shape, len(self.names)):
             raise _refused("an answer of the sizes that its file states", " x ".join(map(str, output.shape)))
         if not np.isfinite(output).all():
             raise _refused("finite boxes and scores", "NaN or infinity")
-        scores = output[:, 4:] if self.layout == "raw" else output[:, :, 4]
+        final = output.shape[2] == 6  # raw are at least the 21 anchors of an input of 32 px
+        scores = output[:, :, 4] if final else output[:, 4:]
         if scores.min(initial=0) < -ROUNDING or scores.max(initial=0) > 1 + ROUNDING:
             raise _refused("scores in 0 to 1", "others: logits or an objectness perhaps")
-        if self.layout == "raw":
-            return suppress(_raw(output[0]))
-        found = _final(output[0], len(self.names))
-        return found[np.argsort(-found.scores, kind="stable")[:MOST]]
+        return _final(output[0], len(self.names)) if final else suppress(_raw(output[0]))
 
 
 def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> Detector:
@@ -94,9 +87,9 @@ def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> D
     if not names:
         stated = repr(about["names"])[:80] if "names" in about else "none"
         raise _refused("the names of its classes in its metadata, {0: 'ship', ...}", stated, path)
-    layout = _layout(model, about, len(names), path)
-    size = _size_px(fixed_tile_px(model), about, size_px, path)
-    return Detector(names, size, layout, _flag(model), _runner(model, threads, path))
+    _require_layout(model, about.get("task", "detect"), len(names), path)
+    size = _size_px(fixed_tile_px(model), about.get("imgsz"), size_px, path)
+    return Detector(names, size, _flag(model), _runner(model, threads, path))
 
 
 def _runner(model: onnx.ModelProto, threads: int, path: Path) -> Callable[[np.ndarray], np.ndarray]:
@@ -121,19 +114,19 @@ def _literal(text: str) -> Any:
         return text
 
 
-def _layout(model: onnx.ModelProto, about: dict[str, Any], classes: int, path: Path) -> Layout:
-    task, channels = about.get("task", "detect"), _sizes(model.graph.input[0])[1:2]
-    outputs = [_sizes(value) for value in model.graph.output]
-    shape = outputs[0] if len(outputs) == 1 and len(outputs[0]) == 3 else [-1]
-    if task == "detect" and channels == [3] and shape[0] in (0, 1):
-        if shape[1] == 4 + classes:
-            return "raw"
-        if shape[2] == 6:
-            return "final"
+def _require_layout(model: onnx.ModelProto, task: Any, classes: int, path: Path) -> None:
+    channels, outputs = _sizes(model.graph.input[0])[1:2], [_sizes(value) for value in model.graph.output]
+    if task == "detect" and channels == [3] and len(outputs) == 1 and _is_read(outputs[0], classes):
+        return
     read = f"for RGB, 1 x {4 + classes} x anchors for {classes} classes (raw) or 1 x N x 6 (nms=True or end2end)"
     shapes = ", ".join(" x ".join(map(str, sizes)) for sizes in outputs)
     got = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}"
     raise _refused(f"a detector's output as Ultralytics exports it {read}", got, path)
+
+
+def _is_read(shape: Sequence[int], classes: int) -> bool:
+    """Whether an output is raw or final, of one image; 0 stands for a size that a file leaves open."""
+    return len(shape) == 3 and shape[0] in (0, 1) and (shape[1] == 4 + classes or shape[2] == 6)
 
 
 def _sizes(value: onnx.ValueInfoProto) -> list[int]:
@@ -141,11 +134,10 @@ def _sizes(value: onnx.ValueInfoProto) -> list[int]:
     return [dimension.dim_value for dimension in value.type.tensor_type.shape.dim]
 
 
-def _size_px(fixed: int | None, about: dict[str, Any], asked: int | None, path: Path) -> int:
+def _size_px(fixed: int | None, stated: Any, asked: int | None, path: Path) -> int:
     if fixed and asked not in (None, fixed):
         expected, remedy = f"{fixed}, which {path.name} is fixed to", f"export it for {asked} px, or leave `side` out"
         raise OptionError("side", expected=expected, got=f"{asked}", remedy=remedy)
-    stated = about.get("imgsz")
     if isinstance(stated, list) and len(stated) == 2 and stated[0] == stated[1]:
         stated = stated[0]
     size = fixed or asked or stated
@@ -176,11 +168,12 @@ def _raw(output: np.ndarray) -> Boxes:
 
 
 def _final(output: np.ndarray, classes: int) -> Boxes:
-    """Rows with a score that counts: the rest pads the list with zeros."""
+    """Rows with a score that counts, the best first: the rest pads the list with zeros."""
     rows = output[output[:, 4] > LEAST_SCORE]
     if not np.isin(rows[:, 5], np.arange(classes)).all():
         raise _refused(f"classes from 0 to {classes - 1} in its sixth column", "others")
-    return Boxes.of(rows[:, :4], rows[:, 5].astype(np.int64), rows[:, 4])
+    rows = rows[np.argsort(-rows[:, 4], kind="stable")[:MOST]]
+    return Boxes.of(rows[:, :4], rows[:, 5], rows[:, 4])
 
 
 def _refused(expected: str, got: str, path: Path | str = "detector") -> ModelError:
@@ -225,19 +218,15 @@ def class_numbers(labelled: Sequence[str], detector: Sequence[str], given: Mappi
     if len(number) < len(detector):
         expected, got = "classes told apart by their letters", "two classes of the same letters"
         raise OptionError("detector", expected=expected, got=got, remedy="export one whose classes differ")
-    _require_known("the labelled", given, labelled)
-    _require_known("the detector's", given.values(), detector)
-    asked = {letters(name): known for name, known in given.items()}
-    numbers = np.array([number.get(letters(asked.get(letters(name), name)), -1) for name in labelled], np.int64)
+    for whose, asked, names in (("the labelled", given, labelled), ("the detector's", given.values(), detector)):
+        for name in asked:
+            if letters(name) not in map(letters, names):
+                expected = f"one of {whose} classes ({', '.join(names)})"
+                raise OptionError(OPTION, expected=expected, got=repr(name), remedy="correct the name")
+    known = {letters(name): letters(own) for name, own in given.items()}
+    numbers = np.array([number.get(known.get(letters(name), letters(name)), -1) for name in labelled], np.int64)
     if not (numbers >= 0).any():
         expected = f"a labelled class that the detector knows ({', '.join(detector)})"
         remedy = f"say which is which: {OPTION} LABELLED=DETECTOR"
-        raise OptionError("classes", expected=expected, got=", ".join(labelled) or "none", remedy=remedy)
+        raise OptionError(OPTION, expected=expected, got=", ".join(labelled) or "none", remedy=remedy)
     return numbers
-
-
-def _require_known(whose: str, asked: Iterable[str], names: Sequence[str]) -> None:
-    for name in asked:
-        if letters(name) not in map(letters, names):
-            expected = f"one of {whose} classes ({', '.join(names)})"
-            raise OptionError(OPTION, expected=expected, got=repr(name), remedy="correct the name")

@@ -13,7 +13,6 @@ Boxes are in continuous pixels of the image, pixel i covering [i, i + 1):
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +20,7 @@ import numpy as np
 
 from beers_deploy.model.io.files import IMAGE_SUFFIXES
 from beers_deploy.model.io.images import image_size_px, list_images
-from beers_deploy.profiles.errors import BeersError, MissingExtraError, OptionError
+from beers_deploy.profiles.errors import MissingExtraError, OptionError
 from beers_deploy.profiles.toml import read_json, read_whole
 from beers_deploy.restoration.index_files import NoDoctype
 from beers_deploy.studies.detection.boxes import Boxes, areas
@@ -37,42 +36,25 @@ SPAN = 1e-3
 HORIZONTAL = "Horizontal Bounding Boxes"
 CORNERS = ("xmin", "ymin", "xmax", "ymax")
 
-
-class LabelledImage(NamedTuple):
-    """An image file with the boxes labelled on it, in its px; their classes are numbers into the set's names."""
-
-    path: Path
-    truth: Boxes
+Box = tuple[str, Sequence[float], bool]
+"""A name, the corners, and whether the box counts neither way."""
 
 
-@dataclass(frozen=True)
-class LabelledSet:
-    """Labelled images of one layout.
+class LabelledSet(NamedTuple):
+    """Image files by name with their boxes, the names of the classes, and a sentence on each kind of box left out."""
 
-    Attributes:
-        images: in the order of their names; some may be without a box.
-        names: of the classes that are labelled.
-        notes: a sentence for each kind of label that was left out or changed.
-    """
-
-    images: tuple[LabelledImage, ...]
-    names: tuple[str, ...]
-    notes: tuple[str, ...]
-
-
-class _Box(NamedTuple):
-    name: str
-    corners: tuple[float, float, float, float]
-    ignored: bool = False
+    images: list[tuple[Path, Boxes]]
+    names: list[str]
+    notes: list[str]
 
 
 class _File(NamedTuple):
-    """The labels of one image; `size_px` is the height and width that they were made for, where they say so."""
+    """The labels of one image; `size_px` is the height and width that they were made for, 0 where they say none."""
 
     image: Path
-    boxes: Sequence[_Box]
     source: Path
-    size_px: tuple[int, int] | None = None
+    boxes: list[Box]
+    size_px: tuple[float, float] = (0, 0)
 
 
 def read_labelled(images: Path, labels: Path | None = None, split: str | None = None) -> LabelledSet:
@@ -84,7 +66,7 @@ def read_labelled(images: Path, labels: Path | None = None, split: str | None = 
         split: which part of a tree; None takes `test` if there is one.
     """
     if labels is None and (images / "Annotations").is_dir() and any(images.glob("JPEGImages*")):
-        return _labelled_set([_read_voc(*pair) for pair in _voc_pairs(images, split)])
+        return _labelled_set(_read_voc_tree(images, split))
     folder = _image_folder(images, split)
     where = labels or _labels_near(images, folder)
     if where.suffix.lower() == ".json":
@@ -129,116 +111,114 @@ def _read_each(images: Sequence[Path], where: Path, named_in: Sequence[Path]) ->
     if not where.is_dir():
         raise _faulty(where, LAYOUTS, "another file" if where.exists() else "no such folder", "give a folder")
     there = {path.name for path in where.iterdir()}
-    xml, text = ([(image, where / f"{image.stem}{suffix}") for image in images] for suffix in (".xml", ".txt"))
-    missing = [labels.name for _, labels in xml if labels.name not in there]
+    missing = [f"{image.stem}.xml" for image in images if f"{image.stem}.xml" not in there]
     if not missing:
-        return [_read_voc(*pair) for pair in xml]
-    if len(missing) < len(xml):
-        got = f"{len(missing)} of {len(xml)} missing, the first {missing[0]}"
+        return [_read_voc(image, where / f"{image.stem}.xml") for image in images]
+    if len(missing) < len(images):
+        got = f"{len(missing)} of {len(images)} missing, the first {missing[0]}"
         remedy = "leave those images out, or give them files without objects"
         raise _faulty(where, "a file of labels for every image", got, remedy)
-    if any(labels.name in there for _, labels in text):
-        names = yolo_names(named_in)
-        return [_read_yolo(*pair, names) for pair in text]
-    raise _faulty(where, LAYOUTS, f"none named as one of the {len(images)} images", "name each file as its image")
+    if not any(f"{image.stem}.txt" in there for image in images):
+        got = f"none named as one of the {len(images)} images"
+        raise _faulty(where, LAYOUTS, got, "name each file as its image")
+    names = yolo_names(named_in)
+    return [_read_yolo(image, where / f"{image.stem}.txt", names) for image in images]
 
 
 def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> LabelledSet:
-    spelled = {letters(box.name): box.name for one in reversed(files) for box in reversed(one.boxes)}
+    spelled = {letters(name): name for one in reversed(files) for name, *_ in reversed(one.boxes)}
     number = {key: i for i, key in enumerate(sorted(spelled))}
     images, lost = [], list[str]()
     for one in sorted(files, key=lambda one: one.image.name):
-        classes, ignored = [number[letters(box.name)] for box in one.boxes], [box.ignored for box in one.boxes]
-        whole = Boxes.of([box.corners for box in one.boxes], classes, ignored=ignored)
+        classes = [number[letters(name)] for name, *_ in one.boxes]
+        corners, ignored = [box[1] for box in one.boxes], [box[2] for box in one.boxes]
+        whole = Boxes.of(corners, classes, ignored=ignored)
         inside = whole[areas(whole.corners) > 0].clipped(*_size_px(one))
         lost += [one.source.name] * (len(whole) - len(inside))
-        images.append(LabelledImage(one.image, inside))
-    if not any(len(image.truth) for image in images):
+        images.append((one.image, inside))
+    if not any(len(truth) for _, truth in images):
         got = f"none on {len(images)} images"
         raise OptionError("labels", expected="one object at least", got=got, remedy="check the labels")
-    names = tuple(spelled[key] for key in sorted(spelled))
-    return LabelledSet(tuple(images), names, (*notes, *_remarks(images, lost)))
+    told = [*notes, *_remarks([truth for _, truth in images], lost)]
+    return LabelledSet(images, [spelled[key] for key in number], told)
 
 
 def _size_px(one: _File) -> tuple[int, int]:
     """Height and width of an image in px; its labels must have been made for them."""
     height, width = image_size_px(one.image)
-    if one.size_px not in (None, (height, width)):
-        expected, got = f"labels of an image of {height} x {width} px", f"{one.size_px[0]} x {one.size_px[1]} px"
+    if min(one.size_px) > 0 and one.size_px != (height, width):
+        expected, got = f"labels of an image of {height} x {width} px", f"{one.size_px[0]:g} x {one.size_px[1]:g} px"
         raise _faulty(one.source, expected, got, "give the image that was labelled")
     return height, width
 
 
-def _remarks(images: Sequence[LabelledImage], lost: Sequence[str]) -> list[str]:
-    empty, ignored = sum(not len(i.truth) for i in images), sum(int(i.truth.ignored.sum()) for i in images)
+def _remarks(truths: Sequence[Boxes], lost: Sequence[str]) -> list[str]:
+    empty, ignored = sum(not len(truth) for truth in truths), sum(int(truth.ignored.sum()) for truth in truths)
     first = lost[0] if lost else ""
     remarks = (
-        (empty, f"Images without a labelled object, all found there is false: {empty} of {len(images)}."),
+        (empty, f"Images without a labelled object, all found there is false: {empty} of {len(truths)}."),
         (lost, f"Boxes left out, without area inside their image: {len(lost)}, the first in {first}."),
         (ignored, f"Boxes that count neither way, difficult, a crowd or visible by less than 30 %: {ignored}."),
     )
     return [sentence for said, sentence in remarks if said]
 
 
-def _voc_pairs(folder: Path, split: str | None) -> list[tuple[Path, Path]]:
-    """Image and label files of a split of VOC's or DIOR's folders; None takes `test`, or all where there is none."""
-    images = {p.stem: p for p in folder.glob("JPEGImages*/*") if p.suffix.lower() in IMAGE_SUFFIXES}
+def _read_voc_tree(folder: Path, split: str | None) -> list[_File]:
+    """The labels of a split of VOC's or DIOR's folders; None takes `test`, or all where there is none."""
+    images = {p.stem: p for p in sorted(folder.glob("JPEGImages*/*")) if p.suffix.lower() in IMAGE_SUFFIXES}
     labels = folder / "Annotations"
     labels = labels / HORIZONTAL if (labels / HORIZONTAL).is_dir() else labels
     lists = {path.stem: path for path in sorted((folder / "ImageSets" / "Main").glob("*.txt"))}
-    wanted = split or "test"
-    if split is None and wanted not in lists:
-        return [(path, labels / f"{stem}.xml") for stem, path in sorted(images.items())]
-    if wanted not in lists:
-        raise _faulty(folder, f"one of its splits ({', '.join(lists) or 'none'})", repr(wanted), "name one of them")
-    stems = sorted({line.split()[0] for line in _lines(lists[wanted])})  # a list of one class has a number behind it
+    stems, wanted = list(images), split or "test"
+    if wanted in lists:
+        # A list of one class has a number behind each name.
+        stems = sorted({line.split()[0] for line in _lines(lists[wanted])})
+    elif split:
+        raise _faulty(folder, f"one of its splits ({', '.join(lists) or 'none'})", repr(split), "name one of them")
     missing = [stem for stem in stems if stem not in images]
     if missing:
         got = f"{len(missing)} of {len(stems)} missing, the first {missing[0]!r}"
         raise _faulty(folder, f"every image of {wanted}", got, "unpack the images whole")
-    return [(images[stem], labels / f"{stem}.xml") for stem in stems]
+    return [_read_voc(images[stem], labels / f"{stem}.xml") for stem in stems]
 
 
 def _read_voc(image: Path, labels: Path) -> _File:
+    text = _read_bytes(labels)
     try:
         # NoDoctype refuses a document type: with entities a file of a hundred bytes can grow to gigabytes.
-        root = ET.fromstring(_read_bytes(labels), ET.XMLParser(target=NoDoctype()))  # noqa: S314
-    except BeersError:
-        raise
+        root = ET.fromstring(text, ET.XMLParser(target=NoDoctype()))  # noqa: S314
     except (ET.ParseError, ValueError, LookupError, RecursionError) as error:  # lookup: of an encoding
         raise _faulty(labels, "plain XML", " ".join(str(error).split())[:100]) from error
     if root.tag != "annotation":
         raise _faulty(labels, "Pascal VOC, an 'annotation'", f"<{root.tag}>"[:80], "give labels of VOC")
-    size = _numbers([root.findtext(f"size/{name}", "0") for name in ("height", "width")], labels, "size")
-    return _File(image, [_voc_box(entry, labels) for entry in root.iter("object")], labels, _stated_px(*size))
+    height, width = _numbers([root.findtext(f"size/{name}", "0") for name in ("height", "width")], labels, "size")
+    return _File(image, labels, [_voc_box(entry, labels) for entry in root.iter("object")], (height, width))
 
 
-def _voc_box(entry: ET.Element, path: Path) -> _Box:
+def _voc_box(entry: ET.Element, path: Path) -> Box:
     name = (entry.findtext("name") or "").strip()
     if not name:
         raise _faulty(path, "a name for every object", "none")
     corners = [entry.findtext(f"bndbox/{corner}", "none") for corner in CORNERS]
     left, top, right, bottom = _numbers(corners, path, f"{', '.join(CORNERS)} of a {name!r}")
-    return _Box(name, (left - 1, top - 1, right, bottom), (entry.findtext("difficult") or "0").strip() == "1")
+    return name, (left - 1, top - 1, right, bottom), (entry.findtext("difficult") or "0").strip() == "1"
 
 
 def _read_coco(labels: Path, folder: Path) -> tuple[list[_File], list[str]]:
     """The labels of every image that is both listed and in the folder, and a sentence about those that are not."""
     try:
         content: Any = read_json(labels)
-        names = {entry["id"]: _text(entry["name"]) for entry in content["categories"]}
-        boxes: dict[Any, list[_Box]] = {entry["id"]: [] for entry in content["images"]}
+        names = {entry["id"]: str.strip(entry["name"]) for entry in content["categories"]}
+        boxes: dict[Any, list[Box]] = {entry["id"]: [] for entry in content["images"]}
         for entry in content["annotations"]:
             left, top, width, height = map(float, entry["bbox"])
-            corners = (left, top, left + width, top + height)
-            boxes[entry["image_id"]].append(_Box(names[entry["category_id"]], corners, bool(entry.get("iscrowd", 0))))
+            box = names[entry["category_id"]], (left, top, left + width, top + height), bool(entry.get("iscrowd", 0))
+            boxes[entry["image_id"]].append(box)
         files = [
-            _File(path, boxes[entry["id"]], labels, _stated_px(entry.get("height") or 0, entry.get("width") or 0))
+            _File(path, labels, boxes[entry["id"]], (float(entry.get("height") or 0), float(entry.get("width") or 0)))
             for entry in content["images"]
-            if (path := _inside(folder, _text(entry["file_name"]))) is not None
+            if (path := _inside(folder, entry["file_name"]))
         ]
-    except BeersError:
-        raise
     except (OSError, LookupError, TypeError, ValueError, OverflowError) as error:
         got = f"{type(error).__name__}: {' '.join(str(error).split())[:100]}"
         remedy = "give COCO's JSON file"
@@ -250,31 +230,19 @@ def _read_coco(labels: Path, folder: Path) -> tuple[list[_File], list[str]]:
     return files, [f"{absent} of {listed} images in {labels.name} are not in the folder."] if absent else []
 
 
-def _stated_px(height: float, width: float) -> tuple[int, int] | None:
-    return (int(height), int(width)) if height > 0 and width > 0 else None
-
-
 def _inside(folder: Path, name: str) -> Path | None:
     """The file of that name in the folder, or of its last part; nothing outside the folder."""
-    for path in (folder / name, folder / Path(name).name):
-        if ".." not in Path(name).parts and not Path(name).is_absolute() and path.is_file():
-            return path
-    return None
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str) or not value.strip():
-        raise ValueError(f"{value!r} where a name belongs")
-    return value.strip()
+    if ".." in Path(name).parts or Path(name).is_absolute():
+        return None
+    return next((path for path in (folder / name, folder / Path(name).name) if path.is_file()), None)
 
 
 def _read_yolo(image: Path, labels: Path, names: Sequence[str]) -> _File:
-    size_px = image_size_px(image)
-    lines = _lines(labels) if labels.exists() else []
-    return _File(image, [_yolo_box(line, labels, names, size_px) for line in lines], labels)
+    lines, size_px = _lines(labels) if labels.exists() else [], image_size_px(image)
+    return _File(image, labels, [_yolo_box(line, labels, names, size_px) for line in lines])
 
 
-def _yolo_box(line: str, path: Path, names: Sequence[str], size_px: tuple[int, int]) -> _Box:
+def _yolo_box(line: str, path: Path, names: Sequence[str], size_px: tuple[int, int]) -> Box:
     words = line.split()
     if len(words) != 5 and (len(words) < 7 or len(words) % 2 == 0):
         raise _faulty(path, "YOLO's 'class cx cy w h'", repr(line[:80]))
@@ -289,8 +257,7 @@ def _yolo_box(line: str, path: Path, names: Sequence[str], size_px: tuple[int, i
     if len(shares) == 4:
         middle, size = points
         points = np.array([middle - size / 2, middle + size / 2])
-    (left, top), (right, bottom) = points.min(axis=0), points.max(axis=0)
-    return _Box(names[int(number)], (left, top, right, bottom))
+    return names[int(number)], (*points.min(axis=0), *points.max(axis=0)), False
 
 
 def yolo_names(folders: Sequence[Path]) -> tuple[str, ...]:

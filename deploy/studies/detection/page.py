@@ -7,17 +7,16 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from beers_deploy.model.io.pictures import grid, picture_url
-from beers_deploy.profiles.figures import by_table
+from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.report.plots import SERIES, Curve, Panel, curves_svg, data_url
-from beers_deploy.studies.detection.average_precision import RECALLS, Hits, mean_known, precisions
-from beers_deploy.studies.detection.boxes import Boxes, iou
+from beers_deploy.studies.detection.average_precision import ALL, RECALLS, match, mean_known, precisions
+from beers_deploy.studies.detection.boxes import Boxes
 from beers_deploy.studies.detection.study import REFERENCE, Comparison
-from beers_deploy.studies.detection.tables import BY_SIZE, MAIN, PAPER_NOTES, detection_rows, headline, paper_rows
+from beers_deploy.studies.detection.tables import BY_SIZE, MAIN, PAPER_NOTES, headline
 from beers_deploy.studies.evaluation.methods import DEGRADED
 
 CROP_PX, ZOOM, PICTURES = 88, 3, 4
-OVERLAP = 0.5
 FOUND, MISSED, FALSE = "#2fd39b", "#ff5a36", "#ffd21f"
 """Colours of boxes."""
 
@@ -34,9 +33,15 @@ NOTES = (
 )
 
 
-def write_page(compared: Sequence[Comparison], notes: Sequence[str], path: Path) -> None:
-    """Write the page of a study, whole or not at all; the comparisons are of one set of scenes."""
-    rows = [*(row for found in compared for row in detection_rows(found)), *paper_rows()]
+def write_page(compared: Sequence[Comparison], rows: Sequence[Row], notes: Sequence[str], path: Path) -> None:
+    """Write the page of a study, whole or not at all.
+
+    Args:
+        compared: comparisons of one set of scenes.
+        rows: of all its tables.
+        notes: what a reader must know besides.
+        path: of the page.
+    """
     tables = [Section(name, each, CAPTIONS.get(name.split(",")[0], "")) for name, each in by_table(rows).items()]
     truths = [each.scene.truth for each in compared[0].scenes]
     objects = sum(int((~truth.ignored).sum()) for truth in truths)
@@ -47,21 +52,17 @@ def write_page(compared: Sequence[Comparison], notes: Sequence[str], path: Path)
 
 def curves(compared: Sequence[Comparison]) -> Picture:
     """Precision by recall at an overlap of one half, means over classes: a panel a sensor."""
-    panels = [
-        Panel(found.name, [_curve(number, *each) for number, each in enumerate(found.hits.items())])
-        for found in compared
-    ]
+    panels = [Panel(found.name, [_curve(found, row) for row in found.hits]) for found in compared]
     svg = curves_svg(panels, "recall", "precision", logarithmic=False)
     caption = "At an overlap of 0.5, mean over the classes that are labelled."
     return Picture("Precision by recall", data_url(svg), caption)
 
 
-def _curve(number: int, row: str, hits: Hits) -> Curve:
-    _, classes, images = hits.objects.shape
-    once = np.ones((1, images), np.int64)
-    values = mean_known(np.array([precisions(hits, kind, once)[0, 0] for kind in range(classes)]))
+def _curve(found: Comparison, row: str) -> Curve:
+    hits, once = found.hits[row], np.ones((1, len(found.scenes)), np.int64)
+    values = mean_known(np.array([precisions(hits, kind, once)[0, 0] for kind in range(len(found.names))]))
     points = tuple(zip(RECALLS.tolist(), values.tolist(), strict=True))
-    return Curve(row, number % len(SERIES), row == REFERENCE, points)
+    return Curve(row, list(found.hits).index(row) % len(SERIES), row == REFERENCE, points)
 
 
 def crops(compared: Sequence[Comparison]) -> list[Picture]:
@@ -73,22 +74,15 @@ def crops(compared: Sequence[Comparison]) -> list[Picture]:
 
 def _lost(found: Comparison, number: int) -> np.ndarray:
     """(M,) objects of a scene that are found on the reference and not on degraded images."""
-    return np.asarray(_found(found, REFERENCE, number)[1] & ~_found(found, DEGRADED, number)[1])
+    return np.asarray(_matched(found, REFERENCE, number)[-1] & ~_matched(found, DEGRADED, number)[-1])
 
 
-def _found(found: Comparison, row: str, number: int) -> tuple[np.ndarray, np.ndarray]:
-    return objects_found(found.scenes[number].scene.truth, found.boxes[row][number], found.confidence)
-
-
-def objects_found(truth: Boxes, boxes: Boxes, confidence: float) -> tuple[np.ndarray, np.ndarray]:
-    """Which boxes (N,) that reach a confidence found an object that they overlap by half, and which objects (M,)."""
-    hits, found = np.zeros(len(boxes), bool), np.zeros(len(truth), bool)
-    overlaps = iou(boxes.corners, truth.corners) * (boxes.classes[:, None] == truth.classes[None, :])
-    for one in np.argsort(-boxes.scores, kind="stable"):
-        free = np.where(found, 0.0, overlaps[one])
-        if boxes.scores[one] >= confidence and len(free) and free.max() >= OVERLAP:
-            hits[one] = found[int(free.argmax())] = True
-    return hits, found
+def _matched(found: Comparison, row: str, number: int) -> tuple[Boxes, np.ndarray, np.ndarray, np.ndarray]:
+    """The boxes on a scene that reach the table's confidence; hits, ignored ones, and objects taken, by half."""
+    boxes = found.boxes[row][number]
+    sure = boxes[boxes.scores >= found.confidence]
+    hits, ignored, taken = (flags[ALL, 0] for flags in match(found.scenes[number].scene.truth, sure))
+    return sure, hits, ignored, taken
 
 
 def _picture(compared: Sequence[Comparison], number: int) -> Picture:
@@ -116,28 +110,20 @@ def _middle(found: Comparison, number: int) -> np.ndarray:
 
 def _cell(found: Comparison, row: str, number: int, middle: np.ndarray) -> np.ndarray:
     """An enlarged crop around a place of the scene, what is missed, falsely found and found drawn over it."""
-    scene, ratio, boxes = found.scenes[number], found.sensors.oversampling, found.boxes[row][number]
-    truth, (hits, objects) = scene.scene.truth, _found(found, row, number)
-    crop, corner = cropped(scene.shown(found.methods[row]), middle / ratio)
-    picture = Image.fromarray(crop).resize((CROP_PX * ZOOM, CROP_PX * ZOOM), Image.Resampling.NEAREST)
+    scene, ratio = found.scenes[number], found.sensors.oversampling
+    truth, (boxes, hits, ignored, taken) = scene.scene.truth, _matched(found, row, number)
+    rgb = np.rint(255 * scene.shown(found.methods[row])).astype(np.uint8)
+    most = np.maximum(np.array(rgb.shape[1::-1]) - CROP_PX, 0)
+    left, top = corner = np.clip(middle / ratio - CROP_PX / 2, 0, most).astype(int).tolist()
+    crop = Image.fromarray(rgb).crop((left, top, left + CROP_PX, top + CROP_PX))  # black beyond the image
+    picture = crop.resize((CROP_PX * ZOOM, CROP_PX * ZOOM), Image.Resampling.NEAREST)
     draw = ImageDraw.Draw(picture)
     shown = (
-        (truth.corners[~objects & ~truth.ignored], MISSED),
-        (boxes.corners[(boxes.scores >= found.confidence) & ~hits], FALSE),
+        (truth.corners[~taken & ~truth.ignored], MISSED),
+        (boxes.corners[~hits & ~ignored], FALSE),
         (boxes.corners[hits], FOUND),
     )
     for corners, colour in shown:
         for x1, y1, x2, y2 in (corners / ratio - np.tile(corner, 2)) * ZOOM:
             draw.rectangle((x1, y1, max(x2 - 1, x1), max(y2 - 1, y1)), outline=colour, width=2)
     return np.asarray(picture)
-
-
-def cropped(rgb: np.ndarray, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A square of an image in 8 bits around x and y, moved inside it, black beyond it; and its left and top."""
-    height, width, _ = rgb.shape
-    corner = np.clip(middle - CROP_PX / 2, 0, np.maximum(np.array([width, height]) - CROP_PX, 0)).astype(int)
-    left, top = corner
-    inside = rgb[top : top + CROP_PX, left : left + CROP_PX]
-    whole = np.zeros((CROP_PX, CROP_PX, 3), np.uint8)
-    whole[: inside.shape[0], : inside.shape[1]] = np.rint(255 * inside)
-    return whole, corner

@@ -7,7 +7,7 @@ polygons in metres around (0, 0), the nose along x, sized as common types: cars 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -33,6 +33,8 @@ PAINTS = [18.0, 60.0, 110.0, 190.0, 280.0]
 
 Part = tuple[list[Point], float]
 """A polygon in metres and its radiance; of several the first is the lowest."""
+Place = Callable[[float, float], Point]
+"""From metres around the middle of an object or a plot to metres on the canvas."""
 
 
 def synthetic_scene(generator: np.random.Generator, height_px: int, width_px: int) -> tuple[np.ndarray, Boxes]:
@@ -47,9 +49,10 @@ def synthetic_scene(generator: np.random.Generator, height_px: int, width_px: in
     # Half the diagonal: how far from the centre there is something to draw.
     world, reach = drawing.turn(x, y, angle), math.hypot(width_px, height_px) * SCENE_GSD_M / 2 + PLOT_M
     places = (np.arange(math.ceil(2 * reach / PLOT_M)) + 0.5) * PLOT_M - reach
-    plots = [Plot(canvas, *world(u, v), angle, (PLOT_M - STREET_M) / 2 - KERB_M) for v in places for u in places]
-    strips = [Plot(canvas, *world(p + PLOT_M / 2, 0), angle + math.pi / 2, reach) for p in places]
-    strips += [Plot(canvas, *world(0, p + PLOT_M / 2), angle, reach) for p in places]
+    half_m, turn = (PLOT_M - STREET_M) / 2 - KERB_M, drawing.turn
+    plots = [Plot(canvas, turn(*world(u, v), angle), half_m) for v in places for u in places]
+    strips = [Plot(canvas, turn(*world(p + PLOT_M / 2, 0), angle + math.pi / 2), reach) for p in places]
+    strips += [Plot(canvas, turn(*world(0, p + PLOT_M / 2), angle), reach) for p in places]
     for strip in strips:
         _street(strip)
     for plot in plots:
@@ -67,31 +70,24 @@ class Canvas:
         self.corners: list[tuple[int, int, int, int]] = []
         self.classes: list[int] = []
         self._size = width_px, height_px
-        self._image, self._shown = Image.new("F", self._size, drawing.GRASS), Image.new("I", self._size, 0)
-        self._draw, self._draw_shown = ImageDraw.Draw(self._image), ImageDraw.Draw(self._shown)
+        self._image, self._taken = Image.new("F", self._size, drawing.GRASS), Image.new("L", self._size, 0)
+        self.draw = ImageDraw.Draw(self._image)
 
     def textured(self) -> np.ndarray:
         """The radiance (H, W) float32 with the ground's texture."""
         width, height = self._size
         return np.asarray(np.asarray(self._image) * drawing.texture(height, width, self.generator), np.float32)
 
-    def area(self, points: Sequence[Point], radiance: float) -> None:
-        """Fill a polygon of the ground."""
-        self._draw.polygon([self._pixel(point) for point in points], fill=radiance)
+    def pixel(self, x: float, y: float) -> Point:
+        """Metres to pixels."""
+        return x / SCENE_GSD_M + self._size[0] / 2, y / SCENE_GSD_M + self._size[1] / 2
 
-    def line(self, points: Sequence[Point], radiance: float, width_m: float) -> None:
-        """Draw a line on the ground."""
-        width_px = max(round(width_m / SCENE_GSD_M), 1)
-        self._draw.line([self._pixel(point) for point in points], fill=radiance, width=width_px)
+    def is_free(self, left: float, top: float, right: float, bottom: float) -> bool:
+        """Whether no object stands in a rectangle, in pixels."""
+        whole = math.floor(left), math.floor(top), math.floor(right), math.floor(bottom)
+        return self._taken.crop(whole).getbbox() is None
 
-    def tree(self, point: Point, radius_m: float) -> None:
-        """Draw a tree, unless an object stands there."""
-        x, y = self._pixel(point)
-        radius = radius_m / SCENE_GSD_M
-        if self._is_free((x - 2 * radius, y - 2 * radius, x + 2 * radius, y + 2 * radius)):
-            drawing.tree(self._draw, x, y, radius, self.generator)
-
-    def put(self, kind: int, parts: list[Part], place: Callable[[float, float], Point], height_m: float) -> bool:
+    def put(self, kind: int, parts: list[Part], place: Place, height_m: float) -> bool:
         """Put an object where it lies whole within the scene and clear of others; says whether it found room.
 
         Args:
@@ -100,48 +96,29 @@ class Canvas:
             place: from there to metres on the canvas.
             height_m: of the object, as far as its shadow is shifted right and down.
         """
-        polygons = [([self._pixel(place(*point)) for point in polygon], paint) for polygon, paint in parts]
+        polygons = [([self.pixel(*place(*point)) for point in polygon], paint) for polygon, paint in parts]
         points, shadow_px = np.array([point for polygon, _ in polygons for point in polygon]), height_m / SCENE_GSD_M
-        area = (*(points.min(0) - GAP_PX), *(points.max(0) + GAP_PX + shadow_px))
-        inside = min(area[:2]) >= 0 and area[2] < self._size[0] and area[3] < self._size[1]
-        if not inside or not self._is_free(area):
+        low, high = points.min(0) - GAP_PX, points.max(0) + GAP_PX + shadow_px
+        if low.min() < 0 or (high >= self._size).any() or not self.is_free(*low, *high):
             return False
         for polygon, _ in polygons:
-            self._draw.polygon([drawing.shift(point, shadow_px) for point in polygon], fill=drawing.SHADOW)
-        self.classes.append(kind)
+            self.draw.polygon([drawing.shift(point, shadow_px) for point in polygon], fill=drawing.SHADOW)
+        own = Image.new("L", self._size, 0)
         for polygon, paint in polygons:
-            self._draw.polygon(polygon, fill=paint)
-            self._draw_shown.polygon(polygon, fill=len(self.classes))
-        self.corners.append(self._corners_within(area))
+            self.draw.polygon(polygon, fill=paint)
+            ImageDraw.Draw(own).polygon(polygon, fill=255)
+        self._taken.paste(255, mask=own)
+        self.classes.append(kind)
+        self.corners.append(own.getbbox() or (0, 0, 0, 0))  # of the pixels that Pillow fills, not of the polygons
         return True
-
-    def _pixel(self, point: Point) -> Point:
-        return point[0] / SCENE_GSD_M + self._size[0] / 2, point[1] / SCENE_GSD_M + self._size[1] / 2
-
-    def _is_free(self, area: tuple[float, ...]) -> bool:
-        return int(self._shown.crop(_whole(area)).getextrema()[1]) == 0  # type: ignore[arg-type]
-
-    def _corners_within(self, area: tuple[float, ...]) -> tuple[int, int, int, int]:
-        """Of the pixels that the last object has coloured: Pillow's polygons, not their corners, are the truth."""
-        left, top, *_ = whole = _whole(area)
-        shown = np.asarray(self._shown.crop(whole)) == len(self.classes)
-        rows, columns = np.flatnonzero(shown.any(1)), np.flatnonzero(shown.any(0))
-        return left + int(columns[0]), top + int(rows[0]), left + int(columns[-1]) + 1, top + int(rows[-1]) + 1
-
-
-def _whole(area: tuple[float, ...]) -> tuple[int, int, int, int]:
-    left, top, right, bottom = map(math.floor, area)
-    return left, top, right, bottom
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A square of ground, in metres around its centre, turned by `angle` against the canvas."""
+    """A square of ground: `place` takes metres around its centre to metres on the canvas."""
 
     canvas: Canvas
-    x: float
-    y: float
-    angle: float
+    place: Place
     half_m: float
 
     @property
@@ -149,10 +126,11 @@ class Plot:
         """The canvas's own generator."""
         return self.canvas.generator
 
-    def rectangle(self, x: float, y: float, width: float, height: float, radiance: float) -> None:
-        """Fill a rectangle of the plot from its corner (x, y)."""
+    def rectangle(self, x: float, y: float, width: float, height: float, radiance: float, by: float = 0) -> None:
+        """Fill a rectangle of the plot from its corner (x, y), moved right and down in the scene `by` pixels."""
         corners = [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
-        self.canvas.area([self.place(*corner) for corner in corners], radiance)
+        moved = [drawing.shift(self._pixel(*corner), by) for corner in corners]
+        self.canvas.draw.polygon(moved, fill=radiance)
 
     def pad(self, radiance: float) -> None:
         """Fill the whole plot."""
@@ -160,11 +138,14 @@ class Plot:
 
     def line(self, start: Point, end: Point, radiance: float, width_m: float) -> None:
         """Draw a line on the plot."""
-        self.canvas.line([self.place(*start), self.place(*end)], radiance, width_m)
+        width_px = max(round(width_m / SCENE_GSD_M), 1)
+        self.canvas.draw.line([self._pixel(*start), self._pixel(*end)], fill=radiance, width=width_px)
 
     def tree(self, x: float, y: float) -> None:
-        """Draw a tree of 1.5 to 3.5 m radius."""
-        self.canvas.tree(self.place(x, y), self.random.uniform(1.5, 3.5))
+        """Draw a tree of 1.5 to 3.5 m radius, unless an object stands there."""
+        radius, middle = self.random.uniform(1.5, 3.5) / SCENE_GSD_M, self._pixel(x, y)
+        if self.canvas.is_free(*drawing.around(*middle, 2 * radius)):
+            drawing.tree(self.canvas.draw, *middle, radius, self.random)
 
     def put(self, kind: int, parts: list[Part], x: float, y: float, turned: float, height_m: float) -> bool:
         """Put an object at (x, y), turned against the plot; one that does not fit into the plot is left out."""
@@ -179,9 +160,8 @@ class Plot:
         for _ in range(count):
             any(put(*self.random.uniform(-self.half_m, self.half_m, 2)) for _ in range(TRIES))
 
-    def place(self, x: float, y: float) -> Point:
-        """Metres of the plot to metres of the canvas."""
-        return drawing.turn(self.x, self.y, self.angle)(x, y)
+    def _pixel(self, x: float, y: float) -> Point:
+        return self.canvas.pixel(*self.place(x, y))
 
 
 def vehicle(generator: np.random.Generator) -> list[Part]:
@@ -346,9 +326,8 @@ def _houses(plot: Plot) -> None:
 
 
 def _house(plot: Plot, x: float, y: float, long: float, wide: float) -> None:
-    bright, shade = plot.random.uniform(60, 200), 2.2
-    corners = [(x, y), (x + long, y), (x + long, y + wide), (x, y + wide)]
-    plot.canvas.area([(px + shade, py + shade) for px, py in (plot.place(*c) for c in corners)], drawing.SHADOW)
+    bright = plot.random.uniform(60, 200)
+    plot.rectangle(x, y, long, wide, drawing.SHADOW, 2.2 / SCENE_GSD_M)
     plot.rectangle(x, y, long, wide / 2, bright)
     plot.rectangle(x, y + wide / 2, long, wide / 2, bright * plot.random.choice([0.55, 1.0]))
 

@@ -241,7 +241,7 @@ def labelled_scenes(
     """
     labelled = read_labelled(images, labels, split)
     numbers = class_numbers(labelled.names, names, given)
-    scenes = [_of_file(each.path, each.truth.renamed(numbers)) for each in labelled.images]
+    scenes = [_of_file(path, truth.renamed(numbers)) for path, truth in labelled.images]
     return scenes, [*labelled.notes, *left_out(labelled.names, numbers)]
 
 

@@ -29,16 +29,11 @@ def detection_rows(found: Comparison) -> list[Row]:
     by_class = {name: f"mAP50 of {name}" for name in labelled}
     by_size = {name: f"mAP50 {name}" for name in list(SIZES_PX)[1:]}
     return [
-        *main_rows(found),
+        *(_main_row(found, row) for row in found.methods),
         *(_own_row(found, row) for row in found.methods),
         *(Row(f"{BY_CLASS}, {found.name}", row, _values(found, row, by_class)) for row in found.methods),
         *(Row(f"{BY_SIZE}, {found.name}", row, _values(found, row, by_size)) for row in found.methods),
     ]
-
-
-def main_rows(found: Comparison) -> list[Row]:
-    """The table that answers the question."""
-    return [_main_row(found, row) for row in found.methods]
 
 
 def _main_row(found: Comparison, row: str) -> Row:
@@ -132,7 +127,7 @@ def headline(compared: Sequence[Comparison]) -> str:
 
 
 def _sentence(found: Comparison) -> str:
-    rows = {row.name: row for row in main_rows(found)}
+    rows = {row: _main_row(found, row) for row in found.methods}
     text = f"{found.name}: mAP50 is {rows[REFERENCE].figures['mAP50']} % on reference images"
     text += f" and {rows[DEGRADED].figures[LOSS]} points less on degraded ones"
     last = list(rows.values())[-1]

@@ -16,6 +16,7 @@ from beers_deploy.studies.detection.average_precision import (
     Hits,
     find_hits,
     interval,
+    match,
     mean_known,
     precisions,
     score,
@@ -133,6 +134,17 @@ def test_precision_and_recall_are_those_of_what_is_left_at_a_confidence(seed: in
             recall.append(true / objects)
     expected = (np.mean(precision), np.mean(recall)) if recall else (np.nan, np.nan)
     np.testing.assert_allclose((figures["precision"], figures["recall"]), expected, rtol=0, atol=1e-12)
+
+
+def test_each_object_is_found_once_by_the_surest_box_of_its_class() -> None:
+    truth = Boxes.of([[0, 0, 10, 10], [20, 0, 30, 10], [40, 0, 50, 10]], [0, 0, 1])
+    corners = [[1, 0, 11, 10], [0, 0, 10, 10], [20, 0, 30, 10], [40, 0, 50, 10]]
+    hits, ignored, taken = (
+        flags[0, 0] for flags in match(truth, Boxes.of(corners, [0, 0, 1, 1], [0.5, 0.9, 0.9, 0.8]))
+    )
+    assert hits.tolist() == [False, True, False, True]  # doubled, found, another class, found
+    assert taken.tolist() == [True, False, True]
+    assert not ignored.any()
 
 
 def test_perfect_boxes_score_one_and_none_score_nothing() -> None:

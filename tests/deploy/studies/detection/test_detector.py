@@ -29,7 +29,7 @@ def test_the_final_layout_gives_its_rows_and_not_its_padding(tmp_path: Path) -> 
     found = opened.detect(IMAGE)
     assert found.corners.tolist() == [[15, 10, 25, 18], [16, 10, 26, 18], [15, 10, 25, 18]]
     assert found.classes.tolist() == [0, 0, 1]
-    assert (opened.names, opened.size_px, opened.layout, opened.flag) == (tuple(NAMES.values()), 64, "final", "")
+    assert (opened.names, opened.size_px, opened.flag) == (tuple(NAMES.values()), 64, "")
 
 
 def test_suppression_inside_the_file_is_flagged_with_its_confidence(tmp_path: Path) -> None:

@@ -21,11 +21,10 @@ SHIP = xml([("ship", 2, 3, 12, 9)])
 
 def boxes_of(found: LabelledSet) -> dict[str, list[tuple[object, ...]]]:
     return {
-        one.path.stem: [
-            (found.names[c], *corners.round(9))
-            for c, corners in zip(one.truth.classes, one.truth.corners, strict=True)
+        path.stem: [
+            (found.names[c], *corners.round(9)) for c, corners in zip(truth.classes, truth.corners, strict=True)
         ]
-        for one in found.images
+        for path, truth in found.images
     }
 
 
@@ -39,10 +38,10 @@ def refused(folder: Path, sentence: str) -> None:
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_every_layout_says_the_same_of_the_same_boxes(layout: str, tmp_path: Path) -> None:
     found = read_labelled(LAYOUTS[layout](tmp_path))
-    assert found.names == ("Expressway-Service-area", "ship")
+    assert found.names == ["Expressway-Service-area", "ship"]
     assert boxes_of(found) == OBJECTS
-    assert not any(one.truth.ignored.any() for one in found.images)
-    assert found.notes == ()
+    assert not any(truth.ignored.any() for _, truth in found.images)
+    assert found.notes == []
 
 
 @pytest.mark.parametrize("layout", ["voc", "yolo", "coco"])
@@ -92,10 +91,10 @@ def test_the_four_photographs_are_read_with_their_boxes(shared_data: Path) -> No
     if not folder.is_dir():
         pytest.skip("no folder shared/data/detection beside the repository")
     found = read_labelled(folder)
-    classes = np.concatenate([one.truth.classes for one in found.images])
+    classes = np.concatenate([truth.classes for _, truth in found.images])
     assert [int((classes == found.names.index(name)).sum()) for name in ("car", "minibus", "Tree")] == [108, 3, 61]
-    assert found.images[0].truth.corners[0].tolist() == [160.0, 97.0, 182.0, 138.0]
-    assert found.notes == ()
+    assert found.images[0][1].corners[0].tolist() == [160.0, 97.0, 182.0, 138.0]
+    assert found.notes == []
 
 
 def test_without_labels_a_yolo_image_shows_nothing_and_a_voc_image_is_refused(tmp_path: Path) -> None:
@@ -103,7 +102,7 @@ def test_without_labels_a_yolo_image_shows_nothing_and_a_voc_image_is_refused(tm
     image(folder / "images" / "val" / "00003.png")
     found = read_labelled(folder)
     assert boxes_of(found)["00003"] == []
-    assert found.notes == ("Images without a labelled object, all found there is false: 1 of 3.",)
+    assert found.notes == ["Images without a labelled object, all found there is false: 1 of 3."]
     image(voc(tmp_path / "voc") / "00003.png")
     refused(tmp_path / "voc", r"a file of labels for every image, got 1 of 3 missing, the first 00003\.xml")
 
@@ -113,7 +112,7 @@ def test_boxes_outside_or_without_area_are_left_out_and_told(tmp_path: Path) -> 
     text(tmp_path / "a.xml", xml([("ship", 5, 5, 9, 9), ("ship", 70, 5, 90, 9), ("ship", 9, 9, 9, 20)]))
     found = read_labelled(tmp_path)
     assert boxes_of(found)["a"] == [("ship", 5, 5, 9, 9)]
-    assert found.notes == ("Boxes left out, without area inside their image: 2, the first in a.xml.",)
+    assert found.notes == ["Boxes left out, without area inside their image: 2, the first in a.xml."]
 
 
 def test_labels_of_an_image_of_another_size_are_refused(tmp_path: Path) -> None:
@@ -199,7 +198,7 @@ def test_a_faulty_text_is_refused_by_a_sentence(name: str, content: str, sentenc
 def test_an_outline_of_yolo_is_enclosed(tmp_path: Path) -> None:
     folder = yolo(tmp_path)
     text(folder / "labels" / "val" / "00001.txt", "1 0.5 0 0.75 0.5 0.5 1 0.25 0.5\n")
-    assert read_labelled(folder).images[0].truth.corners.tolist() == [[15, 0, 45, 40]]
+    assert read_labelled(folder).images[0][1].corners.tolist() == [[15, 0, 45, 40]]
 
 
 def test_names_stand_in_a_list_a_table_or_lines(tmp_path: Path) -> None:
@@ -223,7 +222,7 @@ def test_without_pyyaml_it_is_said_how_to_do_without(tmp_path: Path, monkeypatch
         ({"annotations": [5]}, "got TypeError: 'int'"),
         ({"annotations": [{"image_id": 9, "category_id": 7, "bbox": [0, 0, 1, 1]}]}, "got KeyError: 9"),
         ({"annotations": [{"image_id": [], "category_id": 7, "bbox": [0, 0, 1, 1]}]}, "got TypeError: "),
-        ({"categories": [{"id": 7, "name": 5}]}, "got ValueError: 5 where a name belongs"),
+        ({"categories": [{"id": 7, "name": 5}]}, "got TypeError: "),
         ({"images": [{"id": 0, "file_name": "../../etc/passwd"}]}, "its images in .* got none of 1"),
         ({"images": [{"id": 0, "file_name": "/etc/passwd"}]}, "its images in .* got none of 1"),
     ],
@@ -246,8 +245,8 @@ def test_what_coco_lists_and_the_folder_lacks_is_told_and_a_crowd_need_not_be_fo
     path.write_text(json.dumps(content))
     (tmp_path / "00002.png").unlink()
     found = read_labelled(tmp_path)
-    assert [one.path.stem for one in found.images] == ["00001"]
-    assert found.notes == (
+    assert [path.stem for path, _ in found.images] == ["00001"]
+    assert found.notes == [
         "1 of 2 images in labels.json are not in the folder.",
         "Boxes that count neither way, difficult, a crowd or visible by less than 30 %: 1.",
-    )
+    ]

@@ -43,7 +43,7 @@ def score(int8: bool) -> float:
 @pytest.mark.parametrize("path", [DETECTOR, DETECTOR_INT8])
 def test_both_files_are_read_as_a_detector_of_our_classes(path: Path) -> None:
     detector = open_detector(path, 1)
-    assert (detector.names, detector.size_px, detector.layout, detector.flag) == (CLASSES, 256, "raw", "")
+    assert (detector.names, detector.size_px, detector.flag) == (CLASSES, 256, "")
 
 
 def test_it_was_made_by_the_recipe_that_stands_here() -> None:

@@ -14,7 +14,7 @@ from beers_deploy.profiles.sensor_file import reference_for
 from beers_deploy.studies.detection.average_precision import find_hits, score_rows, site_weights
 from beers_deploy.studies.detection.boxes import Boxes, iou
 from beers_deploy.studies.detection.detector import Detector
-from beers_deploy.studies.detection.page import crops, curves, objects_found
+from beers_deploy.studies.detection.page import crops, curves
 from beers_deploy.studies.detection.study import (
     REFERENCE,
     AcquiredScene,
@@ -45,7 +45,7 @@ def scene(corners: tuple[int, int, int, int], height: int = 150, width: int = 21
 def bright(image: np.ndarray) -> np.ndarray:
     """The box around what is bright in an input, in the raw layout."""
     rows, columns = np.nonzero(image[0, 0] > 0.75)
-    answer = np.zeros((1, 6, 1), np.float32)
+    answer = np.zeros((1, 6, 21), np.float32)
     if len(rows):
         left, top, right, bottom = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
         answer[0, :5, 0] = (left + right) / 2, (top + bottom) / 2, right - left, bottom - top, 0.9
@@ -56,7 +56,7 @@ def bright(image: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("corners", [(24, 36, 84, 72), (60, 12, 96, 120), (131, 85, 190, 133)])
 def test_boxes_come_back_to_where_the_object_lies(ratio: int, corners: tuple[int, int, int, int]) -> None:
     seen = AcquiredScene(scene(corners, 149, 211), sensors(ratio=ratio), Draw(0))
-    found = seen.boxes(Detector(NAMES, 128, "raw", "", bright), None)
+    found = seen.boxes(Detector(NAMES, 128, "", bright), None)
     assert iou(found.corners, np.array([corners], float))[0, 0] > 0.75
     middle = (found.corners[0, :2] + found.corners[0, 2:]) / 2
     np.testing.assert_allclose(middle, (np.array(corners[:2]) + corners[2:]) / 2, atol=0.6 * ratio)
@@ -126,14 +126,6 @@ def test_every_figure_is_measured_or_says_why_not() -> None:
     assert set(rows_of(found, "mAP50 by class, dior-high")[REFERENCE].figures) == {"ship"}  # no tank is labelled
     by_size = rows_of(found, "mAP50 by size, dior-high")["degraded"].figures
     assert [figure.mode for figure in by_size.values()] == ["unavailable", "unavailable", "measured"]
-
-
-def test_each_object_is_found_once_by_the_surest_box_of_its_class() -> None:
-    truth = Boxes.of([[0, 0, 10, 10], [20, 0, 30, 10], [40, 0, 50, 10]], [0, 0, 1])
-    corners = [[1, 0, 11, 10], [0, 0, 10, 10], [20, 0, 30, 10], [40, 0, 50, 10], [20, 0, 30, 10]]
-    hits, found = objects_found(truth, Boxes.of(corners, [0, 0, 1, 1, 0], [0.5, 0.9, 0.9, 0.8, 0.1]), 0.3)
-    assert hits.tolist() == [False, True, False, True, False]  # doubled, found, another class, found, unsure
-    assert found.tolist() == [True, False, True]
 
 
 def test_pictures_show_the_scenes_that_lose_most() -> None:
