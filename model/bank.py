@@ -124,13 +124,17 @@ def _bank(sensor: Instrument, reference: Instrument, sigma: float) -> Bank:
 def in_places(kernels: NDArray[np.float64], scale: int) -> NDArray[np.float64]:
     """Kernels (K, 7, 7) as the convolution that makes their planes where S x S pixels are the channels of one place.
 
+    So for kernels of any odd side. Row i of a place reads row i + d of the same plane, d from -3 to 3: it lies in row
+    (i + d) mod S of the place that is floor((i + d) / S) below. So for columns.
+
     Returns:
         (K S^2, S^2, k, k), k places wide: 7 at scale 1, 5 at scale 2. The channels are ordered as a pixel unshuffle
         of the planes, and of the image, orders them.
     """
-    reach, middle = -(-(SIDE_PX // 2) // scale), SIDE_PX // 2
+    side_px = kernels.shape[-1]
+    reach, middle = -(-(side_px // 2) // scale), side_px // 2
     found = np.zeros((len(kernels), scale, scale, scale, scale, 2 * reach + 1, 2 * reach + 1))
-    for row, column, down, right in product(range(scale), range(scale), range(SIDE_PX), range(SIDE_PX)):
+    for row, column, down, right in product(range(scale), range(scale), range(side_px), range(side_px)):
         (place_y, y), (place_x, x) = divmod(row + down - middle, scale), divmod(column + right - middle, scale)
         found[:, row, column, y, x, place_y + reach, place_x + reach] = kernels[:, down, right]
     return found.reshape(len(kernels) * scale**2, scale**2, 2 * reach + 1, 2 * reach + 1)

@@ -47,11 +47,6 @@ class SceneStats:
     width: int
     oversampling: int
 
-    @property
-    def span(self) -> float:
-        """Largest less smallest radiance, in W/m2/sr/um."""
-        return self.high - self.low
-
 
 def scene_stats(radiance: Tensor, oversampling: int) -> SceneStats:
     """Statistics of a scene's radiance (H, W), in one pass over it."""
@@ -100,7 +95,7 @@ def smear_bound_dn(smear: Smear, stats: SceneStats, ringing: float, gain: float)
     The blur behind it enlarges that by its ringing.
     """
     size, moment = smear_moments(stats.height, stats.oversampling, smear.length_px)
-    return gain * ringing * min(size * stats.span, moment * stats.step_along)
+    return gain * ringing * min(size * (stats.high - stats.low), moment * stats.step_along)
 
 
 def effect_bound_dn(effect: Effect, sensor: Instrument, low: float, high: float) -> float:
@@ -213,7 +208,8 @@ def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
     """Largest change of any pixel by each effect that can be left out, in DN, through all that comes after it."""
     gain, ringing = sensor.gain_dn_per_radiance, ringing_of(sensor, stats)
     # A blur whose kernel sums to 1, in absolute values to `ringing`: |k * (L - m)| <= ringing * span / 2.
-    middle, reach = (stats.low + stats.high) / 2, ringing * stats.span / 2
+    span = stats.high - stats.low
+    middle, reach = (stats.low + stats.high) / 2, ringing * span / 2
     low, high = middle - reach, middle + reach
     smear, total, bounds = sensor.effects.get("smear"), ringing, {}
     if isinstance(smear, Smear):
@@ -224,7 +220,7 @@ def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
         # Its kernel is a unit pulse and all that differs from it.
         total *= 1 + 2 * smear_moments(stats.height, stats.oversampling, smear.length_px)[0]
     # The blurred pixel and the plain mean of its scene pixels lie in one range: they differ by its width at most.
-    bounds["mtf"] = behind("mtf", gain * (1 + total) / 2 * stats.span, sensor)
+    bounds["mtf"] = behind("mtf", gain * (1 + total) / 2 * span, sensor)
     for name in RADIANCE_EFFECTS:
         if name in sensor.effects:
             direct = effect_bound_dn(sensor.effects[name], sensor, low, high)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from beers_deploy.model.convbeers import Network, arrays, save_network, told
 from beers_deploy.model.family import RANGES
-from beers_deploy.model.io.tensors import all_finite, read_tensors, write_tensors
+from beers_deploy.model.io.tensors import all_finite, read_tensors
 from beers_deploy.model.training.losses import PAPER, LossWeights
 from beers_deploy.profiles.errors import ModelError, OptionError
 
@@ -68,6 +68,9 @@ class TrainingRecipe:
         share = (step - self.warm_up_steps) / max(self.steps - self.warm_up_steps, 1)
         return self.learning_rate * 0.5 * (1 + math.cos(math.pi * share))
 
+
+MOMENTS = ("exp_avg", "exp_avg_sq")
+"""What Adam keeps of each parameter, besides its step."""
 
 MAX_BAD_STEPS = 10
 WINDOW_STEPS = 200
@@ -131,29 +134,14 @@ def _error(step: int, expected: str, got: str) -> ModelError:
     return ModelError(f"training step {step}", expected=expected, got=got, remedy=remedy)
 
 
-def write_checkpoint(
-    path: Path,
-    network: Network,
-    average: dict[str, Tensor],
-    optimiser: torch.optim.Optimizer,
-    recipe: TrainingRecipe,
-    step: int,
-    guards: Guards,
-) -> None:
-    """Write weights, running average and Adam's moments, any shape each, with step, recipe and guards."""
-    tensors = {f"network.{k}": v for k, v in network.state_dict().items()}
-    tensors |= {f"average.{k}": v for k, v in average.items()}
-    for name, parameter in network.named_parameters():
-        for moment, value in optimiser.state.get(parameter, {}).items():
-            tensors[f"moment.{name}.{moment}"] = value
-    header = {"step": step, "guards": asdict(guards), "recipe": asdict(recipe)}
-    write_tensors(path, arrays(tensors), header)
+def read_checkpoint(path: Path, network: Network, recipe: TrainingRecipe) -> tuple[dict[str, Tensor], int, Guards]:
+    """The parts of a checkpoint by name (see `Trainer.save`), its step and its guards, once all is as it must be.
 
-
-def read_checkpoint(
-    path: Path, network: Network, average: dict[str, Tensor], optimiser: torch.optim.Optimizer, recipe: TrainingRecipe
-) -> tuple[int, Guards]:
-    """Fill network, average (any shape each) and optimiser from a checkpoint; return its step and guards."""
+    Args:
+        path: the file.
+        network: a network of the same size.
+        recipe: that it was begun with.
+    """
     found, header = read_tensors(path)
     tensors = {name: torch.from_numpy(array) for name, array in found.items()}
     if header.get("recipe") != asdict(recipe):
@@ -171,16 +159,7 @@ def read_checkpoint(
         got = " ".join(str(error).split())[:120]
         remedy = "choose the variant it was begun with"
         raise ModelError(str(path), expected="a checkpoint of this network", got=got, remedy=remedy) from error
-    network.load_state_dict(_part(tensors, "network."))
-    for name, value in _part(tensors, "average.").items():
-        average[name].copy_(value)
-    for name, parameter in network.named_parameters():
-        # Adam keeps its step count on the CPU and its moments with (and laid out as) the parameter.
-        optimiser.state[parameter] = {
-            moment: value if moment == "step" else torch.empty_like(parameter).copy_(value)
-            for moment, value in _part(tensors, f"moment.{name}.").items()
-        }
-    return step, guards
+    return tensors, step, guards
 
 
 def finish(network: Network, path: Path, recipe: dict[str, object]) -> None:
@@ -197,8 +176,8 @@ def _check_parts(tensors: dict[str, Tensor], network: Network, steps: int) -> No
     wanted = {f"{part}.{k}": value for k, value in network.state_dict().items() for part in ("network", "average")}
     if len(tensors) > len(wanted):  # before the first step Adam keeps nothing
         for name, parameter in network.named_parameters():
-            of_one = {"step": parameter.new_zeros(()), "exp_avg": parameter, "exp_avg_sq": parameter}
-            wanted |= {f"moment.{name}.{moment}": like for moment, like in of_one.items()}
+            wanted |= {f"moment.{name}.{moment}": parameter for moment in MOMENTS}
+            wanted[f"moment.{name}.step"] = parameter.new_zeros(())
     for name, like in wanted.items():
         value, moment = tensors[name], name.rsplit(".", 1)[1]
         if value.shape != like.shape or value.dtype != like.dtype:
@@ -208,7 +187,3 @@ def _check_parts(tensors: dict[str, Tensor], network: Network, steps: int) -> No
             raise ValueError(f"{name} that Adam cannot have")
     if len(tensors) != len(wanted) or not all_finite(arrays(tensors)):
         raise ValueError(f"{len(tensors)} tensors in place of {len(wanted)}, or values that are not finite")
-
-
-def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}

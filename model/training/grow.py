@@ -1,12 +1,12 @@
 """A larger network that begins where a smaller one stands: wider, deeper or coarser, with the same outputs."""
 
 from collections.abc import Sequence
-from itertools import product
 from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+from beers_deploy.model.bank import in_places
 from beers_deploy.model.convbeers import Network, initialise
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
@@ -65,17 +65,11 @@ def _repeated(rows: Tensor, shape: Sequence[int], factor: int) -> Tensor:
 
 
 def _coarser(weight: Tensor, factor: int) -> Tensor:
-    """(O, I, 3, 3) to (O S^2, I S^2, 3, 3): the same convolution where S x S places are the channels of one.
-
-    Row i of a place reads row i + d of the same channels, d from -1 to 1: it lies in row (i + d) mod S of the place
-    that is floor((i + d) / S) below. So for columns. The channels are ordered as a pixel unshuffle orders them.
-    """
-    outputs, inputs, steps = *weight.shape[:2], range(-1, 2)
-    coarse = weight.new_zeros(outputs, factor, factor, inputs, factor, factor, 3, 3)
-    for row, column, down, right in product(range(factor), range(factor), steps, steps):
-        (place_y, y), (place_x, x) = divmod(row + down, factor), divmod(column + right, factor)
-        coarse[:, row, column, :, y, x, place_y + 1, place_x + 1] = weight[:, :, down + 1, right + 1]
-    return coarse.reshape(outputs * factor**2, inputs * factor**2, 3, 3)
+    """(O, I, 3, 3) to (O S^2, I S^2, 3, 3): the same convolution where S x S places are the channels of one."""
+    outputs, inputs, places = *weight.shape[:2], factor**2
+    coarse = torch.from_numpy(in_places(weight.flatten(0, 1).double().numpy(), factor)).to(weight)
+    apart = coarse.view(outputs, inputs, places, places, 3, 3).transpose(1, 2)
+    return apart.reshape(outputs * places, inputs * places, 3, 3)
 
 
 def _widened(weight: Tensor, channels: Sequence[int], generator: torch.Generator) -> Tensor:

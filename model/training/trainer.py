@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -15,9 +15,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, initialise
+from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, arrays, initialise
+from beers_deploy.model.io.tensors import write_tensors
 from beers_deploy.model.progress import held_back
-from beers_deploy.model.training.checkpoint import Guards, TrainingRecipe, read_checkpoint, write_checkpoint
+from beers_deploy.model.training.checkpoint import MOMENTS, Guards, TrainingRecipe, read_checkpoint
 from beers_deploy.model.training.losses import RestorationLoss
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import MachineError, OptionError
@@ -217,15 +218,29 @@ class Trainer:
         return network.eval()
 
     def save(self, path: Path) -> None:
-        """Write all that an exact resume needs; of several workers, the first does."""
-        if self.worker.first:
-            parts = self.network, self.average, self.optimiser, self.recipe, self.step, self.guards
-            write_checkpoint(path, *parts)
+        """Write all that an exact resume needs, as safetensors; of several workers, the first does."""
+        if not self.worker.first:
+            return
+        tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
+        tensors |= {f"average.{name}": value for name, value in self.average.items()}
+        for name, parameter in self.network.named_parameters():
+            for moment, value in self.optimiser.state.get(parameter, {}).items():
+                tensors[f"moment.{name}.{moment}"] = value
+        header = {"step": self.step, "guards": asdict(self.guards), "recipe": asdict(self.recipe)}
+        write_tensors(path, arrays(tensors), header)
 
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint of the same recipe, begun on this processor or another."""
-        parts = self.network, self.average, self.optimiser, self.recipe
-        self.step, self.guards = read_checkpoint(path, *parts)
+        tensors, self.step, self.guards = read_checkpoint(path, self.network, self.recipe)
+        self.network.load_state_dict({name: tensors[f"network.{name}"] for name in self.average})
+        for name, value in self.average.items():
+            value.copy_(tensors[f"average.{name}"])
+        if len(tensors) == 2 * len(self.average):  # from before the first step
+            return
+        for name, parameter in self.network.named_parameters():
+            # Adam keeps its step count on the CPU and its moments with (and laid out as) the parameter.
+            moments = {key: torch.empty_like(parameter).copy_(tensors[f"moment.{name}.{key}"]) for key in MOMENTS}
+            self.optimiser.state[parameter] = {"step": tensors[f"moment.{name}.step"], **moments}
 
 
 def require_loss(loss: RestorationLoss, distil: float) -> None:

@@ -12,7 +12,8 @@ from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, save_network
-from beers_deploy.model.training.checkpoint import Guards, TrainingRecipe, read_checkpoint, write_checkpoint
+from beers_deploy.model.training.checkpoint import TrainingRecipe
+from beers_deploy.model.training.trainer import Trainer
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import BeersError
 from beers_deploy.quant.encodings import encoding_faults
@@ -85,31 +86,28 @@ def checkpoint_seeds(folder: Path) -> list[bytes]:
 
 
 def _checkpoint(path: Path, steps: int) -> None:
-    network, optimiser = _fresh()
+    trainer = Trainer(SMALL, RECIPE)
     for _ in range(steps):
-        network(torch.ones(1, 1, 5, 5)).sum().backward()
-        optimiser.step()
-    average = {k: v.detach().clone() for k, v in network.state_dict().items()}
-    write_checkpoint(path, network, average, optimiser, RECIPE, steps, Guards())
+        _step(trainer)
+    trainer.save(path)
 
 
-def _fresh() -> tuple[ConvBEERS, torch.optim.Optimizer]:
-    network = ConvBEERS(SMALL)
-    return network, torch.optim.Adam(network.parameters(), lr=1e-9)
+def _step(trainer: Trainer) -> None:
+    trainer.train_step(torch.ones(1, 1, 5, 5), torch.zeros(1, 1, 5, 5))
 
 
 def go_on(path: Path) -> None:
     """Read a checkpoint, and take a step."""
-    network, optimiser = _fresh()
-    average = {k: v.detach().clone() for k, v in network.state_dict().items()}
-    read_checkpoint(path, network, average, optimiser, RECIPE)
-    network(torch.ones(1, 1, 3, 3)).sum().backward()
-    optimiser.step()
+    trainer = Trainer(SMALL, RECIPE)
+    trainer.resume(path)
+    _step(trainer)
 
 
 def weights_seeds(folder: Path) -> list[bytes]:
     """A network's weights."""
-    return [written(partial(save_network, network=_fresh()[0], recipe={"degraded": "x"}), folder / "w.safetensors")]
+    return [
+        written(partial(save_network, network=ConvBEERS(SMALL), recipe={"degraded": "x"}), folder / "w.safetensors")
+    ]
 
 
 def told_seeds(folder: Path) -> list[bytes]:
