@@ -8,15 +8,16 @@ fault of this program, 130 interrupted.
 
 import inspect
 import io
+import os
 import re
 import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from functools import wraps
 from itertools import pairwise
-from typing import Annotated, Any
+from typing import Annotated, Any, TextIO, cast
 
 import typer
 from typer.core import TyperGroup
@@ -52,11 +53,50 @@ Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Show no progress.")]
 Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Show where in the program an error arose.")]
 
 
+class Stream:
+    """Standard output or error that ends no run: what cannot be written is left out, and `lost` says why.
+
+    A stream that was closed at the start takes everything and loses nothing, as nobody asked for it.
+    """
+
+    def __init__(self, stream: Any) -> None:
+        self.stream, self.lost = stream or open(os.devnull, "w"), ""  # noqa: PTH123, SIM115 - as long as the process
+        if isinstance(self.stream, io.TextIOWrapper):
+            self.stream.reconfigure(errors="backslashreplace")  # a name that a terminal lacks must end no run either
+
+    def write(self, text: str) -> int:
+        """Write and flush, or leave it out."""
+        if not self.lost:
+            try:
+                self.stream.write(text)
+                self.stream.flush()
+            except OSError as error:
+                self.lost = error.strerror or str(error)
+                with suppress(OSError, ValueError):  # what is buffered must not be tried once more at the end
+                    os.dup2(os.open(os.devnull, os.O_WRONLY), self.stream.fileno())
+        return len(text)
+
+    def flush(self) -> None:
+        """Nothing is left to be flushed."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+
 class Group(TyperGroup):
     """Prints warnings as lines, and keeps standard output for results where they are asked for there."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the chosen command."""
+        """Run the chosen command; what was lost on standard output ends it with 70 when all is done."""
+        out: Any = Stream(sys.stdout)
+        sys.stdout, sys.stderr = out, cast(TextIO, Stream(sys.stderr))
+        found = self._invoke(ctx)
+        if out.lost:
+            typer.echo(f"beers-deploy: standard output: {out.lost}; all else is done", err=True)
+            ctx.exit(CRASHED)
+        return found
+
+    def _invoke(self, ctx: Any) -> Any:
         with warnings.catch_warnings(), results_to(sys.stdout) if _pipes_results(ctx) else nullcontext():
             warnings.simplefilter("always", OutsideRangeWarning)
             warnings.showwarning = _print_warning
@@ -141,13 +181,6 @@ app = typer.Typer(
 )
 
 
-def _print_any_name() -> None:
-    """Print what the terminal's encoding lacks as an escape: not every one is UTF-8, and a name must end no run."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
-
-
 @app.callback(invoke_without_command=True)
 def main(
     context: typer.Context,
@@ -156,8 +189,7 @@ def main(
         False, "-v", "--verbose", help="With --version: what it runs on, and what was asked of it."
     ),
 ) -> None:
-    """Check the installation before any command runs."""
-    _print_any_name()
+    """Say what this is, where no command is asked for."""
     if version or context.invoked_subcommand is None:
         typer.echo(f"beers-deploy {__version__}" if version else context.get_help())
         for line in _installation() if version and verbose else ():

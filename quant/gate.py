@@ -191,8 +191,9 @@ def _named(where: str, raw: Mapping[str, object]) -> Limits:
 
 def _is_limit(value: object) -> bool:
     """A number above 0, of no more digits than are compared with others."""
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number and value > 0 and (isinstance(value, float) or value < 1 << 64)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return value > 0 and (isinstance(value, float) or value < 1 << 64)
 
 
 def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None) -> list[Check]:

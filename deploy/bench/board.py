@@ -183,15 +183,14 @@ def bench_board(
     network = load_onnx(model)
     boards, corrected = _boards(target, config, measured)
     try:
-        tiling_of(network)
+        tiling = tiling_of(network)
     except ModelError as error:
         if image or size or within_s is not None:
             raise
         return _frames(model, network, boards, corrected, error, host_task)
     dn = read_acquisition(image, full_scale, None) if image else None
     width_px, height_px = (dn.shape[1], dn.shape[0]) if dn is not None else parse_size(size or PAPER_SIZE)
-    radius_px = tiling_of(network).halo_px if halo == "exact" else 0
-    swath = Swath(width_px, height_px, tiles_px[0], parse_halo(halo, radius_px))
+    swath = Swath(width_px, height_px, tiles_px[0], parse_halo(halo, tiling.halo_px))
     targets = list({dpu.target.name: dpu.target for dpu in boards}.values())
     papers = published_rows() if any(each.name == PAPER_TARGET for each in targets) else []
     beside = [*(processor_row(swath, each) for each in targets), *papers]

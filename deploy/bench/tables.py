@@ -27,6 +27,7 @@ from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Figure, Row, number, predicted, published, unavailable
 from beers_deploy.restoration.plan import plan_side
+from beers_deploy.restoration.source import SIDE_PX
 
 TABLE, LAYERS = "bench", "layers"
 CHAIN = "chain_s_per_mpx"
@@ -369,7 +370,7 @@ def parse_tiles(text: str) -> list[int]:
 def parse_size(text: str) -> tuple[int, int]:
     """WIDTHxHEIGHT in pixels as (width, height)."""
     parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isdecimal() and int(part) > 0 for part in parts):
-        remedy = f"write it as {PAPER_SIZE}"
-        raise OptionError("size", expected="WIDTHxHEIGHT in pixels", got=repr(text), remedy=remedy)
+    if len(parts) != 2 or not all(part.isdecimal() and 0 < int(part[:9]) <= SIDE_PX for part in parts):
+        expected, remedy = f"WIDTHxHEIGHT of 1 to {SIDE_PX} pixels", f"write it as {PAPER_SIZE}"
+        raise OptionError("size", expected=expected, got=repr(text), remedy=remedy)
     return int(parts[0]), int(parts[1])

@@ -220,3 +220,31 @@ def test_simulated_pairs_are_the_same_bytes_for_the_same_seed(tmp_path: Path) ->
         (first,), (again,) = (list((tmp_path / run / role).iterdir()) for run in ("a", "b"))
         assert first.name == again.name == "0000-scene.tif"
         assert first.read_bytes() == again.read_bytes()
+
+
+def run_with(closing: str, *words: object) -> tuple[int, str]:
+    """The program in a shell that redirects its streams; its exit code and what it still says."""
+    words = (sys.executable, "-m", "beers_deploy", *words)
+    line = ["/usr/bin/env", "bash", "-c", f'"$@" {closing}', "bash", *map(str, words)]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    return done.returncode, done.stdout + done.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here: Linux has one")
+@pytest.mark.parametrize(
+    ("closing", "code"),
+    [
+        ("2>&-", 0),
+        (">&- 2>&-", 0),
+        ("> /dev/full", 70),
+        ("2> /dev/full", 0),
+        ("2>&1 | true; exit ${PIPESTATUS[0]}", 70),
+    ],
+)
+def test_no_stream_loses_an_image(closing: str, code: int, tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", np.random.default_rng(0).integers(900, 1200, (40, 50)).astype(np.uint16))
+    network = ("--network", "convbeers-xs-int8")
+    found, said = run_with(closing, "restore", tmp_path / "in.tif", tmp_path / "out.tif", *network)
+    assert tifffile.imread(tmp_path / "out.tif").shape == (40, 50)
+    assert "Traceback" not in said
+    assert found == code or (found == 0 and "true" in closing)  # the pipe may live until the last word

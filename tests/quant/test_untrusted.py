@@ -1,6 +1,7 @@
 """ONNX files that would harm: each is refused by a sentence before a runtime has it."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 from unittest.mock import patch
 
@@ -169,6 +170,26 @@ def test_what_a_runtime_would_do_for_an_untrusted_file_is_refused(
     model.opset_import.extend(helper.make_opsetid(domain, 1) for domain in {n.domain for n in nodes if n.domain})
     with patch("onnx.checker.check_model"):  # some are refused by it too, in other words
         assert words in refusal(model)
+
+
+def test_unknown_opsets_and_batches_of_images_are_refused_by_whoever_reads_them(
+    model: onnx.ModelProto, tmp_path: Path
+) -> None:
+    for words, change in (("opset", _of_opset_99), ("one image", _of_four)):
+        spoilt = deepcopy(model)
+        change(spoilt)
+        onnx.save(spoilt, tmp_path / "spoilt.onnx")
+        for to_run in (True, False):
+            with pytest.raises(ModelError, match=words):
+                load_onnx(tmp_path / "spoilt.onnx", to_run)
+
+
+def _of_opset_99(model: onnx.ModelProto) -> None:
+    model.opset_import[0].version = 99
+
+
+def _of_four(model: onnx.ModelProto) -> None:
+    model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 4
 
 
 def test_functions_and_sparse_weights_are_refused(model: onnx.ModelProto) -> None:

@@ -23,6 +23,8 @@ from beers_deploy.profiles.toml import read_json
 EXAMPLE = 'write [{"model": "core.onnx", "configuration": "C32B3", "tile_px": 640, "fps": 9.5}]'
 RUNS, TILE_PX, FPS = 1000, (16, 1 << 16), (1e-9, 1e9)
 """Most runs; least and most of a tile's side and of a rate."""
+POWER_W, FAR = (0.01, 1000.0), 100
+"""Of a board; and how many times off a rate may be predicted that is one of this network on this board."""
 KEYS = {"model", "configuration", "tile_px", "fps", "power_w"}
 
 
@@ -107,7 +109,11 @@ def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run
     dpu = Dpu(board.target, *board.target.configuration(str(entry.get("configuration", "")) or None))
     model = path.parent / str(entry["model"])
     placement = place(read_network(model, int(tile_px)), dpu)
-    return Run(f"{model.stem}, tiles of {tile_px:g}", placement, dpu, fps, predict(placement, dpu))
+    prediction = predict(placement, dpu)
+    if "power_w" in entry:
+        _number(entry["power_w"], "power_w", POWER_W, where)
+    _number(fps, "fps", (prediction.fps / FAR, prediction.fps * FAR), where)
+    return Run(f"{model.stem}, tiles of {tile_px:g}", placement, dpu, fps, prediction)
 
 
 def _number(value: object, key: str, ends: tuple[float, float], where: str) -> float:

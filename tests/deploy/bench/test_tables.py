@@ -166,7 +166,7 @@ def test_bad_options_are_refused(tmp_path: Path) -> None:
         ("--image colour.tif", "one band"),
         ("--image mono.tif --size 3x4", "--size"),
         ("--full-scale 255", "--full-scale"),
-        ("--image half.tif", "0.5; "),
+        ("--image half.tif", "0.5, which may be shares"),
         ("--target kv261", "kv261"),
     ):
         words = [tmp_path / word if word.endswith(".tif") else word for word in options.split()]

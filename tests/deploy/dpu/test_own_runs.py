@@ -69,6 +69,9 @@ def test_a_part_without_runs_keeps_its_constants(folder: Path) -> None:
         '[{"model": "deep.onnx", "fps": 1e999}]',
         '[{"model": "deep.onnx", "fps": 3, "tile_px": 1048576}]',
         f'[{{"model": "deep.onnx", "fps": 3, "tile_px": {10**300}}}]',
+        '[{"model": "deep.onnx", "fps": 1e-6, "tile_px": 320}]',
+        '[{"model": "deep.onnx", "fps": 1e6, "tile_px": 320}]',
+        '[{"model": "deep.onnx", "fps": 3, "power_w": -3}]',
         f"[{', '.join(1001 * [RUN])}]",
     ],
 )
