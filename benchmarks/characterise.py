@@ -34,7 +34,6 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.studies.characterise import (
     AXES,
-    Box,
     Characterised,
     Snr,
     characterise,
@@ -93,11 +92,11 @@ def look(
     return searched.look(sensor, paths)
 
 
-def boxes_on_target(path: Path) -> tuple[Box, Box]:
+def boxes_on_target(path: Path) -> tuple[str, str]:
     """The upper half of the upright edge, and the right half of the lying one."""
     height, width = tifffile.imread(path).shape
-    upright = Box(path, width // 2 - 10, height // 2 - 50, 28, 34)
-    return upright, Box(path, width // 2 + 16, height // 2 - 10, 34, 28)
+    upright = f"{path}:{width // 2 - 10},{height // 2 - 50},28,34"
+    return upright, f"{path}:{width // 2 + 16},{height // 2 - 10},34,28"
 
 
 def as_read(found: Characterised, path: Path) -> Instrument:
@@ -158,7 +157,7 @@ class Findings:
     snr: list[tuple[float, bool]] = field(default_factory=list)
     asked: int = 0
 
-    def look(self, sensor: Instrument, paths: tuple[Path, ...], boxes: tuple[Box, ...] = ()) -> Characterised | None:
+    def look(self, sensor: Instrument, paths: tuple[Path, ...], boxes: tuple[str, ...] = ()) -> Characterised | None:
         """Characterise one sensor; where its edges are refused, its noise alone."""
         self.asked += 2
         found = None

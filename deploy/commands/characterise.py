@@ -34,11 +34,10 @@ def characterise(
     from beers_deploy.model.io.files import require_writable, write_text
     from beers_deploy.results import Table, print_rows
     from beers_deploy.studies.characterise import characterise as measure
-    from beers_deploy.studies.characterise import profile_toml, read_box
+    from beers_deploy.studies.characterise import profile_toml
 
     require_writable(out, json, inputs=images)
-    boxes = tuple(read_box(text, images) for text in edge or ())
-    found = measure(images, boxes, bits=bits, gain=gain, gsd_m=gsd)
+    found = measure(images, edge or (), bits=bits, gain=gain, gsd_m=gsd)
     rows = found.rows()
     print_rows(f"sensor of {len(images)} image{'' if len(images) == 1 else 's'}", rows)
     write_text(out, profile_toml(found))

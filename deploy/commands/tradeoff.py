@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -11,11 +11,6 @@ from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor, reference_beside
 from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from beers_deploy.studies.tradeoff.advice import Constraint
 
 EXAMPLE = "tradeoff --images aerial/ --out study/ --budget 'latency<=20s'"
 PAPER_SIZE = "13600x9016"
@@ -84,7 +79,7 @@ def tradeoff(
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.shipped import shipped_names
     from beers_deploy.results import print_rows
-    from beers_deploy.studies.tradeoff.advice import parse_constraints
+    from beers_deploy.studies.tradeoff.advice import MAP50, parse_constraints
     from beers_deploy.studies.tradeoff.page import FILES
     from beers_deploy.studies.tradeoff.points import parse_targets
     from beers_deploy.studies.tradeoff.run import tradeoff as measured
@@ -92,7 +87,9 @@ def tradeoff(
     log = partial(say, err=True)
     limits = {name: parse_constraints(name, text) for name, text in (("budget", budget), ("need", need))}
     if labelled is None:
-        _refuse_unlabelled(context, limits)
+        named = [name for name, asked in limits.items() if any(each.key == MAP50 for each in asked)]
+        remedy = "give labelled pictures, or leave it out"
+        refuse(context, ["detector", "classes", *named], expected="--labelled beside it", got="none", remedy=remedy)
     names = [name for each in network or [ALL] for name in (shipped_names() if each == ALL else [each])]
     aim, boards = reference or REFERENCE, parse_targets(target)
     tree = labelled.rglob("*") if labelled else ()
@@ -126,12 +123,3 @@ def tradeoff(
     say(f"wrote {out / FILES[0]}")
     if study.best is None:
         raise typer.Exit(1)
-
-
-def _refuse_unlabelled(context: typer.Context, limits: "Mapping[str, Sequence[Constraint]]") -> None:
-    """Refuse what only labelled pictures have: a detector, its classes, and limits on what it finds."""
-    from beers_deploy.studies.tradeoff.advice import MAP50
-
-    named = [option for option, asked in limits.items() if any(each.key == MAP50 for each in asked)]
-    remedy = "give labelled pictures, or leave it out"
-    refuse(context, ["detector", "classes", *named], expected="--labelled beside it", got="none", remedy=remedy)

@@ -44,42 +44,6 @@ MARGIN = 1e-5
 
 
 @dataclass(frozen=True)
-class Box:
-    """A part of an image with one edge across it."""
-
-    image: Path
-    left: int
-    top: int
-    width: int
-    height: int
-
-    def cut(self, pixels: np.ndarray) -> np.ndarray:
-        """The part of its pixels (H, W)."""
-        part = pixels[self.top : self.top + self.height, self.left : self.left + self.width]
-        if part.shape != (self.height, self.width) or min(part.shape) < BOX_PX:
-            height, width = pixels.shape
-            expected = f"a box of {BOX_PX} x {BOX_PX} pixels or more inside its {width} x {height}"
-            raise OptionError("edge", expected=expected, got=str(self), remedy="X,Y is the upper left pixel, from 0")
-        return part
-
-    def __str__(self) -> str:
-        return f"{self.image}:{self.left},{self.top},{self.width},{self.height}"
-
-
-def read_box(text: str, images: Sequence[Path]) -> Box:
-    """The box that FILE:X,Y,WIDTH,HEIGHT names, FILE being one of the images."""
-    parts = re.fullmatch(r"(.*):(\d{1,8}),(\d{1,8}),(\d{1,8}),(\d{1,8})", text, re.ASCII)
-    if parts is None:
-        expected, remedy = "FILE:X,Y,WIDTH,HEIGHT in whole pixels", "write raw.tif:1200,340,60,60"
-        raise OptionError("edge", expected=expected, got=repr(text), remedy=remedy)
-    name, *places = parts.groups()
-    if Path(name) not in images:
-        remedy = "name it as the argument does"
-        raise OptionError("edge", expected="one of the images that are given", got=repr(name), remedy=remedy)
-    return Box(Path(name), *map(int, places))
-
-
-@dataclass(frozen=True)
 class Snr:
     """The SNR at one radiance, in W/m2/sr/um, with its 95 % interval (its end may be infinite)."""
 
@@ -129,7 +93,7 @@ def _mtf_figure(axis: AxisMtf | None) -> Figure:
 
 def characterise(
     images: Sequence[Path],
-    boxes: Sequence[Box] = (),
+    edges: Sequence[str] = (),
     *,
     bits: int | None = None,
     gain: float | None = None,
@@ -139,7 +103,7 @@ def characterise(
 
     Args:
         images: raw ones of one sensor at one setting.
-        boxes: edges to use; none searches for them.
+        edges: boxes with one straight edge as FILE:X,Y,WIDTH,HEIGHT; none searches for edges.
         bits: of a digital number; None where clipped pixels must tell.
         gain: DN per W/m2/sr/um; None assumes 400 W/m2/sr/um at full scale.
         gsd_m: ground sampling distance; None assumes one.
@@ -150,11 +114,12 @@ def characterise(
     if len({path.resolve() for path in images}) < len(images):
         got, remedy = "one of them twice", "give each once: a second look at the same pixels knows nothing new"
         raise OptionError("images", expected="different images", got=got, remedy=remedy)
+    regions = [(words, cut_box(words, images)) for words in edges]
     stated = {"bits": bits, "gain": gain, "gsd_m": gsd_m}
     bits = _settled_bits(bits, images)
     clipped_at = 2**bits - 1
     noise = measured_noise(images, clipped_at)
-    axes = _axes(images, boxes, noise, clipped_at)
+    axes = _axes(images, regions, noise, clipped_at)
     gain = gain or clipped_at / FULL_SCALE_RADIANCE
     low, high = (snr_at(noise, clipped_at / part, gain) for part in PARTS)
     return Characterised(images, stated, bits, gain, axes, (low, high), noise)
@@ -192,8 +157,7 @@ def characterize(
     several = images if isinstance(images, list | tuple) else [images]
     with TemporaryDirectory(prefix="beers-deploy-") as folder, reporting(progress):
         paths = [_as_file(image, Path(folder) / f"image{number}.tif") for number, image in enumerate(several)]
-        boxes = [read_box(text, paths) for text in edges]
-        found = characterise(paths, boxes, bits=bits, gain=gain, gsd_m=gsd_m)
+        found = characterise(paths, edges, bits=bits, gain=gain, gsd_m=gsd_m)
         profile = Path(folder) / "measured.toml"
         profile.write_text(profile_toml(found), encoding="utf-8")
         sensor = MeasuredSensor(**vars(load_sensor(str(profile))))
@@ -288,13 +252,15 @@ def _named(images: Sequence[Path]) -> str:
     return f"{images[0].name}{more}"
 
 
-def _axes(images: Sequence[Path], boxes: Sequence[Box], noise: NoiseModel, clipped_at: float) -> dict[str, AxisMtf]:
+def _axes(
+    images: Sequence[Path], regions: Sequence[tuple[str, np.ndarray]], noise: NoiseModel, clipped_at: float
+) -> dict[str, AxisMtf]:
     """MTF across (edges near the vertical) and along the track, at least one of them."""
-    upright, lying = _pointed_at(boxes, noise, clipped_at)
-    for tile in () if boxes else _tiles(images):
+    upright, lying = _pointed_at(regions, noise, clipped_at)
+    for tile in () if regions else _tiles(images):
         upright += edge_blur.find_blurs(tile, noise.total, clipped_at)
         lying += edge_blur.find_blurs(tile.T, noise.total, clipped_at)
-    least, edges = 1 if boxes else edge_blur.MIN_FOUND, zip(AXES, (upright, lying), (lying, upright), strict=True)
+    least, edges = 1 if regions else edge_blur.MIN_FOUND, zip(AXES, (upright, lying), (lying, upright), strict=True)
     axes = {name: edge_blur.combine(own, others) for name, own, others in edges if len(own) >= least}
     if not axes:
         expected = (
@@ -306,20 +272,39 @@ def _axes(images: Sequence[Path], boxes: Sequence[Box], noise: NoiseModel, clipp
     return axes
 
 
-def _pointed_at(boxes: Sequence[Box], noise: NoiseModel, clipped_at: float) -> tuple[list[EdgeBlur], list[EdgeBlur]]:
-    """The edges in the boxes: those near the vertical, and those near the horizontal."""
+def _pointed_at(
+    regions: Sequence[tuple[str, np.ndarray]], noise: NoiseModel, clipped_at: float
+) -> tuple[list[EdgeBlur], list[EdgeBlur]]:
+    """The edges in boxes, by their words: those near the vertical, and those near the horizontal."""
     found: tuple[list[EdgeBlur], list[EdgeBlur]] = ([], [])
-    for box in boxes:
-        region = box.cut(read_raw(box.image)).astype(np.float64)
+    for words, region in regions:
         lies = _rise(region.T) > _rise(region)
         edge = edge_blur.fit_blur(region.T if lies else region, noise.total, edge_blur.POINTED_AT)
         if region.min() <= 0 or region.max() >= clipped_at:
             edge = Refusal("clipped pixels")
         if isinstance(edge, Refusal):
             expected, remedy = "one straight edge, from side to side", "box another, or tighter"
-            raise ImageError(f"edge {box}", expected=expected, got=edge.reason, remedy=remedy)
+            raise ImageError(f"edge {words}", expected=expected, got=edge.reason, remedy=remedy)
         found[lies].append(edge)
     return found
+
+
+def cut_box(words: str, images: Sequence[Path]) -> np.ndarray:
+    """The pixels (h, w) that FILE:X,Y,WIDTH,HEIGHT names, FILE being one of the images."""
+    parts = re.fullmatch(r"(.*):(\d{1,8}),(\d{1,8}),(\d{1,8}),(\d{1,8})", words, re.ASCII)
+    if parts is None:
+        expected, remedy = "FILE:X,Y,WIDTH,HEIGHT in whole pixels", "write raw.tif:1200,340,60,60"
+        raise OptionError("edge", expected=expected, got=repr(words), remedy=remedy)
+    name, (left, top, width, height) = Path(parts[1]), map(int, parts.groups()[1:])
+    if name not in images:
+        remedy = "name it as the argument does"
+        raise OptionError("edge", expected="one of the images that are given", got=repr(parts[1]), remedy=remedy)
+    pixels = read_raw(name)
+    region = pixels[top : top + height, left : left + width].astype(np.float64)
+    if region.shape != (height, width) or min(region.shape) < BOX_PX:
+        expected = f"a box of {BOX_PX} x {BOX_PX} pixels or more inside its {pixels.shape[1]} x {pixels.shape[0]}"
+        raise OptionError("edge", expected=expected, got=words, remedy="X,Y is the upper left pixel, from 0")
+    return region
 
 
 def _rise(region: np.ndarray) -> float:

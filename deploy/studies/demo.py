@@ -62,10 +62,6 @@ NOTES = (
 )
 
 
-Sensors = tuple[Sensor, Sensor]
-"""The sensor that acquired an image and the one to imitate."""
-
-
 def run_demo(
     image: Path | None, out: Path, seed: int, say: Log, full_scale: float | None = None, sensor: str = SENSOR
 ) -> Report:
@@ -83,7 +79,9 @@ def run_demo(
     sensors = load_sensors(sensor)
     degraded, pair = read_input(image, seed, sensors, full_scale)
     say("telling the shipped network the sensor, and gating its INT8")
-    write_networks(out, sensors[0])
+    floating, int8 = (Network.load(name, sensor=sensors[0]) for name in (VARIANT, f"{VARIANT}-int8"))
+    for name, network in (("float", floating), ("int8", int8), ("core", int8.core())):
+        network.save(out / f"{name}.onnx")
     float_file, int8_file = out / "float.onnx", out / "int8.onnx"
     verdict = gate(int8_file, float_file, sensor=sensors[0], patches=GATE_PATCHES, seed=seed)
     say("checking every operator against the DPU")
@@ -95,10 +93,13 @@ def run_demo(
         INT8: np.rint(restore(degraded, int8_file, full_scale=MAX_DN)),
     }
     write_tiff(out / "restored.tif", images[INT8].astype(np.uint16))
-    quality = []
+    quality = list[Row]()
     if pair is not None:
         reference = pair.reference.numpy()
-        quality = [_fidelity(name, dn, reference, degraded) for name, dn in images.items()]
+        for name, dn in images.items():
+            psnr = measured(fidelity_db(dn, reference, degraded), "dB", "simulated pair")
+            similarity = measured(ssim(dn, reference, MAX_DN), "ratio", "simulated pair")
+            quality.append(Row("quality", name, {"PSNR": psnr, "SSIM": similarity}))
         images[REFERENCE] = reference
     say("measuring the traditional pipeline, predicting the board")
     bench = bench_tables(int8_file, degraded, sensors)
@@ -108,7 +109,7 @@ def run_demo(
     return Report("From training to board, on one image", sentence, sections, pictures_of(images, out), NOTES)
 
 
-def load_sensors(name: str = SENSOR) -> Sensors:
+def load_sensors(name: str = SENSOR) -> tuple[Sensor, Sensor]:
     """The sensor that the demo simulates, and the one it imitates."""
     degraded = load_sensor(name)
     if degraded.nominal().bits != BITS:
@@ -118,7 +119,7 @@ def load_sensors(name: str = SENSOR) -> Sensors:
 
 
 def read_input(
-    image: Path | None, seed: int, sensors: Sensors, full_scale: float | None = None
+    image: Path | None, seed: int, sensors: tuple[Sensor, Sensor], full_scale: float | None = None
 ) -> tuple[np.ndarray, Pair | None]:
     """The degraded image (H, W) in digital numbers, and the pair that it belongs to where it is simulated.
 
@@ -140,20 +141,7 @@ def read_input(
     return pair.degraded.numpy(), pair
 
 
-def write_networks(out: Path, sensor: Sensor) -> None:
-    """Write the shipped network, told the sensor: in float32, in INT8, and the INT8 core for the board."""
-    floating, int8 = (Network.load(name, sensor=sensor) for name in (VARIANT, f"{VARIANT}-int8"))
-    for name, network in (("float", floating), ("int8", int8), ("core", int8.core())):
-        network.save(out / f"{name}.onnx")
-
-
-def _fidelity(name: str, dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray) -> Row:
-    psnr = measured(fidelity_db(dn, reference, degraded), "dB", "simulated pair")
-    similarity = measured(ssim(dn, reference, MAX_DN), "ratio", "simulated pair")
-    return Row("quality", name, {"PSNR": psnr, "SSIM": similarity})
-
-
-def bench_tables(model: Path, dn: np.ndarray, sensors: Sensors) -> list[Section]:
+def bench_tables(model: Path, dn: np.ndarray, sensors: tuple[Sensor, Sensor]) -> list[Section]:
     """Speed for this image, for the swath of the paper beside its rows, and for that swath on every board."""
     dpu, halo_px = load_dpu(DEFAULT_TARGET), tiling_of(load_onnx(model)).halo_px
     chain = measure_chain(dn, *sensors)

@@ -86,23 +86,18 @@ def simulate_pairs(
             small.append(scene.name)
             continue
         draw = Draw(seed, number)
-        seen, meant = (
+        seen_by, meant_by = (
             each if isinstance(each, Instrument) else each.draw(draw.generator("sensor"))
             for each in (degraded, reference)
         )
-        pairs.append(_simulated(scene, seen, meant, ratio, draw))
+        made = acquire.acquire_three(acquire.prepare_scene(scene.radiance, ratio), seen_by, meant_by, draw)
+        seen, meant, clean = (image.numpy() for image in made)
+        pairs.append(NamedPair(scene.name, seen, meant, oversampling=ratio, noise_free=clean))
     if not pairs:
         least = oversamplings[-1] * (2 * acquire.MARGIN_PX + acquire.LEAST_SIDE_PX)
         expected, got = f"scenes of {least} pixels a side or more", f"{len(small)} smaller ones"
         raise ImageError("images", expected=expected, got=got, remedy="give larger images")
     return pairs, small
-
-
-def _simulated(scene: Scene, degraded: Instrument, reference: Instrument, ratio: int, draw: Draw) -> NamedPair:
-    """Three acquisitions of one scene: the pair, and the reference once more without its noise."""
-    made = acquire.acquire_three(acquire.prepare_scene(scene.radiance, ratio), degraded, reference, draw)
-    seen, meant, clean = (image.numpy() for image in made)
-    return NamedPair(scene.name, seen, meant, oversampling=ratio, noise_free=clean)
 
 
 def oversamplings_of(profile: Sensor) -> tuple[int, ...]:

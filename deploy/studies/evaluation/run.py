@@ -12,7 +12,7 @@ from typing import cast
 import numpy as np
 from PIL import Image
 
-from beers_deploy.model.dataset import PairsRecipe, profiles_for, read_pairs_recipe
+from beers_deploy.model.dataset import profiles_for, read_pairs_recipe
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.images import list_images
 from beers_deploy.model.io.pictures import busiest_windows, error_row, grid, picture_url, stretch_of, strip_row
@@ -25,17 +25,9 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.restoration.function import Restore, network_method
 from beers_deploy.results import Table
+from beers_deploy.studies.evaluation import scores
 from beers_deploy.studies.evaluation.methods import DEGRADED, Method, knowledge_of, method_named
 from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes, read_pairs
-from beers_deploy.studies.evaluation.scores import (
-    Instruments,
-    acquire_targets,
-    paper_rows,
-    perceptual_distances,
-    score,
-    site_rows,
-    target_figures,
-)
 from beers_deploy.studies.evaluation.sweep import run_sweep
 
 Methods = Mapping[str, NetworkLike | Restore] | Sequence[str]
@@ -123,22 +115,28 @@ def evaluate(
     told = once(log)
     with reporting(progress):
         ways = [_method(name, each, sensors, told) for name, each in asked.items()]
-        instruments = Instruments(perceptual_distances(weights), sensors[0].nominal().max_dn)
-        loaded, said = _pairs(made, folder, scenes, sensors, recipe, seed)
-        targets, rows = acquire_targets(sensors[0].nominal(), seed), list[Row]()
+        instruments = scores.Instruments(scores.perceptual_distances(weights), sensors[0].nominal().max_dn)
+        said = list[str]()
+        if made is not None:
+            loaded = [_named(number, pair) for number, pair in enumerate(made)]
+        elif folder is not None:
+            loaded = read_pairs(folder, sensors[0].nominal().max_dn, recipe)
+        else:
+            loaded, said = pairs_of_scenes(scenes, *sensors, seed)
+        targets, rows = scores.acquire_targets(sensors[0].nominal(), seed), list[Row]()
         for way in ways:
-            mean, *each = score(way, loaded, instruments, seed)
-            rows += [replace(mean, figures={**mean.figures, **target_figures(way, targets)}), *each]
+            mean, *each = scores.score(way, loaded, instruments, seed)
+            rows += [replace(mean, figures={**mean.figures, **scores.target_figures(way, targets)}), *each]
         swept = run_sweep(ways, scenes, *sensors, seed).rows if sweep else []
     few = too_few(len({pair.site for pair in loaded}))
     arguments: dict[str, object] = {"images": images, "pairs": folder, "sensor": sensors[0].name, "lpips": lpips}
     arguments |= {"reference": sensors[1].name, "methods": ",".join(asked), "sweep": sweep, "seed": seed}
-    tables = by_table([*rows, *paper_rows()])
+    tables = by_table([*rows, *scores.paper_rows()])
     return Evaluation(
         "evaluate",
         arguments,
         tuple(_inputs(asked, weights, scenes, folder)),
-        (*tables["mean"], *site_rows(tables["images"]), *tables["images"], *swept),
+        (*tables["mean"], *scores.site_rows(tables["images"]), *tables["images"], *swept),
         notes=tuple([few, *said] if few else said),
         sensors=sensors,
         methods=ways,
@@ -151,21 +149,6 @@ def _inputs(asked: Iterable[str], weights: Path | None, scenes: Path | None, pai
     yield from (path for path in (*map(Path, asked), *([weights] if weights else [])) if path.is_file())
     folders = [scenes] if scenes else [pairs / role for role in ("degraded", "reference")] if pairs else []
     yield from (path for folder in folders for path in list_images(folder))
-
-
-def _pairs(
-    made: Sequence[Pair] | None,
-    folder: Path | None,
-    scenes: Path | None,
-    sensors: tuple[Sensor, Sensor],
-    recipe: PairsRecipe | None,
-    seed: int,
-) -> tuple[list[NamedPair], list[str]]:
-    if made is not None:
-        return [_named(number, pair) for number, pair in enumerate(made)], []
-    if folder is not None:
-        return read_pairs(folder, sensors[0].nominal().max_dn, recipe), []
-    return pairs_of_scenes(scenes, *sensors, seed)
 
 
 def _named(number: int, pair: Pair) -> NamedPair:
@@ -188,9 +171,10 @@ SITES, CROP_PX, ZOOM = 4, 96, 2
 
 def chosen_pairs(pairs: Sequence[NamedPair]) -> list[NamedPair]:
     """The first pair of each of the first few sites."""
-    first = {pair.site: pair for pair in reversed(pairs)}
-    sites = dict.fromkeys(pair.site for pair in pairs)
-    return [first[site] for site in sites][:SITES]
+    first = dict[str, NamedPair]()
+    for pair in pairs:
+        first.setdefault(pair.site, pair)
+    return list(first.values())[:SITES]
 
 
 def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, float]:

@@ -7,6 +7,8 @@ input may treat fine texture otherwise. The noise in flat fields is what is left
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -43,19 +45,16 @@ def perceptual_distances(place: Path | None) -> dict[str, Perceptual | str]:
     networks = ("squeeze", "alex", "vgg") if place is None or place.is_dir() else ("squeeze",)
     for network in networks:
         if file := find_backbone(network, place):
-            found[f"LPIPS-{network}"] = _distance(Lpips.load(network, file))
+            found[f"LPIPS-{network}"] = partial(_distance, Lpips.load(network, file))
             if network == "vgg":
-                found["DISTS"] = _distance(Dists.load(file))
+                found["DISTS"] = partial(_distance, Dists.load(file))
     return found
 
 
-def _distance(metric: Lpips | Dists) -> Perceptual:
-    def distance(image: np.ndarray, reference: np.ndarray) -> float:
-        both = [torch.from_numpy(np.asarray(a, np.float32))[None, None] for a in (image, reference)]
-        with torch.inference_mode():
-            return float(metric(*both))
-
-    return distance
+def _distance(metric: Lpips | Dists, image: np.ndarray, reference: np.ndarray) -> float:
+    both = [torch.from_numpy(np.asarray(a, np.float32))[None, None] for a in (image, reference)]
+    with torch.inference_mode():
+        return float(metric(*both))
 
 
 DISTANCE = "distance"
@@ -174,15 +173,11 @@ class Targets:
 
 def acquire_targets(sensor: Instrument, seed: int) -> Targets:
     """Edges at several angles with independent noise, and flat fields at 25 and 100 W/m2/sr/um."""
-    edges = []
-    for number, angle_deg in enumerate(ANGLES_DEG * REPEATS):
-        scene = slanted_edge(SIDE_PX, OVERSAMPLING, angle_deg)
-        edges.append((angle_deg, _acquire(scene, sensor, Draw(seed, number))))
-    flats = []
-    for number, radiance in enumerate(RADIANCES, len(edges)):
-        scene = torch.full((FLAT_PX, FLAT_PX), radiance)
-        flats.append((radiance, _acquire(scene, sensor, Draw(seed, number), ratio=1)))
-    return Targets(sensor, edges, flats)
+    draws = (Draw(seed, number) for number in count())
+    scenes = [(angle, slanted_edge(SIDE_PX, OVERSAMPLING, angle)) for angle in ANGLES_DEG * REPEATS]
+    edges = [(angle, _acquire(scene, sensor, next(draws))) for angle, scene in scenes]
+    fields = [(radiance, torch.full((FLAT_PX, FLAT_PX), radiance)) for radiance in RADIANCES]
+    return Targets(sensor, edges, [(at, _acquire(field, sensor, next(draws), ratio=1)) for at, field in fields])
 
 
 def _acquire(scene: Tensor, sensor: Instrument, draw: Draw, ratio: int = OVERSAMPLING) -> np.ndarray:

@@ -83,7 +83,11 @@ Quality = tuple[float, float, float]
 
 def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
     """A row without flips, and one for every kind of memory and rate."""
-    clean = [_clean_db(target, number) for number in range(len(target.pairs))]
+    clean = []
+    for image, reference in target.pairs:
+        sound = faults.Injected(target.core, SOUND, image, 0)
+        bare, clamped = (_quality_db(sound, guards, reference) for guards in (None, target.guards))
+        clean.append((bare, clamped, clamped))
     rows = [_curve_row("none", [(0, quality) for quality in clean], "patches")]
     with steps("turning bits over", sum(len(m.rates) * m.times * draws for m in faults.MEMORIES.values())) as bar:
         for name, memory in faults.MEMORIES.items():
@@ -98,13 +102,6 @@ def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
 
 def _quality_db(injected: faults.Injected, guards: faults.Guards | None, reference: np.ndarray) -> float:
     return psnr_db(faults.restored(injected, guards), reference, 1.0)
-
-
-def _clean_db(target: FaultTarget, number: int) -> Quality:
-    image, reference = target.pairs[number]
-    sound = faults.Injected(target.core, SOUND, image, 0)
-    bare, clamped = (_quality_db(sound, guards, reference) for guards in (None, target.guards))
-    return bare, clamped, clamped
 
 
 def _drawn(target: FaultTarget, name: str, rate: float, draw: int, seed: int, clean: Quality) -> tuple[int, Quality]:

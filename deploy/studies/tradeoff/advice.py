@@ -16,7 +16,7 @@ from beers_deploy.network import Network
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted
 from beers_deploy.studies.tradeoff.measure import Scores
-from beers_deploy.studies.tradeoff.points import Point
+from beers_deploy.studies.tradeoff.points import UNITS, Point
 
 COSTS = ("board latency", "board energy", "host p50")
 PSNR, MAP50 = "PSNR", "mAP50"
@@ -27,11 +27,7 @@ NAMES: dict[str, tuple[str, str]] = {
     "map50": (MAP50, "%"),
     "host": ("host p50", "s/Mpx"),
     "host-p90": ("host p90", "s/Mpx"),
-    "latency": ("board latency", "s"),
-    "throughput": ("board throughput", "frame/s"),
-    "power": ("board power", "W"),
-    "energy": ("board energy", "J"),
-    "efficiency": ("board efficiency", "px/s/W"),
+    **{key.removeprefix("board "): (key, unit) for key, unit in UNITS.items()},
 }
 """What a user writes: the figure that it stands for, and its unit."""
 BARE_UNITS = ("ratio", "distance")

@@ -22,6 +22,7 @@ from beers_deploy.bench.traditional import drawn_acquisition
 from beers_deploy.export import float_model
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.io.images import list_images
+from beers_deploy.model.metrics.perceptual import find_backbone
 from beers_deploy.model.processor import processor_name
 from beers_deploy.model.shipped import DETECTOR
 from beers_deploy.profiles import load_sensor, sensor_names
@@ -42,13 +43,13 @@ from beers_deploy.studies.detection.detector import Detector, open_detector, par
 from beers_deploy.studies.detection.study import LabelledScene, SensorPair, acquired, labelled_scenes
 from beers_deploy.studies.evaluation.methods import Method
 from beers_deploy.studies.evaluation.pairs import NamedPair
-from beers_deploy.studies.evaluation.scores import NOISE_FREE, Instruments
+from beers_deploy.studies.evaluation.scores import NOISE_FREE, Instruments, perceptual_distances
 from beers_deploy.studies.tradeoff.points import HALO_STEP_PX, Point, Variant, model_of, tiling_of_file
 
 Scores = Mapping[str, float | None]
 """Figures of one image by name; None where an instrument is not there."""
 
-SEAM_ERROR = "seam error"
+LPIPS, SEAM_ERROR = "LPIPS-squeeze", "seam error"
 NOT_SHOWN = ("PSNR gain", NOISE_FREE, SEAM_ERROR)
 """Of the scores of an image, in the means of a point."""
 
@@ -104,23 +105,27 @@ class Benchmark:
         pairs: held-out images, degraded and reference.
         degraded: sensor of the degraded images.
         reference: sensor of the reference images.
-        instruments: PSNR, SSIM and LPIPS.
-        weights: digest of the weights of LPIPS; empty without.
+        lpips: weights of SqueezeNet 1.1, or a folder of backbones; None asks the environment.
         seed: of the bootstrap.
     """
 
     pairs: Sequence[NamedPair]
     degraded: Sensor
     reference: Sensor
-    instruments: Instruments
-    weights: str
+    lpips: Path | None
     seed: int
+
+    @cached_property
+    def instruments(self) -> Instruments:
+        """PSNR, SSIM and LPIPS."""
+        return Instruments({LPIPS: perceptual_distances(self.lpips)[LPIPS]}, self.degraded.nominal().max_dn)
 
     @cached_property
     def digest(self) -> str:
         """Of everything that scores depend on besides the method."""
         pairs = [(pair.name, pair.site, pair.degraded, pair.reference) for pair in self.pairs]
-        return key_of(pairs=pairs, weights=self.weights)
+        weights = find_backbone("squeeze", self.lpips)
+        return key_of(pairs=pairs, weights=weights and sha256(weights))
 
     @property
     def sites(self) -> list[str]:
@@ -224,8 +229,12 @@ class Labelled:
         value = None if np.isnan(values[0]) else float(values[0])
         return {"value": value, "interval": interval(values, len(set(sites)))}
 
-    def figure(self, stored: Mapping[str, Any]) -> Figure:
-        """What `measure` gave, in %."""
+    def figure(self, point: Point, method: Method, kept: Measurements) -> Figure:
+        """What `measure` gives, in %; how often a seam cuts an object is not known."""
+        if point.halo_px is not None:
+            return unavailable("%", "measured with exact halos alone")
+        key = key_of(map50=self.benchmark.depends(point.variant), labelled=self.digest)
+        stored = kept.make(key, lambda: self.measure(method))
         if stored["value"] is None:
             return unavailable("%", "no labelled object")
         sites, ends = len({each.site for each in self.scenes}), stored["interval"]

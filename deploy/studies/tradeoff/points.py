@@ -13,15 +13,8 @@ from pathlib import Path
 
 import onnx
 
-from beers_deploy.bench.tables import (
-    PAPER_TILE_PX,
-    Swath,
-    chain_rate,
-    efficiency,
-    energy,
-    processor_row,
-    swath_latency,
-)
+from beers_deploy.bench import tables
+from beers_deploy.bench.tables import PAPER_TILE_PX, Swath
 from beers_deploy.dpu.board import Dpu, dpu_of
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import dpu_power, predict
@@ -29,6 +22,8 @@ from beers_deploy.dpu.graph import Network
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.export import float_model
 from beers_deploy.model.shipped import shipped_names
+from beers_deploy.model.traditional.nl_bayes import QUALITIES
+from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.network import float_file, int8_file
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.errors import ModelError, OptionError
@@ -161,14 +156,22 @@ def _require_tiles(name: str, tiling: Tiling) -> None:
         raise OptionError("network", expected=expected, got=f"{name}, {tiling.words}{fixed}", remedy=remedy)
 
 
-def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swath) -> list[Point]:
-    """Where a network is looked at: in INT8 on each configuration of the boards, on the first in more tiles too.
+def points_of(networks: Iterable[Variant], boards: Sequence[TargetProfile], whole: Swath) -> list[Point]:
+    """Where networks, traditional chains and other libraries' ways are looked at.
 
     Args:
-        variant: the network.
+        networks: in float32 and in INT8.
         boards: targets with a DPU.
         whole: the swath.
     """
+    chains = [Variant(f"traditional-{quality}") for quality in QUALITIES]
+    found = [point for variant in networks for point in network_points(variant, boards, whole)]
+    found += [Point(chain, board) for chain in chains for board in boards]
+    return [*found, *(Point(Variant(peer)) for peer in PEERS)]
+
+
+def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swath) -> list[Point]:
+    """Where a network is looked at: in INT8 on each configuration of the boards, on the first in more tiles too."""
     if variant.precision == FLOAT:
         return [Point(variant, reason=FLOAT_ON_DPU)]
     found = []
@@ -182,20 +185,15 @@ def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swa
 
 def _on_board(variant: Variant, board: TargetProfile, whole: Swath, *, more: bool) -> list[Point]:
     """The fastest tile on each configuration; on the default one the paper's tile and smaller halos too."""
-    default, *others = configurations(board)
+    default = dpu_of(board)
+    others = [dpu_of(board, name) for name in board.configurations if name != default.name]
     fastest_px = fastest_tile_px(variant, default, whole)
-    points = [Point(variant, board, dpu, fastest_px) for dpu in (default, *others)]
+    points = [Point(variant, board, dpu, fastest_px) for dpu in [default, *others]]
     if more:
         points.append(Point(variant, board, default, PAPER_TILE_PX))
         smaller = (halo for halo in HALOS_PX if halo < radius_px(variant))
         points += [Point(variant, board, default, fastest_px, halo) for halo in smaller]
     return list({point.name: point for point in points}.values())
-
-
-def configurations(board: TargetProfile) -> list[Dpu]:
-    """Those of a board, the default one first."""
-    default = dpu_of(board)
-    return [default, *(dpu_of(board, name) for name in board.configurations if name != default.name)]
 
 
 def fastest_tile_px(variant: Variant, dpu: Dpu, whole: Swath) -> int:
@@ -216,7 +214,7 @@ def dpu_latency(variant: Variant, dpu: Dpu, swath: Swath) -> Figure:
         swath: with its tiles and their halo.
     """
     prediction = predict(place(_graph(variant.file or Path(), swath.tile_px), dpu), dpu)
-    return swath_latency(prediction, math.ceil(swath.tiles / prediction.batch))
+    return tables.swath_latency(prediction, math.ceil(swath.tiles / prediction.batch))
 
 
 def radius_px(variant: Variant) -> int:
@@ -266,14 +264,14 @@ def board_figures(point: Point, whole: Swath, slower: float | None = None) -> di
         swath = replace(whole, tile_px=point.tile_px, halo_px=halo_px)
         latency, power = dpu_latency(point.variant, point.dpu, swath), dpu_power(point.dpu)
     elif point.board is not None and slower is not None:
-        row = processor_row(whole, point.board)
+        row = tables.processor_row(whole, point.board)
         latency, power = _slower(row.figures["latency"], slower), row.figures["power"]
     else:
         latency = unavailable("s", point.reason or "no time of this method on the board's processor is stated")
     if latency.value is None:
         return {key: unavailable(unit, latency.reason) for key, unit in UNITS.items()}
-    work = energy(latency, power), efficiency(whole.pixels, latency, power)
-    return dict(zip(UNITS, (latency, chain_rate(whole, latency), power, *work), strict=True))
+    work = tables.energy(latency, power), tables.efficiency(whole.pixels, latency, power)
+    return dict(zip(UNITS, (latency, tables.chain_rate(whole, latency), power, *work), strict=True))
 
 
 def _slower(latency: Figure, times: float) -> Figure:

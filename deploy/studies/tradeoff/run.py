@@ -9,51 +9,27 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from beers_deploy.bench.tables import PAPER_SIZE, PAPER_TARGET, Swath, parse_size, published_rows
-from beers_deploy.dpu.board import BoardLike, boards_of
+from beers_deploy.dpu.board import BoardLike, boards_of, dpu_of
 from beers_deploy.dpu.cost.model import Constants
-from beers_deploy.model.io.files import sha256
 from beers_deploy.model.io.images import list_images
 from beers_deploy.model.metrics.bootstrap import too_few
 from beers_deploy.model.metrics.perceptual import find_backbone
 from beers_deploy.model.progress import Log, Progress, no_log, reporting, steps
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.model.traditional.nl_bayes import QUALITIES
-from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.errors import MachineError
-from beers_deploy.profiles.figures import Figure, Row, unavailable
+from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import REFERENCE
 from beers_deploy.profiles.target import DEFAULT_TARGET
 from beers_deploy.results import input_of
 from beers_deploy.studies.evaluation.methods import Method, method_named
 from beers_deploy.studies.evaluation.pairs import pairs_of_scenes
-from beers_deploy.studies.evaluation.scores import Instruments, perceptual_distances
-from beers_deploy.studies.tradeoff.advice import (
-    MAP50,
-    Comparison,
-    Constraint,
-    Measured,
-    chosen_cost,
-    front_rows,
-    pareto_front,
-    parse_constraints,
-    recommend,
-)
-from beers_deploy.studies.tradeoff.measure import Benchmark, Labelled, Measurements, key_of, make_int8, measure_host
+from beers_deploy.studies.tradeoff import advice
+from beers_deploy.studies.tradeoff.measure import Benchmark, Labelled, Measurements, make_int8, measure_host
 from beers_deploy.studies.tradeoff.page import Tradeoff
-from beers_deploy.studies.tradeoff.points import (
-    CHAIN,
-    Point,
-    Variant,
-    board_figures,
-    configurations,
-    network_points,
-    network_variants,
-)
-
-LPIPS = "LPIPS-squeeze"
+from beers_deploy.studies.tradeoff.points import CHAIN, Point, Variant, board_figures, network_variants, points_of
 
 
 def tradeoff(
@@ -102,8 +78,8 @@ def tradeoff(
     """
     boards, width_height = boards_of(board), parse_size(size) if isinstance(size, str) else size
     for each in boards:
-        Constants.of(configurations(each)[0])  # a board without them is refused before anything is measured
-    limits = parse_constraints("budget", budget), parse_constraints("need", need)
+        Constants.of(dpu_of(each))  # a board without them is refused before anything is measured
+    limits = advice.parse_constraints("budget", budget), advice.parse_constraints("need", need)
     scenes, weights, calibrated = (None if path is None else Path(path) for path in (images, lpips, calibration))
     degraded = Sensor.load(sensor)
     aim = Sensor.load(reference or REFERENCE).in_units_of(degraded)
@@ -112,15 +88,15 @@ def tradeoff(
     with keep as folder, reporting(progress):
         kept, swath = Measurements.open(Path(folder) / "measurements.json"), Swath(*width_height)
         quantise = partial(make_int8, folder=Path(folder) / "int8", scenes=calibrated, sensor=degraded, seed=seed)
-        variants = network_variants(names, degraded, quantise, log)
-        points = [point for variant in variants for point in network_points(variant, boards, swath)]
-        benchmark, said = _benchmark(scenes, degraded, aim, weights, seed)
+        points = points_of(network_variants(names, degraded, quantise, log), boards, swath)
+        pairs, said = pairs_of_scenes(scenes, degraded, aim, seed)
+        benchmark = Benchmark(pairs, degraded, aim, weights, seed)
         pictures = Labelled.open(Path(labelled), detector, classes, benchmark) if labelled else None
-        measured = _measured([*points, *_others(boards)], benchmark, pictures, kept, swath, log)
+        measured = _measured(points, benchmark, pictures, kept, swath, log)
     if boards[0].name == PAPER_TARGET and width_height == parse_size(PAPER_SIZE):
         for row in published_rows():  # as printed; the paper's images are others
             figures = {f"board {key}": figure for key, figure in row.figures.items()}
-            measured.append(Measured(row.name, figures, {"board": PAPER_TARGET}))
+            measured.append(advice.Measured(row.name, figures, {"board": PAPER_TARGET}))
     notes = (*_notes(benchmark, boards[0].name), *(pictures.notes if pictures else ()), *said)
     files = [path for path in map(Path, names) if path.is_file()]
     files += [path for folder in (scenes, calibrated) if folder for path in list_images(folder)]
@@ -131,42 +107,27 @@ def tradeoff(
     arguments |= {"seed": seed, "target": ",".join(each.name for each in boards), "network": ",".join(names)}
     arguments |= {"labelled": labelled, "detector": detector, "classes": classes} if labelled else {}
     about: dict[str, Any] = {"arguments": arguments, "inputs": tuple(map(input_of, files)), "notes": notes}
-    return _weighed(measured, boards[0], Comparison(benchmark.sites, seed), *limits, **about)
+    return _weighed(measured, boards[0], advice.Comparison(benchmark.sites, seed), *limits, **about)
 
 
 def _weighed(
-    points: Sequence[Measured],
+    points: Sequence[advice.Measured],
     board: TargetProfile,
-    compare: Comparison,
-    budget: Sequence[Constraint],
-    need: Sequence[Constraint],
+    compare: advice.Comparison,
+    budget: Sequence[advice.Constraint],
+    need: Sequence[advice.Constraint],
     **about: Any,
 ) -> Tradeoff:
     """The front and the recommendation, of the points of one board."""
     here = [each for each in points if each.point and each.point.board in (None, board)]
-    cost = chosen_cost(here, budget)
-    front = pareto_front(here, cost)
-    numbered, (best, line) = front_rows(front, cost, compare), recommend(here, budget, need, compare)
+    cost = advice.chosen_cost(here, budget)
+    front, (best, line) = advice.pareto_front(here, cost), advice.recommend(here, budget, need, compare)
+    numbered = advice.front_rows(front, cost, compare)
     name, figures = (best.name, best.figures) if best else ("none", {})
     every = (Row("points", point.name, point.figures, point.text) for point in points)
     rows = (Row("recommended", name, figures, {"line": line}), *numbered, *every)
     about |= {"points": points, "front": front, "front_rows": numbered, "cost": cost, "best": best, "line": line}
     return Tradeoff("tradeoff", rows=rows, board=board.name, **about)
-
-
-def _benchmark(
-    images: Path | None, degraded: Sensor, reference: Sensor, lpips: Path | None, seed: int
-) -> tuple[Benchmark, list[str]]:
-    pairs, said = pairs_of_scenes(images, degraded, reference, seed)
-    distances = {LPIPS: perceptual_distances(lpips)[LPIPS]}
-    backbone, instruments = find_backbone("squeeze", lpips), Instruments(distances, degraded.nominal().max_dn)
-    weights = sha256(backbone) if backbone else ""
-    return Benchmark(pairs, degraded, reference, instruments, weights, seed), said
-
-
-def _others(boards: Sequence[TargetProfile]) -> list[Point]:
-    chains = [Variant(f"traditional-{quality}") for quality in QUALITIES]
-    return [*(Point(chain, board) for chain in chains for board in boards), *(Point(Variant(peer)) for peer in PEERS)]
 
 
 def _measured(
@@ -176,11 +137,11 @@ def _measured(
     kept: Measurements,
     swath: Swath,
     log: Log,
-) -> list[Measured]:
+) -> list[advice.Measured]:
     """Every point with its figures; a method whose library is not installed is left out."""
     methods = _methods([point.variant for point in points], benchmark, log)
     there = [point for point in points if point.variant in methods]
-    found = list[Measured]()
+    found = list[advice.Measured]()
     with steps("tradeoff", len(there) + 1) as bar:
         for point in there:
             bar.advance(0, f"measuring {point.name}")
@@ -188,8 +149,8 @@ def _measured(
             scores = benchmark.scores(point, method.restore, kept)
             figures = benchmark.means(scores)
             if labelled is not None:
-                figures[MAP50] = _map50(point, method, labelled, kept, benchmark)
-            found.append(Measured(point.name, figures, _text(point, method), point, scores))
+                figures[advice.MAP50] = labelled.figure(point, method, kept)
+            found.append(advice.Measured(point.name, figures, _text(point, method), point, scores))
             bar.advance(1, point.name)
         host = measure_host(methods, benchmark, kept)
         bar.advance(1, "timed on this machine")
@@ -210,14 +171,6 @@ def _methods(variants: Sequence[Variant], benchmark: Benchmark, log: Log) -> dic
         except MachineError as error:
             log(f"{variant.name} is left out: {error}")
     return found
-
-
-def _map50(point: Point, method: Method, labelled: Labelled, kept: Measurements, benchmark: Benchmark) -> Figure:
-    """What a detector finds; how often a seam cuts an object is not known."""
-    if point.halo_px is not None:
-        return unavailable("%", "measured with exact halos alone")
-    key = key_of(map50=benchmark.depends(point.variant), labelled=labelled.digest)
-    return labelled.figure(kept.make(key, lambda: labelled.measure(method)))
 
 
 def _text(point: Point, method: Method) -> dict[str, str]:

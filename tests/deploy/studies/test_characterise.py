@@ -21,7 +21,7 @@ from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import BeersError, OptionError
 from beers_deploy.profiles.sensor import Instrument, noise_from_snr
 from beers_deploy.results import SCHEMA_PATH
-from beers_deploy.studies.characterise import Box, characterise, profile_toml, read_box
+from beers_deploy.studies.characterise import characterise, cut_box, profile_toml
 
 RATIO, SIDE, GAIN, BOARD_PX = 4, 1280, 10.2375, 100
 SNRS = (50.0, 110.0)
@@ -99,10 +99,10 @@ def test_without_a_gain_the_noise_over_full_scale_stands(raw: tuple[Path, Path])
     assert written["noise"]["radiance_1"]["value"] == pytest.approx(100)
 
 
-def edge_box(raw: tuple[Path, Path]) -> Box:
+def edge_box(raw: tuple[Path, Path]) -> str:
     """The upper half of the board's upright edge, in an image that has lost 32 pixels a side."""
     middle = SIDE // RATIO // 2 - 32
-    return Box(raw[0], middle - 11, middle - 38, 30, 28)
+    return f"{raw[0]}:{middle - 11},{middle - 38},30,28"
 
 
 def test_a_box_gives_one_axis_for_both(raw: tuple[Path, Path]) -> None:
@@ -135,7 +135,7 @@ def test_images_without_an_edge_are_refused(raw: tuple[Path, Path], tmp_path: Pa
 )
 def test_a_box_written_wrongly_is_refused(box: str, words: str) -> None:
     with pytest.raises(OptionError, match=words):
-        read_box(box, [Path("board.tif")])
+        cut_box(box, [Path("board.tif")])
 
 
 @pytest.mark.parametrize(
@@ -194,7 +194,7 @@ def test_pixels_clipped_at_full_scale_tell_the_bits(raw: tuple[Path, Path], tmp_
     assert found.bits == 12
     assert tomllib.loads(profile_toml(found))["digitiser"]["bits"]["status"] == "measured"
     with pytest.raises(BeersError, match="clipped pixels"):
-        characterise((image, raw[1]), (Box(image, 0, 0, 30, 30),))
+        characterise((image, raw[1]), (f"{image}:0,0,30,30",))
     pixels[:4, :4] = 4000
     with pytest.raises(BeersError, match="bits"):
         characterise((tiff(tmp_path, pixels), raw[1]))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from beers_deploy.restoration.function import Restore
-from beers_deploy.studies.tradeoff import measure, run
+from beers_deploy.studies.tradeoff import measure, points
 
 
 @contextmanager
@@ -17,8 +17,8 @@ def small_studies() -> Iterator[None]:
         for module, name, value in (
             (measure, "PATCHES", 2),
             (measure, "PATCH_PX", 32),
-            (run, "QUALITIES", ("fast",)),
-            (run, "PEERS", ()),
+            (points, "QUALITIES", ("fast",)),
+            (points, "PEERS", ()),
             (measure, "host_times", _steady),
         ):
             patch.setattr(module, name, value)

@@ -18,9 +18,8 @@ from typer.testing import CliRunner
 from beers_deploy.cli import app
 from beers_deploy.model.convbeers import ConvBEERS, initialise, save_network
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.model.variants import Variant
+from beers_deploy.model.variants import Variant as Shape
 from beers_deploy.profiles import load_sensor
-from beers_deploy.profiles.figures import measured
 from beers_deploy.profiles.sensor_file import reference_for
 from beers_deploy.restoration.function import Restore
 from beers_deploy.results import SCHEMA_PATH
@@ -28,8 +27,9 @@ from beers_deploy.studies.evaluation.methods import Method, method_named
 from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes
 from beers_deploy.studies.evaluation.scores import Instruments
 from beers_deploy.studies.tradeoff.advice import TOO_FEW
-from beers_deploy.studies.tradeoff.measure import SEAM_ERROR, Benchmark, Labelled, make_int8
+from beers_deploy.studies.tradeoff.measure import SEAM_ERROR, Benchmark, Labelled, Measurements, make_int8
 from beers_deploy.studies.tradeoff.page import Tradeoff
+from beers_deploy.studies.tradeoff.points import Point, Variant
 from beers_deploy.studies.tradeoff.run import tradeoff
 from tests.deploy.studies.tradeoff.small import small_studies
 
@@ -43,7 +43,7 @@ SENSOR = "pleiades-degraded"
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network, two scenes to judge on and one to calibrate on."""
     folder = tmp_path_factory.mktemp("tiny")
-    network = ConvBEERS(Variant(1, 2))
+    network = ConvBEERS(Shape(1, 2))
     initialise(network, torch.Generator().manual_seed(3))
     save_network(folder / "narrow.safetensors", network, {"degraded": SENSOR})
     for number in range(SITES + 1):
@@ -139,17 +139,19 @@ def test_a_stopped_run_goes_on_and_says_the_same(
     assert sum(counts) == 1
 
 
-def test_a_measurement_depends_on_its_inputs() -> None:
+def test_a_measurement_depends_on_its_inputs(tmp_path: Path) -> None:
     degraded = load_sensor(SENSOR)
     sensors = degraded, reference_for(degraded)
+    weights = tmp_path / "squeezenet.safetensors"
+    weights.write_bytes(b"weights")
     pair = NamedPair("scene", np.zeros((9, 9), np.float32), np.ones((9, 9), np.float32))
-    bench = Benchmark([pair], *sensors, Instruments({}), "", 0)
-    others = [
-        Benchmark([replace(pair, degraded=pair.degraded + 1)], *sensors, Instruments({}), "", 0),
-        Benchmark([replace(pair, name="other")], *sensors, Instruments({}), "", 0),
-        Benchmark([pair], *sensors, Instruments({}), "weights", 0),
+    benches = [
+        Benchmark([pair], *sensors, None, 0),
+        Benchmark([replace(pair, degraded=pair.degraded + 1)], *sensors, None, 0),
+        Benchmark([replace(pair, name="other")], *sensors, None, 0),
+        Benchmark([pair], *sensors, weights, 0),
     ]
-    assert len({bench.digest, *(other.digest for other in others)}) == 4
+    assert len({bench.digest for bench in benches}) == 4
 
 
 def test_an_int8_file_is_made_once(folder: Path, tmp_path: Path) -> None:
@@ -185,16 +187,11 @@ def test_the_papers_runs_stand_beside_its_own_swath_and_compare_with_nothing(
 def test_labelled_pictures_add_map50_beside_exact_halos(
     folder: Path, study: tuple[Tradeoff, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Made:
-        digest, notes, scenes = "d", ("labels",), ()
+    def opened(_: Path, detector: Any, __: None, benchmark: Benchmark) -> Labelled:
+        return Labelled(detector, (), benchmark, "d", ("labels",))
 
-        def measure(self, _: object) -> dict[str, object]:
-            return {"value": 0.5, "interval": None}
-
-        def figure(self, stored: dict[str, float]) -> object:
-            return measured(100 * stored["value"], "%", "made up")
-
-    monkeypatch.setattr(Labelled, "open", lambda *_: Made())
+    monkeypatch.setattr(Labelled, "open", opened)
+    monkeypatch.setattr(Labelled, "measure", lambda *_: {"value": 0.5, "interval": None})
     found = studied(folder, study[1], labelled=folder, need="map50>=40")
     values = {point.text["halo"]: point.figures["mAP50"] for point in found.points if "INT8" in point.name}
     assert values["exact"].value == 50
@@ -212,9 +209,9 @@ def test_a_detector_is_shown_what_each_method_restored(folder: Path, tmp_path: P
     labels = {"images": images, "annotations": boxes, "categories": [{"id": 1, "name": "vehicle"}]}
     (tmp_path / "labels.json").write_text(json.dumps(labels))
     degraded = load_sensor("dior-medium")
-    benchmark = Benchmark([], degraded, reference_for(degraded), Instruments({}), "", 0)
-    looked = Labelled.open(tmp_path, None, None, benchmark)
-    figure = looked.figure(looked.measure(Method("as it is", lambda dn: dn, "")))
+    benchmark = Benchmark([], degraded, reference_for(degraded), None, 0)
+    looked, kept = Labelled.open(tmp_path, None, None, benchmark), Measurements(tmp_path / "measurements.json")
+    figure = looked.figure(Point(Variant("as it is")), Method("as it is", lambda dn: dn, ""), kept)
     assert figure.unit == "%"
     assert 0 <= (figure.value or 0.0) <= 100
     assert figure.interval is None
