@@ -14,20 +14,24 @@ Behind the bank of its sensor (`model.bank`) the same body is one network for ev
 
 What a sensor changes are the filters that make u and w and the unit g, known in closed form, and the bias of the
 head, which is linear in the sensor vector.
+
+A larger network can begin where a smaller one stands (`grow`): wider, deeper or coarser, with the same outputs.
 """
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, pad, pixel_shuffle, pixel_unshuffle
 
-from beers_deploy.model.bank import FILTERS, LARGEST, SIDE_PX, Bank, bank_of_vector
+from beers_deploy.model.bank import FILTERS, LARGEST, SIDE_PX, Bank, bank_of_vector, in_places
 from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.tensors import Weights, read_weights, write_weights
 from beers_deploy.model.variants import BANK_PLANES, SENSOR_VALUES, Variant
+from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Instrument
 
 
@@ -158,6 +162,73 @@ def initialise(network: Network, generator: torch.Generator) -> None:
                 module.weight.normal_(0.0, scale * (2 / fan_in) ** 0.5, generator=generator)
                 if module.bias is not None:
                     module.bias.zero_()
+
+
+N = TypeVar("N", bound=Network)
+
+
+def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
+    """A network of `variant` with the outputs of `network`, up to rounding; the same size is copied.
+
+    Features are copied, and their weights shared out among the copies (Net2Net, Chen et al. 2016). Added blocks lie
+    evenly between the others; their second convolution is zero, so that each hands on what it is given until it has
+    learnt something. At a larger scale each feature becomes one for each pixel of a place (see `_coarser`).
+    """
+    sources = _sources(network.variant, variant)
+    large = type(network)(variant)
+    initialise(large, generator)
+    weights, small, factor = large.state_dict(), network.state_dict(), variant.scale // network.variant.scale
+    for name, source in sources.items():
+        weight, bias = weights[f"{name}.weight"], weights[f"{name}.bias"]
+        if source is not None:
+            weight.copy_(_widened(_coarser(small[f"{source}.weight"], factor), weight.shape, generator))
+            bias.copy_(_repeated(small[f"{source}.bias"], bias.shape, factor))
+        elif name.endswith("second"):
+            weight.zero_()
+    if isinstance(large, BankedConvBEERS):  # its head's bias is told the sensor
+        large.bias.weight.data.copy_(_repeated(small["bias.weight"], large.bias.weight.shape, factor))
+    return large
+
+
+def _sources(small: Variant, large: Variant) -> dict[str, str | None]:
+    """The convolution of the small network that each of the large one's is made from; None for an added one."""
+    factor = large.scale // small.scale
+    fits = small.scale in (1, large.scale) and large.features % (small.features * factor**2) == 0
+    if large.blocks < small.blocks or not fits:
+        expected = f"at most {large.blocks} blocks, of features that divide {large.features} at scale {large.scale}"
+        got = f"{small.blocks} blocks of {small.features} features at scale {small.scale}"
+        raise ModelError("weights to start from", expected=expected, got=got, remedy="start from a smaller network")
+    places = [old * large.blocks // small.blocks for old in range(small.blocks)]
+    kept = {f"body.{place}.": f"body.{old}." for old, place in enumerate(places)}
+    found: dict[str, str | None] = {}
+    for name in large.convolutions:
+        stem, _, last = name.rpartition(".")
+        prefix = kept.get(f"{stem}.")
+        found[name] = name if not stem else prefix and prefix + last
+    return found
+
+
+def _repeated(rows: Tensor, shape: Sequence[int], factor: int) -> Tensor:
+    """A row for each feature, (F, ...), to those of the large network."""
+    coarse = rows.repeat_interleave(factor**2, 0)
+    return coarse.repeat(shape[0] // len(coarse), *[1] * (rows.ndim - 1))
+
+
+def _coarser(weight: Tensor, factor: int) -> Tensor:
+    """(O, I, 3, 3) to (O S^2, I S^2, 3, 3): the same convolution where S x S places are the channels of one."""
+    outputs, inputs, places = *weight.shape[:2], factor**2
+    coarse = torch.from_numpy(in_places(weight.flatten(0, 1).double().numpy(), factor)).to(weight)
+    apart = coarse.view(outputs, inputs, places, places, 3, 3).transpose(1, 2)
+    return apart.reshape(outputs * places, inputs * places, 3, 3)
+
+
+def _widened(weight: Tensor, channels: Sequence[int], generator: torch.Generator) -> Tensor:
+    """(O, I, kh, kw) to as many `channels`: copies along both, divided among the copies of an input."""
+    copies_out, copies_in = channels[0] // weight.shape[0], channels[1] // weight.shape[1]
+    shares = torch.rand(channels[0], copies_in, weight.shape[1], 1, 1, generator=generator) + 0.5
+    shares = shares / shares.sum(1, keepdim=True)
+    spread = weight.repeat(copies_out, 1, 1, 1).unsqueeze(1) * shares
+    return spread.reshape(channels[0], channels[1], *weight.shape[2:])
 
 
 def vector_tensor(sensor: Instrument) -> Tensor:

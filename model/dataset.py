@@ -38,6 +38,7 @@ from beers_deploy.profiles.toml import parse_json, read_json
 DRAWN_SIDE_PX = 3000
 Line = dict[str, object]
 """Of the manifest: one patch."""
+SensorLike = Sensor | str | os.PathLike[str]
 
 
 @dataclass(frozen=True)
@@ -249,9 +250,6 @@ def _read_summary(path: Path) -> dict[str, float]:
     except (ArithmeticError, LookupError, OSError, TypeError, ValueError) as error:
         got, remedy = " ".join(str(error).split())[:120], "choose another folder"
         raise OptionError(str(path), expected="a dataset's manifest", got=got, remedy=remedy) from error
-
-
-SensorLike = Sensor | str | os.PathLike[str]
 
 
 @dataclass(frozen=True)

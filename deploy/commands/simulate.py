@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 EXAMPLE = "simulate aerial.png --sensor pleiades-degraded --out pairs"
 
-
 MIN_RATIO = 2
 """Below it the blur's kernel has negative lobes of its own (0.7 % of its peak at 7 %)."""
 

@@ -19,8 +19,6 @@ MARGIN_PX = 32
 """Target pixels cropped on each side: the FFT wraps around, and the PSF's tail is long (10.8 DN at 32)."""
 LEAST_SIDE_PX = 48
 """Target pixels a side that evaluation and validation want of an image, without its margins."""
-
-
 NOISE = ("noise", "digitising")
 """What an acquisition leaves out to be free of noise: that of the light and the detector, and that of rounding."""
 
@@ -100,12 +98,11 @@ def simulate_pair(
     """
     radiance = crop_divisible(radiance, oversampling)
     spectrum = scene_spectrum(radiance)
-    return Pair(
-        *(
-            acquire(spectrum, radiance.shape[-1], sensor, oversampling, draw, role, margin_px=margin_px)
-            for sensor, role in ((degraded, "degraded"), (reference, "reference"))
-        )
+    pair = (
+        acquire(spectrum, radiance.shape[-1], sensor, oversampling, draw, role, margin_px=margin_px)
+        for sensor, role in ((degraded, "degraded"), (reference, "reference"))
     )
+    return Pair(*pair)
 
 
 def acquire(

@@ -37,7 +37,8 @@ class Chain:
         reference: the sensor to imitate; of its noise nothing is imitated.
         quality: "fast", "standard" or "best" (see `nl_bayes.QUALITIES`).
         order: see above.
-        epsilon: regularisation of the MTF compensation; None lets the noise of `degraded` decide.
+        epsilon: regularisation of the MTF compensation; None lets the noise of
+            `degraded` at the brighter stated radiance decide.
     """
 
     degraded: Instrument
@@ -46,17 +47,12 @@ class Chain:
     order: Order = "denoise-first"
     epsilon: float | None = None
 
-    @property
-    def regularisation(self) -> float:
-        """The epsilon of the MTF compensation: as given, or by the noise at the brighter stated radiance."""
-        if self.epsilon is not None:
-            return self.epsilon
-        bright = self.degraded.radiance_1
-        return EPSILON_PER_PERCENT * self.degraded.noise_sigma(bright) * (100 / bright)
-
     def kernel(self) -> Tensor:
         """The filter of the MTF compensation, (2 R + 1, 2 R + 1) float64."""
-        return compensation_kernel(self.degraded.blur, self.reference.blur, self.regularisation)
+        epsilon, bright = self.epsilon, self.degraded.radiance_1
+        if epsilon is None:
+            epsilon = EPSILON_PER_PERCENT * self.degraded.noise_sigma(bright) * (100 / bright)
+        return compensation_kernel(self.degraded.blur, self.reference.blur, epsilon)
 
 
 def restore_traditional(dn: Tensor, chain: Chain) -> Tensor:
@@ -77,24 +73,17 @@ def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Itera
         ImageError: infinite values; the stabiliser would make NaN of them, which means missing.
     """
     radiance = (to_radiance(strip, chain.degraded) for strip in finite_or_missing(strips))
-    run = _denoise_first if chain.order == "denoise-first" else _deconvolve_first
-    for strip in run(radiance, height, chain, quality_named(chain.quality)):
+    sensor, kernel, quality = with_rounding_noise(chain.degraded), chain.kernel(), quality_named(chain.quality)
+    if chain.order == "denoise-first":
+        clean = denoise_radiance(radiance, height, sensor, Noise(WORKING_SIGMA), quality)
+        restored = filter_strips(clean, height, kernel)
+    else:
+        coloured = coloured_by(kernel, 1.0)
+        amplified = replace(sensor, alpha=sensor.alpha * coloured.sigma**2, beta=sensor.beta * coloured.sigma**2)
+        sharp = filter_strips(radiance, height, kernel)
+        restored = denoise_radiance(sharp, height, amplified, replace(coloured, sigma=WORKING_SIGMA), quality)
+    for strip in restored:
         yield to_dn(strip, chain.reference)
-
-
-def _denoise_first(radiance: Iterable[Tensor], height: int, chain: Chain, quality: Quality) -> Iterator[Tensor]:
-    sensor, white = with_rounding_noise(chain.degraded), Noise(WORKING_SIGMA)
-    clean = denoise_radiance(radiance, height, sensor, white, quality)
-    return filter_strips(clean, height, chain.kernel())
-
-
-def _deconvolve_first(radiance: Iterable[Tensor], height: int, chain: Chain, quality: Quality) -> Iterator[Tensor]:
-    kernel = chain.kernel()
-    coloured = coloured_by(kernel, 1.0)
-    sensor = with_rounding_noise(chain.degraded)
-    amplified = replace(sensor, alpha=sensor.alpha * coloured.sigma**2, beta=sensor.beta * coloured.sigma**2)
-    sharp = filter_strips(radiance, height, kernel)
-    return denoise_radiance(sharp, height, amplified, replace(coloured, sigma=WORKING_SIGMA), quality)
 
 
 def denoise_radiance(

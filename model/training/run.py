@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, load_network
+from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, grow, load_network
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.images import list_images
 from beers_deploy.model.io.pictures import busiest_windows, grid, stretch_of, strip_row
@@ -23,7 +23,6 @@ from beers_deploy.model.progress import steps
 from beers_deploy.model.simulator.procedural import draw_scenes
 from beers_deploy.model.simulator.sampling import Scene, read_scene
 from beers_deploy.model.training.checkpoint import TrainingRecipe, finish, require_finite_output
-from beers_deploy.model.training.grow import grow
 from beers_deploy.model.training.losses import RestorationLoss
 from beers_deploy.model.training.patches import PatchRecipe, PatchSource, StoredPairs, pair_files
 from beers_deploy.model.training.trainer import Batches, Precision, Schedule, Trainer, Worker

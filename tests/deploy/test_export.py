@@ -9,10 +9,9 @@ from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.export import banked_to_onnx, parity, require_parity, to_onnx
-from beers_deploy.model.convbeers import ConvBEERS, arrays, load_network, save_network, vector_tensor
+from beers_deploy.model.convbeers import ConvBEERS, arrays, grow, load_network, save_network, vector_tensor
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.shipped import shipped_weights
-from beers_deploy.model.training.grow import grow
 from beers_deploy.model.variants import VARIANTS, Variant
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError

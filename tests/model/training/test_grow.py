@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS
-from beers_deploy.model.training.grow import grow
+from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, grow
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
 from tests.model.networks import plain
