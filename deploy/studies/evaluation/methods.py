@@ -35,13 +35,12 @@ TRADITIONAL: Final = "traditional"
 DECONVOLVE_FIRST: Final = "deconvolve-first"
 
 ORDERS: dict[str, Order] = {TRADITIONAL: "denoise-first", DECONVOLVE_FIRST: "deconvolve-first"}
-STANDARD = "standard"
 CHAINS: dict[str, tuple[str, Order]] = {
     **{f"{name}-{quality}": (quality, order) for name, order in ORDERS.items() for quality in QUALITIES},
-    **{name: (STANDARD, order) for name, order in ORDERS.items()},
+    **{name: ("standard", order) for name, order in (ORDERS | dict.fromkeys(PEERS, ORDERS[TRADITIONAL])).items()},
 }
-"""Quality and order of each traditional chain, by name."""
-WITHOUT_NETWORK = (DEGRADED, *CHAINS, *PEERS)
+"""Quality and order of each traditional chain, by name, and of its peers."""
+WITHOUT_NETWORK = (DEGRADED, *CHAINS)
 """The input itself, and the traditional chains and their peers."""
 
 KNOWN, BLIND = "known", "blind"
@@ -75,8 +74,7 @@ def method_without_network(name: str, degraded: Instrument, reference: Instrumen
     """The input itself, or a traditional chain or a peer of it, which know both sensors: one of WITHOUT_NETWORK."""
     if name == DEGRADED:
         return Method(name, lambda dn: dn, "the input itself")
-    quality, order = CHAINS.get(name, (STANDARD, "denoise-first"))
-    run = PEERS.get(name, restore_traditional)
+    (quality, order), run = CHAINS[name], PEERS.get(name, restore_traditional)
 
     def specialise(sensor: Instrument) -> Restore:
         chain = Chain(sensor, reference.in_units_of(sensor), quality, order)

@@ -136,10 +136,6 @@ class Guards:
     limit_dn: float
     checksums: Mapping[str, int]
 
-    def clamp(self, name: str, tensor: np.ndarray) -> np.ndarray:
-        """A tensor (N, C, H, W) as the clamped network writes it: int8 units, at most its ReLU6's bound."""
-        return np.minimum(tensor, self.relu6[name]) if name in self.relu6 else tensor
-
     def limit(self, correction: np.ndarray) -> np.ndarray:
         """A correction, any shape, in shares of full scale, clipped to the bound on both sides."""
         bound = np.float32(self.limit_dn / MAX_DN)
@@ -178,7 +174,12 @@ def voted(copies: tuple[Shifts, Shifts, Shifts]) -> Shifts:
 
 def guarded(faults: Faults, guards: Guards) -> Faults:
     """The same faults in a clamped network: a result is bounded before memory can spoil it."""
-    return Faults(faults.shifts, lambda name, tensor: faults.touch(name, guards.clamp(name, tensor)))
+
+    def touch(name: str, tensor: np.ndarray) -> np.ndarray:
+        clamped = np.minimum(tensor, guards.relu6[name]) if name in guards.relu6 else tensor
+        return faults.touch(name, clamped)
+
+    return Faults(faults.shifts, touch)
 
 
 @dataclass(frozen=True)

@@ -218,17 +218,16 @@ def _fractions(image: np.ndarray) -> np.ndarray:
 
 def tiling(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
     """Both networks, tiled by several plans, against the whole image (H, W); plans refuse unsound pixels."""
-    networks = [("float32", subject.float32), ("INT8", subject.int8)]
-    return [m for name, network in networks if network for m in _plans(network, name, case, image)]
-
-
-def _plans(network: Network, name: str, case: Case, image: np.ndarray) -> list[checks.Measure]:
-    cores = (LARGE_CORE_PX,) if case.large else CORES_PX
-    tiles = [2 * network.tiling.halo_px + core for core in cores]
-    if case.pixels in ("infinite", "beyond"):
-        return [checks.refused(partial(network.restore, image, tile_px=tile)) for tile in tiles]
-    whole = network.restore(image)
-    return [checks.differing(f"{name} plans differ", network.restore(image, tile_px=tile), whole) for tile in tiles]
+    measures = []
+    for name, network in [("float32", subject.float32), *([("INT8", subject.int8)] if subject.int8 else [])]:
+        plans = [2 * network.tiling.halo_px + core for core in ((LARGE_CORE_PX,) if case.large else CORES_PX)]
+        ways = [partial(network.restore, image, tile_px=tile_px) for tile_px in plans]
+        if case.pixels in ("infinite", "beyond"):
+            measures += [checks.refused(way) for way in ways]
+        else:
+            whole = network.restore(image)
+            measures += [checks.differing(f"{name} plans differ", way(), whole) for way in ways]
+    return measures
 
 
 Stage = Callable[[Subject, Case, np.ndarray], list[checks.Measure]]

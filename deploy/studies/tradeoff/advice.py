@@ -136,19 +136,15 @@ def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
     value, source = a.value(cost) / b.value(cost), f"{cost} over that of {b.name}"
     if cost.startswith("host"):
         return measured(value, "x", f"{source}, medians of interleaved runs")
-    return predicted(value, "x", _ratio_interval(a, b, cost, value), source)
-
-
-def _ratio_interval(a: Measured, b: Measured, cost: str, value: float) -> tuple[float, float]:
-    first, second = a.point, b.point
-    if first and second and first.dpu and second.dpu:
-        if replace(first, halo_px=second.halo_px) == second:
-            return value, value
-        width = first.dpu.target.tables["cost"].get("pair_width")
-        if cost == "board latency" and width is not None:
-            return value * math.exp(-width.low), value * math.exp(width.low)
     (a_low, a_high), (b_low, b_high) = (ends(each.figures[cost]) for each in (a, b))
-    return a_low / b_high, a_high / b_low
+    interval, first, second = (a_low / b_high, a_high / b_low), a.point, b.point
+    if first and second and first.dpu and second.dpu:
+        width = first.dpu.target.tables["cost"].get("pair_width")
+        if replace(first, halo_px=second.halo_px) == second:
+            interval = value, value
+        elif cost == "board latency" and width is not None:
+            interval = value * math.exp(-width.low), value * math.exp(width.low)
+    return predicted(value, "x", interval, source)
 
 
 def ends(figure: Figure) -> tuple[float, float]:

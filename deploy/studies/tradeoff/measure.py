@@ -262,8 +262,7 @@ def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float
     calls = [partial(restore, tile) for restore in restores]
     for call in calls:
         call()
-    rounds = interleaved(calls, lambda call: timed(call)[1], lambda found: len(found[0]) >= ROUNDS)
-    return [list(times) for times in rounds]
+    return interleaved(calls, lambda call: timed(call)[1], lambda found: len(found[0]) >= ROUNDS)
 
 
 def host_figures(times_s: Sequence[float], pixels: int) -> dict[str, Figure]:

@@ -265,19 +265,14 @@ def board_figures(point: Point, whole: Swath, slower: float | None = None) -> di
         latency, power = dpu_latency(point.variant, point.dpu, swath), dpu_power(point.dpu)
     elif point.board is not None and slower is not None:
         row = tables.processor_row(whole, point.board)
-        latency, power = _slower(row.figures["latency"], slower), row.figures["power"]
+        latency, power = row.figures["latency"], row.figures["power"]
+        if latency.value is not None and latency.interval is not None:
+            low_s, high_s = (end * slower for end in latency.interval)
+            source = f"{latency.source}; times of the chains here: {slower:.2f} of {CHAIN}"
+            latency = predicted(latency.value * slower, "s", (low_s, high_s), source)
     else:
         latency = unavailable("s", point.reason or "no time of this method on the board's processor is stated")
     if latency.value is None:
         return {key: unavailable(unit, latency.reason) for key, unit in UNITS.items()}
     work = tables.energy(latency, power), tables.efficiency(whole.pixels, latency, power)
     return dict(zip(UNITS, (latency, tables.chain_rate(whole, latency), power, *work), strict=True))
-
-
-def _slower(latency: Figure, times: float) -> Figure:
-    """Of another chain than CHAIN, by the ratio measured here."""
-    if latency.value is None or latency.interval is None:
-        return latency
-    low_s, high_s = (end * times for end in latency.interval)
-    source = f"{latency.source}; times of the chains here: {times:.2f} of {CHAIN}"
-    return predicted(latency.value * times, "s", (low_s, high_s), source)
