@@ -14,7 +14,7 @@ from google.protobuf.message import DecodeError
 from onnx import numpy_helper
 
 from beers_deploy.model.io.files import whole_file
-from beers_deploy.profiles.errors import BeersError, ModelError
+from beers_deploy.profiles.errors import BeersError, ModelError, OptionError
 from beers_deploy.profiles.toml import read_whole, unreadable
 from beers_deploy.quant.reading.external import take_in
 from beers_deploy.quant.reading.folding import IR_VERSION, OPSET, simplest
@@ -99,6 +99,14 @@ def _require_one_image(model: onnx.ModelProto, where: str) -> None:
         if len(sizes) == 4 and sizes[0].dim_value > 1:
             got, remedy = f"{value.name} of {sizes[0].dim_value}", "export it for any number of images, or for one"
             raise ModelError(where, expected="an input of one image, or of any number", got=got, remedy=remedy)
+
+
+def require_onnx_name(*paths: Path | None) -> None:
+    """Refuse an output under whose name no program would look for a network."""
+    for path in paths:
+        if path is not None and path.suffix.lower() != ".onnx":
+            remedy = "name it so"
+            raise OptionError(str(path), expected="a name that ends in .onnx", got=path.name, remedy=remedy)
 
 
 def save_onnx(model: onnx.ModelProto, path: Path) -> None:

@@ -55,10 +55,11 @@ def export(
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.io.tensors import is_conditioned, read_plain
     from beers_deploy.network import warn_outside, weights_file, weights_named
-    from beers_deploy.quant.onnx_file import save_onnx
+    from beers_deploy.quant.onnx_file import require_onnx_name, save_onnx
 
     path = weights_file(network) if network.suffix or network.exists() else weights_named(network)
     require_writable(out, board_file, delta, inputs=(path, apply, Path(sensor) if sensor else None))
+    require_onnx_name(out, board_file)
     if path.suffix != ".onnx":
         remedy = "give one that 'quantize' made of weights of 'train --conditioned', or leave it out"
         asked = ["board_file", "delta", "apply"]

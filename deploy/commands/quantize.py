@@ -75,6 +75,7 @@ def quantize(
     from beers_deploy.network import conditioned
     from beers_deploy.profiles.figures import by_table
     from beers_deploy.quant.encodings import read_core
+    from beers_deploy.quant.onnx_file import require_onnx_name
     from beers_deploy.quantise import quantize as quantised
     from beers_deploy.quantise import sensitivity_report
     from beers_deploy.report.page import write_report
@@ -92,6 +93,7 @@ def quantize(
     page, figures = (report / "report.html", report / "report.json") if report else (None, None)
     read = (model, images, samples, *map(Path, (target, sensor)))
     require_writable(out, board_file, json, page, figures, inputs=read)
+    require_onnx_name(out, board_file)
     known = Sensor.load(sensor)
     drawn: dict[str, Any] = {"sensor": known, "images": images, "patches": patches, "seed": seed}
     made = quantised(model, samples, board=target, regime=regime.value, patch_px=patch, finetune=finetune, **drawn)

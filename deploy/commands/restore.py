@@ -83,11 +83,12 @@ def restore(
     With --method traditional the image is stabilised, denoised and sharpened as its --sensor asks, in strips of rows:
     one band, about a minute a megapixel on two cores, not resumable.
     JPEG 2000, NITF and HFA files, VRT mosaics and DIMAP indexes need the extra 'gdal'.
-    Georeference, RPCs and missing pixels (NaN, or the nodata value) are kept. Until OUT is finished its rows lie in
-    .OUT.part beside it. With --scheduler this process reads and writes, and sends tiles to the workers: where they
-    are of one processor and the same versions, the bytes are those of a run without.
+    Georeference, RPCs, missing pixels (NaN, the nodata value, or a mask) and alpha are kept. Until OUT is finished
+    its rows lie in .OUT.part beside it. With --scheduler this process reads and writes, and sends tiles to the
+    workers: where they are of one processor and the same versions, the bytes are those of a run without.
     """
     from beers_deploy.model.io.files import require_writable
+    from beers_deploy.model.io.images import require_image_file
     from beers_deploy.model.shipped import INT8
     from beers_deploy.network import conditioned, network_file
     from beers_deploy.restoration.bands import parse_sensors
@@ -95,6 +96,7 @@ def restore(
     from beers_deploy.restoration.stac import require_stac, write_item
     from beers_deploy.results import Table, print_rows
 
+    require_image_file(image)
     budget_bytes = max(int(memory * 1e9), 1) if memory else None
     sensors = parse_sensors(sensor or BLIND)
     profiles = (Path(each) for each in sensors.values()) if sensor else ()

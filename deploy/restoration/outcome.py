@@ -113,6 +113,8 @@ class Tally:
     def doubts(self) -> list[str]:
         """What a user should look at, a clause each."""
         found = []
+        if self.clipped > MANY_AT_ENDS * max(self.compared, 1):
+            found.append(f"{self.clipped} pixels of the image, nearly all, are above full scale")
         if self.share_at_ends > SOME_AT_ENDS:
             found.append(f"{self.share_at_ends:.0%} of the results are 0 or full scale where the image is not")
         if abs(self.moved) > MEAN_KEPT * self.means[0] + DARK:
@@ -127,7 +129,8 @@ class Tally:
         Raises:
             ImageError: most results at an end of full scale, a mean far from the image's, or a constant result.
         """
-        if self.known >= FEW and (self.share_at_ends > MANY_AT_ENDS or abs(self.moved) > FAR or self.flat):
+        impossible = self.share_at_ends > MANY_AT_ENDS or abs(self.moved) > FAR or self.flat
+        if self.known >= FEW and (impossible or self.clipped > MANY_AT_ENDS * max(self.compared, 1)):
             expected, got = "a network that restores this image", "; ".join(self.doubts)
             remedy = (
                 "check its scale with 'gate' and the image's `full_scale`, or write it all the same: `any_result`"

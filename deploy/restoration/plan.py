@@ -164,7 +164,7 @@ class Plan:
 
 def plan_for(network: onnx.ModelProto, shape: tuple[int, int, int], options: Options) -> Plan:
     """How an image of `shape` (bands, H, W) is cut for a network, as a user's options ask."""
-    tiling = tiling_of(network)
+    tiling = tiling_of(network, str(options.model))
     if tiling.fixed_px is not None:
         require_fixed_tile(tiling.fixed_px, options.tile_px, shape[1:])
     return make_plan(shape, options.tile_px, parse_halo(options.halo, tiling.halo_px), tiling)

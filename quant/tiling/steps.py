@@ -212,4 +212,9 @@ STEPS: dict[str, Callable[[Along], Step]] = {
 
 def refused(expected: str, got: str) -> ModelError:
     """What is raised of a network that cannot be tiled."""
-    return ModelError("tiled model", expected=expected, got=got, remedy="run it on the whole image instead")
+    return ModelError(
+        "tiled model",
+        expected=expected,
+        got=got,
+        remedy="give a network of near pixels alone, one image in and one out",
+    )

@@ -25,6 +25,7 @@ from fractions import Fraction
 import numpy as np
 import onnx
 
+from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph.trials import MOVES, with_shuffles
 from beers_deploy.quant.onnx_file import constants, fixed_tile_px
 from beers_deploy.quant.tiling.steps import STEPS, Along, Step, refused
@@ -66,13 +67,20 @@ class Tiling:
         )
 
 
-def tiling_of(model: onnx.ModelProto) -> Tiling:
-    """How an image may be tiled for a network, float or INT8.
+def tiling_of(model: onnx.ModelProto, where: str = "tiled model") -> Tiling:
+    """How an image may be tiled for a network, float or INT8, `where` in messages.
 
     Raises:
         ModelError: a network that cannot be tiled; the sentence names the node.
     """
-    with contradictions("tiled model"):
+    try:
+        return _tiling_of(model, where)
+    except ModelError as error:
+        raise ModelError(where, expected=error.expected, got=error.got, remedy=error.remedy) from error
+
+
+def _tiling_of(model: onnx.ModelProto, where: str) -> Tiling:
+    with contradictions(where):
         plain, held = with_shuffles(model), constants(model)
         rows, columns = (_Walk(plain, held, side) for side in (0, 1))
         (channels_in, channels_out), fixed_px = _channels(model), fixed_tile_px(model)
