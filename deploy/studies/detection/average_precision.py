@@ -102,21 +102,17 @@ def match(truth: Boxes, found: Boxes) -> tuple[np.ndarray, np.ndarray, np.ndarra
         if overlaps[one].max(initial=0) < OVERLAPS[0]:
             continue
         free = (overlaps[one] >= OVERLAPS[:, None]) & ~(taken & ~truth.ignored)
-        wanted = np.where((free & ~passed).any(axis=-1, keepdims=True), free & ~passed, free)
-        best = len(truth) - 1 - np.where(wanted, overlaps[one], -1.0)[..., ::-1].argmax(axis=-1)[..., None]
-        any_free = free.any(axis=-1)
-        passed_over = np.take_along_axis(passed, best, axis=-1)[..., 0]
-        hits[..., one] = any_free & ~passed_over
-        ignored[..., one] = np.where(any_free, passed_over, ignored[..., one])
-        np.put_along_axis(taken, best, np.take_along_axis(taken, best, axis=-1) | any_free[..., None], axis=-1)
+        at = np.nonzero(free.any(axis=-1))
+        best = np.where(free, overlaps[one] + ~passed, 0.0).argmax(axis=-1)[at]  # what counts goes first
+        hits[*at, one], ignored[*at, one] = ~passed[*at, best], passed[*at, best]
+        taken[*at, best] = True
     return hits, ignored, taken
 
 
 def site_weights(sites: Sequence[str], seed: int, draws: int = DRAWS) -> np.ndarray:
     """How often each image counts, (1 + draws, I): once, then as often as each draw with replacement has its site."""
     names, site = np.unique(np.array(sites), return_inverse=True)
-    shares = np.full(len(names), 1 / len(names))
-    counts = np.random.default_rng(seed).multinomial(len(names), shares, size=draws)
+    counts = np.random.default_rng(seed).multinomial(len(names), np.full(len(names), 1 / len(names)), size=draws)
     return np.vstack([np.ones(len(sites), np.int64), counts[:, site]])
 
 
@@ -204,21 +200,16 @@ def precisions(hits: Hits, kind: int, weights: np.ndarray, size: int = ALL, leve
     Returns:
         NaN where the class has no object.
     """
-    mine = np.flatnonzero(hits.classes == kind)
-    images, totals = hits.images[mine], weights @ hits.objects[size, kind]
+    totals = weights @ hits.objects[size, kind]
     found = np.full((len(weights), levels, len(RECALLS)), np.nan)
-    places = []
     for level in range(levels):
-        hit, passed = (np.flatnonzero(flags[size, level, mine]) for flags in (hits.hits, hits.ignored))
-        places.append((hit, passed, np.searchsorted(passed, hit)))
-    for draw in np.flatnonzero(totals):
-        each = weights[draw, images]
-        so_far = np.cumsum(each)
-        for level, (hit, passed, passed_before) in enumerate(places):
+        counted = np.flatnonzero((hits.classes == kind) & ~hits.ignored[size, level])
+        images, hit = hits.images[counted], np.flatnonzero(hits.hits[size, level, counted])
+        for draw in np.flatnonzero(totals):
             # Precision peaks at hits alone, so a draw has to look at nothing else.
-            true = np.cumsum(each[hit])
-            counted = so_far[hit] - np.concatenate([[0], np.cumsum(each[passed])])[passed_before]
-            precision = np.divide(true, counted, out=np.zeros(len(true)), where=counted > 0)
+            each = weights[draw, images]
+            true, so_far = np.cumsum(each[hit]), np.cumsum(each)[hit]
+            precision = np.divide(true, so_far, out=np.zeros(len(true)), where=so_far > 0)
             best = np.append(np.maximum.accumulate(precision[::-1])[::-1], 0.0)  # beyond the last hit there is none
             found[draw, level] = best[np.searchsorted(true / totals[draw], RECALLS)]
     return found

@@ -8,11 +8,13 @@ network that needs no suppression. Both take RGB in 0 to 1 on a grey letterbox, 
 import ast
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
+from onnxruntime import InferenceSession
 
 from beers_deploy.model.processor import require_cores
 from beers_deploy.profiles.errors import ModelError, OptionError
@@ -89,21 +91,15 @@ def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> D
         raise _refused("the names of its classes in its metadata, {0: 'ship', ...}", stated, path)
     _require_layout(model, about.get("task", "detect"), len(names), path)
     size = _size_px(fixed_tile_px(model), about.get("imgsz"), size_px, path)
-    return Detector(names, size, _flag(model), _runner(model, threads, path))
+    return Detector(names, size, _flag(model), partial(_answer, open_session(model, threads), path))
 
 
-def _runner(model: onnx.ModelProto, threads: int, path: Path) -> Callable[[np.ndarray], np.ndarray]:
-    session = open_session(model, threads)
-    name = session.get_inputs()[0].name
-
-    def run(image: np.ndarray) -> np.ndarray:
-        try:
-            return np.asarray(session.run(None, {name: image})[0])
-        except Exception as error:  # onnxruntime raises a class of its own for each status code
-            got, remedy = " ".join(str(error).split())[:160], "export it again, for one size of image"
-            raise ModelError(str(path), expected="a detector that runs", got=got, remedy=remedy) from error
-
-    return run
+def _answer(session: InferenceSession, path: Path, image: np.ndarray) -> np.ndarray:
+    try:
+        return np.asarray(session.run(None, {session.get_inputs()[0].name: image})[0])
+    except Exception as error:  # onnxruntime raises a class of its own for each status code
+        got, remedy = " ".join(str(error).split())[:160], "export it again, for one size of image"
+        raise ModelError(str(path), expected="a detector that runs", got=got, remedy=remedy) from error
 
 
 def _literal(text: str) -> Any:

@@ -126,13 +126,15 @@ def _read_each(images: Sequence[Path], where: Path, named_in: Sequence[Path]) ->
 
 
 def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> LabelledSet:
-    spelled = {letters(name): name for one in reversed(files) for name, *_ in reversed(one.boxes)}
-    number = {key: i for i, key in enumerate(sorted(spelled))}
+    names = sorted(sorted({name for one in files for name, *_ in one.boxes}), key=letters)
+    number = {name: i for i, name in enumerate(names)}
     images, lost = [], list[str]()
     for one in sorted(files, key=lambda one: one.image.name):
-        classes = [number[letters(name)] for name, *_ in one.boxes]
-        corners, ignored = [box[1] for box in one.boxes], [box[2] for box in one.boxes]
-        whole = Boxes.of(corners, classes, ignored=ignored)
+        whole = Boxes.of(
+            [corners for _, corners, _ in one.boxes],
+            [number[name] for name, *_ in one.boxes],
+            ignored=[ignored for *_, ignored in one.boxes],
+        )
         inside = whole[areas(whole.corners) > 0].clipped(*_size_px(one))
         lost += [one.source.name] * (len(whole) - len(inside))
         images.append((one.image, inside))
@@ -140,7 +142,7 @@ def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> Labelled
         got = f"none on {len(images)} images"
         raise OptionError("labels", expected="one object at least", got=got, remedy="check the labels")
     told = [*notes, *_remarks([truth for _, truth in images], lost)]
-    return LabelledSet(images, [spelled[key] for key in number], told)
+    return LabelledSet(images, names, told)
 
 
 def _size_px(one: _File) -> tuple[int, int]:

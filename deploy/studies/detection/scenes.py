@@ -33,8 +33,6 @@ PAINTS = [18.0, 60.0, 110.0, 190.0, 280.0]
 
 Part = tuple[list[Point], float]
 """A polygon in metres and its radiance; of several the first is the lowest."""
-Place = Callable[[float, float], Point]
-"""From metres around the middle of an object or a plot to metres on the canvas."""
 
 
 def synthetic_scene(generator: np.random.Generator, height_px: int, width_px: int) -> tuple[np.ndarray, Boxes]:
@@ -69,48 +67,31 @@ class Canvas:
         self.generator = generator
         self.corners: list[tuple[int, int, int, int]] = []
         self.classes: list[int] = []
-        self._size = width_px, height_px
-        self._image, self._taken = Image.new("F", self._size, drawing.GRASS), Image.new("L", self._size, 0)
+        self.size = width_px, height_px
+        self._image, self._taken = Image.new("F", self.size, drawing.GRASS), Image.new("L", self.size, 0)
         self.draw = ImageDraw.Draw(self._image)
 
     def textured(self) -> np.ndarray:
         """The radiance (H, W) float32 with the ground's texture."""
-        width, height = self._size
+        width, height = self.size
         return np.asarray(np.asarray(self._image) * drawing.texture(height, width, self.generator), np.float32)
-
-    def pixel(self, x: float, y: float) -> Point:
-        """Metres to pixels."""
-        return x / SCENE_GSD_M + self._size[0] / 2, y / SCENE_GSD_M + self._size[1] / 2
 
     def is_free(self, left: float, top: float, right: float, bottom: float) -> bool:
         """Whether no object stands in a rectangle, in pixels."""
         whole = math.floor(left), math.floor(top), math.floor(right), math.floor(bottom)
         return self._taken.crop(whole).getbbox() is None
 
-    def put(self, kind: int, parts: list[Part], place: Place, height_m: float) -> bool:
-        """Put an object where it lies whole within the scene and clear of others; says whether it found room.
-
-        Args:
-            kind: its class.
-            parts: polygons around (0, 0), the lowest first.
-            place: from there to metres on the canvas.
-            height_m: of the object, as far as its shadow is shifted right and down.
-        """
-        polygons = [([self.pixel(*place(*point)) for point in polygon], paint) for polygon, paint in parts]
-        points, shadow_px = np.array([point for polygon, _ in polygons for point in polygon]), height_m / SCENE_GSD_M
-        low, high = points.min(0) - GAP_PX, points.max(0) + GAP_PX + shadow_px
-        if low.min() < 0 or (high >= self._size).any() or not self.is_free(*low, *high):
-            return False
+    def put(self, kind: int, polygons: list[Part], shadow_px: float) -> None:
+        """Draw an object of polygons in pixels, over the shadow that it throws right and down."""
         for polygon, _ in polygons:
             self.draw.polygon([drawing.shift(point, shadow_px) for point in polygon], fill=drawing.SHADOW)
-        own = Image.new("L", self._size, 0)
+        own = Image.new("L", self.size, 0)
         for polygon, paint in polygons:
             self.draw.polygon(polygon, fill=paint)
             ImageDraw.Draw(own).polygon(polygon, fill=255)
         self._taken.paste(255, mask=own)
         self.classes.append(kind)
         self.corners.append(own.getbbox() or (0, 0, 0, 0))  # of the pixels that Pillow fills, not of the polygons
-        return True
 
 
 @dataclass(frozen=True)
@@ -118,7 +99,7 @@ class Plot:
     """A square of ground: `place` takes metres around its centre to metres on the canvas."""
 
     canvas: Canvas
-    place: Place
+    place: Callable[[float, float], Point]
     half_m: float
 
     @property
@@ -148,12 +129,18 @@ class Plot:
             drawing.tree(self.canvas.draw, *middle, radius, self.random)
 
     def put(self, kind: int, parts: list[Part], x: float, y: float, turned: float, height_m: float) -> bool:
-        """Put an object at (x, y), turned against the plot; one that does not fit into the plot is left out."""
-        own = drawing.turn(x, y, turned)
-        points = np.array([own(*point) for polygon, _ in parts for point in polygon])
-        if np.abs(points).max() > self.half_m:
+        """Put an object at (x, y), turned, if it lies whole within plot and scene and clear of others."""
+        own, shadow_px = drawing.turn(x, y, turned), height_m / SCENE_GSD_M
+        outlines = [[own(*point) for point in polygon] for polygon, _ in parts]
+        polygons = [[self._pixel(*point) for point in outline] for outline in outlines]
+        points = np.concatenate(polygons)
+        low, high = points.min(0) - GAP_PX, points.max(0) + GAP_PX + shadow_px
+        if np.abs(np.concatenate(outlines)).max() > self.half_m or low.min() < 0 or (high >= self.canvas.size).any():
             return False
-        return self.canvas.put(kind, parts, lambda u, v: self.place(*own(u, v)), height_m)
+        if not self.canvas.is_free(*low, *high):
+            return False
+        self.canvas.put(kind, [(each, paint) for each, (_, paint) in zip(polygons, parts, strict=True)], shadow_px)
+        return True
 
     def scatter(self, count: int, put: Callable[[float, float], bool]) -> None:
         """Put several objects somewhere on the plot, each where it finds room."""
@@ -161,7 +148,8 @@ class Plot:
             any(put(*self.random.uniform(-self.half_m, self.half_m, 2)) for _ in range(TRIES))
 
     def _pixel(self, x: float, y: float) -> Point:
-        return self.canvas.pixel(*self.place(x, y))
+        (right, down), (width, height) = self.place(x, y), self.canvas.size
+        return right / SCENE_GSD_M + width / 2, down / SCENE_GSD_M + height / 2
 
 
 def vehicle(generator: np.random.Generator) -> list[Part]:

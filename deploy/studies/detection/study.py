@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from beers_deploy.model.io.images import site_of
-from beers_deploy.model.io.pictures import Stretch, stretch_of
+from beers_deploy.model.io.pictures import stretch_of
 from beers_deploy.model.progress import Log, no_log, once, steps
 from beers_deploy.model.simulator.acquire import acquire_padded
 from beers_deploy.model.simulator.detector import Draw
@@ -69,13 +69,7 @@ class SensorPair:
 
 @dataclass(frozen=True)
 class AcquiredScene:
-    """A scene in front of two sensors; nothing is acquired before it is asked for.
-
-    Attributes:
-        scene: what they see.
-        sensors: that acquire it.
-        draw: of the noise, and of the sensors within their profiles.
-    """
+    """A scene in front of two sensors, under one draw of them and of the noise; acquired once it is asked for."""
 
     scene: LabelledScene
     sensors: SensorPair
@@ -91,14 +85,13 @@ class AcquiredScene:
         """Digital numbers (h, w) of the degraded one."""
         return self._acquired(self.sensors.degraded, DEGRADED)
 
-    @cached_property
-    def display(self) -> Stretch:
-        """How every row's image of this scene is shown."""
-        return stretch_of(self.reference)
-
     def shown(self, method: Method | None) -> np.ndarray:
-        """What a detector is given, (h, w, 3) float32 in 0 to 1: restored by a method; the reference for None."""
-        return self.display.to_srgb(self.reference if method is None else method.restore(self.degraded))
+        """What a detector is given, (h, w, 3) float32 in 0 to 1: restored by a method; the reference for None.
+
+        Every row's image of a scene is shown alike, stretched as the reference asks.
+        """
+        dn = self.reference if method is None else method.restore(self.degraded)
+        return stretch_of(self.reference).to_srgb(dn)
 
     def boxes(self, detector: Detector, method: Method | None) -> Boxes:
         """What a detector finds on it, in scene pixels; arguments as of `shown`."""
@@ -245,11 +238,11 @@ def labelled_scenes(
     return scenes, [*labelled.notes, *left_out(labelled.names, numbers)]
 
 
+def _of_file(path: Path, truth: Boxes) -> LabelledScene:
+    return LabelledScene(path.name, site_of(path.name), truth, path, lambda sensor: read_scene(path, sensor).radiance)
+
+
 def left_out(labelled: Sequence[str], numbers: np.ndarray) -> list[str]:
     """A sentence on the labelled classes that the detector does not know, where there are such."""
     names = ", ".join(name for name, number in zip(labelled, numbers, strict=True) if number < 0)
     return [f"Not known to the detector and left out: {names}. What it finds there counts as false."] if names else []
-
-
-def _of_file(path: Path, truth: Boxes) -> LabelledScene:
-    return LabelledScene(path.name, site_of(path.name), truth, path, lambda sensor: read_scene(path, sensor).radiance)

@@ -15,6 +15,7 @@ from beers_deploy.studies.detection.scenes import (
     SCENE_GSD_M,
     Canvas,
     Part,
+    Plot,
     aircraft,
     ship,
     synthetic_scene,
@@ -32,13 +33,17 @@ def scenes() -> list[Scene]:
     return [synthetic_scene(np.random.default_rng(seed), 600, 701) for seed in range(12)]
 
 
+def whole(canvas: Canvas) -> Plot:
+    """Ground without a border of its own."""
+    return Plot(canvas, turn(0, 0, 0), math.inf)
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.sampled_from(range(4)), st.floats(0, math.tau), st.integers(0, 2**32))
 def test_a_box_is_the_pixels_that_the_object_changed(kind: int, angle: float, seed: int) -> None:
     canvas = Canvas(400, 420, np.random.default_rng(seed))
     before = np.array(canvas._image)
-    placed = canvas.put(kind, SHAPES[kind](canvas.generator), turn(1.3, -2.1, angle), 0.0)
-    assert placed
+    assert whole(canvas).put(kind, SHAPES[kind](canvas.generator), 1.3, -2.1, angle, 0.0)
     rows, columns = np.nonzero(np.array(canvas._image) != before)
     assert canvas.corners == [(columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)]
 
@@ -46,9 +51,10 @@ def test_a_box_is_the_pixels_that_the_object_changed(kind: int, angle: float, se
 def test_nothing_is_put_over_the_border_or_on_another_object() -> None:
     canvas = Canvas(400, 400, np.random.default_rng(0))
     parts = tank(9.0, canvas.generator)
-    assert canvas.put(3, parts, turn(0, 0, 0), 3.0)
-    assert not canvas.put(3, parts, turn(18.2, 0, 0), 3.0)
-    assert not canvas.put(3, parts, turn(45, 0, 0), 3.0)
+    assert whole(canvas).put(3, parts, 0, 0, 0, 3.0)
+    assert not whole(canvas).put(3, parts, 18.2, 0, 0, 3.0)
+    assert not whole(canvas).put(3, parts, 45, 0, 0, 3.0)
+    assert not Plot(canvas, turn(25, 0, 0), 8.0).put(3, parts, 0, 0, 0, 3.0)
     assert len(canvas.corners) == len(canvas.classes) == 1
 
 

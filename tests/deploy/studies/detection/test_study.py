@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from beers_deploy.model.io.pictures import stretch_of
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.constant import Constant
@@ -65,8 +66,9 @@ def test_boxes_come_back_to_where_the_object_lies(ratio: int, corners: tuple[int
 def test_all_rows_are_shown_under_the_stretch_of_the_reference() -> None:
     seen = AcquiredScene(scene((60, 60, 110, 100)), sensors("dior-high"), Draw(0))
     assert seen.degraded.shape == seen.reference.shape == (50, 70)
-    np.testing.assert_array_equal(seen.shown(None), seen.display.to_srgb(seen.reference))
-    assert seen.display.black == pytest.approx(np.percentile(seen.reference, 0.5))
+    shown = stretch_of(seen.reference)
+    for dn, method in ((seen.reference, None), (seen.degraded, Method("degraded", lambda dn: dn, "known"))):
+        np.testing.assert_array_equal(seen.shown(method), shown.to_srgb(dn))
 
 
 def handmade(sites: int = 12, **found: int) -> Comparison:
