@@ -23,7 +23,7 @@ from beers_deploy.profiles.toml import read_json
 EXAMPLE = 'write [{"model": "core.onnx", "configuration": "C32B3", "tile_px": 640, "fps": 9.5}]'
 RUNS, TILE_PX, FPS = 1000, (16, 1 << 16), (1e-9, 1e9)
 """Most runs; least and most of a tile's side and of a rate."""
-POWER_W, FAR = (0.01, 1000.0), 100
+POWER_W, FAR = (0.01, 1000.0), 10_000
 """Of a board; and how many times off a rate may be predicted that is one of this network on this board."""
 KEYS = {"model", "configuration", "tile_px", "fps", "power_w"}
 
