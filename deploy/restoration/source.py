@@ -255,14 +255,14 @@ class VeiledSource:
         pixels = self._source.read(start, stop)
         hidden = (pixels[-1] if self._mask is None else self._mask.read(start, stop)[0]) == 0
         pixels = pixels[: self.raster.bands]
-        return np.asanyarray(np.ma.array(pixels, mask=np.broadcast_to(hidden, pixels.shape)))
+        return np.ma.MaskedArray(pixels, mask=np.broadcast_to(hidden, pixels.shape))
 
     def held_bytes(self, rows_px: int) -> int:
         """As the image's own, and the mask's."""
         return self._source.held_bytes(rows_px) + (self._mask.held_bytes(rows_px) if self._mask else 0)
 
     def _rows_of_veil(self, start: int, stop: int) -> np.ndarray:
-        return self._source.read(start, stop)[-1] if self._mask is None else self._mask.read(start, stop)[0]
+        return np.asarray(self._source.read(start, stop)[-1] if self._mask is None else self._mask.read(start, stop)[0])
 
 
 def fingerprint(files: Iterable[Path]) -> tuple[int, str]:
