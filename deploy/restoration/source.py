@@ -253,7 +253,7 @@ class VeiledSource:
     def read(self, start: int, stop: int) -> np.ndarray:
         """Rows `start` to `stop` (excluded) of every band, masked where the veil is 0."""
         pixels = self._source.read(start, stop)
-        hidden = (pixels[-1] if self._mask is None else self._mask.read(start, stop)[0]) == 0
+        hidden = (pixels[-1] if self._mask is None else self._rows_of_veil(start, stop)) == 0
         pixels = pixels[: self.raster.bands]
         return np.ma.MaskedArray(pixels, mask=np.broadcast_to(hidden, pixels.shape))
 
@@ -262,7 +262,8 @@ class VeiledSource:
         return self._source.held_bytes(rows_px) + (self._mask.held_bytes(rows_px) if self._mask else 0)
 
     def _rows_of_veil(self, start: int, stop: int) -> np.ndarray:
-        return np.asarray(self._source.read(start, stop)[-1] if self._mask is None else self._mask.read(start, stop)[0])
+        rows = self._source.read(start, stop)[-1:] if self._mask is None else self._mask.read(start, stop)
+        return np.asarray(rows[0])
 
 
 def fingerprint(files: Iterable[Path]) -> tuple[int, str]:
