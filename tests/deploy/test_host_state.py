@@ -67,12 +67,6 @@ def test_macos_counts_bytes_and_the_others_kibibytes(
     assert gigabytes(peak_memory()) == pytest.approx(2e6 * unit_bytes / 1e9)
 
 
-def test_windows_counts_a_peak_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "platform", "win32")
-    monkeypatch.setattr(psutil.Process, "memory_info", lambda _: SimpleNamespace(rss=1, peak_wset=700 * MEGABYTE))
-    assert gigabytes(peak_memory()) == pytest.approx(0.7)
-
-
 def test_where_nothing_counts_it_there_is_a_reason_and_no_zero(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("beers_deploy.host_state.STATUS", NOWHERE)
     monkeypatch.setattr(sys, "platform", "unheard-of")

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from beers_deploy.bench.tables import MOST_TILE_PX, parse_tiles
 from beers_deploy.cli import COMMANDS
 from beers_deploy.model.processor import require_cores
 from beers_deploy.profiles.errors import OptionError
@@ -48,10 +47,3 @@ def test_a_huge_number_is_refused_at_once(command: str, option: str) -> None:
     said = refused(command, option, HUGE)
     assert "less than or equal to" in said
     assert option in said
-
-
-def test_tiles_of_a_sweep_have_an_end() -> None:
-    assert parse_tiles(f"16, {MOST_TILE_PX}") == [16, MOST_TILE_PX]
-    for text in (str(MOST_TILE_PX + 1), "9" * 5000, "15"):
-        with pytest.raises(OptionError, match="tile"):
-            parse_tiles(text)

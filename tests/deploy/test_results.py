@@ -6,7 +6,6 @@ from typing import Any
 import jsonschema
 import pytest
 
-from beers_deploy.differences import read_document
 from beers_deploy.profiles.figures import Check, Figure, Row, measured, number, predicted, published, unavailable
 from beers_deploy.quant.gate import GateResult, Limits, gate_row, judge
 from beers_deploy.results import SCHEMA_PATH, Table
@@ -160,15 +159,3 @@ def test_a_host_of_version_2_says_which_kernels_it_took() -> None:
     del sound["host"]["kernels"]
     with pytest.raises(jsonschema.ValidationError, match="'kernels' is a required"):
         jsonschema.validate(sound, SCHEMA)
-
-
-def test_documents_of_version_1_are_still_read(tmp_path: Path) -> None:
-    """They held no verdict, no checks and nothing of the host's kernels."""
-    for path in (Path(__file__).parents[2] / ".ci" / "baselines").iterdir():
-        document = json.loads(path.read_text(encoding="utf-8"))
-        assert document["schema_version"] == 2
-        first = {key: value for key, value in document.items() if key not in ("verdict", "checks")}
-        host = {key: value for key, value in document["host"].items() if key != "kernels"}
-        old = tmp_path / path.name
-        old.write_text(json.dumps(first | {"schema_version": 1, "host": host}), encoding="utf-8")
-        assert read_document(old)["rows"] == document["rows"]

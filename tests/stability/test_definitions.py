@@ -75,13 +75,6 @@ def test_both_files_hold_every_bias_at_its_scale(seed: int, shape: tuple[int, in
     np.testing.assert_array_equal(open_session(board_model(core, {})).run(None, feed)[0], whole)
 
 
-def test_a_bias_one_scale_off_would_show(quantised: Quantised) -> None:
-    core = biased(quantised.core, np.random.default_rng(0))
-    planes = split(np.full((1, 1, 9, 9), 0.5, np.float32))
-    ops = [replace(op, bias_frac_bits=op.bias_frac_bits - 1) if isinstance(op, IntConv) else op for op in core.ops]
-    assert (correction(core, planes) != correction(replace(core, ops=tuple(ops)), planes)).any()
-
-
 MTFS = st.floats(0.001, 0.63)
 
 

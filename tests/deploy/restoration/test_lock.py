@@ -7,7 +7,6 @@ import threading
 import time
 from pathlib import Path
 
-import psutil
 import pytest
 import tifffile
 
@@ -64,30 +63,6 @@ def test_a_killed_run_stands_in_nobody_s_way(image: Path, tmp_path: Path) -> Non
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.tif", "out.tif"]
 
 
-def test_a_killed_process_loses_its_lock_and_a_stopped_one_does_not(tmp_path: Path) -> None:
-    out, folder = tmp_path / "out", tmp_path / ".out.part"
-    hold = f"""
-import time
-from pathlib import Path
-from beers_deploy.restoration.output import only_run
-with only_run(Path({str(out)!r}), Path({str(folder)!r})):
-    print("held", flush=True)
-    time.sleep(600)
-"""
-    with subprocess.Popen([sys.executable, "-c", hold], stdout=subprocess.PIPE, text=True) as holder:
-        try:
-            assert holder.stdout is not None
-            assert holder.stdout.readline() == "held\n"
-            psutil.Process(holder.pid).suspend()
-            with pytest.raises(MachineError, match="no other run"), only_run(out, folder):
-                pass
-        finally:
-            holder.kill()
-    with only_run(out, folder):
-        assert (folder / output.NAME).is_file()
-    assert not folder.exists()
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="flock is what POSIX systems lock by")
 @pytest.mark.parametrize("number", output.NO_LOCKS)
 def test_a_disk_without_locks_locks_nothing_and_is_left_clean(
@@ -124,13 +99,6 @@ def test_rows_outlive_the_lock(tmp_path: Path) -> None:
     with only_run(tmp_path / "out", folder):
         (folder / "rows.raw").unlink()
     assert not folder.exists()
-
-
-def test_it_is_given_back_after_an_error(tmp_path: Path) -> None:
-    for _ in range(2):
-        with pytest.raises(ZeroDivisionError), only_run(tmp_path / "out", tmp_path / ".out.part"):
-            raise ZeroDivisionError
-    assert not list(tmp_path.iterdir())
 
 
 def test_new_folders_above_go_with_it_unless_something_was_written_there(tmp_path: Path) -> None:
@@ -190,12 +158,3 @@ def test_many_that_try_are_never_two_at_once(tmp_path: Path) -> None:
     assert most[0] == 1
     assert refused[0] < 400
     assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
-    (tmp_path / ".out.part").touch()
-    with (
-        pytest.raises(MachineError, match="a folder to write to"),
-        only_run(tmp_path / "out", tmp_path / ".out.part"),
-    ):
-        pass

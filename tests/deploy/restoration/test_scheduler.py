@@ -10,7 +10,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import onnx
 import pytest
 import tifffile
@@ -18,10 +17,10 @@ import tifffile
 from beers_deploy import cluster
 from beers_deploy.cluster import open_cluster
 from beers_deploy.network import shipped_pair
-from beers_deploy.profiles.errors import ImageError, MachineError
+from beers_deploy.profiles.errors import MachineError
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.tiling.walk import tiling_of
-from beers_deploy.restoration.options import Options, Runtime
+from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
 from tests.deploy.restoration.runs import noise, stopped_after
 from tests.deploy.two_workers import local_cluster
@@ -94,14 +93,6 @@ def test_and_with_a_network_for_each_band(
     assert (tifffile.imread(tmp_path / "one.tif")[0] != tifffile.imread(tmp_path / "one.tif")[1]).any()
 
 
-def test_and_with_missing_pixels_and_some_above_full_scale(model: Path, scheduler: str, tmp_path: Path) -> None:
-    pixels = noise(90, 70)
-    pixels[20:50, 10:30] = 7
-    tifffile.imwrite(tmp_path / "in.tif", pixels, extratags=[(42113, "s", 0, "7", True)])
-    one, two = both(tmp_path, Options(model, tile_px=23, full_scale=3000), scheduler)
-    assert two == one
-
-
 @pytest.mark.parametrize("make", [float_unet, espcn, four_bands])
 def test_and_with_users_networks(make: Callable[[], onnx.ModelProto], scheduler: str, tmp_path: Path) -> None:
     """With strides, a larger result, and several bands."""
@@ -113,13 +104,6 @@ def test_and_with_users_networks(make: Callable[[], onnx.ModelProto], scheduler:
     assert two == one
 
 
-def test_and_on_openvino(model: Path, scheduler: str, tmp_path: Path) -> None:
-    pytest.importorskip("openvino")
-    tifffile.imwrite(tmp_path / "in.tif", noise(61, 83))
-    one, two = both(tmp_path, Options(model, tile_px=30, runtime=Runtime.openvino), scheduler)
-    assert two == one
-
-
 def test_a_run_begun_here_is_finished_by_workers(image: Path, model: Path, scheduler: str, tmp_path: Path) -> None:
     options, out = Options(model, TILE_PX), tmp_path / "out.tif"
     restore_file(image, tmp_path / "expected.tif", options, silent)
@@ -127,15 +111,6 @@ def test_a_run_begun_here_is_finished_by_workers(image: Path, model: Path, sched
         restore_file(image, out, options, silent)
     restore_file(image, out, replace(options, resume=True, scheduler=scheduler), silent)
     assert out.read_bytes() == (tmp_path / "expected.tif").read_bytes()
-
-
-def test_what_is_refused_without_workers_is_refused_with_them(
-    image: Path, model: Path, scheduler: str, tmp_path: Path
-) -> None:
-    tifffile.imwrite(image, np.zeros((90, 70), np.float32) * np.nan)
-    with pytest.raises(ImageError, match="NaN"):
-        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX, scheduler=scheduler), silent)
-    assert [p.name for p in tmp_path.iterdir()] == ["in.tif"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signal")
