@@ -81,24 +81,19 @@ def parse_onnx(content: bytes, where: str, to_run: bool = True, path: Path | Non
     except (DecodeError, onnx.checker.ValidationError, ValueError) as error:
         got = " ".join(str(error).split())[:120] or "other bytes"
         raise ModelError(where, expected="an ONNX file", got=got, remedy=REMEDY) from error
-    _require_one_image(model, where)
+    _require_known_opset(model, where)
     if to_run:
         check_runnable(model, where)
     return model
 
 
-def _require_one_image(model: onnx.ModelProto, where: str) -> None:
-    """That the operators are of a version that is known here, and that images come one at a time."""
+def _require_known_opset(model: onnx.ModelProto, where: str) -> None:
+    """That the operators are of a version that is known here."""
     known = onnx.defs.onnx_opset_version()
     opset = max((each.version for each in model.opset_import if not each.domain), default=OPSET)
     if opset > known:
         remedy = "export it for an older one"
         raise ModelError(where, expected=f"an ONNX opset of at most {known}", got=f"{opset}", remedy=remedy)
-    for value in model.graph.input:
-        sizes = value.type.tensor_type.shape.dim
-        if len(sizes) == 4 and sizes[0].dim_value > 1:
-            got, remedy = f"{value.name} of {sizes[0].dim_value}", "export it for any number of images, or for one"
-            raise ModelError(where, expected="an input of one image, or of any number", got=got, remedy=remedy)
 
 
 def require_onnx_name(*paths: Path | None) -> None:

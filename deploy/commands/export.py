@@ -59,11 +59,11 @@ def export(
 
     path = weights_file(network) if network.suffix or network.exists() else weights_named(network)
     require_writable(out, board_file, delta, inputs=(path, apply, Path(sensor) if sensor else None))
-    require_onnx_name(out, board_file)
     if path.suffix != ".onnx":
         remedy = "give one that 'quantize' made of weights of 'train --conditioned', or leave it out"
         asked = ["board_file", "delta", "apply"]
         refuse(context, asked, expected="an INT8 --network", got=str(network), remedy=remedy)
+    require_onnx_name(out, board_file)
     if path.suffix == ".onnx":
         _export_int8(path, out, sensor, tile, board_file, delta, apply)
         return

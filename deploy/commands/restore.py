@@ -96,7 +96,6 @@ def restore(
     from beers_deploy.restoration.stac import require_stac, write_item
     from beers_deploy.results import Table, print_rows
 
-    require_image_file(image)
     budget_bytes = max(int(memory * 1e9), 1) if memory else None
     sensors = parse_sensors(sensor or BLIND)
     profiles = (Path(each) for each in sensors.values()) if sensor else ()
@@ -114,6 +113,7 @@ def restore(
         expected, remedy = "a shipped network, or weights of 'train --conditioned'", "leave --sensor out"
         raise OptionError("--sensor", expected=expected, got=f"{network}, made for one already", remedy=remedy)
     known = {band: load_sensor(each) for band, each in sensors.items()}
+    require_image_file(image)
     if found := conditioned(network):
         told = f"told {sensor}" if sensor else "told no sensor (blind): --sensor tells it yours, and restores better"
         name = network.name if network else f"{found.name}{INT8}"

@@ -225,6 +225,9 @@ def _input_shape(info: onnx.ValueInfoProto, tile_px: int | None, places: tuple[i
     if len(sizes) != 4 or sizes[1] < 1:
         got, remedy = f"{info.name} {sizes}", "export the network as such"
         raise ModelError(where, expected="inputs (N, C, H, W)", got=got, remedy=remedy)
+    if sizes[0] > 1:
+        remedy = "export it for any number of images, or for one"
+        raise ModelError(where, expected="an input of one image", got=f"{info.name} of {sizes[0]}", remedy=remedy)
     if tile_px is None:
         if not all(sizes[2:]):
             raise ModelError(where, expected="an input of a stated size", got="any size", remedy="give `tile`")

@@ -113,7 +113,11 @@ class Checkpoint:
         try:
             yield
         except OSError as error:
-            kept = f"go on with `resume` from row {self.rows} of {self.shape[1]}" if self.rows else "run it again: no row is left to `resume` from"
+            kept = (
+                f"go on with `resume` from row {self.rows} of {self.shape[1]}"
+                if self.rows
+                else "run it again: no row is left to `resume` from"
+            )
             remedy = f"correct that, and {kept}"
             got = error.strerror or str(error)
             raise MachineError(str(self.out), expected="a disk to write to", got=got, remedy=remedy) from error

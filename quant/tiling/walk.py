@@ -101,6 +101,9 @@ def _channels(model: onnx.ModelProto) -> tuple[int, int]:
     images = [value for value in model.graph.input if value.name not in held]
     if len(images) != 1 or len(model.graph.output) != 1:
         raise refused("one image in and one out", f"{len(images)} in and {len(model.graph.output)} out")
+    batch = next((dim.dim_value for dim in images[0].type.tensor_type.shape.dim), 0)
+    if batch > 1:
+        raise refused("any number of images, or one at a time", f"batches of {batch}")
     channels_in, channels_out = _channel_count(images[0]), _channel_count(model.graph.output[0])
     if not channels_in:
         raise refused("an image (N, C, H, W) of a stated number of channels", "none stated")

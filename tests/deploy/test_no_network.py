@@ -67,7 +67,7 @@ def test_the_chain_opens_no_socket(tmp_path: Path, no_sockets: list[tuple[object
     done("quantize", flt, "--out", int8, "--images", scenes, "--patches", 2, "--patch", 32)
     done("gate", flt, int8, "--images", scenes, "--patches", 2, "--json", figures)
     done("check", int8, "--tile", 64)
-    done("bench", int8, "--size", "300x200", "--tile", 64)
+    done("bench", int8, "--size", "300x200", "--tile", 64, "--no-traditional")
     done("restore", tmp_path / "raw.tif", tmp_path / "out.tif", "--network", int8)
     done("diff", figures, figures)
     done("evaluate", "--images", scenes, "--methods", f"degraded,{int8}")

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from unittest.mock import patch
 
@@ -12,10 +13,11 @@ from onnx import TensorProto, helper, numpy_helper
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.reading import read_network
+from beers_deploy.dpu.reading import network_of, read_network
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import any_size, load_onnx, parse_onnx
 from beers_deploy.quant.session import open_session, run
+from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.quant.untrusted import FILE_BYTES
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 from tests.quant.reading.networks import node
@@ -172,24 +174,19 @@ def test_what_a_runtime_would_do_for_an_untrusted_file_is_refused(
         assert words in refusal(model)
 
 
-def test_unknown_opsets_and_batches_of_images_are_refused_by_whoever_reads_them(
+def test_unknown_opsets_are_refused_and_batches_where_images_come_singly(
     model: onnx.ModelProto, tmp_path: Path
 ) -> None:
-    for words, change in (("opset", _of_opset_99), ("one image", _of_four)):
-        spoilt = deepcopy(model)
-        change(spoilt)
-        onnx.save(spoilt, tmp_path / "spoilt.onnx")
-        for to_run in (True, False):
-            with pytest.raises(ModelError, match=words):
-                load_onnx(tmp_path / "spoilt.onnx", to_run)
-
-
-def _of_opset_99(model: onnx.ModelProto) -> None:
-    model.opset_import[0].version = 99
-
-
-def _of_four(model: onnx.ModelProto) -> None:
-    model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 4
+    old, four = deepcopy(model), deepcopy(model)
+    old.opset_import[0].version = 99
+    onnx.save(old, tmp_path / "opset.onnx")
+    for to_run in (True, False):
+        with pytest.raises(ModelError, match="opset"):
+            load_onnx(tmp_path / "opset.onnx", to_run)
+    four.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 4
+    for read in (tiling_of, partial(network_of, tile_px=64)):
+        with pytest.raises(ModelError, match=r"4"):
+            read(four)
 
 
 def test_functions_and_sparse_weights_are_refused(model: onnx.ModelProto) -> None:
