@@ -52,9 +52,9 @@ def in_order(given: Mapping[str, Path], raster: Raster) -> list[Path]:
     return [given[name] for name in names]
 
 
-def require_alike(networks: Sequence[onnx.ModelProto]) -> None:
+def require_alike(networks: Sequence[onnx.ModelProto], paths: Sequence[Path]) -> None:
     """That networks of several bands are met alike by an image: one plan of tiles serves them all."""
-    tilings = [tiling_of(network) for network in networks]
+    tilings = [tiling_of(network, str(path)) for network, path in zip(networks, paths, strict=True)]
     if len(networks) > 1 and (len(set(map(repr, tilings))) > 1 or tilings[0].channels_in != 1):
         remedy = "give one network for all bands"
         got = "networks of several bands, or of different halos"

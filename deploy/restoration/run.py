@@ -78,7 +78,7 @@ def _restore(image: Path, out: Path, options: Options, log: Log, beside: Sequenc
         require_raw(str(image), raster.restored, options.again)
         paths = in_order(options.bands, raster) if options.bands else [options.model]
         networks = [load_onnx(path) for path in paths]
-        require_alike(networks)
+        require_alike(networks, paths)
         plan = plan_for(networks[0], raster.shape, options)
         log(plan.sentence)
         check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
