@@ -57,8 +57,14 @@ def info_row(image: Path, options: Options, target: TargetProfile, measure: bool
         f"time on {target.name}": time_on_board(options.model, plan, target),
     }
     text = {"pixels": str(raster.dtype), **scale_words(image.name, raster, options), **place_words(raster)}
-    nodata = "none" if raster.nodata is None else f"{raster.nodata:g}"
-    return Row("info", image.name, figures, {**text, "nodata": nodata, "halo": plan.halo_words})
+    return Row("info", image.name, figures, {**text, "nodata": missing_words(raster), "halo": plan.halo_words})
+
+
+def missing_words(raster: Raster) -> str:
+    """Which pixels are missing: those of the nodata value, and those that a mask or alpha hides."""
+    hidden = [f"where its {'alpha' if raster.has_alpha else 'mask'} is 0"] if raster.veil else []
+    valued = [] if raster.nodata is None else [f"{raster.nodata:g}"]
+    return ", ".join([*valued, *hidden]) or "none"
 
 
 def scale_words(name: str, raster: Raster, options: Options) -> Mapping[str, str]:

@@ -119,7 +119,7 @@ def raster_of(path: str, pages: Sequence[tifffile.TiffPage]) -> Raster:
     tags = tuple(tag for tag in carried_tags(page) if tag[0] != NODATA_TAG or nodata is not None)
     # A container of whole bytes says nothing of the sensor; packed bits were counted by somebody.
     bits = page.bitspersample if dtype.kind == "u" and page.bitspersample < 8 * dtype.itemsize else None
-    about = bits, _alpha(path, page), page.photometric == RGB, is_restored(page.software, tags)
+    about = bits, _alpha(path, pages), page.photometric == RGB, is_restored(page.software, tags)
     return Raster(bands, height_px, width_px, dtype, nodata, tags, *about)
 
 
@@ -135,10 +135,10 @@ def require_raw(name: str, restored: bool, again: bool) -> None:
         raise ImageError(name, expected="a raw image", got="one that 'restore' has written", remedy=remedy)
 
 
-def _alpha(path: str, page: tifffile.TiffPage) -> Veil:
-    """The kind of alpha that the last sample of a page is, if any."""
-    alphas = [ALPHAS.get(int(code), "") for code in page.extrasamples]
-    if any(alphas[:-1]):
+def _alpha(path: str, pages: Sequence[tifffile.TiffPage]) -> Veil:
+    """The kind of alpha that the last sample of an image is, if any."""
+    alphas = [ALPHAS.get(int(code), "") for page in pages for code in page.extrasamples]
+    if any(alphas[:-1]) or (any(alphas) and len(pages) > 1):
         raise ImageError(path, expected="alpha as the last band", got="one before others", remedy="move it there")
     return alphas[-1] if alphas else ""
 

@@ -108,6 +108,11 @@ def two_pages(path: Path, pixels: np.ndarray) -> None:
         file.write(pixels)
 
 
+def alpha_in_each_page(path: Path, pixels: np.ndarray) -> None:
+    two = np.stack([np.stack([pixels, pixels], axis=2)] * 2)
+    tifffile.imwrite(path, two, photometric="minisblack", planarconfig="contig", extrasamples=["unassalpha"])
+
+
 def two_sizes(path: Path, pixels: np.ndarray) -> None:
     with tifffile.TiffWriter(path) as file:
         file.write(pixels, metadata=None)
@@ -127,6 +132,7 @@ def palette(path: Path, pixels: np.ndarray) -> None:
 REFUSED: dict[str, tuple[Callable[[Path, np.ndarray], object], str]] = {
     "two pages": (two_pages, "2 pages"),
     "two sizes": (two_sizes, "2 pages"),
+    "alpha in each page": (alpha_in_each_page, "alpha as the last band"),
     "white is zero": (lambda path, pixels: tifffile.imwrite(path, pixels, photometric="miniswhite"), "MINISWHITE"),
     "palette": (palette, "PALETTE"),
     "offset": (with_offset, "offset of -1000"),
