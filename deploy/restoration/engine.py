@@ -108,14 +108,12 @@ class Restorer:
         self._require_shape(window, rows, columns)
         restored = window[:, self._within(rows), self._within(columns)]
         result = as_stored(self.raster, restored, self.full_scale)
-        missing = np.zeros(result.shape, bool) if unknown is None else unknown[1]
-        tally = self._tally(strip, strip.kept(bands, rows, columns), restored, ~missing)
-        return Tile(result if unknown is None else np.where(missing, unknown[0], result), tally)
+        known = None if unknown is None else ~unknown[1]
+        tally = self._tally(strip, strip.kept(bands, rows, columns), restored, known)
+        return Tile(result if unknown is None else np.where(unknown[1], unknown[0], result), tally)
 
-    def _tally(
-        self, strip: Strip, kept: tuple[slice, slice, slice], restored: np.ndarray, known: np.ndarray
-    ) -> Tally:
-        """What is seen of a tile's kept pixels, and of their results where `known`."""
+    def _tally(self, strip: Strip, kept: Window, restored: np.ndarray, known: np.ndarray | None) -> Tally:
+        """What is seen of a tile's kept pixels, and of their results where `known`; None for all."""
         seen = None if strip.missing is None else ~strip.missing[kept]
         stored = strip.pixels[kept].astype(np.float64) / self.full_scale
         return Tally.of(stored, restored.astype(np.float64) / self.full_scale, seen, known)

@@ -48,24 +48,28 @@ class Tally:
     after_squared: float = 0.0
 
     @classmethod
-    def of(cls, stored: np.ndarray, restored: np.ndarray, seen: np.ndarray | None, known: np.ndarray) -> "Tally":
+    def of(
+        cls, stored: np.ndarray, restored: np.ndarray, seen: np.ndarray | None, known: np.ndarray | None
+    ) -> "Tally":
         """Of a part of an image.
 
         Args:
             stored: its pixels (bands, h, w), in shares of full scale.
             restored: its results, of as many or other bands, of so many times as many rows and columns.
             seen: which pixels are known; None for all.
-            known: which results are.
+            known: which results are; None for all.
         """
         alike = len(stored) == len(restored)
         between, scale = (stored > 0) & (stored < 1), restored.shape[1] // stored.shape[1]
         within = between.repeat(scale, axis=1).repeat(scale, axis=2) if alike else True
-        at_ends = ((restored <= 0) | (restored >= 1)) & within & known
-        before = stored if seen is None else stored[seen]
-        counts = int(known.sum()), int((before > 1).sum()), int(at_ends.sum())
+        at_ends = ((restored <= 0) | (restored >= 1)) & within
+        before, after = stored, restored
+        if seen is not None and known is not None:
+            at_ends, before, after = at_ends & known, stored[seen], restored[known]
+        counts = after.size, int((before > 1).sum()), int(at_ends.sum())
         if not alike:
             return cls(*counts)
-        before, after = np.minimum(before, 1), restored[known]
+        before = np.minimum(before, 1)
         sums = before.sum(), (before**2).sum(), after.sum(), (after**2).sum()
         return cls(*counts, before.size, *map(float, sums))
 
