@@ -1,6 +1,7 @@
-"""What the tool makes of an image file, before anyone waits for it: no pixel of a TIFF is read.
+"""What the tool makes of an image file, before anyone waits for it.
 
-Time here is predicted only from tiles that were timed; time on the board is the cost model's.
+No pixel of a TIFF is read unless a sensor is told: then windows of the image are held against it. Time here is
+predicted only from tiles that were timed; time on the board is the cost model's.
 """
 
 import math
@@ -15,6 +16,7 @@ import onnx
 
 from beers_deploy.bench.tables import predict_file, swath_latency
 from beers_deploy.dpu.board import dpu_of
+from beers_deploy.model.progress import Log, no_log
 from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.profiles.target import TargetProfile
@@ -22,8 +24,9 @@ from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration.georeference import KEYS, PIXEL_SCALE, POLYNOMIALS, TIE_POINTS, TRANSFORMATION
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.plan import Plan, plan_for
-from beers_deploy.restoration.radiometry import full_scale_of
+from beers_deploy.restoration.radiometry import FullScale, full_scale_of
 from beers_deploy.restoration.runtime import open_runtime, tiles_at_once
+from beers_deploy.restoration.sensor_check import SensorCheck, told_sensor
 from beers_deploy.restoration.source import Raster, open_source
 
 HEADER = "the file's own header"
@@ -34,7 +37,7 @@ RUNS = 3
 UNPLACED = "none"
 
 
-def info_row(image: Path, options: Options, target: TargetProfile, measure: bool = False) -> Row:
+def info_row(image: Path, options: Options, target: TargetProfile, measure: bool = False, log: Log = no_log) -> Row:
     """The facts of an image and of its restoration.
 
     Args:
@@ -42,10 +45,15 @@ def info_row(image: Path, options: Options, target: TargetProfile, measure: bool
         options: as a restoration would be given them.
         target: the board whose time is predicted.
         measure: whether tiles are timed here.
+        log: is told where the image contradicts its sensor.
     """
     network = load_onnx(options.model)
     with open_source(image, options.trust_index) as source:
         raster = source.raster
+        scale = known_scale(image.name, raster, options)
+        check = SensorCheck()
+        if isinstance(scale, FullScale):
+            check = told_sensor(source, options.sensors, scale.value, str(image), options.strict, log)
     plan = plan_for(network, raster.shape, options)
     figures = {
         "width": measured(raster.width_px, "px", HEADER),
@@ -55,9 +63,12 @@ def info_row(image: Path, options: Options, target: TargetProfile, measure: bool
         "work factor": predicted(plan.work_factor, "1", (plan.work_factor, plan.work_factor), ARITHMETIC),
         "time here": time_here(network, plan, options) if measure else _not_measured(),
         f"time on {target.name}": time_on_board(options.model, plan, target),
+        **check.figures,
     }
-    text = {"pixels": str(raster.dtype), **scale_words(image.name, raster, options), **place_words(raster)}
-    return Row("info", image.name, figures, {**text, "nodata": missing_words(raster), "halo": plan.halo_words})
+    open_scale = {"full scale": "open", "full scale from": str(scale)}
+    text = {"pixels": str(raster.dtype), **(scale.text if isinstance(scale, FullScale) else open_scale)}
+    text |= {**place_words(raster), "nodata": missing_words(raster), "halo": plan.halo_words, **check.text}
+    return Row("info", image.name, figures, text)
 
 
 def missing_words(raster: Raster) -> str:
@@ -67,16 +78,14 @@ def missing_words(raster: Raster) -> str:
     return ", ".join([*valued, *hidden]) or "none"
 
 
-def scale_words(name: str, raster: Raster, options: Options) -> Mapping[str, str]:
-    """Full scale, and from where; what is open is said."""
+def known_scale(name: str, raster: Raster, options: Options) -> FullScale | str:
+    """Full scale as far as no pixel is read; else why it is open."""
     if raster.dtype.kind == "f" and options.full_scale is None:
-        why = "the pixels decide when they are read: digital numbers if one is above 2, else state the full scale"
-        return {"full scale": "open", "full scale from": why}
+        return "the pixels decide when they are read: digital numbers if one is above 2, else state the full scale"
     try:
-        scale = full_scale_of(name, raster, (), options.full_scale, options.sensor_bits)
+        return full_scale_of(name, raster, (), options.full_scale, options.sensor_bits)
     except ImageError as error:
-        return {"full scale": "open", "full scale from": f"{error.got}; state the pixel value that is full scale"}
-    return {"full scale": f"{scale.value:g}", "full scale from": scale.source}
+        return f"{error.got}; state the pixel value that is full scale"
 
 
 def place_words(raster: Raster) -> Mapping[str, str]:

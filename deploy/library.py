@@ -4,6 +4,7 @@ The pixels are those that the command `restore` writes of the same image.
 """
 
 import os
+import warnings
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
@@ -28,6 +29,7 @@ from beers_deploy.restoration.plan import Plan, Span, plan_for
 from beers_deploy.restoration.radiometry import full_scale_of
 from beers_deploy.restoration.run import restore_file, scale_of
 from beers_deploy.restoration.runtime import Packed, open_packed, open_runtime, pack, tiles_at_once
+from beers_deploy.restoration.sensor_check import told_sensor
 from beers_deploy.restoration.source import (
     ArraySource,
     Raster,
@@ -60,6 +62,7 @@ def restore(
     cog: bool = False,
     again: bool = False,
     any_result: bool = False,
+    strict: bool = False,
     progress: Progress = None,
 ) -> Any:
     """Restore an image of raw digital numbers: an array, or a file into another.
@@ -89,6 +92,7 @@ def restore(
         cog: write `out` as a Cloud-Optimised GeoTIFF.
         again: take an image that says it was restored already.
         any_result: give a result even if it is clipped, constant or far from the image's mean.
+        strict: refuse an image that contradicts its sensor, which else is a warning; Dask is not looked at.
         progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
 
     Returns:
@@ -106,7 +110,7 @@ def restore(
     """
     known = Sensor.load(sensor)
     options = _options(network, known, tile, halo, full_scale, runtime, threads)
-    job = Job(method, quality, known, nodata, replace(options, again=again, any_result=any_result))
+    job = Job(method, quality, known, nodata, replace(options, again=again, any_result=any_result, strict=strict))
     with reporting(progress):
         if isinstance(image, str | os.PathLike) or hasattr(image, "crs"):  # the latter of rasterio
             path = Path(image if isinstance(image, str | os.PathLike) else image.name)
@@ -151,8 +155,8 @@ def _options(
     threads: int,
 ) -> Options:
     found = Network.load(f"{VARIANT}{INT8}" if network is None else network, sensor=sensor)
-    bits = None if sensor.name == BLIND else int(sensor.bits.low)
-    return Options(found.file, tile_px, str(halo), full_scale, _runtime(runtime), threads, sensor_bits=bits)
+    told = {} if sensor.name == BLIND else {"": sensor}
+    return Options(found.file, tile_px, str(halo), full_scale, _runtime(runtime), threads, sensors=told)
 
 
 def _restore_path(image: Path, options: Options, job: Job, out: str | os.PathLike[str] | None) -> Run:
@@ -163,8 +167,10 @@ def _restore_path(image: Path, options: Options, job: Job, out: str | os.PathLik
     if job.method == TRADITIONAL:
         from beers_deploy.restoration.traditional import Request, restore_file_traditionally  # it takes torch
 
-        request = Request(job.sensor, job.sensor.reference, options.full_scale, again=options.again)
-        row = restore_file_traditionally(image, path, request)
+        request = Request(
+            job.sensor, job.sensor.reference, options.full_scale, again=options.again, strict=options.strict
+        )
+        row = restore_file_traditionally(image, path, request, no_log)
     else:
         row = restore_file(image, path, options, no_log)
     arguments = {"method": job.method, "sensor": job.sensor.name, "tile": options.tile_px, "halo": options.halo}
@@ -244,6 +250,7 @@ def _restore_traditionally(bands: np.ndarray, raster: Raster, job: Job) -> np.nd
     extents = (raster.extent(band) for band in bands)
     full_scale = full_scale_of(NAME, raster, extents, job.options.full_scale, bits).value
     to_dn, restored = np.float32(chain.degraded.max_dn / full_scale), []
+    told_sensor(ArraySource(bands, raster), job.options.sensors, full_scale, NAME, job.options.strict, warnings.warn)
     for band in bands:
         strip = checked_strip(raster, 0, band[None], full_scale, NAME)
         dn = np.ma.getdata(band).astype(np.float32) * to_dn
@@ -286,6 +293,7 @@ def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndar
     at_once = tiles_at_once(options.threads, plan.tiles)
     infer, _ = open_runtime(options.runtime, network, options.threads, at_once)
     full_scale = scale_of(source, plan, options, NAME).value
+    told_sensor(source, options.sensors, full_scale, NAME, options.strict, warnings.warn)
     restorer = Restorer(raster, infer, full_scale, plan.tiling, NAME)
     look = None if options.any_result else partial(Tally.require, name=NAME)
     return restore_array(source, plan, restorer, at_once, look)

@@ -38,6 +38,9 @@ def evaluate(
     sweep: Annotated[
         bool, typer.Option("--sweep", help="Also under 16 sensors known as they are, and 7 known wrongly.")
     ] = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Refuse pairs whose pixels contradict the sensor, instead of saying so.")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
@@ -60,7 +63,7 @@ def evaluate(
     read = (*folders, lpips, *(Path(name) for name in (sensor, reference, *names) if name))
     require_writable(out / "report.html" if out else None, json, inputs=read, folders=(out,))
     about: dict[str, Any] = {"sensor": sensor, "reference": reference, "lpips": lpips}
-    found = compared(names, pairs, images=images, sweep=sweep, seed=seed, log=say, **about)
+    found = compared(names, pairs, images=images, sweep=sweep, strict=strict, seed=seed, log=say, **about)
     for title, rows in {found.title: found.mean, **found.more}.items():
         print_rows(title, rows)
     for note in found.notes:

@@ -33,13 +33,17 @@ def info(
     trust_index: Annotated[
         bool, typer.Option("--trust-index", help="Let a VRT or DIMAP name tiles outside its folder and at URLs.")
     ] = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Refuse FILE whose pixels contradict --sensor, instead of saying so.")
+    ] = False,
     measure: Annotated[bool, typer.Option("--measure", help="Time some tiles here, and predict the whole.")] = False,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Say what an image is, how it would be cut and how long that would take.
 
     Size, type, full scale and who states it, place on Earth, missing pixels; the plan of `restore` with its defaults.
-    No pixel is read but of PNG, JPEG and TIFFs of several pages. Time here is unavailable without --measure.
+    With --sensor, windows of FILE are read and its noise and edges held against what the sensor states; else no pixel
+    is, but of PNG, JPEG and TIFFs of several pages. Time here is unavailable without --measure.
     """
     from beers_deploy.info import info_row
     from beers_deploy.model.io.files import require_writable
@@ -51,9 +55,9 @@ def info(
     require_writable(json, inputs=(image, *tiles, network, Path(sensor) if sensor else None, Path(target)))
     known = load_sensor(sensor or BLIND)
     path = network_file(network, known, partial(say, err=True))
-    bits = int(known.bits.low) if sensor else None
-    options = Options(path, tile, full_scale=full_scale, trust_index=trust_index, sensor_bits=bits)
-    row = info_row(image, options, load_target(target), measure)
+    told = {"": known} if sensor else {}
+    options = Options(path, tile, full_scale=full_scale, trust_index=trust_index, sensors=told, strict=strict)
+    row = info_row(image, options, load_target(target), measure, say)
     print_rows(str(image), [row])
     # No digest of FILE: it would be read whole.
     save(Table("info", arguments(sensor=sensor or BLIND, image=image.name), (path,), (row,)), json)

@@ -71,6 +71,9 @@ def restore(
     any_result: Annotated[
         bool, typer.Option("--any-result", help="Write OUT even if it is clipped, constant or far from IN's mean.")
     ] = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Refuse IN whose pixels contradict --sensor, instead of saying so.")
+    ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped or killed.")] = False,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
@@ -79,7 +82,7 @@ def restore(
     The image is read and written by rows, so memory does not grow with its height. Bands are restored one by one.
     OUT has the scale of IN: 8-bit pixels with --full-scale 255 come out as 0..255, floats with 1 as 0..1.
     A shipped network is told --sensor in a moment, in float32 (NAME) and in INT8 (NAME-int8). Without --sensor it is
-    taken to be in the middle of what it may be.
+    taken to be in the middle of what it may be; with it IN's own noise and edges are held against what it states.
     With --method traditional the image is stabilised, denoised and sharpened as its --sensor asks, in strips of rows:
     one band, about a minute a megapixel on two cores, not resumable.
     JPEG 2000, NITF and HFA files, VRT mosaics and DIMAP indexes need the extra 'gdal'.
@@ -92,8 +95,8 @@ def restore(
     from beers_deploy.model.shipped import INT8
     from beers_deploy.network import conditioned, network_file
     from beers_deploy.restoration.bands import parse_sensors
+    from beers_deploy.restoration.cog import require_stac, write_item
     from beers_deploy.restoration.run import restore_file
-    from beers_deploy.restoration.stac import require_stac, write_item
     from beers_deploy.results import Table, print_rows
 
     budget_bytes = max(int(memory * 1e9), 1) if memory else None
@@ -103,7 +106,7 @@ def restore(
     if method is Method.traditional:
         expected, remedy = "none with --method traditional", "leave it out"
         refuse(context, NETWORK_ONLY, expected=expected, got="one", remedy=remedy)
-        _by_the_chain(image, out, sensor, full_scale, compression, budget_bytes, trust_index, again, json)
+        _by_the_chain(image, out, sensor, full_scale, compression, budget_bytes, trust_index, again, strict, json)
         return
     if stac is not None:
         if not cog:
@@ -135,7 +138,8 @@ def restore(
         resume,
         scheduler,
         trust_index,
-        min(bits) if sensor else None,
+        known if sensor else {},
+        strict,
         cog,
         again,
         any_result,
@@ -157,6 +161,7 @@ def _by_the_chain(
     memory_bytes: int | None,
     trust_index: bool,
     again: bool,
+    strict: bool,
     json: Path | None,
 ) -> None:
     from beers_deploy.restoration.traditional import Request, restore_file_traditionally
@@ -166,7 +171,8 @@ def _by_the_chain(
         remedy = "name a profile ('beers-deploy profiles' lists them) or give your .toml file"
         raise OptionError("--sensor", expected="the sensor that acquired IN", got="none", remedy=remedy)
     degraded = load_sensor(sensor)
-    request = Request(degraded, reference_for(degraded), full_scale, compression, memory_bytes, trust_index, again)
-    row = restore_file_traditionally(image, out, request, (json,))
+    how = full_scale, compression, memory_bytes, trust_index, again, strict
+    request = Request(degraded, reference_for(degraded), *how)
+    row = restore_file_traditionally(image, out, request, say, (json,))
     print_rows(f"wrote {out}", [row])
     save(Table("restore", arguments(), (image,), (row,)), json)

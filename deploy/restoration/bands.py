@@ -6,6 +6,7 @@ Where the image names its bands, each is found by its name; else they are taken 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import onnx
 
@@ -13,6 +14,8 @@ from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.restoration.index_files import NoDoctype
 from beers_deploy.restoration.source import Raster
+
+Each = TypeVar("Each")
 
 METADATA_TAG = 42112
 """GDAL's own of a TIFF, where bands' names stand (https://gdal.org/en/stable/drivers/raster/gtiff.html)."""
@@ -42,8 +45,10 @@ def band_names(raster: Raster) -> tuple[str, ...]:
     return names if all(names) else ()
 
 
-def in_order(given: Mapping[str, Path], raster: Raster) -> list[Path]:
-    """The networks of the bands, in the order of the image's bands."""
+def in_order(given: Mapping[str, Each], raster: Raster) -> list[Each]:
+    """What was given for each band, in the order of the image's bands; what is for all of them alone."""
+    if "" in given:
+        return [given[""]]
     names = band_names(raster) or tuple(given)
     if len(given) != raster.bands or set(names) != set(given):
         expected = f"a sensor for each of {raster.bands} bands" + (f": {', '.join(names)}" if names else "")

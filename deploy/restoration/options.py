@@ -6,6 +6,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.sensor import Sensor
 
 TILE_PX = 640
 """Side of a tile unless somebody asks for another: what the paper's network was given on the board."""
@@ -51,7 +52,8 @@ class Options:
         any_result: whether a result is written that no restoration has.
         bands: networks of single bands by their names, each for its own sensor; empty where `model` is for all.
         cog: whether the output is a Cloud-Optimised GeoTIFF.
-        sensor_bits: bits per pixel of the sensor, where the user named its profile.
+        sensors: that the user named, by band; under no name where one is for all, empty where none was named.
+        strict: whether an image is refused that contradicts its sensor.
         trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
     """
 
@@ -66,11 +68,17 @@ class Options:
     resume: bool = False
     scheduler: str | None = None
     trust_index: bool = False
-    sensor_bits: int | None = None
+    sensors: Mapping[str, Sensor] = field(default_factory=dict)
+    strict: bool = False
     cog: bool = False
     again: bool = False
     any_result: bool = False
     bands: Mapping[str, Path] = field(default_factory=dict)
+
+    @property
+    def sensor_bits(self) -> int | None:
+        """Bits of a digital number, where a sensor was named."""
+        return min((int(sensor.bits.low) for sensor in self.sensors.values()), default=None)
 
 
 def parse_halo(text: str, radius_px: int) -> int:

@@ -37,6 +37,7 @@ from beers_deploy.restoration.output import Checkpoint, only_run, require_codec,
 from beers_deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
 from beers_deploy.restoration.runtime import Infer, infer_on, open_runtime, pack, tiles_at_once
+from beers_deploy.restoration.sensor_check import told_sensor
 from beers_deploy.restoration.source import Source, fingerprint, open_source, require_raw
 
 RUNS_UNTIL_STEADY = 2
@@ -83,6 +84,7 @@ def _restore(image: Path, out: Path, options: Options, log: Log, beside: Sequenc
         log(plan.sentence)
         check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
         scale = scale_of(source, plan, options, str(image))
+        check = told_sensor(source, options.sensors, scale.value, str(image), options.strict, log)
         opened, at_once, runtime = _opened(networks, plan, options, cluster)
         restorer = Restorer(raster, opened[0], scale.value, plan.tiling, str(image), not scale.assumed, opened[1:])
         figures = seam_figures(source, plan, restorer)
@@ -106,8 +108,8 @@ def _restore(image: Path, out: Path, options: Options, log: Log, beside: Sequenc
         share = tally.clipped / prod(raster.shape)
         doubt = f": {share:.0%} of the image; is that its full scale?" if share > MANY else ""
         log(f"{tally.clipped} pixels above full scale, {scale.words}, were clipped to it{doubt}")
-    figures |= tally.figures
-    return run_row(image.name, plan, done_rows, time_s, runtime, options, figures, scale)
+    figures |= {**check.figures, **tally.figures}
+    return run_row(image.name, plan, done_rows, time_s, runtime, options, figures, {**scale.text, **check.text})
 
 
 def _opened(
@@ -247,7 +249,7 @@ def run_row(
     runtime: str,
     options: Options,
     more: dict[str, Figure],
-    scale: FullScale,
+    text: dict[str, str],
 ) -> Row:
     """The figures of one run, of which `done_rows` were finished before."""
     useful_px = plan.bands * (plan.height_px - done_rows) * plan.width_px
@@ -261,4 +263,4 @@ def run_row(
         **more,
     }
     workers = {"workers": options.scheduler} if options.scheduler else {}
-    return Row("restore", name, figures, {"halo": plan.halo_words, **scale.text, "runtime": runtime, **workers})
+    return Row("restore", name, figures, {"halo": plan.halo_words, **text, "runtime": runtime, **workers})

@@ -17,7 +17,7 @@ from torch import Tensor
 from beers_deploy.host_state import peak_memory
 from beers_deploy.model.io.files import require_writable
 from beers_deploy.model.io.images import require_image_file
-from beers_deploy.model.progress import steps
+from beers_deploy.model.progress import Log, steps
 from beers_deploy.model.traditional.pipeline import Chain, restore_strips
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Row, measured
@@ -28,6 +28,7 @@ from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.output import Checkpoint, only_run, require_codec, require_tiff_name, write_output
 from beers_deploy.restoration.plan import Span, check_memory
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
+from beers_deploy.restoration.sensor_check import SensorCheck, told_sensor
 from beers_deploy.restoration.source import Raster, Source, fingerprint, open_source, require_raw
 
 STRIP_PX = 128
@@ -50,6 +51,7 @@ class Request:
         memory_bytes: budget of the process; None is what is free.
         trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
         again: whether the image may be one that was restored already.
+        strict: whether an image is refused that contradicts its sensor.
     """
 
     sensor: Sensor
@@ -59,23 +61,26 @@ class Request:
     memory_bytes: int | None = None
     trust_index: bool = False
     again: bool = False
+    strict: bool = False
 
     def chain(self) -> Chain:
         """The chain from the sensor to the reference, both in the sensor's digital numbers."""
         return Chain(self.sensor.nominal(), self.reference.in_units_of(self.sensor).nominal())
 
 
-def restore_file_traditionally(image: Path, out: Path, request: Request, beside: Sequence[Path | None] = ()) -> Row:
+def restore_file_traditionally(
+    image: Path, out: Path, request: Request, log: Log, beside: Sequence[Path | None] = ()
+) -> Row:
     """As `deploy.restoration.run.restore_file`, of a mono image and by the traditional chain."""
     require_image_file(image)
     require_writable(out, inputs=(image,))
     require_tiff_name(out)
     require_codec(request.compression)
     with only_run(out):
-        return _restore(image, out, request, beside)
+        return _restore(image, out, request, log, beside)
 
 
-def _restore(image: Path, out: Path, request: Request, beside: Sequence[Path | None]) -> Row:
+def _restore(image: Path, out: Path, request: Request, log: Log, beside: Sequence[Path | None]) -> Row:
     started, chain = time.perf_counter(), request.chain()
     with open_source(image, request.trust_index) as source:
         require_writable(out, *beside, inputs=source.files)
@@ -89,6 +94,7 @@ def _restore(image: Path, out: Path, request: Request, beside: Sequence[Path | N
         extents = (raster.extent(source.read(*rows)) for rows in _strips(raster.height_px))
         bits = int(chain.degraded.max_dn).bit_length()
         scale = full_scale_of(str(image), raster, extents, request.full_scale, bits)
+        check = told_sensor(source, {"": request.sensor}, scale.value, str(image), request.strict, log)
         job = {"image": list(fingerprint(source.files)), "method": "traditional"}
         checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, resume=False)
         try:
@@ -97,7 +103,7 @@ def _restore(image: Path, out: Path, request: Request, beside: Sequence[Path | N
         except BaseException:  # a strip is no place to go on from: the chain looks hundreds of rows back
             checkpoint.remove()
             raise
-    return _row(image.name, raster, time.perf_counter() - started, request, scale)
+    return _row(image.name, raster, time.perf_counter() - started, request, scale, check)
 
 
 def _fill(checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: float, name: str) -> None:
@@ -133,11 +139,13 @@ def _strips(height_px: int) -> Iterator[tuple[int, int]]:
         yield start, min(start + STRIP_PX, height_px)
 
 
-def _row(name: str, raster: Raster, time_s: float, request: Request, scale: FullScale) -> Row:
+def _row(name: str, raster: Raster, time_s: float, request: Request, scale: FullScale, check: SensorCheck) -> Row:
     source = f"from opening the image to the finished file, {torch.get_num_threads()} threads"
     figures = {
         "time": measured(time_s, "s", source),
         "throughput": measured(raster.height_px * raster.width_px / time_s / 1e6, "Mpx/s", source),
         "peak memory": peak_memory(),
+        **check.figures,
     }
-    return Row("restore", name, figures, {"method": "traditional", "sensor": request.sensor.name, **scale.text})
+    text = {"method": "traditional", "sensor": request.sensor.name, **scale.text, **check.text}
+    return Row("restore", name, figures, text)

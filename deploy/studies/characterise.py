@@ -20,13 +20,14 @@ from beers_deploy.model.io.images import read_pixels
 from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.metrics import edge_blur
 from beers_deploy.model.metrics.edge_blur import AxisMtf, EdgeBlur
-from beers_deploy.model.metrics.noise_line import NoiseModel, cut_blocks, fit_noise_model, join
+from beers_deploy.model.metrics.noise_line import Blocks, NoiseModel, cut_blocks, fit_noise_model, join
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.profiles.errors import ImageError, OptionError, printable
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.sensor import Sensor, snr_0_bounds
 from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.restoration.sensor_check import NOISE_KEPT
 from beers_deploy.results import Table, input_of
 
 FULL_SCALE_RADIANCE = 400.0
@@ -111,6 +112,8 @@ def characterise(
     for option, value in (("gain", gain), ("gsd", gsd_m)):
         if value is not None and not 0 < value < math.inf:
             raise OptionError(option, expected="a finite number above 0", got=f"{value:g}", remedy="correct it")
+    if not images:
+        raise ImageError("images", expected="one or several", got="none", remedy="give raw images of one sensor")
     if len({path.resolve() for path in images}) < len(images):
         got, remedy = "one of them twice", "give each once: a second look at the same pixels knows nothing new"
         raise OptionError("images", expected="different images", got=got, remedy=remedy)
@@ -238,13 +241,29 @@ def snr_at(noise: NoiseModel, dn: float, gain: float) -> Snr:
 
 def measured_noise(images: Sequence[Path], clipped_at: int) -> NoiseModel:
     """The noise in the digital numbers of images that clip at a value."""
-    blocks = [cut_blocks(tile, clipped_at) for tile in _tiles(images)]
-    noise = fit_noise_model(join(blocks), np.random.default_rng(SEED))
+    each = [join([cut_blocks(tile, clipped_at) for tile in _tiles([image])]) for image in images]
+    noise = fit_noise_model(join(each), np.random.default_rng(SEED))
     if isinstance(noise, Refusal):
         expected = "blurred, raw ground with white noise, from dark to bright"
         remedy = "give more raw images of plain ground, dark and bright, neither restored nor resampled"
         raise ImageError(f"noise of {_named(images)}", expected=expected, got=noise.reason, remedy=remedy)
+    _require_one_sensor(images, each, math.sqrt(math.prod(noise.measured_dn)))
     return noise
+
+
+def _require_one_sensor(images: Sequence[Path], each: Sequence[Blocks], dn: float) -> None:
+    """Refuse images whose own noise at a digital number differs: of another gain, or processed."""
+    lines = [fit_noise_model(blocks, np.random.default_rng(SEED)) for blocks in each] if len(images) > 1 else []
+    seen = {path.name: line.at(dn) for path, line in zip(images, lines, strict=False) if isinstance(line, NoiseModel)}
+    if not seen:
+        return
+    least = min(seen, key=lambda name: seen[name].interval[1])
+    most = max(seen, key=lambda name: seen[name].interval[0])
+    if seen[most].interval[0] > NOISE_KEPT * seen[least].interval[1]:
+        low, high = (f"{seen[name].value:.3g} DN^2 in {name}" for name in (least, most))
+        got = f"a variance of {low} and {high} at {dn:.4g} DN"
+        remedy = "characterise them apart: they differ in gain, or one was processed"
+        raise ImageError("images", expected="images of one sensor at one setting", got=got, remedy=remedy)
 
 
 def _named(images: Sequence[Path]) -> str:

@@ -295,7 +295,7 @@ import sys
 
 class Blocked:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in ("torch", "matplotlib", "skimage", "scipy", "pandas"):
+        if name.split(".")[0] in ("torch", "matplotlib", "skimage", "pandas"):
             raise ModuleNotFoundError("blocked", name=name)
 
 
@@ -311,7 +311,6 @@ for call, extra in (
     (bd.simulate, "torch"),
     (lambda: bd.quantize("tiny.onnx"), "torch"),
     (lambda: bd.evaluate(["degraded"]), "torch"),
-    (lambda: bd.characterize([]), "study"),
     (lambda: bd.sensors().plot(), "study"),
     (lambda: bd.sensors().to_pandas(), "notebook"),
 ):

@@ -24,6 +24,7 @@ from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.restoration.function import Restore, network_method
+from beers_deploy.restoration.sensor_check import WINDOW_PX, held_against
 from beers_deploy.results import Table
 from beers_deploy.studies.evaluation import scores
 from beers_deploy.studies.evaluation.methods import DEGRADED, Method, knowledge_of, method_named
@@ -80,6 +81,7 @@ def evaluate(
     reference: SensorLike | None = None,
     lpips: str | os.PathLike[str] | None = None,
     sweep: bool = False,
+    strict: bool = False,
     seed: int = 0,
     progress: Progress = None,
     log: Log = no_log,
@@ -95,6 +97,7 @@ def evaluate(
         reference: the sensor that is aimed at.
         lpips: weights of SqueezeNet 1.1, or a folder of backbones, for LPIPS.
         sweep: whether other blurs, noises and gains are looked at too.
+        strict: whether pairs are refused whose degraded images contradict the sensor, instead of a note.
         seed: of every random draw.
         progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
         log: is told where a reference is taken in other units than it states.
@@ -116,11 +119,12 @@ def evaluate(
     with reporting(progress):
         ways = [_method(name, each, sensors, told) for name, each in asked.items()]
         instruments = scores.Instruments(scores.perceptual_distances(weights), sensors[0].nominal().max_dn)
-        said = list[str]()
+        said, seen = list[str](), list[Row]()
         if made is not None:
             loaded = [_named(number, pair) for number, pair in enumerate(made)]
         elif folder is not None:
             loaded = read_pairs(folder, sensors[0].nominal().max_dn, recipe)
+            seen = [_seen(loaded, sensors[0], str(folder), strict, said.append)]
         else:
             loaded, said = pairs_of_scenes(scenes, *sensors, seed)
         targets, rows = scores.acquire_targets(sensors[0].nominal(), seed), list[Row]()
@@ -136,12 +140,20 @@ def evaluate(
         "evaluate",
         arguments,
         tuple(_inputs(asked, weights, scenes, folder)),
-        (*tables["mean"], *scores.site_rows(tables["images"]), *tables["images"], *swept),
+        (*tables["mean"], *scores.site_rows(tables["images"]), *tables["images"], *seen, *swept),
         notes=tuple([few, *said] if few else said),
         sensors=sensors,
         methods=ways,
         pairs=loaded,
     )
+
+
+def _seen(pairs: Sequence[NamedPair], sensor: Sensor, name: str, strict: bool, log: Log) -> Row:
+    """The degraded images held against the sensor that they are said to be from."""
+    chosen = pairs[:: -(-len(pairs) // HELD)]
+    windows = [pair.degraded[:WINDOW_PX, :WINDOW_PX] for pair in chosen]
+    check = held_against(windows, sensor, sensor.nominal().max_dn).settled(name, sensor.name, strict, log)
+    return Row("sensor of the degraded images", sensor.name, check.figures, check.text)
 
 
 def _inputs(asked: Iterable[str], weights: Path | None, scenes: Path | None, pairs: Path | None) -> Iterator[Path]:
@@ -167,6 +179,8 @@ def _method(name: str, given: NetworkLike | Restore, sensors: tuple[Sensor, Sens
 
 
 SITES, CROP_PX, ZOOM = 4, 96, 2
+HELD = 16
+"""Images at most that are held against the sensor."""
 
 
 def chosen_pairs(pairs: Sequence[NamedPair]) -> list[NamedPair]:

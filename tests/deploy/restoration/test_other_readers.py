@@ -12,9 +12,9 @@ import pytest
 
 from beers_deploy.network import shipped_pair
 from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.restoration.cog import write_item
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
-from beers_deploy.restoration.stac import write_item
 from tests.deploy.restoration import images
 
 ROOT = Path(__file__).parents[3]

@@ -9,8 +9,10 @@ import pytest
 import tifffile
 
 from beers_deploy.model.io.images import Extent
+from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
 from beers_deploy.restoration.run import restore_file
@@ -21,6 +23,10 @@ SHAPE = 61, 47
 
 def noise(bits: int) -> np.ndarray:
     return np.random.default_rng(bits).integers(1, 1 << bits, SHAPE).astype(np.uint16)
+
+
+def told(bits: int) -> dict[str, Sensor]:
+    return {"": load_sensor("pleiades-degraded").replace(bits=bits)}
 
 
 def run(folder: Path, pixels: np.ndarray, options: Options) -> tuple[np.ndarray, Row, list[str]]:
@@ -69,7 +75,7 @@ def test_a_file_of_such_bits_is_restored_to_its_own_full_scale(bits: int, model:
     assert row.text["full scale from"] == "asked for"
     assert asked.dtype == np.uint16
     assert full / 2 < asked.max() <= full
-    profiled, row, _ = run(tmp_path, noise(bits), Options(model, 23, sensor_bits=bits))
+    profiled, row, _ = run(tmp_path, noise(bits), Options(model, 23, sensors=told(bits)))
     assert row.text["full scale"] == f"{full:g}"
     assert row.text["full scale from"] == f"{bits} bits, of the sensor"
     np.testing.assert_array_equal(profiled, asked)

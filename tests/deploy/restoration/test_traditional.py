@@ -8,6 +8,7 @@ import pytest
 import tifffile
 import torch
 
+from beers_deploy.model.progress import no_log
 from beers_deploy.model.traditional.pipeline import restore_traditional
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError, MachineError
@@ -32,7 +33,7 @@ def of_array(pixels: np.ndarray, asked: Request) -> np.ndarray:
 
 def of_file(folder: Path, pixels: np.ndarray, asked: Request, **written: object) -> np.ndarray:
     tifffile.imwrite(folder / "in.tif", pixels, **written)  # type: ignore[arg-type]
-    row = restore_file_traditionally(folder / "in.tif", folder / "out.tif", asked)
+    row = restore_file_traditionally(folder / "in.tif", folder / "out.tif", asked, no_log)
     assert row.text["method"] == "traditional"
     assert sorted(path.name for path in folder.iterdir()) == ["in.tif", "out.tif"]
     return tifffile.imread(folder / "out.tif")
@@ -88,7 +89,7 @@ def test_what_it_cannot_restore_leaves_the_old_output(pixels: np.ndarray, words:
     tifffile.imwrite(tmp_path / "in.tif", pixels, photometric="rgb" if pixels.ndim == 3 else "minisblack")
     (tmp_path / "out.tif").write_bytes(b"the old one")
     with pytest.raises(ImageError, match=words):
-        restore_file_traditionally(tmp_path / "in.tif", tmp_path / "out.tif", request())
+        restore_file_traditionally(tmp_path / "in.tif", tmp_path / "out.tif", request(), no_log)
     assert (tmp_path / "out.tif").read_bytes() == b"the old one"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif", "out.tif"]
 

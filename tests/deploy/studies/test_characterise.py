@@ -186,6 +186,14 @@ def test_one_image_twice_is_refused(raw: tuple[Path, Path], tmp_path: Path) -> N
     assert (code, "twice" in said) == (2, True)
 
 
+def test_images_of_two_gains_are_refused(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    half = tmp_path / "half.tif"
+    tifffile.imwrite(half, tifffile.imread(raw[0]) // 2)
+    code, said = run(raw[0], half, "--bits", 12, "--out", tmp_path / "mine.toml")
+    assert (code, "differ in gain" in said) == (2, True)
+    assert f"DN^2 in {half.name}" in said
+
+
 def test_pixels_clipped_at_full_scale_tell_the_bits(raw: tuple[Path, Path], tmp_path: Path) -> None:
     pixels = tifffile.imread(raw[0]).copy()
     pixels[:4, :4] = 4095

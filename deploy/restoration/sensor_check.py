@@ -1,0 +1,262 @@
+"""An image held against the sensor it is said to be from: its noise and its blur, by its own pixels alone.
+
+Windows spread over the image give a noise line (`model.metrics.noise_line`) and straight edges
+(`model.metrics.edge_blur`). Where their 95 % intervals lie off what the profile states, a sentence says what was seen
+and what was told. Texture without edges tells no blur, a scene without even ground no noise: then nothing is said.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from beers_deploy.model.metrics import edge_blur
+from beers_deploy.model.metrics.noise_line import ROUNDING, Blocks, NoiseModel, cut_blocks, fit_noise_model, join
+from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.model.progress import Log
+from beers_deploy.model.simulator.mtf import NYQUIST, sensor_mtf
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.figures import Figure, measured, unavailable
+from beers_deploy.profiles.sensor import Instrument, Sensor
+from beers_deploy.restoration.bands import in_order
+from beers_deploy.restoration.source import Source
+
+WINDOW_PX, ACROSS = 512, 4
+"""Side of a window, and how many at most lie side by side, and below one another."""
+EDGES = 20
+"""Enough along an axis: more would take time and tell no more."""
+DRAWS, SEED = 20, 0
+"""Of sensors from a profile with ranges."""
+NOISE_KEPT, BLUR_KEPT = 1.25, 1.15
+"""Factors of the noise's variance, and of the MTF, that an interval may lie off by before anything is said."""
+SMOOTH, QUIET_PERCENT = 0.45, 10.0
+"""Of the noise told: less in a tenth of the blocks is the work of a filter. By chance they hold 0.6 of it."""
+FILTERED = ": restored, resampled or compressed before, or of another gain"
+AXES = ("across", "along")
+
+
+class Told(NamedTuple):
+    """What a profile states, in the image's numbers: variance at a value, and the MTF at Nyquist of both axes."""
+
+    instruments: Sequence[Instrument]
+    unit: float
+
+    def radiance(self, value: float) -> float:
+        """Of a pixel value, in W/m2/sr/um."""
+        first = self.instruments[0]
+        return (value / self.unit - first.offset_dn) / first.gain_dn_per_radiance
+
+    def variances(self, value: np.ndarray | float) -> np.ndarray:
+        """Of the noise at pixel values, without rounding, of each instrument: (I, ...)."""
+        return np.stack([self._variance(each, np.asarray(value, np.float64)) for each in self.instruments])
+
+    def _variance(self, sensor: Instrument, value: np.ndarray) -> np.ndarray:
+        gain = sensor.gain_dn_per_radiance
+        radiance = np.maximum(value / self.unit - sensor.offset_dn, 0) / gain
+        return np.asarray((sensor.alpha * radiance + sensor.beta) * (gain * self.unit) ** 2)
+
+    def mtf(self, axis: str) -> tuple[float, float]:
+        """The least and the most contrast at Nyquist along an axis."""
+        f = np.array([[NYQUIST]]), np.array([[0.0]])
+        fx, fy = f if axis == AXES[0] else f[::-1]
+        found = [abs(complex(sensor_mtf(fx, fy, each).item())) for each in self.instruments]
+        return min(found), max(found)
+
+
+@dataclass(frozen=True)
+class SensorCheck:
+    """What an image shows of its sensor.
+
+    Attributes:
+        figures: SNR and MTF as seen, each with its interval.
+        doubts: a sentence for each that contradicts the profile.
+    """
+
+    figures: Mapping[str, Figure] = field(default_factory=dict)
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> dict[str, str]:
+        """For a row of results: whether the image contradicts its sensor, and how."""
+        seen = any(figure.value is not None for figure in self.figures.values())
+        words = "; ".join(self.doubts) or ("agrees" if seen else "cannot be seen")
+        return {"sensor told": words} if self.figures else {}
+
+    def settled(self, name: str, sensor: str, strict: bool, log: Log) -> "SensorCheck":
+        """This check, once `log` is told of each contradiction.
+
+        Args:
+            name: of the image, for messages.
+            sensor: its profile's name.
+            strict: whether a contradiction is an error instead.
+            log: is told of each.
+
+        Raises:
+            ImageError: with what was seen and what was told, where `strict`.
+        """
+        if self.doubts and strict:
+            remedy = "name its own sensor, measure it with 'characterise', or leave `strict` out"
+            raise ImageError(name, expected=f"an image of {sensor}", got="; ".join(self.doubts), remedy=remedy)
+        for doubt in self.doubts:
+            log(f"look at the sensor: {doubt}")
+        return self
+
+
+def told_sensor(
+    source: Source, sensors: Mapping[str, Sensor], full_scale: float, name: str, strict: bool, log: Log
+) -> SensorCheck:
+    """Hold an image against the sensor that a user named, and say where it contradicts it.
+
+    Args:
+        source: the image.
+        sensors: by band, under no name where one is for all; empty where none was named.
+        full_scale: the pixel value that is the sensors' largest digital number.
+        name: of the image, for messages.
+        strict: whether a contradiction is an error.
+        log: is told of each otherwise.
+
+    Raises:
+        ImageError: a contradiction, where that is asked for.
+    """
+    if not sensors:
+        return SensorCheck()
+    ordered = in_order(sensors, source.raster)
+    names = " and ".join(dict.fromkeys(sensor.name for sensor in ordered))
+    return check_source(source, ordered, full_scale).settled(name, names, strict, log)
+
+
+def check_source(source: Source, sensors: Sequence[Sensor], full_scale: float) -> SensorCheck:
+    """Hold an image against its sensor, band by band.
+
+    Args:
+        source: the image.
+        sensors: one of all bands, or one of each.
+        full_scale: the pixel value that is the sensors' largest digital number.
+    """
+    bands = source.raster.bands
+    windows = [list[np.ndarray]() for _ in range(bands)]
+    for several in _windows(source):
+        for band, window in zip(windows, several, strict=True):
+            band.append(window)
+    found = [held_against(seen, sensors[band % len(sensors)], full_scale) for band, seen in enumerate(windows)]
+    if bands == 1:
+        return found[0]
+    named = {f"band {n}: ": each for n, each in enumerate(found, 1)}
+    figures = {f"{band}{name}": figure for band, each in named.items() for name, figure in each.figures.items()}
+    return SensorCheck(figures, tuple(f"{band}{doubt}" for band, each in named.items() for doubt in each.doubts))
+
+
+def _windows(source: Source) -> Iterator[np.ndarray]:
+    """Windows (bands, h, w) spread evenly over an image, 0 where pixels are missing."""
+    raster = source.raster
+    for down in _spread(raster.height_px):
+        rows = source.read(down.start, down.stop)
+        missing = raster.missing(rows) if raster.may_miss else None
+        known = np.ma.getdata(rows) if missing is None else np.where(missing, 0, np.ma.getdata(rows))
+        for across in _spread(raster.width_px):
+            yield known[:, :, across]
+
+
+def _spread(size_px: int) -> list[slice]:
+    """Windows along a side, evenly from end to end and none over another."""
+    count = min(ACROSS, -(-size_px // WINDOW_PX))
+    side_px = min(WINDOW_PX, size_px // count)
+    return [slice(int(start), int(start) + side_px) for start in np.linspace(0, size_px - side_px, count)]
+
+
+def held_against(windows: Sequence[np.ndarray], sensor: Sensor, full_scale: float) -> SensorCheck:
+    """Hold windows of one band against a sensor.
+
+    Args:
+        windows: (h, w) each, raw values; 0 where pixels are missing.
+        sensor: the profile; where it states ranges, all between their ends is as told.
+        full_scale: the value that is the sensor's largest digital number.
+    """
+    if not all((np.isfinite(window) & (window == np.rint(window))).all() for window in windows):
+        reason = "the pixels are not whole numbers: they were scaled, and the noise of rounding is not known"
+        return SensorCheck({name: unavailable(unit, reason) for name, unit in FIGURES.items()})
+    step = max(int(np.gcd.reduce([np.gcd.reduce(window, axis=None) for window in _whole(windows)])), 1)
+    pixels, clipped_at = [window / step for window in windows], full_scale / step
+    told = _told(sensor, clipped_at)
+    blocks = join([cut_blocks(window, clipped_at) for window in pixels])
+    line = fit_noise_model(blocks, np.random.default_rng(SEED))
+    figures, doubts = _noise(line, blocks, told)
+    for axis, (figure, doubt) in zip(AXES, _blur(pixels, line, told, clipped_at), strict=True):
+        figures[f"MTF {axis} seen"] = figure
+        doubts += doubt
+    return SensorCheck(figures, tuple(doubts))
+
+
+FIGURES = {"SNR seen": "ratio", **{f"MTF {axis} seen": "%" for axis in AXES}}
+
+
+def _whole(windows: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    return (window.astype(np.int64) for window in windows)
+
+
+def _told(sensor: Sensor, clipped_at: float) -> Told:
+    generator = np.random.default_rng(SEED)
+    drawn = [sensor.nominal(), *(sensor.draw(generator) for _ in range(DRAWS))]
+    return Told(drawn, clipped_at / drawn[0].max_dn)
+
+
+def _noise(line: NoiseModel | Refusal, blocks: Blocks, told: Told) -> tuple[dict[str, Figure], list[str]]:
+    """The SNR in the middle of what was measured, and a sentence where it contradicts what was told."""
+    if isinstance(line, Refusal):
+        return {"SNR seen": unavailable("ratio", line.reason)}, _smoothed(blocks, told)
+    value = math.sqrt(math.prod(line.measured_dn))
+    seen, (least, *_, most) = line.at(value), np.sort(told.variances(value))
+    signal, radiance = max(value - told.unit * told.instruments[0].offset_dn, 0), told.radiance(value)
+    variances = seen.interval[1], seen.value, seen.interval[0], told.variances(value)[0]
+    low, snr, high, stated = (signal / math.sqrt(v) if v > 0 else math.inf for v in variances)
+    words = f"at {radiance:.3g} W/m2/sr/um, {line.blocks} blocks of 16 x 16; told {stated:.3g}"
+    figures = {"SNR seen": measured(snr, "ratio", words, (low, high))}
+    if seen.interval[0] > most * NOISE_KEPT or seen.interval[1] < least / NOISE_KEPT:
+        what = f"noise at {radiance:.3g} W/m2/sr/um looks like SNR {snr:.3g}, the profile says {stated:.3g}"
+        return figures, [f"{what}{FILTERED}" if snr > stated else what]
+    return figures, _smoothed(blocks, told)
+
+
+def _smoothed(blocks: Blocks, told: Told) -> list[str]:
+    """A sentence where pixels hold less noise than any image of the sensor."""
+    if not blocks.mean.size:
+        return []
+    expected = told.variances(blocks.mean).min(0)
+    share = float(np.percentile(blocks.fine / (expected + ROUNDING), QUIET_PERCENT))
+    if share > SMOOTH:
+        return []
+    return [f"{share:.0%} of the noise that the profile says{FILTERED}"]
+
+
+def _blur(
+    pixels: Sequence[np.ndarray], line: NoiseModel | Refusal, told: Told, clipped_at: float
+) -> Iterator[tuple[Figure, list[str]]]:
+    """The MTF along each axis, and a sentence where it contradicts what was told."""
+
+    def noise(values: np.ndarray) -> np.ndarray:
+        return np.asarray(told.variances(np.maximum(values, 0))[0] + ROUNDING)
+
+    total = noise if isinstance(line, Refusal) else line.total
+    edges = [_edges(turned, total, clipped_at) for turned in (pixels, [window.T for window in pixels])]
+    for axis, own, others in zip(AXES, edges, edges[::-1], strict=True):
+        if len(own) < edge_blur.MIN_FOUND:
+            yield unavailable("%", f"{len(own)} straight edges, {edge_blur.MIN_FOUND} are needed"), []
+            continue
+        seen, (least, most) = edge_blur.combine(own, others), told.mtf(axis)
+        low, high = seen.interval
+        figure = measured(100 * seen.mtf_nyquist, "%", f"{seen.edges} edges", (100 * low, 100 * high))
+        off = low > most * BLUR_KEPT or high < least / BLUR_KEPT
+        stated = most if low > most else least
+        what = f"MTF {axis} the track looks like {seen.mtf_nyquist:.2%}, the profile says {stated:.2%}"
+        yield figure, [what] if off else []
+
+
+def _edges(windows: Sequence[np.ndarray], noise: edge_blur.Noise, clipped_at: float) -> list[edge_blur.EdgeBlur]:
+    """The blurs across near-vertical edges, of as many windows as it takes to find enough."""
+    found = list[edge_blur.EdgeBlur]()
+    for window in windows:
+        if min(window.shape) > 2 * (edge_blur.HALF_PX + 2) and len(found) < EDGES:
+            found += edge_blur.find_blurs(window, noise, clipped_at)
+    return found[:EDGES]

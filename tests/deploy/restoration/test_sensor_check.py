@@ -1,0 +1,120 @@
+"""An image held against its sensor: what is told rightly passes, what is told wrongly is said, or refused."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+import beers_deploy as bd
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.restoration.sensor_check import SensorCheck, check_source
+from beers_deploy.restoration.source import ArraySource, Raster
+from tests.deploy.command_line import done, refused
+
+NAME = "pleiades-degraded"
+SENSOR = Sensor.load(NAME)
+
+
+@pytest.fixture(scope="module")
+def raw() -> np.ndarray:
+    """A raw image (320, 320), of drawn fields and houses."""
+    return bd.simulate(sensor=SENSOR, size=320, seed=3).degraded
+
+
+def check(
+    image: np.ndarray, sensor: Sensor = SENSOR, full_scale: float = 4095, nodata: float | None = None
+) -> SensorCheck:
+    planes = image if image.ndim == 3 else image[None]
+    bands, height, width = planes.shape
+    raster = Raster(bands, height, width, planes.dtype, nodata)
+    return check_source(ArraySource(planes, raster), [sensor], full_scale)
+
+
+def test_the_true_sensor_is_found_again(raw: np.ndarray) -> None:
+    found = check(raw)
+    assert found.doubts == ()
+    assert found.text == {"sensor told": "agrees"}
+    low, high = found.figures["SNR seen"].interval or (0, 0)
+    assert 0 < high - low < 0.5 * high
+    # Left-justified, and with missing pixels of any value: the same image of the same sensor.
+    assert check(raw * 16, full_scale=16 * 4095).figures["SNR seen"].value == found.figures["SNR seen"].value
+    holed = raw.copy()
+    holed[100:140, 30:300] = 4000
+    assert check(np.where(holed == 4000, 0, raw), nodata=0).doubts == ()
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        ({"mtf_nyquist": 0.14}, "MTF .* the profile says 14"),
+        ({"snr_0": 25, "snr_1": 55}, "looks like SNR .*, the profile says"),
+        ({"snr_0": 100, "snr_1": 220}, "looks like SNR .*, the profile says"),
+        ({"gain_dn_per_radiance": 25.0}, "looks like SNR"),
+    ],
+)
+def test_another_sensor_is_told_apart(numbers: dict[str, float], words: str, raw: np.ndarray) -> None:
+    (doubt, *_) = check(raw, SENSOR.replace(**numbers)).doubts
+    assert re.search(words, doubt)
+
+
+def test_bands_are_held_one_by_one_against_their_own_sensors(raw: np.ndarray) -> None:
+    two = check_source(
+        ArraySource(np.stack([raw, raw]), Raster(2, 320, 320, raw.dtype)),
+        [SENSOR, SENSOR.replace(snr_0=25, snr_1=55)],
+        4095,
+    )
+    assert [doubt[:7] for doubt in two.doubts] == ["band 2:"]
+    assert two.figures["band 1: SNR seen"].value == two.figures["band 2: SNR seen"].value
+
+
+def test_a_restored_image_holds_no_raw_noise(raw: np.ndarray) -> None:
+    (doubt, *_) = check(bd.restore(raw, "convbeers-xs-int8", sensor=SENSOR)).doubts
+    assert "restored, resampled or compressed" in doubt
+
+
+def test_what_cannot_be_seen_is_no_contradiction() -> None:
+    generator = np.random.default_rng(0)
+    for image in (
+        np.full((300, 200), 900, np.uint16),
+        np.zeros((64, 64), np.uint16),
+        generator.random((400, 300)).astype(np.float32),
+        generator.integers(400, 500, (19, 23)).astype(np.uint16),
+    ):
+        found = check(image)
+        assert found.text["sensor told"] in ("cannot be seen", *found.doubts)
+        assert all(figure.mode == "unavailable" and figure.reason for figure in found.figures.values())
+
+
+def test_commands_say_it_and_strict_refuses(raw: np.ndarray, tmp_path: Path) -> None:
+    image, out = tmp_path / "raw.tif", tmp_path / "out.tif"
+    tifffile.imwrite(image, raw)
+    wrong = SENSOR.replace(snr_0=25, snr_1=55).save(tmp_path / "wrong.toml")
+    network = ("--network", "convbeers-xs-int8")
+    assert "look at the sensor: noise at" in done("restore", image, out, *network, "--sensor", wrong)
+    assert "look at the sensor" not in done("info", image, *network, "--sensor", NAME, "--strict")
+    out.unlink()
+    for words in (("restore", image, out, *network), ("info", image, *network)):
+        assert "expected an image of wrong" in refused(*words, "--sensor", wrong, "--strict")
+    refused("restore", image, out, "--method", "traditional", "--sensor", wrong, "--strict")
+    assert not out.exists()
+
+
+def test_the_library_warns_and_strict_refuses(raw: np.ndarray) -> None:
+    wrong = SENSOR.replace(snr_0=25, snr_1=55)
+    with pytest.warns(UserWarning, match="look at the sensor: noise at"):
+        bd.restore(raw, "convbeers-xs-int8", sensor=wrong)
+    with pytest.raises(ValueError, match="expected an image of"):
+        bd.restore(raw, "convbeers-xs-int8", sensor=wrong, strict=True)
+
+
+def test_pairs_that_are_evaluated_are_held_against_it(tmp_path: Path) -> None:
+    wrong = SENSOR.replace(snr_0=25, snr_1=55).save(tmp_path / "wrong.toml")
+    pairs = bd.simulate(sensor=SENSOR, size=320, seed=3).save(tmp_path / "pairs")
+    (pairs / "recipe.json").unlink()
+    words = ("evaluate", "--pairs", pairs, "--methods", "degraded")
+    assert "look at the sensor: noise at" in done(*words, "--sensor", wrong)
+    assert "expected an image of wrong" in refused(*words, "--sensor", wrong, "--strict")
+    found = bd.evaluate(["degraded"], pairs, sensor=SENSOR, strict=True, progress=False)
+    assert next(row for row in found.rows if "sensor" in row.table).text == {"sensor told": "agrees"}
