@@ -7,25 +7,8 @@
 - `figures`: numbers with unit, mode and source; `errors`: what bad input becomes.
 """
 
-from beers_deploy.profiles.errors import BeersError
-from beers_deploy.profiles.figures import Figure, Row
-from beers_deploy.profiles.scene_call import SceneCall, load_scene_call, scene_names
-from beers_deploy.profiles.sensor import Instrument, Sensor
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import load_sensor, sensor_names
 from beers_deploy.profiles.target import TargetProfile, load_target, target_names
 
-__all__ = [
-    "BeersError",
-    "Figure",
-    "Instrument",
-    "Row",
-    "SceneCall",
-    "Sensor",
-    "TargetProfile",
-    "load_scene_call",
-    "load_sensor",
-    "load_target",
-    "scene_names",
-    "sensor_names",
-    "target_names",
-]
+__all__ = ["Sensor", "TargetProfile", "load_sensor", "load_target", "sensor_names", "target_names"]

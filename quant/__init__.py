@@ -9,14 +9,10 @@ for onnxruntime, the board's for its own flow
 - `gate` and `structure` judge an INT8 file, `sensitivity` says which layers err;
 - `tiling` says how an image may be cut for a network: lattice, halo and scale; `samples` are a user's own;
 - `reading` folds what exporters leave in a float file, `untrusted` looks at files before they are used.
-
-What is offered here is loaded when it is asked for.
 """
 
 import os
 import sys
-
-import lazy_loader
 
 
 def _switch_off_telemetry() -> None:
@@ -32,5 +28,3 @@ def _switch_off_telemetry() -> None:
 
 
 _switch_off_telemetry()  # here, because a runtime's first import anywhere in this package is too late
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

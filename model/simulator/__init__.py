@@ -3,10 +3,4 @@
 - `sampling` reads scenes and samples them onto the sensor's grid, `procedural` draws one;
 - `mtf` is the blur, in Fourier; `detector` what detectors and electronics do afterwards, noise among it;
 - `plan` decides, with proven bounds, which optional effects a scene can show; `acquire` puts all in order.
-
-What is offered here is loaded when it is asked for: `mtf` by itself needs no torch.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,19 +9,3 @@ it with.
 Every step takes and gives strips of rows (`rows`), so a chain of any height runs in the memory of some hundred rows;
 NaN marks missing pixels.
 """
-
-from beers_deploy.model.traditional.nl_bayes import QUALITIES
-from beers_deploy.model.traditional.noise import Noise, destabilise, stabilise
-from beers_deploy.model.traditional.peers import PEERS
-from beers_deploy.model.traditional.pipeline import Chain, restore_strips, restore_traditional
-
-__all__ = [
-    "PEERS",
-    "QUALITIES",
-    "Chain",
-    "Noise",
-    "destabilise",
-    "restore_strips",
-    "restore_traditional",
-    "stabilise",
-]

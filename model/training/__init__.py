@@ -5,10 +5,4 @@
 - `losses` holds the terms, `validation` judges on sites held out;
 - `trainer` runs the steps, on one process or several; `checkpoint` keeps them with the recipe, and holds what stops a
   run gone wrong; `run` is a whole run from options to a folder.
-
-What is offered here is loaded when it is asked for.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

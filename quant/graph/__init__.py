@@ -7,7 +7,7 @@
 - `writer`: back to float ONNX.
 """
 
-from beers_deploy.quant.graph.network import Network, channels_of, check_network, refused_graph
+from beers_deploy.quant.graph.network import Network, channels_of, check_network
 from beers_deploy.quant.graph.operations import (
     COARSE_MAX,
     CORRECTION,
@@ -30,7 +30,6 @@ from beers_deploy.quant.graph.operations import (
     Resize,
     Shuffle,
     Window,
-    is_plain,
     read_planes,
     relu_count,
     same,
@@ -46,6 +45,6 @@ __all__ = [
     "COARSE_MAX", "CORRECTION", "COUNT", "IMAGE", "PLANES", "PLANES_FRAC_BITS", "QUARTER", "STEP", "Activation",
     "Add", "AveragePool", "Concat", "Conv", "Graph", "MaxPool", "Mul", "Network", "Op", "Pointwise", "Resize",
     "Shuffle", "Window", "channels_of", "check_network", "correction_graph",
-    "graph_to_onnx", "image_channels", "is_plain", "plain_network", "read_network", "read_planes", "refusal",
-    "refused_graph", "relu_count", "same", "split", "tensors", "tied", "ties_scales",
+    "graph_to_onnx", "image_channels", "plain_network", "read_network", "read_planes", "refusal",
+    "relu_count", "same", "split", "tensors", "tied", "ties_scales",
 ]  # fmt: skip

@@ -7,10 +7,7 @@
 from beers_deploy.quant.integer.reference import (
     INT32_BITS,
     SOUND,
-    Agreement,
     Faults,
-    LayerAgreement,
-    LayerReport,
     agreement,
     correction,
     integer_rows,
@@ -19,6 +16,6 @@ from beers_deploy.quant.integer.reference import (
 )
 
 __all__ = [
-    "INT32_BITS", "SOUND", "Agreement", "Faults", "LayerAgreement", "LayerReport", "agreement", "correction",
+    "INT32_BITS", "SOUND", "Faults", "agreement", "correction",
     "integer_rows", "merged_correction", "run_core",
 ]  # fmt: skip
