@@ -256,18 +256,6 @@ def test_a_tiff_that_would_have_to_be_unpacked_or_paged_through_gets_one_sentenc
     assert "pages" in refusal(sensor_file(tmp_path, mtf)).got
 
 
-def test_a_tiff_whose_pages_lead_in_a_circle_is_refused_at_once(tmp_path: Path) -> None:
-    path = tmp_path / "psf.tif"
-    tifffile.imwrite(path, lopsided().astype(np.float32), metadata=None)
-    content = bytearray(path.read_bytes())
-    first = int.from_bytes(content[4:8], "little")
-    count = int.from_bytes(content[first : first + 2], "little")
-    end = first + 2 + 12 * count
-    content[end : end + 4] = content[4:8]
-    path.write_bytes(content)
-    assert "pages" in refusal(sensor_file(tmp_path, PSF.replace("npy", "tif"))).got
-
-
 def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:
     plain = load_sensor("pleiades-degraded")
     alpha, beta = plain.nominal().alpha, plain.nominal().beta

@@ -13,19 +13,8 @@ from packaging.version import Version
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("deploy", "model", "quant", "profiles")
 OF_ONE_SYSTEM = {
-    "fcntl",
-    "grp",
-    "msvcrt",
-    "nt",
-    "posix",
-    "pty",
-    "pwd",
-    "resource",
-    "syslog",
-    "termios",
-    "tty",
-    "winreg",
-}
+    "fcntl", "grp", "msvcrt", "nt", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty", "winreg",
+}  # fmt: skip
 TORCH = re.compile(r"pip install[^\n]*?[ '\"]torch((?:[<>=!~]=?[\d.]+,?)+)")
 VERSIONS = [Version(text) for text in ("2.4.1", "2.5.0", "2.9.1", "2.13.0", "2.13.1", "2.14.0", "2.15.0", "3.0.0")]
 
