@@ -19,6 +19,7 @@ import beers_deploy as bd
 from beers_deploy.model.progress import Step
 from beers_deploy.profiles.sensor import numbers_of
 from beers_deploy.profiles.sensor_file import sensor_names
+from beers_deploy.profiles.target import board_names
 from beers_deploy.results import SCHEMA_PATH
 from tests.deploy.studies.tradeoff.small import small_studies
 
@@ -189,6 +190,11 @@ def test_a_pair_is_read_as_evaluate_reads_it(pair: bd.Pair, tmp_path: Path) -> N
     )
     assert (names["chain"]["PSNR"].value or 0) > (names["half"]["PSNR"].value or 0)
     assert pair._repr_html_().count("<img") == 3
+    assert repr(pair) == "Pair(70 x 70 px, pleiades-degraded -> pleiades-reference)"
+    assert pair.ssim(pair.reference) == 1 > pair.ssim(pair.degraded) > 0
+    assert bd.simulate(np.full((700, 800), 90.0, np.float32)).degraded.shape == (76, 96)
+    assert {row.name for row in bd.boards().rows} == set(board_names())
+    assert [row.text["precision"] for row in bd.networks().rows] == ["float32", "int8"] * 5
 
 
 def test_tensors_and_masks_come_back_as_they_went(raw: np.ndarray) -> None:
@@ -254,6 +260,16 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], type[Exception], str]] 
     "no limit": (lambda _: bd.gate(f"{SMALL}-int8", SMALL, limits={"maee": 1}), ValueError, "named mae"),
     "no DPU": (lambda _: bd.check(f"{SMALL}-int8", "host-cpu"), ValueError, "a target with a DPU"),
     "no board": (lambda _: bd.predict(SMALL, "none"), ValueError, "expected one of"),
+    "no pairs": (
+        lambda raw: bd.quantize(Tiny(), (raw[None, None], raw[None, None].repeat(2, 0))),
+        ValueError,
+        "a reference for each",
+    ),
+    "no sample": (lambda _: bd.quantize(Tiny(), 3), ValueError, "or a path"),
+    "no batch": (lambda raw: bd.quantize(Tiny(), [raw]), ValueError, "a batch of"),
+    "empty": (lambda _: bd.quantize(Tiny(), []), ValueError, "at least one sample"),
+    "no raw image": (lambda _: bd.characterize([]), ValueError, "one or several"),
+    "no module's size": (lambda _: bd.Network.load(Tiny(), example=(1, 9, 8, 8)), ValueError, "that torch exports"),
     "no size": (lambda _: bd.simulate(size=0), ValueError, "size: expected"),
     "other sizes": (lambda raw: bd.simulate(size=48).psnr(raw), ValueError, "one of shape"),
     "no figure": (lambda _: bd.sensors().plot("x"), ValueError, "figure: expected one of"),

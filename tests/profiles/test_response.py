@@ -139,6 +139,8 @@ def test_a_profile_comes_back_from_json_without_its_file(mtf: str, noise: str | 
     np.save(tmp_path / "psf.npy", lopsided())
     profile = load_sensor(str(sensor_file(tmp_path, mtf, noise)))
     (tmp_path / "psf.npy").unlink()
+    saved = load_sensor(str(profile.save(tmp_path / "saved.toml")))
+    assert saved.nominal().mtf_axes == pytest.approx(profile.nominal().mtf_axes, rel=1e-4)
     back = sensor_from_json("a test", json.loads(json.dumps(asdict(profile))))
     assert back == profile
     assert same_instrument(back, profile)

@@ -65,6 +65,21 @@ def of_one(write: Callable[[GraphWriter], object]) -> onnx.ModelProto:
     return make_model(writer.graph("g", [image_info("image", 1, None)], [result]), {})
 
 
+@pytest.mark.parametrize("kind", ["Add", "Sub", "Mul"])
+@pytest.mark.parametrize("shape", [(1, 2, 1, 1), (2, 1, 1), ()])
+def test_one_number_a_channel_behind_an_activation_is_a_convolution(kind: str, shape: tuple[int, ...]) -> None:
+    value = np.random.default_rng(0).normal(size=shape).astype(np.float32)
+
+    def write(w: GraphWriter) -> None:
+        w.node(kind, "restored", [w.node("LeakyRelu", "y", ["x"], alpha=26 / 256), w.constant("own", value)])
+
+    last = read_network(of_one(write)).graph[-1]
+    assert isinstance(last, Conv)
+    factor, offset = {"Add": (1, value), "Sub": (1, -value), "Mul": (value, 0)}[kind]
+    for found, wanted in ((last.weight, factor), (last.bias, offset)):
+        np.testing.assert_array_equal(found.ravel(), np.broadcast_to(np.ravel(wanted), 2))
+
+
 @pytest.mark.parametrize("factor", [2, 3, 4])
 @pytest.mark.parametrize("rounding", ["floor", "ceil", "round_prefer_floor", "round_prefer_ceil"])
 @pytest.mark.parametrize("where", ["asymmetric", "half_pixel", "pytorch_half_pixel", "align_corners"])
