@@ -88,11 +88,11 @@ class Group(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command; what was lost on standard output ends it with 70 when all is done."""
-        out: Any = Stream(sys.stdout)
+        closed, out = sys.stdout is None, cast(Any, Stream(sys.stdout))
         sys.stdout, sys.stderr = out, cast(TextIO, Stream(sys.stderr))
         found = self._invoke(ctx)
-        if out.lost:
-            typer.echo(f"beers-deploy: standard output: {out.lost}; all else is done", err=True)
+        if out.lost or (closed and _pipes_results(ctx)):
+            typer.echo(f"beers-deploy: standard output: {out.lost or 'closed'}; all else is done", err=True)
             ctx.exit(CRASHED)
         return found
 

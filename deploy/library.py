@@ -226,6 +226,9 @@ def _restore(image: Any, job: Job) -> Any:
     bands = _bands_first(image)
     raster = _raster(bands, job.nodata)
     lazy = hasattr(image, "__dask_graph__")
+    if lazy and np.ma.isMaskedArray(getattr(image, "_meta", None)):
+        remedy = "fill it, dask.array.ma.filled(image, 0), and give that value as `nodata`; or compute it first"
+        raise ImageError(NAME, expected="a Dask array without a mask", got="a masked one", remedy=remedy)
     if job.method == TRADITIONAL:
         if lazy:
             remedy = "compute it first, or take a network"

@@ -196,11 +196,11 @@ class Network:
 
 def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
     """A module of torch as ONNX, for any number and size of images."""
-    torch = optional("torch", "network")
-    if not isinstance(module, torch.nn.Module):
+    if not hasattr(module, "state_dict"):
         expected = "a Network, a ModelProto, a torch.nn.Module, a file or a shipped name"
         remedy = "give one of these"
         raise ModelError("network", expected=expected, got=type(module).__name__, remedy=remedy)
+    torch = optional("torch", "network")
     free = {name: {0: "N", 2: "H", 3: "W"} for name in ("image", "restored")}
     stream, training = io.BytesIO(), module.training
     with warnings.catch_warnings():

@@ -37,7 +37,7 @@ from beers_deploy.quant.samples import CALIBRATED_ON, OwnSamples, samples_of, wi
 from beers_deploy.quant.session import open_any_size
 from beers_deploy.quant.structure import saturated_shares, structure_checks
 from beers_deploy.restoration.options import TILE_PX
-from beers_deploy.results import Table
+from beers_deploy.results import Input, Table, input_of
 
 if TYPE_CHECKING:
     from beers_deploy.quant.samples import Patches
@@ -150,7 +150,8 @@ def compare(
         shares = saturated_shares(ours.model, unseen.degraded)
     arguments: dict[str, object] = {"float": theirs.name, "int8": ours.name, "sensor": known.name, "images": images}
     arguments |= {"patches": patches, "seed": seed, "samples": samples if isinstance(samples, str | Path) else None}
-    rows, inputs = (verdict_row(result, shares),), (theirs.input, ours.input)
+    own = [Path(samples)] if isinstance(samples, str | Path) and Path(samples).is_file() else []
+    rows, inputs = (verdict_row(result, shares),), (theirs.input, ours.input, *map(input_of, own))
     return Comparison(
         "compare",
         arguments,
@@ -297,9 +298,13 @@ def require_same_float(path: Path, found: Comparison) -> None:
     document: Any = read_json(path)
     before = next(row["figures"].get("PSNR float", {}) for row in document["rows"] if row["table"] == "gate")
     same_psnr = abs(found.result.psnr_float_db - float(before.get("value") or math.nan)) < SAME_DB
-    if not same_psnr and found.float_sha256 not in [each["sha256"] for each in document["inputs"]]:
-        remedy = "make it anew with 'gate --json'"
+    digests, remedy = [each["sha256"] for each in document["inputs"]], "make it anew with 'gate --json'"
+    if not same_psnr and found.float_sha256 not in digests:
         raise OptionError(str(path), expected="a baseline of this float network", got="another's", remedy=remedy)
+    own = [each for each in found.inputs[2:] if isinstance(each, Input)]
+    if own and len(digests) > 2 and own[0].sha256 not in digests:
+        expected, got = "a baseline of the same samples", f"one of another {own[0].name}"
+        raise OptionError(str(path), expected=expected, got=got, remedy=remedy)
 
 
 def _plain(name: str, value: object) -> str:

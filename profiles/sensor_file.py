@@ -228,13 +228,17 @@ CHECKS: dict[str, Check] = {
     ),
 }
 """What each constant may be, both ends of a range: in words, and what to do otherwise."""
+LEAST, MOST = 1e-12, 1e12
+"""Of any constant that is not 0: beyond lies no instrument, and powers of it no float."""
 
 
 def _check_each(label: str, constants: Mapping[str, Constant]) -> None:
     for key, constant in constants.items():
         valid, expected, remedy = CHECKS[key]
+        where = f"{label} [{TABLE_OF[key]}] {key}"
+        if any(value and not LEAST <= abs(value) <= MOST for value in (constant.low, constant.high)):
+            raise ProfileError(where, expected=f"{LEAST:g} to {MOST:g}", got=str(constant), remedy=remedy)
         if not (valid(constant.low) and valid(constant.high)):
-            where = f"{label} [{TABLE_OF[key]}] {key}"
             raise ProfileError(where, expected=expected, got=str(constant), remedy=remedy)
 
 

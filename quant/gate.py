@@ -11,10 +11,11 @@ import numpy as np
 import onnxruntime as ort
 
 from beers_deploy.model.metrics.fidelity import psnr_db
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Check, Figure, Row, measured, unavailable
 from beers_deploy.profiles.toml import read_toml_text, unreadable
 from beers_deploy.quant.session import result_of
+from beers_deploy.quant.untrusted import times
 
 if TYPE_CHECKING:
     from beers_deploy.quant.samples import Pair
@@ -61,16 +62,24 @@ def compare(
     pairs: "Iterable[Pair]",
     simulated: bool = True,
 ) -> GateResult:
-    """Run both networks on (degraded, reference) pairs of (1, C, H, W) in [0, 1]; outputs clipped as a file would.
+    """Run both networks on (degraded, reference) pairs of (1, C, H, W) in [0, 1]; images clipped as a file would.
 
     Without references, or where they have another size than what is compared, the PSNRs to them are NaN.
+
+    Raises:
+        ModelError: results of different shapes.
     """
     differences, errors, agreeing = [], [], []
     for degraded, reference in pairs:
         results = [result_of(s, degraded) for s in (float_session, int8_session)]
+        if results[0].shape != results[1].shape:
+            expected, got = (times(result.shape) for result in results)
+            remedy = "give the INT8 file that was made of this float network"
+            raise ModelError("INT8 network", expected=f"results of {expected}, as in float", got=got, remedy=remedy)
         classes = [result.argmax(1) for result in results]
         agreeing.append((classes[0] == classes[1]).mean() if results[0].shape[1] > degraded.shape[1] else math.nan)
-        in_float, in_int8 = (_as_in_a_file(result, degraded) for result in results)
+        is_image = results[0].ndim == 4 and results[0].shape[1] == degraded.shape[1] and _mostly_inside(results[0])
+        in_float, in_int8 = (_as_in_a_file(result, is_image) for result in results)
         differences.append((in_int8 - in_float).ravel())
         errors.append([_psnr_db(image, reference) for image in (degraded, in_float, in_int8)])
     difference = np.concatenate(differences).astype(np.float64)
@@ -90,10 +99,17 @@ def compare(
     )
 
 
-def _as_in_a_file(result: np.ndarray, image: np.ndarray) -> np.ndarray:
+MOST = 0.75
+"""Of a float network's results lie in [0, 1] where they are an image, and not a correction or of another scale."""
+
+
+def _mostly_inside(result: np.ndarray) -> bool:
+    return bool(((result >= 0) & (result <= 1)).mean() >= MOST)
+
+
+def _as_in_a_file(result: np.ndarray, is_image: bool) -> np.ndarray:
     """An image clipped to [0, 1], anything else as it is; NaN where infinite, which no clipping makes a pixel."""
-    clipped = np.clip(result, 0, 1) if result.shape[1:2] == image.shape[1:2] and result.ndim == 4 else result
-    return np.where(np.isinf(result), np.nan, clipped)
+    return np.where(np.isinf(result), np.nan, np.clip(result, 0, 1) if is_image else result)
 
 
 def _psnr_db(image: np.ndarray, reference: np.ndarray) -> float:
@@ -125,15 +141,15 @@ class Limits:
 
 MAE_GROWTH = 1.05
 BREAKABLE = {
-    "mae": (0.0, 1.0),
-    "p999": (0.0, 1.0),
+    "mae": (0.0, 0.5),
+    "p999": (0.0, 0.9),
     "std_over_mae": (0.0, 1000.0),
     "psnr_drop_db": (0.0, 100.0),
     "min_psnr_float_int8_db": (10.0, 1000.0),
-    "saturated": (0.0, 1.0),
+    "saturated": (0.0, 0.9),
     "mae_growth": (0.0, 100.0),
 }
-"""What limits may be: no difference of images in [0, 1] and no share is larger, and no network is so far off."""
+"""What limits may be: images in [0, 1] differ by no more, no layer saturates more, and no network is so far off."""
 
 
 def limits_of(given: "Limits | Mapping[str, float] | str | os.PathLike[str] | None") -> Limits:

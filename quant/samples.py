@@ -8,7 +8,7 @@ should give beside what it reads, as `image` and `reference`.
 import hashlib
 import os
 import zipfile
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -132,7 +132,7 @@ def samples_in(given: object) -> list[Named]:
             got = f"{len(seen)} images and {len(meant)} references"
             raise ImageError(IN_MEMORY, expected="a reference for each image", got=got, remedy=REMEDY)
         return [(f"{IN_MEMORY}[{k}]", *pair) for k, pair in enumerate(zip(seen, meant, strict=True))]
-    if not isinstance(given, Iterable):
+    if not isinstance(given, Iterable) or isinstance(given, str | bytes | Mapping):
         got = type(given).__name__
         raise ImageError(IN_MEMORY, expected="arrays (N, C, H, W), or a path", got=got, remedy=REMEDY)
     items = (tuple(item) if isinstance(item, list) and len(item) == 2 else item for item in given)
@@ -186,14 +186,11 @@ def _samples(path: Path) -> Iterator[Named]:
     if path.is_dir():
         for file in sorted(path.iterdir()):
             if file.suffix.lower() == ".npy":
-                yield file.name, _one(file, _array(file)), NO_REFERENCE
+                yield file.name, _one(file, _stored(file)[0]), NO_REFERENCE
             elif file.suffix.lower() in IMAGE_SUFFIXES:
                 yield file.name, _bands_first(file, read_pixels(file)), NO_REFERENCE
         return
-    if path.suffix.lower() == ".npz":
-        images, references = _archive(path)
-    else:
-        images, references = _array(path), NO_REFERENCE
+    images, references = _stored(path)
     if images.ndim != 4 or (references.size and len(references) != len(images)):
         got = times(images.shape) + (f" and references of {times(references.shape)}" if references.size else "")
         raise ImageError(str(path), expected="a batch of (N, C, H, W)", got=got, remedy=REMEDY)
@@ -207,35 +204,28 @@ def _one(file: Path, array: np.ndarray) -> np.ndarray:
     return array
 
 
-def _array(path: Path) -> np.ndarray:
-    """A .npy file's array, mapped rather than read; nothing is unpickled."""
+def _stored(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The array of a .npy file, mapped rather than read; of a .npz file `image` and `reference`, or its only array.
+
+    Nothing is unpickled.
+    """
     got = unreadable(path)
     if got is not None:
-        raise ImageError(str(path), expected="a .npy file", got=got, remedy="check the path")
+        raise ImageError(str(path), expected="a .npy or .npz file", got=got, remedy="check the path")
     try:
-        return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
-    except (OSError, ValueError, EOFError) as error:
+        held = np.load(path, mmap_mode="r", allow_pickle=False)
+        if isinstance(held, np.ndarray):
+            return np.asarray(held), NO_REFERENCE
+        with held:
+            arrays = {name: held[name] for name in held.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         expected = "a .npy or .npz file of numbers, or a folder of images"
         raise ImageError(str(path), expected=expected, got="another file", remedy=REMEDY) from error
-
-
-def _archive(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """`image` and `reference`, or the only array there is."""
-    got = unreadable(path)
-    if got is not None:
-        raise ImageError(str(path), expected="a .npz file", got=got, remedy="check the path")
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as held:
-            names = list(held.files)
-            image = "image" if "image" in names else names[0] if len(names) == 1 else None
-            if image is None:
-                got = ", ".join(names) or "no array"
-                raise ImageError(str(path), expected="arrays named image and reference", got=got, remedy=REMEDY)
-            return held[image], held["reference"] if "reference" in names else NO_REFERENCE
-    except ImageError:
-        raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ImageError(str(path), expected="a .npz file of numbers", got="another file", remedy=REMEDY) from error
+    image = "image" if "image" in arrays else next(iter(arrays)) if len(arrays) == 1 else None
+    if image is None:
+        got = ", ".join(arrays) or "no array"
+        raise ImageError(str(path), expected="arrays named image and reference", got=got, remedy=REMEDY)
+    return arrays[image], arrays.get("reference", NO_REFERENCE)
 
 
 def _bands_first(path: Path, pixels: np.ndarray) -> np.ndarray:

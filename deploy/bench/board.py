@@ -92,7 +92,7 @@ def predict(
     """
     found = Network.load(network, sensor=SENSOR, to_run=False)
     boards, corrected = _boards(board, dpu, None if measured is None else Path(measured))
-    width_px, height_px = parse_size(size) if isinstance(size, str) else size
+    width_px, height_px = parse_size("x".join(map(str, size)) if isinstance(size, tuple | list) else str(size))
     predictions = [(each, predict_file(found.file, each, _tile_px(found, tile), host_task)) for each in boards]
     try:
         exact_px = found.tiling.halo_px

@@ -95,20 +95,27 @@ def predicted_rows(name: str, prediction: Prediction, swath: Swath, dpu: Dpu) ->
 
 
 def _predicted_row(name: str, prediction: Prediction, swath: Swath, dpu: Dpu, frames: float, batches: float) -> Row:
+    figures = _swath_figures(prediction, swath, dpu, frames, batches) | {
+        "one-thread latency": one_thread_latency(prediction),
+        "host beside the DPU": host_time(prediction, "ms/tile"),
+        "power of products and traffic": counted_power(prediction, dpu),
+    }
+    return Row(TABLE, name, figures, {"fitted range": fitted_range(prediction)})
+
+
+def _swath_figures(
+    prediction: Prediction, swath: Swath, dpu: Dpu, frames: float, batches: float
+) -> dict[str, Figure]:
     power, latency = dpu_power(dpu), swath_latency(prediction, batches)
-    figures = {
+    return {
         "tiles": exact(frames, "tile", ARITHMETIC),
         "work factor": exact(swath.work_factor(frames), "px/px", ARITHMETIC),
         "latency": latency,
         "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
-        "one-thread latency": one_thread_latency(prediction),
-        "host beside the DPU": host_time(prediction, "ms/tile"),
         "power": power,
-        "power of products and traffic": counted_power(prediction, dpu),
         "energy": energy(latency, power),
         "efficiency": efficiency(swath.pixels, latency, power),
     }
-    return Row(TABLE, name, figures, {"fitted range": fitted_range(prediction)})
 
 
 def host_time(prediction: Prediction, unit: str) -> Figure:
@@ -275,15 +282,8 @@ def sweep_rows(
 
 def swath_row(prediction: Prediction, swath: Swath, dpu: Dpu) -> Row:
     """A swath in whole tiles on one configuration."""
-    latency, power = swath_latency(prediction, math.ceil(swath.tiles / prediction.batch)), dpu_power(dpu)
-    figures = {
-        "tiles": exact(swath.tiles, "tile", ARITHMETIC),
-        "work factor": exact(swath.work_factor(swath.tiles), "px/px", ARITHMETIC),
-        "latency": latency,
-        "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
-        "power": power,
-        "energy": energy(latency, power),
-        "efficiency": efficiency(swath.pixels, latency, power),
+    batches = math.ceil(swath.tiles / prediction.batch)
+    figures = _swath_figures(prediction, swath, dpu, swath.tiles, batches) | {
         "maps through memory": exact(prediction.streamed_bytes / 1e6, "MB/tile"),
         "layers on chip": exact(on_chip(prediction), "%"),
     }

@@ -6,9 +6,10 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import BOARDS, arguments, save, say
+from beers_deploy.commands.shared import BOARDS, STDOUT, arguments, save, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.target import DEFAULT_TARGET
 
 EXAMPLE = "gate float.onnx int8.onnx --max-mae 0.0007"
@@ -55,6 +56,8 @@ def gate(
     from beers_deploy.verdict import gate as judged
 
     read = (float_model, int8_model, limits, baseline, images, samples, *map(Path, (target, sensor)))
+    if junit == STDOUT:
+        raise OptionError("--junit", expected="a file", got="-", remedy="name one: standard output is for --json -")
     require_writable(json, junit, inputs=read)
     against, int8 = pair_of(float_model, int8_model)
     allowed = read_limits(limits, max_mae)

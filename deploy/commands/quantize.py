@@ -9,7 +9,7 @@ import typer
 from beers_deploy.commands.shared import BOARDS, arguments, save, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET
 
@@ -90,7 +90,7 @@ def quantize(
     if report and conditioned(model):
         expected, remedy = "a network that is calibrated by itself", "leave it out"
         raise OptionError("--report", expected=expected, got="one behind a bank", remedy=remedy)
-    page, figures = (report / "report.html", report / "report.json") if report else (None, None)
+    page, figures = _report_files(report)
     read = (model, images, samples, *map(Path, (target, sensor)))
     require_writable(out, board_file, json, page, figures, inputs=read)
     require_onnx_name(out, board_file)
@@ -118,3 +118,11 @@ def quantize(
     document = Table("quantize", arguments(), (origin, out), tuple(rows))
     for path in (figures, json):
         save(document, path)
+
+
+def _report_files(folder: Path | None) -> tuple[Path, Path] | tuple[None, None]:
+    """The page and the figures of --report, which matplotlib draws."""
+    if folder is None:
+        return None, None
+    optional("matplotlib", "--report")
+    return folder / "report.html", folder / "report.json"

@@ -1,10 +1,12 @@
 """Bands of several sensors: `B0=a.toml,B1=b.toml` gives each band a network of its own.
 
-Where the image names its bands, each is found by its name; else they are taken in the order given.
+Where the image names its bands, each is found by its name; else by the number that names end in, or in the order
+given.
 """
 
+import re
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -49,12 +51,20 @@ def in_order(given: Mapping[str, Each], raster: Raster) -> list[Each]:
     """What was given for each band, in the order of the image's bands; what is for all of them alone."""
     if "" in given:
         return [given[""]]
-    names = band_names(raster) or tuple(given)
+    named = band_names(raster)
+    names = named or _by_number(given)
     if len(given) != raster.bands or set(names) != set(given):
-        expected = f"a sensor for each of {raster.bands} bands" + (f": {', '.join(names)}" if names else "")
+        expected = f"a sensor for each of {raster.bands} bands" + (f": {', '.join(named)}" if named else "")
         remedy = "name every band of the image; pansharpening is out of scope"
         raise OptionError("sensor", expected=expected, got=", ".join(given), remedy=remedy)
     return [given[name] for name in names]
+
+
+def _by_number(names: Iterable[str]) -> tuple[str, ...]:
+    """Names that end in a number, such as B2, in the order of these; others as they are given."""
+    numbers = {name: re.fullmatch(r"\D*(\d{1,6})", name) for name in names}
+    found = {name: int(match[1]) for name, match in numbers.items() if match}
+    return tuple(sorted(found, key=lambda name: found[name]) if len(found) == len(numbers) else numbers)
 
 
 def require_alike(networks: Sequence[onnx.ModelProto], paths: Sequence[Path]) -> None:

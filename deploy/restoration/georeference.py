@@ -1,13 +1,20 @@
-"""Where an image lies on Earth, carried to one of more pixels: TIFF's tags of geography, scaled.
+"""Where an image lies on Earth, carried to one of more pixels: TIFF's tags of geography, scaled; and files beside it.
 
 A pixel's corner at (column, row) comes to `scale` times both. Tags that say what a pixel's middle is (rational
 polynomials, and GeoTIFF's where the raster is of points) move by the half pixel between the two.
 """
 
+import math
+import xml.etree.ElementTree as ET
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from beers_deploy.restoration.source import Tag
+from beers_deploy.model.io.tiff import number_of, require_small_offset
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.restoration.index_files import NoDoctype
+from beers_deploy.restoration.source import NODATA_TAG, Raster, Tag, usable_nodata
 
 PIXEL_SCALE, TIE_POINTS, TRANSFORMATION, KEYS, POLYNOMIALS = 33550, 33922, 34264, 34735, 50844
 RASTER_TYPE, POINTS = 1025, 2
@@ -63,3 +70,51 @@ def _transformation(value: Sequence[float], scale: int, points: bool) -> tuple[f
         row[3] += shift * (row[0] + row[1])
         row[0], row[1] = row[0] / scale, row[1] / scale
     return tuple(number for row in rows for number in row)
+
+
+AUX_BYTES = 1 << 20
+UNREAD = (".tfw", ".tifw", ".wld", ".jgw", ".pgw", ".j2w", ".RPB", ".rpb", "_RPC.TXT", "_rpc.txt")
+"""Ends of files beside an image that say where it lies, as GDAL finds them."""
+
+
+def of_sidecar(path: Path, raster: Raster) -> Raster:
+    """The raster with the nodata value that GDAL keeps in IMAGE.aux.xml, where the image has none of its own.
+
+    Raises:
+        ImageError: an offset there by which 0 is far from no light, bands of several nodata values, or no metadata.
+    """
+    beside = path.with_name(f"{path.name}.aux.xml")
+    if not beside.is_file():
+        return raster
+    name, bands = str(beside), list(_metadata(beside).iter("PAMRasterBand"))
+    for band in bands:
+        offset, scale = (number_of(band.findtext(key, ""), usual) for key, usual in (("Offset", 0), ("Scale", 1)))
+        require_small_offset(name, offset, scale)
+    stated = {band.findtext("NoDataValue", "").strip() for band in bands} - {""}
+    if len(stated) > 1:
+        raise ImageError(name, expected="one nodata value", got=", ".join(sorted(stated)), remedy="split the bands")
+    found = [number_of(text, math.nan) for text in stated] if raster.nodata is None else []
+    nodata = usable_nodata(name, found[0], raster.dtype) if found else None
+    if nodata is None:
+        return raster
+    return replace(raster, nodata=nodata, tags=(*raster.tags, (NODATA_TAG, 2, 0, f"{nodata:.17g}", True)))
+
+
+def _metadata(path: Path) -> ET.Element:
+    try:
+        if path.stat().st_size > AUX_BYTES:
+            raise ValueError(f"more than {AUX_BYTES >> 20} MiB")
+        return ET.fromstring(path.read_bytes(), ET.XMLParser(target=NoDoctype()))  # noqa: S314 - no document type
+    except (ET.ParseError, ValueError, RecursionError) as error:
+        got, remedy = " ".join(str(error).split())[:120], "write it again, or remove it"
+        raise ImageError(str(path), expected="metadata as GDAL writes it", got=got, remedy=remedy) from error
+
+
+def unread_places(path: Path, raster: Raster) -> list[str]:
+    """A sentence for each file beside an image that says where it lies, which itself does not; they are not read."""
+    if {tag[0] for tag in raster.tags} & {PIXEL_SCALE, TRANSFORMATION, KEYS, POLYNOMIALS}:
+        return []
+    found = [each for end in UNREAD if (each := path.with_name(f"{path.stem}{end}")).is_file()]
+    return [
+        f"{each.name} is not read: keep it beside the result, or write its place into the image" for each in found
+    ]

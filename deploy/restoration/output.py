@@ -189,6 +189,9 @@ def require_tiff_name(path: Path) -> None:
     if path.suffix.lower() not in TIFF_SUFFIXES | BIG_TIFF_SUFFIXES:
         remedy = "name it so; other programs turn a TIFF into what you need"
         raise OptionError("OUT", expected="a TIFF's name, such as restored.tif", got=path.name, remedy=remedy)
+    if (mask := path.with_name(f"{path.name}.msk")).exists():
+        remedy = "remove it, or choose another name: readers would take it for the mask of the new image"
+        raise OptionError("OUT", expected="no mask of that name", got=mask.name, remedy=remedy)
 
 
 def require_codec(compression: Compression) -> None:

@@ -31,7 +31,7 @@ from beers_deploy.quant.reading.external import network_sha256
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.cog import disk_bytes, require_cog, what_was_done, write_cog
 from beers_deploy.restoration.engine import RestoredRow, Restorer, restore_rows
-from beers_deploy.restoration.georeference import enlarged_tags
+from beers_deploy.restoration.georeference import enlarged_tags, unread_places
 from beers_deploy.restoration.options import Compression, Options
 from beers_deploy.restoration.output import Checkpoint, only_run, require_codec, require_tiff_name, write_output
 from beers_deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
@@ -82,6 +82,8 @@ def _restore(image: Path, out: Path, options: Options, log: Log, beside: Sequenc
         require_alike(networks, paths)
         plan = plan_for(networks[0], raster.shape, options)
         log(plan.sentence)
+        for sentence in unread_places(image, raster):
+            log(sentence)
         check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
         scale = scale_of(source, plan, options, str(image))
         check = told_sensor(source, options.sensors, scale.value, str(image), options.strict, log)

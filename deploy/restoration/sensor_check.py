@@ -6,7 +6,7 @@ and what was told. Texture without edges tells no blur, a scene without even gro
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -33,6 +33,8 @@ NOISE_KEPT, BLUR_KEPT = 1.25, 1.15
 """Factors of the noise's variance, and of the MTF, that an interval may lie off by before anything is said."""
 SMOOTH, QUIET_PERCENT = 0.45, 10.0
 """Of the noise told: less in a tenth of the blocks is the work of a filter. By chance they hold 0.6 of it."""
+ABOVE = 0.001
+"""Share of pixels above full scale that no image of the sensor has."""
 FILTERED = ": restored, resampled or compressed before, or of another gain"
 AXES = ("across", "along")
 
@@ -176,24 +178,21 @@ def held_against(windows: Sequence[np.ndarray], sensor: Sensor, full_scale: floa
     """
     if not all((np.isfinite(window) & (window == np.rint(window))).all() for window in windows):
         reason = "the pixels are not whole numbers: they were scaled, and the noise of rounding is not known"
-        return SensorCheck({name: unavailable(unit, reason) for name, unit in FIGURES.items()})
-    step = max(int(np.gcd.reduce([np.gcd.reduce(window, axis=None) for window in _whole(windows)])), 1)
+        blurs = {f"MTF {axis} seen": unavailable("%", reason) for axis in AXES}
+        return SensorCheck({"SNR seen": unavailable("ratio", reason), **blurs})
+    step = max(int(np.gcd.reduce([np.gcd.reduce(window.astype(np.int64), axis=None) for window in windows])), 1)
     pixels, clipped_at = [window / step for window in windows], full_scale / step
     told = _told(sensor, clipped_at)
     blocks = join([cut_blocks(window, clipped_at) for window in pixels])
     line = fit_noise_model(blocks, np.random.default_rng(SEED))
     figures, doubts = _noise(line, blocks, told)
+    above = float(np.mean([(window > clipped_at).mean() for window in pixels]))
+    if above > ABOVE:
+        doubts.append(f"{above:.0%} of the pixels are above its full scale, {full_scale:g}")
     for axis, (figure, doubt) in zip(AXES, _blur(pixels, line, told, clipped_at), strict=True):
         figures[f"MTF {axis} seen"] = figure
         doubts += doubt
     return SensorCheck(figures, tuple(doubts))
-
-
-FIGURES = {"SNR seen": "ratio", **{f"MTF {axis} seen": "%" for axis in AXES}}
-
-
-def _whole(windows: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    return (window.astype(np.int64) for window in windows)
 
 
 def _told(sensor: Sensor, clipped_at: float) -> Told:

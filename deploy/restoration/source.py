@@ -298,6 +298,9 @@ def open_source(path: Path, trusted: bool = False) -> Iterator[Source]:
             source = stack.enter_context(open_pages(path))
         else:
             source = whole_source(path)
+        from beers_deploy.restoration.georeference import of_sidecar  # it reads what this file defines
+
+        source.raster = of_sidecar(path, source.raster)
         beside = path.with_name(f"{path.name}.msk")
         yield stack.enter_context(_masked(source, beside)) if beside.is_file() else source
 

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from beers_deploy.model.io.images import read_pixels
 from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.metrics import edge_blur
 from beers_deploy.model.metrics.edge_blur import AxisMtf, EdgeBlur
@@ -28,6 +27,7 @@ from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.sensor import Sensor, snr_0_bounds
 from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.restoration.sensor_check import NOISE_KEPT
+from beers_deploy.restoration.source import open_source
 from beers_deploy.results import Table, input_of
 
 FULL_SCALE_RADIANCE = 400.0
@@ -184,11 +184,14 @@ def _as_file(image: Any, path: Path) -> Path:
 
 
 def read_raw(path: Path) -> np.ndarray:
-    """Digital numbers (H, W) of one band, integers of any width."""
-    pixels = read_pixels(path)
-    if pixels.ndim != 2:
-        got, remedy = f"{pixels.shape[2]} bands", "extract one band; each has a sensor of its own"
+    """Digital numbers (H, W) of one band, integers of any width; 0 where they are missing."""
+    with open_source(path) as source:
+        raster, rows = source.raster, source.read(0, source.raster.height_px)
+    if raster.bands != 1:
+        got, remedy = f"{raster.bands} bands", "extract one band; each has a sensor of its own"
         raise ImageError(str(path), expected="one band", got=got, remedy=remedy)
+    held = np.ma.getdata(rows)[0]
+    pixels = np.where(raster.missing(rows)[0], 0, held) if raster.may_miss else held
     if (pixels.dtype.kind == "f" and (pixels != np.rint(pixels)).any()) or pixels.min() < 0 or pixels.max() > MAX_DN:
         got = f"{pixels.dtype} from {float(pixels.min()):.4g} to {float(pixels.max()):.4g}"
         remedy = "give the raw image: what was resampled, calibrated or scaled has lost its noise"

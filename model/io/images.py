@@ -73,7 +73,7 @@ def damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
         raise
     except Exception as error:
         name = f"{path}, {where}" if where else str(path)
-        if isinstance(error, ValueError) and "imagecodecs" in str(error):
+        if isinstance(error, ModuleNotFoundError) or "imagecodecs" in str(error):
             remedy = "pip install 'beers-deploy[codecs]'"
             expected = "a TIFF compression known here"
             raise MachineError(name, expected=expected, got=str(error), remedy=remedy) from error

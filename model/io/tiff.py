@@ -74,10 +74,11 @@ def _require_no_offset(path: Path, page: tifffile.TiffPage) -> None:
     said = str(page.tags[GDAL_METADATA].value) if GDAL_METADATA in page.tags else ""
     found = [re.findall(rf'<Item [^>]*role="{role}"[^>]*>([^<]*)<', said) for role in ("offset", "scale")]
     for offset, scale in zip_longest(*found, fillvalue="1"):
-        require_small_offset(str(path), _number(offset, 0), _number(scale, 1))
+        require_small_offset(str(path), number_of(offset, 0), number_of(scale, 1))
 
 
-def _number(text: str, otherwise: float) -> float:
+def number_of(text: str, otherwise: float) -> float:
+    """The number that a text states, or another where it states none."""
     try:
         return float(text)
     except ValueError:
@@ -100,7 +101,6 @@ SIZES = (
     "imagelength", "imagewidth", "imagedepth", "tilelength", "tilewidth", "tiledepth", "rowsperstrip",
     "samplesperpixel", "bitspersample", "planarconfig", "compression",
 )  # fmt: skip
-MARKER, FRAMES = 0xFF, set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def check_page(path: Path, page: tifffile.TiffPage) -> None:
@@ -118,17 +118,16 @@ def check_page(path: Path, page: tifffile.TiffPage) -> None:
         expected, got = f"strips or tiles that fit in {room}", f"{size} for one"
         raise MachineError(str(path), expected=expected, got=got, remedy="rewrite it in smaller tiles")
     _check_whole(path, page)
-    # A frame inside a strip states its own size, which the decoder believes rather than the page's.
-    if page.compression == JPEG:
-        _check_frames(path, page)
-    elif page.compression in DEFLATE and find_spec("imagecodecs") is None:
+    if page.compression in DEFLATE and find_spec("imagecodecs") is None:
         _check_unpacked(path, page)
 
 
 def segment_bytes(page: tifffile.TiffPage) -> int:
     """Bytes of one decoded strip or tile, as the file sizes it."""
     samples = page.samplesperpixel if page.planarconfig == 1 else 1
-    return math.prod(_place_px(page)) * max(page.tiledepth, 1) * samples * max(page.bitspersample // 8, 1)
+    place = page.tilelength, page.tilewidth
+    pixels = math.prod(place if page.is_tiled else (min(page.rowsperstrip, page.imagelength), page.imagewidth))
+    return pixels * max(page.tiledepth, 1) * samples * max(page.bitspersample // 8, 1)
 
 
 def _check_whole(path: Path, page: tifffile.TiffPage) -> None:
@@ -140,40 +139,10 @@ def _check_whole(path: Path, page: tifffile.TiffPage) -> None:
         raise ImageError(str(path), expected="a whole TIFF", got=got, remedy=remedy)
 
 
-def _place_px(page: tifffile.TiffPage) -> tuple[int, int]:
-    """Height and width of a strip or tile."""
-    if page.is_tiled:
-        return page.tilelength, page.tilewidth
-    return min(page.rowsperstrip, page.imagelength), page.imagewidth
-
-
 def _segments(page: tifffile.TiffPage) -> Iterator[bytes]:
     for segment in page.parent.filehandle.read_segments(page.dataoffsets, page.databytecounts):
         if isinstance(segment, tuple) and segment[0] is not None:
             yield segment[0]
-
-
-def _check_frames(path: Path, page: tifffile.TiffPage) -> None:
-    place = _place_px(page)
-    for data in _segments(page):
-        size = jpeg_size_px(data)
-        if size is None:
-            got, remedy = "a damaged one", "copy or convert it again"
-            raise ImageError(str(path), expected="JPEGs with a frame header", got=got, remedy=remedy)
-        if size[0] > place[0] or size[1] > place[1]:
-            raise _swollen(path, f"a JPEG of {size[1]} x {size[0]} pixels in a place of {place[1]} x {place[0]}")
-
-
-def jpeg_size_px(data: bytes) -> tuple[int, int] | None:
-    """Height and width in a JPEG's own header; None where no frame (marker C0 to CF but C4, C8, CC) comes first."""
-    at = 2
-    while at + 9 <= len(data) and data[at] == MARKER:
-        kind = data[at + 1]
-        if kind in FRAMES:
-            return int.from_bytes(data[at + 5 : at + 7]), int.from_bytes(data[at + 7 : at + 9])
-        # a fill byte, or a piece with its length
-        at += 1 if kind == MARKER else 2 + int.from_bytes(data[at + 2 : at + 4])
-    return None
 
 
 def _check_unpacked(path: Path, page: tifffile.TiffPage) -> None:

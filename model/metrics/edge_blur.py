@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.special import stdtrit
 
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX
@@ -308,6 +307,8 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
 
     The shape of the curve is left open: each one counts by what it leaves unexplained of the edges.
     """
+    from scipy.special import stdtrit  # here: who tells no sensor need not wait for SciPy
+
     other = float(np.median([edge.gamma for edge in others])) if others else None
     known = own[:SHAPED_EDGES]
     logs, errors, left = (np.array(part) for part in zip(*(_of_shape(own, other, s) for s in SHAPES), strict=True))

@@ -15,8 +15,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.fft import dctn
-from scipy.optimize import nnls
 
 from beers_deploy.model.metrics.refusal import Refusal
 
@@ -96,6 +94,8 @@ def cut_blocks(image: np.ndarray, clipped_at: float) -> Blocks:
 
 def _energies(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Squared cosine coefficients (N, S, S) of blocks less their planes, and their frequencies (S, S)."""
+    from scipy.fft import dctn  # here, as below: who tells no sensor need not wait for SciPy
+
     place = np.arange(SIDE_PX)
     ramp = place - (SIDE_PX - 1) / 2
     flat = pixels - pixels.mean((1, 2), keepdims=True)
@@ -203,6 +203,8 @@ def _quiet(blocks: Blocks, limit: float) -> tuple[Blocks, np.ndarray]:
 
 def _fitted(blocks: Blocks, weights: np.ndarray, band: str = "fine") -> np.ndarray:
     """(alpha, beta, leak), none negative, of a band; a mean square scatters by its own size."""
+    from scipy.optimize import nnls
+
     seen = getattr(blocks, band)
     size, fit = np.full(seen.size, max(float(weights @ seen / weights.sum()), ROUNDING)), np.zeros(3)
     for _ in range(4):

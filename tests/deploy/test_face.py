@@ -270,6 +270,8 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], type[Exception], str]] 
     "empty": (lambda _: bd.quantize(Tiny(), []), ValueError, "at least one sample"),
     "no raw image": (lambda _: bd.characterize([]), ValueError, "one or several"),
     "no module's size": (lambda _: bd.Network.load(Tiny(), example=(1, 9, 8, 8)), ValueError, "that torch exports"),
+    "no samples": (lambda raw: bd.quantize(Tiny(), {"image": raw}), ValueError, "or a path"),
+    "no swath": (lambda _: bd.predict(SMALL, size=(0, 0)), ValueError, "size: expected"),
     "no size": (lambda _: bd.simulate(size=0), ValueError, "size: expected"),
     "other sizes": (lambda raw: bd.simulate(size=48).psnr(raw), ValueError, "one of shape"),
     "no figure": (lambda _: bd.sensors().plot("x"), ValueError, "figure: expected one of"),

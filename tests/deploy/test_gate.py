@@ -10,6 +10,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import onnx
+import onnxruntime as ort
 import pytest
 from onnx import numpy_helper
 
@@ -17,13 +18,13 @@ import beers_deploy as bd
 from beers_deploy.export import float_model
 from beers_deploy.network import Network, shipped_pair
 from beers_deploy.profiles import load_target
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.figures import Bound, Check, Row, measured
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.free import quantise_free
 from beers_deploy.quant.gate import Limits, compare, judge, judge_saturation, limits_of, read_limits
-from beers_deploy.quant.onnx_file import image_info, load_onnx, save_onnx
+from beers_deploy.quant.onnx_file import GraphWriter, image_info, load_onnx, make_model, save_onnx
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
@@ -244,6 +245,7 @@ def test_the_number_decides(value: float, limit: float, bound: Bound, passed: bo
 def test_one_file_alone_is_no_pair(tmp_path: Path) -> None:
     (tmp_path / "float.onnx").touch()
     assert "expected the INT8 network of float.onnx" in refused("gate", tmp_path / "float.onnx")
+    assert "--junit: expected a file" in refused("gate", "--junit", "-")
 
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -311,6 +313,29 @@ def test_samples_that_calibration_saw_are_left_out_one_by_one(model: Path) -> No
     assert "3 of 7 samples" in found.notes[0]
     with pytest.raises(OptionError, match="calibration did not see"):
         bd.gate(int8, samples=samples[:3])
+
+
+def test_the_baseline_of_other_samples_is_refused(model: Path, tmp_path: Path) -> None:
+    samples, int8, before = (tmp_path / name for name in ("s.npy", "int8.onnx", "before.json"))
+    np.save(samples, np.random.default_rng(0).random((12, 1, 32, 40), np.float32))
+    bd.quantize(model, samples).save(int8)
+    done("gate", model, int8, "--samples", samples, "--max-mae", 0.5, "--json", before)
+    np.save(samples, np.random.default_rng(1).random((12, 1, 32, 40), np.float32))
+    assert "same samples" in refused("gate", model, int8, "--samples", samples, "--baseline", before)
+
+
+def test_what_is_no_image_is_compared_unclipped_and_other_shapes_are_refused() -> None:
+    def shifted(by: float, channels: int = 1) -> ort.InferenceSession:
+        w = GraphWriter()
+        weight = w.constant("w", np.ones((channels, 1, 1, 1), np.float32))
+        w.node("Conv", "y", ["x", weight, w.constant("b", np.full(channels, by, np.float32))])
+        ends = [image_info("x", 1, None)], [image_info("y", channels, None)]
+        return open_session(make_model(w.graph("g", *ends), {}))
+
+    pairs = [(np.random.default_rng(0).random((1, 1, 8, 9), np.float32), np.empty(0, np.float32))]
+    assert compare(shifted(-2), shifted(-3), pairs).mae == pytest.approx(1)
+    with pytest.raises(ModelError, match="as in float"):
+        compare(shifted(0), shifted(0, 3), pairs)
 
 
 def test_samples_without_contrast_judge_nothing() -> None:

@@ -196,6 +196,8 @@ def test_a_dask_array_of_unknown_size_is_refused(da: Any, model: Path) -> None:
     known = da.from_array(noise(20, 20))
     with pytest.raises(ImageError, match="sizes known"):
         restore(known[known[:, 0] > 2000], model)
+    with pytest.raises(ImageError, match="without a mask"):
+        restore(da.ma.masked_equal(da.zeros((9, 9)), 0), model)
 
 
 def test_options_and_models_are_refused_before_anything_is_computed(da: Any, model: Path, tmp_path: Path) -> None:

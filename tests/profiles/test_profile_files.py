@@ -47,7 +47,7 @@ def test_a_missing_table_is_named(table: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "value", ["-1", "-0.07", "nan", "inf", "true", "[]", "[0.01, 0.02, 0.03]", '"7 %"', "1" * 400]
+    "value", ["-1", "-0.07", "1e-200", "nan", "inf", "true", "[]", "[0.01, 0.02, 0.03]", '"7 %"', "1" * 400]
 )
 def test_an_mtf_that_is_no_contrast_is_refused(value: str, tmp_path: Path) -> None:
     assert "mtf_nyquist" in refusal(own_sensor(tmp_path, ("value = 0.07", f"value = {value}"))).where

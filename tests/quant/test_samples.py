@@ -91,7 +91,7 @@ def cut_off(folder: Path) -> Path:
         (of(RAMP[:, :1].astype(np.complex64)), "numbers"),
         (pickled, "a .npy or .npz file of numbers, or a folder"),
         (two_arrays, "got first, second"),
-        (cut_off, "a .npz file of numbers"),
+        (cut_off, "a .npy or .npz file of numbers"),
         (lambda folder: folder / "missing.npy", "no such file"),
         (lambda folder: folder, "at least one sample"),
     ],

@@ -42,6 +42,7 @@ def test_bands_without_names_are_taken_in_order(tmp_path: Path) -> None:
     both, _ = restored(tmp_path / "in.tif", f"red={SECOND},blue={FIRST}")
     for band, sensor in ((0, SECOND), (1, FIRST)):
         np.testing.assert_array_equal(both[band], restored(tmp_path / "in.tif", sensor)[0][band])
+    np.testing.assert_array_equal(restored(tmp_path / "in.tif", f"B1={FIRST},B0={SECOND}")[0], both)
 
 
 def test_a_cog_names_the_sensors_in_the_order_of_the_bands(tmp_path: Path) -> None:

@@ -59,6 +59,10 @@ def test_another_sensor_is_told_apart(numbers: dict[str, float], words: str, raw
     assert re.search(words, doubt)
 
 
+def test_pixels_above_the_sensor_s_full_scale_contradict_it(raw: np.ndarray) -> None:
+    assert any("above its full scale, 1023" in doubt for doubt in check(raw, SENSOR.replace(bits=10), 1023).doubts)
+
+
 def test_bands_are_held_one_by_one_against_their_own_sensors(raw: np.ndarray) -> None:
     two = check_source(
         ArraySource(np.stack([raw, raw]), Raster(2, 320, 320, raw.dtype)),

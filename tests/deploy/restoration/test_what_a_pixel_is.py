@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from onnx import numpy_helper
 from PIL import Image
 
-from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.restoration.options import Compression, Options
 from beers_deploy.restoration.run import restore_file
 from beers_deploy.restoration.source import open_source
+from tests.deploy.command_line import done
 from tests.deploy.restoration.runs import noise
 
 NODATA = 7
@@ -66,6 +67,26 @@ def test_a_mask_is_missing_pixels_and_is_kept(
     np.testing.assert_array_equal(found[~HIDDEN], by_nodata(tmp_path, pixels, model)[~HIDDEN])
     assert kept is not None
     np.testing.assert_array_equal(kept == 0, HIDDEN)
+
+
+def test_what_gdal_keeps_beside_an_image_counts(model: Path, tmp_path: Path) -> None:
+    image, beside = tmp_path / "in.tif", tmp_path / "in.tif.aux.xml"
+    pixels = np.where(HIDDEN, NODATA, pixels_of_test()).astype(np.uint16)
+    tifffile.imwrite(image, pixels)
+    band = "<PAMDataset><PAMRasterBand band='1'>{}</PAMRasterBand></PAMDataset>"
+    beside.write_text(band.format("<NoDataValue>7</NoDataValue>"))
+    np.testing.assert_array_equal(restored(image, model)[0], by_nodata(tmp_path, pixels, model))
+    assert tifffile.TiffFile(tmp_path / "out.tif").pages.first.tags[42113].value == "7"
+    for text, words in ((band.format("<Offset>500</Offset>"), "0 is no light"), ("<", "as GDAL writes")):
+        beside.write_text(text)
+        with pytest.raises(ImageError, match=words):
+            restored(image, model)
+    beside.unlink()
+    (tmp_path / "in.tfw").touch()
+    assert "in.tfw is not read" in done("restore", image, tmp_path / "o.tif", "--network", model)
+    (tmp_path / "out.tif.msk").touch()
+    with pytest.raises(OptionError, match=r"got out\.tif\.msk"):
+        restored(image, model)
 
 
 @pytest.mark.parametrize("kind", ["unassalpha", "assocalpha"])

@@ -160,7 +160,7 @@ WRONG: dict[str, tuple[np.ndarray, tuple[str, ...], str]] = {
     "fractions": (FLAT.astype(np.float32), ("--bits", "12"), "whole digital numbers"),
     "negative": (FLAT.astype(np.int16) - 2000, ("--bits", "12"), "from 0 to 65535"),
     "wide": (FLAT.astype(np.uint32) * 70, ("--bits", "16"), "from 0 to 65535"),
-    "nan": (np.where(FLAT > 1060, np.nan, 7).astype(np.float32), ("--bits", "12"), "finite pixels"),
+    "all missing": (np.full((200, 200), np.nan, np.float32), ("--bits", "12"), "unclipped"),
     "steps": (FLAT.astype(np.uint16) * 16, ("--bits", "16"), "divide it by 16"),
     "open bits": (FLAT.astype(np.uint16), (), "--bits: expected --bits beside images"),
     "wrong bits": (FLAT.astype(np.uint16), ("--bits", "8"), "up to 255"),
