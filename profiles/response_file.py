@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beers_deploy.profiles.constant import Constant, Status, check_keys, is_number, read_stated
 from beers_deploy.profiles.errors import ProfileError
-from beers_deploy.profiles.response import NYQUIST, MtfTable, PointSpread, Response, centroid, packed, unpacked
+from beers_deploy.profiles.response import NYQUIST, MtfTable, PointSpread, Response, centroid, packed
 from beers_deploy.profiles.toml import unreadable
 
 READING = 0.005
@@ -60,7 +60,8 @@ def response_from_json(label: str, raw: object) -> Response:
         response: Response = _table(label, raw)
     else:
         check_keys(label, raw, required={"height", "width", "samples_per_px", "samples"})
-        response = _unpacked_again(label, raw)
+        per_px = _samples_per_px(f"{label} samples_per_px", raw["samples_per_px"])
+        response = PointSpread(raw["height"], raw["width"], per_px, raw["samples"])
     _require_contrast(label, response)
     return response
 
@@ -178,17 +179,6 @@ def _trimmed(samples: Samples) -> Samples:
     return samples[tuple(parts)]
 
 
-def _unpacked_again(label: str, raw: Mapping[str, Any]) -> PointSpread:
-    per_px = _samples_per_px(f"{label} samples_per_px", raw["samples_per_px"])
-    point = PointSpread(raw["height"], raw["width"], per_px, raw["samples"])
-    try:
-        if not 0 < float(unpacked(point).sum()) < math.inf:
-            raise ValueError("samples whose sum is no weight")
-    except (OverflowError, TypeError, ValueError) as error:
-        raise ProfileError(label, expected="packed samples", got="others", remedy="make it anew") from error
-    return point
-
-
 def _read_samples(where: str, path: Path) -> Samples:
     """The samples of a .npy or TIFF file, (H, W)."""
     reader = {".npy": _open_npy, ".tif": _open_tiff, ".tiff": _open_tiff}.get(path.suffix.lower())
@@ -231,13 +221,6 @@ def _open_tiff(path: Path) -> NDArray[Any]:
         page = file.pages.first
         if not page.is_memmappable or page.dtype is None:
             raise ValueError("a TIFF that is compressed or tiled")
-        if _has_second_page(file):
+        if len(file.pages) > 1:
             raise ValueError("a TIFF of several pages")
         return np.memmap(path, file.byteorder + page.dtype.str[1:], "r", page.dataoffsets[0], page.shape)
-
-
-def _has_second_page(file: Any) -> bool:
-    try:
-        return file.pages[1] is not None
-    except IndexError:
-        return False

@@ -78,7 +78,8 @@ def compare(
             raise ModelError("INT8 network", expected=f"results of {expected}, as in float", got=got, remedy=remedy)
         classes = [result.argmax(1) for result in results]
         agreeing.append((classes[0] == classes[1]).mean() if results[0].shape[1] > degraded.shape[1] else math.nan)
-        is_image = results[0].ndim == 4 and results[0].shape[1] == degraded.shape[1] and _mostly_inside(results[0])
+        inside = ((results[0] >= 0) & (results[0] <= 1)).mean()
+        is_image = results[0].ndim == 4 and results[0].shape[1] == degraded.shape[1] and bool(inside >= MOST)
         in_float, in_int8 = (_as_in_a_file(result, is_image) for result in results)
         differences.append((in_int8 - in_float).ravel())
         errors.append([_psnr_db(image, reference) for image in (degraded, in_float, in_int8)])
@@ -101,10 +102,6 @@ def compare(
 
 MOST = 0.75
 """Of a float network's results lie in [0, 1] where they are an image, and not a correction or of another scale."""
-
-
-def _mostly_inside(result: np.ndarray) -> bool:
-    return bool(((result >= 0) & (result <= 1)).mean() >= MOST)
 
 
 def _as_in_a_file(result: np.ndarray, is_image: bool) -> np.ndarray:

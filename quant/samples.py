@@ -213,10 +213,9 @@ def _stored(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if got is not None:
         raise ImageError(str(path), expected="a .npy or .npz file", got=got, remedy="check the path")
     try:
-        held = np.load(path, mmap_mode="r", allow_pickle=False)
-        if isinstance(held, np.ndarray):
-            return np.asarray(held), NO_REFERENCE
-        with held:
+        if path.suffix.lower() != ".npz":
+            return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False)), NO_REFERENCE
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as held:  # NumPy leaves a broken one open
             arrays = {name: held[name] for name in held.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         expected = "a .npy or .npz file of numbers, or a folder of images"

@@ -7,14 +7,12 @@ network unless the user trusts the index, and keeps a cache of blocks that count
 import io
 import logging
 import os
-import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -96,7 +94,7 @@ def _block_px(dataset: Any) -> int:
 @contextmanager
 def _damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
     try:
-        with warnings.catch_warnings(action="ignore"), _log_in_any_bytes():  # an image need not lie on Earth
+        with warnings.catch_warnings(action="ignore"):  # an image need not lie on Earth
             yield
     except (BeersError, MemoryError):
         raise
@@ -108,26 +106,6 @@ def _damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
         got, remedy = " ".join(str(cause).split())[:160] or type(cause).__name__, "check that it is a whole image"
         expected = f"an image that GDAL reads as {GDAL_DRIVERS[path.suffix.lower()]}"
         raise ImageError(name, expected=expected, got=got, remedy=remedy) from error
-
-
-@contextmanager
-def _log_in_any_bytes() -> Iterator[None]:
-    """GDAL repeats bytes of a damaged file, rasterio's log takes them for UTF-8, and a traceback would be printed."""
-    unraisable, uncaught = sys.unraisablehook, sys.excepthook
-
-    def heard(given: "sys.UnraisableHookArgs") -> None:
-        if not isinstance(given.exc_value, UnicodeDecodeError):
-            unraisable(given)
-
-    def printed(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-        if not isinstance(error, UnicodeDecodeError):
-            uncaught(kind, error, trace)
-
-    sys.unraisablehook, sys.excepthook = heard, printed  # Cython calls one, then the other
-    try:
-        yield
-    finally:
-        sys.unraisablehook, sys.excepthook = unraisable, uncaught
 
 
 class GdalSource:

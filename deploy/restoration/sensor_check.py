@@ -45,11 +45,6 @@ class Told(NamedTuple):
     instruments: Sequence[Instrument]
     unit: float
 
-    def radiance(self, value: float) -> float:
-        """Of a pixel value, in W/m2/sr/um."""
-        first = self.instruments[0]
-        return (value / self.unit - first.offset_dn) / first.gain_dn_per_radiance
-
     def variances(self, value: np.ndarray | float) -> np.ndarray:
         """Of the noise at pixel values, without rounding, of each instrument: (I, ...)."""
         return np.stack([self._variance(each, np.asarray(value, np.float64)) for each in self.instruments])
@@ -207,7 +202,9 @@ def _noise(line: NoiseModel | Refusal, blocks: Blocks, told: Told) -> tuple[dict
         return {"SNR seen": unavailable("ratio", line.reason)}, _smoothed(blocks, told)
     value = math.sqrt(math.prod(line.measured_dn))
     seen, (least, *_, most) = line.at(value), np.sort(told.variances(value))
-    signal, radiance = max(value - told.unit * told.instruments[0].offset_dn, 0), told.radiance(value)
+    first = told.instruments[0]
+    signal = max(value - told.unit * first.offset_dn, 0)
+    radiance = signal / (told.unit * first.gain_dn_per_radiance)
     variances = seen.interval[1], seen.value, seen.interval[0], told.variances(value)[0]
     low, snr, high, stated = (signal / math.sqrt(v) if v > 0 else math.inf for v in variances)
     words = f"at {radiance:.3g} W/m2/sr/um, {line.blocks} blocks of 16 x 16; told {stated:.3g}"

@@ -76,7 +76,8 @@ def test_what_gdal_keeps_beside_an_image_counts(model: Path, tmp_path: Path) -> 
     band = "<PAMDataset><PAMRasterBand band='1'>{}</PAMRasterBand></PAMDataset>"
     beside.write_text(band.format("<NoDataValue>7</NoDataValue>"))
     np.testing.assert_array_equal(restored(image, model)[0], by_nodata(tmp_path, pixels, model))
-    assert tifffile.TiffFile(tmp_path / "out.tif").pages.first.tags[42113].value == "7"
+    with tifffile.TiffFile(tmp_path / "out.tif") as file:
+        assert file.pages.first.tags[42113].value == "7"
     for text, words in ((band.format("<Offset>500</Offset>"), "0 is no light"), ("<", "as GDAL writes")):
         beside.write_text(text)
         with pytest.raises(ImageError, match=words):
