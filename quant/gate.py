@@ -100,8 +100,8 @@ def compare(
     )
 
 
-MOST = 0.75
-"""Of a float network's results lie in [0, 1] where they are an image, and not a correction or of another scale."""
+MOST = 0.5
+"""Of a float network's results lie in [0, 1] where they are an image, and not of another scale."""
 
 
 def _as_in_a_file(result: np.ndarray, is_image: bool) -> np.ndarray:
