@@ -25,6 +25,10 @@ def test_the_same_document_has_not_changed(tmp_path: Path) -> None:
     one = document(tmp_path / "a.json")
     output = done("diff", one, one, "--fail-on", "PSNR<0", "--fail-on", "MAE>0%")
     assert "3 figures in both, 0 changed, 0 gone, 0 new" in output
+    for table, words in (("gate", "note: another command: gate, bench"), ("other", "got none in both")):
+        row = Row(table, "network", {"PSNR": measured(46.5, "dB", "22 pairs")})
+        Table("bench", {"model": "b.onnx"}, (one,), (row,)).save(tmp_path / "b.json")
+        assert words in done("diff", one, tmp_path / "b.json", code=2 * (table == "other"))
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,6 @@ def test_no_digital_number_is_lost() -> None:
     assert np.abs(QUARTER * planes[:, 2:] - planes[:, 1:2]).max() <= QUARTER / 2
 
 
-def test_zero_stays_zero_for_the_padding() -> None:
-    assert not split(np.zeros((1, 1, 3, 5), np.float32)).any()
-
-
 def test_values_beyond_the_range_are_clipped_not_wrapped() -> None:
     low, high = (split(np.full((1, 1, 1, 1), v, np.float32)).ravel().tolist() for v in (-3.0, 7.0))
     assert low == [0, 0, 0]
