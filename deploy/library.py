@@ -92,7 +92,7 @@ def restore(
         cog: write `out` as a Cloud-Optimised GeoTIFF.
         again: take an image that says it was restored already.
         any_result: give a result even if it is clipped, constant or far from the image's mean.
-        strict: refuse an image that contradicts its sensor, which else is a warning; Dask is not looked at.
+        strict: refuse an image, none of Dask, that contradicts its sensor; else warn, or say "sensor told" of a file.
         progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
 
     Returns:

@@ -47,9 +47,10 @@ class Told(NamedTuple):
 
     def variances(self, value: np.ndarray | float) -> np.ndarray:
         """Of the noise at pixel values, without rounding, of each instrument: (I, ...)."""
-        return np.stack([self._variance(each, np.asarray(value, np.float64)) for each in self.instruments])
+        return np.stack([self.variance(each, np.asarray(value, np.float64)) for each in self.instruments])
 
-    def _variance(self, sensor: Instrument, value: np.ndarray) -> np.ndarray:
+    def variance(self, sensor: Instrument, value: np.ndarray) -> np.ndarray:
+        """Of the noise at pixel values, of one instrument."""
         gain = sensor.gain_dn_per_radiance
         radiance = np.maximum(value / self.unit - sensor.offset_dn, 0) / gain
         return np.asarray((sensor.alpha * radiance + sensor.beta) * (gain * self.unit) ** 2)
@@ -183,7 +184,7 @@ def held_against(windows: Sequence[np.ndarray], sensor: Sensor, full_scale: floa
     figures, doubts = _noise(line, blocks, told)
     above = float(np.mean([(window > clipped_at).mean() for window in pixels]))
     if above > ABOVE:
-        doubts.append(f"{above:.0%} of the pixels are above its full scale, {full_scale:g}")
+        doubts.append(f"{above:.1%} of the pixels are above its full scale, {full_scale:g}")
     for axis, (figure, doubt) in zip(AXES, _blur(pixels, line, told, clipped_at), strict=True):
         figures[f"MTF {axis} seen"] = figure
         doubts += doubt
@@ -192,8 +193,8 @@ def held_against(windows: Sequence[np.ndarray], sensor: Sensor, full_scale: floa
 
 def _told(sensor: Sensor, clipped_at: float) -> Told:
     generator = np.random.default_rng(SEED)
-    drawn = [sensor.nominal(), *(sensor.draw(generator) for _ in range(DRAWS))]
-    return Told(drawn, clipped_at / drawn[0].max_dn)
+    first, drawn = sensor.nominal(), (sensor.draw(generator) for _ in range(DRAWS))
+    return Told([first, *(each for each in drawn if each != first)], clipped_at / first.max_dn)
 
 
 def _noise(line: NoiseModel | Refusal, blocks: Blocks, told: Told) -> tuple[dict[str, Figure], list[str]]:
@@ -201,15 +202,14 @@ def _noise(line: NoiseModel | Refusal, blocks: Blocks, told: Told) -> tuple[dict
     if isinstance(line, Refusal):
         return {"SNR seen": unavailable("ratio", line.reason)}, _smoothed(blocks, told)
     value = math.sqrt(math.prod(line.measured_dn))
-    seen, (least, *_, most) = line.at(value), np.sort(told.variances(value))
-    first = told.instruments[0]
+    seen, expected, first = line.at(value), told.variances(value), told.instruments[0]
     signal = max(value - told.unit * first.offset_dn, 0)
     radiance = signal / (told.unit * first.gain_dn_per_radiance)
-    variances = seen.interval[1], seen.value, seen.interval[0], told.variances(value)[0]
+    variances = seen.interval[1], seen.value, seen.interval[0], expected[0]
     low, snr, high, stated = (signal / math.sqrt(v) if v > 0 else math.inf for v in variances)
     words = f"at {radiance:.3g} W/m2/sr/um, {line.blocks} blocks of 16 x 16; told {stated:.3g}"
     figures = {"SNR seen": measured(snr, "ratio", words, (low, high))}
-    if seen.interval[0] > most * NOISE_KEPT or seen.interval[1] < least / NOISE_KEPT:
+    if seen.interval[0] > expected.max() * NOISE_KEPT or seen.interval[1] < expected.min() / NOISE_KEPT:
         what = f"noise at {radiance:.3g} W/m2/sr/um looks like SNR {snr:.3g}, the profile says {stated:.3g}"
         return figures, [f"{what}{FILTERED}" if snr > stated else what]
     return figures, _smoothed(blocks, told)
@@ -232,7 +232,7 @@ def _blur(
     """The MTF along each axis, and a sentence where it contradicts what was told."""
 
     def noise(values: np.ndarray) -> np.ndarray:
-        return np.asarray(told.variances(np.maximum(values, 0))[0] + ROUNDING)
+        return told.variance(told.instruments[0], values) + ROUNDING
 
     total = noise if isinstance(line, Refusal) else line.total
     edges = [_edges(turned, total, clipped_at) for turned in (pixels, [window.T for window in pixels])]
