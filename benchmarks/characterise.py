@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 import tifffile
 import torch
-from torch import Tensor
 
 from beers_deploy.export import torch_network
 from beers_deploy.model.family import LEAST_ALONG, SensorFamily
@@ -139,12 +138,12 @@ def written(
     return tuple(paths)
 
 
-def with_target(radiance: Tensor) -> Tensor:
+def with_target(radiance: np.ndarray) -> np.ndarray:
     """The scene (H, W) with the checkerboard in its middle."""
     upright = slanted_edge(TARGET_PX, RATIO, LEAN_DEG, (-1.0, 1.0))
     board = (DARK + BRIGHT) / 2 + (BRIGHT - DARK) / 2 * upright * slanted_edge(TARGET_PX, RATIO, -LEAN_DEG, (-1, 1)).T
     top, left = ((size - board.shape[0]) // 2 for size in radiance.shape)
-    laid = radiance.clone()
+    laid = radiance.copy()
     laid[top : top + board.shape[0], left : left + board.shape[1]] = board
     return laid
 

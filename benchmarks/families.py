@@ -160,7 +160,8 @@ def trained(name: str, source: PatchSource, count: int, path: Path) -> Restoring
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, count)
     network.narrow, begun = False, time.process_time()
     with steps(f"training {name}", count) as bar:
-        for degraded, reference in islice(source.batches(), count):
+        for batch in islice(source.batches(), count):
+            degraded, reference = map(torch.from_numpy, batch)
             loss, _ = LOSS(network(degraded), reference)
             optimiser.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]

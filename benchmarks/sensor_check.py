@@ -15,7 +15,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from characterise import LEAST_SIDE_PX, LIKE, RATIO, draw
 from scipy.ndimage import gaussian_filter, shift
 
@@ -124,11 +123,11 @@ def acquisitions(folder: Path, count: int, seed: int) -> Iterator[tuple[Instrume
         sensor, scene = draw(generator), scenes[int(generator.integers(len(scenes)))]
         radiance = crop_divisible(scene.radiance, RATIO)
         yield sensor, seen(radiance, sensor, number), "photograph"
-        yield sensor, seen(torch.from_numpy(texture(generator)), sensor, number), "texture"
+        yield sensor, seen(texture(generator), sensor, number), "texture"
         yield sensor, seen(procedural_scene(SIDE_PX, SIDE_PX, generator).radiance, sensor, number), "drawn town"
 
 
-def seen(radiance: torch.Tensor, sensor: Instrument, number: int) -> Image:
+def seen(radiance: np.ndarray, sensor: Instrument, number: int) -> Image:
     """What a sensor sees of a scene (H, W)."""
     return to_uint16(acquire_padded(radiance, sensor, RATIO, Draw(number), "degraded"))
 
@@ -152,5 +151,4 @@ def timed(image: Image) -> None:
 
 
 if __name__ == "__main__":
-    torch.set_num_threads(1)
     main()

@@ -19,8 +19,7 @@ from functools import lru_cache
 from statistics import median
 
 import numpy as np
-import torch
-from torch import Tensor
+from scipy import fft
 
 from beers_deploy.model.simulator.acquire import prepare_scene, simulate_planned
 from beers_deploy.model.simulator.detector import (
@@ -50,27 +49,27 @@ def sensors(effects: dict[str, Effect]) -> tuple[Instrument, Instrument]:
     return replace(degraded, effects=effects), replace(reference, effects=effects)
 
 
-def ours(radiance: Tensor, eyes: tuple[Instrument, Instrument], number: int) -> None:
+def ours(radiance: np.ndarray, eyes: tuple[Instrument, Instrument], number: int) -> None:
     """One transform of the scene, then for each sensor a plan and one fused pass."""
     scene = prepare_scene(radiance, RATIO)
     for sensor, role in zip(eyes, ROLES, strict=True):
         simulate_planned(scene, sensor, Draw(0, number), make_plan(sensor, scene.stats), role, MARGIN_PX)
 
 
-def one_by_one(radiance: Tensor, eyes: tuple[Instrument, Instrument], number: int) -> None:
+def one_by_one(radiance: np.ndarray, eyes: tuple[Instrument, Instrument], number: int) -> None:
     """Every effect of each sensor in turn."""
     for sensor, role in zip(eyes, ROLES, strict=True):
         _acquire_plainly(radiance, sensor, number, role)
 
 
-def _acquire_plainly(radiance: Tensor, sensor: Instrument, number: int, role: str) -> Tensor:
+def _acquire_plainly(radiance: np.ndarray, sensor: Instrument, number: int, role: str) -> np.ndarray:
     """Each effect by itself at full resolution, random ones included where they act on the scene's grid."""
     height, width = radiance.shape
     antialias, smear = sensor.effects.get("antialias"), sensor.effects.get("smear")
     sigma_px = antialias.sigma_px if isinstance(antialias, AntiAlias) else 0.0
     length_px = smear.length_px if isinstance(smear, Smear) else 0.0
     for response in _responses(height, width, sensor.mtf_nyquist, sigma_px, length_px):
-        radiance = torch.fft.irfft2(torch.fft.rfft2(radiance) * response, s=(height, width))
+        radiance = fft.irfft2(fft.rfft2(radiance) * response, s=(height, width))
     draw = Draw(0, number)
     for name in RADIANCE_EFFECTS:
         radiance = _apply(radiance, name, sensor, draw, role)
@@ -82,7 +81,7 @@ def _acquire_plainly(radiance: Tensor, sensor: Instrument, number: int, role: st
 
 
 @lru_cache
-def _responses(height: int, width: int, mtf_nyquist: float, sigma_px: float, length_px: float) -> list[Tensor]:
+def _responses(height: int, width: int, mtf_nyquist: float, sigma_px: float, length_px: float) -> list[np.ndarray]:
     """One transfer function for each blur that is not neutral."""
     fy, fx = np.fft.fftfreq(height, 1 / RATIO)[:, None], np.fft.rfftfreq(width, 1 / RATIO)[None]
     responses = [mtf(fx, fy, mtf_nyquist)]
@@ -90,16 +89,16 @@ def _responses(height: int, width: int, mtf_nyquist: float, sigma_px: float, len
         responses.append(gaussian_response(np.hypot(fx, fy), sigma_px))
     if length_px:
         responses.append(smear_response(fy, length_px))
-    return [torch.from_numpy(response).float() for response in responses]
+    return [response.astype(np.float32) for response in responses]
 
 
-def _apply(image: Tensor, name: str, sensor: Instrument, draw: Draw, role: str) -> Tensor:
+def _apply(image: np.ndarray, name: str, sensor: Instrument, draw: Draw, role: str) -> np.ndarray:
     if name not in sensor.effects:
         return image
     return apply_effect(image, sensor.effects[name], sensor, lambda: draw.generator(f"{name}-{role}"))
 
 
-WAYS: dict[str, tuple[Callable[[Tensor, tuple[Instrument, Instrument], int], None], bool, bool]] = {
+WAYS: dict[str, tuple[Callable[[np.ndarray, tuple[Instrument, Instrument], int], None], bool, bool]] = {
     # name: (way, all effects called for, all effects made)
     "two effects: ours": (ours, False, False),
     "two effects: (a) one by one": (one_by_one, False, False),
@@ -111,7 +110,6 @@ WAYS: dict[str, tuple[Callable[[Tensor, tuple[Instrument, Instrument], int], Non
 
 def rate(name: str, seconds: float, seed: int) -> float:
     """Pairs a second of one process."""
-    torch.set_num_threads(1)
     way, _, made = WAYS[name]
     side = (PATCH_PX + 2 * MARGIN_PX) * RATIO
     radiance = procedural_scene(side, side, np.random.default_rng(seed)).radiance

@@ -46,7 +46,8 @@ def main() -> None:
     recipe = TrainingRecipe(steps=(TURNS + 1) * arguments.steps, batch=BATCH, loss=LOSS)
     variant, steps = VARIANTS[arguments.variant], arguments.steps
     trainers = {name: Trainer(variant, recipe, precision=name) for name in get_args(Precision)}
-    made, batches = list(islice(source.batches(), steps)), source.batches()
+    made = [tuple(map(torch.from_numpy, batch)) for batch in islice(source.batches(), steps)]
+    batches = source.batches()
     bare: dict[str, list[float]] = {name: [] for name in trainers}
     whole: dict[str, list[float]] = {name: [] for name in trainers}
     with tempfile.TemporaryDirectory() as folder:
@@ -79,10 +80,10 @@ def bare_loop(trainer: Trainer, batches: list[tuple[Tensor, ...]]) -> None:
         optimiser.step()
 
 
-def run(trainer: Trainer, batches: Iterator[tuple[Tensor, ...]], steps: int, checkpoint: Path) -> None:
+def run(trainer: Trainer, batches: Iterator[tuple[np.ndarray, ...]], steps: int, checkpoint: Path) -> None:
     """So many further steps of a run, simulation included, and a checkpoint."""
-    for degraded, reference in islice(batches, steps):
-        trainer.train_step(degraded, reference)
+    for batch in islice(batches, steps):
+        trainer.train_step(*map(torch.from_numpy, batch))
     trainer.save(checkpoint)
 
 

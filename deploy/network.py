@@ -397,7 +397,7 @@ def family_model(
         seed: of the patches.
         shifts: the windows of the target.
     """
-    from beers_deploy.model.simulator.procedural import load_scenes  # torch, which a restoration does not need
+    from beers_deploy.model.simulator.procedural import load_scenes  # SciPy, which a restoration does without
     from beers_deploy.quant.banked.calibrate import family_images, quantise_family
 
     weights = read_conditioned(network.weights)

@@ -15,7 +15,7 @@ from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import SensorLike
-from beers_deploy.profiles.errors import ImageError, OptionError, optional
+from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.scene_call import calling_for, load_scene_call
 from beers_deploy.profiles.sensor import Instrument, Sensor, require_same_units
 
@@ -122,12 +122,10 @@ def simulate(
         ImageError: a scene that cannot be read, or too small for the margin that the blur needs.
         ProfileError: no such sensor or scene.
         OptionError: no such effect, or a size that is not simulated at once.
-        MissingExtraError: torch is not installed.
     """
     if not 1 <= size <= LARGEST_PX:
         remedy = "give another, or simulate a data set with beers-deploy simulate"
         raise OptionError("size", expected=f"1 to {LARGEST_PX} pixels", got=str(size), remedy=remedy)
-    optional("torch", "simulate")
     from beers_deploy.model.simulator.acquire import acquire_three, prepare_scene
     from beers_deploy.model.simulator.detector import Draw, to_uint16
 
@@ -142,7 +140,7 @@ def simulate(
         for role, profile in (("degraded", degraded), ("reference", aim))
     )
     seen, meant, clean = acquire_three(prepare_scene(radiance, ratio), seen_by, meant_by, draw)
-    return Pair(to_uint16(seen), to_uint16(meant), clean.numpy(), seen_by, (degraded, aim))
+    return Pair(to_uint16(seen), to_uint16(meant), clean, seen_by, (degraded, aim))
 
 
 def _scene(

@@ -54,7 +54,7 @@ def batches(name: str, scenes: Sequence[Scene], seed: int) -> Iterator[Batch]:
         return gratings(torch.Generator().manual_seed(seed), example.side_px or PATCH_PX)
     if example.inputs == len(GAINS):
         return banded(scenes, np.random.default_rng(seed))
-    pairs = PatchSource(list(scenes), RECIPE, BATCH, seed).batches()
+    pairs = (map(torch.from_numpy, pair) for pair in PatchSource(list(scenes), RECIPE, BATCH, seed).batches())
     if name == "segment":
         return ((image, bright(reference)) for image, reference in pairs)
     if example.scale > 1:
@@ -94,20 +94,20 @@ def banded(scenes: Sequence[Scene], generator: np.random.Generator) -> Iterator[
     while True:
         drawn = [passes[generator.integers(len(passes))] for _ in range(MIXED)]
         pieces = [_mixed(_acquire_bands(scene, ratio, generator), generator)[:MOST] for scene, ratio in drawn]
-        for patches in torch.split(_mixed(torch.cat(pieces), generator), BATCH):
+        for patches in torch.split(torch.from_numpy(_mixed(np.concatenate(pieces), generator)), BATCH):
             yield patches[:, : len(GAINS)], patches[:, len(GAINS) :]
 
 
 def _fits(scene: Visited, ratio: int) -> bool:
-    return min(scene.spectrum.shape[-2], scene.width) // ratio >= PATCH_PX + 2 * RECIPE.margin_px
+    return bool(min(scene.spectrum.shape[-2], scene.width) // ratio >= PATCH_PX + 2 * RECIPE.margin_px)
 
 
-def _mixed(patches: Tensor, generator: np.random.Generator) -> Tensor:
+def _mixed(patches: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """Patches (N, C, P, P) in another order."""
     return patches[generator.permutation(len(patches))]
 
 
-def _acquire_bands(scene: Visited, ratio: int, generator: np.random.Generator) -> Tensor:
+def _acquire_bands(scene: Visited, ratio: int, generator: np.random.Generator) -> np.ndarray:
     """The patches of one pass over a scene, (N, 8, P, P) in [0, 1]: four degraded bands, then their references."""
     phase_y, phase_x = (float(offset) for offset in generator.uniform(-ratio / 2, ratio / 2, 2))
     exposure, seed = float(generator.uniform(*RECIPE.exposures)), int(generator.integers(2**31))
@@ -118,7 +118,7 @@ def _acquire_bands(scene: Visited, ratio: int, generator: np.random.Generator) -
             spectrum, draw = scene.spectrum * (exposure * gain), Draw(seed, band)
             dn = acquire(spectrum, scene.width, sensor, ratio, draw, role, (phase_y, phase_x), RECIPE.margin_px)
             images.append(dn / sensor.max_dn)
-    return turn(cut(torch.stack(images), PATCH_PX, generator), generator)
+    return turn(cut(np.stack(images), PATCH_PX, generator), generator)
 
 
 def batches_of(name: str, folder: Path | None, seed: int) -> Iterator[Batch]:

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from beers_deploy.model.io.files import sha256, whole_file, write_text
 from beers_deploy.model.io.images import site_of
@@ -128,13 +127,12 @@ class Patch(NamedTuple):
 
 
 def make_patches(recipe: DatasetRecipe, windows: list[Window]) -> list[Patch]:
-    """Simulate some patches of one scene, with one thread."""
-    torch.set_num_threads(1)
+    """Simulate some patches of one scene."""
     radiance = load(recipe, windows[0].scene).radiance
     return [_make_patch(recipe, window, radiance) for window in windows]
 
 
-def _make_patch(recipe: DatasetRecipe, window: Window, radiance: torch.Tensor) -> Patch:
+def _make_patch(recipe: DatasetRecipe, window: Window, radiance: np.ndarray) -> Patch:
     bottom, right = window.top + window.height, window.left + window.width
     part = prepare_scene(radiance[window.top : bottom, window.left : right], recipe.oversampling)
     draw = Draw(recipe.seed, window.number)
@@ -191,7 +189,7 @@ def write_dataset(
     waiting = {path: chunk for path, chunk in parts.items() if not path.exists()}
     with ExitStack() as stack:
         if pool is None and workers > 1 and len(waiting) > 1:
-            spawn = multiprocessing.get_context("spawn")  # a forked copy of torch's thread pools can hang
+            spawn = multiprocessing.get_context("spawn")  # a forked copy of a library's threads can hang
             pool = stack.enter_context(ProcessPoolExecutor(min(workers, MOST_PROCESSES), mp_context=spawn))
         for path, patches in stack.enter_context(closing(_made(recipe, waiting, workers, pool))):
             for patch in patches:

@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from beers_deploy.model.family import SensorFamily
 from beers_deploy.model.simulator.acquire import MARGIN_PX, acquire
@@ -60,7 +58,7 @@ class Ground:
     exposure: float
 
     @property
-    def radiance(self) -> Tensor:
+    def radiance(self) -> np.ndarray:
         """In W/m2/sr/um, on the scene's grid: a square of side_px * oversampling."""
         return self.exposure * self._part(1)
 
@@ -69,7 +67,7 @@ class Ground:
         """Its mean radiance, to within what one scene pixel in each target pixel tells."""
         return self.exposure * float(self._part(self.oversampling).mean())
 
-    def _part(self, step: int) -> Tensor:
+    def _part(self, step: int) -> np.ndarray:
         side = self.side_px * self.oversampling
         return self.scene.radiance[self.top : self.top + side : step, self.left : self.left + side : step]
 
@@ -139,7 +137,7 @@ def _places(scenes: Sequence[Scene], recipe: PatchRecipe) -> list[tuple[Scene, i
 def _room_px(scene: Scene, oversampling: int) -> int:
     """Target pixels of a scene within the margin."""
     height, width = (size // oversampling - 2 * MARGIN_PX for size in scene.radiance.shape)
-    return height * width
+    return int(height * width)
 
 
 def _ground(place: tuple[Scene, int], recipe: PatchRecipe, generator: np.random.Generator) -> Ground:
@@ -203,8 +201,8 @@ def _simulate(ground: Ground, sensors: dict[str, Instrument], draw: Draw) -> lis
     ]
     transfer_function.cache_clear()  # no two patches share one, and each is megabytes
     mirrors, quarters = sensors[DEGRADED].symmetry
-    turned = turn(torch.stack(images)[:, None], draw.generator("turn"), quarters, mirrors)
-    return [np.ascontiguousarray(image[None]) for image in turned.numpy()]
+    turned = turn(np.stack(images)[:, None], draw.generator("turn"), quarters, mirrors)
+    return [np.ascontiguousarray(image[None]) for image in turned]
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 @pytest.fixture(scope="session", autouse=True)
 def scenes_drawn_once() -> None:
-    """Keep the drawn scenes, where a test's imports reach them: an emulated processor is spared torch."""
+    """Keep the drawn scenes, where a test's imports reach them: an emulated processor is spared Pillow and SciPy."""
     if drawing := sys.modules.get("beers_deploy.model.simulator.procedural"):
         drawing.draw_scenes = lru_cache(maxsize=4)(drawing.draw_scenes)  # type: ignore[attr-defined]
 
@@ -48,5 +48,5 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from beers_deploy.model.simulator.procedural import procedural_scene
 
     folder = tmp_path_factory.mktemp("scenes")
-    tifffile.imwrite(folder / "drawn.tif", procedural_scene(900, 900, np.random.default_rng(77)).radiance.numpy())
+    tifffile.imwrite(folder / "drawn.tif", procedural_scene(900, 900, np.random.default_rng(77)).radiance)
     return folder

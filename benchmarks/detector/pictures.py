@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from beers_deploy.model.io.pictures import stretch_of
 from beers_deploy.model.simulator.acquire import acquire_padded
@@ -49,7 +48,7 @@ def drawn_picture(sensor: Instrument, oversampling: int, side_px: int, seed: int
     side = side_px * oversampling
     radiance, truth = synthetic_scene(np.random.default_rng([STREAM, seed, number]), side, side)
     draw = Draw(seed, number)
-    dn = acquire_padded(torch.from_numpy(radiance), sensor, oversampling, draw, "reference").numpy()
+    dn = acquire_padded(radiance, sensor, oversampling, draw, "reference")
     rgb = stretch_of(dn).to_srgb(dn).transpose(2, 0, 1)
     return picture_of(rgb, truth.corners / oversampling, truth.classes)
 

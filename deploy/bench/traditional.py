@@ -80,7 +80,7 @@ def drawn_acquisition(swath: Swath, degraded: Sensor, reference: Sensor, seed: i
     height, width = ((side + 2 * MARGIN_PX) * ratio for side in sides)
     scene = procedural_scene(height, width, np.random.default_rng(seed))
     pair = simulate_pair(scene.radiance, degraded.nominal(), reference.nominal(), ratio, Draw(seed))
-    return pair.degraded.numpy()
+    return pair.degraded
 
 
 def _crops(dn: np.ndarray) -> Iterator[np.ndarray]:

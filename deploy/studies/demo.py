@@ -95,7 +95,7 @@ def run_demo(
     write_tiff(out / "restored.tif", images[INT8].astype(np.uint16))
     quality = list[Row]()
     if pair is not None:
-        reference = pair.reference.numpy()
+        reference = pair.reference
         for name, dn in images.items():
             psnr = measured(fidelity_db(dn, reference, degraded), "dB", "simulated pair")
             similarity = measured(ssim(dn, reference, MAX_DN), "ratio", "simulated pair")
@@ -138,7 +138,7 @@ def read_input(
     else:
         return read_acquisition(image, full_scale, None), None
     pair = simulate_pair(scene.radiance, degraded, reference, ratio, Draw(seed))
-    return pair.degraded.numpy(), pair
+    return pair.degraded, pair
 
 
 def bench_tables(model: Path, dn: np.ndarray, sensors: tuple[Sensor, Sensor]) -> list[Section]:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from torch import Tensor
 
 from beers_deploy.model.io.pictures import Stretch, strip
 from beers_deploy.model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
@@ -92,7 +91,7 @@ def figure() -> Image.Image:
     sensors["all"] = replace(plain(), effects=effects)
     images = {}
     for name, sensor in sensors.items():
-        images[name] = simulate_planned(scene, sensor, Draw(0), make_plan(sensor, scene.stats)).numpy()
+        images[name] = simulate_planned(scene, sensor, Draw(0), make_plan(sensor, scene.stats))
     names = list(images)
     rows = [{name: images[name] for name in names[k : k + COLUMNS]} for k in range(0, len(names), COLUMNS)]
     strips = [strip(row, [(0, 0)], SIDE_PX, 2, Stretch(0.0, 2600.0)) for row in rows]
@@ -107,7 +106,7 @@ def stronger(name: str, effect: Effect) -> Effect:
     return replace(effect, **SHOWN.get(name, {}))  # type: ignore[arg-type]
 
 
-def bounds(radiance: Tensor) -> Iterator[str]:
+def bounds(radiance: np.ndarray) -> Iterator[str]:
     """The effects that each scene asks for, as a Markdown table of their bounds."""
     plans = {name: plan_of(load_scene_call(name), radiance) for name in scene_names()}
     yield f"| effect | {' | '.join(plans)} |"
@@ -118,7 +117,7 @@ def bounds(radiance: Tensor) -> Iterator[str]:
             yield f"| {effect} | {' | '.join('-' if cell is None else f'{cell:.3g}' for cell in cells)} |"
 
 
-def plan_of(call: SceneCall, radiance: Tensor) -> Plan:
+def plan_of(call: SceneCall, radiance: np.ndarray) -> Plan:
     """The plan of one scene."""
     sensor = calling_for(load_sensor("pleiades-degraded"), call).nominal()
     return make_plan(sensor, scene_stats(radiance * call.radiance_scale.low, RATIO))

@@ -16,9 +16,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
-from torch import Tensor
 
 from beers_deploy.model.metrics.refusal import Refusal
 
@@ -192,7 +190,7 @@ def _transform(variance_px2: float) -> np.ndarray:
 
 def slanted_edge(
     side_px: int, oversampling: int, angle_deg: float, radiance: tuple[float, float] = (40.0, 200.0)
-) -> Tensor:
+) -> np.ndarray:
     """A straight edge through the middle of a square scene, (S, S) with S = side_px * oversampling.
 
     Simulate a scene much larger than the part you measure: its borders wrap around, which puts a second edge there.
@@ -214,7 +212,7 @@ def slanted_edge(
     distance = place[None, :] * math.cos(angle) + place[:, None] * math.sin(angle)
     covered = _covered(distance, abs(math.cos(angle)), abs(math.sin(angle)))
     left, right = radiance
-    return torch.from_numpy((left + (right - left) * _sharpened(covered)).astype(np.float32))
+    return np.asarray(left + (right - left) * _sharpened(covered), np.float32)
 
 
 def _covered(distance: np.ndarray, width: float, height: float) -> np.ndarray:

@@ -5,8 +5,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from beers_deploy.model.simulator.detector import Draw, detect
 from beers_deploy.model.simulator.mtf import sensor_transfer
@@ -27,15 +25,15 @@ NOISE = ("noise", "digitising")
 class Pair:
     """Two acquisitions of one scene, (..., H, W) float32 holding whole digital numbers."""
 
-    degraded: Tensor
-    reference: Tensor
+    degraded: np.ndarray
+    reference: np.ndarray
 
 
 @dataclass(frozen=True)
 class PreparedScene:
     """A scene (H, W) in W/m2/sr/um on its way to several sensors: what they share is computed once."""
 
-    radiance: Tensor
+    radiance: np.ndarray
     oversampling: int
 
     @cached_property
@@ -44,12 +42,12 @@ class PreparedScene:
         return scene_stats(self.radiance, self.oversampling)
 
     @cached_property
-    def spectrum(self) -> Tensor:
+    def spectrum(self) -> np.ndarray:
         """Half spectrum (H, W // 2 + 1) of the scene, computed when the first plan asks for a blur."""
         return scene_spectrum(self.radiance)
 
 
-def prepare_scene(radiance: Tensor, oversampling: int) -> PreparedScene:
+def prepare_scene(radiance: np.ndarray, oversampling: int) -> PreparedScene:
     """Crop a scene (H, W) to whole target pixels: H and W become multiples of `oversampling`."""
     return PreparedScene(crop_divisible(radiance, oversampling), oversampling)
 
@@ -61,7 +59,7 @@ def simulate_planned(
     plan: Plan,
     role: str = "degraded",
     margin_px: int = MARGIN_PX,
-) -> Tensor:
+) -> np.ndarray:
     """Acquire a scene with only the effects that its plan calls for.
 
     Returns:
@@ -71,7 +69,8 @@ def simulate_planned(
         kept, width, ratio = without(sensor, plan.skipped), scene.radiance.shape[-1], scene.oversampling
         return acquire(scene.spectrum, width, kept, ratio, draw, role, margin_px=margin_px, skip=plan.skipped)
     # Without any blur a target pixel is the mean of its scene pixels, which needs no transform.
-    pixels = torch.nn.functional.avg_pool2d(scene.radiance[None, None], scene.oversampling)[0, 0]
+    ratio, (height, width) = scene.oversampling, scene.radiance.shape
+    pixels = scene.radiance.reshape(height // ratio, ratio, width // ratio, ratio).mean((1, 3))
     return detect(crop_margin(pixels, margin_px), sensor, draw, role, plan.skipped)
 
 
@@ -81,7 +80,7 @@ def without(sensor: Instrument, skipped: Collection[str]) -> Instrument:
 
 
 def simulate_pair(
-    radiance: Tensor,
+    radiance: np.ndarray,
     degraded: Instrument,
     reference: Instrument,
     oversampling: int,
@@ -106,7 +105,7 @@ def simulate_pair(
 
 
 def acquire(
-    spectrum: Tensor,
+    spectrum: np.ndarray,
     width: int,
     sensor: Instrument,
     oversampling: int,
@@ -115,7 +114,7 @@ def acquire(
     offset_px: tuple[float, float] = (0.0, 0.0),
     margin_px: int = MARGIN_PX,
     skip: Collection[str] = (),
-) -> Tensor:
+) -> np.ndarray:
     """Digital numbers (h, w) of one acquisition: blur and sampling, then what `detect` does on the target grid.
 
     Args:
@@ -129,25 +128,25 @@ def acquire(
         margin_px: target pixels cropped on each side.
         skip: what to leave out of `detect`.
     """
-    transfer = sensor_transfer(spectrum.shape[-2], width, oversampling, sensor, spectrum.device)
+    transfer = sensor_transfer(spectrum.shape[-2], width, oversampling, sensor)
     signal = crop_margin(sample(spectrum, transfer, width, oversampling, offset_px), margin_px)
     return detect(signal, sensor, draw, role, skip)
 
 
 def acquire_three(
     scene: PreparedScene, degraded: Instrument, reference: Instrument, draw: Draw
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A pair of one scene, and the reference once more without noise and rounding: digital numbers (h, w) each."""
 
-    def by(sensor: Instrument, role: str, skip: Collection[str] = ()) -> Tensor:
+    def by(sensor: Instrument, role: str, skip: Collection[str] = ()) -> np.ndarray:
         return acquire(scene.spectrum, scene.radiance.shape[-1], sensor, scene.oversampling, draw, role, skip=skip)
 
     return by(degraded, "degraded"), by(reference, "reference"), by(reference, "reference", NOISE)
 
 
 def acquire_padded(
-    radiance: Tensor, sensor: Instrument, oversampling: int, draw: Draw, role: str, skip: Collection[str] = ()
-) -> Tensor:
+    radiance: np.ndarray, sensor: Instrument, oversampling: int, draw: Draw, role: str, skip: Collection[str] = ()
+) -> np.ndarray:
     """Acquire a scene (H, W) whole: what the margin would cut off is a mirror image around it.
 
     Returns:
@@ -156,18 +155,17 @@ def acquire_padded(
     """
     margin_px = MARGIN_PX * oversampling
     after = [margin_px - size % -oversampling for size in radiance.shape]
-    mirrored = np.pad(radiance.cpu().numpy(), [(margin_px, each) for each in after], mode="reflect")
-    scene = torch.from_numpy(mirrored)
+    scene = np.pad(radiance, [(margin_px, each) for each in after], mode="reflect")
     return acquire(scene_spectrum(scene), scene.shape[1], sensor, oversampling, draw, role, skip=skip)
 
 
-def fitting_oversampling(radiance: Tensor, oversamplings: Iterable[int], side_px: int) -> int | None:
+def fitting_oversampling(radiance: np.ndarray, oversamplings: Iterable[int], side_px: int) -> int | None:
     """The first oversampling that leaves `side_px` target pixels within the margin of a scene (H, W), or None."""
     target_px = side_px + 2 * MARGIN_PX
     return next((ratio for ratio in oversamplings if min(radiance.shape) // ratio >= target_px), None)
 
 
-def crop_margin(image: Tensor, margin_px: int) -> Tensor:
+def crop_margin(image: np.ndarray, margin_px: int) -> np.ndarray:
     """Cut `margin_px` from every side of (..., H, W)."""
     height, width = image.shape[-2:]
     if min(height, width) <= 2 * margin_px:

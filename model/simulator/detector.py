@@ -9,96 +9,101 @@ import zlib
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from beers_deploy.profiles.effects import Defects, Dsnu, Effect, FullWell, Haze, Offset, Prnu, Striping
 from beers_deploy.profiles.sensor import Instrument
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Pixels = TypeVar("Pixels", np.ndarray, "Tensor")
+"""The traditional chain computes with tensors."""
 
 NOISE_LIMIT = 6.0
 """Draws are clipped here (two in a billion), so that the effect of noise has a bound."""
 
 
-def noise_sigma(radiance: Tensor, sensor: Instrument) -> Tensor:
+def noise_sigma(radiance: np.ndarray, sensor: Instrument) -> np.ndarray:
     """sigma(L) = sqrt(alpha L + beta), in W/m2/sr/um, for radiances of any shape (paper, section 3.3).
 
     Ringing can push L below zero, where there is no light to be noisy about: L counts as 0 there. A negative
     variance (possible only for a sensor built by hand) counts as 0 too.
     """
-    return (sensor.alpha * radiance.clamp(min=0) + sensor.beta).clamp(min=0).sqrt()
+    return np.asarray(np.sqrt(np.maximum(sensor.alpha * np.maximum(radiance, 0) + sensor.beta, 0)))
 
 
-def add_noise(radiance: Tensor, sensor: Instrument, generator: np.random.Generator) -> Tensor:
-    """L + sigma(L) * n, n standard normal and independent per pixel; any shape, which is kept, as is the device."""
-    normal = generator.standard_normal(tuple(radiance.shape), dtype=np.float32)
+def add_noise(radiance: np.ndarray, sensor: Instrument, generator: np.random.Generator) -> np.ndarray:
+    """L + sigma(L) * n, n standard normal and independent per pixel; any shape."""
+    normal = generator.standard_normal(radiance.shape, dtype=np.float32)
     np.clip(normal, -NOISE_LIMIT, NOISE_LIMIT, out=normal)
-    return radiance + noise_sigma(radiance, sensor) * torch.from_numpy(normal).to(radiance.device)
+    return radiance + noise_sigma(radiance, sensor) * normal
 
 
 PATTERN_LIMIT = 4.0
 """Detectors further out are rejected at the factory: draws are clipped here, so that bounds can be proven."""
 
 
-def apply_prnu(radiance: Tensor, prnu: Prnu, generator: np.random.Generator) -> Tensor:
+def apply_prnu(radiance: np.ndarray, prnu: Prnu, generator: np.random.Generator) -> np.ndarray:
     """L' = (1 + rms * n) * L for L (..., H, W), n standard normal per column, clipped at 4; rms 0 changes nothing."""
     return radiance * (1 + prnu.rms * _columns(radiance, generator))
 
 
-def apply_dsnu(dn: Tensor, dsnu: Dsnu, generator: np.random.Generator) -> Tensor:
+def apply_dsnu(dn: np.ndarray, dsnu: Dsnu, generator: np.random.Generator) -> np.ndarray:
     """DN' = DN + rms_dn * n for DN (..., H, W), n normal per column, clipped at 4; rms_dn 0 changes nothing."""
     return dn + dsnu.rms_dn * _columns(dn, generator)
 
 
-def apply_striping(dn: Tensor, striping: Striping) -> Tensor:
+def apply_striping(dn: np.ndarray, striping: Striping) -> np.ndarray:
     """Add half of odd_even_dn to even columns of DN (..., H, W) and take it from odd ones; 0 changes nothing."""
-    columns = torch.arange(dn.shape[-1], device=dn.device)
-    return dn + striping.odd_even_dn * (0.5 - (columns % 2).to(dn.dtype))
+    columns = np.arange(dn.shape[-1]) % 2
+    return dn + striping.odd_even_dn * (0.5 - columns.astype(dn.dtype))
 
 
-def _columns(image: Tensor, generator: np.random.Generator) -> Tensor:
+def _columns(image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """One clipped standard normal number a column, (W,) float32."""
     draw = generator.standard_normal(image.shape[-1], dtype=np.float32)
-    return torch.from_numpy(np.clip(draw, -PATTERN_LIMIT, PATTERN_LIMIT)).to(image.device)
+    return np.asarray(np.clip(draw, -PATTERN_LIMIT, PATTERN_LIMIT))
 
 
-def saturate(radiance: Tensor, well: FullWell) -> Tensor:
+def saturate(radiance: np.ndarray, well: FullWell) -> np.ndarray:
     """L' = min(L + share * (k * max(L - well, 0)), well), in W/m2/sr/um.
 
     k spreads the excess up and down the column, falling by e every `blooming_px` pixels, and sums to 1 at most
     (what leaves the image is lost). Limits: below the well nothing changes; share 0 is a plain clip.
     """
-    excess = (radiance - well.radiance).clamp(min=0)
-    if well.blooming_share > 0 and well.blooming_px > 0 and bool((excess > 0).any()):
+    excess = np.maximum(radiance - well.radiance, 0)
+    if well.blooming_share > 0 and well.blooming_px > 0 and (excess > 0).any():
         radiance = radiance + well.blooming_share * _spread(excess, well.blooming_px)
-    return radiance.clamp(max=well.radiance)
+    return np.asarray(np.minimum(radiance, well.radiance))
 
 
-def _spread(excess: Tensor, length_px: float) -> Tensor:
+def _spread(excess: np.ndarray, length_px: float) -> np.ndarray:
     """Convolve each column of (..., H, W) with the two-sided exponential without its centre, normalised."""
     radius = min(int(6 * length_px) + 1, excess.shape[-2] - 1)
     if radius < 1:
-        return torch.zeros_like(excess)
-    distance = torch.arange(-radius, radius + 1, dtype=torch.float64).abs()
-    kernel = torch.exp(-distance / length_px) * (distance > 0)
+        return np.zeros_like(excess)
+    distance = np.abs(np.arange(-radius, radius + 1, dtype=np.float64))
+    kernel = np.exp(-distance / length_px) * (distance > 0)
     if kernel.sum() == 0:  # so short that not even a neighbour is reached
-        return torch.zeros_like(excess)
-    kernel = (kernel / kernel.sum()).to(excess)
-    columns = excess.reshape(-1, 1, *excess.shape[-2:])
-    return torch.nn.functional.conv2d(columns, kernel[None, None, :, None], padding=(radius, 0)).reshape(excess.shape)
+        return np.zeros_like(excess)
+    from scipy.ndimage import convolve1d  # a sixth of a second to load, for what few sensors have
+
+    return np.asarray(convolve1d(excess, kernel / kernel.sum(), axis=-2, mode="constant"))
 
 
-def add_defects(dn: Tensor, defects: Defects, max_dn: int, generator: np.random.Generator) -> Tensor:
+def add_defects(dn: np.ndarray, defects: Defects, max_dn: int, generator: np.random.Generator) -> np.ndarray:
     """Pixels of DN (H, W) dead (0 DN) or hot (max_dn), each at its rate per million; rates 0 change nothing."""
-    draw = torch.from_numpy(generator.random(tuple(dn.shape), dtype=np.float32)).to(dn.device)
+    draw = generator.random(dn.shape, dtype=np.float32)
     dead, hot = defects.dead_per_million / 1e6, defects.hot_per_million / 1e6
-    dn = torch.where(draw < dead, torch.zeros_like(dn), dn)
+    dn = np.where(draw < dead, np.float32(0), dn)
     # One draw decides both, so a pixel is never dead and hot.
-    return torch.where(draw >= 1 - hot, torch.full_like(dn, float(max_dn)), dn) if hot > 0 else dn
+    return np.where(draw >= 1 - hot, np.float32(max_dn), dn) if hot > 0 else dn
 
 
-def add_haze(radiance: Tensor, haze: Haze) -> Tensor:
+def add_haze(radiance: np.ndarray, haze: Haze) -> np.ndarray:
     """L' = transmittance * L + path radiance, in W/m2/sr/um, for L of any shape.
 
     Limits: (1, 0) changes nothing; transmittance 0 leaves the path radiance alone. It is the same before and after
@@ -107,27 +112,27 @@ def add_haze(radiance: Tensor, haze: Haze) -> Tensor:
     return radiance * haze.transmittance + haze.path_radiance
 
 
-def digitise(dn: Tensor, sensor: Instrument) -> Tensor:
+def digitise(dn: np.ndarray, sensor: Instrument) -> np.ndarray:
     """Round digital numbers, of any shape, to whole ones and clip them to the converter's range.
 
     Rounding adds 1/12 DN^2 of variance. Clipping comes before any cast, so that nothing wraps around.
     """
-    return dn.round().clamp(0, sensor.max_dn)
+    return np.asarray(np.rint(dn).clip(0, sensor.max_dn))
 
 
-def to_radiance(dn: Tensor, sensor: Instrument) -> Tensor:
+def to_radiance(dn: Pixels, sensor: Instrument) -> Pixels:
     """Radiance in W/m2/sr/um of digital numbers of any shape, the offset taken off."""
     return (dn - sensor.offset_dn) / sensor.gain_dn_per_radiance
 
 
-def to_dn(radiance: Tensor, sensor: Instrument) -> Tensor:
+def to_dn(radiance: Pixels, sensor: Instrument) -> Pixels:
     """Digital numbers of radiances of any shape: `to_radiance` backwards, clipped to the range and not rounded."""
-    return (radiance * sensor.gain_dn_per_radiance + sensor.offset_dn).clamp(0, sensor.max_dn)
+    return (radiance * sensor.gain_dn_per_radiance + sensor.offset_dn).clip(0, sensor.max_dn)
 
 
-def to_uint16(dn: Tensor) -> np.ndarray:
+def to_uint16(dn: np.ndarray) -> np.ndarray:
     """Whole digital numbers of at most 16 bits, of any shape, as the array that a TIFF file takes."""
-    return np.asarray(dn.round().clamp(0, 65535).cpu().numpy().astype(np.uint16))
+    return np.asarray(np.rint(dn).clip(0, 65535), np.uint16)
 
 
 @dataclass(frozen=True)
@@ -147,7 +152,7 @@ RADIANCE_EFFECTS = ("veil", "full_well", "prnu")
 DN_EFFECTS = ("dsnu", "striping", "offset", "defects")
 
 
-def detect(signal: Tensor, sensor: Instrument, draw: Draw, role: str, skip: Collection[str] = ()) -> Tensor:
+def detect(signal: np.ndarray, sensor: Instrument, draw: Draw, role: str, skip: Collection[str] = ()) -> np.ndarray:
     """Digital numbers of a blurred, sampled signal (..., H, W) in W/m2/sr/um: whole ones, unless told otherwise.
 
     Args:
@@ -159,7 +164,7 @@ def detect(signal: Tensor, sensor: Instrument, draw: Draw, role: str, skip: Coll
     """
     wanted = {name: effect for name, effect in sensor.effects.items() if name not in skip}
 
-    def apply(image: Tensor, names: tuple[str, ...]) -> Tensor:
+    def apply(image: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
         for name in names:
             if name in wanted:
                 image = apply_effect(image, wanted[name], sensor, partial(draw.generator, f"{name}-{role}"))
@@ -169,12 +174,12 @@ def detect(signal: Tensor, sensor: Instrument, draw: Draw, role: str, skip: Coll
     if "noise" not in skip:
         signal = add_noise(signal, sensor, draw.generator(f"noise-{role}"))
     dn = apply(signal * sensor.gain_dn_per_radiance, DN_EFFECTS)
-    return dn.clamp(0, sensor.max_dn) if "digitising" in skip else digitise(dn, sensor)
+    return dn.clip(0, sensor.max_dn) if "digitising" in skip else digitise(dn, sensor)
 
 
 def apply_effect(
-    image: Tensor, effect: Effect, sensor: Instrument, generator: Callable[[], np.random.Generator]
-) -> Tensor:
+    image: np.ndarray, effect: Effect, sensor: Instrument, generator: Callable[[], np.random.Generator]
+) -> np.ndarray:
     """Apply one effect of the target grid to an image (..., H, W); the generator is made only for those that draw."""
     match effect:
         case Haze():

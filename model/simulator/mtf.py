@@ -2,7 +2,6 @@
 
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,10 +10,6 @@ from beers_deploy.profiles.effects import AntiAlias, Smear
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.response import PointSpread, Response
 from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX, Instrument, mtf_limit
-
-if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
 
 NYQUIST = 0.5
 """Cycles per target pixel."""
@@ -107,11 +102,9 @@ def _filter_and_smear(sensor: Instrument) -> tuple[float, float]:
     return sigma_px, smear.length_px if isinstance(smear, Smear) else 0.0
 
 
-def sensor_transfer(
-    height: int, width: int, oversampling: int, sensor: Instrument, device: "torch.device | None" = None
-) -> "Tensor":
+def sensor_transfer(height: int, width: int, oversampling: int, sensor: Instrument) -> NDArray[np.inexact]:
     """All the linear, shift-invariant effects of a sensor as one transfer function (H, W // 2 + 1)."""
-    return transfer_function(height, width, oversampling, sensor.blur, *_filter_and_smear(sensor), device)
+    return transfer_function(height, width, oversampling, sensor.blur, *_filter_and_smear(sensor))
 
 
 @lru_cache(maxsize=64)
@@ -122,15 +115,12 @@ def transfer_function(
     blur: Blur,
     antialias_sigma_px: float = 0.0,
     smear_px: float = 0.0,
-    device: "torch.device | None" = None,
-) -> "Tensor":
+) -> NDArray[np.inexact]:
     """MTF and smear on the half spectrum of a scene: (H, W // 2 + 1) float32, ready to multiply an rfft2.
 
     `height` and `width` are in scene pixels, `oversampling` of which make one target pixel. Complex64 for a
     point-spread function, which may be lopsided or lie aslant.
     """
-    import torch
-
     aslant = isinstance(blur, PointSpread)
     vertical = np.fft.fftfreq if aslant else np.fft.rfftfreq
     fy, fx = vertical(height, 1 / oversampling), np.fft.rfftfreq(width, 1 / oversampling)
@@ -138,7 +128,6 @@ def transfer_function(
     if smear_px:
         found = found * smear_response(fy[:, None], smear_px)
     if aslant:
-        return torch.from_numpy(found.astype(np.complex64)).to(device)
+        return found.astype(np.complex64)
     upper = found.astype(np.float32)
-    whole = np.concatenate([upper, upper[1 : (height + 1) // 2][::-1]])  # even in fy: the rows below are the same
-    return torch.from_numpy(whole).to(device)
+    return np.concatenate([upper, upper[1 : (height + 1) // 2][::-1]])  # even in fy: the rows below are the same

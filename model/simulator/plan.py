@@ -15,8 +15,7 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-import torch
-from torch import Tensor
+from scipy import fft
 
 from beers_deploy.model.simulator.detector import DN_EFFECTS, NOISE_LIMIT, PATTERN_LIMIT, RADIANCE_EFFECTS
 from beers_deploy.model.simulator.mtf import Blur, smear_response, transfer_function
@@ -48,10 +47,10 @@ class SceneStats:
     oversampling: int
 
 
-def scene_stats(radiance: Tensor, oversampling: int) -> SceneStats:
+def scene_stats(radiance: np.ndarray, oversampling: int) -> SceneStats:
     """Statistics of a scene's radiance (H, W), in one pass over it."""
-    low, high = (float(v) for v in torch.aminmax(radiance))
-    step = max(float((radiance[1:] - radiance[:-1]).abs().max()), float((radiance[0] - radiance[-1]).abs().max()))
+    low, high = float(radiance.min()), float(radiance.max())
+    step = max(float(np.abs(radiance[1:] - radiance[:-1]).max()), float(np.abs(radiance[0] - radiance[-1]).max()))
     height, width = radiance.shape
     return SceneStats(low, high, step, height, width, oversampling)
 
@@ -75,8 +74,8 @@ def ringing_of(sensor: Instrument, stats: SceneStats) -> float:
 
 @lru_cache(maxsize=256)
 def _kernel_sum(height: int, width: int, oversampling: int, blur: Blur, sigma_px: float) -> float:
-    transfer = transfer_function(height, width, oversampling, blur, sigma_px).to(torch.complex128)
-    return float(torch.fft.irfft2(transfer, s=(height, width)).abs().sum())
+    transfer = transfer_function(height, width, oversampling, blur, sigma_px).astype(np.complex128)
+    return float(np.abs(fft.irfft2(transfer, s=(height, width))).sum())
 
 
 @lru_cache(maxsize=256)

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image, ImageDraw
+from scipy import fft
 
 from beers_deploy.model.io.images import list_images
 from beers_deploy.model.simulator.sampling import Scene, read_scene
@@ -43,7 +43,7 @@ def procedural_scene(height_px: int, width_px: int, generator: np.random.Generat
     radiance = np.asarray(canvas) * texture(height_px, width_px, generator)
     canvas = Image.fromarray(radiance.astype(np.float32))
     _pattern(ImageDraw.Draw(canvas), canvas.size)
-    return Scene("procedural", torch.from_numpy(np.array(canvas, dtype=np.float32)))
+    return Scene("procedural", np.array(canvas, dtype=np.float32))
 
 
 def _fields(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator) -> None:
@@ -186,8 +186,8 @@ def texture(height_px: int, width_px: int, generator: np.random.Generator) -> np
     white = generator.standard_normal((height_px, width_px), dtype=np.float32)
     fy, fx = np.fft.fftfreq(height_px)[:, None], np.fft.rfftfreq(width_px)[None, :]
     radius = np.hypot(fx, fy)
-    spectrum = np.fft.rfft2(white) / np.maximum(radius, 1 / 400)
-    pattern = np.fft.irfft2(spectrum, s=(height_px, width_px))
+    spectrum = fft.rfft2(white) / np.maximum(radius, 1 / 400).astype(np.float32)
+    pattern = fft.irfft2(spectrum, s=(height_px, width_px))
     return np.asarray(np.exp(0.12 * pattern / pattern.std()))
 
 

@@ -7,23 +7,25 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
-from torch import Tensor
+from scipy import fft
 
 from beers_deploy.model.io.images import read_pixels
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument
 
 
-def scene_spectrum(radiance: Tensor) -> Tensor:
+def scene_spectrum(radiance: np.ndarray) -> np.ndarray:
     """Half spectrum (..., H, W // 2 + 1) of a scene (..., H, W), to be sampled through any number of sensors."""
-    spectrum: Tensor = torch.fft.rfft2(radiance)
-    return spectrum
+    return np.asarray(fft.rfft2(radiance))
 
 
 def sample(
-    spectrum: Tensor, transfer: Tensor, width: int, oversampling: int, offset_px: tuple[float, float] = (0.0, 0.0)
-) -> Tensor:
+    spectrum: np.ndarray,
+    transfer: np.ndarray,
+    width: int,
+    oversampling: int,
+    offset_px: tuple[float, float] = (0.0, 0.0),
+) -> np.ndarray:
     """Blur by `transfer` and keep every r-th point in both directions.
 
     Target pixel n covers scene pixels r*n to r*n + r - 1, so it is sampled at their centre, r*n + (r - 1) / 2. For
@@ -41,23 +43,24 @@ def sample(
     """
     height = spectrum.shape[-2]
     centre = (oversampling - 1) / 2
-    ramp_y = _ramp(torch.fft.fftfreq(height, device=spectrum.device), centre + offset_px[0])
-    ramp_x = _ramp(torch.fft.rfftfreq(width, device=spectrum.device), centre + offset_px[1])
+    ramp_y = _ramp(np.fft.fftfreq(height), centre + offset_px[0])
+    ramp_x = _ramp(np.fft.rfftfreq(width), centre + offset_px[1])
     # Keeping every r-th row is adding up the r aliases of each frequency: what follows is r times smaller.
     rows = height // oversampling
-    blurred = (spectrum * transfer).mul_(ramp_y[:, None])
-    folded = blurred.reshape(*blurred.shape[:-2], oversampling, rows, -1).sum(-3).mul_(ramp_x / oversampling)
-    lines: Tensor = torch.fft.irfft(torch.fft.ifft(folded, dim=-2), n=width, dim=-1)
-    return lines[..., ::oversampling].contiguous()
+    blurred = spectrum * transfer
+    blurred *= ramp_y[:, None]
+    folded = blurred.reshape(*blurred.shape[:-2], oversampling, rows, -1).sum(-3) * (ramp_x / oversampling)
+    lines = fft.irfft(fft.ifft(folded, axis=-2, overwrite_x=True), n=width, axis=-1, overwrite_x=True)
+    return np.ascontiguousarray(lines[..., ::oversampling])
 
 
-def crop_divisible(radiance: Tensor, oversampling: int) -> Tensor:
+def crop_divisible(radiance: np.ndarray, oversampling: int) -> np.ndarray:
     """Cut the last rows and columns of (..., H, W), so that H and W are multiples of the oversampling."""
     height, width = (size // oversampling * oversampling for size in radiance.shape[-2:])
     return radiance[..., :height, :width]
 
 
-def resample(radiance: Tensor, height: int, width: int) -> Tensor:
+def resample(radiance: np.ndarray, height: int, width: int) -> np.ndarray:
     """A scene (H, W) on another grid over the same ground, band-limited: for ratios that are no whole number.
 
     Frequencies that the new grid cannot hold are cut, others kept as they are; new ones are zero. Pixel n of the new
@@ -69,23 +72,22 @@ def resample(radiance: Tensor, height: int, width: int) -> Tensor:
         (height, width) float32, in the unit of the scene.
     """
     old_height, old_width = radiance.shape[-2:]
-    spectrum = torch.fft.rfft2(radiance)
-    fy = torch.fft.fftfreq(old_height, device=radiance.device)
-    fx = torch.fft.rfftfreq(old_width, device=radiance.device)
-    spectrum = spectrum * _ramp(fy, (old_height / height - 1) / 2)[:, None] * _ramp(fx, (old_width / width - 1) / 2)
+    fy, fx = np.fft.fftfreq(old_height), np.fft.rfftfreq(old_width)
+    ramp_y, ramp_x = (
+        _ramp(f, shift) for f, shift in ((fy, (old_height / height - 1) / 2), (fx, (old_width / width - 1) / 2))
+    )
+    spectrum = scene_spectrum(radiance) * ramp_y[:, None] * ramp_x
     rows, columns = min(old_height, height), min(old_width, width)
     top, bottom, half = (rows + 1) // 2, rows // 2, columns // 2 + 1
-    cut = torch.zeros(height, width // 2 + 1, dtype=spectrum.dtype, device=spectrum.device)
+    cut = np.zeros((height, width // 2 + 1), spectrum.dtype)
     cut[:top, :half] = spectrum[:top, :half]
     cut[height - bottom :, :half] = spectrum[old_height - bottom :, :half]
     scale = height * width / (old_height * old_width)
-    resampled: Tensor = torch.fft.irfft2(cut, s=(height, width)) * scale
-    return resampled
+    return np.asarray(fft.irfft2(cut, s=(height, width)) * scale)
 
 
-def _ramp(frequency: Tensor, shift_px: float) -> Tensor:
-    angle = 2 * torch.pi * frequency.double() * shift_px
-    return torch.polar(torch.ones_like(angle), angle).to(torch.complex64)
+def _ramp(frequency: np.ndarray, shift_px: float) -> np.ndarray:
+    return np.exp(2j * np.pi * frequency * shift_px).astype(np.complex64)
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ class Scene:
     """Radiance (H, W) float32 in W/m2/sr/um, and the name it goes by."""
 
     name: str
-    radiance: Tensor
+    radiance: np.ndarray
 
 
 def read_scene(path: Path, sensor: Instrument) -> Scene:
@@ -123,7 +125,7 @@ def scene_of(name: str, pixels: np.ndarray, sensor: Instrument) -> Scene:
         expected = "8-bit RGB or mono, 16-bit mono, or float mono pixels"
         got = f"{pixels.dtype} of shape {pixels.shape}"
         raise ImageError(name, expected=expected, got=got, remedy="convert it to one of these")
-    return Scene(name, torch.from_numpy(np.ascontiguousarray(radiance, dtype=np.float32)))
+    return Scene(name, np.ascontiguousarray(radiance, dtype=np.float32))
 
 
 def _linear(pixels: np.ndarray) -> np.ndarray:

@@ -7,7 +7,9 @@ in the place of NL-Bayes in the chain.
 from collections.abc import Callable
 from functools import partial
 
+import numpy as np
 import torch
+from scipy import fft
 from skimage import restoration
 from torch import Tensor
 
@@ -26,28 +28,26 @@ Peer = Callable[[Tensor, Chain], Tensor]
 """(H, W) digital numbers of the degraded sensor, and the two sensors, to those of the reference."""
 
 
-def wiener(image: Tensor, blur: Tensor) -> Tensor:
+def wiener(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
     """scikit-image's Wiener filter with a Laplacian regulariser, balance 0.01."""
-    restored = restoration.wiener(image.numpy(), blur.numpy().astype(complex), WIENER_BALANCE, clip=False)
-    return torch.from_numpy(restored)
+    return np.asarray(restoration.wiener(image, blur.astype(complex), WIENER_BALANCE, clip=False))
 
 
-def unsupervised_wiener(image: Tensor, blur: Tensor) -> Tensor:
+def unsupervised_wiener(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
     """scikit-image's Wiener filter that estimates its own regularisation (seed 0)."""
-    restored, _ = restoration.unsupervised_wiener(image.numpy(), blur.numpy().astype(complex), clip=False, rng=0)
-    return torch.from_numpy(restored)
+    restored, _ = restoration.unsupervised_wiener(image, blur.astype(complex), clip=False, rng=0)
+    return np.asarray(restored)
 
 
-def richardson_lucy(image: Tensor, blur: Tensor) -> Tensor:
+def richardson_lucy(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
     """scikit-image's Richardson-Lucy deconvolution, 20 steps."""
     side = 2 * PAD_PX + 1
-    spread = torch.fft.irfft2(blur, s=tuple(image.shape)).roll((PAD_PX, PAD_PX), (0, 1))[:side, :side]
+    spread = np.roll(fft.irfft2(blur, s=image.shape), (PAD_PX, PAD_PX), (0, 1))[:side, :side]
     # Richardson-Lucy is defined for kernels that are nowhere negative, and this one may ring below 0.
-    spread = spread.clamp(min=0)
-    point = (spread / spread.sum()).numpy()
+    spread = np.maximum(spread, 0)
     # It divides by its own blurred estimate, which goes to 0 where the image is 0.
-    light = image.clamp(min=1e-6).numpy()
-    return torch.from_numpy(restoration.richardson_lucy(light, point, RICHARDSON_LUCY_STEPS, clip=False))
+    light = np.maximum(image, 1e-6)
+    return np.asarray(restoration.richardson_lucy(light, spread / spread.sum(), RICHARDSON_LUCY_STEPS, clip=False))
 
 
 def nl_means(dn: Tensor, chain: Chain) -> Tensor:
@@ -62,7 +62,7 @@ def nl_means(dn: Tensor, chain: Chain) -> Tensor:
     return to_dn(sharp, chain.reference)
 
 
-def _deconvolved(deconvolve: Callable[[Tensor, Tensor], Tensor], dn: Tensor, chain: Chain) -> Tensor:
+def _deconvolved(deconvolve: Callable[[np.ndarray, np.ndarray], np.ndarray], dn: Tensor, chain: Chain) -> Tensor:
     """Undo the degraded MTF on mirrored borders, at a scale of 1 for full scale, and blur to the reference's.
 
     `deconvolve` takes an image (H, W) and the half spectrum of its blur, (H, W // 2 + 1).
@@ -70,11 +70,11 @@ def _deconvolved(deconvolve: Callable[[Tensor, Tensor], Tensor], dn: Tensor, cha
     full_scale = chain.degraded.max_dn / chain.degraded.gain_dn_per_radiance
     rows, columns = (mirrored(-PAD_PX, size + PAD_PX, size) for size in dn.shape)
     height, width = len(rows), len(columns)
-    wide = ((dn.double() - chain.degraded.offset_dn) / chain.degraded.max_dn)[rows][:, columns]
+    wide = ((dn.double() - chain.degraded.offset_dn) / chain.degraded.max_dn)[rows][:, columns].numpy()
     blur, target = (transfer_function(height, width, 1, s.blur) for s in (chain.degraded, chain.reference))
-    sharp = torch.fft.rfft2(deconvolve(wide, blur)) * target
-    inside = torch.fft.irfft2(sharp, s=(height, width))[PAD_PX:-PAD_PX, PAD_PX:-PAD_PX]
-    return to_dn((inside * full_scale).float(), chain.reference)
+    sharp = fft.rfft2(deconvolve(wide, blur)) * target
+    inside = fft.irfft2(sharp, s=(height, width))[PAD_PX:-PAD_PX, PAD_PX:-PAD_PX]
+    return to_dn(torch.from_numpy((inside * full_scale).astype(np.float32)), chain.reference)
 
 
 PEERS: dict[str, Peer] = {

@@ -6,20 +6,17 @@ and exposure. Visiting whole scenes yields many patches for one transform.
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
-from torch import Tensor
+from numpy.lib.stride_tricks import sliding_window_view
 
-from beers_deploy.model.convbeers import vector_tensor
-from beers_deploy.model.family import SensorFamily
+from beers_deploy.model.family import SensorFamily, sensor_vector
 from beers_deploy.model.io.images import list_images, read_acquisition
 from beers_deploy.model.simulator.acquire import acquire
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import Scene, crop_divisible, scene_spectrum
-from beers_deploy.model.training.trainer import Worker
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument, Sensor, require_same_units
 
@@ -56,7 +53,7 @@ class PatchRecipe:
 class Visited:
     """A scene ready to be visited: its half spectrum and its width in pixels."""
 
-    spectrum: Tensor
+    spectrum: np.ndarray
     width: int
 
 
@@ -75,14 +72,14 @@ class PatchSource:
         recipe: PatchRecipe,
         batch: int,
         seed: int,
-        worker: Worker | None = None,
-        device: torch.device | None = None,
+        rank: int = 0,
+        workers: int = 1,
     ) -> None:
-        self.recipe, self.batch, self.seed, self.worker = recipe, batch, seed, worker or Worker()
+        self.recipe, self.batch, self.seed, self.rank, self.workers = recipe, batch, seed, rank, workers
         common = int(np.lcm.reduce(recipe.oversamplings))
-        self._scenes = [prepare(scene, common, device) for scene in scenes]
+        self._scenes = [prepare(scene, common) for scene in scenes]
 
-    def batches(self, first: int = 0) -> Iterator[tuple[Tensor, ...]]:
+    def batches(self, first: int = 0) -> Iterator[tuple[np.ndarray, ...]]:
         """Batch number `first` and all that follow, of (N, 1, P, P): a resumed run goes on where it stopped.
 
         The next shard is made while the present one is used.
@@ -96,39 +93,36 @@ class PatchSource:
                 waiting = ahead.submit(self._shard, number)
                 for k in range(within, self.SHARD_BATCHES):
                     part = slice(k * self.batch, (k + 1) * self.batch)
-                    yield tuple(tensor[part] for tensor in shard)
+                    yield tuple(array[part] for array in shard)
                 within = 0
 
-    def _shard(self, number: int) -> tuple[Tensor, ...]:
+    def _shard(self, number: int) -> tuple[np.ndarray, ...]:
         # Keyed by its number and not drawn in sequence: a resumed run makes the same shard.
-        own = number * self.worker.count + self.worker.rank
-        generator = Draw(self.seed, own).generator("shard")
-        wanted, pieces, vectors, count = self.batch * self.SHARD_BATCHES, list[Tensor](), list[Tensor](), 0
+        generator = Draw(self.seed, number * self.workers + self.rank).generator("shard")
+        wanted, pieces, vectors, count = self.batch * self.SHARD_BATCHES, list[np.ndarray](), list[np.ndarray](), 0
         for _ in range(50 * wanted):
             piece, vector = visit(self._scenes[generator.integers(len(self._scenes))], self.recipe, generator)
             pieces.append(piece)
-            vectors.append(vector.expand(len(piece), -1))
+            vectors.append(np.broadcast_to(vector, (len(piece), len(vector))))
             count += len(piece)
             if count >= wanted:
                 # Mixed, because neighbours of one scene would make a batch whose gradient knows one scene.
-                order = torch.from_numpy(generator.permutation(count)[:wanted])
-                patches = torch.cat(pieces)
-                patches = patches[order.to(patches.device)]
-                patches = roughened(patches, self.recipe.rough, generator)
-                pair = patches[:, :1].contiguous(), patches[:, 1:].contiguous()
-                return (*pair, torch.cat(vectors)[order]) if self.recipe.family else pair
+                order = generator.permutation(count)[:wanted]
+                patches = roughened(np.concatenate(pieces)[order], self.recipe.rough, generator)
+                pair = np.ascontiguousarray(patches[:, :1]), np.ascontiguousarray(patches[:, 1:])
+                return (*pair, np.concatenate(vectors)[order]) if self.recipe.family else pair
         expected = f"scenes that hold a patch of {self.recipe.patch_px} target pixels"
         remedy = "give larger images or a smaller patch"
         raise ImageError("training images", expected=expected, got="none large enough", remedy=remedy)
 
 
-def prepare(scene: Scene, multiple: int, device: torch.device | None = None) -> Visited:
-    """Crop a scene to multiples of every oversampling, and transform it once, where the patches are wanted."""
-    radiance = crop_divisible(scene.radiance, multiple).to(device or scene.radiance.device)
+def prepare(scene: Scene, multiple: int) -> Visited:
+    """Crop a scene to multiples of every oversampling, and transform it once."""
+    radiance = crop_divisible(scene.radiance, multiple)
     return Visited(scene_spectrum(radiance), radiance.shape[-1])
 
 
-def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -> tuple[Tensor, Tensor]:
+def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """All the patches of one simulated pass over a scene, (N, 2, P, P), and the vector (4,) of its sensor.
 
     The patches are degraded and reference in [0, 1].
@@ -136,43 +130,45 @@ def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -
     ratio = int(generator.choice(recipe.oversamplings))
     room = min(scene.spectrum.shape[-2], scene.width) // ratio - 2 * recipe.margin_px
     if room < recipe.patch_px:
-        return scene.spectrum.real.new_empty(0, 2, recipe.patch_px, recipe.patch_px), torch.empty(4)
+        return np.empty((0, 2, recipe.patch_px, recipe.patch_px), np.float32), np.empty(4, np.float32)
     images, sensor = _acquire_pair(scene, recipe, ratio, generator)
     patches = cut(images, recipe.patch_px, generator)
     # A conditioned network learns that a sensor's axes changed places, and is told so; a plain one cannot.
     mirrors, quarters = sensor.symmetry
     quarter, mirrored = draw_turn(generator, quarters or recipe.family is not None, mirrors)
-    vector = vector_tensor(sensor)
+    vector = np.array(sensor_vector(sensor).values, np.float32)
     return turned(patches, quarter, mirrored), vector[[1, 0, 2, 3]] if quarter % 2 else vector
 
 
 def _acquire_pair(
     scene: Visited, recipe: PatchRecipe, ratio: int, generator: np.random.Generator
-) -> tuple[Tensor, Instrument]:
+) -> tuple[np.ndarray, Instrument]:
     """Degraded and reference, (2, H, W), and the sensor of the degraded one."""
     # Exposure is linear, so it scales the spectrum that is already there.
     spectrum = scene.spectrum * float(generator.uniform(*recipe.exposures))
     # One phase for both images of a pair: restoring must not shift anything.
     phase_y, phase_x = (float(v) for v in generator.uniform(-ratio / 2, ratio / 2, 2))
     draw = Draw(int(generator.integers(2**31)))
-    images, sensors = list[Tensor](), list[Instrument]()
+    images, sensors = list[np.ndarray](), list[Instrument]()
     for profile, role in ((recipe.family or recipe.degraded, "degraded"), (recipe.reference, "reference")):
         sensor = profile.draw(generator)
         dn = acquire(spectrum, scene.width, sensor, ratio, draw, role, (phase_y, phase_x), recipe.margin_px)
         images.append(dn / sensor.max_dn)
         sensors.append(sensor)
-    return torch.stack(images), sensors[0]
+    return np.stack(images), sensors[0]
 
 
-def cut(images: Tensor, patch_px: int, generator: np.random.Generator) -> Tensor:
+def cut(images: np.ndarray, patch_px: int, generator: np.random.Generator) -> np.ndarray:
     """Cut (C, H, W) into as many whole patches as fit, from a random corner: (N, C, P, P)."""
     height, width = images.shape[-2:]
     top, left = (int(generator.integers(size % patch_px + 1)) for size in (height, width))
-    grid = images[:, top:, left:].unfold(1, patch_px, patch_px).unfold(2, patch_px, patch_px)
-    return grid.permute(1, 2, 0, 3, 4).reshape(-1, images.shape[0], patch_px, patch_px)
+    windows = sliding_window_view(images[:, top:, left:], (patch_px, patch_px), (1, 2))[:, ::patch_px, ::patch_px]
+    return windows.transpose(1, 2, 0, 3, 4).reshape(-1, images.shape[0], patch_px, patch_px)
 
 
-def turn(patches: Tensor, generator: np.random.Generator, quarters: bool = True, mirrors: bool = True) -> Tensor:
+def turn(
+    patches: np.ndarray, generator: np.random.Generator, quarters: bool = True, mirrors: bool = True
+) -> np.ndarray:
     """Patches (..., P, P) in one of the square's eight symmetries, the same for all; see `draw_turn`."""
     return turned(patches, *draw_turn(generator, quarters, mirrors))
 
@@ -189,17 +185,17 @@ def draw_turn(generator: np.random.Generator, quarters: bool, mirrors: bool = Tr
     return quarter if quarters else quarter - quarter % 2, mirrored
 
 
-def turned(patches: Tensor, quarter: int, mirrored: bool) -> Tensor:
+def turned(patches: np.ndarray, quarter: int, mirrored: bool) -> np.ndarray:
     """Patches (..., P, P) turned by quarters, then mirrored."""
-    rotated = torch.rot90(patches, quarter, (-2, -1))
-    return rotated.flip(-1) if mirrored else rotated
+    rotated = np.rot90(patches, quarter, (-2, -1))
+    return rotated[..., ::-1] if mirrored else rotated
 
 
 LEAST_CONTRAST = 0.25
 """Between neighbouring pixels of a rough patch, of full scale: more than any sensor trained on lets through."""
 
 
-def roughened(patches: Tensor, share: float, generator: np.random.Generator) -> Tensor:
+def roughened(patches: np.ndarray, share: float, generator: np.random.Generator) -> np.ndarray:
     """Pairs (N, 2, P, P) of which a share, at random, became contrast between pixels that is to be left as it is.
 
     No sensor makes such images, but faults do, and a network that never saw one may answer with black: at half
@@ -207,8 +203,7 @@ def roughened(patches: Tensor, share: float, generator: np.random.Generator) -> 
     """
     chosen = generator.permutation(len(patches))[: round(share * len(patches))]
     if len(chosen):
-        made = np.stack([_rough_image(patches.shape[-1], generator) for _ in chosen])
-        patches[torch.from_numpy(chosen)] = torch.from_numpy(made)[:, None].to(patches)
+        patches[chosen] = np.stack([_rough_image(patches.shape[-1], generator) for _ in chosen])[:, None]
     return patches
 
 
@@ -248,7 +243,8 @@ class StoredPairs:
         max_dn: the largest digital number of the sensor that made the pairs.
         batch: patches of a batch.
         seed: of what is drawn.
-        worker: which of several this is.
+        rank: which of the workers this is.
+        workers: how many there are.
         quarters: whether patches may be turned by quarters: not those of a sensor whose two axes differ.
         mirrors: whether they may be mirrored: not those of a sensor whose blur is lopsided.
     """
@@ -258,21 +254,21 @@ class StoredPairs:
     max_dn: int
     batch: int
     seed: int
-    worker: Worker = field(default_factory=Worker)
+    rank: int = 0
+    workers: int = 1
     quarters: bool = True
     mirrors: bool = True
 
-    def batches(self, first: int = 0) -> Iterator[tuple[Tensor, Tensor]]:
+    def batches(self, first: int = 0) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Batch number `first` and all that follow: (degraded, reference), (N, 1, P, P) in [0, 1] each."""
         number = first
         while True:
-            own = number * self.worker.count + self.worker.rank
-            generator = Draw(self.seed, own).generator("stored")
-            patches = torch.stack([self._patch(generator) for _ in range(self.batch)]) / self.max_dn
-            yield patches[:, :1].contiguous(), patches[:, 1:].contiguous()
+            generator = Draw(self.seed, number * self.workers + self.rank).generator("stored")
+            patches = np.stack([self._patch(generator) for _ in range(self.batch)]) / np.float32(self.max_dn)
+            yield np.ascontiguousarray(patches[:, :1]), np.ascontiguousarray(patches[:, 1:])
             number += 1
 
-    def _patch(self, generator: np.random.Generator) -> Tensor:
+    def _patch(self, generator: np.random.Generator) -> np.ndarray:
         """One patch (2, P, P) of a random pair."""
         files = self.files[int(generator.integers(len(self.files)))]
         images = [read_acquisition(file, remedy=RESCALE, max_dn=self.max_dn) for file in files]
@@ -284,5 +280,5 @@ class StoredPairs:
             raise ImageError(str(files[0]), expected=expected, got=got, remedy=remedy)
         top, left = (int(generator.integers(size - self.patch_px + 1)) for size in (height, width))
         window = slice(top, top + self.patch_px), slice(left, left + self.patch_px)
-        both = torch.stack([torch.from_numpy(image[window]) for image in images])
-        return turn(both[None], generator, self.quarters, self.mirrors)[0]
+        both = np.stack([image[window] for image in images])
+        return np.asarray(turn(both, generator, self.quarters, self.mirrors))

@@ -144,9 +144,10 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
     if run.pairs is not None:
         files = pair_files(run.pairs)
         degraded = run.patches.degraded
-        given = (run.patches.patch_px, degraded.nominal().max_dn, recipe.batch, recipe.seed, trainer.worker)
+        given = (run.patches.patch_px, degraded.nominal().max_dn, recipe.batch, recipe.seed)
         mirrors, alike = degraded.nominal().symmetry
-        source = StoredPairs(files, *given, alike and degraded.mtf_nyquist_along is None, mirrors)
+        turns = alike and degraded.mtf_nyquist_along is None
+        source = StoredPairs(files, *given, trainer.worker.rank, trainer.worker.count, turns, mirrors)
         return source.batches, Validation([], *sensors), [degraded.name for degraded, _ in files]
     scenes = read_scenes(run)
     kept, held = split_by_site([scene.name for scene in scenes])
@@ -156,7 +157,8 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
     if not train_on:
         remedy = "give `images`, `pairs` or `drawn`"
         raise OptionError("training data", expected="images, pairs or drawn scenes", got="none", remedy=remedy)
-    patches = PatchSource(train_on, run.patches, recipe.batch, recipe.seed, trainer.worker, trainer.device)
+    worker = trainer.worker
+    patches = PatchSource(train_on, run.patches, recipe.batch, recipe.seed, worker.rank, worker.count)
     return patches.batches, validation, [scene.name for scene in train_on]
 
 

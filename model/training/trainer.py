@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
@@ -70,7 +71,7 @@ def joined(device: str) -> Iterator[Worker]:
         torch.distributed.destroy_process_group()
 
 
-Batches = Callable[[int], Iterator[tuple[Tensor, ...]]]
+Batches = Callable[[int], Iterator[tuple[np.ndarray, ...]]]
 """The batches from a number on: (degraded, reference), (N, 1, P, P) in [0, 1] each, of patches made on the fly or of
 stored pairs; for a conditioned network (degraded, reference, sensor vectors (N, 4))."""
 
@@ -148,7 +149,7 @@ class Trainer:
         with held_back() as interrupt:
             following = batches(self.step)
             while self.step < self.recipe.steps and not self.worker.any(interrupt.asked, self.device):
-                seen.append(self.train_step(*next(following)))
+                seen.append(self.train_step(*map(torch.from_numpy, next(following))))
                 if self._due(schedule.report_steps):
                     schedule.report(self.step, *self._summary(seen, time.monotonic() - begun))
                     seen, begun = [], time.monotonic()

@@ -57,7 +57,7 @@ class Validation:
             pair = simulate_pair(scene.radiance, sensors[0], sensors[1], ratio, draw)
             height, width = (min(side, SIDE_PX) for side in pair.degraded.shape)
             both = (pair.degraded / sensors[0].max_dn, pair.reference / sensors[1].max_dn)
-            degraded_image, reference_image = (image[None, None, :height, :width] for image in both)
+            degraded_image, reference_image = (torch.from_numpy(image[None, None, :height, :width]) for image in both)
             self.names.append(scene.name)
             self.pairs.append((degraded_image, reference_image))
             self.vectors.append(vector_tensor(sensors[0]))

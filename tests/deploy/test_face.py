@@ -325,9 +325,10 @@ samples = np.load("samples.npy")
 int8 = bd.quantize("tiny.onnx", samples, progress=False)
 assert bd.gate(int8, samples=samples, limits={"mae": 0.01}) and bd.check(int8) and bd.predict(int8)
 assert bd.restore(np.full((40, 50), 900, np.uint16), "convbeers-xs-int8").shape == (40, 50)
+assert bd.simulate(size=48).degraded.shape == (48, 48)
+assert bd.quantize("tiny.onnx", patches=1, patch_px=48, progress=False).layers
 for call, extra in (
-    (bd.simulate, "torch"),
-    (lambda: bd.quantize("tiny.onnx"), "torch"),
+    (lambda: bd.quantize("tiny.onnx", samples, finetune=1, progress=False), "torch"),
     (lambda: bd.evaluate(["degraded"]), "torch"),
     (lambda: bd.sensors().plot(), "study"),
     (lambda: bd.sensors().to_pandas(), "notebook"),

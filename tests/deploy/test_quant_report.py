@@ -67,7 +67,7 @@ def test_a_network_fixed_to_one_tile_is_quantised_reported_and_gated(tmp_path: P
 @pytest.mark.slow
 def test_quantize_reports_layers(tmp_path: Path) -> None:
     float_file(tmp_path / "f.onnx")
-    dn = procedural_scene(640, 700, np.random.default_rng(0)).radiance.numpy() * 4095 / 400
+    dn = procedural_scene(640, 700, np.random.default_rng(0)).radiance * 4095 / 400
     write_tiff(tmp_path / "scenes" / "drawn.tif", np.rint(dn).astype(np.uint16))
     options = ["--out", str(tmp_path / "i.onnx"), "--patches", "4", "--json", str(tmp_path / "q.json")]
     options += ["--patch", "96", "--report", str(tmp_path / "r"), "--images", str(tmp_path / "scenes")]

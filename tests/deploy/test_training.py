@@ -27,7 +27,7 @@ SIDE = 420
 def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("images")
     for number, site in enumerate(("coast_1", "forest_1", "town_1")):
-        radiance = procedural_scene(SIDE, SIDE, np.random.default_rng(number)).radiance.numpy()
+        radiance = procedural_scene(SIDE, SIDE, np.random.default_rng(number)).radiance
         grey = np.clip(255 * (radiance / 400) ** (1 / 2.2), 0, 255).astype(np.uint8)
         Image.fromarray(grey).save(folder / f"{site}.png")
     return folder

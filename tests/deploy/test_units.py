@@ -5,7 +5,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -68,7 +67,7 @@ def rounding_db(psnr_db: np.ndarray, bits: int, pixels: int) -> np.ndarray:
     stays within four standard deviations; errors are alike within a patch of 5 x 5 pixels.
     """
     steps = np.hypot(1 / 4095, 1 / (2**bits - 1)) / np.sqrt(12)
-    fx, fy = torch.fft.fftfreq(64)[None], torch.fft.fftfreq(64)[:, None]
+    fx, fy = np.fft.fftfreq(64)[None], np.fft.fftfreq(64)[:, None]
     ratio = mtf(fx, fy, (0.25, 0.25)) / mtf(fx, fy, (0.07, 0.07))
     share = steps * np.sqrt(float(np.square(ratio).mean()) + 2) / 10 ** (-psnr_db / 20)
     return np.asarray(10 * np.log10(1 + share**2 + 2 * 4 * share / np.sqrt(pixels / 25)))

@@ -50,16 +50,16 @@ def sensor_of(case: Case) -> Instrument:
     return replace(sensor, mtf_nyquist={"MTF 0.1 %": 0.001, "MTF 60 %": 0.6}.get(case.name, sensor.mtf_nyquist))
 
 
-def radiance_of(image: np.ndarray, sensor: Instrument) -> Tensor:
+def radiance_of(image: np.ndarray, sensor: Instrument) -> np.ndarray:
     """Each pixel as RATIO x RATIO scene pixels, W/m2/sr/um."""
     fine = np.repeat(np.repeat(np.asarray(image, np.float32), RATIO, 0), RATIO, 1)
-    return torch.from_numpy(fine / np.float32(sensor.gain_dn_per_radiance))
+    return np.asarray(fine / np.float32(sensor.gain_dn_per_radiance))
 
 
 def acquired(image: np.ndarray, sensor: Instrument) -> np.ndarray:
     radiance = radiance_of(image, sensor)
     spectrum = scene_spectrum(radiance)
-    return acquire(spectrum, radiance.shape[-1], sensor, RATIO, Draw(0), "degraded", margin_px=0).numpy()
+    return acquire(spectrum, radiance.shape[-1], sensor, RATIO, Draw(0), "degraded", margin_px=0)
 
 
 @named([*SOUND, BY_NAME["beyond 12 bits"]])
@@ -93,17 +93,17 @@ def signal(image: np.ndarray, sensor: Instrument) -> np.ndarray:
     radiance = radiance_of(image, sensor)
     height, width = radiance.shape
     sampled = sample(scene_spectrum(radiance), sensor_transfer(height, width, RATIO, sensor), width, RATIO)
-    return np.asarray(sampled.numpy() * np.float32(sensor.gain_dn_per_radiance))
+    return np.asarray(sampled * np.float32(sensor.gain_dn_per_radiance))
 
 
 def signal_by_formula(image: np.ndarray, sensor: Instrument) -> np.ndarray:
     """The whole transform in float64, then the samples between two scene pixels."""
-    radiance = radiance_of(image, sensor).double()
-    fy, fx = (torch.fft.fftfreq(side, dtype=torch.float64) for side in radiance.shape)
-    response = torch.from_numpy(mtf(RATIO * fx[None, :], RATIO * fy[:, None], sensor.mtf_axes))
-    shift = torch.exp(1j * torch.pi * (RATIO - 1) * fy)[:, None] * torch.exp(1j * torch.pi * (RATIO - 1) * fx)
-    blurred = torch.fft.ifft2(torch.fft.fft2(radiance) * response * shift).real
-    return np.asarray(blurred[::RATIO, ::RATIO].numpy() * sensor.gain_dn_per_radiance)
+    radiance = radiance_of(image, sensor).astype(np.float64)
+    fy, fx = (np.fft.fftfreq(side) for side in radiance.shape)
+    response = mtf(RATIO * fx[None, :], RATIO * fy[:, None], sensor.mtf_axes)
+    shift = np.exp(1j * np.pi * (RATIO - 1) * fy)[:, None] * np.exp(1j * np.pi * (RATIO - 1) * fx)
+    blurred = np.fft.ifft2(np.fft.fft2(radiance) * response * shift).real
+    return np.asarray(blurred[::RATIO, ::RATIO] * sensor.gain_dn_per_radiance)
 
 
 @named(LOST)

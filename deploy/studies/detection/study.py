@@ -10,8 +10,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from beers_deploy.model.io.images import site_of
 from beers_deploy.model.io.pictures import stretch_of
@@ -51,7 +49,7 @@ class LabelledScene:
     site: str
     truth: Boxes
     path: Path | None
-    radiance: Callable[[Instrument], Tensor]
+    radiance: Callable[[Instrument], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,7 @@ class AcquiredScene:
 
     def _acquired(self, profile: Sensor, role: str) -> np.ndarray:
         sensor, radiance = profile.draw(self.draw.generator("sensor")), self.scene.radiance(profile.nominal())
-        return acquire_padded(radiance, sensor, self.sensors.oversampling, self.draw, role).numpy()
+        return acquire_padded(radiance, sensor, self.sensors.oversampling, self.draw, role)
 
 
 @dataclass(frozen=True)
@@ -216,8 +214,8 @@ def synthetic_labelled(number: int, seed: int, classes: np.ndarray) -> LabelledS
         classes: the synthetic classes as the detector's, as `class_numbers` gives them.
     """
     radiance, truth = synthetic_scene(np.random.default_rng([seed, number]), SIDE_PX, SIDE_PX)
-    light, name = torch.from_numpy(radiance), f"synthetic {number}"
-    return LabelledScene(name, name, truth.renamed(classes), None, lambda _: light)
+    name = f"synthetic {number}"
+    return LabelledScene(name, name, truth.renamed(classes), None, lambda _: radiance)
 
 
 def labelled_scenes(

@@ -90,8 +90,8 @@ def simulate_pairs(
             each if isinstance(each, Instrument) else each.draw(draw.generator("sensor"))
             for each in (degraded, reference)
         )
-        made = acquire.acquire_three(acquire.prepare_scene(scene.radiance, ratio), seen_by, meant_by, draw)
-        seen, meant, clean = (image.numpy() for image in made)
+        ready = acquire.prepare_scene(scene.radiance, ratio)
+        seen, meant, clean = acquire.acquire_three(ready, seen_by, meant_by, draw)
         pairs.append(NamedPair(scene.name, seen, meant, oversampling=ratio, noise_free=clean))
     if not pairs:
         least = oversamplings[-1] * (2 * acquire.MARGIN_PX + acquire.LEAST_SIDE_PX)

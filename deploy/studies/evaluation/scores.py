@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from scipy.special import stdtrit
-from torch import Tensor
 
 from beers_deploy.model.io.images import MAX_DN
 from beers_deploy.model.metrics.bootstrap import site_interval
@@ -176,12 +175,12 @@ def acquire_targets(sensor: Instrument, seed: int) -> Targets:
     draws = (Draw(seed, number) for number in count())
     scenes = [(angle, slanted_edge(SIDE_PX, OVERSAMPLING, angle)) for angle in ANGLES_DEG * REPEATS]
     edges = [(angle, _acquire(scene, sensor, next(draws))) for angle, scene in scenes]
-    fields = [(radiance, torch.full((FLAT_PX, FLAT_PX), radiance)) for radiance in RADIANCES]
+    fields = [(radiance, np.full((FLAT_PX, FLAT_PX), radiance, np.float32)) for radiance in RADIANCES]
     return Targets(sensor, edges, [(at, _acquire(field, sensor, next(draws), ratio=1)) for at, field in fields])
 
 
-def _acquire(scene: Tensor, sensor: Instrument, draw: Draw, ratio: int = OVERSAMPLING) -> np.ndarray:
-    return acquire(scene_spectrum(scene), scene.shape[1], sensor, ratio, draw, "degraded", margin_px=0).numpy()
+def _acquire(scene: np.ndarray, sensor: Instrument, draw: Draw, ratio: int = OVERSAMPLING) -> np.ndarray:
+    return acquire(scene_spectrum(scene), scene.shape[1], sensor, ratio, draw, "degraded", margin_px=0)
 
 
 def snr_name(radiance: float) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
+from scipy import fft
 
 from beers_deploy.model.simulator.mtf import transfer_function
 
@@ -136,8 +136,8 @@ def ground(side: int, generator: np.random.Generator, mtf_nyquist: float = DRAWN
         top, left = generator.integers(0, side, 2)
         height, width = generator.integers(1, max(side // 3, 2), 2)
         image[top : top + height, left : left + width] = generator.uniform(100, 4000)
-    spectrum = torch.fft.rfft2(torch.from_numpy(image)) * transfer_function(side, side, 1, mtf_nyquist)
-    return _digital(torch.fft.irfft2(spectrum, s=(side, side)).numpy())
+    spectrum = fft.rfft2(image) * transfer_function(side, side, 1, mtf_nyquist)
+    return _digital(fft.irfft2(spectrum, s=(side, side)))
 
 
 def _filled(side: int, dn: float) -> np.ndarray:

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-import torch
 from jsonschema import validate
 from typer.testing import CliRunner
 
@@ -28,9 +27,9 @@ SNRS = (50.0, 110.0)
 SENSOR = Instrument(0.09, *noise_from_snr(25, SNRS[0], 100, SNRS[1]), GAIN, 12, {}, 0.05)
 
 
-def landscape(seed: int, board: bool) -> torch.Tensor:
+def landscape(seed: int, board: bool) -> np.ndarray:
     """A drawn scene without its own calibration site; a leaning checkerboard of 100 x 100 pixels in it or none."""
-    radiance = procedural_scene(SIDE, SIDE, np.random.default_rng(seed)).radiance.clone()
+    radiance = procedural_scene(SIDE, SIDE, np.random.default_rng(seed)).radiance.copy()
     radiance[:420] = radiance[420:840]
     if board:
         upright = slanted_edge(BOARD_PX, RATIO, 7, (-1, 1))

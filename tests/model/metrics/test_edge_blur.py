@@ -3,7 +3,6 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-import torch
 
 from beers_deploy.model.metrics.edge_blur import FOUND, HALF_PX, POINTED_AT, EdgeBlur, combine, find_blurs, fit_blur
 from beers_deploy.model.metrics.refusal import Refusal
@@ -19,10 +18,10 @@ def noise(values: np.ndarray) -> np.ndarray:
     return np.full(values.shape, SIGMA**2)
 
 
-def blurred(scene: torch.Tensor, mtf_nyquist: Blur, smear_px: float = 0.0) -> np.ndarray:
+def blurred(scene: np.ndarray, mtf_nyquist: Blur, smear_px: float = 0.0) -> np.ndarray:
     side = scene.shape[-1]
     transfer = transfer_function(side, side, RATIO, mtf_nyquist, 0.0, smear_px)
-    return np.asarray(sample(scene_spectrum(scene), transfer, side, RATIO)) * 10.0
+    return np.asarray(sample(scene_spectrum(scene), transfer, side, RATIO) * 10.0)
 
 
 @lru_cache
@@ -100,7 +99,7 @@ def test_clipped_edges_are_left_alone() -> None:
 
 def test_a_landscape_has_no_such_edge() -> None:
     """Roads, roofs and crop rows, textured: steep places by the hundred, and none that is a plain step."""
-    scene = procedural_scene(1200, 1200, np.random.default_rng(3)).radiance.clone()
+    scene = procedural_scene(1200, 1200, np.random.default_rng(3)).radiance.copy()
     scene[:400] = scene[400:800]  # the drawn calibration site
     image = blurred(scene, 0.07)
     image = image + SIGMA * np.random.default_rng(2).standard_normal(image.shape)

@@ -3,7 +3,6 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-import torch
 
 from beers_deploy.model.metrics.noise_line import Blocks, NoiseModel, cut_blocks, fit_noise_model, join
 from beers_deploy.model.metrics.refusal import Refusal
@@ -19,7 +18,7 @@ RADIANCES = (25.0, 100.0)
 
 
 @lru_cache
-def spectra() -> list[torch.Tensor]:
+def spectra() -> list[np.ndarray]:
     """Two drawn landscapes, nothing on which is flat."""
     generators = np.random.default_rng(7).spawn(2)
     return [scene_spectrum(procedural_scene(1280, 1280, g).radiance) for g in generators]
@@ -28,7 +27,7 @@ def spectra() -> list[torch.Tensor]:
 def seen(pair: tuple[float, float], seed: int, mtf_nyquist: float = 0.07) -> Blocks:
     alpha, beta = noise_from_snr(RADIANCES[0], pair[0], RADIANCES[1], pair[1])
     sensor = Instrument(mtf_nyquist, alpha, beta, GAIN, 12)
-    images = [acquire(s, 1280, sensor, RATIO, Draw(seed, k), "degraded").numpy() for k, s in enumerate(spectra())]
+    images = [acquire(s, 1280, sensor, RATIO, Draw(seed, k), "degraded") for k, s in enumerate(spectra())]
     return join([cut_blocks(image, MAX_DN) for image in images])
 
 

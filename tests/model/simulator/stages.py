@@ -6,13 +6,11 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from beers_deploy.model.simulator.acquire import without
 from beers_deploy.model.simulator.detector import DN_EFFECTS, RADIANCE_EFFECTS, Draw, add_noise, apply_effect
 from beers_deploy.model.simulator.mtf import Blur, mtf, sensor_transfer
-from beers_deploy.model.simulator.sampling import sample, scene_spectrum
+from beers_deploy.model.simulator.sampling import crop_divisible, sample, scene_spectrum
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import Effect, middle_effect
 from beers_deploy.profiles.response import MtfTable, PointSpread, Response, packed
@@ -28,11 +26,11 @@ def plain_sensor(**effects: Effect) -> Instrument:
 
 
 def before_digitising(
-    radiance: Tensor, sensor: Instrument, ratio: int, draw: Draw, skip: Collection[str] = ()
-) -> Tensor:
+    radiance: np.ndarray, sensor: Instrument, ratio: int, draw: Draw, skip: Collection[str] = ()
+) -> np.ndarray:
     """What `simulate_planned` computes, up to the converter, so that no rounding hides a difference."""
     if "mtf" in skip:
-        signal = torch.nn.functional.avg_pool2d(radiance[None, None], ratio)[0, 0]
+        signal = pixel_means(radiance, ratio)
     else:
         height, width = radiance.shape
         transfer = sensor_transfer(height, width, ratio, without(sensor, skip))
@@ -47,7 +45,13 @@ def before_digitising(
     return dn
 
 
-def _apply(image: Tensor, name: str, sensor: Instrument, draw: Draw, skip: Collection[str]) -> Tensor:
+def pixel_means(radiance: np.ndarray, ratio: int) -> np.ndarray:
+    """The mean radiance of each whole target pixel."""
+    height, width = (size // ratio for size in radiance.shape)
+    return np.asarray(crop_divisible(radiance, ratio).reshape(height, ratio, width, ratio).mean((1, 3)))
+
+
+def _apply(image: np.ndarray, name: str, sensor: Instrument, draw: Draw, skip: Collection[str]) -> np.ndarray:
     if name in skip or name not in sensor.effects:
         return image
     return apply_effect(image, sensor.effects[name], sensor, partial(draw.generator, f"{name}-degraded"))
@@ -66,15 +70,15 @@ def point_spread(samples: np.ndarray, per_px: float) -> PointSpread:
 
 def formula_table(across: float, along: float, steps: int = 5) -> MtfTable:
     """The paper's formula at `steps` frequencies above 0, up to Nyquist."""
-    f = torch.linspace(0, 0.5, steps + 1, dtype=torch.float64)
-    columns = (mtf(f, torch.zeros(()), contrast).tolist() for contrast in (across, along))
+    f = np.linspace(0, 0.5, steps + 1)
+    columns = (mtf(f, 0.0, contrast).tolist() for contrast in (across, along))
     return MtfTable(tuple(f.tolist()), *map(tuple, columns))
 
 
 def formula_point(blur: Blur, per_px: int, side_px: int, odd: bool) -> PointSpread:
     """The formula's own point-spread function, by inverse transform; of an even side the middle is no sample's."""
     side = per_px * side_px + odd
-    f = torch.fft.fftfreq(side, 1 / per_px, dtype=torch.float64)
+    f = np.fft.fftfreq(side, 1 / per_px)
     samples = np.fft.fftshift(np.fft.ifft2(mtf(f[None], f[:, None], blur)).real)
     return point_spread(samples, per_px)
 
@@ -97,44 +101,41 @@ def lopsided_point(per_px: int = 4, rows: int = 37, columns: int = 48) -> PointS
     return point_spread(core + 0.2 * tail - 0.02 * np.exp(-((np.hypot(x, y) - 2.5) ** 2)), per_px)
 
 
-def blob(side: int, sigma: float) -> Tensor:
+def blob(side: int, sigma: float) -> np.ndarray:
     """A Gaussian centred in an even-sided square, between its four middle pixels."""
-    x = torch.arange(side, dtype=torch.float64) - (side - 1) / 2
-    line = torch.exp(-0.5 * (x / sigma) ** 2)
-    return (line[:, None] * line).float()
+    x = np.arange(side) - (side - 1) / 2
+    line = np.exp(-0.5 * (x / sigma) ** 2)
+    return np.asarray(line[:, None] * line, np.float32)
 
 
-def centroid(image: Tensor) -> tuple[float, float]:
+def centroid(image: np.ndarray) -> tuple[float, float]:
     """(row, column) from the middle of the image, in its own pixels."""
-    image = image.double()
-    rows, columns = (torch.arange(n, dtype=torch.float64) - (n - 1) / 2 for n in image.shape)
+    image = image.astype(np.float64)
+    rows, columns = (np.arange(n) - (n - 1) / 2 for n in image.shape)
     return float((image.sum(1) * rows).sum() / image.sum()), float((image.sum(0) * columns).sum() / image.sum())
 
 
-def slanted_edge(side: int, ratio: int, slope: float) -> tuple[Tensor, Tensor]:
+def slanted_edge(side: int, ratio: int, slope: float) -> tuple[np.ndarray, np.ndarray]:
     """A scene with an edge that moves `slope` target pixels a row, and each target pixel's distance from it."""
-    y, x = (torch.arange(side * ratio, dtype=torch.float64) + 0.5 for _ in range(2))
-    middle = side * ratio / 2
-    coverage = (0.5 + x - (middle + slope * (y[:, None] - middle))).clamp(0, 1)  # of each scene pixel
-    pixels = (torch.arange(side, dtype=torch.float64) + 0.5) - side / 2
-    return (40 + 200 * coverage).float(), pixels - slope * pixels[:, None]
+    x, middle = np.arange(side * ratio) + 0.5, side * ratio / 2
+    coverage = (0.5 + x - (middle + slope * (x[:, None] - middle))).clip(0, 1)  # of each scene pixel
+    pixels = (np.arange(side) + 0.5) - side / 2
+    return np.asarray(40 + 200 * coverage, np.float32), pixels - slope * pixels[:, None]
 
 
-def edge_contrast(image: Tensor, distance: Tensor, ratio: int) -> float:
+def edge_contrast(image: np.ndarray, distance: np.ndarray, ratio: int) -> float:
     """Contrast at Nyquist of an edge's image (160, 160), ISO 12233 in short.
 
     Rows shifted onto one another, finely binned, differentiated, transformed.
     """
     bins, inner = 8, slice(40, 120)  # far from where the borders wrap
-    index = ((distance[inner] + 36) * bins).round().long().flatten()
+    index = np.rint((distance[inner] + 36) * bins).astype(int).ravel()
     wanted = (index >= 0) & (index < 72 * bins)
-    value = image[inner].double().flatten()[wanted]
-    total = torch.zeros(72 * bins, dtype=torch.float64).index_add_(0, index[wanted], value)
-    edge = total / torch.bincount(index[wanted], minlength=72 * bins)
-    spread = torch.diff(edge)
-    cycles = torch.arange(len(spread), dtype=torch.float64) / bins
-    wave = torch.exp(-2j * math.pi * 0.5 * cycles)
-    measured = float((spread * wave).sum().abs() / spread.sum())
+    total = np.bincount(index[wanted], image[inner].ravel()[wanted], 72 * bins)
+    edge = total / np.bincount(index[wanted], minlength=72 * bins)
+    spread = np.diff(edge)
+    wave = np.exp(-2j * math.pi * 0.5 * np.arange(len(spread)) / bins)
+    measured = float(abs((spread * wave).sum()) / spread.sum())
     steps = math.sin(math.pi * 0.5 / bins) / (math.pi * 0.5 / bins)  # of the bins' differences
     raster = math.sin(math.pi * 0.5 / ratio) / (math.pi * 0.5 / ratio)  # of the scene's own pixels
     return measured / (steps * raster)

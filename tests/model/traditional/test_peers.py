@@ -4,22 +4,21 @@ import pytest
 import torch
 from torch import Tensor
 
-from beers_deploy.model.simulator.acquire import Pair
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.pipeline import Chain
 from beers_deploy.profiles import load_sensor
-from tests.model.traditional.test_pipeline import psnr_db, restored_db, seen_by
+from tests.model.traditional.test_pipeline import Seen, psnr_db, restored_db, seen_by
 
 CHAIN = Chain(load_sensor("pleiades-degraded").nominal(), load_sensor("pleiades-reference").nominal())
 
 
 @pytest.fixture(scope="module")
-def pair(camera: Tensor) -> Pair:
+def pair(camera: Tensor) -> Seen:
     return seen_by(camera, CHAIN.degraded, CHAIN.reference)
 
 
 @pytest.mark.parametrize("name", PEERS)
-def test_a_peer_gains_decibels_and_stays_behind_the_chain(name: str, pair: Pair) -> None:
+def test_a_peer_gains_decibels_and_stays_behind_the_chain(name: str, pair: Seen) -> None:
     """Were a peer misled about gain, shift or target MTF, it would lose, and flatter the chain."""
     restored = PEERS[name](pair.degraded, CHAIN)
     before, after = (psnr_db(image, pair.reference) for image in (pair.degraded, restored))
@@ -29,7 +28,7 @@ def test_a_peer_gains_decibels_and_stays_behind_the_chain(name: str, pair: Pair)
 
 @pytest.mark.parametrize("name", PEERS)
 @pytest.mark.parametrize("shape", [(37, 53), (14, 21)])
-def test_any_shape_comes_back_within_range(name: str, shape: tuple[int, int], pair: Pair) -> None:
+def test_any_shape_comes_back_within_range(name: str, shape: tuple[int, int], pair: Seen) -> None:
     restored = PEERS[name](pair.degraded[: shape[0], : shape[1]], CHAIN)
     assert restored.shape == shape
     assert bool(torch.isfinite(restored).all())
@@ -37,6 +36,6 @@ def test_any_shape_comes_back_within_range(name: str, shape: tuple[int, int], pa
 
 
 @pytest.mark.parametrize("name", PEERS)
-def test_the_brightness_is_kept(name: str, pair: Pair) -> None:
+def test_the_brightness_is_kept(name: str, pair: Seen) -> None:
     restored = PEERS[name](pair.degraded, CHAIN)
     assert float(restored.mean() / pair.degraded.mean()) == pytest.approx(1, abs=5e-3)

@@ -1,14 +1,14 @@
 """The whole chain on a simulated pair: what it gains, and what it loses when told the wrong sensor."""
 
 from dataclasses import replace
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from beers_deploy.model.simulator.acquire import Pair, simulate_pair
+from beers_deploy.model.simulator.acquire import simulate_pair
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.mtf import transfer_function
 from beers_deploy.model.simulator.sampling import sample, scene_spectrum
@@ -36,13 +36,21 @@ ORDERS: tuple[Order, ...] = get_args(Order)
 NOISE_FREE = replace(REFERENCE, alpha=0.0, beta=0.0)
 
 
-def seen_by(camera: Tensor, sensor: Instrument, reference: Instrument = NOISE_FREE) -> Pair:
+class Seen(NamedTuple):
+    """Two acquisitions (H, W), as the chain takes them."""
+
+    degraded: Tensor
+    reference: Tensor
+
+
+def seen_by(camera: Tensor, sensor: Instrument, reference: Instrument = NOISE_FREE) -> Seen:
     """A photograph of up to 200 W/m2/sr/um, 139 x 145 pixels within the margin, its reference without noise."""
-    return simulate_pair(camera[64:267, 128:337] * (200 / 255), sensor, reference, 1, Draw(seed=1))
+    pair = simulate_pair(camera[64:267, 128:337].numpy() * (200 / 255), sensor, reference, 1, Draw(seed=1))
+    return Seen(torch.from_numpy(pair.degraded), torch.from_numpy(pair.reference))
 
 
 @pytest.fixture(scope="module")
-def pair(camera: Tensor) -> Pair:
+def pair(camera: Tensor) -> Seen:
     return seen_by(camera, DEGRADED)
 
 
@@ -52,11 +60,11 @@ def psnr_db(image: Tensor, truth: Tensor) -> float:
     return float(10 * torch.log10(DEGRADED.max_dn**2 / difference.square().mean()))
 
 
-def restored_db(pair: Pair, chain: Chain) -> float:
+def restored_db(pair: Seen, chain: Chain) -> float:
     return psnr_db(restore_traditional(pair.degraded, chain), pair.reference)
 
 
-def test_the_chain_gains_many_decibels_over_the_degraded_image(pair: Pair) -> None:
+def test_the_chain_gains_many_decibels_over_the_degraded_image(pair: Seen) -> None:
     restored = restore_traditional(pair.degraded, Chain(DEGRADED, REFERENCE))
     assert restored.shape == pair.degraded.shape
     assert restored.dtype == torch.float32
@@ -64,7 +72,7 @@ def test_the_chain_gains_many_decibels_over_the_degraded_image(pair: Pair) -> No
     assert float(restored.mean() / pair.degraded.mean()) == pytest.approx(1, abs=2e-3)
 
 
-def test_each_half_of_the_chain_is_needed(pair: Pair) -> None:
+def test_each_half_of_the_chain_is_needed(pair: Seen) -> None:
     whole = restored_db(pair, Chain(DEGRADED, REFERENCE))
     assert restored_db(pair, Chain(DEGRADED, replace(REFERENCE, mtf_nyquist=0.07))) < whole - 3  # denoised alone
     assert psnr_db(compensate(pair.degraded, 0.07, 0.25, 3e-3), pair.reference) < whole - 3
@@ -73,7 +81,7 @@ def test_each_half_of_the_chain_is_needed(pair: Pair) -> None:
 @pytest.mark.parametrize(
     "told", [replace(DEGRADED, mtf_nyquist=0.04), replace(DEGRADED, mtf_nyquist=0.15), replace(DEGRADED, alpha=0.5)]
 )
-def test_the_wrong_sensor_costs_decibels(pair: Pair, told: Instrument) -> None:
+def test_the_wrong_sensor_costs_decibels(pair: Seen, told: Instrument) -> None:
     assert restored_db(pair, Chain(told, REFERENCE)) < restored_db(pair, Chain(DEGRADED, REFERENCE)) - 1
 
 
@@ -101,19 +109,20 @@ def test_both_orders_reach_the_measured_quality(
 def blurred_pair(radiance: Tensor, sensor: Instrument) -> tuple[Tensor, Tensor]:
     """Digital numbers through the sensor, and the radiance at 25 % MTF without noise."""
     rows = mirrored(-64, radiance.shape[0] + 64, radiance.shape[0])
-    wide = radiance[rows][:, rows]
+    wide = radiance[rows][:, rows].numpy()
     size, inside = wide.shape[0], slice(64, -64)
     dim, sharp = (
         sample(scene_spectrum(wide), transfer_function(size, size, 1, mtf), size, 1)[inside, inside]
         for mtf in (sensor.mtf_nyquist, 0.25)
     )
-    normal = torch.from_numpy(np.random.default_rng(0).standard_normal(tuple(radiance.shape)))
-    noisy = dim + normal * (sensor.alpha * dim.clamp(min=0) + sensor.beta).sqrt()
-    return (noisy * sensor.gain_dn_per_radiance).round().clamp(0, sensor.max_dn).float(), sharp
+    normal = np.random.default_rng(0).standard_normal(dim.shape)
+    noisy = dim + normal * np.sqrt(sensor.alpha * dim.clip(0) + sensor.beta)
+    dn = np.rint(noisy * sensor.gain_dn_per_radiance).clip(0, sensor.max_dn)
+    return torch.from_numpy(dn).float(), torch.from_numpy(sharp)
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_strips_change_no_bit(order: Order, pair: Pair) -> None:
+def test_strips_change_no_bit(order: Order, pair: Seen) -> None:
     chain = Chain(DEGRADED, REFERENCE, "fast", order)
     dn = pair.degraded.clone()
     dn[:9, 20:50] = torch.nan
@@ -123,7 +132,7 @@ def test_strips_change_no_bit(order: Order, pair: Pair) -> None:
     assert torch.equal(whole.isnan(), dn.isnan())
 
 
-def test_without_the_colour_deconvolving_first_loses_decibels(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_colour_deconvolving_first_loses_decibels(pair: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
     chain = Chain(DEGRADED, REFERENCE, order="deconvolve-first", epsilon=0.0)
     told = restored_db(pair, chain)
 
@@ -134,7 +143,7 @@ def test_without_the_colour_deconvolving_first_loses_decibels(pair: Pair, monkey
     assert restored_db(pair, chain) < told - 0.5
 
 
-def test_the_gain_of_each_sensor_is_its_own(pair: Pair) -> None:
+def test_the_gain_of_each_sensor_is_its_own(pair: Seen) -> None:
     crop = pair.degraded[:37, :45]
     same = restore_traditional(crop, Chain(DEGRADED, REFERENCE, "fast"))
     half = restore_traditional(crop, Chain(DEGRADED, replace(REFERENCE, gain_dn_per_radiance=10.2375 / 2), "fast"))

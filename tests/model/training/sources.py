@@ -9,7 +9,6 @@ from beers_deploy.model.family import SensorFamily
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.patches import PatchRecipe, PatchSource
-from beers_deploy.model.training.trainer import Worker
 from beers_deploy.profiles import load_sensor
 
 
@@ -22,7 +21,8 @@ def source(
     scene: Scene | None = None,
     seed: int = 0,
     patch_px: int = 32,
-    worker: Worker | None = None,
+    rank: int = 0,
+    workers: int = 1,
     *,
     conditioned: bool = False,
 ) -> PatchSource:
@@ -30,4 +30,4 @@ def source(
     recipe = PatchRecipe(load_sensor("pleiades-variable"), load_sensor("pleiades-reference"), patch_px=patch_px)
     if conditioned:
         recipe = replace(recipe, family=SensorFamily(load_sensor("pleiades-degraded").nominal()))
-    return PatchSource([scene or small_scene()], recipe, batch=3, seed=seed, worker=worker)
+    return PatchSource([scene or small_scene()], recipe, batch=3, seed=seed, rank=rank, workers=workers)

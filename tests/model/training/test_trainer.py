@@ -26,7 +26,7 @@ from beers_deploy.model.training.checkpoint import (
 )
 from beers_deploy.model.training.losses import LossWeights
 from beers_deploy.model.training.patches import PatchSource
-from beers_deploy.model.training.trainer import Schedule, Trainer, Worker
+from beers_deploy.model.training.trainer import Schedule, Trainer
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
 from tests.model.training.sources import small_scene, source
@@ -111,7 +111,7 @@ class Poisoned(PatchSource):
 
     bad: frozenset[int] | None = None
 
-    def batches(self, first: int = 0) -> Iterator[tuple[Tensor, Tensor]]:
+    def batches(self, first: int = 0) -> Iterator[tuple[np.ndarray, ...]]:
         for number, (degraded, reference) in enumerate(super().batches(first), first):
             yield (degraded * float("nan") if self.bad is None or number in self.bad else degraded), reference
 
@@ -148,7 +148,7 @@ def test_one_nan_batch_is_skipped_and_the_run_goes_on(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("level", [0.0, 80.0, 4000.0])
 def test_a_constant_scene_trains_without_nan(level: float, tmp_path: Path) -> None:
-    scene = Scene("flat", torch.full((420, 480), level))
+    scene = Scene("flat", np.full((420, 480), level, np.float32))
     trainer = Trainer(VARIANT, TrainingRecipe(steps=4, batch=3))
     trainer.run(source(scene).batches, tmp_path / "c", Schedule())
     assert trainer.guards.bad_steps == 0
@@ -224,7 +224,7 @@ def test_a_student_is_pulled_towards_its_teacher(tmp_path: Path) -> None:
         )
         student = Trainer(VARIANT, recipe, teacher=teacher if distil else None)
         student.run(source().batches, tmp_path / f"{distil}", Schedule())
-        image = next(source(seed=3).batches())[0]
+        image = torch.from_numpy(next(source(seed=3).batches())[0])
         return float((student.averaged()(image) - teacher(image)).detach().abs().mean())
 
     assert distance(20.0) < 0.7 * distance(0.0)
@@ -261,17 +261,17 @@ torch.set_num_threads(1)
 with joined("cpu") as worker:
     recipe = TrainingRecipe(steps=3, batch=3, warm_up_steps=1)
     trainer = Trainer(Variant(blocks=1, features=4), recipe, worker=worker, precision="float32")
-    trainer.run(source(worker=worker).batches, Path(sys.argv[1]), Schedule())
+    trainer.run(source(rank=worker.rank, workers=worker.count).batches, Path(sys.argv[1]), Schedule())
 """
 
 
 class Together:
     """The batches of two workers as one."""
 
-    def batches(self, first: int = 0) -> Iterator[tuple[Tensor, Tensor]]:
-        each = [source(worker=Worker(rank, 2)).batches(first) for rank in range(2)]
+    def batches(self, first: int = 0) -> Iterator[tuple[np.ndarray, ...]]:
+        each = [source(rank=rank, workers=2).batches(first) for rank in range(2)]
         for one, other in zip(*each, strict=True):
-            yield torch.cat([one[0], other[0]]), torch.cat([one[1], other[1]])
+            yield tuple(map(np.concatenate, zip(one, other, strict=True)))
 
 
 @pytest.mark.slow

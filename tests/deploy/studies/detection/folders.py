@@ -108,7 +108,7 @@ def labelled(folder: Path, count: int) -> Path:
     folder.mkdir()
     for number in range(count):
         one = synthetic_labelled(number, 0, np.arange(len(CLASSES)))
-        shown = Stretch(0, 4095 / full_scale.gain_dn_per_radiance).to_srgb(one.radiance(full_scale).numpy())
+        shown = Stretch(0, 4095 / full_scale.gain_dn_per_radiance).to_srgb(one.radiance(full_scale))
         Image.fromarray(np.rint(255 * shown).astype(np.uint8)).save(folder / f"s{number}x.png")
         boxes: list[Object] = [
             (SPELT[c], *corners.tolist()) for c, corners in zip(one.truth.classes, one.truth.corners, strict=True)

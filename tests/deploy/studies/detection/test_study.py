@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from beers_deploy.model.io.pictures import stretch_of
 from beers_deploy.model.simulator.detector import Draw
@@ -38,7 +37,7 @@ def sensors(name: str = "dior-medium", ratio: int = 3) -> SensorPair:
 
 
 def scene(corners: tuple[int, int, int, int], height: int = 150, width: int = 210, name: str = "a") -> LabelledScene:
-    radiance, (x1, y1, x2, y2) = torch.full((height, width), GROUND), corners
+    radiance, (x1, y1, x2, y2) = np.full((height, width), GROUND, np.float32), corners
     radiance[y1:y2, x1:x2] = SHIP
     return LabelledScene(name, name, Boxes.of([corners], [0]), None, lambda _: radiance)
 

@@ -88,7 +88,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Swept:
 
     able = Method("able", half, BLIND, specialise)
     folder, scene = tmp_path_factory.mktemp("scenes"), procedural_scene(500, 560, np.random.default_rng(5))
-    tifffile.imwrite(folder / "scene.tif", scene.radiance.numpy())
+    tifffile.imwrite(folder / "scene.tif", scene.radiance)
     rows = run_sweep([Method("half", half, BLIND), able], folder, PROFILE, REFERENCE, 0).rows
     return {table: {row.name: row for row in rows} for table, rows in by_table(rows).items()}, given
 

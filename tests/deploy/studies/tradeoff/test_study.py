@@ -47,7 +47,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     initialise(network, torch.Generator().manual_seed(3))
     save_network(folder / "narrow.safetensors", network, {"degraded": SENSOR})
     for number in range(SITES + 1):
-        scene = procedural_scene(300, 340, np.random.default_rng(number)).radiance.numpy()
+        scene = procedural_scene(300, 340, np.random.default_rng(number)).radiance
         place = folder / ("images" if number < SITES else "calibration") / f"site{'abc'[number]}.png"
         place.parent.mkdir(exist_ok=True)
         Image.fromarray(np.clip(scene, 0, 255).astype(np.uint8)).save(place)
