@@ -13,7 +13,7 @@ import re
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext, suppress
 from functools import wraps
 from itertools import pairwise
@@ -25,7 +25,6 @@ from typer.core import TyperGroup
 from beers_deploy import __version__
 from beers_deploy.commands import (
     bench,
-    characterise,
     check,
     demo,
     detect,
@@ -33,6 +32,7 @@ from beers_deploy.commands import (
     evaluate,
     export,
     gate,
+    golden,
     info,
     profiles,
     quantize,
@@ -44,7 +44,7 @@ from beers_deploy.commands import (
 )
 from beers_deploy.commands.shared import results_to, running
 from beers_deploy.model.progress import reporting
-from beers_deploy.profiles.errors import BeersError, OutsideRangeWarning, missing_extra, visible
+from beers_deploy.profiles.errors import BeersError, OptionError, OutsideRangeWarning, missing_extra, visible
 
 CRASHED, INTERRUPTED = 70, 130
 """Exit codes of a fault in this program (sysexits' EX_SOFTWARE), and of Ctrl-C."""
@@ -113,6 +113,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     def run(*given: Any, quiet: bool = False, verbose: bool = False, **named: Any) -> None:
         try:
             with reporting(False if quiet else None), running(named):
+                _require_values(named)
                 function(*given, **named)
         except (typer.Exit, typer.Abort):
             raise
@@ -130,6 +131,13 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     run.__signature__ = signature.replace(parameters=own)  # type: ignore[attr-defined]
     run.__annotations__ = {**function.__annotations__, **more}
     return run
+
+
+def _require_values(named: Mapping[str, object]) -> None:
+    """Refuse an option that is given without a value, such as that of an unset variable: it would count as none."""
+    for name, value in named.items():
+        if value == "":
+            raise OptionError(name, expected="a value", got="an empty one", remedy="give one, or leave it out")
 
 
 def ending(error: BaseException, function: Callable[..., None]) -> tuple[str, int]:
@@ -233,13 +241,14 @@ COMMANDS: dict[str, tuple[Callable[..., None], str, str]] = {
     "gate": (gate.gate, gate.EXAMPLE, INT8),
     "diff": (diff.diff, diff.EXAMPLE, INT8),
     "check": (check.check, check.EXAMPLE, BOARDS),
+    "golden": (golden.golden, golden.EXAMPLE, BOARDS),
     "bench": (bench.bench, bench.EXAMPLE, BOARDS),
     "evaluate": (evaluate.evaluate, evaluate.EXAMPLE, STUDY),
     "tradeoff": (tradeoff.tradeoff, tradeoff.EXAMPLE, STUDY),
     "stress": (stress.stress, stress.EXAMPLE, STUDY),
     "detect": (detect.detect, detect.EXAMPLE, STUDY),
     "profiles": (profiles.profiles, profiles.EXAMPLE, TRAIN),
-    "characterise": (characterise.characterise, characterise.EXAMPLE, TRAIN),
+    "characterise": (profiles.characterise, profiles.CHARACTERISE_EXAMPLE, TRAIN),
     "simulate": (simulate.simulate, simulate.EXAMPLE, TRAIN),
     "train": (train.train, train.EXAMPLE, TRAIN),
 }

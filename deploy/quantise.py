@@ -22,7 +22,7 @@ from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.free import quantise_free
 from beers_deploy.quant.gate import compare, gate_row
 from beers_deploy.quant.integer import integer_rows
-from beers_deploy.quant.onnx_file import require_quantised
+from beers_deploy.quant.onnx_file import faults_named, require_quantised
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import OwnSamples, samples_of
 from beers_deploy.quant.sensitivity import WORST, headline, layer_error_rows, sizes_row, spread_of, worst_row
@@ -87,8 +87,9 @@ def quantize(
         raise OptionError("a network behind a bank", expected=expected, got="one", remedy=remedy)
     origin = Network.load(network, sensor=known)
     require_quantised(origin.model, origin.label, wanted=False)
-    own, scenes = samples_of(origin.model, samples), None if images is None else Path(images)
-    with reporting(progress):
+    scenes = None if images is None else Path(images)
+    with reporting(progress), faults_named(origin.label):
+        own = samples_of(origin.model, samples)
         if banked:
             simulated = _simulated(known, scenes, patches, patch_px, seed)
             return replace(_banked(banked, simulated, known, target), origin=origin)
@@ -107,8 +108,7 @@ def _conditioned(network: NetworkLike) -> Conditioned | None:
 
 
 def _simulated(sensor: Sensor, images: Path | None, patches: int, patch_px: int, seed: int) -> "Calibration":
-    optional("torch", "samples")  # which simulates
-    from beers_deploy.quant.calibration import Calibration
+    from beers_deploy.quant.calibration import Calibration  # SciPy, which samples of one's own do without
 
     return Calibration(sensor, images, patches, patch_px, seed)
 

@@ -25,14 +25,14 @@ from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike, SensorLike
-from beers_deploy.profiles.errors import OptionError, optional, printable
+from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Check
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.profiles.toml import read_json, unreadable
 from beers_deploy.quant.gate import GateResult, Limits, judge, judge_saturation, limits_of, verdict_row
 from beers_deploy.quant.gate import compare as differences
-from beers_deploy.quant.onnx_file import fixed_tile_px, metadata, require_quantised
+from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px, metadata, require_quantised
 from beers_deploy.quant.samples import CALIBRATED_ON, OwnSamples, samples_of, without
 from beers_deploy.quant.session import open_any_size
 from beers_deploy.quant.structure import saturated_shares, structure_checks
@@ -143,7 +143,7 @@ def compare(
     known = Sensor.load(sensor)
     ours, theirs = _pair(int8, against, known)
     scenes = None if images is None else Path(images)
-    with reporting(progress):
+    with reporting(progress), faults_named(theirs.label):
         unseen, simulated, notes = _unseen(ours, theirs, known, samples, scenes, patches, seed)
         sessions = open_any_size(theirs.model), open_any_size(ours.model)
         result = differences(*sessions, unseen.pairs, simulated)
@@ -247,8 +247,7 @@ def _unseen(
     """What the two are compared on, whether it is simulated, and what a reader must know of it."""
     own = samples_of(floating.model, samples)
     if own is None:
-        optional("torch", "samples")  # which simulates
-        from beers_deploy.quant.calibration import unseen_patches
+        from beers_deploy.quant.calibration import unseen_patches  # SciPy, which samples of one's own do without
 
         return unseen_patches(sensor, images, patches, seed), True, ()
     calibrated = set(metadata(int8.model).get(CALIBRATED_ON, "").split())

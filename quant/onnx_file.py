@@ -4,7 +4,8 @@ Also what a network's file says of itself: its metadata, and the tile that it is
 into tiles for it is `quant.tiling`'s matter.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
 
@@ -221,6 +222,21 @@ def is_quantised(model: onnx.ModelProto) -> bool:
     """Whether any node computes on, makes or reads quantised numbers."""
     kinds = {node.op_type.lower() for node in model.graph.node}
     return any(mark in kind for kind in kinds for mark in ("qlinear", "quantizelinear", "integer"))
+
+
+NAMELESS = "ONNX model", "float model", "tiled model"
+"""What readers call a model in memory."""
+
+
+@contextmanager
+def faults_named(label: str) -> Iterator[None]:
+    """Give a model in memory its name in whatever is found to be wrong with it."""
+    try:
+        yield
+    except ModelError as error:
+        if error.where not in NAMELESS:
+            raise
+        raise ModelError(label, expected=error.expected, got=error.got, remedy=error.remedy) from error
 
 
 def require_quantised(model: onnx.ModelProto, name: str, wanted: bool) -> None:

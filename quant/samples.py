@@ -244,7 +244,7 @@ def _sound(name: str, image: np.ndarray, channels: int) -> np.ndarray:
     values = np.asarray(image, np.float32)
     low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
     if not (low >= 0 and high <= LARGEST):
-        remedy = "divide them by full scale"
+        remedy = "divide them by full scale" if np.isfinite(high) else "leave out samples with missing pixels"
         raise ImageError(name, expected="values in [0, 1]", got=f"{low:.4g} to {high:.4g}", remedy=remedy)
     return np.minimum(values, 1)
 

@@ -31,7 +31,7 @@ from beers_deploy.bench.tables import (
 )
 from beers_deploy.dpu.board import ALL, BoardLike, Dpu, boards_of, dpu_of
 from beers_deploy.dpu.cost.latency import Prediction
-from beers_deploy.dpu.cost.model import Task
+from beers_deploy.dpu.cost.model import TASKS, Task
 from beers_deploy.dpu.cost.own_runs import read_own_runs
 from beers_deploy.dpu.reading import own_tile_px
 from beers_deploy.model.io.images import read_acquisition
@@ -42,7 +42,7 @@ from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.target import DEFAULT_TARGET
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.tiling.walk import tiling_of
-from beers_deploy.restoration.options import parse_halo
+from beers_deploy.restoration.options import parse_halo, require_side
 from beers_deploy.results import Table
 
 FACE = {"throughput": "fps", "latency": "swath"}
@@ -90,6 +90,10 @@ def predict(
         ProfileError: no such board or configuration.
         OptionError: options that do not go together.
     """
+    require_side(tile)
+    if host_task not in (None, *TASKS):
+        expected = f"one of {', '.join(TASKS)}, or None"
+        raise OptionError("host_task", expected=expected, got=repr(host_task), remedy="choose one")
     found = Network.load(network, sensor=SENSOR, to_run=False)
     boards, corrected = _boards(board, dpu, None if measured is None else Path(measured))
     width_px, height_px = parse_size("x".join(map(str, size)) if isinstance(size, tuple | list) else str(size))

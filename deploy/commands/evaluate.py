@@ -52,8 +52,8 @@ def evaluate(
     @blind or with @ and another sensor.
     """
     from beers_deploy.model.io.files import require_writable
+    from beers_deploy.model.io.images import list_images
     from beers_deploy.results import print_rows
-    from beers_deploy.studies.evaluation.run import evaluate as compared
 
     if pairs is not None and (images is not None or sweep):
         expected = "no --images or --sweep beside it: pairs are as they are"
@@ -62,6 +62,10 @@ def evaluate(
     folders = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
     read = (*folders, lpips, *(Path(name) for name in (sensor, reference, *names) if name))
     require_writable(out / "report.html" if out else None, json, inputs=read, folders=(out,))
+    if images is not None:
+        list_images(images)  # an empty folder is refused before torch is loaded
+    from beers_deploy.studies.evaluation.run import evaluate as compared
+
     about: dict[str, Any] = {"sensor": sensor, "reference": reference, "lpips": lpips}
     found = compared(names, pairs, images=images, sweep=sweep, strict=strict, seed=seed, log=say, **about)
     for title, rows in {found.title: found.mean, **found.more}.items():

@@ -99,7 +99,7 @@ def restore(
     from beers_deploy.restoration.run import restore_file
     from beers_deploy.results import Table, print_rows
 
-    budget_bytes = max(int(memory * 1e9), 1) if memory else None
+    budget_bytes = None if memory is None else max(int(memory * 1e9), 1)
     sensors = parse_sensors(sensor or BLIND)
     profiles = (Path(each) for each in sensors.values()) if sensor else ()
     require_writable(out, json, stac, inputs=(image, network, *profiles))

@@ -8,10 +8,10 @@ import torch
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import network_of
-from beers_deploy.export import banked_to_onnx, parity, require_parity, to_onnx
+from beers_deploy.export import banked_to_onnx, float_for, parity, require_parity, to_onnx, torch_network
 from beers_deploy.model.convbeers import ConvBEERS, arrays, grow, load_network, save_network, vector_tensor
 from beers_deploy.model.io.tensors import Weights
-from beers_deploy.model.shipped import shipped_weights
+from beers_deploy.model.shipped import shipped_names, shipped_weights
 from beers_deploy.model.variants import VARIANTS, Variant
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError
@@ -34,6 +34,12 @@ def test_torch_and_onnxruntime_agree(network: ConvBEERS, tile_px: int | None, tm
     save_onnx(to_onnx(network, {"variant": "test"}, tile_px), path)
     assert parity(network, path, tile_px or 33) < 1e-6
     assert fixed_tile_px(onnx.load(path)) == tile_px
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_torch_and_onnxruntime_agree_on_shipped_weights(name: str) -> None:
+    weights, sensor = shipped_weights(name), load_sensor("pleiades-degraded")
+    require_parity(torch_network(weights, sensor.nominal()), float_for(weights, name, sensor), 38)
 
 
 @pytest.mark.parametrize("scale", [2, 3])

@@ -17,6 +17,7 @@ from beers_deploy.dpu.checker.finding import Finding, Rule
 from beers_deploy.dpu.checker.forms import forms
 from beers_deploy.dpu.graph import Kind, Operation
 from beers_deploy.profiles.constant import check_keys
+from beers_deploy.profiles.errors import MachineError
 
 CONV: tuple[Rule, ...] = (
     conv_rules.conv_kernel,
@@ -144,7 +145,11 @@ def _facts(dpu: Dpu) -> Mapping[str, Mapping[str, object]]:
 
 @cache
 def _template(rule: Callable[..., object]) -> str:
-    return " ".join((inspect.getdoc(rule) or "").split())
+    text = inspect.getdoc(rule)
+    if text is None:
+        remedy = "start it without -OO and PYTHONOPTIMIZE=2"
+        raise MachineError("Python", expected="docstrings, where the rules' texts stand", got="none", remedy=remedy)
+    return " ".join(text.split())
 
 
 @cache

@@ -12,6 +12,7 @@ from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.figures import Check, Figure, Row, predicted, unavailable
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.quant.graph import refusal
+from beers_deploy.restoration.options import TILE_PX, require_side
 from beers_deploy.results import Table
 
 Remark = Callable[[Placement, Dpu, int], str | None]
@@ -70,7 +71,6 @@ def remarks_on(placement: Placement, dpu: Dpu, tile_px: int) -> dict[str, str]:
 
 
 SOURCE = "operator rules of the target profile"
-TILE_PX = 640
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -120,10 +120,10 @@ def check(
     Raises:
         ModelError: no ONNX network of images.
         ProfileError: no such board or configuration.
-        OptionError: a board without a DPU.
+        OptionError: a board without a DPU, or a tile of no pixels.
     """
     read, asked = Network.load(network, sensor=SENSOR, to_run=False), dpu_of(TargetProfile.load(board), dpu)
-    tile_px = tile or own_tile_px(read.model) or TILE_PX
+    tile_px = own_tile_px(read.model) or TILE_PX if tile is None else require_side(tile)
     placement = place(network_of(read.model, tile_px, read.label), asked)
     arguments = {"target": asked.target.name, "dpu": asked.name, "tile": tile_px}
     rows, checks = tuple(network_rows(placement, asked, tile_px)), (legality(placement),)
