@@ -1,12 +1,16 @@
 """Boards for notebooks, what a board's engineer is handed, and tables of what is shipped."""
 
+import json
 import os
 import shutil
 from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.model.io.files import whole_file
+from beers_deploy.dpu.checker.table import check
+from beers_deploy.kit.golden import write_golden
+from beers_deploy.kit.record import recorded, write_record
+from beers_deploy.model.io.files import whole_file, write_text
 from beers_deploy.model.shipped import INT8, shipped_names
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.constant import Constant
@@ -14,44 +18,97 @@ from beers_deploy.profiles.figures import Figure, Mode, Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import sensor_names
 from beers_deploy.profiles.target import TargetProfile, board_names
+from beers_deploy.quant.banked.filters import MIDDLE_DN, PART, STEP_DN
+from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import board_model, read_core
+from beers_deploy.quant.ends import FINE_MAX
+from beers_deploy.quant.graph import CORRECTION, QUARTER, STEP
 from beers_deploy.quant.onnx_file import metadata, save_onnx
 from beers_deploy.quant.session import open_session, tensors_of
+from beers_deploy.restoration.options import TILE_PX
 from beers_deploy.results import Table
 
-TILE_PX = 640
-MEASURE = Path(__file__).with_name("board_measure.py")
+MEASURE, HOST, README = (Path(__file__).parent / "kit" / name for name in ("measure.py", "host.py", "readme.md"))
 
 
 class Board(TargetProfile):
     """A processing board: its DPU's configurations, rules and cost constants, each with its source."""
 
-    def kit(self, int8: NetworkLike, out: str | os.PathLike[str], *, tile: int = TILE_PX) -> Path:
+    def kit(
+        self, int8: NetworkLike, out: str | os.PathLike[str], *, tile: int = TILE_PX, record: bool = False
+    ) -> Path:
         """Write what a board's engineer needs of an INT8 network to a folder, and return it.
 
         `core.onnx` is the part that the DPU computes, fixed to a tile. `measure.py` times it there and writes
         `board.json`, which `predict` takes as `measured`. `input.npy` and `expected.npy` are one input of the core
-        and what onnxruntime makes of it on this processor.
+        and what onnxruntime makes of it on this processor. `host.py` is the host's part around it in plain NumPy,
+        `golden` has what every layer must write, and README.md says what to do there.
 
         Args:
             int8: the network, quantised under this board's rules.
             out: the folder.
             tile: side of a tile in pixels.
+            record: whether a record of evidence is added: what the network is, and what `check` says of it.
 
         Raises:
+            MissingExtraError: a record, and cyclonedx-python-lib is not installed.
             ModelError: a float network, or one that was not quantised under a DPU's rules here.
         """
         network, folder = Network.load(int8), Path(out)
-        core = board_model(read_core(network.model), metadata(network.model), tile)
-        save_onnx(core, folder / "core.onnx")
-        session = open_session(core)
+        core = read_core(network.model)
+        board_file = board_model(core, metadata(network.model), tile)
+        save_onnx(board_file, folder / "core.onnx")
+        session = open_session(board_file)
         shape = [side if isinstance(side, int) else 1 for side in session.get_inputs()[0].shape]
         planes = np.random.default_rng(0).integers(-64, 64, shape).astype(_dtype(session.get_inputs()[0].type))
         for name, values in (("input", planes), ("expected", tensors_of(session, None, planes)[0])):
             with whole_file(folder / f"{name}.npy") as temporary, temporary.open("wb") as stream:
                 np.save(stream, values)
         shutil.copyfile(MEASURE, folder / "measure.py")
+        if (said := host_constants(network, core, tile)) is not None:
+            write_text(folder / "host.json", json.dumps(said, indent=1) + "\n")
+            shutil.copyfile(HOST, folder / "host.py")
+        write_golden(network, folder / "golden", board=self)
+        if recorded(folder / "record" if record else None):
+            write_record(check(network, self, tile=tile), network, folder / "record")
+        words = {"network": network.name, "board": self.name, "tile": tile}
+        write_text(folder / "README.md", README.read_text(encoding="utf-8").format(**words))
         return folder
+
+
+def host_constants(network: Network, core: IntCore, tile_px: int) -> dict[str, object] | None:
+    """What host.py needs to know; None of a network whose result is no image, or whose pixels move otherwise."""
+    ends = core.ends
+    shuffles = {
+        "front": (ends.front, ends.channels),
+        "back": (ends.back, ends.outputs),
+        "last": (ends.last, ends.outputs),
+    }
+    # Of one band ONNX's order of the channels is that of torch, which host.py takes.
+    plain = all(each.columns_first or wide == each.block**2 for found, wide in shuffles.values() for each in found)
+    if not ends.is_image or ends.direct or not plain or any(len(found) > 1 for found, _ in shuffles.values()):
+        return None
+    tiling, scale = network.tiling, core.scale(CORRECTION)
+    step, part, middle = (STEP_DN, PART, MIDDLE_DN) if ends.banked else (STEP, QUARTER, 0)
+    return {
+        **{name: found[0].block if found else 1 for name, (found, _) in shuffles.items()},
+        "tile_px": tile_px,
+        "halo_px": tiling.halo_px,
+        "lattice_px": tiling.lattice_px,
+        "scale": int(tiling.scale),
+        "bands": tiling.channels_out,
+        "border_px": ends.border_px,
+        "step": step,
+        "part": part,
+        "middle": middle,
+        "coarse": 2 if ends.banked else 1,
+        "copies": ends.copies,
+        "offsets": ends.offsets,
+        "fine_max": (FINE_MAX + 0.5) * scale,
+        "analytic": ends.analytic_gain(scale),
+        "unit": ends.unit,
+        "adds_image": ends.adds_image,
+    }
 
 
 def _dtype(name: str) -> type[np.generic]:

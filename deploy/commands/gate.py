@@ -42,6 +42,9 @@ def gate(
     patches: Annotated[int, typer.Option(min=1, max=100_000, help="Test patches of 128 x 128.")] = 32,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of the patches.")] = 0,
     junit: Annotated[Path | None, typer.Option(help="Write the verdict here as JUnit XML.")] = None,
+    record: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for a record of evidence: JSON, a page and an ML-BOM.")
+    ] = None,
     json: Annotated[Path | None, typer.Option(help="Write verdict, checks and figures here.")] = None,
 ) -> None:
     """Compare a float and an INT8 network on simulated pairs neither was calibrated on.
@@ -49,8 +52,9 @@ def gate(
     Also checked: what saturates inside, the DPU's rules, that no ReLU was lost, and that onnxruntime's optimisations
     change no bit.
     """
+    from beers_deploy.kit.record import recorded, write_record
     from beers_deploy.model.io.files import require_writable, write_text
-    from beers_deploy.network import pair_of
+    from beers_deploy.network import Network, pair_of
     from beers_deploy.quant.gate import read_limits
     from beers_deploy.results import print_rows
     from beers_deploy.verdict import gate as judged
@@ -58,7 +62,7 @@ def gate(
     read = (float_model, int8_model, limits, baseline, images, samples, *map(Path, (target, sensor)))
     if junit == STDOUT:
         raise OptionError("--junit", expected="a file", got="-", remedy="name one: standard output is for --json -")
-    require_writable(json, junit, inputs=read)
+    require_writable(json, junit, *recorded(record), inputs=read)
     against, int8 = pair_of(float_model, int8_model)
     allowed = read_limits(limits, max_mae)
     verdict = judged(
@@ -81,6 +85,8 @@ def gate(
     save(replace(verdict, arguments=arguments(max_mae=allowed.mae)), json)
     if junit is not None:
         write_text(junit, verdict.to_junit())
+    if record is not None:
+        write_record(verdict, Network.load(int8, sensor=sensor), record)
     say(str(verdict))
     if not verdict:
         raise typer.Exit(1)

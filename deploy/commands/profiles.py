@@ -1,11 +1,12 @@
-"""`beers-deploy profiles`: list the sensor, scene and target profiles, or show one with each constant's source."""
+"""`beers-deploy profiles` shows sensors, scenes and boards; `characterise` makes a sensor of raw images."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import say
+from beers_deploy.commands.shared import arguments, save, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles import Sensor, load_sensor, load_target, sensor_names, target_names
 from beers_deploy.profiles.constant import Constant, Words
@@ -19,6 +20,7 @@ from beers_deploy.profiles.toml import profile_path, read_toml
 Row = tuple[str, ...]
 
 EXAMPLE = "profiles pleiades-degraded"
+CHARACTERISE_EXAMPLE = "characterise raw1.tif raw2.tif --bits 12 --out my-sensor.toml"
 
 
 def profiles(
@@ -111,3 +113,39 @@ def _effects(effects: Mapping[str, Table]) -> list[Row]:
 
 def _row(key: str, constant: Constant | Words) -> Row:
     return key, str(constant), constant.status, constant.source
+
+
+def characterise(
+    images: Annotated[list[Path], typer.Argument(help="Raw images of one sensor: whole digital numbers, one band.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The sensor profile, a TOML file.")],
+    edge: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FILE:X,Y,WIDTH,HEIGHT", help="A box with one straight edge; searched for if none."),
+    ] = None,
+    bits: Annotated[
+        int | None, typer.Option(min=1, max=16, help="Of a digital number; told by clipped pixels if none.")
+    ] = None,
+    gain: Annotated[
+        float | None, typer.Option(help="DN per W/m2/sr/um; full scale is taken for 400 W/m2/sr/um if none.")
+    ] = None,
+    gsd: Annotated[float | None, typer.Option(help="Ground sampling distance in m; no pixel depends on it.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the figures with their intervals here.")] = None,
+) -> None:
+    """Measure MTF and noise on raw images and write them as a sensor profile, for every --sensor.
+
+    The MTF needs straight edges between even areas: a target, a large roof, an apron. The noise needs raw pixels:
+    what was denoised, sharpened or resampled is refused.
+    """
+    from beers_deploy.model.io.files import require_writable, write_text
+    from beers_deploy.results import Table as Results
+    from beers_deploy.results import print_rows
+    from beers_deploy.studies.characterise import characterise as measure
+    from beers_deploy.studies.characterise import profile_toml
+
+    require_writable(out, json, inputs=images)
+    found = measure(images, edge or (), bits=bits, gain=gain, gsd_m=gsd)
+    rows = found.rows()
+    print_rows(f"sensor of {len(images)} image{'' if len(images) == 1 else 's'}", rows)
+    write_text(out, profile_toml(found))
+    save(Results("characterise", arguments(), tuple(images), tuple(rows)), json)
+    say(f"wrote {out}: beers-deploy profiles {out}")

@@ -46,11 +46,12 @@ PATHS = {
         ("sensor", "target"),
     ),
     "gate": Paths(
-        {"junit": FILE, "json": FILE},
+        {"junit": FILE, "record": FOLDER, "json": FILE},
         ("float_model", "int8_model", "limits", "baseline", "images", "samples"),
         ("sensor", "target"),
     ),
     "check": Paths({"picture": FILE, "json": FILE}, ("model",), ("target",)),
+    "golden": Paths({"out": FOLDER, "json": FILE}, ("given", "compare"), ("target",)),
     "bench": Paths({"json": FILE}, ("model", "image", "measured"), ("sensor", "target")),
     "info": Paths({"json": FILE}, ("image", "network"), ("sensor", "target")),
     "restore": Paths({"out": FILE, "json": FILE, "stac": FILE}, ("image", "network"), ("sensor",)),
@@ -171,6 +172,7 @@ REFUSED = {
     "export": [
         Refused(("board_file", "delta", "apply"), without="--network"),
     ],
+    "golden": [Refused(("tile", "target"), "--compare COMPARE"), Refused(("json",), without="--compare")],
     "quantize": [Refused(("board_file", "report", "finetune"), "--regime free")],
     "bench": [
         Refused(

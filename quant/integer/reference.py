@@ -95,8 +95,9 @@ def run_core(
     """Every tensor of the core for its int8 planes (N, P, H, W), as int16, and a report a layer."""
     tensors, reports = {PLANES: faults.touch(PLANES, planes.astype(np.int16))}, []
     for op in core.ops:
-        sums, shift, bound, finer = _sums(core, op, tensors, faults)
-        result, ties = _shifted(sums, shift, half_even)
+        sums, shift, bound, finer = layer_sums(core, op, tensors, faults)
+        whole, ties = rounded(sums, shift, half_even)
+        result = saturated(whole)
         tensors[op.output] = faults.touch(op.output, result)
         ends = (result == INT8_MAX) | (result == INT8_MIN)
         peak = max(float(np.log2(max(int(np.abs(sums).max()), 1))) - finer, 0.0)
@@ -124,7 +125,15 @@ INT8_BITS = 7.0
 """Of what only moves values, without the sign."""
 
 
-def _sums(core: IntCore, op: IntConv | Op, tensors: Mapping[str, np.ndarray], faults: Faults) -> Sums:
+def layer_sums(core: IntCore, op: IntConv | Op, tensors: Mapping[str, np.ndarray], faults: Faults = SOUND) -> Sums:
+    """What an operation adds up, before it is rounded to int8.
+
+    Args:
+        core: of the operation.
+        op: the operation.
+        tensors: what it reads, by name.
+        faults: wrong shifts.
+    """
     read = [tensors[name] for name in op.inputs]
     if isinstance(op, IntConv):
         return _conv(core, op, read[0], faults)
@@ -177,17 +186,19 @@ def _add(core: IntCore, op: Add, read: list[np.ndarray], faults: Faults) -> Sums
     return sums, finest - coarsest + write + finer, float(np.log2(bound)), finer
 
 
-def _shifted(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray, float]:
-    """Sums divided by 2^shift, rounded and clipped to int8, as int16; and the share that lay half-way."""
+def rounded(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray, float]:
+    """Sums divided by 2^shift and rounded, not clipped; and the share that lay half-way."""
     if shift <= 0:
-        moved = np.clip(sums, INT8_MIN, INT8_MAX) << min(-shift, 8)  # by 8 all but 0 has come to an end
-        return np.clip(moved, INT8_MIN, INT8_MAX).astype(np.int16), 0.0
+        return sums << min(-shift, 8), 0.0  # by 8 all but 0 lies beyond int8
     half = 1 << (shift - 1)
-    rounded = (sums + half) >> shift
+    whole = (sums + half) >> shift
     ties = (sums & ((1 << shift) - 1)) == half
-    if half_even:
-        rounded = rounded - (ties & (rounded % 2 == 1))
-    return np.clip(rounded, INT8_MIN, INT8_MAX).astype(np.int16), float(ties.mean())
+    return np.asarray(whole - (ties & (whole % 2 == 1)) if half_even else whole), float(ties.mean())
+
+
+def saturated(whole: np.ndarray) -> np.ndarray:
+    """Whole numbers clipped to int8, as int16."""
+    return np.asarray(np.clip(whole, INT8_MIN, INT8_MAX), np.int16)
 
 
 @dataclass(frozen=True)

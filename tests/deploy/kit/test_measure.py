@@ -7,13 +7,13 @@ from types import ModuleType
 
 import pytest
 
-from beers_deploy import board_measure
+from beers_deploy.kit import measure
 from tests.deploy.dpu.graphs import board_convbeers
 
 
 @pytest.fixture
 def script() -> ModuleType:
-    return board_measure
+    return measure
 
 
 def run(script: ModuleType, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:

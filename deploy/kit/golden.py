@@ -1,0 +1,322 @@
+"""Golden vectors: what every layer of an INT8 network must write on a board, and what is wrong where one does not.
+
+A folder holds the network (int8.onnx), golden.json and, for each case, its image and the int8 tensors of all layers
+as .npy files (N, C, H, W), numbered in the order in which they are computed. What a board wrote are files of the same
+names in folders of the same names, as many of them as it can hand out.
+"""
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beers_deploy import __version__
+from beers_deploy.model.io.files import whole_file, write_text
+from beers_deploy.network import Network, NetworkLike
+from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
+from beers_deploy.profiles.figures import Check, Row, measured
+from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
+from beers_deploy.profiles.toml import read_json
+from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.graph import PLANES, Op
+from beers_deploy.quant.integer import run_core
+from beers_deploy.quant.integer.diagnosis import Seen, explain, where
+from beers_deploy.quant.onnx_file import fixed_tile_px
+from beers_deploy.results import Input, Table
+
+SCHEMA, SCHEMA_VERSION = "beers-deploy/golden", 1
+TILE_PX = 64
+INDEX, NETWORK, PICTURE = "golden.json", "int8.onnx", "image.npy"
+SCENE_PX = 8
+"""Pixels of the drawn scene for one of an image."""
+
+
+def write_golden(
+    int8: NetworkLike,
+    out: str | os.PathLike[str],
+    *,
+    tile: int | None = None,
+    board: "TargetProfile | str" = DEFAULT_TARGET,
+    seed: int = 0,
+) -> Path:
+    """Write golden vectors of an INT8 network to a folder, and return it.
+
+    Args:
+        int8: the network, quantised under a board's rules.
+        out: the folder.
+        tile: side of a tile in pixels; the network's own if it has one, else 64.
+        board: whose way to round ties is taken.
+        seed: of what is drawn.
+
+    Raises:
+        ModelError: a float network, or one that was not quantised under a DPU's rules here.
+        OptionError: a tile that the network does not take.
+    """
+    network, folder = Network.load(int8), Path(out)
+    core, half_even = read_core(network.model), rounds_to_even(TargetProfile.load(board))
+    names, said = files_of(core), {}
+    for case, image in _images(network, core, tile, np.random.default_rng(seed)).items():
+        planes = core.ends.split(image) if case != EXTREMES else image
+        tensors, _ = run_core(core, planes, half_even)
+        for name, file in names.items():
+            _save(folder / case / file, tensors[name].astype(np.int8))
+        if case != EXTREMES:
+            _save(folder / case / PICTURE, image)
+        said[case] = {names[name]: _digest(tensors[name]) for name in names}
+    network.save(folder / NETWORK)
+    index = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "tool_version": __version__, "cases": said}
+    index |= {"network": network.input._asdict(), "half_even": half_even, "layers": _layers(core, names)}
+    write_text(folder / INDEX, json.dumps(index, indent=1) + "\n")
+    return folder
+
+
+def rounds_to_even(board: TargetProfile) -> bool:
+    """Whether a board rounds ties to even; a DPU rounds them up."""
+    return bool(board.tables.get("numbers", {}).get("half_even"))
+
+
+def files_of(core: IntCore) -> dict[str, str]:
+    """The file of every tensor of a core, in the order in which they are computed."""
+    tensors = [PLANES, *(op.output for op in core.ops)]
+    return {name: f"{k:02d}-{re.sub(r'[^A-Za-z0-9._-]+', '_', name)}.npy" for k, name in enumerate(tensors)}
+
+
+def _layers(core: IntCore, names: Mapping[str, str]) -> list[dict[str, object]]:
+    ops = {op.output: op for op in core.ops}
+    return [
+        {
+            "file": file,
+            "tensor": name,
+            "layer": ops[name].name if name in ops else "the planes that the core reads",
+            "operator": type(ops[name]).__name__ if name in ops else "",
+            "reads": list(ops[name].inputs) if name in ops else [],
+            "fractional_bits": core.frac_bits[name],
+        }
+        for name, file in names.items()
+    ]
+
+
+EXTREMES = "extremes"
+"""The case whose planes are int8's ends in random order, which no image makes."""
+
+
+def _images(
+    network: Network, core: IntCore, tile: int | None, generator: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """The images (1, C, H, W) of the cases; of the last its planes, int8."""
+    fixed_px, lattice_px = fixed_tile_px(network.model), _lattice_px(network)
+    side = fixed_px or tile or -(-TILE_PX // lattice_px) * lattice_px
+    if (fixed_px and tile not in (None, fixed_px)) or side % lattice_px or side < 1:
+        expected = f"{fixed_px} px, to which the network is fixed" if fixed_px else f"a multiple of {lattice_px} px"
+        raise OptionError("tile", expected=expected, got=f"{tile} px", remedy="choose another")
+    channels = core.ends.image_channels
+    shape = 1, channels, side, side
+    square, spots = np.indices((side, side)).sum(0) // 8 % 2, np.zeros((side, side))
+    spots[3::11, 5::13] = 1
+    found = {
+        "scene": _scene(channels, side, side, generator),
+        "noise": generator.random(shape, dtype=np.float32),
+        "steps": np.broadcast_to(np.maximum(square, spots).astype(np.float32), shape).copy(),
+        "black": np.zeros(shape, np.float32),
+        "white": np.ones(shape, np.float32),
+    }
+    if not fixed_px:
+        rows, columns = (lattice_px * (side * part // (8 * lattice_px) | 1) for part in (5, 7))
+        found["odd"] = _scene(channels, rows, columns, generator)
+    planes = core.ends.split(found["noise"])
+    return {**found, EXTREMES: generator.choice(np.array([-128, 127], np.int8), planes.shape)}
+
+
+def _lattice_px(network: Network) -> int:
+    try:
+        return network.tiling.lattice_px
+    except ModelError:
+        if fixed_tile_px(network.model) is None:
+            raise
+        return 1  # of one size, and never cut
+
+
+def _scene(channels: int, rows: int, columns: int, generator: np.random.Generator) -> np.ndarray:
+    """A drawn scene (1, C, rows, columns) in [0, 1], each channel a little darker than the one before."""
+    from beers_deploy.model.simulator.procedural import procedural_scene  # SciPy
+
+    drawn = procedural_scene(SCENE_PX * rows, SCENE_PX * columns, generator).radiance
+    mean = drawn.reshape(rows, SCENE_PX, columns, SCENE_PX).mean((1, 3))
+    bright = mean / np.quantile(mean, 0.99)
+    darker = 1 - 0.3 * np.arange(channels)[:, None, None] / channels
+    return np.asarray(np.clip(bright * darker, 0, 1)[None], np.float32)
+
+
+def _save(path: Path, values: np.ndarray) -> None:
+    with whole_file(path) as temporary, temporary.open("wb") as stream:
+        np.save(stream, values)
+
+
+def _digest(values: np.ndarray) -> str:
+    return hashlib.sha256(np.ascontiguousarray(values, np.int8).tobytes()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Golden:
+    """A folder of golden vectors, read.
+
+    Attributes:
+        core: the network's integers.
+        half_even: how ties are rounded.
+        cases: every sound tensor of each case.
+        network: its name and digest.
+    """
+
+    core: IntCore
+    half_even: bool
+    cases: Mapping[str, Mapping[str, np.ndarray]]
+    network: Input
+
+
+def read_golden(folder: Path) -> Golden:
+    """Read a folder that `write_golden` made; its tensors are computed again and held to their digests."""
+    remedy = "make it anew with 'beers-deploy golden'"
+    try:
+        said: Any = read_json(folder / INDEX)
+        if said["schema"] != SCHEMA or said["schema_version"] != SCHEMA_VERSION:
+            raise ValueError(said["schema"])
+        digests = {str(case): dict(files) for case, files in said["cases"].items()}
+        half_even, network = bool(said["half_even"]), Input(**said["network"])
+    except (AttributeError, LookupError, OSError, TypeError, ValueError) as error:
+        expected = f"a folder of golden vectors with its {INDEX}"
+        raise OptionError(str(folder), expected=expected, got="none", remedy=remedy) from error
+    core = read_core(Network.load(folder / NETWORK).model)
+    names, cases = files_of(core), {}
+    for case, files in digests.items():
+        planes = _array(folder / case / names[PLANES])
+        cases[case], _ = run_core(core, planes, half_even)
+        wrong = [file for name, file in names.items() if files.get(file) != _digest(cases[case][name])]
+        if wrong:
+            got = f"other numbers in {case}/{wrong[0]}"
+            raise OptionError(str(folder), expected="the vectors that were written", got=got, remedy=remedy)
+    return Golden(core, half_even, cases, network)
+
+
+def _array(path: Path) -> np.ndarray:
+    try:
+        return np.asarray(np.load(path, allow_pickle=False))
+    except (OSError, ValueError, EOFError) as error:
+        got = "no such file" if not path.exists() else "another file"
+        raise ImageError(str(path), expected="an array (.npy)", got=got, remedy="write it with numpy.save") from error
+
+
+def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[str]) -> Table:
+    """Hold what a board wrote against golden vectors; false where a layer differs.
+
+    Args:
+        folder: of the golden vectors.
+        results: folders of the cases' names with files of the layers' names, any of them: int8, uint8 around 128,
+            or float multiples of the tensor's scale; channels first, or last.
+
+    Raises:
+        OptionError: no golden vectors, or no results of theirs.
+        ImageError: results that are no such numbers, or of another shape.
+    """
+    golden, given = read_golden(Path(folder)), Path(results)
+    seen = _results(golden, given)
+    wrong = [
+        name
+        for name in files_of(golden.core)
+        if any(not np.array_equal(case[name], golden.cases[key][name]) for key, case in seen.items() if name in case)
+    ]
+    verdict = _verdict(golden, seen, wrong[0]) if wrong else ""
+    rows = tuple(_row(golden, seen, name, verdict if name in wrong[:1] else "") for name in _compared(golden, seen))
+    checks = (Check("layers that differ", len(wrong), 0, "layer", detail=verdict),)
+    return Table("golden", {"results": given.name}, (golden.network, Path(folder) / INDEX), rows, checks)
+
+
+Results = Mapping[str, Mapping[str, np.ndarray]]
+"""By case and tensor."""
+
+
+def _results(golden: Golden, given: Path) -> Results:
+    files = {file: name for name, file in files_of(golden.core).items()}
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for path in sorted(given.glob("*/*.npy")):
+        case, name = path.parent.name, files.get(path.name)
+        if path.name == PICTURE:
+            continue
+        if case not in golden.cases or name is None:
+            expected, remedy = "the names of the golden vectors", "name cases and layers as they are named there"
+            raise OptionError(str(given), expected=expected, got=f"{case}/{path.name}", remedy=remedy)
+        meant = golden.cases[case][name]
+        found.setdefault(case, {})[name] = _integers(path, meant.shape, golden.core.frac_bits[name])
+    if not found:
+        expected, remedy = "results as CASE/LAYER.npy", f"name them as in {INDEX}"
+        raise OptionError(str(given), expected=expected, got="none", remedy=remedy)
+    return found
+
+
+def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
+    """What a board wrote of a tensor as int16 (N, C, H, W)."""
+    values = _array(path)
+    if values.shape != shape and values.ndim == len(shape) and np.moveaxis(values, -1, 1).shape == shape:
+        values = np.moveaxis(values, -1, 1)
+    if values.shape != shape:
+        got, remedy = f"{values.shape}", "write the tensor whole, of the tile that the vectors have"
+        raise ImageError(str(path), expected=f"shape {shape}", got=got, remedy=remedy)
+    whole = values.astype(np.float64)
+    if values.dtype == np.uint8:
+        whole -= 128
+    elif values.dtype.kind == "f":
+        whole *= 2.0**frac_bits
+    if not (np.abs(whole - np.rint(whole)) < 1e-3).all() or np.abs(whole).max(initial=0) > 128:
+        expected = f"int8, or its values as whole multiples of 2^{-frac_bits}"
+        raise ImageError(str(path), expected=expected, got=f"other {values.dtype} numbers", remedy="write these")
+    return np.rint(whole).astype(np.int16)
+
+
+def _compared(golden: Golden, seen: Results) -> Iterator[str]:
+    return (name for name in files_of(golden.core) if any(name in case for case in seen.values()))
+
+
+def _verdict(golden: Golden, seen: Results, name: str) -> str:
+    """The first layer that differs, and the fault that gives just that."""
+    given = ((golden.cases[key], case[name]) for key, case in seen.items() if name in case)
+    cases = [Seen(sound, found) for sound, found in given if not np.array_equal(sound[name], found)]
+    between = _unseen_before(golden.core, name, {each for case in seen.values() for each in case})
+    fault = explain(golden.core, between, cases, golden.half_even)
+    unseen = f" ({len(between) - 1} layers before it were not handed out)" if len(between) > 1 else ""
+    why = f"as if {fault}" if fault else "by no fault that is known"
+    return f"the first to differ is {_layer(golden.core, name)}{unseen}, {why}"
+
+
+def _layer(core: IntCore, name: str) -> str:
+    return next((op.name for op in core.ops if op.output == name), PLANES)
+
+
+def _unseen_before(core: IntCore, name: str, seen: set[str]) -> list[IntConv | Op]:
+    """The operations between tensors that a board handed out and the one of that name, which is the last."""
+    wanted, found = {name}, list[IntConv | Op]()
+    for op in reversed(core.ops):
+        if op.output in wanted and (op.output == name or op.output not in seen):
+            found.insert(0, op)
+            wanted |= set(op.inputs)
+    return found
+
+
+def _row(golden: Golden, seen: Results, name: str, verdict: str) -> Row:
+    pairs = {key: (case[name], golden.cases[key][name]) for key, case in seen.items() if name in case}
+    values = sum(meant.size for _, meant in pairs.values())
+    by = [np.abs(found - meant) for found, meant in pairs.values()]
+    source = f"{len(pairs)} cases, {values} values, against the integer reference"
+    figures = {
+        "differing": measured(100 * sum(int((each > 0).sum()) for each in by) / values, "%", source),
+        "at most by": measured(max(int(each.max()) for each in by), "LSB", source),
+    }
+    wrong = [pair for pair in pairs.values() if not np.array_equal(*pair)]
+    alike = [pair for pair in wrong if pair[0].shape == wrong[0][0].shape]  # the odd case has a size of its own
+    text = {"where": where(*map(np.concatenate, zip(*alike, strict=True)))} if wrong else {}
+    return Row("golden", _layer(golden.core, name), figures, text | ({"first": verdict} if verdict else {}))

@@ -1,0 +1,132 @@
+"""A record of evidence: what a network is, what made it, and what was checked, as JSON, a page and an ML-BOM."""
+
+import hashlib
+import json
+from importlib.metadata import metadata as of_package
+from pathlib import Path
+from typing import Any
+from uuid import NAMESPACE_URL, uuid5
+
+from beers_deploy import __version__
+from beers_deploy.model.family import RANGES
+from beers_deploy.model.io.files import sha256, write_text
+from beers_deploy.model.io.tensors import read_conditioned
+from beers_deploy.model.shipped import shipped_names, shipped_weights
+from beers_deploy.network import WEIGHTS, Network
+from beers_deploy.profiles.errors import optional
+from beers_deploy.profiles.figures import Row
+from beers_deploy.quant.banked.family import FAMILY
+from beers_deploy.quant.encodings.description import KEY
+from beers_deploy.quant.onnx_file import metadata
+from beers_deploy.quant.samples import CALIBRATED_ON
+from beers_deploy.report.page import Report, Section, write_report
+from beers_deploy.results import Table
+
+SCHEMA, SCHEMA_VERSION = "beers-deploy/record", 1
+NAMES = "record.json", "record.html", "record.cdx.json"
+LIMITATIONS = (
+    "Nothing here has run on a board: figures of a board are predicted by a cost model, or published.",
+    "INT8 is judged on onnxruntime; a DPU rounds ties up, which moves single results by one unit.",
+    "Images that no sensor in range makes (restored, resampled or compressed ones) were not judged.",
+)
+BULKY = {KEY, FAMILY, CALIBRATED_ON}
+"""Of what a file says of itself: numbers, not words."""
+
+
+def recorded(folder: Path | None) -> list[Path]:
+    """The files that a record will be, refused where the library for one is missing; none without a folder."""
+    if folder is None:
+        return []
+    optional("cyclonedx", "record")
+    return [folder / name for name in NAMES]
+
+
+def write_record(judged: Table, network: Network, folder: Path) -> Path:
+    """Write what is known of a network, and what a verb found of it, to a folder; return the folder.
+
+    Args:
+        judged: figures and checks, with the inputs that they rest on.
+        network: that they speak of.
+        folder: gets record.json, record.html and record.cdx.json (CycloneDX 1.6).
+
+    Raises:
+        MissingExtraError: cyclonedx-python-lib is not installed.
+    """
+    said = record_of(judged, network)
+    write_text(folder / NAMES[0], json.dumps(said, indent=1) + "\n")
+    write_report(_page(judged, said), folder / NAMES[1])
+    write_text(folder / NAMES[2], bill_of(said))
+    return folder
+
+
+def record_of(judged: Table, network: Network) -> dict[str, Any]:
+    """The record as one document; what a file does not say of itself is null."""
+    about, weights = metadata(network.model), metadata(network.model).get(WEIGHTS)
+    return {
+        "schema": SCHEMA,
+        "schema_version": SCHEMA_VERSION,
+        "tool": {"name": "beers-deploy", "version": __version__, "code_sha256": code_sha256()},
+        "network": {"name": network.name, "precision": network.precision, "sha256": network.sha256},
+        "weights_sha256": weights,
+        "training": _training(weights),
+        "says": {key: text for key, text in about.items() if key not in BULKY},
+        "calibration_samples": about.get(CALIBRATED_ON, "").split() or None,
+        "sensors_in_range": {key: list(ends) for key, ends in RANGES.items()} if FAMILY in about else None,
+        "limitations": [*LIMITATIONS, *judged.notes],
+        "licence": of_package("beers-deploy")["License-Expression"] if weights else None,
+        "passed": bool(judged),
+        "results": judged.to_dict(),
+    }
+
+
+def code_sha256() -> str:
+    """Of the sources of this package, whose names and bytes in their order are one text."""
+    root, digest = Path(__file__).parents[1], hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        digest.update(f"{path.relative_to(root).as_posix()} {sha256(path)}\n".encode())
+    return digest.hexdigest()
+
+
+def _training(weights: str | None) -> dict[str, Any] | None:
+    """The recipe of the shipped weights of that digest; None of others, which are not here."""
+    found = (shipped_weights(name) for name in shipped_names())
+    return next((read_conditioned(path).recipe for path in found if sha256(path) == weights), None)
+
+
+def _page(judged: Table, said: dict[str, Any]) -> Report:
+    words = {key: said[key] for key in ("weights_sha256", "training", "sensors_in_range", "licence")}
+    facts = said["network"] | said["says"] | words
+    rows = [Row("network", key, {}, {"said": str(value)}) for key, value in facts.items()]
+    checks = [
+        Row("checks", each.name, {}, {"found": each.found, "allowed": each.allowed, "passed": str(each.passed)})
+        for each in judged.checks
+    ]
+    tables = [Section("What it is", rows), Section("Checks", checks), Section("Figures", judged.rows)]
+    verdict = "All checks passed." if judged else "A check failed."
+    return Report(f"Record of {said['network']['name']}", verdict, tables, [], said["limitations"])
+
+
+def bill_of(said: dict[str, Any]) -> str:
+    """A bill of materials in CycloneDX 1.6; the library has no model cards yet, so facts are properties."""
+    from cyclonedx.model import HashAlgorithm, HashType, Property
+    from cyclonedx.model.bom import Bom
+    from cyclonedx.model.component import Component, ComponentType
+    from cyclonedx.output.json import JsonV1Dot6
+
+    def component(kind: ComponentType, name: str, digest: str, **more: Any) -> Component:
+        hashes = [HashType(alg=HashAlgorithm.SHA_256, content=digest)]
+        return Component(type=kind, name=name, bom_ref=f"{kind.value}:{name}", hashes=hashes, **more)
+
+    facts = {**said["says"], "training": said["training"], "sensors_in_range": said["sensors_in_range"]}
+    facts |= {"limitations": said["limitations"], "passed": said["passed"], "licence": said["licence"]}
+    properties = [Property(name=f"beers-deploy:{key}", value=json.dumps(value)) for key, value in facts.items()]
+    network, bom = said["network"], Bom(serial_number=uuid5(NAMESPACE_URL, json.dumps(said)))
+    kind = ComponentType.MACHINE_LEARNING_MODEL
+    bom.metadata.component = component(kind, network["name"], network["sha256"], properties=properties)
+    bom.metadata.tools.components.add(
+        component(ComponentType.APPLICATION, "beers-deploy", said["tool"]["code_sha256"], version=__version__)
+    )
+    files = [component(ComponentType.FILE, each["name"], each["sha256"]) for each in said["results"]["inputs"]]
+    bom.components.update(files)
+    bom.register_dependency(bom.metadata.component, files)
+    return str(JsonV1Dot6(bom).output_as_string(indent=1)) + "\n"

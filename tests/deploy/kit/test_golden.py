@@ -1,0 +1,208 @@
+"""Golden vectors, held against boards that compute wrongly in ways of our own making."""
+
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import beers_deploy as bd
+from beers_deploy.kit.golden import Golden, compare_golden, files_of, read_golden, write_golden
+from beers_deploy.profiles.errors import BeersError
+from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.graph import PLANES, Add, Op
+from beers_deploy.quant.integer.reference import layer_sums, rounded, saturated
+from examples.networks import build, to_onnx
+from tests.deploy.command_line import done, refused
+from tests.quant.quick import one_guess
+
+SHIPPED, USERS = ("convbeers-xs-int8", "convbeers-half-xs-int8"), ("unet", "mobile")
+TILE_PX = 32
+
+
+def network(name: str) -> bd.Network:
+    if name in SHIPPED:
+        return bd.Network.load(name)
+    samples = np.random.default_rng(0).random((4, 1, 32, 32), dtype=np.float32)
+    with one_guess():
+        return bd.quantize(to_onnx(name, build(name, torch.Generator().manual_seed(0))), samples, progress=False)
+
+
+@pytest.fixture(scope="module", params=[*SHIPPED, *USERS])
+def vectors(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_golden(network(request.param), tmp_path_factory.mktemp("golden"), tile=TILE_PX)
+
+
+@pytest.fixture(scope="module")
+def golden(vectors: Path) -> Golden:
+    return read_golden(vectors)
+
+
+def middle(core: IntCore) -> IntConv:
+    """A convolution in the middle, which faults are put into."""
+    return core.convolutions[len(core.convolutions) // 2]
+
+
+def with_middle(core: IntCore, **other: Any) -> IntCore:
+    return replace(core, ops=tuple(replace(op, **other) if op is middle(core) else op for op in core.ops))
+
+
+def flipped(values: np.ndarray, place: tuple[int, ...], bit: int) -> np.ndarray:
+    changed = values.copy()
+    changed.view(np.uint8)[place] ^= np.uint8(1 << bit)
+    return changed
+
+
+Layer = Callable[[IntConv | Op, np.ndarray], np.ndarray]
+"""What a board makes of a layer's rounded sums."""
+
+
+def board(
+    core: IntCore,
+    planes: np.ndarray,
+    layer: Layer = lambda _, whole: saturated(whole),
+    half_even: bool = False,
+    cut: Mapping[str, int] | None = None,
+) -> dict[str, np.ndarray]:
+    """What a board writes of every tensor."""
+    made = {PLANES: planes.astype(np.int16)}
+    for op in core.ops:
+        sums, shift, _, _ = layer_sums(core, op, made)
+        whole, _ = rounded(sums, shift + (cut or {}).get(op.name, 0), half_even)
+        made[op.output] = layer(op, whole)
+    return made
+
+
+def wrapped(op: IntConv | Op, whole: np.ndarray) -> np.ndarray:
+    return ((whole + 128) % 256 - 128).astype(np.int16) if isinstance(op, Add) else saturated(whole)
+
+
+def bordered(planes: np.ndarray) -> np.ndarray:
+    bare = np.zeros_like(planes)
+    bare[..., 3:-3, 3:-3] = planes[..., 3:-3, 3:-3]
+    return bare
+
+
+def at_middle(core: IntCore, change: Callable[[np.ndarray], np.ndarray]) -> Layer:
+    return lambda op, whole: change(saturated(whole)) if op.name == middle(core).name else saturated(whole)
+
+
+def swapped(values: np.ndarray) -> np.ndarray:
+    order = np.arange(values.shape[1])
+    order[:2] = 1, 0
+    return values[:, order]
+
+
+Board = Callable[[IntCore, np.ndarray], dict[str, np.ndarray]]
+FAULTS: dict[str, tuple[Board, str, str]] = {
+    "ties": (lambda core, planes: board(core, planes, half_even=True), "first", "ties are rounded to even instead"),
+    "bias": (
+        lambda core, planes: board(with_middle(core, bias=flipped(middle(core).bias, (1,), 3)), planes),
+        "middle",
+        "bit 3 of the bias of channel 1 is flipped",
+    ),
+    "weight": (
+        lambda core, planes: board(with_middle(core, weight=flipped(middle(core).weight, (0, 0, 0, 0), 6)), planes),
+        "middle",
+        "bit 6 of weight [0, 0, 0, 0] is flipped",
+    ),
+    "halo": (lambda core, planes: board(core, bordered(planes)), PLANES, "the outer 3 px of the planes are zeros"),
+    "channels": (
+        lambda core, planes: board(core, planes, at_middle(core, swapped)),
+        "middle",
+        "channels stand in another order: 1 at 0, 0 at 1",
+    ),
+    "scale": (
+        lambda core, planes: board(core, planes, cut={middle(core).name: 1}),
+        "middle",
+        "is taken as 2^1 times what it is",
+    ),
+    "row": (
+        lambda core, planes: board(core, planes, at_middle(core, lambda values: np.roll(values, 1, 2))),
+        "middle",
+        "the tile is shifted by 1 px down",
+    ),
+}
+
+
+def results(golden: Golden, folder: Path, run: Board, kept: Callable[[str], bool] = lambda _: True) -> Path:
+    """What a board writes of some tensors, in a folder."""
+    for case, sound in golden.cases.items():
+        (folder / case).mkdir(parents=True)
+        made = run(golden.core, sound[PLANES])
+        for name, file in files_of(golden.core).items():
+            if kept(name):
+                np.save(folder / case / file, made[name].astype(np.int8))
+    return folder
+
+
+def test_a_sound_board_differs_nowhere(vectors: Path, golden: Golden, tmp_path: Path) -> None:
+    found = compare_golden(vectors, results(golden, tmp_path / "r", board))
+    assert found
+    assert all(row.figures["differing"].value == 0 and not row.text for row in found)
+    assert {"odd", "extremes", "black", "white"} < set(golden.cases)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_named_at_its_first_layer(fault: str, vectors: Path, golden: Golden, tmp_path: Path) -> None:
+    run, place, words = FAULTS[fault]
+    found = compare_golden(vectors, results(golden, tmp_path / "r", run))
+    where = {"first": golden.core.ops[0].name, "middle": middle(golden.core).name}.get(place, place)
+    assert not found
+    assert f"the first to differ is {where}, as if" in found.checks[0].detail
+    assert words in found.checks[0].detail
+
+
+def test_adds_that_wrap_are_named(tmp_path: Path) -> None:
+    vectors = write_golden("convbeers-xs-int8", tmp_path / "golden", tile=TILE_PX)
+    golden = read_golden(vectors)
+    seen = results(golden, tmp_path / "r", lambda core, planes: board(core, planes, wrapped))
+    first = next(op.name for op in golden.core.ops if isinstance(op, Add))
+    assert f"{first}, as if results beyond int8 wrap around" in compare_golden(vectors, seen).checks[0].detail
+
+
+def test_of_the_last_layer_alone_a_rule_is_still_named(vectors: Path, golden: Golden, tmp_path: Path) -> None:
+    run, last = FAULTS["ties"][0], golden.core.ops[-1].output
+    said = compare_golden(vectors, results(golden, tmp_path / "r", run, lambda name: name == last)).checks[0].detail
+    assert "were not handed out" in said
+    assert "ties are rounded to even instead of up, in every layer" in said
+
+
+def test_results_are_taken_as_boards_write_them(tmp_path: Path) -> None:
+    """Channels last, uint8 around 128, and floats; other numbers, names and shapes are refused."""
+    vectors, seen = write_golden("convbeers-xs-int8", tmp_path / "golden", tile=TILE_PX), tmp_path / "r" / "noise"
+    golden = read_golden(vectors)
+    names, sound = list(files_of(golden.core).items()), golden.cases["noise"]
+    seen.mkdir(parents=True)
+    (first, one), (second, two), (third, three) = names[1:4]
+    np.save(seen / one, np.moveaxis(sound[first], 1, -1).astype(np.int8))
+    np.save(seen / two, (sound[second] + 128).astype(np.uint8))
+    np.save(seen / three, (sound[third] * golden.core.scale(third)).astype(np.float32))
+    assert compare_golden(vectors, tmp_path / "r")
+    for values, said in ((sound[third][:, :1], "expected shape"), (sound[third] + 0.3, "whole multiples")):
+        np.save(seen / three, values)
+        with pytest.raises(BeersError, match=said):
+            compare_golden(vectors, tmp_path / "r")
+    (seen / three).rename(seen / "other.npy")
+    with pytest.raises(BeersError, match=r"got noise/other.npy"):
+        compare_golden(vectors, tmp_path / "r")
+
+
+def test_the_command_writes_and_compares(tmp_path: Path) -> None:
+    out, seen = tmp_path / "golden", tmp_path / "seen"
+    done("golden", "convbeers-xs", "--tile", TILE_PX, "--out", out)
+    for case in ("scene", "noise"):
+        shutil.copytree(out / case, seen / case)
+    assert "no layer differs: 20 compared" in done("golden", seen, "--compare", out)
+    path = next((seen / "noise").glob("19-*"))
+    np.save(path, np.load(path) + 1)
+    assert "the first to differ is joined" in done("golden", seen, "--compare", out, code=1)
+    assert "expected one of --out and --compare" in refused("golden", seen)
+    assert "expected a folder of golden vectors" in refused("golden", seen, "--compare", seen)
+    assert "multiple of 2 px" in refused("golden", "convbeers-half-xs", "--tile", 33, "--out", tmp_path / "x")
+    np.save(out / "noise" / "00-planes.npy", np.zeros((1, 4, 38, 38), np.int8))
+    assert "other numbers in noise" in refused("golden", seen, "--compare", out)
