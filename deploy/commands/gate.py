@@ -62,7 +62,7 @@ def gate(
     read = (float_model, int8_model, limits, baseline, images, samples, *map(Path, (target, sensor)))
     if junit == STDOUT:
         raise OptionError("--junit", expected="a file", got="-", remedy="name one: standard output is for --json -")
-    require_writable(json, junit, *recorded(record), inputs=read)
+    require_writable(json, junit, *recorded(record), inputs=read, folders=(record,))
     against, int8 = pair_of(float_model, int8_model)
     allowed = read_limits(limits, max_mae)
     verdict = judged(

@@ -39,6 +39,8 @@ def golden(
     from beers_deploy.network import in_int8
     from beers_deploy.results import print_rows
 
+    inputs = given, compare, Path(target)
+    require_writable(json, out / "golden.json" if out else None, inputs=inputs, folders=(out,))
     if compare is None:
         refuse(context, ("json",), expected="--compare beside it", got="none", remedy="leave it out, or compare")
     else:
@@ -47,11 +49,9 @@ def golden(
         expected, remedy = "one of --out and --compare", "give the folder to write, or the folder to compare with"
         raise OptionError("out", expected=expected, got="both" if out else "none", remedy=remedy)
     if out is not None:
-        require_writable(json, out / "golden.json", inputs=(given,))
         say(f"wrote {write_golden(in_int8(given), out, tile=tile, board=target)}")
         return
     assert compare is not None  # noqa: S101
-    require_writable(json, inputs=(given, compare))
     found = compare_golden(compare, given)
     print_rows(f"{given.name} against {compare.name}", list(found.rows))
     save(found, json)

@@ -24,6 +24,8 @@ INSIDE = {
     "simulate": "recipe.json",
     "train": "checkpoint.safetensors",
     "quantize": "report.html",
+    "gate": "record.json",
+    "golden": "golden.json",
     "evaluate": "report.html",
     "detect": "report.html",
     "tradeoff": "tradeoff.html",
