@@ -32,6 +32,7 @@ from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.profiles.toml import read_json, unreadable
 from beers_deploy.quant.gate import GateResult, Limits, judge, judge_saturation, limits_of, verdict_row
 from beers_deploy.quant.gate import compare as differences
+from beers_deploy.quant.metrics import METRICS
 from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px, metadata, require_quantised
 from beers_deploy.quant.samples import CALIBRATED_ON, OwnSamples, samples_of, without
 from beers_deploy.quant.session import open_any_size
@@ -120,6 +121,7 @@ def compare(
     images: str | os.PathLike[str] | None = None,
     patches: int = 32,
     seed: int = 0,
+    metric: str | None = None,
     progress: Progress = None,
 ) -> Comparison:
     """Compare an INT8 network with its float network, on patches or samples that calibration did not see.
@@ -133,6 +135,7 @@ def compare(
         images: folder of scenes for them; None for drawn ones.
         patches: how many of 128 x 128 are simulated.
         seed: of the patches.
+        metric: psnr, ssim, mae, top1 or iou, by which results are held against the samples' references too.
         progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
 
     Raises:
@@ -141,12 +144,14 @@ def compare(
         ImageError: samples that the networks do not take.
     """
     known = Sensor.load(sensor)
+    if metric not in (None, *METRICS):
+        raise OptionError("metric", expected=f"one of {', '.join(METRICS)}", got=repr(metric), remedy="choose one")
     ours, theirs = _pair(int8, against, known)
     scenes = None if images is None else Path(images)
     with reporting(progress), faults_named(theirs.label):
         unseen, simulated, notes = _unseen(ours, theirs, known, samples, scenes, patches, seed)
         sessions = open_any_size(theirs.model), open_any_size(ours.model)
-        result = differences(*sessions, unseen.pairs, simulated)
+        result = differences(*sessions, unseen.pairs, simulated, metric)
         shares = saturated_shares(ours.model, unseen.degraded)
     arguments: dict[str, object] = {"float": theirs.name, "int8": ours.name, "sensor": known.name, "images": images}
     arguments |= {"patches": patches, "seed": seed, "samples": samples if isinstance(samples, str | Path) else None}
@@ -176,6 +181,7 @@ def gate(
     images: str | os.PathLike[str] | None = None,
     patches: int = 32,
     seed: int = 0,
+    metric: str | None = None,
     progress: Progress = None,
 ) -> Verdict:
     """Judge an INT8 network beside its float one; the verdict is true where every check passed.
@@ -191,6 +197,7 @@ def gate(
         images: folder of scenes for them.
         patches: how many.
         seed: of the patches.
+        metric: beside the references; its limit is metric_loss.
         progress: how it is told.
 
     Raises:
@@ -210,14 +217,19 @@ def gate(
         "target": target.name,
     }
     arguments |= {"sensor": sensor if isinstance(sensor, str) else known.name, "images": images, "patches": patches}
-    arguments |= {"seed": seed, "samples": data}
+    arguments |= {"seed": seed, "samples": data} | ({"metric": metric} if metric else {})
     before = None if baseline is None else baseline_mae(Path(baseline), arguments)
     if before is None and allowed.mae_growth is not None:
         remedy = "give what an earlier 'gate --json' wrote, or leave that limit out"
         raise OptionError("baseline", expected="one beside the limit mae_growth", got="none", remedy=remedy)
-    if allowed.psnr_drop_db is not None and samples is not None:
-        _require_references(samples_of(theirs.model, samples))
-    found = compare(ours, theirs, samples, sensor=known, images=images, patches=patches, seed=seed, progress=progress)
+    if (allowed.metric_loss is None) < (metric is None):
+        remedy = "name the metric, or leave that limit out"
+        raise OptionError("metric", expected="one beside the limit metric_loss", got="none", remedy=remedy)
+    wanted = "psnr_drop_db" if allowed.psnr_drop_db is not None else "a metric" if metric else ""
+    if wanted and samples is not None:
+        _require_references(samples_of(theirs.model, samples), wanted)
+    how: dict[str, Any] = {"sensor": known, "images": images, "patches": patches, "seed": seed, "metric": metric}
+    found = compare(ours, theirs, samples, **how, progress=progress)
     if ALL_SEEN in found.notes:
         expected, remedy = "samples that calibration did not see", "give others, or quantise with four or more"
         raise OptionError("samples", expected=expected, got="those of the calibration", remedy=remedy)
@@ -259,9 +271,9 @@ def _unseen(
     return found, False, (f"{len(found.pairs)} of {count} samples: the others were calibrated on",)
 
 
-def _require_references(own: OwnSamples | None) -> None:
+def _require_references(own: OwnSamples | None, wanted: str) -> None:
     if own is not None and not any(reference.size for _, reference in own.all.pairs):
-        expected, remedy = "references for psnr_drop_db", "give images and references, or no such limit"
+        expected, remedy = f"references for {wanted}", "give images and references, or leave it out"
         raise OptionError("samples", expected=expected, got="images alone", remedy=remedy)
 
 

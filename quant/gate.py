@@ -14,6 +14,7 @@ from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Check, Figure, Row, measured, unavailable
 from beers_deploy.profiles.toml import read_toml_text, unreadable
+from beers_deploy.quant.metrics import METRICS, Measured
 from beers_deploy.quant.session import result_of
 from beers_deploy.quant.untrusted import times
 
@@ -26,6 +27,7 @@ class GateResult:
     """Differences in [0, 1] of full scale over all pixels; PSNRs over full scale, in dB, NaN without references.
 
     `same_class` is the share of results whose largest channel is the same: of networks that tell classes, else NaN.
+    `metric` is what the user measures results by, `metric_float` and `metric_int8` what was found of the two.
     """
 
     mae: float
@@ -39,6 +41,15 @@ class GateResult:
     patches: int
     same_class: float = math.nan
     simulated: bool = True
+    metric: str = ""
+    metric_float: float = math.nan
+    metric_int8: float = math.nan
+
+    @property
+    def metric_loss(self) -> float:
+        """What INT8 loses by the user's metric: above 0 it is worse than float."""
+        lost = self.metric_float - self.metric_int8
+        return lost if METRICS[self.metric].larger_is_better else -lost
 
     @property
     def source(self) -> str:
@@ -61,15 +72,24 @@ def compare(
     int8_session: ort.InferenceSession,
     pairs: "Iterable[Pair]",
     simulated: bool = True,
+    metric: str | None = None,
 ) -> GateResult:
     """Run both networks on (degraded, reference) pairs of (1, C, H, W) in [0, 1]; images clipped as a file would.
 
     Without references, or where they have another size than what is compared, the PSNRs to them are NaN.
 
+    Args:
+        float_session: the float network's.
+        int8_session: the INT8 network's.
+        pairs: what both are run on.
+        simulated: whether these are simulated patches.
+        metric: one of `METRICS`, by which results are held against the references too.
+
     Raises:
         ModelError: results of different shapes.
+        OptionError: references that the metric does not take.
     """
-    differences, errors, agreeing = [], [], []
+    differences, errors, agreeing, measures = [], [], [], [Measured(), Measured()]
     for degraded, reference in pairs:
         results = [result_of(s, degraded) for s in (float_session, int8_session)]
         if results[0].shape != results[1].shape:
@@ -83,6 +103,9 @@ def compare(
         in_float, in_int8 = (_as_in_a_file(result, is_image) for result in results)
         differences.append((in_int8 - in_float).ravel())
         errors.append([_psnr_db(image, reference) for image in (degraded, in_float, in_int8)])
+        for measure, result in zip(measures, (in_float, in_int8), strict=True):
+            if metric is not None:
+                measure.add(metric, result, reference)
     difference = np.concatenate(differences).astype(np.float64)
     degraded_db, float_db, int8_db = np.mean(errors, axis=0)
     return GateResult(
@@ -97,6 +120,9 @@ def compare(
         patches=len(errors),
         same_class=float(np.mean(agreeing)),
         simulated=simulated,
+        metric=metric or "",
+        metric_float=measures[0].value,
+        metric_int8=measures[1].value,
     )
 
 
@@ -123,6 +149,7 @@ class Limits:
         std_over_mae: 1.25 is rounding alone; clipping drives it up.
         psnr_drop_db: PSNR lost against the reference.
         min_psnr_float_int8_db: smallest PSNR of INT8 against float.
+        metric_loss: what INT8 loses by the metric that is chosen.
         saturated: share of a layer's results at the ends of 8 bits, of the layer with most.
         mae_growth: how many times a stored baseline's MAE; 1.05 where there is a baseline and no such limit.
     """
@@ -132,6 +159,7 @@ class Limits:
     std_over_mae: float | None = None
     psnr_drop_db: float | None = None
     min_psnr_float_int8_db: float | None = None
+    metric_loss: float | None = None
     saturated: float | None = None
     mae_growth: float | None = None
 
@@ -143,6 +171,7 @@ BREAKABLE = {
     "std_over_mae": (0.0, 1000.0),
     "psnr_drop_db": (0.0, 100.0),
     "min_psnr_float_int8_db": (10.0, 1000.0),
+    "metric_loss": (0.0, 100.0),
     "saturated": (0.0, 0.9),
     "mae_growth": (0.0, 100.0),
 }
@@ -218,6 +247,9 @@ def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None)
         _at_most("std / MAE", result.std_over_mae, limits.std_over_mae, "ratio"),
         _at_most("PSNR drop", result.drop_db, limits.psnr_drop_db, "dB"),
     ]
+    if limits.metric_loss is not None and result.metric:
+        unit = METRICS[result.metric].unit
+        checks.append(_at_most(f"{result.metric} lost", result.metric_loss, limits.metric_loss, unit))
     if limits.min_psnr_float_int8_db is not None:
         least = limits.min_psnr_float_int8_db
         checks.append([Check("PSNR float-INT8", result.psnr_between_db, least, "dB", "at least")])
@@ -254,6 +286,10 @@ def gate_row(result: GateResult) -> Row:
     figures = {name: _figure(value, unit, result) for name, (value, unit) in found.items()}
     if not math.isnan(result.same_class):
         figures["same class"] = _figure(100 * result.same_class, "%", result)
+    if result.metric:
+        values = {"float": result.metric_float, "INT8": result.metric_int8, "lost": result.metric_loss}
+        unit = METRICS[result.metric].unit
+        figures |= {f"{result.metric} {name}": _figure(value, unit, result) for name, value in values.items()}
     return Row("gate", "INT8 against float", figures)
 
 

@@ -127,7 +127,8 @@ def samples_in(given: object) -> list[Named]:
     if hasattr(given, "ndim"):
         return [(f"{IN_MEMORY}[{k}]", image, NO_REFERENCE) for k, image in enumerate(_batch(given))]
     if isinstance(given, tuple) and len(given) == 2 and all(hasattr(each, "ndim") for each in given):
-        seen, meant = map(_batch, given)
+        seen, meant = _batch(given[0]), _plain(given[1])  # a reference may be a class, or a class for each pixel
+        meant = meant[None] if np.ndim(given[0]) == 3 else meant
         if len(seen) != len(meant):
             got = f"{len(seen)} images and {len(meant)} references"
             raise ImageError(IN_MEMORY, expected="a reference for each image", got=got, remedy=REMEDY)
@@ -144,10 +145,14 @@ def samples_in(given: object) -> list[Named]:
 
 def _batch(array: Any) -> np.ndarray:
     """One image or a batch of NumPy or torch as (N, C, H, W)."""
-    found = np.asarray(array.detach() if hasattr(array, "detach") else array)
+    found = _plain(array)
     if found.ndim not in (3, 4):
         raise ImageError(IN_MEMORY, expected="a batch of (N, C, H, W)", got=times(found.shape), remedy=REMEDY)
     return found if found.ndim == 4 else found[None]
+
+
+def _plain(array: Any) -> np.ndarray:
+    return np.asarray(array.detach() if hasattr(array, "detach") else array)
 
 
 NO_REFERENCE = np.empty(0, np.float32)

@@ -40,6 +40,9 @@ def gate(
         typer.Option(help="Your own samples in their place: .npy or .npz (N, C, H, W), or a folder of images."),
     ] = None,
     patches: Annotated[int, typer.Option(min=1, max=100_000, help="Test patches of 128 x 128.")] = 32,
+    metric: Annotated[
+        str | None, typer.Option(help="Hold results against references too: psnr, ssim, mae, top1 or iou.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of the patches.")] = 0,
     junit: Annotated[Path | None, typer.Option(help="Write the verdict here as JUnit XML.")] = None,
     record: Annotated[
@@ -76,6 +79,7 @@ def gate(
         images=images,
         patches=patches,
         seed=seed,
+        metric=metric,
     )
     print_rows("float against INT8", verdict.rows)
     for note in verdict.notes:

@@ -118,6 +118,7 @@ WORDS = {
     "forbid": "effect",
     "halo": "exact, or whole px from 0",
     "methods": "names with commas",
+    "metric": "psnr, ssim, mae, top1, iou",
     "name": "profile",
     "need": "limits such as psnr>=44",
     "network": "network",
