@@ -14,9 +14,8 @@ from beers_deploy.dpu.checker.operators import NUMBERS, RULES, SHIFTS, SIZES, ap
 from beers_deploy.dpu.checker.other_rules import INSTEAD
 from beers_deploy.dpu.checker.table import REMARKS
 from beers_deploy.dpu.cost.latency import dpu_power
-from beers_deploy.dpu.graph import Kind
-from beers_deploy.dpu.reading import KINDS
 from beers_deploy.profiles.target import board_names
+from beers_deploy.quant.graph.nodes import KINDS, Kind
 
 TARGET = Path(__file__).parents[1] / "reference" / "operators.md"
 DPUS = {name: load_dpu(name) for name in board_names()}

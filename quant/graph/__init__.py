@@ -1,8 +1,10 @@
 """A network as the short list of operations that a DPU computes: what quantisation works on.
 
+- `nodes`: the one reading of an ONNX file, for `check` and tiling too, with `moves` of pixels in one spelling, the
+  `sizes` of results and how numbers are `quantised`;
 - `operations`: what there is, convolutions to pixel shuffles, which tensors must share a scale, and how 12 bits enter
   int8;
-- `reader`: from float ONNX to a `network`, cut where the host's part ends, with `trials` of what exporters spell out;
+- `reader`: from float ONNX to a `network`, cut where the host's part ends;
 - `tail`: what the host computes behind the last map, kept as ONNX nodes;
 - `writer`: back to float ONNX.
 """

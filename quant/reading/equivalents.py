@@ -242,7 +242,7 @@ def _keeps_channels(source: str, affine: Affine, shapes: Shapes) -> bool:
 def _may_scale_inputs(graph: Nodes, node: NodeProto, name: str, affine: Affine) -> bool:
     """Zeros that a convolution pads with are not shifted: a shift passes one without padding alone."""
     given = attributes_of(node)
-    unpadded = node.op_type == "Conv" and given.get("auto_pad", b"NOTSET") in (b"NOTSET", b"VALID")
+    unpadded = node.op_type == "Conv" and given.get("auto_pad", "NOTSET") in ("NOTSET", "VALID")
     unpadded = unpadded and not any(given.get("pads", []))
     return graph.is_linear(node) and list(node.input).count(name) == 1 and (unpadded or not affine.shift.any())
 

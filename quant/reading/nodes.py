@@ -109,5 +109,6 @@ Step = Callable[[Nodes, NodeProto], list[NodeProto] | None]
 
 
 def attributes_of(node: NodeProto) -> dict[str, Any]:
-    """The attributes that a node states, by name."""
-    return {a.name: helper.get_attribute_value(a) for a in node.attribute}
+    """The attributes that a node states, by name, text as such."""
+    values = {a.name: helper.get_attribute_value(a) for a in node.attribute}
+    return {k: v.decode(errors="replace") if isinstance(v, bytes) else v for k, v in values.items()}

@@ -22,12 +22,12 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 
-import numpy as np
 import onnx
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.graph.trials import MOVES, with_shuffles
-from beers_deploy.quant.onnx_file import constants, fixed_tile_px
+from beers_deploy.quant.graph.moves import MOVES, with_shuffles
+from beers_deploy.quant.graph.nodes import Node, OnnxGraph
+from beers_deploy.quant.onnx_file import fixed_tile_px
 from beers_deploy.quant.tiling.steps import STEPS, Along, Step, refused
 from beers_deploy.quant.untrusted import contradictions
 
@@ -81,8 +81,8 @@ def tiling_of(model: onnx.ModelProto, where: str = "tiled model") -> Tiling:
 
 def _tiling_of(model: onnx.ModelProto, where: str) -> Tiling:
     with contradictions(where):
-        plain, held = with_shuffles(model), constants(model)
-        rows, columns = (_Walk(plain, held, side) for side in (0, 1))
+        graph = with_shuffles(model)
+        rows, columns = (_Walk(graph, axis) for axis in (0, 1))
         (channels_in, channels_out), fixed_px = _channels(model), fixed_tile_px(model)
         lattice_px = math.lcm(rows.lattice_px, columns.lattice_px)
         radius_px = max(rows.radius_px, columns.radius_px)
@@ -145,14 +145,15 @@ class _Grid:
 class _Walk:
     """Follows the image along one side, from node to node, and back what a cell of the lattice reads."""
 
-    def __init__(self, model: onnx.ModelProto, held: dict[str, np.ndarray], side: int) -> None:
-        self._side, self._values, self._shapes = side, held, {name: value.shape for name, value in held.items()}
-        self._grids = {value.name: _Grid(Fraction(1), 0) for value in model.graph.input if value.name not in held}
-        self._steps: list[tuple[onnx.NodeProto, Step]] = []
+    def __init__(self, graph: OnnxGraph, axis: int) -> None:
+        self._graph, self._axis = graph, axis
+        self._shapes = {name: value.shape for name, value in graph.constants.items()}
+        self._grids = dict.fromkeys(graph.inputs, _Grid(Fraction(1), 0))
+        self._steps: list[tuple[Node, Step]] = []
         self.least_px = 1
-        for node in model.graph.node:
+        for node in graph.nodes:
             self._visit(node)
-        output = model.graph.output[0].name
+        output = graph.outputs[0]
         if output not in self._grids:
             raise refused("an output that depends on the image", "one of constants alone")
         self.scale, extra = self._grids[output].per_px, self._grids[output].extra
@@ -164,25 +165,24 @@ class _Walk:
             raise refused(f"a network that repeats within {PERIOD} pixels", f"a period of {period}")
         self.radius_px = self._radius_px(output)
 
-    def _visit(self, node: onnx.NodeProto) -> None:
-        read = [self._grids[name] for name in node.input if name in self._grids]
-        given = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
-        at = Along(node, given, self._side, read[0].extra if read else 0, self._values, self._shapes)
+    def _visit(self, node: Node) -> None:
+        read = [self._grids[name] for name in node.inputs if name in self._grids]
+        at = Along(node, self._axis, read[0].extra if read else 0, self._graph, self._shapes)
         if read:
             step = self._step(at, read)
             at.require(step.growth > 0, "of no stride")
             self._steps.append((node, step))
-            self._grids.update(dict.fromkeys(node.output, _Grid(read[0].per_px * step.growth, step.extra)))
+            self._grids.update(dict.fromkeys(node.outputs, _Grid(read[0].per_px * step.growth, step.extra)))
             if step.mirrored:
                 self.least_px = max(self.least_px, math.ceil((1 + step.mirrored) / read[0].per_px))
-        elif node.op_type != "Constant":  # such as weights dequantised in a board file
+        else:  # such as weights dequantised in a board file
             at.require(node.op_type in KEEPING, "of constants alone: fold them")
-            self._shapes[node.output[0]] = self._shapes[node.input[0]]
+            self._shapes[node.outputs[0]] = self._shapes[node.inputs[0]]
 
     def _step(self, at: Along, read: list[_Grid]) -> Step:
         if at.node.op_type in STEPS:
-            at.require(at.node.input[0] in self._grids and len(read) == 1, "steered by the image")
-            at.require(len([name for name in at.node.output if name]) == 1, "which tells places")
+            at.require(at.node.inputs[0] in self._grids and len(read) == 1, "steered by the image")
+            at.require(len([name for name in at.node.outputs if name]) == 1, "which tells places")
             return STEPS[at.node.op_type](at)
         _require_pointwise(at)
         at.require(len(set(read)) == 1, "of tensors of unequal sizes")
@@ -192,8 +192,8 @@ class _Walk:
         """How far beyond a cell of the lattice lies what its result depends on."""
         read = {output: (0, self._grids[output].in_cell(self.lattice_px) - 1)}
         for node, step in reversed(self._steps):
-            wanted = [read[name] for name in node.output if name in read]
-            for name in (name for name in node.input if wanted and name in self._grids):
+            wanted = [read[name] for name in node.outputs if name in read]
+            for name in (name for name in node.inputs if wanted and name in self._grids):
                 size = self._grids[name].in_cell(self.lattice_px) + self._grids[name].extra
                 ends = step.reads(*_hull(wanted), size)
                 read[name] = _hull([ends, read.get(name, ends)])
@@ -207,16 +207,16 @@ def _hull(ranges: list[tuple[int, int]]) -> tuple[int, int]:
 def _require_pointwise(at: Along) -> None:
     kind = at.node.op_type
     if kind in AXES:
-        at.require(at.given.get("axis", AXES[kind]) in (1, -3), "along other sides than the channels")
+        at.require(at.given("axis", AXES[kind]) in (1, -3), "along other sides than the channels")
     elif kind == "Gather":  # an activation as a table
-        table = at.shapes.get(at.node.input[0], ())
-        at.require(len(table) == 1 and at.given.get("axis", 0) == 0, "which moves pixels")
+        table = at.shapes.get(at.node.inputs[0], ())
+        at.require(len(table) == 1 and at.given("axis", 0) == 0, "which moves pixels")
     else:
         why = next(
             (why for why, marks in WHY.items() if any(mark in kind for mark in marks)), "of which it is not known"
         )
         at.require(kind in POINTWISE, why)
-        flat = all(set(at.shapes.get(name, ())[-2:]) <= {1} for name in at.node.input)
+        flat = all(set(at.shapes.get(name, ())[-2:]) <= {1} for name in at.node.inputs)
         at.require(flat, "with a constant that differs from pixel to pixel")
 
 

@@ -153,18 +153,20 @@ def mul_constant(op: Operation, dpu: Dpu) -> Finding | None:
     return Finding(f"a constant factor of shape {shape}", "use one factor a channel, shape (1, C, 1, 1)")
 
 
+CORNERS = "coordinate_transformation_mode"
+
+
 def pad_mode(op: Operation, dpu: Dpu) -> Finding | None:
     """Padding is constant or symmetric; reflect runs on the CPU ({documents[operators]}, pad)."""
-    mode = op.attributes.get("mode", b"constant")
-    if mode == b"constant":
+    mode = op.attributes.get("mode", "constant")
+    if mode == "constant":
         return None
-    name = mode.decode() if isinstance(mode, bytes) else mode
-    return Finding(f"pad mode {name}", "use zero padding inside the convolution, or pad the image on the host")
+    return Finding(f"pad mode {mode}", "use zero padding inside the convolution, or pad the image on the host")
 
 
 def resize_mode(op: Operation, dpu: Dpu) -> Finding | None:
     """Resize is nearest without align_corners, or bilinear ({documents[operators]}, resize)."""
-    mode, corners = _text(op, "mode", "nearest"), _text(op, "coordinate_transformation_mode", "half_pixel")
+    mode, corners = op.attributes.get("mode", "nearest"), op.attributes.get(CORNERS, "half_pixel")
     if mode == "linear" or (mode == "nearest" and corners != "align_corners"):
         return None
     return Finding(f"resize mode {mode} with {corners}", "use nearest with coordinate mode asymmetric")
@@ -176,9 +178,9 @@ def resize_scale(op: Operation, dpu: Dpu) -> Finding | None:
     With half-pixel centres {resize[half_pixel_scale]} ({resize[half_pixel_scale].source}).
     """
     before, after = op.in_shapes[0] if op.in_shapes else None, op.out_shape
-    if _text(op, "mode", "nearest") != "linear" or before is None or after is None:
+    if op.attributes.get("mode") != "linear" or before is None or after is None:
         return None
-    half = _text(op, "coordinate_transformation_mode", "half_pixel") == "half_pixel"
+    half = op.attributes.get(CORNERS, "half_pixel") == "half_pixel"
     limit = dpu.limit("resize", "half_pixel_scale" if half else "bilinear_scale")
     scales = {after[1] / before[1], after[2] / before[2]}
     if scales <= {2.0, 4.0, 8.0} and len(scales) == 1 and limit.low <= min(scales) <= limit.high:
@@ -190,11 +192,6 @@ def resize_scale(op: Operation, dpu: Dpu) -> Finding | None:
 def resize_channels(op: Operation, dpu: Dpu) -> Finding | None:
     """Resize takes at most {limits[channels]} channels ({documents[operators]})."""
     return _too_many(op.channels[0], dpu.channels_max, "reduce them with a 1 x 1 convolution before")
-
-
-def _text(op: Operation, key: str, default: str) -> str:
-    value = op.attributes.get(key, default)
-    return value.decode() if isinstance(value, bytes) else str(value)
 
 
 WINDOWED = {"conv", "grouped conv", "depthwise", "transposed", "pool"}

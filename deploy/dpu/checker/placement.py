@@ -155,7 +155,7 @@ def _reached(operations: Sequence[Operation], starts: set[str], *, forwards: boo
 
 def _is_host_front(op: Operation, network: Network, *, trails: bool) -> bool:
     """In a quantised file whatever leads to the core; in a float file scaling, mirroring, and pixels to channels."""
-    mirrors = op.op_type == "Pad" and op.inputs[0] in network.inputs and op.attributes.get("mode") == b"reflect"
+    mirrors = op.op_type == "Pad" and op.inputs[0] in network.inputs and op.attributes.get("mode") == "reflect"
     moves = (op.op_type == "SpaceToDepth" or mirrors) and not trails
     return network.quantised or op.op_type in SCALING or moves
 

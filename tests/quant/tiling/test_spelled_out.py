@@ -10,7 +10,7 @@ from onnx import helper
 from torch import nn
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.graph.trials import with_shuffles
+from beers_deploy.quant.graph.moves import with_shuffles
 from beers_deploy.quant.tiling.walk import Tiling, tiling_of
 from tests.quant.tiling.small_networks import graph, whole
 
@@ -40,7 +40,7 @@ def test_what_torch_makes_of_an_unshuffle_is_one(size: int, any_size: bool, tmp_
 def test_a_shuffle_of_an_old_opset_is_one(tmp_path: Path) -> None:
     model = exported(nn.Sequential(nn.Conv2d(1, 4, 1), nn.PixelShuffle(2)), False, tmp_path, opset=9)
     assert "DepthToSpace" not in {node.op_type for node in model.graph.node}
-    assert with_shuffles(model).graph.node[-1].op_type == "DepthToSpace"
+    assert with_shuffles(model).nodes[-1].op_type == "DepthToSpace"
     assert tiling_of(model).scale == 2
 
 
@@ -67,7 +67,7 @@ LEFT = {
 
 @pytest.mark.parametrize("name", LEFT)
 def test_whatever_else_moves_pixels_is_left(name: str) -> None:
-    assert with_shuffles(LEFT[name]).graph == LEFT[name].graph
+    assert [node.proto for node in with_shuffles(LEFT[name]).nodes] == list(LEFT[name].graph.node)
     with pytest.raises(ModelError, match="which moves pixels"):
         tiling_of(LEFT[name])
 

@@ -1,0 +1,155 @@
+"""Moves of pixels that exporters write in several ways: shuffles as Reshape and Transpose, resizes of all opsets.
+
+torch writes PixelUnshuffle as Reshape and Transpose, and PixelShuffle in old opsets. What such nodes do is tried out
+on an image of numbered pixels.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import numpy as np
+import onnx
+from onnx import helper, numpy_helper
+from onnx.reference import ReferenceEvaluator
+
+from beers_deploy.quant.graph.nodes import Node, OnnxGraph
+from beers_deploy.quant.graph.operations import Shuffle
+
+MOVES = ("Reshape", "Transpose", "Squeeze", "Unsqueeze")
+ORDERS = {"CRD": True, "DCR": False}
+"""The modes of ONNX's DepthToSpace, and whether columns come first."""
+SIDES_PX = 24, 35
+"""Of images that moves are tried on: blocks of 2 to 8 fit one of them."""
+VALUES = 1 << 22
+"""Most of an image of a stated size."""
+
+
+def with_shuffles(model: onnx.ModelProto) -> OnnxGraph:
+    """The nodes of a model, with one DepthToSpace or SpaceToDepth for each that is spelled out.
+
+    Its `mode`, of SpaceToDepth too, says in which order the channels come: one of `ORDERS`, empty for any other.
+    """
+    graph = OnnxGraph(model)
+    if not any(node.op_type in MOVES for node in graph.nodes):
+        return graph
+    inferred = onnx.shape_inference.infer_shapes(model).graph
+    known = {value.name: value.type.tensor_type.shape.dim for value in (*inferred.input, *inferred.value_info)}
+    for chain in _chains(graph):
+        sizes = [dim.dim_value for dim in known.get(chain[0].inputs[0], ())]
+        shuffle = _shuffle(chain, sizes, model, graph.constants)
+        if shuffle is not None:
+            graph.nodes = [shuffle if node is chain[-1] else node for node in graph.nodes if node not in chain[:-1]]
+    return graph
+
+
+def _chains(graph: OnnxGraph) -> list[list[Node]]:
+    """Nodes that do nothing but move pixels, each of which only the next one reads."""
+    chains: dict[str, list[Node]] = {}  # by the tensor that they have come to
+    for node in graph.nodes:
+        if node.op_type in MOVES:
+            before = chains.pop(node.inputs[0], []) if graph.reads(node.inputs[0]) == 1 else []
+            chains[node.outputs[0]] = [*before, node]
+    return list(chains.values())
+
+
+def _shuffle(
+    chain: list[Node], sizes: list[int], model: onnx.ModelProto, constants: Mapping[str, np.ndarray]
+) -> Node | None:
+    """The pixel shuffle that a chain is, of an image of these sizes, 0 where they are free; None of what is none."""
+    for side_px in SIDES_PX if len(sizes) == 4 and sizes[1] else ():
+        shape = sizes[0] or 1, sizes[1], sizes[2] or side_px, sizes[3] or 2 * side_px
+        if math.prod(shape) > VALUES:
+            continue
+        image = np.arange(math.prod(shape)).reshape(shape)
+        result = _moved(chain, image, model, constants)
+        growth = _growth(result, shape)
+        if growth is None:
+            continue
+        up, block = growth > 1, max(growth.numerator, growth.denominator)
+        trials = ((mode, Shuffle("", "", "", block, up, first)(image)) for mode, first in ORDERS.items())
+        mode = next((mode for mode, moved in trials if block > 1 and np.array_equal(moved, result)), "")
+        kind, ends = "DepthToSpace" if up else "SpaceToDepth", ([chain[0].inputs[0]], [chain[-1].outputs[0]])
+        node = Node.of(helper.make_node(kind, *ends, chain[-1].name, blocksize=block))
+        return replace(node, name=chain[0].name, attributes={"blocksize": block, "mode": mode})
+    return None
+
+
+def _moved(
+    chain: list[Node], image: np.ndarray, model: onnx.ModelProto, constants: Mapping[str, np.ndarray]
+) -> np.ndarray:
+    """Where a chain takes the pixels of an image; nothing where it does not run."""
+    read = {name for node in chain for name in node.inputs[1:]}
+    held = [numpy_helper.from_array(constants[name], name) for name in read if name in constants]
+    names = chain[0].inputs[0], chain[-1].outputs[0]
+    ends = [helper.make_tensor_value_info(name, onnx.TensorProto.INT64, None) for name in names]
+    graph = helper.make_graph([node.proto for node in chain], "moves", ends[:1], ends[1:], held)
+    try:
+        alone = helper.make_model(graph, opset_imports=model.opset_import)
+        (result,) = ReferenceEvaluator(alone).run(None, {names[0]: image})
+    except Exception:  # noqa: BLE001 - the evaluator raises whatever it stumbles over
+        return np.array([])
+    return np.asarray(result)
+
+
+def _growth(result: np.ndarray, shape: tuple[int, int, int, int]) -> Fraction | None:
+    """Pixels of a shuffle's result for one of its source, along either side; None of what is no shuffle.
+
+    It is one where each pixel comes from its own place: the pixel there, or the block of them.
+    """
+    if result.ndim != 4 or len(result) != shape[0]:
+        return None
+    growth = Fraction(result.shape[2], shape[2])
+    rows, columns = (source // growth.denominator for source in np.unravel_index(result, shape)[2:])
+    down, across = (np.arange(side) // growth.numerator for side in result.shape[2:])
+    whole = 1 in (growth.numerator, growth.denominator)
+    return growth if whole and (rows == down[:, None]).all() and (columns == across).all() else None
+
+
+PLACES: dict[str, Callable[[int, float], float]] = {
+    "asymmetric": lambda pixel, factor: pixel / factor,
+    "half_pixel": lambda pixel, factor: (pixel + 0.5) / factor - 0.5,
+    "pytorch_half_pixel": lambda pixel, factor: (pixel + 0.5) / factor - 0.5,
+    "tf_half_pixel_for_nn": lambda pixel, factor: (pixel + 0.5) / factor,
+}
+"""Where a pixel of an enlarged image lies in the image before. ONNX's other coordinates depend on the sizes."""
+ROUNDINGS: dict[str, Callable[[float], int]] = {
+    "floor": math.floor,
+    "ceil": math.ceil,
+    "round_prefer_floor": lambda place: math.ceil(place - 0.5),
+    "round_prefer_ceil": lambda place: math.floor(place + 0.5),
+}
+
+
+@dataclass(frozen=True)
+class Resizing:
+    """A Resize, or an Upsample of older opsets, with ONNX's defaults filled in.
+
+    `factors` are those of N, C, H and W; none where they are computed, or a size is stated.
+    """
+
+    factors: tuple[float, ...]
+    mode: str
+    where: str
+    rounding: str
+
+    @classmethod
+    def of(cls, node: Node, graph: OnnxGraph) -> "Resizing":
+        """What a node states."""
+        old = node.op_type == "Upsample" or len(node.inputs) == 2  # before opset 11
+        given, scales = node.attributes.get, graph.numbers(node, 1 if old else 2, "scales") or []
+        factors = dict(zip((axis % 4 for axis in given("axes", range(4))), scales, strict=bool(scales)))
+        return cls(
+            tuple(factors.get(axis, 1.0) for axis in range(4)) if factors else (),
+            given("mode", "nearest"),
+            given("coordinate_transformation_mode", "asymmetric" if old else "half_pixel"),
+            given("nearest_mode", "floor" if old else "round_prefer_floor"),
+        )
+
+    def makes_blocks(self, factor: int) -> bool:
+        """Whether nearest pixels, enlarged by a factor, are those whose block each pixel of the result lies in."""
+        if self.where not in PLACES or self.rounding not in ROUNDINGS:
+            return False
+        place, rounded = PLACES[self.where], ROUNDINGS[self.rounding]
+        return all(rounded(place(k, factor)) == k // factor for k in range(factor))

@@ -1,0 +1,174 @@
+"""An ONNX file read once: its nodes with their attributes, kinds and windows, and its constants as arrays.
+
+Nothing is refused here: `quantize` takes a short list of operations of it, tiling what it can prove, `check` all.
+"""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+import onnx
+
+from beers_deploy.quant.onnx_file import constants
+from beers_deploy.quant.reading.nodes import attributes_of
+
+Pair = tuple[int, int]
+"""Of rows and columns."""
+Kind = Literal[
+    "conv", "grouped conv", "depthwise", "transposed", "add", "mul", "pool", "activation", "concat", "pad", "resize",
+    "pixel shuffle", "argmax", "quantise", "dequantise", "other",
+]  # fmt: skip
+POOLS = ("AveragePool", "GlobalAveragePool")
+OPERATORS: dict[Kind, tuple[str, ...]] = {
+    "conv": ("Conv", "QLinearConv"),
+    "transposed": ("ConvTranspose",),
+    "add": ("Add", "QLinearAdd"),
+    "mul": ("Mul", "QLinearMul"),
+    "concat": ("Concat", "QLinearConcat"),
+    "pad": ("Pad",),
+    "resize": ("Resize", "Upsample"),
+    "pixel shuffle": ("DepthToSpace", "SpaceToDepth"),
+    "argmax": ("ArgMax",),
+    "quantise": ("QuantizeLinear",),
+    "dequantise": ("DequantizeLinear",),
+    "activation": ("Relu", "LeakyRelu", "QLinearLeakyRelu", "PRelu", "HardSigmoid", "HardSwish"),
+    "pool": ("MaxPool", *POOLS, *(f"QLinear{pool}" for pool in POOLS), "GlobalMaxPool"),
+}
+KINDS: dict[str, Kind] = {op_type: kind for kind, op_types in OPERATORS.items() for op_type in op_types}
+WEIGHTS = {"Conv": 1, "ConvInteger": 1, "ConvTranspose": 1, "QLinearConv": 3}
+"""Operator, and which input holds its weights."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """What a convolution or a pool reads for one output pixel; pairs are (height, width), axis 0 is the height."""
+
+    kernel: Pair = (1, 1)
+    stride: Pair = (1, 1)
+    pads: tuple[int, int, int, int] = (0, 0, 0, 0)  # top, left, bottom, right
+    dilation: Pair = (1, 1)
+    output_padding: Pair = (0, 0)
+
+    def extent(self, axis: int) -> int:
+        """Pixels from the first to the last that it reads."""
+        return (self.kernel[axis] - 1) * self.dilation[axis] + 1
+
+    def slid(self, axis: int, size: int, ceil: bool = False) -> int:
+        """How many places it has on so many pixels; with `ceil` the last may reach beyond the padding."""
+        stride, before = self.stride[axis], self.pads[axis]
+        room = size + before + self.pads[axis + 2] - self.extent(axis)
+        return min(-(-room // stride), (size + before - 1) // stride) + 1 if ceil else room // stride + 1
+
+    def put_down(self, axis: int, size: int) -> int:
+        """How many pixels it makes of so many where it is put down at each, as a transposed convolution does."""
+        beyond = self.output_padding[axis] - self.pads[axis] - self.pads[axis + 2]
+        return self.stride[axis] * (size - 1) + self.extent(axis) + beyond
+
+    def padded(self, auto_pad: str, size: Pair) -> "Window":
+        """With the pads that `auto_pad` asks for on such a map: as many places as size / stride, rounded up."""
+        total = [0, 0] if auto_pad == "VALID" else [self._lacking(axis, size[axis]) for axis in (0, 1)]
+        less, more = [t // 2 for t in total], [t - t // 2 for t in total]
+        begin, end = (more, less) if auto_pad == "SAME_LOWER" else (less, more)
+        return replace(self, pads=(begin[0], begin[1], end[0], end[1]))
+
+    def _lacking(self, axis: int, size: int) -> int:
+        return max(self.extent(axis) - self.stride[axis] + -size % self.stride[axis], 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """An operator; an input that is left out has no name.
+
+    Attributes:
+        op_type: ONNX's name of it.
+        name: its own, or its first result's.
+        inputs: the tensors that it reads, in ONNX's order.
+        outputs: the tensors that it writes.
+        attributes: what it states, by name.
+        proto: as the file holds it.
+    """
+
+    op_type: str
+    name: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    attributes: Mapping[str, Any]
+    proto: onnx.NodeProto
+
+    @classmethod
+    def of(cls, proto: onnx.NodeProto) -> "Node":
+        """What a file holds of it."""
+        name = proto.name or proto.output[0]
+        return cls(proto.op_type, name, tuple(proto.input), tuple(proto.output), attributes_of(proto), proto)
+
+    def __str__(self) -> str:
+        return f"{self.op_type} {self.name}"
+
+    def window(self, kernel: Sequence[int] = (), size: Pair = (0, 0)) -> Window | None:
+        """How it moves over rows and columns, None where it states no window of these.
+
+        Args:
+            kernel: of its weights; what it states where there are none.
+            size: of the map that it reads, or any that is smaller or larger by whole strides: for `auto_pad`.
+        """
+        given = self.attributes.get
+        sides = kernel or given("kernel_shape", ()), given("strides", (1, 1)), given("dilations", (1, 1))
+        pads, beyond = given("pads", (0, 0, 0, 0)), given("output_padding", (0, 0))
+        if [len(each) for each in (*sides, pads, beyond)] != [2, 2, 2, 4, 2]:
+            return None
+        (rows, columns), stride, dilation = sides
+        window = Window((rows, columns), tuple(stride), tuple(pads), tuple(dilation), tuple(beyond))
+        auto_pad = given("auto_pad", "NOTSET")
+        return window.padded(auto_pad, size) if auto_pad in ("VALID", "SAME_UPPER", "SAME_LOWER") else window
+
+
+class OnnxGraph:
+    """The nodes of a model in order, but for those that only hold a constant.
+
+    Attributes:
+        nodes: in order.
+        constants: initializers and what nodes of the kind Constant hold, by name.
+        inputs: tensors that are no constants, with their types and sizes.
+        outputs: the names of the results.
+    """
+
+    def __init__(self, model: onnx.ModelProto) -> None:
+        self.constants = constants(model)
+        self.nodes = [Node.of(node) for node in model.graph.node if node.op_type != "Constant"]
+        self.inputs = {v.name: v.type.tensor_type for v in model.graph.input if v.name not in self.constants}
+        self.outputs = tuple(value.name for value in model.graph.output)
+
+    @cached_property
+    def readers(self) -> Mapping[str, list[Node]]:
+        """The nodes that read each tensor, one as often as it does."""
+        found = defaultdict(list)
+        for node in self.nodes:
+            for name in node.inputs:
+                found[name].append(node)
+        return found
+
+    def reads(self, name: str) -> int:
+        """How often a tensor is read, by nodes and as a result."""
+        return len(self.readers.get(name, ())) + self.outputs.count(name)
+
+    def value(self, node: Node, place: int) -> np.ndarray | None:
+        """A constant that a node reads, None where it reads none there."""
+        return self.constants.get(node.inputs[place]) if place < len(node.inputs) else None
+
+    def numbers(self, node: Node, place: int, key: str, otherwise: Sequence[float] = ()) -> list[Any] | None:
+        """What a node states in a constant input or, of older opsets, in an attribute; None where it is computed."""
+        if place < len(node.inputs) and node.inputs[place]:
+            value = self.value(node, place)
+            return None if value is None else list(value.ravel().tolist())
+        return list(node.attributes.get(key, otherwise))
+
+
+def kind_of(node: Node, weight: np.ndarray | None) -> Kind:
+    """What a node is, of a convolution by its weights."""
+    kind = KINDS.get(node.op_type, "other")
+    if kind != "conv" or weight is None or node.attributes.get("group", 1) == 1:
+        return kind
+    return "depthwise" if weight.shape[1] == 1 else "grouped conv"

@@ -1,0 +1,229 @@
+"""Which nodes of a file compute on integers, with which scales, and which nodes are mere notation for that.
+
+A tensor holds one of four things:
+
+1. "float": what the host computes with.
+2. "int8": written by QuantizeLinear, a cast to int8 or an integer kernel (or the same numbers as uint8 around 128).
+3. "seen": int8 seen as float, behind DequantizeLinear.
+4. "wide": a sum of products of such, on its way to a QuantizeLinear.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from onnx import TensorProto
+
+from beers_deploy.quant.graph.nodes import WEIGHTS, Node, OnnxGraph
+
+RESULT = -1
+ONE = {0: (1, 2), RESULT: (3, 4)}
+TWO = {0: (1, 2), 3: (4, 5), RESULT: (6, 7)}
+FORMATS: dict[str, dict[int, tuple[int, int]]] = {
+    **dict.fromkeys(("QLinearConv", "QLinearAdd", "QLinearMul"), TWO),
+    **dict.fromkeys(("QLinearAveragePool", "QLinearGlobalAveragePool", "QLinearLeakyRelu"), ONE),
+    "QuantizeLinear": {RESULT: (1, 2)},
+    "DequantizeLinear": {0: (1, 2)},
+}
+"""Where an operator names the scale and zero point of input i, or of its result."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How a quantised tensor is to be read: value = scale * (q - zero_point)."""
+
+    scales: tuple[float, ...]
+    zero_points: tuple[int, ...]
+    integer_type: str
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether zero stands for zero: int8 around 0, or the same numbers as uint8 around 128."""
+        middle = 128 if self.integer_type == "uint8" else 0
+        return self.integer_type in ("int8", "uint8", "int32") and set(self.zero_points) == {middle}
+
+    @property
+    def frac_bits(self) -> int | None:
+        """The p of a scale 2^-p, None for any other scale."""
+        if len(self.scales) != 1:
+            return None
+        fraction, exponent = math.frexp(self.scales[0])
+        return 1 - exponent if fraction == 0.5 else None
+
+
+def stated(node: Node, graph: OnnxGraph) -> Iterator[tuple[str, Scale]]:
+    """The tensors whose format a node names, constants among them, each with that format."""
+    places = FORMATS.get(node.op_type, {})
+    if node.op_type == "QLinearConcat":
+        places = {RESULT: (0, 1)} | {i: (i + 1, i + 2) for i in range(2, len(node.inputs), 3)}
+    for place, (scale, zero_point) in places.items():
+        name = node.outputs[0] if place == RESULT else node.inputs[place]
+        scales, zeros = graph.constants.get(node.inputs[scale], np.zeros(0)), graph.value(node, zero_point)
+        if zeros is None:  # its type is the constant's own, or ONNX's where QuantizeLinear names none
+            zeros = np.zeros(1, graph.constants[name].dtype if name in graph.constants else np.uint8)
+        yield name, Scale(tuple(scales.astype(float).ravel()), tuple(map(int, zeros.ravel())), str(zeros.dtype))
+
+
+Content = Literal["float", "int8", "seen", "wide"]
+
+BYTES = (TensorProto.INT8, TensorProto.UINT8)
+ACTIVATIONS = {"Relu", "LeakyRelu", "PRelu", "HardSigmoid", "HardSwish", "Clip"}
+OPERANDS = {
+    **dict.fromkeys(("QuantizeLinear", "DequantizeLinear"), slice(0, 1)),
+    **dict.fromkeys(("QLinearAdd", "QLinearMul"), slice(0, 4, 3)),
+    "QLinearConcat": slice(2, None, 3),
+}
+"""Which inputs are tensors of the network; the rest are scales and zero points."""
+ELEMENTWISE = {"Add", "Mul", "Concat", "QLinearAdd", "QLinearMul", "QLinearConcat"}
+"""Operators whose constant operands are numbers of the network."""
+
+
+class Integers:
+    """The number formats of one file."""
+
+    def __init__(self, graph: OnnxGraph) -> None:
+        self.present = any(node.op_type in FORMATS for node in graph.nodes)
+        self._graph, self._constants = graph, graph.constants
+        self._same: dict[str, str] = {}
+        self._seen: dict[str, str] = {}
+        self._formats: dict[str, tuple[Scale, ...]] = {}  # the writer's first, then whatever contradicts it
+        self._content: dict[str, Content] = {
+            name: "int8" if kind.elem_type in BYTES else "float" for name, kind in graph.inputs.items()
+        }
+        self._becomes = self._rounded()
+        for node in graph.nodes:
+            self._read_formats(node)
+            self._follow(node)
+
+    def resolve(self, name: str) -> str:
+        """The tensor that a name stands for once notation is dissolved."""
+        while name in self._same:
+            name = self._same[name]
+        return name
+
+    def constant(self, name: str) -> np.ndarray | None:
+        """A constant, dequantised or not, as it is stored; None of what nodes compute."""
+        return self._constants.get(self.resolve(name))
+
+    def weight(self, node: Node) -> np.ndarray | None:
+        """The weights of a convolution as stored; None where there are none, or nodes compute them."""
+        place = WEIGHTS.get(node.op_type, len(node.inputs))
+        return self.constant(node.inputs[place]) if place < len(node.inputs) else None
+
+    def is_integer(self, node: Node) -> bool:
+        """Whether the file computes this node on integers."""
+        return self._content.get(node.outputs[0], "float") in ("int8", "wide")
+
+    def is_notation(self, node: Node) -> bool:
+        """Whether a node only says how its neighbours' integers are to be read."""
+        result = node.outputs[0]
+        if node.op_type == "DequantizeLinear" and result not in self._same:
+            readers = self._graph.readers.get(result, [])
+            return result not in self._graph.outputs and all(map(self.is_integer, readers))
+        return result in self._same
+
+    def activations(self, node: Node) -> tuple[str, ...]:
+        """The tensors of the network that a node reads."""
+        names = [name for name in self._operands(node) if name]
+        if self.is_integer(node) and node.op_type != "QuantizeLinear":
+            names = [self._seen.get(name, name) for name in names]
+        return tuple(name for name in map(self.resolve, names) if name not in self._constants)
+
+    def operand(self, node: Node) -> np.ndarray | None:
+        """The first constant among what an operator computes with, as stored."""
+        found = (self.constant(name) for name in self._operands(node))
+        return next((value for value in found if value is not None), None)
+
+    def formats(self, node: Node) -> dict[str, tuple[Scale, ...]]:
+        """Of a node's tensors by role: "input 0", ..., "weight", "bias", "constant 1", "output".
+
+        Several where the file contradicts itself, the writer's first; none where it says nothing.
+        """
+        own, numbers = dict(stated(node, self._graph)), self._numbers(node)
+        found = {role: self._formats.get(self.resolve(name), ()) for role, name in self._tensors(node).items()}
+        return found | {role: (own[n],) if n in own else self._formats.get(n, ()) for role, n in numbers.items()}
+
+    def numbers(self, node: Node) -> dict[str, np.ndarray | None]:
+        """The constants of a node as stored, by role as in `formats`; None for one that other nodes compute."""
+        return {role: self.constant(name) for role, name in self._numbers(node).items()}
+
+    def _operands(self, node: Node) -> tuple[str, ...]:
+        default = slice(0, 1) if node.op_type.startswith("QLinear") else slice(None)
+        return node.inputs[OPERANDS.get(node.op_type, default)]
+
+    def _tensors(self, node: Node) -> dict[str, str]:
+        """The activations that an integer node reads and writes, by role."""
+        if not self.is_integer(node):
+            return {}
+        inputs = {f"input {i}": name for i, name in enumerate(self.activations(node))}
+        result = node.outputs[0]
+        return inputs | {"output": result if self._content[result] == "int8" else self._becomes[result]}
+
+    def _numbers(self, node: Node) -> dict[str, str]:
+        """What an integer node computes with besides activations, by role."""
+        names: dict[str, str] = {}
+        if not self.is_integer(node):
+            return names
+        if node.op_type in ("Conv", "ConvTranspose", "QLinearConv"):
+            behind = node.inputs[1:] if node.op_type != "QLinearConv" else (node.inputs[3], *node.inputs[8:])
+            names = dict(zip(("weight", "bias"), behind, strict=False))
+        elif node.op_type in ELEMENTWISE:
+            operands = enumerate(self._operands(node))
+            names = {f"constant {i}": name for i, name in operands if self.constant(name) is not None}
+        return {role: name for role, name in names.items() if name}
+
+    def _follow(self, node: Node) -> None:
+        """Work out what a node's results hold, from what its inputs hold."""
+        content = self._result(node)
+        self._content |= dict.fromkeys(node.outputs, content)
+        source, result = node.inputs[0] if node.inputs else "", node.outputs[0]
+        if node.op_type == "DequantizeLinear":
+            aliases = self._seen if self.constant(source) is None else self._same
+            aliases[result] = source
+        elif node.op_type == "QuantizeLinear" and self._content.get(source) == "wide":
+            self._same[result] = source
+            self._give(source, self._formats[result][0])
+        elif content == "int8" and result not in self._formats and source in self._formats:
+            self._give(result, self._formats[source][0])
+
+    def _result(self, node: Node) -> Content:
+        if node.op_type == "DequantizeLinear":
+            return "seen"
+        if node.op_type in FORMATS or node.op_type == "QLinearConcat":
+            return "int8"
+        if node.op_type == "Cast":
+            return "int8" if node.attributes.get("to") in BYTES else "float"
+        names = [self.resolve(name) for name in node.inputs if name]
+        holds = {self._content.get(name, "float") for name in names if name not in self._constants}
+        if holds == {"int8"}:
+            return "int8"
+        return "wide" if holds and holds <= {"seen", "wide"} and node.outputs[0] in self._becomes else "float"
+
+    def _rounded(self) -> dict[str, str]:
+        """The int8 tensor that each one becomes that is rounded next, or behind activations."""
+        found: dict[str, str] = {}
+        for node in reversed(self._graph.nodes):
+            readers = self._graph.readers.get(node.outputs[0], [])
+            kinds = {reader.op_type for reader in readers}
+            if node.outputs[0] in self._graph.outputs or not kinds:
+                continue
+            if kinds == {"QuantizeLinear"}:
+                found[node.outputs[0]] = readers[0].outputs[0]
+            elif len(readers) == 1 and kinds <= ACTIVATIONS and readers[0].outputs[0] in found:
+                found[node.outputs[0]] = found[readers[0].outputs[0]]
+        return found
+
+    def _read_formats(self, node: Node) -> None:
+        """A constant's format is its reader's own: two nodes may read the same bytes at two scales."""
+        for name, scale in stated(node, self._graph):
+            if name not in self._constants:
+                self._give(self.resolve(name), scale)
+            elif node.op_type == "DequantizeLinear":
+                self._give(node.outputs[0], scale)
+
+    def _give(self, tensor: str, scale: Scale) -> None:
+        known = self._formats.get(tensor, ())
+        if scale not in known:
+            self._formats[tensor] = (*known, scale)
