@@ -21,7 +21,7 @@ from beers_deploy.quant.core import IntCore, Shifts, target_shifts
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.free import quantise_free
 from beers_deploy.quant.gate import compare, gate_row
-from beers_deploy.quant.integer import integer_rows
+from beers_deploy.quant.integer.reference import integer_rows
 from beers_deploy.quant.onnx_file import faults_named, require_quantised
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import OwnSamples, samples_of

@@ -17,16 +17,15 @@ from beers_deploy.profiles.figures import Check
 from beers_deploy.quant.encodings import encoding_faults, read_core
 from beers_deploy.quant.ends import ZERO
 from beers_deploy.quant.graph import CORRECTION
-from beers_deploy.quant.onnx_file import any_size, constants, with_outputs
+from beers_deploy.quant.graph.nodes import Node, OnnxGraph
+from beers_deploy.quant.graph.quantised import result_zero
+from beers_deploy.quant.onnx_file import any_size, with_outputs
 from beers_deploy.quant.session import open_any_size, open_session, result_of, tensors_of
 from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.quant.untrusted import contradictions
 
-ZERO_POINTS = {"QuantizeLinear": 2, "QLinearConv": 7, "QLinearAdd": 7, "QLinearMul": 7, "QLinearMatMul": 7}
-"""ONNX's and onnxruntime's operators that round to 8 bits, of those that may run (`quant.untrusted`), and which input
-holds the zero point of their result."""
-
 RELUS = ("Relu", "Max")
+BYTES = (np.int8, np.uint8)
 TABLE = 256
 """Values of 8 bits, each of which a table of ours maps."""
 
@@ -82,22 +81,20 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
 def rounded_tensors(model: onnx.ModelProto) -> list[Rounded]:
     """What the graph's nodes round to 8 bits, in the graph's order."""
     with contradictions("INT8 model"):
-        return [tensor for tensor in _rounded(model) if tensor.zero_point.dtype in (np.int8, np.uint8)]
+        return _rounded(OnnxGraph(model), _coarse(model))
 
 
-def _rounded(model: onnx.ModelProto) -> list[Rounded]:
-    known = constants(model)
-    read_as = {node.output[0]: node.input[0] for node in model.graph.node if node.op_type == "DequantizeLinear"}
-    relus = {name for node in model.graph.node if node.op_type in RELUS for name in node.input}
+def _rounded(graph: OnnxGraph, coarse: slice) -> list[Rounded]:
+    read_as = {node.outputs[0]: node.inputs[0] for node in graph.nodes if node.op_type == "DequantizeLinear"}
+    relus = {name for node in graph.nodes if node.op_type in RELUS for name in node.inputs}
     relus |= {read_as[name] for name in relus & set(read_as)}
     found = []
-    for node in model.graph.node:
-        place = ZERO_POINTS.get(node.op_type)
-        if place is not None and node.input[0] not in known:
-            stored = known.get(node.input[place]) if len(node.input) > place else None
-            zero_point = _default_zero_point(node) if stored is None else stored
-            counted = _coarse(model) if node.output[0] == CORRECTION else slice(None)
-            found.append(Rounded(node.output[0], zero_point, node.output[0] in relus, counted))
+    for node in graph.nodes:
+        zero_point = result_zero(node, graph)
+        if zero_point is not None and zero_point.dtype in BYTES and node.inputs[0] not in graph.constants:
+            name = node.outputs[0]
+            counted = coarse if name == CORRECTION else slice(None)
+            found.append(Rounded(name, zero_point, name in relus, counted))
     return found
 
 
@@ -110,13 +107,6 @@ def _coarse(model: onnx.ModelProto) -> slice:
     if ends.offsets:
         return slice(0, ends.outputs)
     return slice(ends.outputs, None) if ends.gains == 2 else slice(None)
-
-
-def _default_zero_point(node: onnx.NodeProto) -> np.ndarray:
-    """Of a node that names none: 0, of the type that it asks for, or uint8."""
-    kinds = [a.i for a in node.attribute if a.name == "output_dtype" and a.i]
-    kind = onnx.helper.tensor_dtype_to_np_dtype(kinds[0]) if kinds else np.uint8
-    return np.zeros((), kind)
 
 
 @dataclass(frozen=True)
@@ -142,38 +132,36 @@ class Relus:
 def count_relus(model: onnx.ModelProto) -> Relus:
     """The ReLUs of a file."""
     with contradictions("model"):
-        known, rounded = constants(model), {tensor.name: tensor for tensor in rounded_tensors(model)}
-        convolved = {name for node in model.graph.node if "Conv" in node.op_type for name in node.output}
-        explicit = [n.op_type == "Relu" or _cuts_at_zero(n, known, rounded) for n in model.graph.node]
-        tables = sum(_is_table_of_relu(node, known) for node in model.graph.node)
-        folded = sum(_begins_at_zero(node, rounded, convolved) for node in model.graph.node)
-        return Relus(sum(explicit) + tables, folded)
+        graph = OnnxGraph(model)
+        rounded = {tensor.name: tensor for tensor in _rounded(graph, slice(None))}
+        convolved = {name for node in graph.nodes if "Conv" in node.op_type for name in node.outputs}
+        explicit = sum(_is_relu(node, graph, rounded) for node in graph.nodes)
+        return Relus(explicit, sum(_begins_at_zero(node, rounded, convolved) for node in graph.nodes))
 
 
-def _cuts_at_zero(node: onnx.NodeProto, known: dict[str, np.ndarray], rounded: dict[str, Rounded]) -> bool:
-    """Whether it is a Max with zero, which in 8 bits is the zero point of what it is compared with."""
-    floors = [known[name] for name in node.input if name in known]
-    if node.op_type == "Clip":  # ReLU6
-        return [float(floor) for floor in floors if floor.size == 1] == [0.0, 6.0]
-    if node.op_type != "Max" or not floors:
-        return False
-    zeros = [rounded[name].zero_point for name in node.input if name in rounded] or [np.zeros(())]
-    return bool((floors[0] == zeros[0]).all())
+def _is_relu(node: Node, graph: OnnxGraph, rounded: dict[str, Rounded]) -> bool:
+    """Whether it is one, ReLU6, a Max with zero, which in 8 bits is a zero point, or a table of one."""
+    known = [graph.constants[name] for name in node.inputs if name in graph.constants]
+    if node.op_type == "Clip":
+        return [float(limit) for limit in known if limit.size == 1] == [0.0, 6.0]
+    if node.op_type == "Max" and known:
+        zeros = [rounded[name].zero_point for name in node.inputs if name in rounded] or [np.zeros(())]
+        return bool((known[0] == zeros[0]).all())
+    return node.op_type == "Relu" or (node.op_type == "Gather" and _is_table_of_relu(graph.value(node, 0)))
 
 
-def _is_table_of_relu(node: onnx.NodeProto, known: dict[str, np.ndarray]) -> bool:
-    """Whether it looks up what our files keep a ReLU behind other than a convolution as: nothing below zero."""
-    table = known.get(node.input[0]) if node.op_type == "Gather" else None
+def _is_table_of_relu(table: np.ndarray | None) -> bool:
+    """Whether it is what our files keep a ReLU behind other than a convolution as: nothing below zero."""
     if table is None or table.shape != (TABLE,) or table.dtype != np.uint8:
         return False
     values = table.astype(np.int16) - ZERO
     return bool((values[:ZERO] == 0).all() and (np.diff(values[ZERO:]) >= 0).all() and values[-1] > 0)
 
 
-def _begins_at_zero(node: onnx.NodeProto, rounded: dict[str, Rounded], convolved: set[str]) -> bool:
+def _begins_at_zero(node: Node, rounded: dict[str, Rounded], convolved: set[str]) -> bool:
     """Whether a convolution's result is rounded to numbers of which none is below zero."""
-    value = rounded.get(node.output[0]) if node.output else None
-    if value is None or not (node.op_type == "QLinearConv" or node.input[0] in convolved):
+    value = rounded.get(node.outputs[0])
+    if value is None or not (node.op_type == "QLinearConv" or node.inputs[0] in convolved):
         return False
     return bool((value.zero_point == value.lowest).all())
 

@@ -5,19 +5,24 @@ on an image of numbered pixels.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
 import onnx
-from onnx import helper, numpy_helper
-from onnx.reference import ReferenceEvaluator
+from onnx import helper
 
 from beers_deploy.quant.graph.nodes import Node, OnnxGraph
 from beers_deploy.quant.graph.operations import Shuffle
 
-MOVES = ("Reshape", "Transpose", "Squeeze", "Unsqueeze")
+MOVES: dict[str, tuple[str, Callable[[np.ndarray, list[int]], np.ndarray]]] = {
+    "Reshape": ("shape", lambda image, sizes: image.reshape([n or image.shape[k] for k, n in enumerate(sizes)])),
+    "Squeeze": ("axes", lambda image, axes: image.squeeze(tuple(axes) or None)),
+    "Transpose": ("perm", lambda image, axes: image.transpose(axes or None)),
+    "Unsqueeze": ("axes", lambda image, axes: np.expand_dims(image, tuple(axes))),
+}
+"""Operators that do nothing but move pixels: what they state, in an input or an attribute, and what they do."""
 ORDERS = {"CRD": True, "DCR": False}
 """The modes of ONNX's DepthToSpace, and whether columns come first."""
 SIDES_PX = 24, 35
@@ -37,8 +42,7 @@ def with_shuffles(model: onnx.ModelProto) -> OnnxGraph:
     inferred = onnx.shape_inference.infer_shapes(model).graph
     known = {value.name: value.type.tensor_type.shape.dim for value in (*inferred.input, *inferred.value_info)}
     for chain in _chains(graph):
-        sizes = [dim.dim_value for dim in known.get(chain[0].inputs[0], ())]
-        shuffle = _shuffle(chain, sizes, model, graph.constants)
+        shuffle = _shuffle(chain, [dim.dim_value for dim in known.get(chain[0].inputs[0], ())], graph)
         if shuffle is not None:
             graph.nodes = [shuffle if node is chain[-1] else node for node in graph.nodes if node not in chain[:-1]]
     return graph
@@ -54,16 +58,14 @@ def _chains(graph: OnnxGraph) -> list[list[Node]]:
     return list(chains.values())
 
 
-def _shuffle(
-    chain: list[Node], sizes: list[int], model: onnx.ModelProto, constants: Mapping[str, np.ndarray]
-) -> Node | None:
+def _shuffle(chain: list[Node], sizes: list[int], graph: OnnxGraph) -> Node | None:
     """The pixel shuffle that a chain is, of an image of these sizes, 0 where they are free; None of what is none."""
     for side_px in SIDES_PX if len(sizes) == 4 and sizes[1] else ():
         shape = sizes[0] or 1, sizes[1], sizes[2] or side_px, sizes[3] or 2 * side_px
         if math.prod(shape) > VALUES:
             continue
         image = np.arange(math.prod(shape)).reshape(shape)
-        result = _moved(chain, image, model, constants)
+        result = _moved(chain, image, graph)
         growth = _growth(result, shape)
         if growth is None:
             continue
@@ -76,21 +78,18 @@ def _shuffle(
     return None
 
 
-def _moved(
-    chain: list[Node], image: np.ndarray, model: onnx.ModelProto, constants: Mapping[str, np.ndarray]
-) -> np.ndarray:
-    """Where a chain takes the pixels of an image; nothing where it does not run."""
-    read = {name for node in chain for name in node.inputs[1:]}
-    held = [numpy_helper.from_array(constants[name], name) for name in read if name in constants]
-    names = chain[0].inputs[0], chain[-1].outputs[0]
-    ends = [helper.make_tensor_value_info(name, onnx.TensorProto.INT64, None) for name in names]
-    graph = helper.make_graph([node.proto for node in chain], "moves", ends[:1], ends[1:], held)
-    try:
-        alone = helper.make_model(graph, opset_imports=model.opset_import)
-        (result,) = ReferenceEvaluator(alone).run(None, {names[0]: image})
-    except Exception:  # noqa: BLE001 - the evaluator raises whatever it stumbles over
-        return np.array([])
-    return np.asarray(result)
+def _moved(chain: list[Node], image: np.ndarray, graph: OnnxGraph) -> np.ndarray:
+    """Where a chain takes the pixels of an image; nowhere where it does not fit."""
+    for node in chain:
+        key, move = MOVES[node.op_type]
+        stated = graph.numbers(node, 1, key)
+        if stated is None:
+            return np.array([])
+        try:
+            image = move(image, stated)
+        except (IndexError, ValueError):
+            return np.array([])
+    return image
 
 
 def _growth(result: np.ndarray, shape: tuple[int, int, int, int]) -> Fraction | None:

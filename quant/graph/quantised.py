@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from onnx import TensorProto
+from onnx import TensorProto, helper
 
 from beers_deploy.quant.graph.nodes import WEIGHTS, Node, OnnxGraph
 
@@ -22,7 +22,7 @@ RESULT = -1
 ONE = {0: (1, 2), RESULT: (3, 4)}
 TWO = {0: (1, 2), 3: (4, 5), RESULT: (6, 7)}
 FORMATS: dict[str, dict[int, tuple[int, int]]] = {
-    **dict.fromkeys(("QLinearConv", "QLinearAdd", "QLinearMul"), TWO),
+    **dict.fromkeys(("QLinearConv", "QLinearMatMul", "QLinearAdd", "QLinearMul"), TWO),
     **dict.fromkeys(("QLinearAveragePool", "QLinearGlobalAveragePool", "QLinearLeakyRelu"), ONE),
     "QuantizeLinear": {RESULT: (1, 2)},
     "DequantizeLinear": {0: (1, 2)},
@@ -51,6 +51,16 @@ class Scale:
             return None
         fraction, exponent = math.frexp(self.scales[0])
         return 1 - exponent if fraction == 0.5 else None
+
+
+def result_zero(node: Node, graph: OnnxGraph) -> np.ndarray | None:
+    """The zero point that a node rounds its result around, as it is stored; None where it rounds to no integers."""
+    places = FORMATS.get(node.op_type, {}).get(RESULT)
+    if places is None:
+        return None
+    asked = helper.tensor_dtype_to_np_dtype(node.attributes.get("output_dtype") or TensorProto.UINT8)
+    stated = graph.value(node, places[1])
+    return np.zeros((), asked) if stated is None else stated
 
 
 def stated(node: Node, graph: OnnxGraph) -> Iterator[tuple[str, Scale]]:

@@ -3,19 +3,3 @@
 - `reference`: a core run on planes, layer by layer, and how far onnxruntime agrees;
 - `arithmetic`: exact convolutions, maxima and means, and the DPU's fixed-point constants.
 """
-
-from beers_deploy.quant.integer.reference import (
-    INT32_BITS,
-    SOUND,
-    Faults,
-    agreement,
-    correction,
-    integer_rows,
-    merged_correction,
-    run_core,
-)
-
-__all__ = [
-    "INT32_BITS", "SOUND", "Faults", "agreement", "correction",
-    "integer_rows", "merged_correction", "run_core",
-]  # fmt: skip

@@ -237,6 +237,6 @@ KEEPING = {"BatchNormalization", "Cast", "DequantizeLinear", "Identity", "Quanti
 WHY = {
     "which looks at the whole image": ("Dynamic", "Global", "Normalization", "Reduce", "Shape"),
     "fully connected": ("Flatten", "Gemm", "MatMul"),
-    "which moves pixels": MOVES,
+    "which moves pixels": tuple(MOVES),
 }
 """What is refused, by parts of its name."""

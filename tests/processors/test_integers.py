@@ -8,7 +8,7 @@ import pytest
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from beers_deploy.quant.encodings import board_model, host_model
 from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activation, same, split
-from beers_deploy.quant.integer import agreement, correction, merged_correction, run_core
+from beers_deploy.quant.integer.reference import agreement, correction, merged_correction, run_core
 from beers_deploy.quant.session import open_session, run
 from tests.processors.conftest import Encodings
 

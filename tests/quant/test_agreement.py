@@ -8,7 +8,7 @@ import pytest
 from beers_deploy.model.shipped import SHIPPED
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import split
-from beers_deploy.quant.integer import agreement, merged_correction, run_core
+from beers_deploy.quant.integer.reference import agreement, merged_correction, run_core
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.quantise import Quantised
 from tests.quant.quick import changed

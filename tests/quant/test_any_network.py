@@ -21,7 +21,7 @@ from beers_deploy.quant.core import INT8_MAX, INT8_MIN
 from beers_deploy.quant.encodings import as_on_board, encoding_faults, read_core
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.graph import Conv, correction_graph
-from beers_deploy.quant.integer import agreement, merged_correction, run_core
+from beers_deploy.quant.integer.reference import agreement, merged_correction, run_core
 from beers_deploy.quant.integer.trainable import TrainableCore
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.quantise import Quantised, quantise_model

@@ -7,7 +7,7 @@ import pytest
 
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activation, Add, split
-from beers_deploy.quant.integer import correction, run_core
+from beers_deploy.quant.integer.reference import correction, run_core
 from beers_deploy.quant.quantise import Quantised
 from beers_deploy.quant.session import open_session
 from tests.quant.quick import image

@@ -18,7 +18,7 @@ from beers_deploy.model.processor import int8_adds_exactly
 from beers_deploy.network import shipped_pair
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.encodings import read_core
-from beers_deploy.quant.integer import merged_correction, run_core
+from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.kernels import INT16_MAX, INT16_MIN, Way, cannot_saturate, made_exact
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session, run

@@ -10,7 +10,7 @@ from onnx import TensorProto, helper
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph import read_network
-from beers_deploy.quant.integer import agreement
+from beers_deploy.quant.integer.reference import agreement
 from beers_deploy.quant.onnx_file import GraphWriter, make_model
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.session import open_session, result_of

@@ -10,7 +10,7 @@ from onnx import helper, numpy_helper
 from beers_deploy.network import shipped_pair
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import CORRECTION
-from beers_deploy.quant.integer import run_core
+from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.onnx_file import image_info, load_onnx, make_model
 from beers_deploy.quant.structure import rounded_tensors, saturated_shares
 

@@ -19,7 +19,7 @@ from beers_deploy.quant.encodings import as_on_board, encoding_faults, read_core
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.graph import CORRECTION, read_network
 from beers_deploy.quant.graph.tail import Tail
-from beers_deploy.quant.integer import agreement, integer_rows
+from beers_deploy.quant.integer.reference import agreement, integer_rows
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.quantise import Quantised
 from beers_deploy.quant.reading.folding import simplest

@@ -13,7 +13,7 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.quant.core import IntConv, IntCore, shift_faults
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import Conv, Shuffle, correction_graph, read_planes
-from beers_deploy.quant.integer import merged_correction, run_core
+from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.integer.trainable import TrainableCore
 from beers_deploy.quant.passes.tune import BORDER_PX, Sample, Tuning, tune
 from beers_deploy.quant.quantise import Quantised, quantise_model

@@ -16,7 +16,7 @@ from beers_deploy.profiles.figures import Row
 from beers_deploy.quant.calibration import Calibration
 from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.graph import Activation
-from beers_deploy.quant.integer import SOUND
+from beers_deploy.quant.integer.reference import SOUND
 from beers_deploy.restoration.options import TILE_PX
 from beers_deploy.studies.stress.bit_flips import (
     FaultTarget,

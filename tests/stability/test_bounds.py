@@ -14,7 +14,7 @@ from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import CORRECTION, split
-from beers_deploy.quant.integer import INT32_BITS, correction, run_core
+from beers_deploy.quant.integer.reference import INT32_BITS, correction, run_core
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.quantise import Quantised
 from beers_deploy.quant.session import open_session, run

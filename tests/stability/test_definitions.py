@@ -15,7 +15,7 @@ from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings import board_model, host_model
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, split
-from beers_deploy.quant.integer import correction
+from beers_deploy.quant.integer.reference import correction
 from beers_deploy.quant.quantise import Quantised
 from beers_deploy.quant.session import open_session, run
 

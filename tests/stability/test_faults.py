@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.graph import split
-from beers_deploy.quant.integer import run_core
+from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.quantise import Quantised
 from beers_deploy.studies.stress.faults import (
     SHIFT_BITS,

@@ -6,7 +6,7 @@ import pytest
 from beers_deploy.model.io.images import MAX_DN
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, split
-from beers_deploy.quant.integer import SOUND, Faults, merged_correction, run_core
+from beers_deploy.quant.integer.reference import SOUND, Faults, merged_correction, run_core
 from beers_deploy.quant.quantise import Quantised
 from beers_deploy.studies.stress.faults import (
     Guards,

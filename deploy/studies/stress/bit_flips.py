@@ -21,7 +21,7 @@ from beers_deploy.profiles.figures import Row, measured, predicted
 from beers_deploy.quant.calibration import HELD_OUT_SEED, Calibration
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.graph import Activation
-from beers_deploy.quant.integer import SOUND
+from beers_deploy.quant.integer.reference import SOUND
 from beers_deploy.report.plots import Curve, Panel, curves_svg
 from beers_deploy.restoration.options import TILE_PX
 from beers_deploy.studies.stress import faults

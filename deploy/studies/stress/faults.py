@@ -15,7 +15,7 @@ from beers_deploy.model.io.images import MAX_DN
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, SHIFTS, IntConv, IntCore, op_shifts
 from beers_deploy.quant.graph import PLANES, Activation, channels_of
-from beers_deploy.quant.integer import SOUND, Faults, merged_correction, run_core
+from beers_deploy.quant.integer.reference import SOUND, Faults, merged_correction, run_core
 
 MEGABIT = 1e6
 INT8_BITS, PIXEL_BITS, SHIFT_BITS = 8, 12, 6

@@ -23,7 +23,7 @@ from beers_deploy.quant.bounds import saturable
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import CORRECTION, IMAGE, Activation, Add, Conv, Graph, correction_graph, image_channels
-from beers_deploy.quant.integer import merged_correction, run_core
+from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.onnx_file import any_size, load_onnx, require_quantised
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.walk import Tiling, tiling_of
