@@ -18,14 +18,14 @@ from beers_deploy.quant.encodings import encoding_faults, read_core
 from beers_deploy.quant.ends import ZERO
 from beers_deploy.quant.graph import CORRECTION
 from beers_deploy.quant.graph.nodes import Node, OnnxGraph
-from beers_deploy.quant.graph.quantised import result_zero
+from beers_deploy.quant.graph.quantised import Scale, stated
 from beers_deploy.quant.onnx_file import any_size, with_outputs
 from beers_deploy.quant.session import open_any_size, open_session, result_of, tensors_of
 from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.quant.untrusted import contradictions
 
 RELUS = ("Relu", "Max")
-BYTES = (np.int8, np.uint8)
+BYTES = ("int8", "uint8")
 TABLE = 256
 """Values of 8 bits, each of which a table of ours maps."""
 
@@ -36,25 +36,25 @@ class Rounded:
 
     Attributes:
         name: in the graph.
-        zero_point: its value for 0, which says its type too.
+        scale: how it is to be read.
         low_is_relu: whether what is clipped at the lower end would have become zero anyway.
         counted: which channels count: of a result in gains or windows the coarse ones, which hold what others clip.
     """
 
     name: str
-    zero_point: np.ndarray
+    scale: Scale
     low_is_relu: bool
     counted: slice = field(default_factory=lambda: slice(None))
 
     @property
     def lowest(self) -> int:
         """The smallest number that its 8 bits hold."""
-        return int(np.iinfo(self.zero_point.dtype).min)
+        return int(np.iinfo(self.scale.integer_type).min)
 
     def at_ends(self, values: np.ndarray) -> np.ndarray:
         """Which of its values (N, C, H, W) lie at an end."""
         kept = values[:, self.counted] if values.ndim > 1 else values
-        low = (kept == self.lowest) & (not self.low_is_relu and bool(self.zero_point.min() > self.lowest))
+        low = (kept == self.lowest) & (not self.low_is_relu and self.lowest not in self.scale.zero_points)
         return np.asarray((kept == self.lowest + 255) | low)
 
 
@@ -66,7 +66,7 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
     looked_at = rounded_tensors(model)
     if not looked_at:
         return {}
-    kinds = {t.name: onnx.helper.np_dtype_to_tensor_dtype(t.zero_point.dtype) for t in looked_at}
+    kinds = {t.name: onnx.helper.np_dtype_to_tensor_dtype(np.dtype(t.scale.integer_type)) for t in looked_at}
     session = open_session(with_outputs(any_size(model), kinds), optimise=False)
     ends, counts = np.zeros(len(looked_at)), np.zeros(len(looked_at))
     for image in images:
@@ -90,11 +90,10 @@ def _rounded(graph: OnnxGraph, coarse: slice) -> list[Rounded]:
     relus |= {read_as[name] for name in relus & set(read_as)}
     found = []
     for node in graph.nodes:
-        zero_point = result_zero(node, graph)
-        if zero_point is not None and zero_point.dtype in BYTES and node.inputs[0] not in graph.constants:
-            name = node.outputs[0]
-            counted = coarse if name == CORRECTION else slice(None)
-            found.append(Rounded(name, zero_point, name in relus, counted))
+        name = node.outputs[0]
+        scale = dict(stated(node, graph)).get(name)
+        if scale is not None and scale.integer_type in BYTES and node.inputs[0] not in graph.constants:
+            found.append(Rounded(name, scale, name in relus, coarse if name == CORRECTION else slice(None)))
     return found
 
 
@@ -145,8 +144,8 @@ def _is_relu(node: Node, graph: OnnxGraph, rounded: dict[str, Rounded]) -> bool:
     if node.op_type == "Clip":
         return [float(limit) for limit in known if limit.size == 1] == [0.0, 6.0]
     if node.op_type == "Max" and known:
-        zeros = [rounded[name].zero_point for name in node.inputs if name in rounded] or [np.zeros(())]
-        return bool((known[0] == zeros[0]).all())
+        zeros = [rounded[name].scale.zero_points for name in node.inputs if name in rounded] or [(0,)]
+        return bool((known[0] == np.array(zeros[0])).all())
     return node.op_type == "Relu" or (node.op_type == "Gather" and _is_table_of_relu(graph.value(node, 0)))
 
 
@@ -163,7 +162,7 @@ def _begins_at_zero(node: Node, rounded: dict[str, Rounded], convolved: set[str]
     value = rounded.get(node.outputs[0])
     if value is None or not (node.op_type == "QLinearConv" or node.inputs[0] in convolved):
         return False
-    return bool((value.zero_point == value.lowest).all())
+    return set(value.scale.zero_points) == {value.lowest}
 
 
 def structure_checks(float_model: onnx.ModelProto, int8: onnx.ModelProto) -> list[Check]:

@@ -75,8 +75,7 @@ def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX mo
 
 
 def _inputs(graph: OnnxGraph, tile_px: int | None, places: tuple[int, int], where: str) -> dict[str, Shape]:
-    sizes = {name: [dim.dim_value for dim in kind.shape.dim] for name, kind in graph.inputs.items()}
-    return {name: _input_shape(name, stated, tile_px, places, where) for name, stated in sizes.items()}
+    return {name: _input_shape(name, sizes, tile_px, places, where) for name, sizes in graph.inputs.items()}
 
 
 class _Reader:

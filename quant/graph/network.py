@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.graph.nodes import Pair, Window
 from beers_deploy.quant.graph.operations import (
     CORRECTION,
     IMAGE,
@@ -21,7 +22,6 @@ from beers_deploy.quant.graph.operations import (
     MaxPool,
     Mul,
     Op,
-    Pair,
     Resize,
     Shuffle,
 )
@@ -179,14 +179,11 @@ def sized(graph: Graph, size: Pair) -> Graph:
 
 
 def _size(op: Op, read: Pair) -> Pair:
-    if isinstance(op, Conv) and op.transposed:
-        (rows, columns), (top, left, bottom, right) = op.window.strides, op.window.pads
-        tall, broad = op.weight.shape[2:]
-        return (read[0] - 1) * rows + tall - top - bottom, (read[1] - 1) * columns + broad - left - right
     if isinstance(op, Conv | MaxPool | AveragePool):
-        kernel = (op.weight.shape[2], op.weight.shape[3]) if isinstance(op, Conv) else op.kernel
-        assert kernel is not None  # noqa: S101
-        return op.window.out_size(read, kernel)
+        rows, columns = op.weight.shape[2:] if isinstance(op, Conv) else op.kernel or read
+        window = Window((rows, columns), op.window.strides, op.window.pads, op.window.dilations)
+        move = window.put_down if isinstance(op, Conv) and op.transposed else window.slid
+        return move(0, read[0]), move(1, read[1])
     if isinstance(op, Resize):
         return read[0] * op.factor, read[1] * op.factor
     if isinstance(op, Shuffle):

@@ -131,14 +131,17 @@ class OnnxGraph:
     Attributes:
         nodes: in order.
         constants: initializers and what nodes of the kind Constant hold, by name.
-        inputs: tensors that are no constants, with their types and sizes.
+        inputs: tensors that are no constants, with their sizes, 0 where the file states none.
+        types: ONNX's number of what each of them holds.
         outputs: the names of the results.
     """
 
     def __init__(self, model: onnx.ModelProto) -> None:
         self.constants = constants(model)
         self.nodes = [Node.of(node) for node in model.graph.node if node.op_type != "Constant"]
-        self.inputs = {v.name: v.type.tensor_type for v in model.graph.input if v.name not in self.constants}
+        inputs = {v.name: v.type.tensor_type for v in model.graph.input if v.name not in self.constants}
+        self.inputs = {name: [dim.dim_value for dim in tensor.shape.dim] for name, tensor in inputs.items()}
+        self.types = {name: tensor.elem_type for name, tensor in inputs.items()}
         self.outputs = tuple(value.name for value in model.graph.output)
 
     @cached_property

@@ -101,16 +101,6 @@ class Window:
     pads: tuple[int, int, int, int] = (0, 0, 0, 0)
     dilations: Pair = (1, 1)
 
-    def out_size(self, size: Pair, kernel: Pair) -> Pair:
-        """Rows and columns of what a window of `kernel` makes of an image of `size`."""
-        top, left, bottom, right = self.pads
-        padded = size[0] + top + bottom, size[1] + left + right
-        places = [
-            (side - (k - 1) * dilation - 1) // stride + 1
-            for side, k, dilation, stride in zip(padded, kernel, self.dilations, self.strides, strict=True)
-        ]
-        return places[0], places[1]
-
 
 def same(weight: np.ndarray) -> Window:
     """Of stride 1, with the padding that keeps the size: for weights (O, I, kh, kw) of odd sides."""

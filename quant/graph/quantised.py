@@ -1,17 +1,13 @@
 """Which nodes of a file compute on integers, with which scales, and which nodes are mere notation for that.
 
-A tensor holds one of four things:
-
-1. "float": what the host computes with.
-2. "int8": written by QuantizeLinear, a cast to int8 or an integer kernel (or the same numbers as uint8 around 128).
-3. "seen": int8 seen as float, behind DequantizeLinear.
-4. "wide": a sum of products of such, on its way to a QuantizeLinear.
+A tensor holds one of four things: float numbers that the host computes with; "int8", written by QuantizeLinear, a
+cast or an integer kernel (or the same numbers as uint8 around 128); int8 "seen" as float, behind DequantizeLinear; or
+a "wide" sum of products of such, on its way to a QuantizeLinear.
 """
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from onnx import TensorProto, helper
@@ -53,16 +49,6 @@ class Scale:
         return 1 - exponent if fraction == 0.5 else None
 
 
-def result_zero(node: Node, graph: OnnxGraph) -> np.ndarray | None:
-    """The zero point that a node rounds its result around, as it is stored; None where it rounds to no integers."""
-    places = FORMATS.get(node.op_type, {}).get(RESULT)
-    if places is None:
-        return None
-    asked = helper.tensor_dtype_to_np_dtype(node.attributes.get("output_dtype") or TensorProto.UINT8)
-    stated = graph.value(node, places[1])
-    return np.zeros((), asked) if stated is None else stated
-
-
 def stated(node: Node, graph: OnnxGraph) -> Iterator[tuple[str, Scale]]:
     """The tensors whose format a node names, constants among them, each with that format."""
     places = FORMATS.get(node.op_type, {})
@@ -71,12 +57,11 @@ def stated(node: Node, graph: OnnxGraph) -> Iterator[tuple[str, Scale]]:
     for place, (scale, zero_point) in places.items():
         name = node.outputs[0] if place == RESULT else node.inputs[place]
         scales, zeros = graph.constants.get(node.inputs[scale], np.zeros(0)), graph.value(node, zero_point)
-        if zeros is None:  # its type is the constant's own, or ONNX's where QuantizeLinear names none
-            zeros = np.zeros(1, graph.constants[name].dtype if name in graph.constants else np.uint8)
+        if zeros is None:  # around 0, of the constant's own type, the one that is asked for, or ONNX's default
+            asked = helper.tensor_dtype_to_np_dtype(node.attributes.get("output_dtype") or TensorProto.UINT8)
+            zeros = np.zeros(1, graph.constants[name].dtype if name in graph.constants else asked)
         yield name, Scale(tuple(scales.astype(float).ravel()), tuple(map(int, zeros.ravel())), str(zeros.dtype))
 
-
-Content = Literal["float", "int8", "seen", "wide"]
 
 BYTES = (TensorProto.INT8, TensorProto.UINT8)
 ACTIVATIONS = {"Relu", "LeakyRelu", "PRelu", "HardSigmoid", "HardSwish", "Clip"}
@@ -96,12 +81,11 @@ class Integers:
     def __init__(self, graph: OnnxGraph) -> None:
         self.present = any(node.op_type in FORMATS for node in graph.nodes)
         self._graph, self._constants = graph, graph.constants
-        self._same: dict[str, str] = {}
-        self._seen: dict[str, str] = {}
+        self._int8 = {name for name, kind in graph.types.items() if kind in BYTES}
+        self._wide: set[str] = set()
+        self._seen: dict[str, str] = {}  # and the int8 tensor that each is
+        self._same: dict[str, str] = {}  # notation, and what it stands for
         self._formats: dict[str, tuple[Scale, ...]] = {}  # the writer's first, then whatever contradicts it
-        self._content: dict[str, Content] = {
-            name: "int8" if kind.elem_type in BYTES else "float" for name, kind in graph.inputs.items()
-        }
         self._becomes = self._rounded()
         for node in graph.nodes:
             self._read_formats(node)
@@ -124,7 +108,7 @@ class Integers:
 
     def is_integer(self, node: Node) -> bool:
         """Whether the file computes this node on integers."""
-        return self._content.get(node.outputs[0], "float") in ("int8", "wide")
+        return node.outputs[0] in self._int8 | self._wide
 
     def is_notation(self, node: Node) -> bool:
         """Whether a node only says how its neighbours' integers are to be read."""
@@ -169,7 +153,7 @@ class Integers:
             return {}
         inputs = {f"input {i}": name for i, name in enumerate(self.activations(node))}
         result = node.outputs[0]
-        return inputs | {"output": result if self._content[result] == "int8" else self._becomes[result]}
+        return inputs | {"output": result if result in self._int8 else self._becomes[result]}
 
     def _numbers(self, node: Node) -> dict[str, str]:
         """What an integer node computes with besides activations, by role."""
@@ -186,30 +170,30 @@ class Integers:
 
     def _follow(self, node: Node) -> None:
         """Work out what a node's results hold, from what its inputs hold."""
-        content = self._result(node)
-        self._content |= dict.fromkeys(node.outputs, content)
         source, result = node.inputs[0] if node.inputs else "", node.outputs[0]
         if node.op_type == "DequantizeLinear":
             aliases = self._seen if self.constant(source) is None else self._same
             aliases[result] = source
-        elif node.op_type == "QuantizeLinear" and self._content.get(source) == "wide":
+        elif node.op_type == "QuantizeLinear" and source in self._wide:
+            self._int8.add(result)
             self._same[result] = source
             self._give(source, self._formats[result][0])
-        elif content == "int8" and result not in self._formats and source in self._formats:
-            self._give(result, self._formats[source][0])
+        elif self._writes_int8(node):
+            self._int8.update(node.outputs)
+            if result not in self._formats and source in self._formats:
+                self._give(result, self._formats[source][0])
+        elif result in self._becomes and self._reads(node) and self._reads(node) <= self._wide | self._seen.keys():
+            self._wide.update(node.outputs)
 
-    def _result(self, node: Node) -> Content:
-        if node.op_type == "DequantizeLinear":
-            return "seen"
-        if node.op_type in FORMATS or node.op_type == "QLinearConcat":
-            return "int8"
+    def _writes_int8(self, node: Node) -> bool:
         if node.op_type == "Cast":
-            return "int8" if node.attributes.get("to") in BYTES else "float"
-        names = [self.resolve(name) for name in node.inputs if name]
-        holds = {self._content.get(name, "float") for name in names if name not in self._constants}
-        if holds == {"int8"}:
-            return "int8"
-        return "wide" if holds and holds <= {"seen", "wide"} and node.outputs[0] in self._becomes else "float"
+            return node.attributes.get("to") in BYTES
+        rounds = node.op_type in FORMATS or node.op_type == "QLinearConcat"
+        return rounds or (bool(self._reads(node)) and self._reads(node) <= self._int8)
+
+    def _reads(self, node: Node) -> set[str]:
+        """The tensors that it reads, constants left out."""
+        return {name for name in map(self.resolve, filter(None, node.inputs)) if name not in self._constants}
 
     def _rounded(self) -> dict[str, str]:
         """The int8 tensor that each one becomes that is rounded next, or behind activations."""

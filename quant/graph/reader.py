@@ -50,8 +50,7 @@ def read_network(model: onnx.ModelProto) -> Network:
     with contradictions("float model"):
         body, tail = without_tail(model, {*READERS, *ACTIVATIONS})
         reader = _Reader(body)
-        graph, channels = reader.sized_graph(), _channels_in(reader.image)
-        network = replace(cut(graph, channels, reader.flat, reader.softmax), tail=tail)
+        network = replace(cut(reader.sized_graph(), reader.channels(), reader.flat, reader.softmax), tail=tail)
         check_network(network)
     return network
 
@@ -92,21 +91,21 @@ def refusal(model: onnx.ModelProto) -> str:
     return ""
 
 
-def _channels_in(image: onnx.ValueInfoProto) -> int:
-    sizes = image.type.tensor_type.shape.dim
-    if len(sizes) != 4:
-        raise refused_graph("an input of (N, C, H, W)", f"{len(sizes)} sizes")
-    return int(sizes[1].dim_value) or 1
-
-
 class _Reader:
     """Walks the nodes once; a tensor that is another's by a new name is known by the first."""
 
     def __init__(self, model: onnx.ModelProto) -> None:
         self.source = with_shuffles(model)
-        self.image, self.result = model.graph.input[0], model.graph.output[0].name
+        (self.image, *_), self.result = self.source.inputs, model.graph.output[0].name
         self.ops: list[Op] = []
         self.flat = self.softmax = False
+
+    def channels(self) -> int:
+        """Of the image."""
+        sizes = self.source.inputs[self.image]
+        if len(sizes) != 4:
+            raise refused_graph("an input of (N, C, H, W)", f"{len(sizes)} sizes")
+        return sizes[1] or 1
 
     def graph(self) -> Graph:
         """The operations, from the network's own input to its own output."""
@@ -117,13 +116,13 @@ class _Reader:
             self._read(node)
         if not self.ops or self.ops[-1].output != self.result:
             raise refused_graph("an operation that writes the output", "none")
-        return named_apart(self.ops, {self.image.name: IMAGE, self.result: CORRECTION})
+        return named_apart(self.ops, {self.image: IMAGE, self.result: CORRECTION})
 
     def sized_graph(self) -> Graph:
         """As `graph`, the windows of global pooling known: a network that pools so has one size of image."""
         graph = self.graph()
         pools = [op for op in graph if isinstance(op, AveragePool) and op.kernel is None]
-        rows, columns = (side.dim_value for side in self.image.type.tensor_type.shape.dim[2:])
+        rows, columns = self.source.inputs[self.image][2:]
         if pools and not (rows and columns):
             remedy = "export it with fixed height and width: what pools over the whole image has one size"
             raise refused_graph("images of one size", f"any size, and global pooling at {pools[0].name}", remedy)
@@ -224,7 +223,7 @@ class _Reader:
         self._require(own, node, "a constant of one number a channel", f"one of {times(value.shape)}")
         self._require(node.op_type != "Sub" or place == 1, node, "a constant that is taken off")
         source = node.inputs[1 - place]
-        channels = channels_of(tuple(self.ops), {self.image.name: _channels_in(self.image)})[source]
+        channels = channels_of(tuple(self.ops), {self.image: self.channels()})[source]
         self._require(value.size in (1, channels), node, f"{channels} numbers", f"{value.size}")
         each = np.broadcast_to(value.astype(np.float32).ravel(), (channels,))
         one, none = np.ones(channels, np.float32), np.zeros(channels, np.float32)

@@ -83,7 +83,7 @@ def _tiling_of(model: onnx.ModelProto, where: str) -> Tiling:
     with contradictions(where):
         graph = with_shuffles(model)
         rows, columns = (_Walk(graph, axis) for axis in (0, 1))
-        (channels_in, channels_out), fixed_px = _channels(model), fixed_tile_px(model)
+        (channels_in, channels_out), fixed_px = _channels(graph, model), fixed_tile_px(model)
         lattice_px = math.lcm(rows.lattice_px, columns.lattice_px)
         radius_px = max(rows.radius_px, columns.radius_px)
         if rows.scale != columns.scale:
@@ -95,21 +95,19 @@ def _tiling_of(model: onnx.ModelProto, where: str) -> Tiling:
         return Tiling(halo_px, lattice_px, rows.scale, channels_in, channels_out, fixed_px, least_px)
 
 
-def _channels(model: onnx.ModelProto) -> tuple[int, int]:
+def _channels(graph: OnnxGraph, model: onnx.ModelProto) -> tuple[int, int]:
     """Channels of the only image in and the only one out."""
-    held = {tensor.name for tensor in model.graph.initializer}
-    images = [value for value in model.graph.input if value.name not in held]
-    if len(images) != 1 or len(model.graph.output) != 1:
-        raise refused("one image in and one out", f"{len(images)} in and {len(model.graph.output)} out")
-    batch = next((dim.dim_value for dim in images[0].type.tensor_type.shape.dim), 0)
-    if batch > 1:
-        raise refused("any number of images, or one at a time", f"batches of {batch}")
-    channels_in, channels_out = _channel_count(images[0]), _channel_count(model.graph.output[0])
-    if not channels_in:
+    if len(graph.inputs) != 1 or len(graph.outputs) != 1:
+        raise refused("one image in and one out", f"{len(graph.inputs)} in and {len(graph.outputs)} out")
+    (sizes,) = graph.inputs.values()
+    if sizes and sizes[0] > 1:
+        raise refused("any number of images, or one at a time", f"batches of {sizes[0]}")
+    if len(sizes) != 4 or not sizes[1]:
         raise refused("an image (N, C, H, W) of a stated number of channels", "none stated")
-    channels_out = channels_out or _channel_count(onnx.shape_inference.infer_shapes(model).graph.output[0])
+    given = _channel_count(model.graph.output[0])
+    given = given or _channel_count(onnx.shape_inference.infer_shapes(model).graph.output[0])
     # Where neither file nor inference tells, as with a runtime's own operators, what comes out is judged as it comes.
-    return channels_in, channels_out or channels_in
+    return sizes[1], given or sizes[1]
 
 
 def _channel_count(value: onnx.ValueInfoProto) -> int:

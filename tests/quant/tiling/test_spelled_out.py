@@ -10,7 +10,9 @@ from onnx import helper
 from torch import nn
 
 from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.graph import read_network
 from beers_deploy.quant.graph.moves import with_shuffles
+from beers_deploy.quant.reading.folding import simplest
 from beers_deploy.quant.tiling.walk import Tiling, tiling_of
 from tests.quant.tiling.small_networks import graph, whole
 
@@ -35,6 +37,8 @@ def test_what_torch_makes_of_an_unshuffle_is_one(size: int, any_size: bool, tmp_
     model = exported(network, any_size, tmp_path)
     assert "Transpose" in {node.op_type for node in model.graph.node}
     assert tiling_of(model) == Tiling(size, size, fixed_px=None if any_size else 70)
+    front = read_network(simplest(model, "exported")).front
+    assert [(shuffle.block, shuffle.up, shuffle.columns_first) for shuffle in front] == [(size, False, True)]
 
 
 def test_a_shuffle_of_an_old_opset_is_one(tmp_path: Path) -> None:
