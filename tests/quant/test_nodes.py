@@ -1,0 +1,55 @@
+"""Sizes behind a window, and moves of pixels, are those of onnx's own runtimes."""
+
+from typing import Any
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from onnx import helper
+from onnx.reference import ReferenceEvaluator
+
+from beers_deploy.dpu.reading import network_of
+from beers_deploy.quant.graph.moves import MOVES
+from beers_deploy.quant.session import open_session, result_of
+from tests.quant.tiling.small_networks import Row, taps
+
+
+@st.composite
+def windowed(draw: st.DrawFn) -> Row:
+    """A transposed convolution, one with automatic padding, or a pool."""
+    pairs = st.tuples(*[st.integers(1, 3)] * 2)
+    kernel, strides, pads = draw(pairs), draw(pairs), draw(st.tuples(*[st.integers(0, 2)] * 4))
+    moves: dict[str, Any] = {"strides": strides, "dilations": draw(pairs)}
+    kind = draw(st.sampled_from(["ConvTranspose", "Conv", "MaxPool"]))
+    if kind == "MaxPool":
+        moves |= {"pads": [min(pad, k - 1) for pad, k in zip(pads, kernel * 2, strict=True)]}
+        return Row().add(kind, kernel_shape=kernel, ceil_mode=int(draw(st.booleans())), **moves)
+    if kind == "Conv":
+        moves = {"strides": strides, "auto_pad": draw(st.sampled_from(["VALID", "SAME_UPPER", "SAME_LOWER"]))}
+    else:
+        moves |= {"pads": pads, "output_padding": [draw(st.integers(0, stride - 1)) for stride in strides]}
+    return Row().add(kind, taps("w", 1, 1, *kernel), **moves)
+
+
+@settings(max_examples=60)
+@given(windowed(), st.integers(5, 13))
+def test_sizes_are_the_runtimes_own(row: Row, side: int) -> None:
+    model = row.model()
+    shape = network_of(model, side).operations[0].out_shape
+    if shape is not None:
+        assert result_of(open_session(model), np.zeros((1, 1, side, side), np.float32)).shape[1:] == shape
+
+
+RESHAPED = [[0, 6, -1], [-1, 3, 0, 10], [1, 3, 2, 20]]
+
+
+@given(st.permutations(range(4)), st.sampled_from(RESHAPED), st.sampled_from([0, 2]))
+def test_moves_are_those_of_onnx(perm: list[int], sizes: list[int], axis: int) -> None:
+    image = np.arange(120).reshape(1, 6, 4, 5)
+    for kind, stated in {"Transpose": perm, "Reshape": sizes, "Unsqueeze": [axis], "Squeeze": [0]}.items():
+        if kind == "Transpose":
+            node, feeds = helper.make_node(kind, ["x"], ["y"], perm=stated), {"x": image}
+        else:
+            node, feeds = helper.make_node(kind, ["x", "s"], ["y"]), {"x": image, "s": np.array(stated)}
+        (expected,) = list(ReferenceEvaluator(node).run(None, feeds))
+        np.testing.assert_array_equal(MOVES[kind][1](image, stated), expected)
