@@ -41,11 +41,12 @@ def with_shuffles(model: onnx.ModelProto) -> OnnxGraph:
         return graph
     inferred = onnx.shape_inference.infer_shapes(model).graph
     known = {value.name: value.type.tensor_type.shape.dim for value in (*inferred.input, *inferred.value_info)}
+    nodes = list(graph.nodes)
     for chain in _chains(graph):
         shuffle = _shuffle(chain, [dim.dim_value for dim in known.get(chain[0].inputs[0], ())], graph)
         if shuffle is not None:
-            graph.nodes = [shuffle if node is chain[-1] else node for node in graph.nodes if node not in chain[:-1]]
-    return graph
+            nodes = [shuffle if node is chain[-1] else node for node in nodes if node not in chain[:-1]]
+    return OnnxGraph(model, nodes)
 
 
 def _chains(graph: OnnxGraph) -> list[list[Node]]:

@@ -136,9 +136,11 @@ class OnnxGraph:
         outputs: the names of the results.
     """
 
-    def __init__(self, model: onnx.ModelProto) -> None:
+    def __init__(self, model: onnx.ModelProto, nodes: Sequence[Node] | None = None) -> None:
+        """Of a model as it is, or with other nodes in the place of its own."""
         self.constants = constants(model)
-        self.nodes = [Node.of(node) for node in model.graph.node if node.op_type != "Constant"]
+        own = (Node.of(node) for node in model.graph.node if node.op_type != "Constant")
+        self.nodes = tuple(own if nodes is None else nodes)
         inputs = {v.name: v.type.tensor_type for v in model.graph.input if v.name not in self.constants}
         self.inputs = {name: [dim.dim_value for dim in tensor.shape.dim] for name, tensor in inputs.items()}
         self.types = {name: tensor.elem_type for name, tensor in inputs.items()}

@@ -6,7 +6,7 @@ a "wide" sum of products of such, on its way to a QuantizeLinear.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,7 +108,7 @@ class Integers:
 
     def is_integer(self, node: Node) -> bool:
         """Whether the file computes this node on integers."""
-        return node.outputs[0] in self._int8 | self._wide
+        return node.outputs[0] in self._int8 or node.outputs[0] in self._wide
 
     def is_notation(self, node: Node) -> bool:
         """Whether a node only says how its neighbours' integers are to be read."""
@@ -182,18 +182,19 @@ class Integers:
             self._int8.update(node.outputs)
             if result not in self._formats and source in self._formats:
                 self._give(result, self._formats[source][0])
-        elif result in self._becomes and self._reads(node) and self._reads(node) <= self._wide | self._seen.keys():
+        elif node.op_type != "Cast" and result in self._becomes and self._reads(node, self._wide, self._seen):
             self._wide.update(node.outputs)
 
     def _writes_int8(self, node: Node) -> bool:
         if node.op_type == "Cast":
             return node.attributes.get("to") in BYTES
         rounds = node.op_type in FORMATS or node.op_type == "QLinearConcat"
-        return rounds or (bool(self._reads(node)) and self._reads(node) <= self._int8)
+        return rounds or self._reads(node, self._int8)
 
-    def _reads(self, node: Node) -> set[str]:
-        """The tensors that it reads, constants left out."""
-        return {name for name in map(self.resolve, filter(None, node.inputs)) if name not in self._constants}
+    def _reads(self, node: Node, *tensors: Container[str]) -> bool:
+        """Whether all that it reads is among these, constants left out, and there is any."""
+        names = [name for name in map(self.resolve, filter(None, node.inputs)) if name not in self._constants]
+        return bool(names) and all(any(name in each for each in tensors) for name in names)
 
     def _rounded(self) -> dict[str, str]:
         """The int8 tensor that each one becomes that is rounded next, or behind activations."""

@@ -3,12 +3,14 @@
 import warnings
 from pathlib import Path
 
+import numpy as np
 import onnx
 import pytest
 import torch
-from onnx import helper
+from onnx import helper, numpy_helper
 from torch import nn
 
+from beers_deploy.dpu.reading import network_of
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph import read_network
 from beers_deploy.quant.graph.moves import with_shuffles
@@ -78,3 +80,19 @@ def test_whatever_else_moves_pixels_is_left(name: str) -> None:
 
 def test_a_row_that_leads_back_is_a_shuffle_of_one() -> None:
     assert tiling_of(moves(MORE, helper.make_node("Squeeze", ["more", "at"], ["restored"]))) == Tiling(0)
+
+
+def test_moves_between_integers_are_of_integers() -> None:
+    unit = ["unit", "zero"]
+    nodes = [
+        helper.make_node("QuantizeLinear", ["image", *unit], ["int8"]),
+        helper.make_node("DequantizeLinear", ["int8", *unit], ["seen"]),
+        helper.make_node("Unsqueeze", ["seen", "at"], ["more"]),
+        helper.make_node("Squeeze", ["more", "at"], ["less"]),
+        helper.make_node("QuantizeLinear", ["less", *unit], ["moved"]),
+        helper.make_node("DequantizeLinear", ["moved", *unit], ["restored"]),
+    ]
+    held = {"unit": np.float32(0.5), "zero": np.int8(0), "at": np.array([2])}
+    model = graph(nodes, *(numpy_helper.from_array(np.asarray(value), name) for name, value in held.items()))
+    kinds = [(op.kind, op.integer) for op in network_of(model, 8).operations]
+    assert kinds == [("quantise", True), ("pixel shuffle", True), ("dequantise", False)]
