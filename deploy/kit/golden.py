@@ -26,7 +26,7 @@ from beers_deploy.profiles.toml import read_json
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import PLANES, Op
-from beers_deploy.quant.integer import run_core
+from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.integer.diagnosis import Seen, explain, where
 from beers_deploy.quant.onnx_file import fixed_tile_px
 from beers_deploy.results import Input, Table
