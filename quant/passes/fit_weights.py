@@ -18,6 +18,9 @@ from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import CORRECTION, PLANES, Conv, Graph, Op, graph_to_onnx, tensors
 from beers_deploy.quant.session import crops, halo_of, open_session, planes_of, tensor_values
 
+FLOOR = 1e-2
+"""Added to every variance, as a share of their mean. Without it the weights of a channel that hardly changes run to
+int8's ends to make up a little of what others err by, and the bias that makes up for its mean is coarse then."""
 EVERY_PX = 4
 """Windows are taken so far apart in both directions: neighbours say nearly the same."""
 
@@ -48,9 +51,9 @@ class Moments:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(n, n) covariance, a little of its mean variance added to the diagonal so that no direction is free."""
+        """(n, n) covariance, a share of its mean variance added to the diagonal so that no direction is free."""
         covariance = self.products / self.count - np.outer(self.mean, self.mean)
-        floor = 1e-6 * np.trace(covariance) / len(covariance)
+        floor = FLOOR * np.trace(covariance) / len(covariance)
         return np.asarray(covariance + floor * np.eye(len(covariance)))
 
 

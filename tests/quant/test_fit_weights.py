@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import Conv, Graph
-from beers_deploy.quant.passes.fit_weights import Moments, descend, fit_weights, input_moments
+from beers_deploy.quant.passes.fit_weights import FLOOR, Moments, descend, fit_weights, input_moments
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session, planes_of
 from tests.quant.quick import quickly
@@ -45,13 +45,30 @@ def test_of_weights_that_meet_unrelated_values_the_nearest_stay() -> None:
     assert (descend(wanted, np.rint(wanted), np.diag(np.arange(1.0, 19))) == np.rint(wanted)).all()
 
 
+@given(st.integers(0, 2**32 - 1), st.floats(-4, -1), st.integers(1, 5))
+def test_weights_of_a_channel_that_hardly_changes_stay_near(seed: int, exponent: float, still: int) -> None:
+    generator = np.random.default_rng(seed)
+    spread = np.where(np.arange(12) < still, 10.0**exponent, 1.0)
+    seen, other = (generator.normal(0, 1, (400, 12)) + generator.normal(0, 2, (400, 1)) for _ in range(2))
+    moments = Moments.of_none(12)
+    moments.add((3 + spread * seen).astype(np.float32))
+    wanted = generator.uniform(-100, 100, (24, 12))
+    found = descend(wanted, np.rint(wanted), moments.covariance)
+    assert np.abs(found - wanted).max() <= 4
+    covariance = np.cov(spread * other, rowvar=False)
+    errors = [squared(whole, wanted, covariance).mean() for whole in (found, np.rint(wanted))]
+    assert errors[0] <= errors[1]
+
+
 def test_moments_are_those_of_the_windows() -> None:
     windows = np.random.default_rng(0).normal(2, 1, (50, 4)).astype(np.float32)
     moments = Moments(np.zeros((4, 4)), np.zeros(4))
     for part in np.array_split(windows, 3):
         moments.add(part)
     assert_allclose(moments.mean, windows.mean(axis=0), rtol=1e-5)
-    assert_allclose(moments.covariance, np.cov(windows.T, bias=True), rtol=1e-3, atol=1e-5)
+    covariance = np.cov(windows.T, bias=True)
+    floor = FLOOR * np.diag(covariance).mean() * np.eye(4)
+    assert_allclose(moments.covariance, covariance + floor, rtol=1e-3, atol=1e-5)
 
 
 def test_the_first_convolution_s_moments_are_those_of_the_planes(graph: Graph, patches: Patches) -> None:
