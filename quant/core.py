@@ -13,7 +13,7 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import PLANES, Activation, Add, Conv, Graph, Mul, Op, Window, ties_scales
-from beers_deploy.quant.graph.operations import OneInput
+from beers_deploy.quant.graph.operations import SIX, OneInput
 
 INT8_MIN, INT8_MAX = -128, 127
 CANDIDATES = 6
@@ -184,8 +184,14 @@ def _quantise_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntCo
     frac_bits[op.output] = product - cut
     weight = quantise(op.weight, weight_frac_bits)
     bias, bias_frac_bits = quantise_bias(op.bias, product, shifts)
-    kind = (op.activation, op.window, op.groups, op.transposed)
+    kind = (_activation(op, frac_bits[op.output]), op.window, op.groups, op.transposed)
     return IntConv(op.name, op.input, op.output, weight, weight_frac_bits, bias, bias_frac_bits, *kind)
+
+
+def _activation(op: Conv, frac_bits: int) -> Activation:
+    """Of whole numbers: ReLU6 is ReLU where int8 ends no later than the six, as it does once `equalise` scaled."""
+    ends_first = op.ceiling is not None or INT8_MAX * 2.0**-frac_bits <= SIX
+    return Activation.relu if op.activation is Activation.relu6 and ends_first else op.activation
 
 
 def quantise_bias(bias: np.ndarray, product: int, shifts: Shifts = SHIFTS) -> tuple[np.ndarray, int]:

@@ -18,6 +18,8 @@ IMAGE, CORRECTION = "image", "correction"
 Pair = tuple[int, int]
 LEAKY_SLOPE = 26 / 256
 """The one slope of LeakyReLU that a DPU computes."""
+SIX = 6
+"""Where ReLU6 clips."""
 SIXTH = 2731 / 2**14
 """What its fixed-point HardSigmoid has for 1/6 (UG1414)."""
 
@@ -43,7 +45,7 @@ class Activation(StrEnum):
 
     @property
     def homogeneous(self) -> bool:
-        """Whether f(k x) = k f(x) for k above 0: what lets factors pass through."""
+        """Whether f(k x) = k f(x) for k above 0: what lets factors pass, as ReLU6 does once its six is scaled."""
         return self in (Activation.none, Activation.relu, Activation.leaky_relu)
 
 
@@ -149,6 +151,12 @@ class Conv(OneInput):
     window: Window = field(default_factory=Window)
     groups: int = 1
     transposed: bool = False
+    ceiling: np.ndarray | None = None  # (O,) where ReLU6 clips each channel once they are scaled; None at 6
+
+    @property
+    def ceilings(self) -> np.ndarray:
+        """(O,) where ReLU6 clips each channel."""
+        return np.full(len(self.bias), float(SIX)) if self.ceiling is None else self.ceiling
 
 
 @dataclass(frozen=True)

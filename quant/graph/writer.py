@@ -59,7 +59,11 @@ def write_float(w: GraphWriter, op: Op, feeds: Sequence[str], output: str) -> No
     activation = Activation.none if isinstance(op, Pointwise) else getattr(op, "activation", Activation.none)
     result = output if activation is Activation.none else f"{op.output}.linear"
     _WRITERS[type(op)](w, op, list(feeds), result)
-    if activation is not Activation.none:
+    if isinstance(op, Conv) and op.ceiling is not None:
+        w.node("Relu", f"{output}.above_0", [result])
+        ceiling = w.constant(f"{op.name}.ceiling", np.asarray(op.ceiling, np.float32)[:, None, None])
+        w.node("Min", output, [f"{output}.above_0", ceiling], f"{op.name}.{activation.name}")
+    elif activation is not Activation.none:
         _activation(w, activation, result, output, f"{op.name}.{activation.name}")
 
 

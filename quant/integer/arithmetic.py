@@ -8,13 +8,13 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv
 from beers_deploy.quant.graph import Activation, AveragePool, MaxPool, Pointwise, Window
+from beers_deploy.quant.graph.operations import SIX
 
 FLOAT32_WHOLE_MAX = 2**24
 """Up to here float32 holds whole numbers exactly, and sums them in any order."""
 STRIP_VALUES = 1 << 22
 """Values of the windows that are laid out at a time: 16 MB of float32."""
 LEAKY_OF_256 = 26
-SIX = 6
 
 
 def convolve(

@@ -30,8 +30,8 @@ from beers_deploy.quant.graph import (
     Shuffle,
     Window,
 )
-from beers_deploy.quant.graph.operations import LEAKY_SLOPE, SIXTH
-from beers_deploy.quant.integer.arithmetic import SIX, activation_table, mean_factor
+from beers_deploy.quant.graph.operations import LEAKY_SLOPE, SIX, SIXTH
+from beers_deploy.quant.integer.arithmetic import activation_table, mean_factor
 
 Tensor = torch.Tensor
 

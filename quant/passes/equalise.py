@@ -15,7 +15,7 @@ import numpy as np
 
 from beers_deploy.quant.core import INT8_MAX
 from beers_deploy.quant.ends import ONE_CHANNEL, Ends
-from beers_deploy.quant.graph import Conv, Graph
+from beers_deploy.quant.graph import Activation, Conv, Graph
 from beers_deploy.quant.passes.stream import STREAM_FRAC_BITS, Stream
 from beers_deploy.quant.session import values_of
 
@@ -25,6 +25,9 @@ QUANTILE = 0.9999
 LEVELLING = (0.5, 0.75, 1.0)
 HEADROOM = (0.64, 0.8, 1.0, 1.25)
 """First guesses tried: gamma, and the largest range as a share of int8's. Above 1 the largest values are clipped."""
+
+FULL = INT8_MAX * 2.0**-STREAM_FRAC_BITS
+"""Where int8 ends in tensors that are equalised."""
 
 STEPS = (1.5, 1.2)
 """Factors by which each channel is tried larger and smaller, a sweep each."""
@@ -49,17 +52,26 @@ Trial = Callable[[Graph], Costs]
 
 
 def equalise(graph: Graph, stream: Stream, factors: np.ndarray) -> Graph:
-    """The same network with channel c of a stream scaled by factors[c], (C,) above 0."""
+    """The same network with channel c of a stream scaled by factors[c], (C,) above 0.
+
+    A channel behind ReLU6 is scaled until it can fill int8: the end of int8 is its clip then, and ReLU does.
+    """
+    clipped = [
+        op for op in graph if isinstance(op, Conv) and op.output in stream and op.activation is Activation.relu6
+    ]
+    for op in clipped:
+        factors = np.maximum(factors, FULL / op.ceilings)
     return tuple(_scaled(op, factors, stream) if isinstance(op, Conv) else op for op in graph)
 
 
 def _scaled(op: Conv, factors: np.ndarray, stream: Stream) -> Conv:
-    weight, bias = op.weight.astype(np.float64), op.bias.astype(np.float64)
+    weight, bias, ceiling = op.weight.astype(np.float64), op.bias.astype(np.float64), op.ceiling
     if op.output in stream:
         weight, bias = weight * factors[:, None, None, None], bias * factors
+        ceiling = op.ceilings * factors if op.activation is Activation.relu6 else None
     if op.input in stream:
         weight = weight / (factors[None, :, None, None] if op.groups == 1 else factors[:, None, None, None])
-    return replace(op, weight=weight.astype(np.float32), bias=bias.astype(np.float32))
+    return replace(op, weight=weight.astype(np.float32), bias=bias.astype(np.float32), ceiling=ceiling)
 
 
 def channel_ranges(
@@ -108,8 +120,7 @@ def above_dead(ranges: np.ndarray) -> np.ndarray:
 def first_guess(ranges: np.ndarray, levelling: float, headroom: float) -> np.ndarray:
     """Factors that level the ranges, and fit the largest into int8 at the stream's scale."""
     factors = (ranges.max() / ranges) ** levelling
-    limit = INT8_MAX * 2.0**-STREAM_FRAC_BITS
-    return np.asarray(factors * headroom * limit / (ranges * factors).max())
+    return np.asarray(factors * headroom * FULL / (ranges * factors).max())
 
 
 def search(graph: Graph, stream: Stream, ranges: np.ndarray, trial: Trial) -> np.ndarray:

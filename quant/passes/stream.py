@@ -45,8 +45,13 @@ def _passes_factors(graph: Graph, stream: Stream) -> bool:
     touching = [op for op in graph if stream.intersection((*op.inputs, op.output))]
     known = all(isinstance(op, Conv | Add) for op in touching)
     writers = [op for op in touching if op.output in stream]
-    homogeneous = all(isinstance(op, Conv | Add) and op.activation.homogeneous for op in writers)
+    homogeneous = all(isinstance(op, Conv | Add) and _passes(op.activation, len(stream) == 1) for op in writers)
     return known and homogeneous and not stream & {PLANES, CORRECTION}
+
+
+def _passes(activation: Activation, lone: bool) -> bool:
+    """Whether factors pass; ReLU6 where `equalise` may make int8's end its clip, so not of sums that exceed six."""
+    return activation.homogeneous or (lone and activation is Activation.relu6)
 
 
 def share_stream_scale(streams: Iterable[Stream], frac_bits: Mapping[str, int]) -> dict[str, int]:

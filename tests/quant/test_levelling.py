@@ -4,19 +4,27 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
+from beers_deploy.quant.core import build_core
 from beers_deploy.quant.ends import Ends, ends_of
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
+    PLANES_FRAC_BITS,
+    Activation,
     Conv,
     Graph,
     channels_of,
     graph_to_onnx,
     read_network,
     read_planes,
+    same,
+    split,
 )
+from beers_deploy.quant.integer import run_core
 from beers_deploy.quant.passes import level
 from beers_deploy.quant.passes.equalise import MOST_CHANNELS, Costs
 from beers_deploy.quant.passes.level import Chain, chain_ranges
@@ -46,7 +54,7 @@ def correction(graph: Graph, ends: Ends) -> np.ndarray:
     return np.asarray(session.run(None, {PLANES: planes_of(images()[1], ends)})[0])
 
 
-@pytest.mark.parametrize("name", ["dncnn", "espcn", "unet", "segment"])
+@pytest.mark.parametrize("name", ["dncnn", "espcn", "unet", "segment", "mobile"])
 def test_levelling_leaves_the_float_network_as_it_was(name: str) -> None:
     _, graph, ends, chain = read(name)
     factors = np.random.default_rng(1).uniform(0.2, 5, sum(chain.widths))
@@ -72,6 +80,37 @@ def test_activations_that_factors_do_not_pass_are_left_alone() -> None:
     curved = {op.output for op in graph if op.name.endswith("HardSwish") or "Hardswish" in op.name}
     assert not curved & set(chain.tensors)
     assert CORRECTION not in chain.tensors
+
+
+def with_relu6(size: float) -> Graph:
+    """A depthwise convolution between others, behind each a ReLU6; the larger `size`, the more is clipped."""
+    generator = np.random.default_rng(0)
+    shapes = {"a": (5, 3, 3, 3), "b": (5, 1, 3, 3), "c": (4, 5, 1, 1), CORRECTION: (1, 4, 3, 3)}
+    graph, source = [], PLANES
+    for name, shape in shapes.items():
+        weight = (size * generator.normal(0.2, 1, shape)).astype(np.float32)
+        bias, groups = generator.normal(0, 1, shape[0]).astype(np.float32), 5 if name == "b" else 1
+        activation = Activation.none if name == CORRECTION else Activation.relu6
+        graph.append(Conv(name, source, name, weight, bias, activation, same(weight), groups))
+        source = name
+    return tuple(graph)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 1.0, 3.0]))
+def test_relu6_is_the_end_of_int8_whatever_the_factors(seed: int, size: float) -> None:
+    graph, ends = with_relu6(size), Ends()
+    chain = Chain(tuple(lone_tensors(graph)), (5, 5, 4))
+    assert chain.tensors == ("a", "b", "c")
+    scaled = chain.scaled(graph, np.random.default_rng(seed).lognormal(-2, 1, 14))
+    wanted = correction(graph, ends)
+    np.testing.assert_allclose(correction(scaled, ends), wanted, atol=2e-5 * np.abs(wanted).max())
+    core = build_core(scaled, {PLANES: PLANES_FRAC_BITS, CORRECTION: 4} | dict.fromkeys("abc", STREAM_FRAC_BITS))
+    kinds = [op.activation for op in core.convolutions]
+    assert kinds == [Activation.relu] * 3 + [Activation.none]
+    tensors, _ = run_core(core, split(images()[0]))
+    for op in scaled[:-1]:
+        assert isinstance(op, Conv)
+        assert (tensors[op.output].max((0, 2, 3)) * core.scale(op.output) <= op.ceilings * (1 + 1e-6)).all()
 
 
 class Bowl:
