@@ -129,6 +129,18 @@ class IntCore:
         return [op for op in self.ops if isinstance(op, IntConv)]
 
 
+def dequantised(op: Conv, whole: IntConv) -> Conv:
+    """The same convolution in float, with the values that its int8 weights and bias stand for."""
+    weight = (whole.weight * 2.0**-whole.weight_frac_bits).astype(np.float32)
+    return replace(op, weight=weight, bias=whole.float_bias.astype(np.float32))
+
+
+def rounded_to(values: np.ndarray, frac_bits: int) -> np.ndarray:
+    """To whole multiples of 2^-n, half up, and clipped, as the DPU does."""
+    scale = np.float32(2.0**frac_bits)
+    return np.asarray(np.clip(np.floor(values * scale + np.float32(0.5)), INT8_MIN, INT8_MAX) / scale)
+
+
 def build_core(
     graph: Graph, frac_bits: Mapping[str, int], shifts: Shifts = SHIFTS, ends: Ends | None = None
 ) -> IntCore:

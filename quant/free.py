@@ -154,7 +154,7 @@ def free_model(
 
 def _conv(w: HostWriter, op: Conv, scales: Mapping[str, Scale], moments: Moments | None) -> None:
     whole, units = round_weight(op.weight, np.abs(op.bias) / (scales[op.input].unit * MAX_BIAS))
-    whole, shifted = fit(op.weight, whole, units, moments) if moments else (whole, np.zeros(1))
+    whole, shifted = fit(op.weight, units, moments) if moments else (whole, np.zeros(1))
     products = np.float32(scales[op.input].unit) * units.astype(np.float64)
     bias = np.rint((op.bias - shifted) / products).astype(np.int32)
     feeds = [op.input, *_scale(w, scales[op.input])]

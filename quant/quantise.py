@@ -46,7 +46,7 @@ from beers_deploy.quant.passes.equalise import (
     search,
     with_room,
 )
-from beers_deploy.quant.passes.fit_weights import fit_weights, input_moments
+from beers_deploy.quant.passes.fit_weights import fit_weights
 from beers_deploy.quant.passes.level import Chain, chain_ranges, level
 from beers_deploy.quant.passes.stream import (
     MAX_CHANNELS,
@@ -246,8 +246,7 @@ def rounded(plan: Plan, images: Remade[np.ndarray], log: Log = no_log) -> tuple[
         last_sum = frozenset(paired[-2].inputs)
     final = plan.ended(paired)
     log("rounding of the weights")
-    moments = input_moments(final, images, plan.ends)
-    return fit_weights(final, plan.core(final, frac_bits), moments, plan.shifts), final, last_sum
+    return fit_weights(final, plan.core(final, frac_bits), images, plan.shifts), final, last_sum
 
 
 def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], log: Log) -> Graph:

@@ -42,6 +42,17 @@ def graph_to_onnx(graph: Graph, outputs: list[str], channels: int = 3) -> onnx.M
     return make_model(writer.graph("core", [image_info(PLANES, channels, None)], results), {})
 
 
+def operation_to_onnx(op: Op) -> onnx.ModelProto:
+    """One operation by itself, from the tensors that it reads to the one that it writes."""
+    model = graph_to_onnx((op,), [op.output])
+    del model.graph.input[:]
+    sides = ["N", "C", None, None]
+    model.graph.input.extend(
+        helper.make_tensor_value_info(n, TensorProto.FLOAT, sides) for n in dict.fromkeys(op.inputs)
+    )
+    return model
+
+
 def onnx_weight(weight: np.ndarray, transposed: bool) -> np.ndarray:
     """Weights (O, I, kh, kw) as ONNX wants them: (I, O, kh, kw) of a transposed convolution."""
     return np.ascontiguousarray(weight.swapaxes(0, 1)) if transposed else weight

@@ -5,17 +5,32 @@ same pixel and add up. The squared error of the result is e^T C e, with e the ro
 and C the covariance of what they are multiplied with (the criterion of AdaRound, Nagel et al. 2020, and of GPTQ,
 Frantar et al. 2023). From the nearest numbers on, weight after weight takes the whole number that lowers it most,
 until none does. What the mean is off by then goes into the bias.
+
+Convolutions are rounded one after the other on what they read in INT8, so the bias of each also makes up for what
+those before it are off by in the mean.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from beers_deploy.quant.core import INT8_MAX, INT8_MIN, SHIFTS, IntConv, IntCore, Shifts, quantise_bias
+from beers_deploy.quant.core import (
+    INT8_MAX,
+    INT8_MIN,
+    SHIFTS,
+    IntConv,
+    IntCore,
+    Shifts,
+    dequantised,
+    quantise_bias,
+    rounded_to,
+)
 from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import CORRECTION, PLANES, Conv, Graph, Op, graph_to_onnx, tensors
+from beers_deploy.quant.graph.writer import operation_to_onnx
+from beers_deploy.quant.samples import Remade
 from beers_deploy.quant.session import crops, halo_of, open_session, planes_of, tensor_values
 
 FLOOR = 1e-2
@@ -23,38 +38,47 @@ FLOOR = 1e-2
 int8's ends to make up a little of what others err by, and the bias that makes up for its mean is coarse then."""
 EVERY_PX = 4
 """Windows are taken so far apart in both directions: neighbours say nearly the same."""
+SEEN_PX = 16 * 128**2
+"""Pixels of the images that are looked at, all of whose tensors are kept from operation to operation."""
 
 
 @dataclass
 class Moments:
-    """Sums over windows x, (I kh kw,) each, that a convolution multiplies its weights with."""
+    """Sums over windows x, (G, n) each, that the groups of a convolution read in INT8, and over what they lost."""
 
-    products: np.ndarray  # (n, n) float64, sum of x x^T
-    total: np.ndarray  # (n,) float64, sum of x
+    products: np.ndarray  # (G, n, n) float64, sum of x x^T
+    total: np.ndarray  # (G, n), sum of x
+    lost: np.ndarray  # (G, n), sum of what x is in float less x
     count: int = 0
 
     @classmethod
-    def of_none(cls, size: int) -> "Moments":
+    def of_none(cls, groups: int, size: int) -> "Moments":
         """Of no windows yet."""
-        return cls(np.zeros((size, size)), np.zeros(size))
+        return cls(np.zeros((groups, size, size)), np.zeros((groups, size)), np.zeros((groups, size)))
 
-    def add(self, windows: np.ndarray) -> None:
-        """Count further windows (K, n) float32."""
-        self.products += windows.T @ windows
+    def add(self, windows: np.ndarray, exact: np.ndarray) -> None:
+        """Count further windows (K, G, n) float32, and what they are in float."""
+        self.products += windows.transpose(1, 2, 0) @ windows.transpose(1, 0, 2)
         self.total += windows.sum(axis=0, dtype=np.float64)
+        self.lost += np.subtract(exact, windows, dtype=np.float64).sum(axis=0)
         self.count += len(windows)
 
     @property
     def mean(self) -> np.ndarray:
-        """(n,) mean window."""
+        """(G, n) mean window."""
         return np.asarray(self.total / self.count)
 
     @property
+    def exact_mean(self) -> np.ndarray:
+        """(G, n) mean window in float."""
+        return np.asarray((self.total + self.lost) / self.count)
+
+    @property
     def covariance(self) -> np.ndarray:
-        """(n, n) covariance, a share of its mean variance added to the diagonal so that no direction is free."""
-        covariance = self.products / self.count - np.outer(self.mean, self.mean)
-        floor = FLOOR * np.trace(covariance) / len(covariance)
-        return np.asarray(covariance + floor * np.eye(len(covariance)))
+        """(G, n, n) covariance, a share of its mean variance added to the diagonal so that no direction is free."""
+        covariance = self.products / self.count - self.mean[:, :, None] * self.mean[:, None]
+        floor = FLOOR * np.trace(covariance, axis1=1, axis2=2).mean() / covariance.shape[-1]
+        return np.asarray(covariance + floor * np.eye(covariance.shape[-1]))
 
 
 def input_moments(graph: Graph, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL) -> dict[str, Moments]:
@@ -62,8 +86,8 @@ def input_moments(graph: Graph, images: Iterable[np.ndarray], ends: Ends = ONE_C
 
     The values are those of the float network.
     """
-    convs = [op for op in graph if isinstance(op, Conv) and fits(op)]
-    found = {op.name: Moments.of_none(op.weight[0].size) for op in convs}
+    convs = [op for op in graph if isinstance(op, Conv)]
+    found = {op.name: Moments.of_none(op.groups, op.weight[0].size) for op in convs}
     names, halo_px = tensors(graph), halo_of(graph)
     session = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels))
     for image in images:
@@ -71,92 +95,131 @@ def input_moments(graph: Graph, images: Iterable[np.ndarray], ends: Ends = ONE_C
         for crop, values in zip(crops(image, halo_px), tiles, strict=True):
             read = {PLANES: planes_of(crop, ends), **dict(zip(names, values, strict=True))}
             for op in convs:
-                found[op.name].add(_windows(read[op.input], op))
+                windows = _windows(read[op.input], op)
+                found[op.name].add(windows, windows)
     return found
 
 
-def fits(op: Conv) -> bool:
-    """Whether a convolution's windows are gathered: of one group, and not transposed."""
-    return op.groups == 1 and not op.transposed
-
-
 def _windows(values: np.ndarray, op: Conv) -> np.ndarray:
-    """(K, I kh kw) of the windows within (1, I, H, W), some pixels apart."""
+    """(K, G, n) of the windows within (1, I, H, W), some pixels apart."""
     (rows, columns), (tall, broad) = op.window.strides, op.window.dilations
     kernel = (op.weight.shape[2] - 1) * tall + 1, (op.weight.shape[3] - 1) * broad + 1
     every = -(-EVERY_PX // rows) * rows, -(-EVERY_PX // columns) * columns
     if min(n - k for n, k in zip(values.shape[2:], kernel, strict=True)) < 0:
-        return np.empty((0, op.weight[0].size), np.float32)
+        return np.empty((0, op.groups, op.weight[0].size), np.float32)
     # In step with the windows that are computed, which begin in the padding.
     first = -op.window.pads[0] % rows, -op.window.pads[1] % columns
     windows = sliding_window_view(values[0], kernel, axis=(1, 2))
     windows = windows[:, first[0] :: every[0], first[1] :: every[1], ::tall, ::broad]
-    return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).reshape(-1, op.weight[0].size)
+    return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).reshape(-1, op.groups, op.weight[0].size)
+
+
+@dataclass(frozen=True)
+class Crop:
+    """What one crop's tensors (1, C, H, W) are in float and in INT8, as far as the network is computed."""
+
+    exact: dict[str, np.ndarray]
+    whole: dict[str, np.ndarray]
+
+    def forget(self, names: Iterable[str]) -> None:
+        """Drop tensors that no operation reads any more."""
+        for name in names:
+            del self.exact[name], self.whole[name]
 
 
 SWEEPS = 20
 """At most; a sweep that changes nothing ends it, after some five."""
 
 
-def fit_weights(graph: Graph, core: IntCore, moments: Mapping[str, Moments], shifts: Shifts = SHIFTS) -> IntCore:
+def fit_weights(graph: Graph, core: IntCore, images: Remade[np.ndarray], shifts: Shifts = SHIFTS) -> IntCore:
     """The core with weights and biases rounded for what each convolution reads; scales stay.
 
     Args:
         graph: the float operations that the core was built from.
         core: with weights rounded to nearest.
-        moments: of each convolution's input, by its name.
+        images: (1, C, H, W) in [0, 1], of which some are looked at.
         shifts: the windows of the target.
     """
-    pairs = zip(graph, core.ops, strict=True)
-    ops, ends = list[IntConv | Op](), core.ends
-    for op, whole in pairs:
-        if isinstance(op, Conv) and isinstance(whole, IntConv) and _enough(moments.get(op.name)):
-            fitted, shifted = _fit(op, whole, core.frac_bits[whole.input], moments[op.name], shifts)
+    ops, ends, seen = list[IntConv | Op](), core.ends, _seen(graph, core, images)
+    last_read = {name: op.name for op in graph for name in op.inputs}
+    for op, nearest in zip(graph, core.ops, strict=True):
+        whole = nearest
+        if isinstance(op, Conv) and isinstance(nearest, IntConv):
+            whole, shifted = _fit(op, nearest, core.frac_bits[op.input], _moments(op, seen), shifts)
             if op.output == CORRECTION and ends.offsets:  # the biases left over are others now
-                ends = ends.moved(whole.float_bias - shifted - fitted.float_bias)
-            ops.append(fitted)
-        else:
-            ops.append(whole)
+                ends = ends.moved(nearest.float_bias - shifted - whole.float_bias)
+        ops.append(whole)
+        _compute(op, whole, core.frac_bits[op.output], seen)
+        for crop in seen:
+            crop.forget(name for name in dict.fromkeys(op.inputs) if last_read[name] == op.name)
     return replace(core, ops=tuple(ops), ends=ends)
 
 
-def _enough(moments: Moments | None) -> bool:
-    """Whether there are more windows than weights: fewer say nothing of how errors add up."""
-    return moments is not None and moments.count > len(moments.total)
+def _seen(graph: Graph, core: IntCore, images: Remade[np.ndarray]) -> list[Crop]:
+    """Crops from all over the images, of SEEN_PX together, and their planes."""
+    halo_px = None if halo_of(graph) is None else 0
+    first = crops(images[0], halo_px)
+    count = max(SEEN_PX // first[0][0, 0].size, 1)
+    chosen = [images[k] for k in np.unique(np.linspace(0, len(images) - 1, count).astype(int))]
+    found = [crop for image in chosen for crop in crops(image, halo_px)]
+    planes = [planes_of(crop, core.ends) for crop in found[:: -(-len(found) // count)]]
+    return [Crop({PLANES: each}, {PLANES: each}) for each in planes]
+
+
+def _moments(op: Conv, seen: list[Crop]) -> Moments:
+    moments = Moments.of_none(op.groups, op.weight[0].size)
+    for crop in [] if op.transposed else seen:
+        moments.add(_windows(crop.whole[op.input], op), _windows(crop.exact[op.input], op))
+    return moments
+
+
+def _compute(op: Op, whole: IntConv | Op, frac_bits: int, seen: list[Crop]) -> None:
+    """One more tensor of each crop, in float and rounded."""
+    in_int8 = dequantised(op, whole) if isinstance(op, Conv) and isinstance(whole, IntConv) else op
+    sessions = [open_session(operation_to_onnx(each)) for each in (op, in_int8)]
+    for crop in seen:
+        for session, known in zip(sessions, (crop.exact, crop.whole), strict=True):
+            (known[op.output],) = session.run(None, {name: known[name] for name in dict.fromkeys(op.inputs)})
+        crop.whole[op.output] = rounded_to(crop.whole[op.output], frac_bits)
 
 
 def _fit(
     op: Conv, whole: IntConv, input_frac_bits: int, moments: Moments, shifts: Shifts
 ) -> tuple[IntConv, np.ndarray]:
-    """The fitted convolution, and by how much its weights raise the mean results, (O,): what its bias takes off."""
-    weight, shifted = fit(op.weight, whole.weight, np.array([2.0**-whole.weight_frac_bits]), moments)
+    """The fitted convolution, and by how much its weights raise the mean results, (O,): what its bias takes off.
+
+    Fewer windows than weights say nothing of how errors add up.
+    """
+    if moments.count <= op.weight[0].size:
+        return whole, np.zeros(len(op.bias))
+    weight, shifted = fit(op.weight, np.array([2.0**-whole.weight_frac_bits]), moments)
     bias, bias_frac_bits = quantise_bias(op.bias - shifted, whole.weight_frac_bits + input_frac_bits, shifts)
     return replace(whole, weight=weight, bias=bias, bias_frac_bits=bias_frac_bits), shifted
 
 
-def fit(
-    weight: np.ndarray, nearest: np.ndarray, scales: np.ndarray, moments: Moments
-) -> tuple[np.ndarray, np.ndarray]:
+def fit(weight: np.ndarray, scales: np.ndarray, moments: Moments) -> tuple[np.ndarray, np.ndarray]:
     """Whole weights (O, I, kh, kw) int8, and by how much they raise the mean result of each channel (O,).
 
     Args:
         weight: (O, I, kh, kw), what they stand for.
-        nearest: each rounded by itself.
         scales: (1,) or (O,), the value of 1.
         moments: of what the convolution reads.
     """
-    wanted = weight.reshape(len(weight), -1) / scales[:, None].astype(np.float64)
-    fitted = descend(wanted, nearest.reshape(wanted.shape), moments.covariance)
-    return fitted.astype(np.int8).reshape(weight.shape), (fitted - wanted) @ moments.mean * scales
+    groups, size = moments.mean.shape
+    exact = weight.reshape(groups, -1, size).astype(np.float64)
+    units = np.broadcast_to(scales, len(weight)).reshape(groups, -1, 1).astype(np.float64)
+    fitted = np.stack([descend(*each) for each in zip(exact / units, moments.covariance, strict=True)])
+    raised = (fitted * units) @ moments.mean[:, :, None] - exact @ moments.exact_mean[:, :, None]
+    return fitted.astype(np.int8).reshape(weight.shape), np.asarray(raised).ravel()
 
 
-def descend(wanted: np.ndarray, nearest: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+def descend(wanted: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Whole numbers (O, n) in [-128, 127] near the wanted ones, of less e^T C e than the nearest.
 
     Coordinate descent: along one weight the least error lies at q_i - (C e)_i / C_ii, rounded. A weight that meets
     nothing but one value stays: the bias makes up for it.
     """
-    whole = nearest.astype(np.float64)
+    whole: np.ndarray = np.clip(np.rint(wanted), INT8_MIN, INT8_MAX)
     gradient = (whole - wanted) @ covariance
     variance = np.diag(covariance)
     for _ in range(SWEEPS):

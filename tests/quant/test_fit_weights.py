@@ -3,17 +3,29 @@
 import numpy as np
 import onnx
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.gate import compare
-from beers_deploy.quant.graph import Conv, Graph
-from beers_deploy.quant.passes.fit_weights import FLOOR, Moments, descend, fit_weights, input_moments
+from beers_deploy.quant.graph import PLANES, Graph, graph_to_onnx, tensors
+from beers_deploy.quant.integer import run_core
+from beers_deploy.quant.passes.fit_weights import FLOOR, Moments, descend, fit, fit_weights, input_moments
+from beers_deploy.quant.reading.folding import simplest
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session, planes_of
+from examples.networks import build, to_onnx
 from tests.quant.quick import quickly
+
+
+def moments_of(*parts: np.ndarray) -> Moments:
+    """Of windows (K, G, n) that lose nothing."""
+    moments = Moments.of_none(*parts[0].shape[1:])
+    for part in parts:
+        moments.add(part, part)
+    return moments
 
 
 def squared(whole: np.ndarray, wanted: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -28,7 +40,7 @@ def test_no_channel_errs_more_than_rounded_to_nearest(seed: int, channels: int, 
     windows = generator.normal(0, 1, (3 * size, size)) + generator.normal(0, 3, (3 * size, 1))
     covariance = windows.T @ windows / len(windows) + 1e-6 * np.eye(size)
     nearest = np.rint(wanted)
-    found = descend(wanted, nearest, covariance)
+    found = descend(wanted, covariance)
     assert (squared(found, wanted, covariance) <= squared(nearest, wanted, covariance) + 1e-9).all()
     assert (found == np.rint(found)).all()
     assert np.abs(found).max() <= 128
@@ -36,13 +48,13 @@ def test_no_channel_errs_more_than_rounded_to_nearest(seed: int, channels: int, 
 
 def test_weights_that_meet_the_same_pixel_keep_their_sum() -> None:
     wanted = np.full((1, 9), 0.3)
-    found = descend(wanted, np.zeros((1, 9)), np.ones((9, 9)) + 1e-3 * np.eye(9))
+    found = descend(wanted, np.ones((9, 9)) + 1e-3 * np.eye(9))
     assert found.sum() == 3  # nearest to 2.7; each by itself rounds to 0
 
 
 def test_of_weights_that_meet_unrelated_values_the_nearest_stay() -> None:
     wanted = np.random.default_rng(2).uniform(-120, 120, (4, 18))
-    assert (descend(wanted, np.rint(wanted), np.diag(np.arange(1.0, 19))) == np.rint(wanted)).all()
+    assert (descend(wanted, np.diag(np.arange(1.0, 19))) == np.rint(wanted)).all()
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(-4, -1), st.integers(1, 5))
@@ -50,10 +62,9 @@ def test_weights_of_a_channel_that_hardly_changes_stay_near(seed: int, exponent:
     generator = np.random.default_rng(seed)
     spread = np.where(np.arange(12) < still, 10.0**exponent, 1.0)
     seen, other = (generator.normal(0, 1, (400, 12)) + generator.normal(0, 2, (400, 1)) for _ in range(2))
-    moments = Moments.of_none(12)
-    moments.add((3 + spread * seen).astype(np.float32))
+    moments = moments_of((3 + spread * seen).astype(np.float32)[:, None])
     wanted = generator.uniform(-100, 100, (24, 12))
-    found = descend(wanted, np.rint(wanted), moments.covariance)
+    found = descend(wanted, moments.covariance[0])
     assert np.abs(found - wanted).max() <= 4
     covariance = np.cov(spread * other, rowvar=False)
     errors = [squared(whole, wanted, covariance).mean() for whole in (found, np.rint(wanted))]
@@ -62,20 +73,18 @@ def test_weights_of_a_channel_that_hardly_changes_stay_near(seed: int, exponent:
 
 def test_moments_are_those_of_the_windows() -> None:
     windows = np.random.default_rng(0).normal(2, 1, (50, 4)).astype(np.float32)
-    moments = Moments(np.zeros((4, 4)), np.zeros(4))
-    for part in np.array_split(windows, 3):
-        moments.add(part)
-    assert_allclose(moments.mean, windows.mean(axis=0), rtol=1e-5)
+    moments = moments_of(*np.array_split(windows[:, None], 3))
+    assert_allclose(moments.mean[0], windows.mean(axis=0), rtol=1e-5)
     covariance = np.cov(windows.T, bias=True)
     floor = FLOOR * np.diag(covariance).mean() * np.eye(4)
-    assert_allclose(moments.covariance, covariance + floor, rtol=1e-3, atol=1e-5)
+    assert_allclose(moments.covariance[0], covariance + floor, rtol=1e-3, atol=1e-5)
 
 
 def test_the_first_convolution_s_moments_are_those_of_the_planes(graph: Graph, patches: Patches) -> None:
     head = graph[0]
     moments = input_moments(graph, patches.degraded)[head.name]
     planes = np.concatenate([planes_of(image) for image in patches.degraded])
-    centre = moments.mean.reshape(3, 3, 3)[:, 1, 1]
+    centre = moments.mean[0].reshape(3, 3, 3)[:, 1, 1]
     assert_allclose(centre, planes.mean(axis=(0, 2, 3)), rtol=0.05, atol=2e-3)
 
 
@@ -84,21 +93,38 @@ def to_nearest(_graph: Graph, core: IntCore, *_: object) -> IntCore:
     return core
 
 
-def test_every_layer_errs_less_on_what_it_reads(
-    float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches, monkeypatch: pytest.MonkeyPatch
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(1, 5))
+def test_each_group_is_fitted_to_what_it_reads_in_int8_and_to_its_float_mean(
+    seed: int, groups: int, outputs: int
 ) -> None:
+    generator = np.random.default_rng(seed)
+    exact = generator.normal(0, 1, (500, groups, 6)) + generator.normal(2, 2, (500, groups, 1))
+    read, unit = np.floor(2 * exact) / 2, 2.0**-3
+    weight = generator.uniform(-10, 10, (outputs * groups, 6, 1, 1)).astype(np.float32)
+    moments = Moments.of_none(groups, 6)
+    moments.add(read.astype(np.float32), exact.astype(np.float32))
+    fitted, raised = fit(weight, np.array([unit]), moments)
+    wanted, found = (values.reshape(groups, outputs, 6) for values in (weight, unit * fitted))
+    lost = np.einsum("kgn,gon->kgo", read, found) - np.einsum("kgn,gon->kgo", exact, wanted)
+    assert_allclose(raised, lost.mean(axis=0).ravel(), atol=1e-3)
+    for each, meant, covariance in zip(found / unit, wanted / unit, moments.covariance, strict=True):
+        assert (each == descend(meant, covariance)).all()
+
+
+@pytest.mark.parametrize("name", ["dncnn", "mobile"])
+def test_every_layer_errs_less(name: str, patches: Patches, unseen: Patches, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("beers_deploy.quant.quantise.fit_weights", to_nearest)
-    nearest = quickly(float_onnx, patches)
-    fitted = fit_weights(nearest.graph, nearest.core, input_moments(nearest.graph, patches.degraded))
-    other = input_moments(nearest.graph, unseen.degraded)
-    for op, before, after in zip(nearest.graph, nearest.core.ops, fitted.ops, strict=True):
-        if isinstance(op, Conv) and isinstance(before, IntConv) and isinstance(after, IntConv):
-            moments = other[op.name]
-            wanted = op.weight.reshape(len(op.weight), -1) * 2.0**before.weight_frac_bits
-            errors = [
-                squared(whole.weight.reshape(wanted.shape), wanted, moments.covariance) for whole in (before, after)
-            ]
-            assert errors[1].mean() < errors[0].mean(), op.name
+    nearest = quickly(simplest(to_onnx(name, build(name, torch.Generator().manual_seed(0))), name), patches)
+    fitted = fit_weights(nearest.graph, nearest.core, patches.degraded)
+    exact = open_session(graph_to_onnx(nearest.graph, tensors(nearest.graph)))
+    errors = np.zeros((2, len(nearest.graph)))
+    for image in unseen.degraded:
+        wanted = exact.run(None, {PLANES: planes_of(image)})
+        for k, core in enumerate((nearest.core, fitted)):
+            found, _ = run_core(core, core.ends.split(image))
+            scaled = (found[op.output] * core.scale(op.output) for op in core.ops)
+            errors[k] += [np.square(a - b).mean() for a, b in zip(scaled, wanted, strict=True)]
+    assert (errors[1, :-1] < errors[0, :-1]).all()  # the last comes in gains
 
 
 def test_it_lowers_the_network_s_error_on_unseen_patches(
