@@ -25,7 +25,7 @@ from beers_deploy.quant.integer.reference import integer_rows
 from beers_deploy.quant.onnx_file import faults_named, require_quantised
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import OwnSamples, samples_of
-from beers_deploy.quant.sensitivity import WORST, headline, layer_error_rows, sizes_row, spread_of, worst_row
+from beers_deploy.quant.sensitivity import WORST, headline, layer_error_rows, losses, sizes_row, spread_of, worst_row
 from beers_deploy.quant.session import open_any_size
 from beers_deploy.report.page import Report
 from beers_deploy.report.sensitivity_page import sensitivity_page
@@ -156,6 +156,21 @@ def _shifts_of(target: TargetProfile) -> Shifts:
         remedy = "choose another, or the free regime"
         raise OptionError("target", expected=expected, got=repr(target.name), remedy=remedy)
     return target_shifts(target)
+
+
+def losses_of(network: Network, samples: object = None, **drawn: Any) -> str:
+    """What INT8 costs on patches or samples that calibration did not see, in one sentence.
+
+    Args:
+        network: what `quantize` made in the regime "legal".
+        samples: as given there.
+        drawn: sensor, images, patches, patch_px and seed as given there.
+    """
+    assert network.origin is not None and network.quantised is not None  # noqa: S101, PT018
+    model, result = network.origin.model, network.quantised
+    held_out = (samples_of(model, samples) or _simulated(**drawn)).unseen
+    found = compare(open_any_size(model), open_any_size(result.host), held_out.pairs, samples is None)
+    return losses(result, found, held_out)
 
 
 def sensitivity_report(

@@ -28,6 +28,7 @@ class GateResult:
 
     `same_class` is the share of results whose largest channel is the same: of networks that tell classes, else NaN.
     `metric` is what the user measures results by, `metric_float` and `metric_int8` what was found of the two.
+    `worst_drop_db` is what the patch loses that loses most.
     """
 
     mae: float
@@ -41,6 +42,7 @@ class GateResult:
     patches: int
     same_class: float = math.nan
     simulated: bool = True
+    worst_drop_db: float = math.nan
     metric: str = ""
     metric_float: float = math.nan
     metric_int8: float = math.nan
@@ -123,6 +125,7 @@ def compare(
         metric=metric or "",
         metric_float=measures[0].value,
         metric_int8=measures[1].value,
+        worst_drop_db=float(np.max([in_float - in_int8 for _, in_float, in_int8 in errors])),
     )
 
 

@@ -17,7 +17,7 @@ from onnx import TensorProto, helper
 from beers_deploy.model.io.images import MAX_DN
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from beers_deploy.quant.core import IntConv, IntCore, dequantised, rounded_to
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.gate import GateResult
 from beers_deploy.quant.graph import (
@@ -117,11 +117,13 @@ def layer_errors(graph: Graph, core: IntCore, crops: Iterable[np.ndarray]) -> tu
             if op.output == CORRECTION:  # of two gains one is coarse and the other clipped: together they count
                 result = core.ends.merge(result, scale)
                 meant = core.ends.whole(meant)
+            layer.alone.add(result, meant)
+            result = result - (result - meant).mean((2, 3), keepdims=True)  # for which the next bias makes up
+            if op.output == CORRECTION:
                 found = core.ends.finished(crop, result)
             else:
                 feed = {PLANES: planes_of(crop, core.ends), op.output: result}
                 found = core.ends.restored(crop, rests[op.output].run(None, feed)[0], scale)
-            layer.alone.add(result, meant)
             layer.network.add(found, restored, offset)
         together.add(result_of(int8, crop), restored, offset)
     return layers, together
@@ -130,9 +132,7 @@ def layer_errors(graph: Graph, core: IntCore, crops: Iterable[np.ndarray]) -> tu
 def _twin(op: Op, whole: IntConv) -> Conv:
     """The same convolution, by its side, with the values that its int8 weights and bias stand for."""
     assert isinstance(op, Conv)  # noqa: S101 - the core was built from the graph
-    weight, bias = whole.weight * 2.0**-whole.weight_frac_bits, whole.bias * 2.0**-whole.bias_frac_bits
-    changed = replace(op, weight=weight.astype(np.float32), bias=bias.astype(np.float32))
-    return replace(changed, name=op.name + IN_INT8, output=op.output + IN_INT8)
+    return replace(dequantised(op, whole), name=op.name + IN_INT8, output=op.output + IN_INT8)
 
 
 def _rest(graph: Graph, given: str, width: int) -> onnx.ModelProto:
@@ -145,19 +145,13 @@ def _rest(graph: Graph, given: str, width: int) -> onnx.ModelProto:
 def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarray:
     """A layer's result when it alone is in int8."""
     if isinstance(op, Conv):
-        return _rounded(exact[op.output + IN_INT8], core.frac_bits[op.output])
+        return rounded_to(exact[op.output + IN_INT8], core.frac_bits[op.output])
     if ties_scales(op) and not isinstance(op, AveragePool | Resize):
         return exact[op.output]
     if not isinstance(op, Add):
-        return _rounded(exact[op.output], core.frac_bits[op.output])
-    left, right = (_rounded(exact[name], core.frac_bits[name]) for name in op.inputs)
-    return np.asarray(exact[op.output] + (_rounded(left + right, core.frac_bits[op.output]) - (left + right)))
-
-
-def _rounded(values: np.ndarray, frac_bits: int) -> np.ndarray:
-    """To whole multiples of 2^-n, half up, and clipped, as the DPU does."""
-    scale = np.float32(2.0**frac_bits)
-    return np.asarray(np.clip(np.floor(values * scale + np.float32(0.5)), INT8_MIN, INT8_MAX) / scale)
+        return rounded_to(exact[op.output], core.frac_bits[op.output])
+    left, right = (rounded_to(exact[name], core.frac_bits[name]) for name in op.inputs)
+    return np.asarray(exact[op.output] + (rounded_to(left + right, core.frac_bits[op.output]) - (left + right)))
 
 
 @dataclass(frozen=True)
@@ -258,10 +252,39 @@ def sizes_row(spread: Spread) -> Row:
     return Row("error sizes", "INT8 against float", figures)
 
 
+MUCH_DB, SAME_CLASS = 0.2, 0.99
+"""From here on, or below, a network has lost so much that it is worth asking where."""
+
+
+def losses(result: Quantised, gate: GateResult, patches: Patches) -> str:
+    """What INT8 costs, on the worst patch too; where that is much, which tensors cost most and what to try."""
+    if not math.isnan(gate.drop_db):
+        worst = f"{gate.drop_db:.2f} dB of {gate.psnr_float_db:.2f}, and {gate.worst_drop_db:.2f} dB where most"
+        said, much = f"INT8 loses {worst}", gate.drop_db > MUCH_DB
+    elif not math.isnan(gate.same_class):
+        said, much = f"INT8 tells {100 * gate.same_class:.2f} % of the classes as float", gate.same_class < SAME_CLASS
+    else:
+        said, much = f"INT8 differs from float by {gate.mae:.2g} of full scale on average", False
+    return f"{said} ({gate.source}){': ' + _costliest(result, patches) if much else ''}"
+
+
+def _costliest(result: Quantised, patches: Patches) -> str:
+    layers, _ = layer_errors(result.graph, result.core, few_crops(patches.degraded, result.host))
+    whole = sum(layer.network.squared for layer in layers)
+    layers.sort(key=lambda layer: layer.network.squared, reverse=True)
+    named = ", ".join(f"{layer.name} ({100 * layer.network.squared / whole:.0f} %)" for layer in layers[:MOST])
+    add = "" if result.core.ends.adds_image else ", or a network that ends with a global add, of which INT8 errs less"
+    return f"most of it in {named}; try --finetune 250{add}"
+
+
+MOST = 3
+"""Layers that are named."""
+
+
 def headline(gate: GateResult, layers: list[Row]) -> str:
     """How much INT8 loses, of what kind the errors are, and which layers make most of them."""
     shares = {row.name: row.figures["share of squared error"].value or 0 for row in layers[:-1]}
-    most = sorted(shares, key=lambda name: shares[name], reverse=True)[:3]
+    most = sorted(shares, key=lambda name: shares[name], reverse=True)[:MOST]
     named = ", ".join(f"{name} {shares[name]:.0f} %" for name in most)
     drop = "" if math.isnan(gate.drop_db) else f" and costs {gate.drop_db:.2f} dB"
     return (

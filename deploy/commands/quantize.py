@@ -76,17 +76,14 @@ def quantize(
     from beers_deploy.profiles.figures import by_table
     from beers_deploy.quant.encodings import read_core
     from beers_deploy.quant.onnx_file import require_onnx_name
+    from beers_deploy.quantise import losses_of, sensitivity_report
     from beers_deploy.quantise import quantize as quantised
-    from beers_deploy.quantise import sensitivity_report
     from beers_deploy.report.page import write_report
     from beers_deploy.results import Table, print_rows
     from beers_deploy.verdict import compare
 
     free = regime is Regime.free
-    if free and (board_file or report or finetune):
-        remedy = "leave it out, or take --regime legal"
-        expected = "no --board-file, --report or --finetune"
-        raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
+    _require_legal(free and bool(board_file or report or finetune))
     if report and conditioned(model):
         expected, remedy = "a network that is calibrated by itself", "leave it out"
         raise OptionError("--report", expected=expected, got="one behind a bank", remedy=remedy)
@@ -104,6 +101,8 @@ def quantize(
     if board_file is not None:
         made.core().save(board_file)
         say(f"wrote {board_file}: the same numbers in the board's encoding")
+    if made.quantised:
+        say(losses_of(made, samples, patch_px=patch, **drawn))
     rows = list(made.layers)
     if free:
         rows += compare(made, samples=samples, sensor=known, images=images, seed=seed).rows
@@ -118,6 +117,14 @@ def quantize(
     document = Table("quantize", arguments(), (origin, out), tuple(rows))
     for path in (figures, json):
         save(document, path)
+
+
+def _require_legal(asked: bool) -> None:
+    """Refuse what was asked of the regime "free" and belongs to the other."""
+    if asked:
+        remedy = "leave it out, or take --regime legal"
+        expected = "no --board-file, --report or --finetune"
+        raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
 
 
 def _report_files(folder: Path | None) -> tuple[Path, Path] | tuple[None, None]:

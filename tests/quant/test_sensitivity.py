@@ -8,11 +8,13 @@ import pytest
 
 from beers_deploy.model.io.images import MAX_DN
 from beers_deploy.quant.core import IntConv
+from beers_deploy.quant.encodings import host_model
+from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import Add
 from beers_deploy.quant.quantise import Quantised
 from beers_deploy.quant.samples import Patches
-from beers_deploy.quant.sensitivity import LayerError, Loss, layer_errors, spread_of
-from beers_deploy.quant.session import open_session, run
+from beers_deploy.quant.sensitivity import LayerError, Loss, layer_errors, losses, spread_of
+from beers_deploy.quant.session import few_crops, open_session, run
 from tests.quant.quick import quickly
 
 
@@ -51,16 +53,40 @@ def test_adds_of_a_shared_residual_scale_lose_nothing_but_what_saturates(
     assert sum(layers[name].network.squared for name in adds) < 0.1 * rounded
 
 
-def test_a_spoilt_layer_is_found(quantised: Quantised, crops: list[np.ndarray]) -> None:
-    """One layer's weights lose their sign: it, and no other, gets the error."""
-    ops = list(quantised.core.ops)
-    at = next(k for k, op in enumerate(ops) if op.name == "body.1.second")
-    spoilt = ops[at]
-    assert isinstance(spoilt, IntConv)
-    ops[at] = replace(spoilt, weight=-spoilt.weight)
-    layers, _ = layer_errors(quantised.graph, replace(quantised.core, ops=tuple(ops)), crops)
-    assert min(layers, key=lambda layer: layer.alone.sqnr_db).name == "body.1.second"
-    assert layers[at].alone.sqnr_db < 0
+@pytest.fixture(scope="module")
+def spoilt(quantised: Quantised) -> Quantised:
+    """The weights of one layer lose their sign."""
+    spoilt = [op.name == "body.1.second" for op in quantised.core.ops]
+    ops = [
+        replace(op, weight=-op.weight) if bad and isinstance(op, IntConv) else op
+        for op, bad in zip(quantised.core.ops, spoilt, strict=True)
+    ]
+    core = replace(quantised.core, ops=tuple(ops))
+    return replace(quantised, core=core, host=host_model(core, {}))
+
+
+def test_what_is_lost_is_told_and_of_much_also_where(
+    float_onnx: onnx.ModelProto, spoilt: Quantised, patches: Patches
+) -> None:
+    gate = compare(open_session(float_onnx), open_session(spoilt.host), patches.pairs)
+    assert gate.worst_drop_db > gate.drop_db
+    little, much = (
+        losses(spoilt, replace(gate, psnr_float_db=40.0, psnr_int8_db=db, worst_drop_db=2.0), patches)
+        for db in (39.9, 39.6)
+    )
+    assert little == "INT8 loses 0.10 dB of 40.00, and 2.00 dB where most (6 simulated patches of 128 x 128)"
+    layers, _ = layer_errors(spoilt.graph, spoilt.core, few_crops(patches.degraded, spoilt.host))
+    worst = max(layers, key=lambda layer: layer.network.squared)
+    assert f": most of it in {worst.name} (" in much
+    assert much.endswith("; try --finetune 250")
+
+
+def test_a_spoilt_layer_is_found(spoilt: Quantised, crops: list[np.ndarray]) -> None:
+    """It, and no other, gets the error."""
+    layers, _ = layer_errors(spoilt.graph, spoilt.core, crops)
+    worst = min(layers, key=lambda layer: layer.alone.sqnr_db)
+    assert worst.name == "body.1.second"
+    assert worst.alone.sqnr_db < 0
     assert all(layer.alone.sqnr_db > 10 for layer in layers if layer.name != "body.1.second")
 
 
