@@ -134,5 +134,5 @@ def time_on_board(model: Path, plan: Plan, target: TargetProfile) -> Figure:
     try:
         prediction = predict_file(model, dpu_of(target), max(plan.tile_shape))
     except BeersError as error:
-        return unavailable("s", f"the cost model does not take this network: {error.got}")
+        return unavailable("s", f"the cost model takes {error.expected}, got {error.got}")
     return swath_latency(prediction, math.ceil(plan.tiles / prediction.batch))

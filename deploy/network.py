@@ -24,7 +24,7 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 
-from beers_deploy.export import float_for, float_model
+from beers_deploy.export import float_for, float_model, require_tile
 from beers_deploy.model.bank import REFERENCE, bank_of_vector, network_bank
 from beers_deploy.model.family import RANGES, sensor_vector
 from beers_deploy.model.io.files import sha256
@@ -35,10 +35,11 @@ from beers_deploy.profiles.errors import ModelError, OptionError, OutsideRangeWa
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor, numbers_of
 from beers_deploy.profiles.sensor_file import BLIND, load_sensor
+from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.profiles.toml import unreadable
 from beers_deploy.quant.banked.family import FAMILY, required_family, with_delta
 from beers_deploy.quant.core import SHIFTS, Shifts
-from beers_deploy.quant.encodings import board_model, host_model, read_core
+from beers_deploy.quant.encodings import board_model, host_model, read_core, vint8_model
 from beers_deploy.quant.onnx_file import fixed_tile_px, is_quantised, load_onnx, metadata, read_onnx, save_onnx
 from beers_deploy.quant.reading.external import network_sha256
 from beers_deploy.quant.reading.folding import OPSET
@@ -121,14 +122,21 @@ class Network:
         save_onnx(self.model, Path(path))
         return Path(path)
 
-    def core(self) -> "Network":
-        """The part of an INT8 network that the DPU computes, in the encoding that a board's tools read.
+    def core(self, board: TargetProfile | str = DEFAULT_TARGET, tile: int | None = None) -> "Network":
+        """The part of an INT8 network that the DPU or NPU computes, in the encoding that a board's tools read.
+
+        Args:
+            board: whose tools; those of an NPU read VINT8, of one tile.
+            tile: side in pixels of the image that it is fixed to; the network's own, or any, if None.
 
         Raises:
             ModelError: a float network, or an INT8 one that was not quantised under the DPU's rules here.
+            OptionError: an NPU and no tile, or one that the network cannot rearrange.
         """
-        made = board_model(read_core(self.model), metadata(self.model), fixed_tile_px(self.model))
-        return Network(made, f"{self.name}-core")
+        core, side_px = read_core(self.model), tile or fixed_tile_px(self.model)
+        require_tile(side_px, core.ends.place_px)
+        write = vint8_model if TargetProfile.load(board).npu else board_model
+        return Network(write(core, metadata(self.model), side_px), f"{self.name}-core")
 
     def __call__(self, images: Any) -> np.ndarray:
         """What the network makes of images (N, C, H, W) in [0, 1]: (N, C', H', W') float32."""

@@ -16,7 +16,7 @@ from beers_deploy.network import Conditioned, Network, NetworkLike, SensorLike, 
 from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile, board_names
+from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile, board_names, npu_names
 from beers_deploy.quant.core import IntCore, Shifts, target_shifts
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.free import quantise_free
@@ -75,7 +75,7 @@ def quantize(
 
     Raises:
         ModelError: an operation that the DPU does not compute, or weights of no sensible size.
-        OptionError: a board without a DPU, samples that the network needs, or options that do not go together.
+        OptionError: a board without a DPU or NPU, samples that the network needs, or options that do not go together.
         ImageError: samples that the network does not take.
         ProfileError: no such board or sensor.
     """
@@ -151,8 +151,8 @@ def _layers(model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, patche
 
 
 def _shifts_of(target: TargetProfile) -> Shifts:
-    if not target.configurations:
-        expected = f"a target with a DPU: {', '.join(board_names())}"
+    if not (target.configurations or target.npu):
+        expected = f"a target with a DPU or NPU: {', '.join(board_names() + npu_names())}"
         remedy = "choose another, or the free regime"
         raise OptionError("target", expected=expected, got=repr(target.name), remedy=remedy)
     return target_shifts(target)

@@ -18,7 +18,7 @@ from xml.etree import ElementTree as ET
 
 import onnx
 
-from beers_deploy.dpu.board import BoardLike, dpu_of
+from beers_deploy.dpu.board import BoardLike, ruled
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.checker.table import legality
 from beers_deploy.dpu.reading import network_of
@@ -329,11 +329,11 @@ def file_checks(float_model: onnx.ModelProto, int8: Network, target: TargetProfi
 
 
 def _legality(int8: Network, target: TargetProfile) -> list[Check]:
-    """The DPU's rules; a target without a DPU has none."""
-    if not target.configurations:
+    """The rules of the DPU or NPU; a target without one has none."""
+    if not (target.configurations or target.npu):
         return []
     read = network_of(int8.model, fixed_tile_px(int8.model) or TILE_PX, int8.name)
-    return [legality(place(read, dpu_of(target)))]
+    return [legality(place(read, ruled(target)), npu=bool(target.npu))]
 
 
 def sentence(checks: Sequence[Check], passed: str) -> str:

@@ -48,12 +48,13 @@ class Words:
         return ", ".join(self.value) or "none"
 
 
-def read_words(where: str, raw: object, known: Collection[str]) -> Words:
-    """Read `["ReLU"]` or `{ value = ["ReLU"], status = ..., source = ... }`."""
+def read_words(where: str, raw: object, known: Collection[str] = ()) -> Words:
+    """Read `["ReLU"]` or `{ value = ["ReLU"], status = ..., source = ... }`; of any names where none are known."""
     value, status, source = read_stated(where, raw)
-    if not isinstance(value, list) or not all(isinstance(name, str) and name in known for name in value):
+    if not isinstance(value, list) or not all(isinstance(name, str) and name in (known or value) for name in value):
+        expected = f"a list out of {', '.join(known)}" if known else "a list of names"
         remedy = "correct the names; an empty list stands for none"
-        raise ProfileError(where, expected=f"a list out of {', '.join(known)}", got=repr(value), remedy=remedy)
+        raise ProfileError(where, expected=expected, got=repr(value), remedy=remedy)
     return Words(tuple(value), status, source)
 
 

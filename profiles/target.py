@@ -26,6 +26,8 @@ PLACES = frozenset({"conv", "depthwise", "pool", "sum", "alone"})
 """Where: behind a convolution, a depthwise one, a pool, an add or a mul; or by themselves, behind anything."""
 DOCUMENTS = frozenset({"operators", "numbers", "quantiser"})
 """Where a DPU's operators are listed, where its numbers are described, and the quantiser that knows their windows."""
+NPU = frozenset({"device", "int8", "no_int8"})
+"""Of an NPU in place of a DPU's list: the compiler's name of it, and the operators that it has or lacks in INT8."""
 
 WATTS = "_w"
 """How the names of measured powers end, which no board takes from another."""
@@ -39,7 +41,8 @@ class TargetProfile:
 
     `tables` maps a topic ("array", "memory", "conv", "power", ...) to its constants; `configurations` maps the name
     of a build of the accelerator to its constants, and is empty where there is but one. `activations` says what is
-    fused with which operation, `documents` names the manuals; both are empty of a board without a DPU.
+    fused with which operation, `documents` names the manuals; both are empty of a board without a DPU. `npu` says
+    which operators an NPU computes, and is empty of every other board.
     """
 
     name: str
@@ -49,6 +52,7 @@ class TargetProfile:
     tables: dict[str, dict[str, Constant]]
     activations: dict[str, Words] = field(default_factory=dict)
     documents: dict[str, str] = field(default_factory=dict)
+    npu: dict[str, Words] = field(default_factory=dict)
 
     @classmethod
     def load(cls, board: "TargetProfile | str | os.PathLike[str]") -> Self:
@@ -113,8 +117,17 @@ def target_names() -> list[str]:
 
 def board_names() -> list[str]:
     """The names of the shipped targets with a DPU: their files name its manual."""
+    return _names_with(r"^(base =|operators =)")
+
+
+def npu_names() -> list[str]:
+    """The names of the shipped targets with an NPU: it has rules and no cost model."""
+    return _names_with(r"^\[npu]")
+
+
+def _names_with(line: str) -> list[str]:
     texts = {name: profile_path("targets", name).read_text(encoding="utf-8") for name in target_names()}
-    return [name for name, text in texts.items() if re.search(r"^(base =|\[documents])", text, re.MULTILINE)]
+    return [name for name, text in texts.items() if re.search(line, text, re.MULTILINE)]
 
 
 def load_target(name: str) -> TargetProfile:
@@ -126,7 +139,7 @@ def load_target(name: str) -> TargetProfile:
         ProfileError: unknown name, or a table that is not made of constants.
     """
     label, raw = _with_base(*read_toml("targets", name.removesuffix(MODEL_SUFFIX)))
-    special = {"description", "default_configuration", "configurations", "activations", "documents"}
+    special = {"description", "default_configuration", "configurations", "activations", "documents", "npu"}
     check_keys(label, {k: v for k, v in raw.items() if k in special}, {"description"}, special)
     tables = {k: _table(f"{label} [{k}]", v) for k, v in raw.items() if k not in special}
     configurations = {
@@ -135,7 +148,8 @@ def load_target(name: str) -> TargetProfile:
     }
     default = raw.get("default_configuration")
     activations = _whole_table(label, raw, "activations", PLACES)
-    documents = _whole_table(label, raw, "documents", DOCUMENTS)
+    npu = _whole_table(label, raw, "npu", NPU)
+    documents = _whole_table(label, raw, "documents", frozenset({"quantiser"}) if npu else DOCUMENTS)
     profile = TargetProfile(
         label.removesuffix(".toml"),
         str(raw["description"]),
@@ -144,6 +158,7 @@ def load_target(name: str) -> TargetProfile:
         tables,
         {key: read_words(f"{label} [activations] {key}", value, FUSED) for key, value in activations.items()},
         {key: str(value) for key, value in documents.items()},
+        {key: read_words(f"{label} [npu] {key}", value) for key, value in npu.items()},
     )
     if configurations:
         profile.configuration()

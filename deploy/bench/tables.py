@@ -171,6 +171,22 @@ def _ends(figure: Figure) -> Interval:
     return figure.interval or (figure.value or 0.0, figure.value or 0.0)
 
 
+QUOTED = {"latency": "ms", "throughput": "fps"}
+"""Of the tables [published_latency_ms] and [published_throughput_fps]: the figure's name and unit."""
+
+
+def quoted_rows(network: str, target: TargetProfile) -> list[Row]:
+    """A network on a board without a cost model, unavailable; and what the board's maker prints of other networks."""
+    reason = f"too few rates of {target.name} are published to fit a cost model"
+    own = {key: unavailable(unit, reason) for key, unit in QUOTED.items()}
+    own["power"] = unavailable("W", f"no power of {target.name} is published")
+    rows = [Row(TABLE, f"{network} on {target.name}", own)]
+    for key, unit in QUOTED.items():
+        for name, constant in target.tables.get(f"published_{key}_{unit}", {}).items():
+            rows.append(Row(TABLE, f"quoted: {name}", {key: published(constant.low, unit, constant.source)}))
+    return rows
+
+
 def published_rows() -> list[Row]:
     """The paper's two runs on the VCK190, as printed; its DPU configuration is not named."""
     runs = {

@@ -103,7 +103,8 @@ def bench(
 ) -> None:
     """Compare a network on the DPU with the traditional pipeline and with the paper's figures."""
     from beers_deploy.bench.board import bench_board
-    from beers_deploy.bench.tables import parse_tiles
+    from beers_deploy.bench.tables import parse_tiles, quoted_rows
+    from beers_deploy.dpu.board import ALL
     from beers_deploy.dpu.cost.model import TASKS
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.network import int8_file
@@ -120,6 +121,9 @@ def bench(
         for table, part in by_table(rows).items():
             print_rows(f"{path.name} on this machine: {table}", part)
         say(NO_PROXY)
+    elif board != ALL and (profile := load_target(board)).npu:
+        rows = quoted_rows(path.stem, profile)
+        print_rows(f"{path.name} on {profile.name}: nothing is predicted; published are other networks", rows)
     else:
         task = next((name for name in TASKS if name == host_task), None)
         found = bench_board(

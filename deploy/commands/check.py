@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import BOARDS, save, say
-from beers_deploy.profiles.target import DEFAULT_TARGET
+from beers_deploy.commands.shared import RULED, save, say
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.target import DEFAULT_TARGET, load_target
 
 EXAMPLE = "check network.onnx --target zcu102 --dpu B4096"
 
@@ -18,7 +19,7 @@ def check(
             metavar="[MODEL]", help="ONNX network: float, INT8 or board core, anyone's; the shipped INT8 one if none."
         ),
     ] = None,
-    target: Annotated[str, typer.Option(help=f"Profile of a board with a DPU: {BOARDS}.")] = DEFAULT_TARGET,
+    target: Annotated[str, typer.Option(help=f"Profile of a board with a DPU or NPU: {RULED}.")] = DEFAULT_TARGET,
     dpu: Annotated[
         str | None, typer.Option(help="DPU configuration that the profile lists; the target's own if none.")
     ] = None,
@@ -31,7 +32,10 @@ def check(
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the findings here.")] = None,
 ) -> None:
-    """Place every node of a network on the host, the DPU or the CPU; exit code 1 if the DPU cannot run its part."""
+    """Place every node of a network on the host, the DPU or the CPU; exit code 1 if the DPU cannot run its part.
+
+    Of an NPU, whose limits nobody publishes, nodes are placed by AMD's table of operators alone.
+    """
     from beers_deploy.dpu.checker.picture import require_picture, write_picture
     from beers_deploy.dpu.checker.table import check as placed
     from beers_deploy.model.io.files import require_writable
@@ -41,6 +45,9 @@ def check(
 
     require_picture(picture)
     require_writable(picture, json, inputs=(model, Path(target)))
+    if picture and load_target(target).npu:
+        remedy = "leave it out: where a node of this board goes is not known"
+        raise OptionError("--picture", expected="a board with a DPU", got=target, remedy=remedy)
     found = placed(in_int8(model or Path(VARIANT)), target, dpu=dpu, tile=tile)
     print_rows(found.title, [row for row in found.rows if row.table == "nodes"])
     if picture is not None:

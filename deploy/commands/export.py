@@ -6,10 +6,11 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import refuse, say
+from beers_deploy.commands.shared import RULED, config_beside, refuse, save_core, say
 from beers_deploy.model.shipped import SENSOR, SHIPPED, VARIANT
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile, load_target
 
 EXAMPLE = "export --network convbeers-s --out float.onnx"
 
@@ -33,6 +34,9 @@ def export(
     ] = None,
     board_file: Annotated[
         Path | None, typer.Option(help="Of an INT8 file: also write its integers in the board's encoding.")
+    ] = None,
+    target: Annotated[
+        str | None, typer.Option(help=f"Whose encoding --board-file has, QDQ ONNX or an NPU's VINT8: {RULED}.")
     ] = None,
     delta: Annotated[
         Path | None, typer.Option(help="Of an INT8 file: also write what the sensor changes in it, 1 to 3 kB.")
@@ -60,14 +64,18 @@ def export(
     from beers_deploy.quant.onnx_file import require_onnx_name, save_onnx
 
     path = weights_file(network) if network.suffix or network.exists() else weights_named(network)
-    require_writable(out, board_file, delta, inputs=(path, apply, Path(sensor) if sensor else None))
+    board = load_target(target or DEFAULT_TARGET)
+    config = config_beside(board_file, board)
+    require_writable(out, board_file, config, delta, inputs=(path, apply, Path(sensor) if sensor else None))
     if path.suffix != ".onnx":
         remedy = "give one that 'quantize' made of weights of 'train --conditioned', or leave it out"
         asked = ["board_file", "delta", "apply"]
         refuse(context, asked, expected="an INT8 --network", got=str(network), remedy=remedy)
     require_onnx_name(out, board_file)
+    if board_file is None:
+        refuse(context, ["target"], expected="--board-file beside it", got="none", remedy="leave it out")
     if path.suffix == ".onnx":
-        _export_int8(path, out, sensor, tile, board_file, delta, apply)
+        _export_int8(path, out, sensor, tile, (board_file, board), delta, apply)
         return
     known = load_sensor(sensor or SENSOR) if is_conditioned(path) else None
     if known is not None:
@@ -93,7 +101,7 @@ def _export_int8(
     out: Path,
     sensor: str | None,
     tile_px: int | None,
-    board: Path | None,
+    board: tuple[Path | None, TargetProfile],
     delta: Path | None,
     apply: Path | None,
 ) -> None:
@@ -104,15 +112,15 @@ def _export_int8(
         out: the host's.
         sensor: that is told; the default one if None.
         tile_px: side of an image that the files are fixed to; None leaves them as they are.
-        board: the same integers in the board's encoding, or None.
+        board: where the same integers go in the board's encoding, or None; and the board.
         delta: what the sensor changes, or None.
         apply: a delta that is told in place of a sensor, or None.
     """
     from beers_deploy.export import require_tile
     from beers_deploy.model.io.files import whole_file
-    from beers_deploy.network import told_by_delta, told_int8
+    from beers_deploy.network import Network, told_by_delta, told_int8
     from beers_deploy.quant.banked.family import delta_of_file
-    from beers_deploy.quant.encodings import board_model, host_model, read_core
+    from beers_deploy.quant.encodings import host_model, read_core
     from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
 
     if apply is not None and (sensor or delta):
@@ -125,11 +133,11 @@ def _export_int8(
         made = told_int8(model, load_sensor(sensor or SENSOR), log=partial(say, err=True))
     core, about, side_px = read_core(made), metadata(made), tile_px or fixed_tile_px(made)
     require_tile(side_px, core.ends.place_px)
+    board_file, profile = board
+    for_board = Network(made, out.stem).core(profile, tile_px) if board_file else None
     save_onnx(host_model(core, about, side_px), out)
     say(f"wrote {out}")
-    if board is not None:
-        save_onnx(board_model(core, about, side_px), board)
-        say(f"wrote {board}: the same numbers in the board's encoding")
+    save_core(for_board, board_file, profile)
     if delta is not None:
         packed = delta_of_file(made)
         with whole_file(delta) as temporary:

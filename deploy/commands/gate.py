@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import BOARDS, STDOUT, arguments, save, say
+from beers_deploy.commands.shared import RULED, STDOUT, arguments, save, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
@@ -29,7 +29,7 @@ def gate(
     limits: Annotated[Path | None, typer.Option(help="TOML file of limits; see docs/how-to/gate.md.")] = None,
     baseline: Annotated[Path | None, typer.Option(help="What 'gate --json' wrote before: MAE may not grow.")] = None,
     target: Annotated[
-        str, typer.Option(help=f"Board whose rules the INT8 file must keep: {BOARDS}.")
+        str, typer.Option(help=f"Board whose rules the INT8 file must keep: {RULED}.")
     ] = DEFAULT_TARGET,
     sensor: Annotated[
         str, typer.Option(help="Profile of the test patches, and what a shipped network is told.")

@@ -6,12 +6,12 @@ from typing import Annotated, Any
 
 import typer
 
-from beers_deploy.commands.shared import BOARDS, arguments, save, say
+from beers_deploy.commands.shared import RULED, arguments, config_beside, save, save_core, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.target import DEFAULT_TARGET
+from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile, load_target
 
 EXAMPLE = "quantize float.onnx --target zcu104 --sensor pleiades-degraded --out int8.onnx"
 
@@ -36,13 +36,17 @@ def quantize(
         Path, typer.Argument(help="Float ONNX or weights, or a shipped network's name, then told --sensor.")
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="INT8 ONNX for stock onnxruntime.")],
-    target: Annotated[str, typer.Option(help=f"Whose rules to obey: {BOARDS}.")] = DEFAULT_TARGET,
+    target: Annotated[str, typer.Option(help=f"Whose rules to obey: {RULED}.")] = DEFAULT_TARGET,
     sensor: Annotated[str, typer.Option(help="Profile that calibration patches are drawn from.")] = SENSOR,
     regime: Annotated[
         Regime, typer.Option(help="legal: the DPU's rules; free: float scales, a channel's own for weights.")
     ] = Regime.legal,
     board_file: Annotated[
-        Path | None, typer.Option(help="Also write the DPU's core in the board's encoding.")
+        Path | None, typer.Option(help="Also write the core in the board's encoding: QDQ ONNX, of an NPU VINT8.")
+    ] = None,
+    tile: Annotated[
+        int | None,
+        typer.Option(min=16, max=8192, help="Fix --board-file to one tile of this side, as an NPU's must be."),
     ] = None,
     images: Annotated[Path | None, typer.Option(help="Folder of scenes for calibration; drawn ones if none.")] = None,
     samples: Annotated[
@@ -82,25 +86,25 @@ def quantize(
     from beers_deploy.results import Table, print_rows
     from beers_deploy.verdict import compare
 
-    free = regime is Regime.free
+    free, board = regime is Regime.free, load_target(target)
     _require_legal(free and bool(board_file or report or finetune))
     if report and conditioned(model):
         expected, remedy = "a network that is calibrated by itself", "leave it out"
         raise OptionError("--report", expected=expected, got="one behind a bank", remedy=remedy)
+    _require_tile(tile, board_file, board)
     page, figures = _report_files(report)
     read = (model, images, samples, *map(Path, (target, sensor)))
-    require_writable(out, board_file, json, page, figures, inputs=read)
+    require_writable(out, board_file, config_beside(board_file, board), json, page, figures, inputs=read)
     require_onnx_name(out, board_file)
     known = Sensor.load(sensor)
     drawn: dict[str, Any] = {"sensor": known, "images": images, "patches": patches, "seed": seed}
-    made = quantised(model, samples, board=target, regime=regime.value, patch_px=patch, finetune=finetune, **drawn)
+    made = quantised(model, samples, board=board, regime=regime.value, patch_px=patch, finetune=finetune, **drawn)
+    core = made.core(board, tile) if board_file else None
     made.save(out)
     kept = f", {made.quantised.relus} ReLUs kept" if made.quantised else f", told {known.name}"
     count = f"{len(read_core(made.model).ops)} integer operations{kept}" if not free else "float scales"
     say(f"wrote {out}: {count}")
-    if board_file is not None:
-        made.core().save(board_file)
-        say(f"wrote {board_file}: the same numbers in the board's encoding")
+    save_core(core, board_file, board)
     if made.quantised:
         say(losses_of(made, samples, patch_px=patch, **drawn))
     rows = list(made.layers)
@@ -125,6 +129,16 @@ def _require_legal(asked: bool) -> None:
         remedy = "leave it out, or take --regime legal"
         expected = "no --board-file, --report or --finetune"
         raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
+
+
+def _require_tile(tile: int | None, board_file: Path | None, board: TargetProfile) -> None:
+    """A tile is that of a board's file, and before minutes of calibration an NPU's is known to have one."""
+    from beers_deploy.quant.encodings import required_tile
+
+    if tile and board_file is None:
+        raise OptionError("--tile", expected="--board-file beside it", got="none", remedy="leave it out")
+    if board_file and board.npu:
+        required_tile(tile)
 
 
 def _report_files(folder: Path | None) -> tuple[Path, Path] | tuple[None, None]:

@@ -12,13 +12,16 @@ from typing import TYPE_CHECKING, TextIO
 import typer
 
 from beers_deploy.profiles.errors import OptionError, visible
-from beers_deploy.profiles.target import board_names
+from beers_deploy.profiles.target import TargetProfile, board_names, npu_names
 
 if TYPE_CHECKING:
+    from beers_deploy.network import Network
     from beers_deploy.results import Table
 
 BOARDS = f"{', '.join(board_names())}, or your .toml file"
 """What --target takes, for its help."""
+RULED = ", ".join([*npu_names(), BOARDS])
+"""The same where rules alone are asked for, which an NPU has too."""
 
 
 def refuse(context: typer.Context, names: Iterable[str], *, expected: str, got: str, remedy: str) -> None:
@@ -82,6 +85,28 @@ def save(table: "Table", path: Path | None) -> None:
         (_results.get() or sys.stdout).write(json.dumps(table.to_dict(), indent=1) + "\n")
     elif path is not None:
         table.save(path)
+
+
+def save_core(core: "Network | None", path: Path | None, board: TargetProfile) -> None:
+    """Write a network's core for a board, where one is wanted, and beside it what the compiler of an NPU reads."""
+    from beers_deploy.model.io.files import write_text
+    from beers_deploy.quant.encodings import compiler_config
+
+    if core is None or path is None:
+        return
+    core.save(path)
+    say(f"wrote {path}: the same numbers in the board's encoding")
+    config = config_beside(path, board)
+    if config is not None:
+        write_text(config, json.dumps(compiler_config(*board.npu["device"].value), indent=1) + "\n")
+        say(f"wrote {config}: what AMD's compiler is told")
+
+
+def config_beside(path: Path | None, board: TargetProfile) -> Path | None:
+    """What the compiler of an NPU reads beside a core; None of other boards."""
+    from beers_deploy.quant.encodings import CONFIG
+
+    return path.with_name(CONFIG) if path is not None and board.npu else None
 
 
 def say(text: str, err: bool = False) -> None:

@@ -138,6 +138,16 @@ def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
     return dpu
 
 
+def ruled(profile: TargetProfile, configuration: str | None = None) -> Dpu:
+    """What a network is held against: as `dpu_of`, or an NPU, which has rules and nothing that predicts."""
+    if not profile.npu:
+        return dpu_of(profile, configuration)
+    if configuration is not None:
+        expected, remedy = f"none beside {profile.name}, which has an NPU", "leave it out"
+        raise OptionError("dpu", expected=expected, got=repr(configuration), remedy=remedy)
+    return Dpu(profile, "NPU", {})
+
+
 def _require(where: str, constant: Constant | None, least: float) -> None:
     if constant is None or not least <= constant.low <= constant.high < LARGEST:
         got, expected = str(constant or "none"), f"a number of at least {least:g} that a board can have"

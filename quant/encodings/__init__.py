@@ -1,21 +1,27 @@
-"""The integer core as ONNX, in two encodings of the same numbers, and read back.
+"""The integer core as ONNX, in three encodings of the same numbers, and read back.
 
 The host's file runs on stock onnxruntime by integer kernels, from image to restored image; the board's is the core by
-itself as QDQ ONNX, with int8 bias and power-of-two scales. Reading a host file back gives numbers to reason about.
+itself as QDQ ONNX, with int8 bias and power-of-two scales; VINT8 is that in the layout that AMD's NPU flow takes.
+Reading a host file back gives numbers to reason about.
 """
 
 from beers_deploy.quant.encodings.board import as_on_board, board_model
 from beers_deploy.quant.encodings.description import BORDER_PX, PLACE_PX
 from beers_deploy.quant.encodings.host import MICROSOFT, host_model
 from beers_deploy.quant.encodings.reading import encoding_faults, read_core
+from beers_deploy.quant.encodings.vint8 import CONFIG, compiler_config, required_tile, vint8_model
 
 __all__ = [
     "BORDER_PX",
+    "CONFIG",
     "MICROSOFT",
     "PLACE_PX",
     "as_on_board",
     "board_model",
+    "compiler_config",
     "encoding_faults",
     "host_model",
     "read_core",
+    "required_tile",
+    "vint8_model",
 ]

@@ -5,6 +5,7 @@ import onnx
 
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings.description import BORDER_PX, KEY, PLACE_PX, described_core
+from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import CORRECTION, PLANES, Conv
 from beers_deploy.quant.graph.writer import onnx_weight, write_float
 from beers_deploy.quant.onnx_file import GraphWriter, constants, fixed_tile_px, image_info, make_model, metadata
@@ -18,17 +19,21 @@ def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None
 
     The correction's channels come several times where it has gains or windows: `quant.ends.Ends.merge` makes one.
     """
-    writer = _BoardWriter()
+    writer = BoardWriter()
     writer.quantised("planes.dequantised", PLANES, core.frac_bits[PLANES])
     for op in core.ops:
         feeds = ["planes.dequantised" if i == PLANES else i for i in op.inputs]
         output = f"{op.output}.float"
         if isinstance(op, IntConv):
-            _conv(writer, op, feeds[0], output)
+            write_conv(writer, op, feeds[0], output)
         else:
             write_float(writer, op, feeds, output)
         writer.quantised(op.output, output, core.frac_bits[op.output])
-    ends = core.ends
+    return core_file(writer, core.ends, about, tile_px)
+
+
+def core_file(writer: GraphWriter, ends: Ends, about: dict[str, str], tile_px: int | None) -> onnx.ModelProto:
+    """The model of what was written, from the planes that `ends` makes to the correction that it finishes."""
     read_px = tile_px and (tile_px + 2 * ends.border_px) // ends.place_px
     size = image_info(PLANES, ends.planes * ends.channels, read_px)
     result = image_info(CORRECTION, ends.copies * ends.outputs, tile_px and tile_px // ends.correction_px)
@@ -53,7 +58,8 @@ def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
         return board_model(core, {}, fixed_tile_px(model))
 
 
-def _conv(w: "_BoardWriter", op: IntConv, source: str, output: str) -> None:
+def write_conv(w: "BoardWriter", op: IntConv, source: str, output: str) -> None:
+    """Write a convolution and its activation, weights and bias as int8 seen as float."""
     weight = w.dequantised(f"{op.name}.weight", onnx_weight(op.weight, op.transposed), op.weight_frac_bits)
     bias = w.dequantised(f"{op.name}.bias", op.bias, op.bias_frac_bits)
     kind = (op.activation, op.window, op.groups, op.transposed)
@@ -61,19 +67,20 @@ def _conv(w: "_BoardWriter", op: IntConv, source: str, output: str) -> None:
     write_float(w, as_float, [source, weight, bias], output)
 
 
-class _BoardWriter(GraphWriter):
+class BoardWriter(GraphWriter):
     """Writes tensors as the board's flow reads them: quantised to int8, and seen as float again."""
 
-    def scale(self, frac_bits: int) -> list[str]:
+    def scale(self, tensor: str, frac_bits: int) -> list[str]:  # noqa: ARG002 - tensors of one scale share it here
+        """Scale and zero point of a tensor."""
         name = self.constant(f"scale_2^{-frac_bits}", np.array(2.0**-frac_bits, np.float32))
         return [name, self.constant("zero_point", np.array(0, np.int8))]
 
     def quantised(self, output: str, source: str, frac_bits: int) -> None:
         """Quantise and dequantise an activation."""
-        middle = self.node("QuantizeLinear", f"{source}.int8", [source, *self.scale(frac_bits)])
-        self.node("DequantizeLinear", output, [middle, *self.scale(frac_bits)], f"{middle}.float")
+        middle = self.node("QuantizeLinear", f"{source}.int8", [source, *self.scale(source, frac_bits)])
+        self.node("DequantizeLinear", output, [middle, *self.scale(source, frac_bits)], f"{middle}.float")
 
     def dequantised(self, name: str, value: np.ndarray, frac_bits: int) -> str:
         """An int8 constant seen as float."""
-        feeds = [self.constant(name, value), *self.scale(frac_bits)]
+        feeds = [self.constant(name, value), *self.scale(name, frac_bits)]
         return self.node("DequantizeLinear", f"{name}.float", feeds)

@@ -18,7 +18,7 @@ from beers_deploy.dpu.graph import Operation, Window
 def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:
     """The operation as it is written, then what else it may be taken as, each to be held against the rules."""
     yield op
-    if fully_connected(op):
+    if "array" in dpu.tables and fully_connected(op):  # an NPU's file does not state the array that it would fit
         yield _in_parts(op, dpu)
         yield _in_parts(_flat(op), dpu)
 

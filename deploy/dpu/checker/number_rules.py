@@ -31,6 +31,12 @@ def symmetric(op: Operation, dpu: Dpu) -> Finding | None:
     return Finding("; ".join(faults), f"calibrate with a zero point of 0; {AGAIN}") if faults else None
 
 
+def int8_alone(op: Operation, dpu: Dpu) -> Finding | None:
+    """Tensors are int8 around {numbers[zero_point]}, none is uint8 ({numbers[zero_point].source})."""
+    faults = [role for role, scale in op.scales.items() if scale.integer_type == "uint8"]
+    return Finding(f"{', '.join(faults)} in uint8", f"quantise to int8; {AGAIN}") if faults else None
+
+
 def per_tensor(op: Operation, dpu: Dpu) -> Finding | None:
     """A tensor has one scale, not one a channel ({documents[quantiser]})."""
     faults = [f"{role} has {len(scale.scales)} scales" for role, scale in op.scales.items() if len(scale.scales) != 1]
@@ -38,7 +44,7 @@ def per_tensor(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def power_of_two(op: Operation, dpu: Dpu) -> Finding | None:
-    """Scales are powers of two ({documents[numbers]})."""
+    """Scales are powers of two ({documents[quantiser]})."""
     single = {role: scale for role, scale in op.scales.items() if len(scale.scales) == 1}
     faults = [f"{role} scale {scale.scales[0]:.4g}" for role, scale in single.items() if scale.frac_bits is None]
     remedy = f"round each scale to 2^-n; {AGAIN}, and so does AMD Quark's XINT8"
@@ -68,6 +74,17 @@ def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
     low = min(0, cut + 8 - dpu.whole("numbers", "accumulator_bits"))
     high, shift = dpu.whole("numbers", "shift_bias_max"), product - bias
     return None if low <= shift <= high else Finding(f"shift_bias {shift}, allowed {low} to {high}", MOVE)
+
+
+def bias_width(op: Operation, dpu: Dpu) -> Finding | None:
+    """A bias shifted to the products' scale fits {numbers[bias_bits]} bits ({numbers[bias_bits].source})."""
+    product, frac_bits, values = product_frac_bits(op), _frac_bits(op, "bias"), op.constants.get("bias")
+    if product is None or frac_bits is None or values is None:
+        return None
+    largest, most = np.abs(values.astype(np.float64)).max(initial=0), 2 ** (dpu.whole("numbers", "bias_bits") - 1) - 1
+    size = largest * 2.0 ** (product - frac_bits)
+    remedy = "train with smaller biases, or with larger weights behind a smaller scale"
+    return None if size <= most else Finding(f"a bias of {size:g} in units of the products, at most {most}", remedy)
 
 
 def shift_read(op: Operation, dpu: Dpu) -> Finding | None:
@@ -136,9 +153,10 @@ def int8_constants(op: Operation, dpu: Dpu) -> Finding | None:
 def int8_bias(op: Operation, dpu: Dpu) -> Finding | None:
     """A bias is int8 with a scale of its own, not int32 at the products' scale ({documents[quantiser]}).
 
-    The operator QLinearConv demands int32: its bias has a rule of its own.
+    The operator QLinearConv demands int32: its bias has a rule of its own. Judged where weights are in 8 bits.
     """
-    if "bias" not in op.constants or op.op_type == "QLinearConv":
+    whole = _kind(op.constants.get("weight")) in BYTES
+    if "bias" not in op.constants or op.op_type == "QLinearConv" or not whole:
         return None
     kind = _kind(op.constants["bias"])
     return None if kind == "int8" else Finding(f"its bias is {kind}", f"quantise the bias to int8; {AGAIN}")

@@ -60,15 +60,25 @@ RULES: Mapping[Kind, tuple[Rule, ...]] = {
 SIZES: tuple[Rule, ...] = (other_rules.map_exists, other_rules.maps_aligned, other_rules.map_in_memory)
 """What the tile's size has to allow every node."""
 
+EVERY: tuple[Rule, ...] = (other_rules.int8_operator, *SIZES)
+"""What a node of any kind has to keep."""
+
 NUMBERS: tuple[Rule, ...] = (
     number_rules.on_integers,
     number_rules.symmetric,
+    number_rules.int8_alone,
     number_rules.per_tensor,
     number_rules.power_of_two,
     number_rules.one_format,
     number_rules.int8_constants,
 )
-SUMS = (number_rules.int8_bias, number_rules.int32_bias, number_rules.shift_cut, number_rules.shift_bias)
+SUMS = (
+    number_rules.int8_bias,
+    number_rules.int32_bias,
+    number_rules.bias_width,
+    number_rules.shift_cut,
+    number_rules.shift_bias,
+)
 SHIFTS: Mapping[Kind, tuple[Rule, ...]] = {
     **dict.fromkeys(("conv", "depthwise", "transposed"), SUMS),
     "add": (number_rules.shift_read, number_rules.shift_write),
@@ -96,7 +106,7 @@ def judge(op: Operation, dpu: Dpu, quantised: bool) -> tuple[Broken, ...]:
 
 
 def _broken(op: Operation, dpu: Dpu, quantised: bool) -> tuple[Broken, ...]:
-    rules = RULES[op.kind] + SIZES
+    rules = RULES[op.kind] + EVERY
     if quantised and op.kind not in ("other", "argmax"):  # whose results are no numbers of 8 bits
         rules += NUMBERS + SHIFTS.get(op.kind, ())
     findings = ((rule, rule(op, dpu)) for rule in rules if applies(rule, dpu))
@@ -105,7 +115,7 @@ def _broken(op: Operation, dpu: Dpu, quantised: bool) -> tuple[Broken, ...]:
 
 def all_rules() -> Iterator[Rule]:
     """Every rule once, in the order of the tables."""
-    chains = [*RULES.values(), SIZES, NUMBERS, *SHIFTS.values()]
+    chains = [*RULES.values(), EVERY, NUMBERS, *SHIFTS.values()]
     yield from dict.fromkeys(rule for chain in chains for rule in chain)
 
 
@@ -140,7 +150,7 @@ def _facts(dpu: Dpu) -> Mapping[str, Mapping[str, object]]:
     facts: dict[str, Mapping[str, object]] = {**dpu.tables}
     if "channel_groups" in facts.get("array", {}):
         facts["limits"] = {"channels": dpu.channels_max}
-    return facts | {"activations": dpu.target.activations, "documents": dpu.target.documents}
+    return facts | {key: getattr(dpu.target, key) for key in ("activations", "documents", "npu")}
 
 
 @cache

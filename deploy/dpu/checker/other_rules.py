@@ -60,6 +60,14 @@ def known_operator(op: Operation, dpu: Dpu) -> Finding | None:
     return Finding(f"{op.op_type} always runs on the CPU", remedy)
 
 
+def int8_operator(op: Operation, dpu: Dpu) -> Finding | None:
+    """The NPU computes an operator in INT8 unless it is one of {npu[no_int8]} ({npu[no_int8].source})."""
+    if op.op_type not in dpu.target.npu["no_int8"].value:
+        return None
+    remedy = INSTEAD.get(op.op_type, "leave it to the host, or train with another, such as LeakyReLU for PReLU")
+    return Finding(f"AMD's table has N/A for {op.op_type} in INT8; left in float it would be BF16", remedy)
+
+
 def shuffle_place(op: Operation, dpu: Dpu) -> Finding | None:
     """A pixel shuffle or its inverse stands behind a convolution or its activation ({documents[operators]})."""
     if op.follows in CONVOLUTIONS or op.follows == "activation":

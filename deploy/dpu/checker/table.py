@@ -4,7 +4,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from beers_deploy.dpu.board import BoardLike, Dpu, dpu_of
+from beers_deploy.dpu.board import BoardLike, Dpu, ruled
+from beers_deploy.dpu.checker.npu import file_checks, notes_on, words_of
 from beers_deploy.dpu.checker.placement import Cut, PlacedNode, Placement, place
 from beers_deploy.dpu.reading import network_of, own_tile_px
 from beers_deploy.model.shipped import SENSOR
@@ -66,6 +67,8 @@ REMARKS: tuple[Remark, ...] = (fix2float, subgraphs, streaming, shuffles)
 
 def remarks_on(placement: Placement, dpu: Dpu, tile_px: int) -> dict[str, str]:
     """Every remark that a placed network calls for, by name."""
+    if dpu.target.npu:
+        return notes_on(placement, dpu)
     found = {remark.__name__: remark(placement, dpu, tile_px) for remark in REMARKS}
     return {name: text for name, text in found.items() if text is not None}
 
@@ -103,7 +106,7 @@ class Checked(Table):
     def lines(self) -> list[str]:
         """What a person wants to know, in a few lines."""
         refused = refusal(self.network.model) if self.placement.note else ""
-        return summary(self.placement, self.dpu, self.tile_px, refused)
+        return summary(self, refused)
 
 
 def check(
@@ -113,65 +116,72 @@ def check(
 
     Args:
         network: float, INT8 or a board's core, anyone's.
-        board: with a DPU.
+        board: with a DPU or an NPU.
         dpu: configuration of the DPU that the board's file lists; its own default if None.
         tile: side of a tile in pixels; the network's own where it has one, else 640.
 
     Raises:
         ModelError: no ONNX network of images.
         ProfileError: no such board or configuration.
-        OptionError: a board without a DPU, or a tile of no pixels.
+        OptionError: a board without a DPU or NPU, or a tile of no pixels.
     """
-    read, asked = Network.load(network, sensor=SENSOR, to_run=False), dpu_of(TargetProfile.load(board), dpu)
+    read, asked = Network.load(network, sensor=SENSOR, to_run=False), ruled(TargetProfile.load(board), dpu)
     tile_px = own_tile_px(read.model) or TILE_PX if tile is None else require_side(tile)
     placement = place(network_of(read.model, tile_px, read.label), asked)
-    arguments = {"target": asked.target.name, "dpu": asked.name, "tile": tile_px}
-    rows, checks = tuple(network_rows(placement, asked, tile_px)), (legality(placement),)
-    return Checked(
-        "check", arguments, (read.input,), rows, checks, placement=placement, dpu=asked, tile_px=tile_px, network=read
-    )
+    arguments: dict[str, object] = {"target": asked.target.name, "dpu": asked.name, "tile": tile_px}
+    rows, npu = tuple(network_rows(placement, asked, tile_px)), bool(asked.target.npu)
+    checks = [legality(placement, npu=npu), *(file_checks(read.model, asked) if npu else [])]
+    about = ("check", arguments, (read.input,), rows, tuple(checks))
+    return Checked(*about, placement=placement, dpu=asked, tile_px=tile_px, network=read)
 
 
 def network_rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
     """Every node, then the subgraphs, the tensors that cross, what else to know, and the counts."""
-    nodes = [row for node in placement.nodes for row in _node_rows(node)]
+    npu = dpu.target.npu
+    nodes = [row for node in placement.nodes for row in _node_rows(node, placement, dpu)]
     found = remarks_on(placement, dpu, tile_px).items()
     remarks = [Row("remarks", name, {}, {"remark": text}) for name, text in found]
-    parts, refused = _count(placement.dpu_subgraphs, "subgraph"), _count(len(placement.failed), "node")
-    summary = Row("summary", "placement", {"DPU subgraphs": parts, "nodes refused": refused})
+    refused = {"nodes refused": _count(len(placement.failed), "node")}
+    if npu:  # into which parts its compiler cuts a network is not known
+        return [*nodes, *remarks, Row("summary", "placement", refused)]
+    parts = {"DPU subgraphs": _count(placement.dpu_subgraphs, "subgraph")}
+    summary = Row("summary", "placement", parts | refused)
     return [*nodes, *_subgraph_rows(placement), *map(_cut_row, placement.cuts), *remarks, summary]
 
 
-def legality(placement: Placement) -> Check:
-    """The verdict on a network: no node of its core may break a rule."""
+def legality(placement: Placement, *, npu: bool = False) -> Check:
+    """The verdict on a network: no node of its core may break a rule. What an NPU refuses is not known."""
+    name = "nodes that break a rule" if npu else "nodes the DPU refuses"
     failed = placement.failed
     first = f"{failed[0].op.name}: {failed[0].broken[0].finding.reason}" if failed else ""
-    return Check("nodes the DPU refuses", len(failed), 0, "node", detail=first)
+    return Check(name, len(failed), 0, "node", detail=first)
 
 
-def summary(placement: Placement, dpu: Dpu, tile_px: int, refusal: str = "") -> list[str]:
-    """What a person wants to know, in a few lines.
+def summary(checked: Checked, refusal: str = "") -> list[str]:
+    """What a person wants to know, in a few lines; `refusal` is why `quantize` does not take a float file."""
+    placement, dpu = checked.placement, checked.dpu
+    lines = [] if dpu.target.npu else _crossings(placement)
+    lines += [f"{name}: {text}" for name, text in remarks_on(placement, dpu, checked.tile_px).items()]
+    if placement.note:
+        lines.append(placement.note)
+        lines.append(f"'quantize' does not take it: {refusal}" if refusal else "'quantize' takes it")
+    failed = "; ".join(str(check) for check in checked.checks if not check.passed)
+    sound = "no rule is broken, not compiled" if dpu.target.npu else "the core runs whole on the DPU"
+    return [*lines, f"check FAILED: {failed}" if failed else f"check passed: {sound}"]
 
-    Args:
-        placement: every node on its device.
-        dpu: the DPU that was asked.
-        tile_px: side of a tile.
-        refusal: why `quantize` does not take a float file; empty where it does.
-    """
+
+def _crossings(placement: Placement) -> list[str]:
     lines = [f"device subgraphs: {len(_subgraphs_of(placement))}, DPU subgraphs: {placement.dpu_subgraphs}"]
     for cut in placement.cuts:
         size = "a size unknown" if cut.size_bytes is None else f"{cut.size_bytes / 1e6:.2f} MB"
         lines.append(f"{'to' if cut.onto_dpu else 'from'} the DPU: {cut.tensor}, {size} an image as int8")
-    lines += [f"{name}: {text}" for name, text in remarks_on(placement, dpu, tile_px).items()]
-    if placement.note:
-        lines.append(placement.note)
-        lines.append(f"'quantize' does not take it: {refusal}" if refusal else "'quantize' takes it")
-    verdict = f"FAILED: {legality(placement)}" if placement.failed else "passed: the core runs whole on the DPU"
-    return [*lines, f"check {verdict}"]
+    return lines
 
 
-def _node_rows(node: PlacedNode) -> list[Row]:
+def _node_rows(node: PlacedNode, placement: Placement, dpu: Dpu) -> list[Row]:
     words = {"operator": node.op.op_type, "part": node.part, "device": node.device}
+    if dpu.target.npu:
+        words |= {"part": node.part.removeprefix("dpu-"), "device": words_of(node, placement, dpu)}
     if not node.broken:
         return [Row("nodes", node.op.name, {}, words)]
     broken = [{"rule": b.text, "reason": b.finding.reason, "remedy": b.finding.remedy} for b in node.broken]

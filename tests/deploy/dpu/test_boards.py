@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.bench.tables import efficiency, energy
-from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.board import load_dpu, ruled
 from beers_deploy.dpu.checker.conv_rules import conv_area, conv_weight_bank
 from beers_deploy.dpu.checker.operators import all_rules, applies, rule_name, rule_text
 from beers_deploy.dpu.checker.placement import place
@@ -21,7 +21,7 @@ from beers_deploy.model.shipped import shipped_names
 from beers_deploy.network import shipped_pair
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.figures import predicted
-from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
+from beers_deploy.profiles.target import DEFAULT_TARGET, board_names, npu_names
 from beers_deploy.quant.core import SHIFTS, target_shifts
 from beers_deploy.quant.onnx_file import load_onnx
 from tests.deploy.dpu.draws import Draw, behind_conv, behind_sum, between_convs, broken_rules, conv, node
@@ -174,7 +174,8 @@ def test_every_text_names_the_boards_own_dpu(name: str) -> None:
 
 
 def test_a_rule_whose_constants_no_file_states_would_be_dead() -> None:
-    assert all(any(applies(rule, dpu) for dpu in DPUS.values()) for rule in all_rules())
+    stating = [*DPUS.values(), *(ruled(load_target(name)) for name in npu_names())]
+    assert all(any(applies(rule, dpu) for dpu in stating) for rule in all_rules())
 
 
 def test_a_batch_has_an_image_for_each_batch_handler_of_each_core() -> None:

@@ -77,8 +77,8 @@ CASES: dict[str, tuple[Draw, Draw]] = {
 }
 WIDE = {"conv channels", "conv weight bank", "depthwise channels", "transposed channels", "resize channels"}
 WIDE |= {"elementwise channels", "shuffle channels"}
-OTHERS = {"conv area"}
-"""Rules of other boards: tests/deploy/dpu/test_boards.py."""
+OTHERS = {"conv area", "int8 operator", "int8 alone", "bias width"}
+"""Rules of other boards: tests/deploy/dpu/test_boards.py, test_npu.py."""
 SIZES = {"map exists", "maps aligned", "map in memory"}
 NUMBERS = {
     "int8 bias",
