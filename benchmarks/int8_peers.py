@@ -7,6 +7,9 @@ On Linux. Prints a Markdown table. Each way quantises in a process of its own; i
 libraries in it. Peers get the plain graph, and the one that we quantise: planes in, the correction out, the add
 left to the host.
 
+With Quark a line below the table compares our VINT8 file with its own, of the rewritten graph: which scales of ours
+its adjuster moves, and whether operators, types and pairs are alike.
+
 Quark wants other versions of its libraries, so it lives in its own environment. Without the CPU build of torch, pip
 would fetch gigabytes of CUDA packages:
 
@@ -23,6 +26,7 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +38,7 @@ from beers_deploy.export import float_model as read_float
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.model.shipped import shipped_weights
 from beers_deploy.model.simulator.procedural import load_scenes
+from beers_deploy.network import Network
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.sensor_file import reference_for
 from beers_deploy.quant.calibration import HELD_OUT_SEED, draw_patches
@@ -64,6 +69,7 @@ def ways(adaround_iterations: int) -> list[Way]:
     peers: list[tuple[str, Path, tuple[str, ...], tuple[str, ...]]] = [
         ("onnxruntime min-max", OURS, ("minmax",), ()),
         ("onnxruntime percentile 99.99", OURS, ("percentile",), ()),
+        ("Quark VINT8", QUARK, (), ("vint8",)),
         ("Quark XINT8", QUARK, (), ("0",)),
         ("Quark XINT8 + AdaRound", QUARK, (), (str(adaround_iterations),)),
     ]
@@ -144,6 +150,22 @@ def quantise(way: Way, files: dict[bool, tuple[Path, Path]], out: Path, python: 
     return told["seconds"], told["peak_mb"]
 
 
+def layout(path: Path) -> Counter[tuple[str, ...]]:
+    """How often an operator reads what: of each input the operator that writes it, or the type of a constant."""
+    graph = onnx.load(path).graph
+    sources = {tensor.name: onnx.TensorProto.DataType.Name(tensor.data_type) for tensor in graph.initializer}
+    sources |= {name: node.op_type for node in graph.node for name in node.output}
+    return Counter((node.op_type, *(sources.get(name, "input") for name in node.input)) for node in graph.node)
+
+
+def vint8_words(host: Path, theirs: Path, tile_px: int, python: str) -> str:
+    """What Quark's adjuster makes of our VINT8 file, and where the layout is not that of Quark's own."""
+    ours = Network.load(host).core("vek385", tile_px).save(host.with_name("vint8.onnx"))
+    done = subprocess.run([python, str(QUARK), "adjust", str(ours)], check=True, capture_output=True, text=True)  # noqa: S603
+    one, other = layout(ours), layout(theirs)
+    return f"VINT8: {done.stdout.strip().splitlines()[-1]}; ours alone {[*(one - other)]}, Quark's {[*(other - one)]}"
+
+
 COLUMNS = (
     *("tool", "graph", "MAE", "std", "max", "std / MAE", "PSNR float dB", "PSNR INT8 dB", "drop dB", "SSIM"),
     *("same class %", "s", "peak MB"),
@@ -186,6 +208,7 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
     in_float = network.runner(files[False][0])
     yield f"| {' | '.join(COLUMNS)} |"
     yield "|---" * len(COLUMNS) + "|"
+    made: dict[str, Path] = {}
     for number, way in enumerate(ways(arguments.adaround_iterations)):
         graph = "rewritten" if way.rewritten or way.name.startswith("beers") else "plain"
         if not re.search(arguments.only, f"{way.name}, {graph}"):
@@ -202,6 +225,10 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
             continue
         cells = [*scores(in_float, network.runner(out), held_out), f"{seconds:.0f}", f"{peak_mb:.0f}"]
         yield f"| {way.name} | {graph} | {' | '.join(cells)} |"
+        made[f"{way.name}, {graph}"] = out
+    host, theirs = made.get("beers-deploy legal, rewritten"), made.get("Quark VINT8, rewritten")
+    if host and theirs:
+        yield vint8_words(host, theirs, images.shape[2], arguments.quark_python)
 
 
 def main() -> None:
@@ -209,7 +236,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--variant", default="convbeers-s", help="shipped weights of this name")
     parser.add_argument("--float", type=Path, help="another float network, .onnx or .safetensors")
-    parser.add_argument("--samples", type=Path, help="samples to calibrate on, as 'quantize --samples' takes them")
+    parser.add_argument("--data", type=Path, help="samples to calibrate on, as 'quantize --samples' takes them")
     parser.add_argument("--held-out-data", type=Path, help="samples to judge on; those of --data if none")
     parser.add_argument("--images", type=Path, help="folder of scenes for calibration; drawn ones if none")
     parser.add_argument("--sensor", default="pleiades-variable", help="profile of the calibration patches")

@@ -1,9 +1,12 @@
 """Quantise one ONNX file with AMD Quark: `int8_peers.py` runs it in Quark's own environment. Imports nothing of ours.
 
-    PYTHON quark_child.py FLOAT PATCHES OUT ADAROUND_ITERATIONS
+    PYTHON quark_child.py FLOAT PATCHES OUT HOW
+    PYTHON quark_child.py adjust FILE
 
-FLOAT is a float ONNX file, PATCHES an .npy file (K, C, H, W) of what its input takes; 0 iterations leave AdaRound
-out. Writes OUT, and prints seconds and peak resident memory as the last line, in JSON.
+FLOAT is a float ONNX file, PATCHES an .npy file (K, C, H, W) of what its input takes. HOW is vint8, as AMD's
+tutorials of the VEK385 ask for it, or the iterations of AdaRound under XINT8, 0 for none. Writes OUT, and prints
+seconds and peak resident memory as the last line, in JSON. `adjust` says how many scales of a VINT8 file Quark's
+adjuster moves, and of how many convolutions it does not find the scales.
 """
 
 import json
@@ -14,7 +17,10 @@ from pathlib import Path
 import numpy as np
 import onnx
 from onnxruntime.quantization import CalibrationDataReader
+from onnxruntime.quantization.onnx_model import ONNXModel
 from quark.onnx import AdaRoundConfig, ModelQuantizer, QConfig, QLayerConfig, XInt8Spec
+from quark.onnx.postprocess.refinement.refine import QuantPosManager, adjust_quantize_info
+from quark.onnx.quantization.config import Config, get_default_config
 
 
 class Reader(CalibrationDataReader):
@@ -35,15 +41,38 @@ class Reader(CalibrationDataReader):
 
 
 def main() -> None:
-    """Quantise and say what it took."""
-    network, patches, out, iterations = sys.argv[1:]
+    """Quantise and say what it took, or look at a file."""
+    if sys.argv[1] == "adjust":
+        print(json.dumps(adjusted(onnx.load(sys.argv[2]))))
+        return
+    network, patches, out, how = sys.argv[1:]
     reader = Reader(onnx.load(network).graph.input[0].name, np.load(patches))
-    finetuning = [AdaRoundConfig(num_iterations=int(iterations))] if int(iterations) else []
-    config = QConfig(QLayerConfig(activation=XInt8Spec(), weight=XInt8Spec()), algo_config=finetuning)
     started = time.perf_counter()
-    ModelQuantizer(config).quantize_model(network, out, reader)
+    ModelQuantizer(config_of(how)).quantize_model(network, out, reader)
     seconds = time.perf_counter() - started
     print(json.dumps({"seconds": seconds, "peak_mb": peak_mb()}))
+
+
+def config_of(how: str) -> QConfig | Config:
+    """What Quark is asked for."""
+    if how == "vint8":
+        preset = get_default_config("VINT8")
+        preset.enable_npu_cnn, preset.extra_options["UseRandomData"] = True, False
+        return Config(global_quant_config=preset)
+    finetuning = [AdaRoundConfig(num_iterations=int(how))] if int(how) else []
+    return QConfig(QLayerConfig(activation=XInt8Spec(), weight=XInt8Spec()), algo_config=finetuning)
+
+
+def adjusted(model: onnx.ModelProto) -> dict[str, int]:
+    """Scales that the adjuster moves, and convolutions whose scales it does not find, by their counts."""
+    positions, constants = QuantPosManager(ONNXModel(model)), model.graph.initializer
+    before = {tensor.name: tensor.SerializeToString() for tensor in constants}
+    finders = positions.get_ipos_name, positions.get_wpos_name, positions.get_opos_name
+    convolutions = [node for node in model.graph.node if node.op_type in ("Conv", "ConvTranspose")]
+    unseen = sum(any(find(node) is None for find in finders) for node in convolutions)
+    adjust_quantize_info(ONNXModel(model))
+    moved = sum(tensor.SerializeToString() != before[tensor.name] for tensor in constants)
+    return {"moved": moved, "unseen": unseen, "convolutions": len(convolutions)}
 
 
 def peak_mb() -> float:

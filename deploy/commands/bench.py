@@ -13,7 +13,7 @@ from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.errors import OptionError, missing_extra
 from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.profiles.sensor_file import REFERENCE
-from beers_deploy.profiles.target import DEFAULT_TARGET, MODEL_SUFFIX, board_names
+from beers_deploy.profiles.target import DEFAULT_TARGET, MODEL_SUFFIX, board_names, npu_names
 
 if TYPE_CHECKING:
     import numpy as np
@@ -62,7 +62,7 @@ def bench(
         str,
         typer.Option(
             help=f"The modelled board ({BOARDS}, or your .toml file), with or without -model behind its name; "
-            "'all' of them; or host, this machine."
+            f"'all' of them; host, this machine; or {', '.join(npu_names())}, of which figures are quoted alone."
         ),
     ] = BOARD,
     sensor: Annotated[

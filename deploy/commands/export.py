@@ -64,16 +64,16 @@ def export(
     from beers_deploy.quant.onnx_file import require_onnx_name, save_onnx
 
     path = weights_file(network) if network.suffix or network.exists() else weights_named(network)
+    if board_file is None:
+        refuse(context, ["target"], expected="--board-file beside it", got="none", remedy="leave it out")
     board = load_target(target or DEFAULT_TARGET)
-    config = config_beside(board_file, board)
-    require_writable(out, board_file, config, delta, inputs=(path, apply, Path(sensor) if sensor else None))
+    config, profiles = config_beside(board_file, board), (Path(given) for given in (sensor, target) if given)
+    require_writable(out, board_file, config, delta, inputs=(path, apply, *profiles))
     if path.suffix != ".onnx":
         remedy = "give one that 'quantize' made of weights of 'train --conditioned', or leave it out"
         asked = ["board_file", "delta", "apply"]
         refuse(context, asked, expected="an INT8 --network", got=str(network), remedy=remedy)
     require_onnx_name(out, board_file)
-    if board_file is None:
-        refuse(context, ["target"], expected="--board-file beside it", got="none", remedy="leave it out")
     if path.suffix == ".onnx":
         _export_int8(path, out, sensor, tile, (board_file, board), delta, apply)
         return

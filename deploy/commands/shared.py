@@ -18,10 +18,9 @@ if TYPE_CHECKING:
     from beers_deploy.network import Network
     from beers_deploy.results import Table
 
-BOARDS = f"{', '.join(board_names())}, or your .toml file"
-"""What --target takes, for its help."""
-RULED = ", ".join([*npu_names(), BOARDS])
-"""The same where rules alone are asked for, which an NPU has too."""
+OR_YOURS = "or your .toml file"
+BOARDS, RULED = (", ".join([*names, OR_YOURS]) for names in (board_names(), board_names() + npu_names()))
+"""What --target takes, for its help: where something is predicted, and where rules alone are asked for."""
 
 
 def refuse(context: typer.Context, names: Iterable[str], *, expected: str, got: str, remedy: str) -> None:

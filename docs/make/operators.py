@@ -8,13 +8,13 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
-from beers_deploy.dpu.board import Dpu, load_dpu
+from beers_deploy.dpu.board import Dpu, load_dpu, ruled
 from beers_deploy.dpu.checker.finding import Rule
-from beers_deploy.dpu.checker.operators import NUMBERS, RULES, SHIFTS, SIZES, applies, rule_name, rule_text
+from beers_deploy.dpu.checker.operators import NUMBERS, RULES, SHIFTS, SIZES, all_rules, applies, rule_name, rule_text
 from beers_deploy.dpu.checker.other_rules import INSTEAD
 from beers_deploy.dpu.checker.table import REMARKS
 from beers_deploy.dpu.cost.latency import dpu_power
-from beers_deploy.profiles.target import board_names
+from beers_deploy.profiles.target import board_names, load_target, npu_names
 from beers_deploy.quant.graph.nodes import KINDS, Kind
 
 TARGET = Path(__file__).parents[1] / "reference" / "operators.md"
@@ -50,6 +50,7 @@ def document() -> str:
         "Numbers, in a quantised file", [*NUMBERS, *dict.fromkeys(r for rules in SHIFTS.values() for r in rules)]
     )
     parts += _rules("Remarks, which break no rule", REMARKS)
+    parts += [line for name in npu_names() for line in _npu(ruled(load_target(name)))]
     parts += ["## What to use instead\n"]
     parts += [f"- {names}: {remedy}" for names, remedy in _alike(dict(sorted(INSTEAD.items())))]
     return "\n".join([*parts, ""])
@@ -100,6 +101,14 @@ def _rules(title: str, rules: Iterable[Callable[..., object]]) -> list[str]:
     """A line for each rule, and for each wording where the boards differ in more than numbers."""
     lines = [line for rule in rules for line in _lines(rule)]
     return [f"## {title}\n", *(lines or ["Runs on every DPU."]), ""]
+
+
+def _npu(npu: Dpu) -> Iterator[str]:
+    """Every rule of a board with an NPU: AMD's table of operators and the numbers of a VINT8 file."""
+    yield f"## The NPU of {npu.target.name}: a table of operators, and numbers alone\n"
+    yield "AMD publishes no limits. [The NPU's flow](npu.md) has what else is known.\n"
+    yield from (f"- **{rule_name(rule)}**: {rule_text(rule, npu)}" for rule in all_rules() if applies(rule, npu))
+    yield ""
 
 
 def _lines(rule: Callable[..., object]) -> Iterator[str]:

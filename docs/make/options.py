@@ -39,7 +39,7 @@ PATHS = {
     "characterise": Paths({"out": FILE, "json": FILE}, ("images",)),
     "simulate": Paths({"out": FOLDER}, ("scenes",), ("sensor", "reference", "scene")),
     "train": Paths({"out": FOLDER}, ("images", "pairs", "lpips", "start", "teacher"), ("sensor", "reference")),
-    "export": Paths({"out": FILE, "board_file": FILE, "delta": FILE}, ("network", "apply"), ("sensor",)),
+    "export": Paths({"out": FILE, "board_file": FILE, "delta": FILE}, ("network", "apply"), ("sensor", "target")),
     "quantize": Paths(
         {"out": FILE, "board_file": FILE, "report": FOLDER, "json": FILE},
         ("model", "images", "samples"),
@@ -172,9 +172,13 @@ REFUSED = {
     ],
     "export": [
         Refused(("board_file", "delta", "apply"), without="--network"),
+        Refused(("target",), without="--board-file"),
+    ],
+    "quantize": [
+        Refused(("board_file", "report", "finetune"), "--regime free"),
+        Refused(("tile",), without="--board-file"),
     ],
     "golden": [Refused(("tile", "target"), "--compare COMPARE"), Refused(("json",), without="--compare")],
-    "quantize": [Refused(("board_file", "report", "finetune"), "--regime free")],
     "bench": [
         Refused(
             (

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from beers_deploy.dpu.board import CHOICES, CONFIGURATION, DIVISORS
 from beers_deploy.profiles.constant import Constant
-from beers_deploy.profiles.target import DOCUMENTS, FUSED, PLACES, board_names, load_target
+from beers_deploy.profiles.target import DOCUMENTS, FUSED, NPU, PLACES, board_names, load_target
 
 TARGET = Path(__file__).parents[1] / "reference" / "target-file.md"
 BUILD = "configurations.NAME"
@@ -188,6 +188,13 @@ def _words() -> Iterator[str]:
     yield "\n## Words\n"
     yield f"`[activations]` has a list for each of {_names(PLACES)}: what is fused behind it, out of {_names(FUSED)}."
     yield f"\n`[documents]` names the manuals that findings cite: {_names(DOCUMENTS)}."
+    yield "\n## A board with an NPU\n"
+    yield (
+        f"A file with `[npu]` has no DPU and predicts nothing. The table lists {_names(NPU)}: the device that AMD's "
+        "compiler is told, and the operators with Y and with N/A in INT8. `[documents]` then has `quantiser` alone, "
+        "`[file]` `opset_max`, `[numbers]` the windows above with `zero_point` and `bias_bits`, the width that a "
+        "shifted bias must fit; `[published_latency_ms]` and `[published_throughput_fps]` name what `bench` quotes."
+    )
 
 
 def _names(names: frozenset[str] | tuple[str, ...]) -> str:

@@ -4,6 +4,9 @@ One image of one tile, every size stated; a pair of Q and DQ for each reader of 
 its own for each tensor; and a pair between an operation and a clamp behind it, which AMD's quantiser writes there
 too. On the result's own grid it does not matter whether a value is clamped before it is rounded or after, so no bit
 changes. LeakyReLU is no clamp: it stays behind the sums, as the core computes it.
+
+As in the board's file, HardSigmoid, HardSwish and the mean of a window that is no power of two are ONNX's own, and
+the host's file has the DPU's approximations of them: there results may differ by a few steps.
 """
 
 from collections import Counter
@@ -90,12 +93,7 @@ class _Writer(BoardWriter):
 
 def compiler_config(device: str) -> dict[str, object]:
     """What `CONFIG` says: the device, and for the rest the compiler's own defaults."""
-    partition = {"name": "vaiml_partition", "plugin": "vaip-pass_vaiml_partition"}
-    return {
-        "passes": [
-            {"name": "init", "plugin": "vaip-pass_init"},
-            {**partition, "vaiml_config": {"device": device, "optimize_level": 2}},
-        ],
-        "target": "VAIML",
-        "targets": [{"name": "VAIML", "pass": ["init", "vaiml_partition"]}],
-    }
+    names, vaiml = ("init", "vaiml_partition"), {"device": device, "optimize_level": 2}
+    first, second = ({"name": name, "plugin": f"vaip-pass_{name}"} for name in names)
+    passes = [first, {**second, "vaiml_config": vaiml}]
+    return {"passes": passes, "target": "VAIML", "targets": [{"name": "VAIML", "pass": [*names]}]}

@@ -28,12 +28,10 @@ def words_of(node: PlacedNode, placement: Placement, dpu: Dpu) -> str:
 
 
 def unread(placement: Placement, dpu: Dpu) -> str:
-    """Operators that the stored copy of AMD's table does not have."""
-    known = dpu.target.npu["int8"].value
-    names = {op.op_type for op in placement.core if op.kind not in ("quantise", "dequantise")} - {*known}
-    return (
-        f"{', '.join(sorted(names))}: look them up in AMD's table, whose copy read here lacks them" if names else ""
-    )
+    """Operators that the part of AMD's table that was read does not have."""
+    core = {op.op_type for op in placement.core if op.kind not in ("quantise", "dequantise")}
+    names = sorted(core - {*dpu.target.npu["int8"].value})
+    return f"{', '.join(names)}: not in the part of AMD's table that was read, look there" if names else ""
 
 
 def depthwise(placement: Placement, dpu: Dpu) -> str:  # noqa: ARG001 - every remark takes both

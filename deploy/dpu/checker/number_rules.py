@@ -22,7 +22,7 @@ def on_integers(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def symmetric(op: Operation, dpu: Dpu) -> Finding | None:
-    """Tensors are int8 around zero, or the same numbers as uint8 around 128 ({documents[quantiser]})."""
+    """Tensors are int8 around zero, or the same numbers as uint8 around 128 ({documents[numbers]})."""
     faults = [
         f"{role} {scale.integer_type} around {scale.zero_points[0]}"
         for role, scale in op.scales.items()
@@ -32,9 +32,10 @@ def symmetric(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def int8_alone(op: Operation, dpu: Dpu) -> Finding | None:
-    """Tensors are int8 around {numbers[zero_point]}, none is uint8 ({numbers[zero_point].source})."""
-    faults = [role for role, scale in op.scales.items() if scale.integer_type == "uint8"]
-    return Finding(f"{', '.join(faults)} in uint8", f"quantise to int8; {AGAIN}") if faults else None
+    """Tensors are int8 around {numbers[zero_point]} ({numbers[zero_point].source})."""
+    wanted, others = {dpu.value("numbers", "zero_point")}, {r: s for r, s in op.scales.items() if r != "bias"}
+    faults = [r for r, s in others.items() if s.integer_type != "int8" or set(s.zero_points) != wanted]
+    return Finding(f"{', '.join(faults)}: not int8 around 0", f"quantise to int8; {AGAIN}") if faults else None
 
 
 def per_tensor(op: Operation, dpu: Dpu) -> Finding | None:
