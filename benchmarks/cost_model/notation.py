@@ -5,7 +5,8 @@
 
     network small
         family resnet                      # networks of one family resemble one another
-        host   argmax                      # what the host does with the results: copy argmax softmax sort image
+        host   argmax                      # what the host does with the results: copy argmax softmax sort image, or
+                                           # none, where the rates are the DPU's alone
         gop    1.2                         # published operations (two a product), in 10^9
         source He et al. 2015, table 1     # where the layers are written
         image  224 224                     # height, width, and channels if not 3
@@ -82,6 +83,15 @@ SIGNS: Mapping[type[ast.operator], Callable[[int, int], int]] = {
     ast.Mult: operator.mul,
     ast.Div: operator.floordiv,
 }
+KINDS = {
+    "images": "image-to-image",
+    "segmentation": "segmentation",
+    "detectors": "detectors",
+    "yolo": "detectors",
+    "classifiers": "classifiers",
+    "inceptions": "classifiers",
+}
+"""What the networks of a file do."""
 HEADER = ("family", "host", "gop", "source", "image")
 
 
@@ -95,8 +105,9 @@ class Block:
 
 @dataclass
 class Entry:
-    """A network of a file: its header, and its lines, each with its place."""
+    """A network of a file: what it does, its header, and its lines, each with its place."""
 
+    kind: str = ""
     header: dict[str, str] = field(default_factory=dict)
     lines: list[tuple[str, str]] = field(default_factory=list)
 
@@ -106,10 +117,9 @@ class Entry:
         return self.header["family"]
 
     @property
-    def host(self) -> Task:
-        """What the host does with the results."""
-        found: Task = next(task for task in get_args(Task) if task == self.header["host"])
-        return found
+    def host(self) -> Task | None:
+        """What the host does with the results; None where the rates are the DPU's alone."""
+        return next((task for task in get_args(Task) if task == self.header["host"]), None)
 
     @property
     def operations(self) -> float:
@@ -161,7 +171,7 @@ def read_library(paths: Sequence[Path]) -> Library:
                 pairs = (parameter.partition("=") for parameter in parameters)
                 target = blocks[name] = Block({key: default or None for key, _, default in pairs})
             else:
-                target = networks[rest.strip()] = Entry()
+                target = networks[rest.strip()] = Entry(KINDS[path.stem])
     return Library(blocks, networks)
 
 

@@ -15,9 +15,11 @@ import numpy as np
 
 from beers_deploy.dpu.cost.latency import WIDTHS
 from benchmarks.cost_model.fit import fit, rounded
-from benchmarks.cost_model.published import boards, written
+from benchmarks.cost_model.notation import KINDS
+from benchmarks.cost_model.published import NETWORKS, boards, written
 from benchmarks.cost_model.validation import (
     Nested,
+    bias,
     by_network,
     coverage,
     nested,
@@ -31,7 +33,6 @@ from benchmarks.cost_model.validation import (
 TARGETS = Path(__file__).parents[2] / "profiles" / "targets"
 HEADER = "[cost] # written by benchmarks/cost_model/refit.py; the formula: deploy/dpu/cost/model.py"
 CHOSEN = "the choice of least error on families left out: benchmarks/cost_model/validation.py"
-STRUCTURE = {"serial": ("assumed", "the middle of 0 to 1: the published rates do not tell")}
 FITTED = "fit to the published rates of {rows} networks and configurations, benchmarks/cost_model/zoo/published.csv"
 
 
@@ -52,12 +53,14 @@ def cost_table(board: str) -> Iterator[tuple[str, str, str, str]]:
     source = FITTED.format(rows=len(found.cases.rows))
     for key, value in asdict(rounded(fit(found.cases))).items():
         yield key, f"{value:.4g}", "inferred", source
-    for key, value in asdict(found.cases.structure).items():
-        yield key, f"{value:g}", *STRUCTURE.get(key, ("inferred", CHOSEN))
+    yield "overlap", f"{found.cases.structure.overlap:g}", "assumed", "benchmarks/cost_model/validation.py, OVERLAP"
+    yield "crowding", f"{found.cases.structure.crowding:g}", "inferred", CHOSEN
     families = len(set(found.cases.families))
     left_out = f"|ln(predicted / published)| that nine of ten families keep to, from {families}, each left out once"
     for kind, width in found.widths.items():
         yield WIDTHS[kind], f"{width:.3f}", "inferred", f"{left_out}; {kind}"
+    held = "share of the families, each left out of fit and widths, that their intervals held with every rate"
+    yield "families_held", f"{coverage(found.rows)[1]:.2f}", "inferred", held
     widest = max(*found.widths.values(), outside_width(found.cases))
     far = "the widest, or the error of networks with the largest maps, predicted from those with a quarter"
     yield WIDTHS["outside"], f"{widest:.3f}", "inferred", far
@@ -100,6 +103,28 @@ def accuracy() -> Iterator[tuple[object, ...]]:
         yield board, *counts, *_spread(off), f"{rank_correlation(found):.3f}", _percent(held), _percent(whole)
 
 
+def by_kind() -> Iterator[tuple[object, ...]]:
+    """A row a board and kind of network: errors of networks whose family was left out."""
+    yield "board", "kind", "networks", "rates", "median", "mean", "bias", "largest", "rates inside", "families"
+    for board in boards():
+        for kind in dict.fromkeys(KINDS.values()):
+            rows = [row for row in nested(board).rows if NETWORKS[row.network].kind == kind]
+            if not rows:
+                continue
+            off = by_network((row.network for row in rows), (row.rates for row in rows))
+            held, whole = coverage(rows)
+            counts = len(off), sum(len(row.rates) for row in rows)
+            yield (
+                board,
+                kind,
+                *counts,
+                *_spread(off)[:2],
+                f"{100 * bias(rows):+.1f} %",
+                *_spread(off)[2:],
+                *map(_percent, (held, whole)),
+            )
+
+
 def others() -> Iterator[tuple[object, ...]]:
     """Rates of one thread, and boards predicted with the ZCU102's constants."""
     yield "what", "networks", "median", "mean", "largest"
@@ -139,6 +164,7 @@ def main() -> int:
             path.write_text(new, encoding="utf-8", newline="\n")
     print(f"{'not as fitted' if check else 'rewritten'}: {', '.join(stale) or 'none'}\n")
     print(table(accuracy()))
+    print(table(by_kind()))
     print(table(others()))
     return int(check and bool(stale))
 

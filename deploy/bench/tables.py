@@ -33,6 +33,8 @@ TABLE, LAYERS = "bench", "layers"
 CHAIN = "chain_s_per_mpx"
 """In a target's [cpu]: time of the traditional pipeline for 10^6 pixels on all cores."""
 COST_SOURCE = "cost model fitted on published networks, docs/explanation/cost-model.md"
+HELD = 0.9
+"""Share of families left out of the fit that an interval is meant to hold."""
 ARITHMETIC = "arithmetic of the tile grid"
 PAPER = "ConvBEERS paper, table of the VCK190 benchmark, 13600 x 9016"
 PAPER_TILE_PX, PAPER_SIZE = 640, "13600x9016"
@@ -140,8 +142,10 @@ def swath_latency(prediction: Prediction, batches: float) -> Figure:
 
 
 def fitted_range(prediction: Prediction) -> str:
-    """Whether the fitted networks speak for this one."""
-    return f"outside: {'; '.join(prediction.outside)}" if prediction.outside else "inside"
+    """Whether the fitted networks speak for this one, and how often the board's intervals held, if too rarely."""
+    found = f"outside: {'; '.join(prediction.outside)}" if prediction.outside else "inside"
+    held = f"; intervals held {100 * prediction.held:.0f} % of families left out"
+    return found + held if prediction.held < HELD else found
 
 
 def energy(latency: Figure, power: Figure) -> Figure:
@@ -235,14 +239,11 @@ def _processor_power(board: TargetProfile) -> Figure:
 
 
 def layer_rows(prediction: Prediction, dpu: Dpu) -> list[Row]:
-    """One row a layer and one for the start of a batch; their times add up to that of a batch, the last row.
+    """One row a layer; their times add up to that of a batch, the last row.
 
     The columns are those of AMD's vaitrace, with what bounds the layer; bytes and energy are those of one image.
     """
     rows = [_layer_row(layer, prediction, dpu) for layer in prediction.layers]
-    rows.append(
-        Row(LAYERS, "start of a batch", {"time": _time(prediction.overhead_s, prediction)}, {"bound": "overhead"})
-    )
     total = f"sum: one batch of {prediction.batch}"
     return [*rows, Row(LAYERS, total, {"time": _time(prediction.batch_time_s, prediction)})]
 

@@ -33,8 +33,6 @@ SIZED = ("array", "memory", "elementwise")
 """Tables whose constants a configuration may state for itself, by their names: a smaller array has smaller banks."""
 DIVISORS = {**dict.fromkeys(SIZED, 1.0), "cost": SMALLEST, "power": SMALLEST}
 """Tables of widths, rates and energies, by which rules and cost model divide, and the least that each can be."""
-CHOICES = ("serial", "bursts")
-"""Constants of the cost model by which nothing is divided: they may be 0."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +132,7 @@ def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
     dpu = Dpu(profile, name, constants)
     for table, least in DIVISORS.items():
         for key, constant in dpu.tables.get(table, {}).items():
-            _require(f"{profile.name} [{table}] {key}", constant, 0.0 if key in CHOICES else least)
+            _require(f"{profile.name} [{table}] {key}", constant, least)
     return dpu
 
 

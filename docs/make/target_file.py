@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-from beers_deploy.dpu.board import CHOICES, CONFIGURATION, DIVISORS
+from beers_deploy.dpu.board import CONFIGURATION, DIVISORS
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.target import DOCUMENTS, FUSED, NPU, PLACES, board_names, load_target
 
@@ -90,12 +90,10 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "tile": {"memory_bytes": ("B", "memory of the board, into which maps must fit")},
     "cost": {
-        "array_efficiency": ("1", "share of the peak that convolutions reach; fitted"),
-        "lane_efficiency": ("1", "share of `channels_per_cycle` x `pixels_per_cycle` that is reached; fitted"),
+        "array_efficiency": ("1", "share of the peak that convolutions reach, at most 1; fitted"),
         "port_bytes_per_cycle": ("B/cycle", "rate between a core and the memory; fitted"),
         "memory_efficiency": ("1", "share of `ddr_bytes_per_s` that maps reach; fitted"),
         "layer_s": ("s", "time added to each layer; fitted"),
-        "batch_s": ("s", "time added to each batch; fitted"),
         "host_image_s": ("s", "time of the host for an image; fitted"),
         "host_in_bytes_per_s": ("B/s", "rate of input from the host; fitted"),
         "host_out_bytes_per_s": ("B/s", "rate of output to the host; fitted"),
@@ -103,13 +101,13 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
         "softmax_values_per_s": ("1/s", "likewise"),
         "sort_values_per_s": ("1/s", "likewise, for boxes and key points"),
         "image_values_per_s": ("1/s", "likewise, for an image"),
-        "serial": ("1", "share of the shorter of computing and moving that is not hidden; assumed"),
+        "overlap": ("1", "share of the shorter of computing and moving that is hidden behind the longer; assumed"),
         "crowding": ("1", "how sharply the slower of DPU and host sets the rate; chosen by cross-validation"),
-        "bursts": ("0 or 1", "1 if weights cross the memory at its peak rate; chosen by cross-validation"),
         "width_host": ("1", "half width of the interval of ln(FPS) where the host sets the rate"),
         "width_small_maps": ("1", "the same for small maps"),
         "width_large_maps": ("1", "the same for large maps"),
         "width_outside": ("1", "the same for a network beyond those fitted"),
+        "families_held": ("1", "share of the families of networks, each left out of the fit, that intervals held"),
         "pair_width": ("1", "the same for ln of the ratio of two networks' rates"),
         "fitted_map_bytes": ("B", "range of the fitted networks"),
         "fitted_operations": ("operations", "range of the fitted networks"),
@@ -159,7 +157,7 @@ def least(table: str, key: str) -> str:
     asked = CONFIGURATION.get(key) if table == BUILD else DIVISORS.get(table)
     if asked is None:
         return ""
-    return "0" if key in CHOICES else f"{asked:g}" if asked >= 1 else "above 0"
+    return f"{asked:g}" if asked >= 1 else "above 0"
 
 
 def line(table: str, key: str, constants: list[Constant]) -> str:

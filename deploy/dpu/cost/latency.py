@@ -17,6 +17,7 @@ from functools import cached_property
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.placement import Placement
 from beers_deploy.dpu.cost.model import (
+    OWN_SPEEDS,
     Constants,
     Interval,
     Layers,
@@ -25,6 +26,7 @@ from beers_deploy.dpu.cost.model import (
     Task,
     between,
     frame_rate,
+    own_speed,
     placed_work,
     refused_interval_s,
     regime_of,
@@ -68,12 +70,12 @@ class Prediction:
         alone_s: such a batch on the DPU while its other cores rest.
         host_cores: of the board's processor.
         layers: what each costs, for a batch.
-        overhead_s: start of a batch.
         host_s: time of an image on the host's cores together.
         task: what the host does with the results.
         regime: what sets the rate.
         width: half that of the interval, in ln(FPS).
-        structure: variants of the formula.
+        structure: what the board's kind decides.
+        held: share of left-out families that such intervals held.
         outside: what lies beyond the fitted networks; empty where nothing does.
         refused: names of nodes that the DPU refuses and the host runs.
         refused_s: what they take of `host_s`, least and most.
@@ -85,12 +87,12 @@ class Prediction:
     alone_s: float
     host_cores: int
     layers: tuple[LayerCost, ...]
-    overhead_s: float
     host_s: float
     task: Task
     regime: Regime
     width: float
     structure: Structure
+    held: float
     outside: tuple[str, ...] = ()
     note: str = ""
     refused: tuple[str, ...] = ()
@@ -98,8 +100,8 @@ class Prediction:
 
     @cached_property
     def batch_time_s(self) -> float:
-        """Time of one batch on the DPU: the layers and the overhead, nothing else."""
-        return math.fsum([*(layer.time_s for layer in self.layers), self.overhead_s])
+        """Time of one batch on the DPU: its layers, nothing else."""
+        return math.fsum(layer.time_s for layer in self.layers)
 
     @property
     def fps(self) -> float:
@@ -179,15 +181,15 @@ def predict(placement: Placement, dpu: Dpu, task: Task | None = None) -> Predict
         remedy = "give a network with convolutions"
         raise ModelError("cost model", expected="work for the DPU", got="no convolution", remedy=remedy)
     columns = Layers.of(works, dpu)
-    compute_s, memory_s = columns.compute_s(constants), columns.memory_s(constants, structure)
-    times_s = columns.time_s(constants, structure)
-    parts = zip(works, compute_s.tolist(), memory_s.tolist(), times_s.tolist(), strict=True)
+    speed, host_speed = (own_speed(dpu, part) for part in OWN_SPEEDS)
+    times = columns.compute_s(constants), columns.memory_s(constants), columns.time_s(constants, structure)
+    parts = zip(works, *((each / speed).tolist() for each in times), strict=True)
     layers = tuple(LayerCost(*part) for part in parts)
     refused = [node.op for node in placement.failed]
     cores, refused_s = dpu.whole("cpu", "cores"), refused_interval_s(refused, dpu)
     task = task or task_of(placement)
-    host_s = float(placed_work(placement, task) @ constants.host_s_per_unit) / cores + between(refused_s)
-    dpu_s = math.fsum([*(layer.time_s for layer in layers), constants.batch_s]) / dpu.batch
+    host_s = float(placed_work(placement, task) @ constants.host_s_per_unit) / cores / host_speed + between(refused_s)
+    dpu_s = math.fsum(layer.time_s for layer in layers) / dpu.batch
     map_bytes = largest_map_bytes(placement.core)
     regime = regime_of(host_s > dpu_s, map_bytes)
     outside = _outside(placement.core, map_bytes, dpu)
@@ -196,15 +198,15 @@ def predict(placement: Placement, dpu: Dpu, task: Task | None = None) -> Predict
         configuration=dpu.name,
         batch=dpu.batch,
         handlers=dpu.batch // dpu.cores,
-        alone_s=float(columns.time_s(constants, structure, alone=True).sum()) + constants.batch_s,
+        alone_s=float(columns.time_s(constants, structure, alone=True).sum()) / speed,
         host_cores=cores,
         layers=layers,
-        overhead_s=constants.batch_s,
         host_s=host_s,
         task=task,
         regime=regime,
         width=width,
         structure=structure,
+        held=dpu.value("cost", "families_held"),
         outside=outside,
         note=placement.note,
         refused=tuple(op.name for op in refused),

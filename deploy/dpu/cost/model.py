@@ -1,10 +1,11 @@
 """The formula of the cost model, and its constants, which stand in a target's [cost].
 
-compute = array operations / (peak array_efficiency) + lane steps / (lanes lane_efficiency)
+compute = array operations / (peak array_efficiency) + lane steps / lanes
 memory  = longer of (weights + maps) / port and cores (weights + batch handlers maps) / (DDR memory_efficiency)
-layer   = longer of the two + serial shorter of the two + layer_s
-batch   = sum of layers + batch_s
+layer   = longer of the two + (1 - overlap) shorter of the two + layer_s
+batch   = sum of layers
 host    = host_image_s + bytes in / rate + bytes out / rate + values of the task / its rate
+rate    = 1 / (dpu^crowding + host^crowding)^(1 / crowding)
 """
 
 import math
@@ -28,21 +29,17 @@ Interval = tuple[float, float]
 class Constants:
     """What is fitted. Hardware is never among it, so a board may be predicted with another's of the same kind.
 
-    The first six are the DPU's. Rates of the host are those of one of its cores; a value is one number of a result.
+    The first four are the DPU's. Rates of the host are those of one of its cores; a value is one number of a result.
     """
 
     array_efficiency: float
-    """Share of the array's peak that a full layer reaches."""
-    lane_efficiency: float
-    """Pools, depthwise convolutions and adds, against the lanes that the file states."""
+    """Share of the array's peak that a full layer reaches, at most 1."""
     port_bytes_per_cycle: float
     """What one batch handler moves in a cycle of the programmable logic."""
     memory_efficiency: float
     """Share of the memory's peak that all cores together reach."""
     layer_s: float
     """Start of a layer."""
-    batch_s: float
-    """Start of a batch."""
     host_image_s: float
     """What the host does for any image."""
     host_in_bytes_per_s: float
@@ -62,32 +59,28 @@ class Constants:
     @property
     def host_s_per_unit(self) -> Array:
         """Time of an image, of a byte in, of a byte out and of a value of each task, (7,)."""
-        values = np.array([getattr(self, name) for name in NAMES[DPU_CONSTANTS:]])
-        return np.concatenate([values[:1], 1 / values[1:]])
-
-    def faster(self, dpu: float, host: float) -> Self:
-        """The constants of a board whose DPU and host are that many times as fast."""
-        factors = DPU_CONSTANTS * [dpu] + (len(NAMES) - DPU_CONSTANTS) * [host]
-        values = ((name, getattr(self, name), factor) for name, factor in zip(NAMES, factors, strict=True))
-        return type(self)(*(value / by if name in TIMES else value * by for name, value, by in values))
+        first, *rates = (getattr(self, name) for name in NAMES[NAMES.index("host_image_s") :])
+        return np.array([first, *(1 / rate for rate in rates)])
 
 
-DPU_CONSTANTS = 6
 NAMES = tuple(field.name for field in fields(Constants))
-TIMES = ("layer_s", "batch_s", "host_image_s")
-"""Constants that shrink as a board gets faster; the others are rates."""
+OWN_SPEEDS = ("dpu_speed", "host_speed")
+"""How many times as fast as the constants say an owner's DPU and host are: `own_runs` adds them to [cost]."""
+
+
+def own_speed(dpu: Dpu, part: str) -> float:
+    """One of OWN_SPEEDS; 1 where no owner measured."""
+    return dpu.value("cost", part) if part in dpu.tables.get("cost", {}) else 1.0
 
 
 @dataclass(frozen=True)
 class Structure:
-    """Which of the formula's variants a board follows, chosen by cross-validation."""
+    """What a board's kind decides."""
 
-    serial: float
-    """Share of the shorter of compute and memory that is not hidden behind the longer."""
+    overlap: float
+    """Share of the shorter of compute and memory that is hidden behind the longer."""
     crowding: float
     """Exponent q of (dpu^q + host^q)^(1/q): 2 where the two get in each other's way, large where they do not."""
-    bursts: float
-    """1 where weights, which lie in one piece, cross the memory at its peak; 0 where no faster than maps."""
 
     @classmethod
     def of(cls, dpu: Dpu) -> Self:
@@ -122,20 +115,19 @@ class Layers:
 
     def compute_s(self, constants: Constants) -> Array:
         """Time of the array and of the engines beside it, (n,): all batch handlers work at once."""
-        return self.array_s / constants.array_efficiency + self.lane_s / constants.lane_efficiency
+        return self.array_s / constants.array_efficiency + self.lane_s
 
-    def memory_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
+    def memory_s(self, constants: Constants, *, alone: bool = False) -> Array:
         """Time of the transfers, for a batch of every core or, `alone`, of one core (n,)."""
         port = constants.port_bytes_per_cycle * self.pl_clock_hz
-        maps_rate = constants.memory_efficiency * self.memory_bytes_per_s
-        weights_rate = self.memory_bytes_per_s if structure.bursts else maps_rate
-        shared_s = self.weight_bytes / weights_rate + self.handlers * self.map_bytes / maps_rate
+        shared = constants.memory_efficiency * self.memory_bytes_per_s
+        shared_s = (self.weight_bytes + self.handlers * self.map_bytes) / shared
         return np.maximum((self.weight_bytes + self.map_bytes) / port, (1.0 if alone else self.cores) * shared_s)
 
     def time_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
         """Time of each layer, for a batch (n,)."""
-        compute, memory = self.compute_s(constants), self.memory_s(constants, structure, alone=alone)
-        busy: Array = np.maximum(compute, memory) + structure.serial * np.minimum(compute, memory)
+        compute, memory = self.compute_s(constants), self.memory_s(constants, alone=alone)
+        busy: Array = np.maximum(compute, memory) + (1 - structure.overlap) * np.minimum(compute, memory)
         return busy + constants.layer_s * self.launched
 
 

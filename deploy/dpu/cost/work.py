@@ -11,7 +11,9 @@ from beers_deploy.dpu.graph import Operation, Shape
 FUSED = ("activation", "quantise", "dequantise", "pixel shuffle")
 """Kinds that cost nothing: done on the way out of the operation before; a pixel shuffle is where its results go."""
 UNSTARTED = ("add", "mul", "concat")
-"""Kinds without a start of their own: fused with the operation before, or no more than places."""
+"""Kinds without a start of their own: behind the operation before, or no more than places."""
+BURST_BYTES = 64
+"""The least that the memory moves at a time: eight beats of 64 bit DDR4, sixteen of 32 bit LPDDR4."""
 AUGMENTATION = 2
 """Channels of several columns that the array takes in side by side, over input_channel_parallel: up to 32 of the
 DPUCZDX8G and DPUCVDX8G, 64 of the DPUCV2DX8G (Vitis-AI master, targets/*.prototxt)."""
@@ -101,7 +103,14 @@ def _up(count: int, size: int) -> int:
 
 
 class _Flow:
-    """Which results pass through memory: what banks cannot hold, or not for long, and what a concat joins."""
+    """Which results pass through memory: what banks cannot hold, or not for long, and what a concat joins.
+
+    An add or mul of maps that fit the chip is fused with the operation before it. Of larger ones it is a pass of its
+    own: two maps loaded, one stored, each operand stored by what made it.
+
+    What a concat joins, and what a pixel shuffle moves, is stored pixel by pixel between what others store: a pixel's
+    channels take whole bursts.
+    """
 
     def __init__(self, operations: Sequence[Operation], dpu: Dpu) -> None:
         self._kept_bytes, self._lanes = kept_bytes(dpu), dpu.input_parallel
@@ -114,13 +123,20 @@ class _Flow:
         self._shapes = {op.output: op.out_shape for op in computing}
         self._reads = {name: {self._root(i) for i in op.inputs} for op in computing for name in op.outputs}
         self._readers = Counter(self._root(name) for op in computing for name in op.inputs)
-        self._joined = {self._root(i) for op in computing if op.kind == "concat" for i in op.inputs}
-        self._sums = {self._root(self._fused(op)): op.output for op in computing if op.kind in ("add", "mul")}
+        self._concats = {op.output for op in computing if op.kind == "concat"}
+        self._pieces = self._piece_channels(operations)
+        sums = [op for op in computing if op.kind in ("add", "mul")]
+        self._passes = {op.output for op in sums if self._is_pass(op)}
+        reading = [op for op in computing if op.output in self._passes | self._concats]
+        self._stored = {self._root(name) for op in reading for name in op.inputs}
+        self._sums = {self._root(self._fused(op)): op.output for op in sums if op.output not in self._passes}
 
     def load(self, op: Operation) -> int:
         """Bytes read: all operands but the one that an add is fused with, and what that one has read already."""
         if op.kind == "concat":
             return 0
+        if op.output in self._passes:
+            return sum(map(_size, op.in_shapes))
         here = set()
         if op.kind in ("add", "mul"):
             fused = self._root(self._fused(op))
@@ -129,14 +145,31 @@ class _Flow:
         return sum(_size(shape) for name, shape in fed if self._root(name) not in here and self._leaves(name))
 
     def store(self, op: Operation) -> int:
-        """Bytes written; an add's are those of the operation that it is fused with."""
-        if op.kind in UNSTARTED:
+        """Bytes written; a fused add's are those of the operation that it is fused with."""
+        if op.kind in UNSTARTED and op.output not in self._passes:
             return 0
         name = self._root(op.output)
         while name in self._sums and self._readers[name] == 1:
             name = self._sums[name]
-        last = not self._readers[name]
-        return _size(op.out_shape) if last or name in self._joined or self._leaves(name) else 0
+        if self._readers[name] and name not in self._stored and not self._leaves(name):
+            return 0
+        size, piece = _size(op.out_shape), self._pieces.get(name)
+        return size // piece * _up(piece, BURST_BYTES) if piece else size
+
+    def _piece_channels(self, operations: Sequence[Operation]) -> dict[str, int]:
+        """Channels of a pixel that lie in one piece, by result; a shuffle at a network's end is left to the host."""
+        found: dict[str, int] = {}
+        for op in operations:
+            taken, given = next(iter(op.in_shapes), None), op.out_shape
+            if op.kind == "pixel shuffle" and taken and given and self._readers[self._root(op.output)]:
+                found[self._root(op.output)] = min(taken[0], given[0])
+            if op.kind == "concat":
+                fed = zip(op.inputs, op.in_shapes, strict=True)
+                found |= {self._root(name): shape[0] for name, shape in fed if shape is not None}
+        return found
+
+    def _is_pass(self, op: Operation) -> bool:
+        return len(op.inputs) == 2 and op.in_shapes[0] == op.in_shapes[1] and not self._fits(op.output)
 
     def _fused(self, add: Operation) -> str:
         """The operand of an add that is made last."""
@@ -144,9 +177,12 @@ class _Flow:
 
     def _leaves(self, name: str) -> bool:
         root = self._root(name)
+        outside = root not in self._order or root in self._concats
+        return outside or not self._fits(root) or self._readers[root] > SHARING
+
+    def _fits(self, root: str) -> bool:
         shape = self._shapes.get(root)
-        held = _up(shape[0], self._lanes) * shape[1] * shape[2] if shape else 0
-        return root not in self._order or held > self._kept_bytes or self._readers[root] > SHARING
+        return shape is None or _up(shape[0], self._lanes) * shape[1] * shape[2] <= self._kept_bytes
 
     def _root(self, name: str) -> str:
         return self._same.get(name, name)
