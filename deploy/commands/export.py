@@ -6,11 +6,11 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import RULED, config_beside, refuse, save_core, say
+from beers_deploy.commands.shared import RULED, board_for, refuse, save_core, say
 from beers_deploy.model.shipped import SENSOR, SHIPPED, VARIANT
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError
-from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile, load_target
+from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 
 EXAMPLE = "export --network convbeers-s --out float.onnx"
 
@@ -64,16 +64,16 @@ def export(
     from beers_deploy.quant.onnx_file import require_onnx_name, save_onnx
 
     path = weights_file(network) if network.suffix or network.exists() else weights_named(network)
+    read = [path, apply, *(Path(given) for given in (sensor, target) if given)]
+    require_writable(out, board_file, delta, inputs=read)
     if board_file is None:
         refuse(context, ["target"], expected="--board-file beside it", got="none", remedy="leave it out")
-    board = load_target(target or DEFAULT_TARGET)
-    config, profiles = config_beside(board_file, board), (Path(given) for given in (sensor, target) if given)
-    require_writable(out, board_file, config, delta, inputs=(path, apply, *profiles))
     if path.suffix != ".onnx":
         remedy = "give one that 'quantize' made of weights of 'train --conditioned', or leave it out"
         asked = ["board_file", "delta", "apply"]
         refuse(context, asked, expected="an INT8 --network", got=str(network), remedy=remedy)
     require_onnx_name(out, board_file)
+    board = board_for(target or DEFAULT_TARGET, board_file, tile, read)
     if path.suffix == ".onnx":
         _export_int8(path, out, sensor, tile, (board_file, board), delta, apply)
         return

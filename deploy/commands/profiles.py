@@ -78,7 +78,7 @@ def _shown(name: str) -> tuple[str, list[Row]]:
             **target.tables,
             **{f"configurations.{k}": v for k, v in target.configurations.items()},
         }
-        groups |= {"activations": target.activations}
+        groups |= {"activations": target.activations, "npu": target.npu}
         rows = [_row(f"{group}.{key}", value) for group, table in groups.items() for key, value in table.items()]
         return f"{target.name}: {target.description}", rows
     known = ", ".join([*sensor_names(), *scene_names(), *target_names()])

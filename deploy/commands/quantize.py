@@ -6,12 +6,12 @@ from typing import Annotated, Any
 
 import typer
 
-from beers_deploy.commands.shared import RULED, arguments, config_beside, save, save_core, say
+from beers_deploy.commands.shared import RULED, arguments, board_for, refuse, save, save_core, say
 from beers_deploy.model.processor import SEEDS
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile, load_target
+from beers_deploy.profiles.target import DEFAULT_TARGET
 
 EXAMPLE = "quantize float.onnx --target zcu104 --sensor pleiades-degraded --out int8.onnx"
 
@@ -32,6 +32,7 @@ TITLES = {
 
 
 def quantize(
+    context: typer.Context,
     model: Annotated[
         Path, typer.Argument(help="Float ONNX or weights, or a shipped network's name, then told --sensor.")
     ],
@@ -86,16 +87,18 @@ def quantize(
     from beers_deploy.results import Table, print_rows
     from beers_deploy.verdict import compare
 
-    free, board = regime is Regime.free, load_target(target)
+    free = regime is Regime.free
     _require_legal(free and bool(board_file or report or finetune))
     if report and conditioned(model):
         expected, remedy = "a network that is calibrated by itself", "leave it out"
         raise OptionError("--report", expected=expected, got="one behind a bank", remedy=remedy)
-    _require_tile(tile, board_file, board)
+    if board_file is None:
+        refuse(context, ["tile"], expected="--board-file beside it", got="none", remedy="leave it out")
     page, figures = _report_files(report)
     read = (model, images, samples, *map(Path, (target, sensor)))
-    require_writable(out, board_file, config_beside(board_file, board), json, page, figures, inputs=read)
+    require_writable(out, board_file, json, page, figures, inputs=read)
     require_onnx_name(out, board_file)
+    board = board_for(target, board_file, tile, read)
     known = Sensor.load(sensor)
     drawn: dict[str, Any] = {"sensor": known, "images": images, "patches": patches, "seed": seed}
     made = quantised(model, samples, board=board, regime=regime.value, patch_px=patch, finetune=finetune, **drawn)
@@ -129,16 +132,6 @@ def _require_legal(asked: bool) -> None:
         remedy = "leave it out, or take --regime legal"
         expected = "no --board-file, --report or --finetune"
         raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
-
-
-def _require_tile(tile: int | None, board_file: Path | None, board: TargetProfile) -> None:
-    """A tile is that of a board's file, and before minutes of calibration an NPU's is known to have one."""
-    from beers_deploy.quant.encodings import required_tile
-
-    if tile and board_file is None:
-        raise OptionError("--tile", expected="--board-file beside it", got="none", remedy="leave it out")
-    if board_file and board.npu:
-        required_tile(tile)
 
 
 def _report_files(folder: Path | None) -> tuple[Path, Path] | tuple[None, None]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TextIO
 import typer
 
 from beers_deploy.profiles.errors import OptionError, visible
-from beers_deploy.profiles.target import TargetProfile, board_names, npu_names
+from beers_deploy.profiles.target import TargetProfile, board_names, load_target, npu_names
 
 if TYPE_CHECKING:
     from beers_deploy.network import Network
@@ -86,26 +86,38 @@ def save(table: "Table", path: Path | None) -> None:
         table.save(path)
 
 
+def board_for(target: str, core: Path | None, tile: int | None, inputs: Iterable[Path | None]) -> TargetProfile:
+    """The board of a core that is to be written: of an NPU a tile is asked for, and room for what its compiler reads.
+
+    Args:
+        target: as --target names it.
+        core: the file; None where none is wanted.
+        tile: its side in pixels, if it is fixed to one.
+        inputs: what is read, and may not be written.
+    """
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.quant.encodings import CONFIG, required_tile
+
+    board = load_target(target)
+    if core is not None and board.npu:
+        required_tile(tile)
+        require_writable(core.with_name(CONFIG), inputs=inputs)
+    return board
+
+
 def save_core(core: "Network | None", path: Path | None, board: TargetProfile) -> None:
     """Write a network's core for a board, where one is wanted, and beside it what the compiler of an NPU reads."""
     from beers_deploy.model.io.files import write_text
-    from beers_deploy.quant.encodings import compiler_config
+    from beers_deploy.quant.encodings import CONFIG, compiler_config
 
     if core is None or path is None:
         return
     core.save(path)
     say(f"wrote {path}: the same numbers in the board's encoding")
-    config = config_beside(path, board)
-    if config is not None:
-        write_text(config, json.dumps(compiler_config(*board.npu["device"].value), indent=1) + "\n")
-        say(f"wrote {config}: what AMD's compiler is told")
-
-
-def config_beside(path: Path | None, board: TargetProfile) -> Path | None:
-    """What the compiler of an NPU reads beside a core; None of other boards."""
-    from beers_deploy.quant.encodings import CONFIG
-
-    return path.with_name(CONFIG) if path is not None and board.npu else None
+    if board.npu:
+        told = json.dumps(compiler_config(*board.npu["device"].value), indent=1)
+        write_text(path.with_name(CONFIG), told + "\n")
+        say(f"wrote {path.with_name(CONFIG)}: what AMD's compiler is told")
 
 
 def say(text: str, err: bool = False) -> None:
