@@ -19,11 +19,9 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import sensor_names
 from beers_deploy.profiles.target import TargetProfile, board_names
 from beers_deploy.quant.banked.filters import MIDDLE_DN, PART, STEP_DN
-from beers_deploy.quant.core import IntCore
-from beers_deploy.quant.encodings import board_model, read_core
+from beers_deploy.quant.encodings import CONFIG, compiler_config, read_core
 from beers_deploy.quant.ends import FINE_MAX
 from beers_deploy.quant.graph import CORRECTION, QUARTER, STEP
-from beers_deploy.quant.onnx_file import metadata, save_onnx
 from beers_deploy.quant.session import open_session, tensors_of
 from beers_deploy.restoration.options import TILE_PX
 from beers_deploy.results import Table
@@ -55,17 +53,18 @@ class Board(TargetProfile):
             ModelError: a float network, or one that was not quantised under a DPU's rules here.
         """
         network, folder = Network.load(int8), Path(out)
-        core = read_core(network.model)
-        board_file = board_model(core, metadata(network.model), tile)
-        save_onnx(board_file, folder / "core.onnx")
-        session = open_session(board_file)
+        core = network.core(self, tile)
+        core.save(folder / "core.onnx")
+        if self.npu:
+            write_text(folder / CONFIG, json.dumps(compiler_config(*self.npu["device"].value), indent=1) + "\n")
+        session = open_session(core.model)
         shape = [side if isinstance(side, int) else 1 for side in session.get_inputs()[0].shape]
         planes = np.random.default_rng(0).integers(-64, 64, shape).astype(_dtype(session.get_inputs()[0].type))
         for name, values in (("input", planes), ("expected", tensors_of(session, None, planes)[0])):
             with whole_file(folder / f"{name}.npy") as temporary, temporary.open("wb") as stream:
                 np.save(stream, values)
         shutil.copyfile(MEASURE, folder / "measure.py")
-        if (said := host_constants(network, core, tile)) is not None:
+        if (said := host_constants(network, tile)) is not None:
             write_text(folder / "host.json", json.dumps(said, indent=1) + "\n")
             shutil.copyfile(HOST, folder / "host.py")
         write_golden(network, folder / "golden", board=self)
@@ -76,8 +75,9 @@ class Board(TargetProfile):
         return folder
 
 
-def host_constants(network: Network, core: IntCore, tile_px: int) -> dict[str, object] | None:
+def host_constants(network: Network, tile_px: int) -> dict[str, object] | None:
     """What host.py needs to know; None of a network whose result is no image, or whose pixels move otherwise."""
+    core = read_core(network.model)
     ends = core.ends
     shuffles = {
         "front": (ends.front, ends.channels),

@@ -26,8 +26,8 @@ from beers_deploy.profiles.toml import read_json
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import PLANES, Op
-from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.integer.diagnosis import Seen, explain, where
+from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.onnx_file import fixed_tile_px
 from beers_deploy.results import Input, Table
 
@@ -78,8 +78,8 @@ def write_golden(
 
 
 def rounds_to_even(board: TargetProfile) -> bool:
-    """Whether a board rounds ties to even; a DPU rounds them up."""
-    return bool(board.tables.get("numbers", {}).get("half_even"))
+    """Whether a board rounds ties to even, as the kernel does that AMD shows for its NPU; a DPU rounds them up."""
+    return bool(board.npu)
 
 
 def files_of(core: IntCore) -> dict[str, str]:

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import PLANES, Graph, graph_to_onnx, tensors
-from beers_deploy.quant.integer import run_core
+from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.passes.fit_weights import FLOOR, Moments, descend, fit, fit_weights, input_moments
 from beers_deploy.quant.reading.folding import simplest
 from beers_deploy.quant.samples import Patches

@@ -24,7 +24,7 @@ from beers_deploy.quant.graph import (
     same,
     split,
 )
-from beers_deploy.quant.integer import run_core
+from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.passes import level
 from beers_deploy.quant.passes.equalise import MOST_CHANNELS, Costs
 from beers_deploy.quant.passes.level import Chain, chain_ranges

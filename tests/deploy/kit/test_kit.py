@@ -12,6 +12,7 @@ from cyclonedx.schema import SchemaVersion
 from cyclonedx.validation.json import JsonStrictValidator
 
 import beers_deploy as bd
+from beers_deploy.kit.golden import read_golden
 from beers_deploy.kit.record import NAMES
 from tests.deploy.command_line import done
 from tests.deploy.kit.test_golden import network
@@ -66,3 +67,10 @@ def test_of_a_users_network_nothing_is_made_up(tmp_path: Path) -> None:
     assert (said["training"], said["licence"], said["weights_sha256"], said["sensors_in_range"]) == (None,) * 4
     assert len(said["calibration_samples"]) == 3
     onnx.checker.check_model(onnx.load(folder / "core.onnx"))
+
+
+def test_for_an_npu_the_core_is_what_its_compiler_reads(tmp_path: Path) -> None:
+    folder = bd.Board.load("vek385").kit("convbeers-xs-int8", tmp_path / "kit", tile=48)
+    assert "ve2-xc2ve3858" in (folder / "vitisai_config.json").read_text(encoding="utf-8")
+    assert read_golden(folder / "golden").half_even
+    assert bd.check(folder / "core.onnx", "vek385")
