@@ -96,11 +96,11 @@ def host_cores(board: str) -> int:
 
 
 @cache
-def published_cases(board: str) -> tuple[Case, ...]:
-    """The published rates of a board, one case a network and configuration."""
+def published_cases(board: str, *, slower: bool = False) -> tuple[Case, ...]:
+    """The published rates of a board, or those of its SLOWER releases; one case a network and configuration."""
     found = defaultdict(list)
     for rate in published_rates():
-        if rate["board"] == board and rate["release"] not in SLOWER.get(board, ()):
+        if rate["board"] == board and (rate["release"] in SLOWER.get(board, ())) is slower:
             found[rate["network"], rate["configuration"]].append(rate)
     return tuple(
         network_case(

@@ -16,7 +16,7 @@ import numpy as np
 from beers_deploy.dpu.cost.latency import WIDTHS
 from benchmarks.cost_model.fit import fit, rounded
 from benchmarks.cost_model.notation import KINDS
-from benchmarks.cost_model.published import NETWORKS, boards, written
+from benchmarks.cost_model.published import NETWORKS, SLOWER, boards, written
 from benchmarks.cost_model.validation import (
     Nested,
     bias,
@@ -25,6 +25,7 @@ from benchmarks.cost_model.validation import (
     nested,
     one_thread,
     outside_width,
+    owner_errors,
     pair_width,
     rank_correlation,
     transferred,
@@ -125,6 +126,15 @@ def by_kind() -> Iterator[tuple[object, ...]]:
             )
 
 
+def owners() -> Iterator[tuple[object, ...]]:
+    """What one run of an owner's board leaves of the error on other families."""
+    yield "board of the owner", "no run", "one run", "one run, wholly believed"
+    for board in boards():
+        yield board, *map(_percent, owner_errors(board))
+    for board, releases in SLOWER.items():
+        yield f"{board}, {' and '.join(releases)}", *map(_percent, owner_errors(board, slower=True))
+
+
 def others() -> Iterator[tuple[object, ...]]:
     """Rates of one thread, and boards predicted with the ZCU102's constants."""
     yield "what", "networks", "median", "mean", "largest"
@@ -166,6 +176,7 @@ def main() -> int:
     print(table(accuracy()))
     print(table(by_kind()))
     print(table(others()))
+    print(table(owners()))
     return int(check and bool(stale))
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.stats import binom, spearmanr
 
 from beers_deploy.dpu.cost.model import Array, Constants, Regime, Structure, regime_of
+from beers_deploy.dpu.cost.own_runs import SCATTER
 from beers_deploy.profiles import load_target
 from benchmarks.cost_model.fit import Cases, fit
 from benchmarks.cost_model.published import boards, host_cores, published_cases
@@ -269,6 +270,24 @@ def one_thread(board: str) -> tuple[list[str], list[Array]]:
                 names.append(row.network)
                 errors.append(np.array([error]))
     return names, errors
+
+
+def owner_errors(board: str, *, slower: bool = False) -> list[float]:
+    """Mean |predicted / published - 1| with no run of an owner, with one, and with one that is wholly believed.
+
+    Each case in turn is the owner's run and corrects all others of its part (DPU or host), each family predicted
+    without itself; only other families count. `slower` takes an owner whose board has one of SLOWER's images.
+    """
+    trial = _trial(board, chosen(board))
+    cases = Cases(published_cases(board, slower=slower), trial.cases.structure)
+    errors, on_host = np.zeros(len(cases.rows)), np.zeros(len(cases.rows), dtype=bool)
+    for name in dict.fromkeys(cases.families):
+        mine, constants = cases.families == name, trial.fit_without({name})
+        errors[mine] = cases.only(mine).errors(constants)
+        on_host[mine] = [kind == "host" for kind in regimes_of(cases.only(mine), constants)]
+    owners = errors[:, None] * (on_host[:, None] == on_host)
+    others = cases.families[:, None] != cases.families
+    return [float(np.abs(np.expm1(errors - share * owners))[others].mean()) for share in (0, 1 / (1 + SCATTER), 1)]
 
 
 def transferred(source: str, target: str) -> tuple[list[str], list[Array]]:
