@@ -4,11 +4,6 @@ Least squares on ln(FPS) with a soft L1 loss (a rate far off counts linearly), e
 damped Gauss-Newton steps on the logarithms of the constants. Rates with several threads tell how much the DPU and the
 host get done side by side; those with one thread, which weigh ALONE as much, how long they take one after the other.
 A weak prior pulls each logarithm to its start. No array does more than its peak, so its efficiency ends at 1.
-
-`scipy.optimize.least_squares` with the same loss finds the same constants to 0.4 % on four boards. On the VCK190,
-where the cost has a kink, it ends 2.4 % lower, with the port and the memory 15 % faster and the same mean error.
-Moving to it would move every prediction of that board by about 10 %, for which no published rate speaks, so the
-constants stay.
 """
 
 from collections import Counter
@@ -26,7 +21,7 @@ START = Constants(0.8, 40, 0.55, 6e-6, 5e-5, 0.4e9, 0.8e9, 0.3e9, 30e6, 60e6, 1.
 """Where the fit begins: the right orders of magnitude; a pixel of an image takes the host a clock cycle."""
 SPREAD = np.array([0.3, 1, 0.2, 1, 1, 0.7, 0.7, 0.7, 1, 1, 0.5])
 """How far each logarithm may lie from its start, a standard deviation: shares less than times and rates. Few
-networks tell what the VCK190's memory reaches, and they differ twofold: the other boards' 0.5 to 0.65 count too."""
+networks tell what the VCK190's memory reaches, and they differ by 1.7: the other boards' 0.5 to 0.65 count too."""
 SOFT = 0.1
 """Residual in ln(FPS) from where a rate counts linearly."""
 ALONE = 0.25

@@ -113,17 +113,9 @@ def by_kind() -> Iterator[tuple[object, ...]]:
             if not rows:
                 continue
             off = by_network((row.network for row in rows), (row.rates for row in rows))
-            held, whole = coverage(rows)
-            counts = len(off), sum(len(row.rates) for row in rows)
-            yield (
-                board,
-                kind,
-                *counts,
-                *_spread(off)[:2],
-                f"{100 * bias(rows):+.1f} %",
-                *_spread(off)[2:],
-                *map(_percent, (held, whole)),
-            )
+            counts, (median, mean, largest) = (len(off), sum(len(row.rates) for row in rows)), _spread(off)
+            errors = median, mean, f"{100 * bias(rows):+.1f} %", largest
+            yield board, kind, *counts, *errors, *map(_percent, coverage(rows))
 
 
 def owners() -> Iterator[tuple[object, ...]]:
