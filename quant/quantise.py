@@ -37,6 +37,7 @@ from beers_deploy.quant.graph import (
 from beers_deploy.quant.graph.tail import Tail
 from beers_deploy.quant.onnx_file import fixed_tile_px, metadata
 from beers_deploy.quant.passes.equalise import (
+    FULL,
     LEVELLING,
     Costs,
     Trial,
@@ -265,6 +266,9 @@ def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray],
         log(f"equalising the channels of {len(plan.chain.tensors)} tensors")
         ranges = chain_ranges(graph, plan.chain, images, plan.ends)
         graph = plan.chain.scaled(graph, level(graph, plan.chain, ranges, np.ones(len(ranges)), trial))
+    if plan.ends.offsets and plan.chain.tensors:  # the image itself passes through: what is clipped is lost
+        largest = chain_ranges(graph, plan.chain, images, plan.ends, quantile=1.0)
+        graph = plan.chain.scaled(graph, FULL / np.maximum(largest, FULL))
     return graph
 
 

@@ -20,6 +20,7 @@ from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import Conv, Graph
 from beers_deploy.quant.passes.equalise import (
     MOST_CHANNELS,
+    QUANTILE,
     Best,
     Costs,
     Trial,
@@ -100,10 +101,12 @@ class Chain:
         return np.repeat(own, self.widths)
 
 
-def chain_ranges(graph: Graph, chain: Chain, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL) -> np.ndarray:
+def chain_ranges(
+    graph: Graph, chain: Chain, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL, quantile: float = QUANTILE
+) -> np.ndarray:
     """The range of every channel over images (1, C, H, W), that of the tile where it is widest."""
     widest = [np.zeros(width) for width in chain.widths]
-    for sizes in channel_sizes(graph, list(chain.tensors), images, ends):
+    for sizes in channel_sizes(graph, list(chain.tensors), images, ends, quantile):
         widest = [np.maximum(most, size) for most, size in zip(widest, sizes, strict=True)]
     return np.concatenate([above_dead(ranges) for ranges in widest])
 

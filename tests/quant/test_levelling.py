@@ -26,7 +26,7 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.passes import level
-from beers_deploy.quant.passes.equalise import MOST_CHANNELS, Costs
+from beers_deploy.quant.passes.equalise import FULL, MOST_CHANNELS, Costs
 from beers_deploy.quant.passes.level import Chain, chain_ranges
 from beers_deploy.quant.passes.stream import STREAM_FRAC_BITS, lone_tensors
 from beers_deploy.quant.reading.folding import simplest
@@ -145,6 +145,17 @@ def test_the_start_leaves_each_tensor_the_scale_it_has() -> None:
     *_, chain = read("espcn")
     factors = chain.unscaled(dict.fromkeys(chain.tensors, STREAM_FRAC_BITS - 2))
     np.testing.assert_array_equal(factors, np.full(sum(chain.widths), 0.25))
+
+
+@pytest.mark.parametrize("loud", [0.1, 20.0])
+def test_what_calibration_sees_is_not_clipped_where_the_image_itself_passes(
+    loud: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("beers_deploy.quant.quantise.level", lambda _g, _c, ranges, *_: loud * FULL / ranges)
+    model, _, _, chain = read("espcn")
+    made = quickly(model, patches_of(images()))
+    assert made.core.ends.offsets
+    assert chain_ranges(made.graph, chain, images(), made.core.ends, quantile=1.0).max() <= FULL * (1 + 1e-5)
 
 
 def test_unequal_channels_err_half_as_much_once_they_are_levelled(monkeypatch: pytest.MonkeyPatch) -> None:
