@@ -1,6 +1,6 @@
 """The DPUCVDX8G from the outside: what it can run, where each node goes, how long it takes, at what power.
 
 - `board`: a configuration with its constants; `graph`: a network as the DPU sees it;
-- `reading`: an ONNX file becomes such a graph; `integers`: its numbers;
+- `reading`: an ONNX file becomes such a graph;
 - `checker`: rules and placement; `cost`: time and power.
 """

@@ -10,37 +10,17 @@ from itertools import chain, product
 
 import numpy as np
 
-from beers_deploy.quant.core import INT8_MIN, IntConv, IntCore
+from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from beers_deploy.quant.graph import PLANES, Activation, Op, Window
 from beers_deploy.quant.integer.arithmetic import convolve
-from beers_deploy.quant.integer.reference import Faults, layer_sums, rounded, saturated
+from beers_deploy.quant.integer.reference import layer_sums, rounded, saturated
 
+Layer = IntConv | Op
 Tensors = Mapping[str, np.ndarray]
 Compute = Callable[[Tensors], np.ndarray]
 """A layer's results (N, C, H, W) from the tensors that it reads."""
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """What a fault would make of a layer.
-
-    Attributes:
-        words: the fault, as a sentence names it.
-        compute: the results with it.
-        inside: whether the border is not compared, a quarter of the side: the fault brings in what nobody knows.
-    """
-
-    words: str
-    compute: Compute
-    inside: bool = False
-
-    def left(self, case: "Seen") -> int:
-        """How many values it makes that are not what the board wrote."""
-        made, seen = self.compute(case.tensors), case.seen
-        if self.inside:
-            rows, columns = (slice(side // 4, side - side // 4) for side in seen.shape[2:])
-            made, seen = made[..., rows, columns], seen[..., rows, columns]
-        return int((made != seen).sum()) if made.shape == seen.shape else seen.size
+Explanation = tuple[str, Compute]
+"""A fault in words, and what it would make of a layer."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +30,27 @@ class Seen:
     tensors: Tensors
     seen: np.ndarray
 
+    def unlike(self, made: np.ndarray, shifted: bool = False) -> int:
+        """How many values are not those; of what is `shifted`, its border of a quarter of the side left out."""
+        seen = self.seen
+        if shifted:
+            rows, columns = (slice(side // 4, side - side // 4) for side in seen.shape[2:])
+            made, seen = made[..., rows, columns], seen[..., rows, columns]
+        return int((made != seen).sum()) if made.shape == seen.shape else seen.size
+
 
 MOST_LEFT = 0.1
 """Of the differences, by a fault that explains the rest: there may be two at a time."""
+SHIFTED = "the tile is shifted by "
+PADDINGS = {"copies of the border": "edge", "a mirror image": "reflect", "-128": "constant"}
+MOST_CHANNELS, LIKELY = 4, 12
+"""Channels that are looked through for a wrong bit, which shows in one; and weights of each that are tried."""
+HALO_MAX_PX = 16
+SIDES = {"outer": (1, 1, 1, 1), "upper": (1, 0, 0, 0), "left": (0, 1, 0, 0), "lower": (0, 0, 1, 0)}
+SIDES["right"] = (0, 0, 0, 1)
 
 
-def explain(core: IntCore, ops: Sequence[IntConv | Op], cases: Sequence[Seen], half_even: bool) -> str:
+def explain(core: IntCore, ops: Sequence[Layer], cases: Sequence[Seen], half_even: bool) -> str:
     """The fault that gives exactly what a board wrote of one layer; empty where none that is known does.
 
     Args:
@@ -65,163 +60,160 @@ def explain(core: IntCore, ops: Sequence[IntConv | Op], cases: Sequence[Seen], h
         cases: in which its results differ.
         half_even: how a sound board rounds ties: to even, or else up.
     """
-    output = ops[-1].output if ops else PLANES
-    counts = [int((case.seen != case.tensors[output]).sum()) for case in cases]
+    output, faults, best = ops[-1].output if ops else PLANES, Faulty(core, half_even), (MOST_LEFT, "")
+    counts = [case.unlike(case.tensors[output]) for case in cases]
     worst = cases[int(np.argmax(counts))]
-    alone = _explanations(core, ops[-1] if ops else None, worst, half_even)
-    best = MOST_LEFT, ""
-    for each in chain(alone, _between(core, ops, half_even) if len(ops) > 1 else ()):
-        if each.left(worst) > MOST_LEFT * max(counts):
+    alone = faults.of_layer(ops[-1], worst) if ops else faults.of_tensor(PLANES, lambda known: known[PLANES], worst)
+    for words, compute in chain(alone, faults.before(ops) if len(ops) > 1 else ()):
+        shifted = words.startswith(SHIFTED)
+        if worst.unlike(compute(worst.tensors), shifted) > MOST_LEFT * max(counts):
             continue
-        left = sum(map(each.left, cases))
+        left = sum(case.unlike(compute(case.tensors), shifted) for case in cases)
         if not left:
-            return each.words
-        best = min(best, (left / sum(counts), each.words))
+            return words
+        best = min(best, (left / sum(counts), words))
     return f"{best[1]}, which leaves {best[0]:.1%} of the differences" if best[1] else ""
 
 
-def rule_faults(core: IntCore, op: IntConv | Op, half_even: bool) -> Iterator[Explanation]:
-    """Faults of a board's rules, which may be the same in every layer: rounding, saturation, scales, padding."""
-    yield from _rounding(core, op, half_even)
-    yield from _scales(core, op, half_even)
-    if isinstance(op, IntConv):
-        yield from _convolution(core, op, half_even)
+@dataclass(frozen=True)
+class Faulty:
+    """A network's integers, and how a sound board rounds ties: what faulty boards make of its layers."""
 
+    core: IntCore
+    half_even: bool
 
-def sound(core: IntCore, op: IntConv | Op, half_even: bool, faults: Faults | None = None) -> Compute:
-    """A layer as it should be computed, or with wrong shifts."""
+    def sound(self, op: Layer, **other: object) -> Compute:
+        """A layer as it should be computed, or with some of its numbers replaced."""
+        changed = replace(op, **other) if other else op  # type: ignore[type-var]
+        return self._summed(changed, lambda sums, shift: saturated(self._whole(sums, shift)))
 
-    def compute(tensors: Tensors) -> np.ndarray:
-        sums, shift, _, _ = layer_sums(core, op, tensors, faults or Faults())
-        return saturated(rounded(sums, shift, half_even)[0])
+    def _whole(self, sums: np.ndarray, shift: int) -> np.ndarray:
+        return rounded(sums, shift, self.half_even)[0]
 
-    return compute
+    def _summed(self, op: Layer, change: Callable[[np.ndarray, int], np.ndarray]) -> Compute:
+        return lambda known: change(*layer_sums(self.core, op, known)[:2])
 
-
-def _explanations(core: IntCore, op: IntConv | Op | None, worst: Seen, half_even: bool) -> Iterator[Explanation]:
-    if op is None:
-        meant: Compute = lambda tensors: tensors[PLANES]  # noqa: E731
-        output = PLANES
-    else:
-        yield from rule_faults(core, op, half_even)
-        meant, output = sound(core, op, half_even), op.output
-    yield from _halo(op, meant)
-    yield from _order(meant, worst.tensors[output], worst.seen)
-    yield from _places(meant)
-    if isinstance(op, IntConv):
-        yield from _numbers(core, op, worst, half_even)
-
-
-def _rounding(core: IntCore, op: IntConv | Op, half_even: bool) -> Iterator[Explanation]:
-    def other(change: Callable[[np.ndarray, int], np.ndarray]) -> Compute:
-        return lambda tensors: change(*layer_sums(core, op, tensors)[:2])
-
-    def whole(sums: np.ndarray, shift: int) -> np.ndarray:
-        return rounded(sums, shift, half_even)[0]
-
-    rule = "up instead of to even" if half_even else "to even instead of up"
-    yield Explanation(f"ties are rounded {rule}", sound(core, op, not half_even))
-    yield Explanation(
-        "results are cut off instead of rounded", other(lambda sums, shift: saturated(sums >> max(shift, 0)))
-    )
-    yield Explanation(
-        "ties are rounded away from zero",
-        other(lambda sums, shift: saturated(np.sign(sums) * rounded(np.abs(sums), shift, half_even=False)[0])),
-    )
-    yield Explanation(
-        "results beyond int8 wrap around instead of saturating",
-        other(lambda sums, shift: ((whole(sums, shift) - INT8_MIN) % 256 + INT8_MIN).astype(np.int16)),
-    )
-    yield Explanation(
-        "results saturate at -127 instead of -128",
-        other(lambda sums, shift: np.maximum(saturated(whole(sums, shift)), INT8_MIN + 1)),
-    )
-
-
-def _scales(core: IntCore, op: IntConv | Op, half_even: bool) -> Iterator[Explanation]:
-    """Scales that are powers of two off: of the result, of an input, of the weights or the bias."""
-    for by in (1, -1, 2, -2):
-        for name in dict.fromkeys((op.output, *op.inputs)):
-            moved = replace(core, frac_bits={**core.frac_bits, name: core.frac_bits[name] + by})
-            words = f"the scale of {name} is taken as 2^{-by} times what it is"
-            yield Explanation(words, sound(moved, op, half_even))
+    def of_layer(self, op: Layer, worst: Seen) -> Iterator[Explanation]:
+        """Every fault of a layer whose inputs are sound."""
+        yield from self.of_rules(op)
+        if PLANES in op.inputs:
+            yield from _halo(self.sound(op))
+        yield from self.of_tensor(op.output, self.sound(op), worst)
         if isinstance(op, IntConv):
-            bias = replace(op, bias_frac_bits=op.bias_frac_bits - by)
-            yield Explanation(f"its bias is taken as 2^{by} times what it is", sound(core, bias, half_even))
+            yield from self._bits(op, worst)
+
+    def of_rules(self, op: Layer) -> Iterator[Explanation]:
+        """Faults of a board's rules, which may be the same in every layer: rounding, saturation, scales, padding."""
+        other = replace(self, half_even=not self.half_even).sound(op)
+        yield f"ties are rounded {'up instead of to even' if self.half_even else 'to even instead of up'}", other
+        cut = self._summed(op, lambda sums, shift: saturated(sums >> max(shift, 0)))
+        yield "results are cut off instead of rounded", cut
+        away = self._summed(op, lambda sums, by: saturated(np.sign(sums) * rounded(np.abs(sums), by, False)[0]))
+        yield "ties are rounded away from zero", away
+        wrap = self._summed(op, lambda sums, by: ((self._whole(sums, by) + 128) % 256 - 128).astype(np.int16))
+        yield "results beyond int8 wrap around instead of saturating", wrap
+        short = self._summed(op, lambda sums, by: np.clip(self._whole(sums, by), -INT8_MAX, INT8_MAX))
+        yield "results saturate at -127 instead of -128", short
+        for by, name in product((1, -1, 2, -2), dict.fromkeys((op.output, *op.inputs))):
+            moved = replace(self.core, frac_bits={**self.core.frac_bits, name: self.core.frac_bits[name] + by})
+            yield f"the scale of {name} is taken as 2^{-by} times what it is", replace(self, core=moved).sound(op)
+        if isinstance(op, IntConv):
+            yield from self._of_convolution(op)
+
+    def _of_convolution(self, op: IntConv) -> Iterator[Explanation]:
+        for by in (1, -1, 2, -2):
+            yield (
+                f"its bias is taken as 2^{by} times what it is",
+                self.sound(op, bias_frac_bits=op.bias_frac_bits - by),
+            )
+        yield "its bias is not added", self.sound(op, bias=np.zeros_like(op.bias))
+        if op.activation is not Activation.none:
+            yield f"its activation {op.activation} is missing", self.sound(op, activation=Activation.none)
+        yield "its kernels are turned by half a turn", self.sound(op, weight=op.weight[:, :, ::-1, ::-1])
+        if not op.transposed and any(op.window.pads):
+            inside = self.sound(op, window=Window(op.window.strides, dilations=op.window.dilations))
+            for words, mode in PADDINGS.items():
+                yield f"it is padded with {words} instead of zeros", _padded(op, inside, mode)
+
+    def of_tensor(self, name: str, meant: Compute, worst: Seen) -> Iterator[Explanation]:
+        """Values that are right, and stand in other channels or places; of the planes also a halo of zeros."""
+        if name == PLANES:
+            yield from _halo(meant)
+        of = [_channel_like(worst.tensors[name], worst.seen[:, k], k) for k in range(worst.seen.shape[1])]
+        if None not in of:
+            moved, sources = ", ".join(f"{each} at {k}" for k, each in enumerate(of) if each != k), np.array(of)
+            yield f"channels stand in another order: {moved}", lambda known: meant(known)[:, sources]
+        yield "rows and columns changed places", lambda known: meant(known).swapaxes(2, 3)
+        yield from _shifted(meant)
+
+    def _bits(self, op: IntConv, worst: Seen) -> Iterator[Explanation]:
+        """One bit of one bias or one weight that is not what it should be."""
+        channels = (worst.seen != worst.tensors[op.output]).any((0, 2, 3)).nonzero()[0]
+        for channel, bit in product(map(int, channels[: len(channels) <= MOST_CHANNELS and MOST_CHANNELS]), range(8)):
+            words = f"bit {bit} of the bias of channel {channel} is flipped"
+            yield words, self.sound(op, bias=_flipped(op.bias, (channel,), bit))
+            for place in _likely_weights(op, channel, worst):
+                words = f"bit {bit} of weight {list(place)} is flipped"
+                yield words, self.sound(op, weight=_flipped(op.weight, place, bit))
+
+    def before(self, ops: Sequence[Layer]) -> Iterator[Explanation]:
+        """Faults of what came before a layer: of a rule in all layers, all of a kind or one; or ahead of all."""
+        faults = {op.output: dict(self.of_rules(op)) for op in ops}
+
+        def through(wrong: Mapping[str, Compute]) -> Compute:
+            def compute(known: Tensors) -> np.ndarray:
+                made = dict(known)
+                for op in ops:
+                    made[op.output] = wrong.get(op.output, self.sound(op))(made)
+                return made[ops[-1].output]
+
+            return compute
+
+        kinds = {f"every {kind}": [op for op in ops if _kind(op) == kind] for kind in map(_kind, ops)}
+        for place, chosen in {"every layer": ops, **kinds, **{op.name: [op] for op in ops}}.items():
+            for words in dict.fromkeys(words for op in chosen for words in faults[op.output]):
+                wrong = {op.output: faults[op.output][words] for op in chosen if words in faults[op.output]}
+                yield f"{words}, in {place}", through(wrong)
+        if any(PLANES in op.inputs for op in ops):
+            yield from chain(_halo(through({})), _shifted(through({})))
 
 
-def _convolution(core: IntCore, op: IntConv, half_even: bool) -> Iterator[Explanation]:
-    yield Explanation("its bias is not added", sound(core, replace(op, bias=np.zeros_like(op.bias)), half_even))
-    if op.activation is not Activation.none:
-        without = replace(op, activation=Activation.none)
-        yield Explanation(f"its activation {op.activation} is missing", sound(core, without, half_even))
-    turned = replace(op, weight=np.ascontiguousarray(op.weight[:, :, ::-1, ::-1]))
-    yield Explanation("its kernels are turned by half a turn", sound(core, turned, half_even))
-    if op.transposed or not any(op.window.pads):
-        return
-    inside = replace(op, window=Window(op.window.strides, dilations=op.window.dilations))
-    for words, how in PADDINGS.items():
-        yield Explanation(f"it is padded with {words} instead of zeros", _padded(core, inside, op, how, half_even))
+def _kind(op: Layer) -> str:
+    return "convolution" if isinstance(op, IntConv) else type(op).__name__
 
 
-PADDINGS: Mapping[str, Mapping[str, object]] = {
-    "copies of the border": {"mode": "edge"},
-    "a mirror image": {"mode": "reflect"},
-    "-128": {"mode": "constant", "constant_values": INT8_MIN},
-    "127": {"mode": "constant", "constant_values": -1 - INT8_MIN},
-}
-
-
-def _padded(core: IntCore, inside: IntConv, op: IntConv, how: Mapping[str, object], half_even: bool) -> Compute:
+def _padded(op: IntConv, inside: Compute, mode: str) -> Compute:
     top, left, bottom, right = op.window.pads
-    sizes = ((0, 0), (0, 0), (top, bottom), (left, right))
+    sizes, more = ((0, 0), (0, 0), (top, bottom), (left, right)), {"constant_values": INT8_MIN}
 
-    def compute(tensors: Tensors) -> np.ndarray:
-        wide = np.pad(tensors[op.input], sizes, **how)  # type: ignore[call-overload]
-        return sound(core, inside, half_even)({**tensors, op.input: wide})
+    def compute(known: Tensors) -> np.ndarray:
+        wide = np.pad(known[op.input], sizes, mode, **(more if mode == "constant" else {}))  # type: ignore[call-overload]
+        return inside({**known, op.input: wide})
 
     return compute
 
 
-HALO_MAX_PX = 16
-SIDES = {
-    "outer": (1, 1, 1, 1),
-    "upper": (1, 0, 0, 0),
-    "left": (0, 1, 0, 0),
-    "lower": (0, 0, 1, 0),
-    "right": (0, 0, 0, 1),
-}
-
-
-def _halo(op: IntConv | Op | None, meant: Compute) -> Iterator[Explanation]:
+def _halo(meant: Compute) -> Iterator[Explanation]:
     """What surrounds a tile is zeros where the planes come in."""
-    if op is not None and PLANES not in op.inputs:
-        return
     for (side, ends), width in product(SIDES.items(), range(1, HALO_MAX_PX + 1)):
 
-        def compute(tensors: Tensors, pads: list[int] = [width * end for end in ends]) -> np.ndarray:  # noqa: B006
-            bare = np.zeros_like(tensors[PLANES])
-            height, across = bare.shape[2:]
+        def compute(known: Tensors, pads: tuple[int, ...] = tuple(width * end for end in ends)) -> np.ndarray:
+            bare, (height, across) = np.zeros_like(known[PLANES]), known[PLANES].shape[2:]
             inside = ..., slice(pads[0], height - pads[2]), slice(pads[1], across - pads[3])
-            bare[inside] = tensors[PLANES][inside]
-            return meant({**tensors, PLANES: bare})
+            bare[inside] = known[PLANES][inside]
+            return meant({**known, PLANES: bare})
 
-        words = f"the {side} {width} px of the planes are zeros instead of the tile's surroundings"
-        yield Explanation(words, compute)
+        yield f"the {side} {width} px of the planes are zeros instead of the tile's surroundings", compute
 
 
-def _order(meant: Compute, right: np.ndarray, seen: np.ndarray) -> Iterator[Explanation]:
-    """Channels that stand in another order, or axes that changed places."""
-    of = [_channel_like(right, seen[:, k], k) for k in range(seen.shape[1])]
-    if None not in of:
-        words = ", ".join(f"{source} at {k}" for k, source in enumerate(of) if source != k)
-        sources = np.array(of)
-        yield Explanation(f"channels stand in another order: {words}", lambda tensors: meant(tensors)[:, sources])
-    yield Explanation("rows and columns changed places", lambda tensors: meant(tensors).swapaxes(2, 3))
-    yield Explanation(
-        "the tensor is written with its channels last and read as if they came first",
-        lambda tensors: np.moveaxis(meant(tensors), 1, -1).reshape(meant(tensors).shape),
-    )
+def _shifted(meant: Compute) -> Iterator[Explanation]:
+    """Pixels that lie beside their places."""
+    for down, across in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (2, 0), (-2, 0), (0, 2), (0, -2)):
+
+        def compute(known: Tensors, by: tuple[int, int] = (down, across)) -> np.ndarray:
+            return np.roll(meant(known), by, (2, 3))
+
+        yield SHIFTED + " and ".join(f"{n} px {way}" for n, way in ((down, "down"), (across, "right")) if n), compute
 
 
 def _channel_like(right: np.ndarray, channel: np.ndarray, place: int) -> int | None:
@@ -230,54 +222,19 @@ def _channel_like(right: np.ndarray, channel: np.ndarray, place: int) -> int | N
     return place if same[place] else int(same.argmax()) if same.any() else None
 
 
-def _places(meant: Compute) -> Iterator[Explanation]:
-    """Pixels that lie beside their places."""
-    for down, across in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (2, 0), (-2, 0), (0, 2), (0, -2)):
-
-        def compute(tensors: Tensors, by: tuple[int, int] = (down, across)) -> np.ndarray:
-            return np.roll(meant(tensors), by, (2, 3))
-
-        words = " and ".join(f"{n} {axis}" for n, axis in ((down, "px down"), (across, "px to the right")) if n)
-        yield Explanation(f"the tile is shifted by {words}", compute, inside=True)
-
-
-MOST_CHANNELS = 4
-"""That are looked through for a wrong weight or bias: a fault in one number shows in one channel."""
-
-
-def _numbers(core: IntCore, op: IntConv, worst: Seen, half_even: bool) -> Iterator[Explanation]:
-    """One bit of one bias or one weight that is not what it should be."""
-    channels = (worst.seen != worst.tensors[op.output]).any((0, 2, 3)).nonzero()[0]
-    if len(channels) > MOST_CHANNELS:
-        return
-    for channel in channels:
-        for bit in range(8):
-            bias = _flipped(op.bias, (int(channel),), bit)
-            words = f"bit {bit} of the bias of channel {channel} is flipped"
-            yield Explanation(words, sound(core, replace(op, bias=bias), half_even))
-        for place in _likely_weights(op, int(channel), worst):
-            for bit in range(8):
-                weight = _flipped(op.weight, place, bit)
-                words = f"bit {bit} of weight {list(place)} is flipped"
-                yield Explanation(words, sound(core, replace(op, weight=weight), half_even))
-
-
 def _flipped(values: np.ndarray, place: tuple[int, ...], bit: int) -> np.ndarray:
     changed = values.copy()
     changed.view(np.uint8)[place] ^= np.uint8(1 << bit)
     return changed
 
 
-LIKELY = 12
-
-
 def _likely_weights(op: IntConv, channel: int, worst: Seen) -> list[tuple[int, ...]]:
     """The weights of a channel with whose inputs the differences go up and down most."""
     difference = (worst.seen - worst.tensors[op.output])[:, channel].astype(np.float64).ravel()
+    count, row = (len(op.weight), channel) if op.groups > 1 else (1, 0)  # kernels that are computed, and which counts
     alike: dict[tuple[int, ...], float] = {}
-    row = channel if op.groups > 1 else 0  # of the kernels that are computed
     for place in np.ndindex(*op.weight.shape[1:]):
-        alone = np.zeros((len(op.weight) if op.groups > 1 else 1, *op.weight.shape[1:]), np.int8)
+        alone = np.zeros((count, *op.weight.shape[1:]), np.int8)
         alone[(row, *place)] = 1
         read = convolve(worst.tensors[op.input], alone, op.window, op.groups, op.transposed)[:, row]
         values = read.astype(np.float64).ravel()
@@ -299,38 +256,3 @@ def where(seen: np.ndarray, meant: np.ndarray) -> str:
         if len(found) <= size // 4:
             return f"in {name}s {found[0]} to {found[-1]}{within}"
     return f"everywhere{within}" if within else f"everywhere, in {len(channels)} of {seen.shape[1]} channels"
-
-
-def _between(core: IntCore, ops: Sequence[IntConv | Op], half_even: bool) -> Iterator[Explanation]:
-    """Faults of what came before a layer: of a rule in all layers or in one kind of them, in one layer, or ahead."""
-    meant = {op.output: sound(core, op, half_even) for op in ops}
-    faults = {op.output: {each.words: each.compute for each in rule_faults(core, op, half_even)} for op in ops}
-
-    def through(wrong: Mapping[str, Compute]) -> Compute:
-        def compute(tensors: Tensors) -> np.ndarray:
-            made = dict(tensors)
-            for op in ops:
-                made[op.output] = wrong.get(op.output, meant[op.output])(made)
-            return made[ops[-1].output]
-
-        return compute
-
-    for place, chosen in _places_of(ops):
-        for words in dict.fromkeys(words for op in chosen for words in faults[op.output]):
-            wrong = {op.output: faults[op.output][words] for op in chosen if words in faults[op.output]}
-            yield Explanation(f"{words}, in {place}", through(wrong))
-    if any(PLANES in op.inputs for op in ops):
-        yield from _halo(None, through({}))
-        yield from _places(through({}))
-
-
-def _places_of(ops: Sequence[IntConv | Op]) -> Iterator[tuple[str, Sequence[IntConv | Op]]]:
-    """Where a fault of a rule may be: in all layers, in all of a kind, in one."""
-    yield "every layer", ops
-    for kind in dict.fromkeys(map(_kind, ops)):
-        yield f"every {kind}", [op for op in ops if _kind(op) == kind]
-    yield from ((op.name, [op]) for op in ops)
-
-
-def _kind(op: IntConv | Op) -> str:
-    return "convolution" if isinstance(op, IntConv) else type(op).__name__
