@@ -224,7 +224,7 @@ def is_quantised(model: onnx.ModelProto) -> bool:
     return any(mark in kind for kind in kinds for mark in ("qlinear", "quantizelinear", "integer"))
 
 
-NAMELESS = "ONNX model", "float model", "tiled model"
+NAMELESS = "ONNX model", "float model", "tiled model", "INT8 core"
 """What readers call a model in memory."""
 
 

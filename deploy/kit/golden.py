@@ -28,7 +28,7 @@ from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import PLANES, Op
 from beers_deploy.quant.integer.diagnosis import Seen, explain, where
 from beers_deploy.quant.integer.reference import run_core
-from beers_deploy.quant.onnx_file import fixed_tile_px
+from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px
 from beers_deploy.results import Input, Table
 
 SCHEMA, SCHEMA_VERSION = "beers-deploy/golden", 1
@@ -60,7 +60,9 @@ def write_golden(
         OptionError: a tile that the network does not take.
     """
     network, folder = Network.load(int8), Path(out)
-    core, half_even = read_core(network.model), rounds_to_even(TargetProfile.load(board))
+    with faults_named(network.label):
+        core = read_core(network.model)
+    half_even = rounds_to_even(TargetProfile.load(board))
     names, said = files_of(core), {}
     for case, image in _images(network, core, tile, np.random.default_rng(seed)).items():
         planes = core.ends.split(image) if case != EXTREMES else image
