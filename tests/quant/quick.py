@@ -13,6 +13,7 @@ from onnxruntime.quantization import CalibrationDataReader
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles import load_sensor
 from beers_deploy.quant.calibration import draw_patches
+from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Conv, Graph, Op, same
 from beers_deploy.quant.quantise import Quantised, quantise_model
 from beers_deploy.quant.samples import Patches, Remade
 
@@ -33,6 +34,20 @@ def drawn(count: int, seed: int, scene: int = 1, patch_px: int = 128) -> Patches
     ground = procedural_scene(900, 960, np.random.default_rng(scene))
     sensors = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
     return draw_patches([ground], *sensors, count, seed, patch_px=patch_px)
+
+
+def with_relu6(size: float) -> Graph:
+    """A depthwise convolution between others, behind each a ReLU6; the larger `size`, the more is clipped."""
+    generator = np.random.default_rng(0)
+    shapes = {"a": (5, 3, 3, 3), "b": (5, 1, 3, 3), "c": (4, 5, 1, 1), CORRECTION: (1, 4, 3, 3)}
+    graph, source = list[Op](), PLANES
+    for name, shape in shapes.items():
+        weight = (size * generator.normal(0.2, 1, shape)).astype(np.float32)
+        bias, groups = generator.normal(0, 1, shape[0]).astype(np.float32), 5 if name == "b" else 1
+        activation = Activation.none if name == CORRECTION else Activation.relu6
+        graph.append(Conv(name, source, name, weight, bias, activation, same(weight), groups))
+        source = name
+    return tuple(graph)
 
 
 def copied(model: onnx.ModelProto) -> onnx.ModelProto:

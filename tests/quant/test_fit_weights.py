@@ -3,21 +3,19 @@
 import numpy as np
 import onnx
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from beers_deploy.quant.core import IntCore
+from beers_deploy.quant.core import IntCore, build_core
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import PLANES, Graph, graph_to_onnx, tensors
 from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.passes.fit_weights import FLOOR, Moments, descend, fit, fit_weights, input_moments
-from beers_deploy.quant.reading.folding import simplest
+from beers_deploy.quant.quantise import choose_frac_bits
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session, planes_of
-from examples.networks import build, to_onnx
-from tests.quant.quick import quickly
+from tests.quant.quick import quickly, with_relu6
 
 
 def moments_of(*parts: np.ndarray) -> Moments:
@@ -111,20 +109,21 @@ def test_each_group_is_fitted_to_what_it_reads_in_int8_and_to_its_float_mean(
         assert (each == descend(meant, covariance)).all()
 
 
-@pytest.mark.parametrize("name", ["dncnn", "mobile"])
-def test_every_layer_errs_less(name: str, patches: Patches, unseen: Patches, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("beers_deploy.quant.quantise.fit_weights", to_nearest)
-    nearest = quickly(simplest(to_onnx(name, build(name, torch.Generator().manual_seed(0))), name), patches)
-    fitted = fit_weights(nearest.graph, nearest.core, patches.degraded)
-    exact = open_session(graph_to_onnx(nearest.graph, tensors(nearest.graph)))
-    errors = np.zeros((2, len(nearest.graph)))
+@pytest.mark.parametrize("depthwise", [False, True])
+def test_every_layer_errs_less(depthwise: bool, graph: Graph, patches: Patches, unseen: Patches) -> None:
+    graph = with_relu6(0.5) if depthwise else graph
+    nearest = build_core(graph, choose_frac_bits(graph, patches.degraded))
+    fitted = fit_weights(graph, nearest, patches.degraded)
+    exact = open_session(graph_to_onnx(graph, tensors(graph)))
+    errors = np.zeros((2, len(graph)))
     for image in unseen.degraded:
         wanted = exact.run(None, {PLANES: planes_of(image)})
-        for k, core in enumerate((nearest.core, fitted)):
+        for k, core in enumerate((nearest, fitted)):
             found, _ = run_core(core, core.ends.split(image))
             scaled = (found[op.output] * core.scale(op.output) for op in core.ops)
             errors[k] += [np.square(a - b).mean() for a, b in zip(scaled, wanted, strict=True)]
-    assert (errors[1, :-1] < errors[0, :-1]).all()  # the last comes in gains
+    behind = 1 if depthwise else 0  # the first of so few channels errs by chance, and reads nothing that is rounded
+    assert (errors[1] < errors[0])[behind:].all()
 
 
 def test_it_lowers_the_network_s_error_on_unseen_patches(

@@ -21,7 +21,6 @@ from beers_deploy.quant.graph import (
     graph_to_onnx,
     read_network,
     read_planes,
-    same,
     split,
 )
 from beers_deploy.quant.integer.reference import run_core
@@ -32,7 +31,7 @@ from beers_deploy.quant.passes.stream import STREAM_FRAC_BITS, lone_tensors
 from beers_deploy.quant.reading.folding import simplest
 from beers_deploy.quant.session import open_session, planes_of
 from examples.networks import build, to_onnx
-from tests.quant.quick import patches_of, quickly
+from tests.quant.quick import patches_of, quickly, with_relu6
 
 
 def read(name: str) -> tuple[onnx.ModelProto, Graph, Ends, Chain]:
@@ -80,20 +79,6 @@ def test_activations_that_factors_do_not_pass_are_left_alone() -> None:
     curved = {op.output for op in graph if op.name.endswith("HardSwish") or "Hardswish" in op.name}
     assert not curved & set(chain.tensors)
     assert CORRECTION not in chain.tensors
-
-
-def with_relu6(size: float) -> Graph:
-    """A depthwise convolution between others, behind each a ReLU6; the larger `size`, the more is clipped."""
-    generator = np.random.default_rng(0)
-    shapes = {"a": (5, 3, 3, 3), "b": (5, 1, 3, 3), "c": (4, 5, 1, 1), CORRECTION: (1, 4, 3, 3)}
-    graph, source = [], PLANES
-    for name, shape in shapes.items():
-        weight = (size * generator.normal(0.2, 1, shape)).astype(np.float32)
-        bias, groups = generator.normal(0, 1, shape[0]).astype(np.float32), 5 if name == "b" else 1
-        activation = Activation.none if name == CORRECTION else Activation.relu6
-        graph.append(Conv(name, source, name, weight, bias, activation, same(weight), groups))
-        source = name
-    return tuple(graph)
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 1.0, 3.0]))
