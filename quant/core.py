@@ -191,6 +191,8 @@ def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends:
 def _quantise_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntConv:
     finest = shifts.cut[1] + frac_bits[op.output] - frac_bits[op.input]  # finer weights would make the result clip
     weight_frac_bits = min(best_frac_bits(op.weight), finest)
+    if op.ceiling is not None:  # the result keeps its scale, for it clips where int8 ends
+        weight_frac_bits = max(weight_frac_bits, frac_bits[op.output] - frac_bits[op.input])
     product = weight_frac_bits + frac_bits[op.input]
     cut = clamp(product - frac_bits[op.output], shifts.cut)
     frac_bits[op.output] = product - cut
