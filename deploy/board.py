@@ -68,7 +68,7 @@ class Board(TargetProfile):
             write_text(folder / "host.json", json.dumps(said, indent=1) + "\n")
             shutil.copyfile(HOST, folder / "host.py")
         write_golden(network, folder / "golden", board=self)
-        if recorded(folder / "record" if record else None):
+        if record and recorded(folder / "record"):
             write_record(check(network, self, tile=tile), network, folder / "record")
         words = {"network": network.name, "board": self.name, "tile": tile}
         write_text(folder / "README.md", README.read_text(encoding="utf-8").format(**words))

@@ -257,4 +257,5 @@ def unseen_patches(degraded: Sensor, images: Path | None, patches: int, seed: in
         seed: of the calibration.
     """
     reference, other = reference_for(degraded), seed + HELD_OUT_SEED
-    return draw_patches(load_scenes(images, reference.nominal(), other), degraded, reference, patches, other)
+    scenes = load_scenes(images, reference.nominal(), other, patches)
+    return draw_patches(scenes, degraded, reference, patches, other)

@@ -33,10 +33,8 @@ BULKY = {KEY, FAMILY, CALIBRATED_ON}
 """Of what a file says of itself: numbers, not words."""
 
 
-def recorded(folder: Path | None) -> list[Path]:
-    """The files that a record will be, refused where the library for one is missing; none without a folder."""
-    if folder is None:
-        return []
+def recorded(folder: Path) -> list[Path]:
+    """The files that a record will be, refused where the library for one of them is missing."""
     optional("cyclonedx", "record")
     return [folder / name for name in NAMES]
 

@@ -86,7 +86,8 @@ def _spread(excess: np.ndarray, length_px: float) -> np.ndarray:
     if radius < 1:
         return np.zeros_like(excess)
     distance = np.abs(np.arange(-radius, radius + 1, dtype=np.float64))
-    kernel = np.exp(-distance / length_px) * (distance > 0)
+    with np.errstate(over="ignore"):  # of a length near 0 no neighbour is reached
+        kernel = np.exp(-distance / length_px) * (distance > 0)
     if kernel.sum() == 0:  # so short that not even a neighbour is reached
         return np.zeros_like(excess)
     from scipy.ndimage import convolve1d  # a sixth of a second to load, for what few sensors have

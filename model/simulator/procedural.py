@@ -228,11 +228,18 @@ def around(x: float, y: float, radius: float) -> tuple[float, float, float, floa
     return (x - radius, y - radius, x + radius, y + radius)
 
 
-def load_scenes(folder: Path | None, sensor: Instrument, seed: int) -> list[Scene]:
-    """The scenes of a folder of images, or drawn ones, other for every seed."""
+def load_scenes(folder: Path | None, sensor: Instrument, seed: int, most: int = SCENES) -> list[Scene]:
+    """The scenes of a folder of images, or drawn ones, other for every seed and no more than are of use.
+
+    Args:
+        folder: of images; None draws scenes.
+        sensor: whose full scale is white in a photograph.
+        seed: of drawn scenes.
+        most: of these that can be of use.
+    """
     if folder is not None:
         return [read_scene(path, sensor) for path in list_images(folder)]
-    return draw_scenes(SCENES, seed)
+    return draw_scenes(min(SCENES, most), seed)
 
 
 def draw_scenes(count: int, seed: int) -> list[Scene]:
