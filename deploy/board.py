@@ -19,7 +19,7 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import sensor_names
 from beers_deploy.profiles.target import TargetProfile, board_names
 from beers_deploy.quant.banked.filters import MIDDLE_DN, PART, STEP_DN
-from beers_deploy.quant.encodings import CONFIG, compiler_config, read_core
+from beers_deploy.quant.encodings import read_core, save_config
 from beers_deploy.quant.ends import FINE_MAX
 from beers_deploy.quant.graph import CORRECTION, QUARTER, STEP
 from beers_deploy.quant.session import open_session, tensors_of
@@ -53,10 +53,12 @@ class Board(TargetProfile):
             ModelError: a float network, or one that was not quantised under a DPU's rules here.
         """
         network, folder = Network.load(int8), Path(out)
+        if record:
+            recorded(folder / "record")  # refused before anything is written
         core = network.core(self, tile)
         core.save(folder / "core.onnx")
         if self.npu:
-            write_text(folder / CONFIG, json.dumps(compiler_config(*self.npu["device"].value), indent=1) + "\n")
+            save_config(folder / "core.onnx", *self.npu["device"].value)
         session = open_session(core.model)
         shape = [side if isinstance(side, int) else 1 for side in session.get_inputs()[0].shape]
         planes = np.random.default_rng(0).integers(-64, 64, shape).astype(_dtype(session.get_inputs()[0].type))
@@ -68,7 +70,7 @@ class Board(TargetProfile):
             write_text(folder / "host.json", json.dumps(said, indent=1) + "\n")
             shutil.copyfile(HOST, folder / "host.py")
         write_golden(network, folder / "golden", board=self)
-        if record and recorded(folder / "record"):
+        if record:
             write_record(check(network, self, tile=tile), network, folder / "record")
         words = {"network": network.name, "board": self.name, "tile": tile}
         write_text(folder / "README.md", README.read_text(encoding="utf-8").format(**words))

@@ -107,17 +107,14 @@ def board_for(target: str, core: Path | None, tile: int | None, inputs: Iterable
 
 def save_core(core: "Network | None", path: Path | None, board: TargetProfile) -> None:
     """Write a network's core for a board, where one is wanted, and beside it what the compiler of an NPU reads."""
-    from beers_deploy.model.io.files import write_text
-    from beers_deploy.quant.encodings import CONFIG, compiler_config
+    from beers_deploy.quant.encodings import save_config
 
     if core is None or path is None:
         return
     core.save(path)
     say(f"wrote {path}: the same numbers in the board's encoding")
     if board.npu:
-        told = json.dumps(compiler_config(*board.npu["device"].value), indent=1)
-        write_text(path.with_name(CONFIG), told + "\n")
-        say(f"wrote {path.with_name(CONFIG)}: what AMD's compiler is told")
+        say(f"wrote {save_config(path, *board.npu['device'].value)}: what AMD's compiler is told")
 
 
 def say(text: str, err: bool = False) -> None:

@@ -9,7 +9,7 @@ from beers_deploy.quant.encodings.board import as_on_board, board_model
 from beers_deploy.quant.encodings.description import BORDER_PX, PLACE_PX
 from beers_deploy.quant.encodings.host import MICROSOFT, host_model
 from beers_deploy.quant.encodings.reading import encoding_faults, read_core
-from beers_deploy.quant.encodings.vint8 import CONFIG, compiler_config, required_tile, vint8_model
+from beers_deploy.quant.encodings.vint8 import CONFIG, required_tile, save_config, vint8_model
 
 __all__ = [
     "BORDER_PX",
@@ -18,10 +18,10 @@ __all__ = [
     "PLACE_PX",
     "as_on_board",
     "board_model",
-    "compiler_config",
     "encoding_faults",
     "host_model",
     "read_core",
     "required_tile",
+    "save_config",
     "vint8_model",
 ]

@@ -9,14 +9,17 @@ As in the board's file, HardSigmoid, HardSwish and the mean of a window that is 
 the host's file has the DPU's approximations of them: there results may differ by a few steps.
 """
 
+import json
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import onnx
 from onnx import shape_inference
 
+from beers_deploy.model.io.files import write_text
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings.board import BoardWriter, core_file, write_conv
@@ -91,9 +94,11 @@ class _Writer(BoardWriter):
         return self.node("DequantizeLinear", name or reader, [middle, *numbers])
 
 
-def compiler_config(device: str) -> dict[str, object]:
-    """What `CONFIG` says: the device, and for the rest the compiler's own defaults."""
+def save_config(core: Path, device: str) -> Path:
+    """Write what AMD's compiler reads beside the file of a core: the device, and for the rest its own defaults."""
     names, vaiml = ("init", "vaiml_partition"), {"device": device, "optimize_level": 2}
     first, second = ({"name": name, "plugin": f"vaip-pass_{name}"} for name in names)
     passes = [first, {**second, "vaiml_config": vaiml}]
-    return {"passes": passes, "target": "VAIML", "targets": [{"name": "VAIML", "pass": [*names]}]}
+    said = {"passes": passes, "target": "VAIML", "targets": [{"name": "VAIML", "pass": [*names]}]}
+    write_text(core.with_name(CONFIG), json.dumps(said, indent=1) + "\n")
+    return core.with_name(CONFIG)
