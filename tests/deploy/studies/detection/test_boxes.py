@@ -76,10 +76,11 @@ def test_pixels_go_where_the_letterbox_takes_their_box(height: int, width: int, 
     assert found.dtype == np.float32
     left, top, right, bottom = box.to_input(np.array([[0, 0, width, height]]))[0].astype(int)
     inside = np.zeros((size, size), bool)
-    inside[top + 2 : bottom - 2, left + 2 : right - 2] = True  # at the border it can only repeat the last pixel
+    inside[top:bottom, left:right] = True
     rows, columns = np.nonzero(inside)
     middles = np.stack([columns, rows, columns, rows], axis=1) + 0.5
-    on_scene = box.to_image(middles)
+    # Between the middles of the outermost pixels: at the border it can only repeat the last one.
+    on_scene = np.clip(box.to_image(middles), 0.5, np.array([width, height, width, height]) - 0.5)
     assert np.abs(found[0][inside] * width - on_scene[:, 0]).max() < 0.01
     assert np.abs(found[1][inside] * height - on_scene[:, 1]).max() < 0.01
 
