@@ -1,5 +1,7 @@
 # Three stages: the first installs by hash, the second lists what was installed, the third holds only Python and that.
-#   docker build -t beers-deploy .
+#   docker build -t beers-deploy .                                                     every command
+#   docker build -t beers-deploy:core --build-arg LOCK=requirements-core.lock .        without PyTorch and plots:
+#     restore, simulate, check, bench, quantize, gate, golden
 #   docker run --rm --read-only --tmpfs /tmp --network none --user "$(id -u):$(id -g)" -v "$PWD:/data" \
 #     beers-deploy restore raw.tif restored.tif
 # The tag is for people; what is pulled is the digest (docker buildx imagetools inspect TAG shows a tag's present one).
@@ -7,11 +9,12 @@ FROM python:3.11.14-slim-bookworm@sha256:65a93d69fa75478d554f4ad27c85c1e69fa1849
 
 FROM base AS build
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
+ARG LOCK=requirements.lock
 WORKDIR /src
 RUN python -m venv /opt/venv
 ENV PATH=/opt/venv/bin:$PATH PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
-COPY requirements.lock ./
-RUN pip install --only-binary :all: --no-deps --require-hashes --extra-index-url "$TORCH_INDEX" -r requirements.lock
+COPY requirements.lock requirements-core.lock ./
+RUN pip install --only-binary :all: --no-deps --require-hashes --extra-index-url "$TORCH_INDEX" -r "$LOCK"
 COPY pyproject.toml setup.py README.md LICENSE ./
 COPY profiles profiles
 COPY model model

@@ -20,7 +20,7 @@ import lazy_loader
 import beers_deploy.quant  # noqa: F401  # switches telemetry off before a module here loads a runtime
 from beers_deploy.profiles.errors import missing_extra
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 _loaded, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 

@@ -1,4 +1,4 @@
-"""`requirements.lock` holds what pyproject.toml asks for, each version once and by its hashes."""
+"""The locks hold what pyproject.toml asks for, each version once and by its hashes; the core's is part of the other."""
 
 import re
 import tomllib
@@ -10,16 +10,13 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).resolve().parents[2]
 PIN = re.compile(r"(?P<name>[\w.-]+)==(?P<version>[\w.!]+)(?P<hashes>( --hash=sha256:[0-9a-f]{64})+)")
 
+PINNED = re.compile(r"(?m)^[\w.-]+==[\w.!]+")
 
-def asked_for() -> list[str]:
+
+def asked_for(*extras: str) -> list[str]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    extras = project["project"]["optional-dependencies"]
-    return [
-        *project["project"]["dependencies"],
-        *extras["study"],
-        *extras["torch"],
-        *project["build-system"]["requires"],
-    ]
+    wanted = [each for extra in extras for each in project["project"]["optional-dependencies"][extra]]
+    return [*project["project"]["dependencies"], *wanted, *project["build-system"]["requires"]]
 
 
 def faults(lock: str, wanted: list[str]) -> list[str]:
@@ -34,5 +31,9 @@ def faults(lock: str, wanted: list[str]) -> list[str]:
     return found
 
 
-def test_the_lock_satisfies_the_project() -> None:
-    assert faults((ROOT / "requirements.lock").read_text(), asked_for()) == []
+def test_the_locks_satisfy_the_project() -> None:
+    whole, core = ((ROOT / name).read_text() for name in ("requirements.lock", "requirements-core.lock"))
+    assert faults(whole, asked_for("study", "torch")) == []
+    assert faults(core, asked_for()) == []
+    assert set(PINNED.findall(core)) < set(PINNED.findall(whole))
+    assert "torch==" not in core
