@@ -24,7 +24,7 @@ from beers_deploy.profiles.errors import ImageError, MachineError, sizes
 PLAIN: dict[str, Any] = dict.fromkeys(
     (
         "is_avs", "is_bif", "is_eer", "is_fluoview", "is_lsm", "is_mdgel", "is_mmstack", "is_ndpi", "is_ndtiff",
-        "is_nih", "is_ome", "is_philips", "is_qpi", "is_scanimage", "is_scn", "is_sis", "is_stk", "is_svs",
+        "is_nih", "is_ome", "is_philips", "is_qpi", "is_scanimage", "is_scn", "is_sis", "is_stk",
     ),
     False,
 )  # fmt: skip
