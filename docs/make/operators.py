@@ -105,14 +105,28 @@ def _rules(title: str, rules: Iterable[Callable[..., object]]) -> list[str]:
 
 def _npu(npu: Dpu) -> Iterator[str]:
     """Every rule of a board with an NPU: AMD's table of operators and the numbers of a VINT8 file."""
+    texts = {rule_name(rule): (rule, rule_text(rule, npu)) for rule in all_rules() if applies(rule, npu)}
+    same = [name for name, (rule, text) in texts.items() if _without_sources(text, npu) in _texts(rule).values()]
     yield f"## The NPU of {npu.target.name}: a table of operators, and numbers alone\n"
-    yield "AMD publishes no limits. [The NPU's flow](npu.md) has what else is known.\n"
-    yield from (f"- **{rule_name(rule)}**: {rule_text(rule, npu)}" for rule in all_rules() if applies(rule, npu))
+    yield "AMD publishes no limits; numbers are its quantiser's. [The NPU's flow](npu.md) has what else is known."
+    yield f"As for the DPUs: {', '.join(same)}. Otherwise ({npu.target.documents['quantiser']}):\n"
+    rest = {name: text for name, (_, text) in texts.items() if name not in same}
+    yield from (f"- **{name}**: {_without_quantiser(text, npu)}" for name, text in rest.items())
     yield ""
 
 
+def _without_quantiser(text: str, npu: Dpu) -> str:
+    """A rule's text without the source that stands above all of them."""
+    return text.replace(f" ({npu.target.documents['quantiser']})", "")
+
+
+def _texts(rule: Callable[..., object]) -> dict[str, str]:
+    """What a rule says on each board with a DPU to which it applies."""
+    return {name: _without_sources(rule_text(rule, dpu), dpu) for name, dpu in DPUS.items() if applies(rule, dpu)}
+
+
 def _lines(rule: Callable[..., object]) -> Iterator[str]:
-    texts = {name: _without_sources(rule_text(rule, dpu), dpu) for name, dpu in DPUS.items() if applies(rule, dpu)}
+    texts = _texts(rule)
     if len({re.sub(r"\d+", "", text) for text in texts.values()}) == 1:
         texts = dict.fromkeys(texts, _with_each_number(texts))
     for names, text in _alike(texts):

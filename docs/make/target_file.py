@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-from beers_deploy.dpu.board import CONFIGURATION, DIVISORS
+from beers_deploy.dpu.board import DIVISORS, SMALLEST
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.target import DOCUMENTS, FUSED, NPU, PLACES, board_names, load_target
 
@@ -90,14 +90,14 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "tile": {"memory_bytes": ("B", "memory of the board, into which maps must fit")},
     "cost": {
-        "array_efficiency": ("1", "share of the peak that convolutions reach, at most 1; fitted"),
-        "port_bytes_per_cycle": ("B/cycle", "rate between a core and the memory; fitted"),
-        "memory_efficiency": ("1", "share of `ddr_bytes_per_s` that maps reach; fitted"),
-        "layer_s": ("s", "time added to each layer; fitted"),
-        "host_image_s": ("s", "time of the host for an image; fitted"),
-        "host_in_bytes_per_s": ("B/s", "rate of input from the host; fitted"),
-        "host_out_bytes_per_s": ("B/s", "rate of output to the host; fitted"),
-        "argmax_values_per_s": ("1/s", "rate of this task on the host; fitted"),
+        "array_efficiency": ("1", "share of the peak that convolutions reach, at most 1"),
+        "port_bytes_per_cycle": ("B/cycle", "rate between a core and the memory"),
+        "memory_efficiency": ("1", "share of `ddr_bytes_per_s` that maps reach"),
+        "layer_s": ("s", "time added to each layer"),
+        "host_image_s": ("s", "time of the host for an image"),
+        "host_in_bytes_per_s": ("B/s", "rate of input from the host"),
+        "host_out_bytes_per_s": ("B/s", "rate of output to the host"),
+        "argmax_values_per_s": ("1/s", "rate of this task on the host"),
         "softmax_values_per_s": ("1/s", "likewise"),
         "sort_values_per_s": ("1/s", "likewise, for boxes and key points"),
         "image_values_per_s": ("1/s", "likewise, for an image"),
@@ -152,20 +152,19 @@ def shipped() -> dict[str, dict[str, list[Constant]]]:
     return found
 
 
-def least(table: str, key: str) -> str:
-    """The smallest value that is taken, where one is asked for."""
-    asked = CONFIGURATION.get(key) if table == BUILD else DIVISORS.get(table)
-    if asked is None:
-        return ""
-    return f"{asked:g}" if asked >= 1 else "above 0"
+def least(table: str) -> str:
+    """The smallest values that a table takes, where they are asked for."""
+    if table == BUILD:
+        return "At least 1, `peak_tops` above 0.\n"
+    fitted = "Fitted, where nothing else is said. " if table == "cost" else ""
+    return {None: "", 1.0: "At least 1.\n", SMALLEST: f"{fitted}Above 0.\n"}[DIVISORS.get(table)]
 
 
-def line(table: str, key: str, constants: list[Constant]) -> str:
-    """A row of the page."""
-    unit, meaning = KEYS[table][key]
+def line(key: str, unit: str, meaning: str, constants: list[Constant]) -> str:
+    """A key: what it is, its unit, and the values among the shipped boards."""
     low, high = min(c.low for c in constants), max(c.high for c in constants)
     among = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
-    return f"| `[{table}] {key}` | {unit} | {least(table, key)} | {among} | {meaning} |"
+    return f"- `{key}`: {meaning} ({among}{f' {unit}' if unit != '1' else ''})"
 
 
 def document() -> str:
@@ -175,11 +174,14 @@ def document() -> str:
 
 def _constants() -> Iterator[str]:
     yield "## Constants\n"
-    yield f"A configuration may state these keys of other tables with its own value: {_names((*SIZES,))}.\n"
-    yield "| key | unit | at least | among shipped boards | what it is |\n|---|---|---|---|---|"
+    yield "Parentheses have the values among the shipped boards and the unit. A configuration may state these keys of"
+    yield f"other tables for itself: {_names((*SIZES,))}."
     found = shipped()
-    shown = ((table, key) for table, keys in KEYS.items() for key in keys if table != BUILD or key not in SIZES)
-    yield from (line(table, key, found[table][key]) for table, key in shown)
+    for table, keys in KEYS.items():
+        yield f"\n### [{table}]\n"
+        yield from filter(None, [least(table)])
+        shown = {key: stated for key, stated in keys.items() if table != BUILD or key not in SIZES}
+        yield from (line(key, *stated, found[table][key]) for key, stated in shown.items())
 
 
 def _words() -> Iterator[str]:
