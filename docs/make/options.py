@@ -1,4 +1,4 @@
-"""What every option of every command takes and what it is refused with, for docs/make/commands.py.
+"""What every option of every command takes, for docs/make/commands.py, and what it is refused with, for tests.
 
 Types and ranges are read from the commands. The tables below hold what the commands do not say themselves. Tests give
 every command each combination of options that it is said to refuse, and fail for an option that is in no table.
@@ -278,10 +278,3 @@ def _range(info: Any) -> str:
     if low is None:
         return ""
     return f" from {low}" if high is None else f", {low} to {'2^62' if high == SEEDS else high}"
-
-
-def refusals(command: str) -> str:
-    """The combinations of options that a command refuses, as one sentence; empty where there are none."""
-    labels = {each.name: f"`{each.label}`" for each in parameters(command)}
-    cases = (f"{', '.join(labels[name] for name in case.options)} {case}" for case in REFUSED.get(command, ()))
-    return "; ".join(cases)
