@@ -95,7 +95,7 @@ def test_the_commands_that_give_a_verdict_are_named() -> None:
 
 def test_the_glossary_has_the_words_of_the_pages() -> None:
     page = (DOCS / "reference" / "glossary.md").read_text(encoding="utf-8")
-    terms = " ".join(re.findall(r"^\| (.*?) \|", page, re.MULTILINE))
+    terms = " ".join(re.findall(r"^- \*\*(.*?)\*\*: ", page, re.MULTILINE))
     assert [term for term in TERMS if term not in terms] == []
 
 
