@@ -32,7 +32,7 @@ figures follow from the seed.
 A particle can flip a bit in a memory (a single-event upset). Bit flips are injected into one kind of memory at a
 time: int8 weights and bias, six-bit shifts of each operation, int8 feature maps, and 12-bit pixels. The DPU's
 arithmetic then runs in integers (`quant/integer/`). Instructions, addresses, accumulators, read shifts of adds and
-the processor's own memory get no flips. The copy from which weights are loaded, and the checksums, are taken as intact.
+the processor's own memory get no flips. The copy from which weights are loaded, and the checksums, count as intact.
 
 Guards:
 
