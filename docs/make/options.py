@@ -1,6 +1,6 @@
 """What every option of every command takes, for docs/make/commands.py, and what it is refused with, for tests.
 
-Types and ranges are read from the commands. The tables below hold what the commands do not say themselves. Tests give
+Types are read from the commands. The tables below hold what the commands do not say themselves. Tests give
 every command each combination of options that it is said to refuse, and fail for an option that is in no table.
 """
 
@@ -13,7 +13,6 @@ from typing import Any, get_args, get_origin, get_type_hints
 from typer.main import get_command
 
 from beers_deploy.cli import COMMANDS, app
-from beers_deploy.model.processor import SEEDS
 
 FILE, FOLDER = "file", "folder"
 
@@ -94,14 +93,14 @@ UNITS = {
     "radiance_weight": "weight",
     "psnr_weight": "weight",
     "rough": "of patches",
-    "seed": "",
+    "seed": "integer",
     "side": "px",
     "steps": "steps",
-    "threads": "threads, at most the cores",
+    "threads": "threads",
     "tile": "px",
     "tolerance": "DN",
     "validate_every": "steps",
-    "workers": "processes, at most the cores",
+    "workers": "processes",
     "within": "s",
 }
 """Of numbers."""
@@ -233,7 +232,7 @@ class Parameter:
 
     @property
     def kind(self) -> str:
-        """What it takes: a path, a flag, one of several words, a number with its range and unit, or a text.
+        """What it takes: a path, a flag, one of several words, the unit of a number, or a text.
 
         Raises:
             KeyError: the tables above do not know it.
@@ -244,8 +243,7 @@ class Parameter:
         if self.hint is bool:
             return "flag"
         if self.hint in (int, float):
-            number, unit = "integer" if self.hint is int else "number", UNITS[self.name]
-            return f"{number}{_range(self.info)}{', ' if unit else ''}{unit}"
+            return UNITS[self.name]
         if issubclass(self.hint, StrEnum):
             return ", ".join(self.hint)
         return WORDS[self.name] + (" or file" if self.name in paths.also_read else "")
@@ -271,10 +269,3 @@ def _plain(hint: Any) -> Any:
     if not within:
         return hint
     return _plain(within[0]) if get_origin(hint) is list or len(within) == 1 else hint
-
-
-def _range(info: Any) -> str:
-    low, high = info.min, info.max
-    if low is None:
-        return ""
-    return f" from {low}" if high is None else f", {low} to {'2^62' if high == SEEDS else high}"
