@@ -99,6 +99,15 @@ def test_the_glossary_has_the_words_of_the_pages() -> None:
     assert [term for term in TERMS if term not in terms] == []
 
 
+def test_every_number_of_the_readme_stands_where_it_says_how_it_is_known() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    page = (DOCS / "explanation" / "how-we-know.md").read_text(encoding="utf-8")
+    told = re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", "", readme, flags=re.DOTALL)
+    numbers = set(re.findall(r"(?<![\w-])\d+(?:\.\d+)*", told))
+    assert len(numbers) > 10
+    assert numbers - set(re.findall(r"\d+(?:\.\d+)*", page)) == set()
+
+
 def test_the_citation_is_of_this_version() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     cited = dict(re.findall(r"^([\w-]+): (.+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE))
