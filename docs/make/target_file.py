@@ -22,9 +22,9 @@ PADDED = {
 }
 SIZES = {
     "input_channel_parallel": ("channels", "input channels read at a time"),
-    "pixel_parallel": ("px", "pixels computed at a time, or their rows where `column_parallel` is above 1"),
-    "feature_map_bytes": ("B", "size of one group of on-chip banks for maps"),
-    "weight_bytes": ("B", "size of the on-chip banks for weights"),
+    "pixel_parallel": ("px", "pixels at a time, or rows where `column_parallel` is above 1"),
+    "feature_map_bytes": ("B", "one group of on-chip banks for maps"),
+    "weight_bytes": ("B", "on-chip banks for weights"),
     "weight_banks": ("banks", "banks for weights"),
     "channels_per_cycle": ("channels", "channels per cycle of pools, depthwise convolutions and adds"),
     "pixels_per_cycle": ("px", "their pixels per cycle"),
@@ -33,11 +33,11 @@ SIZES = {
 
 KEYS: dict[str, dict[str, tuple[str, str]]] = {
     BUILD: {
-        "cores": ("cores", "compute units, each with its own weights"),
-        "batch_handlers": ("handlers", "images that a core computes at once, with the same weights"),
-        "cpb": ("channels", "output channels that a batch handler computes at a time"),
+        "cores": ("cores", "compute units"),
+        "batch_handlers": ("handlers", "images that a core computes at once"),
+        "cpb": ("channels", "output channels at a time"),
         "aie_cores": ("cores", "AI engines"),
-        "peak_tops": ("10^12/s", "int8 operations of all cores together; a multiply-accumulate counts as two"),
+        "peak_tops": ("10^12/s", "int8 operations of all cores; a multiply-accumulate is two"),
         **SIZES,
     },
     "array": {
@@ -56,12 +56,12 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "conv": {
         **WINDOW,
-        "weight_bias_depth": ("words", "depth that the bias takes in a bank for weights"),
+        "weight_bias_depth": ("words", "depth of the bias in a bank for weights"),
         "window_max": ("1", "largest kernel area x ceil(input channels / `window_channels`)"),
         "window_channels": ("channels", "see `window_max`"),
         "area_max": ("px", "largest kernel height x width"),
     },
-    "depthwise": {**WINDOW, **PADDED, "window_max": ("1", "largest share of a bank for weights that a kernel takes")},
+    "depthwise": {**WINDOW, **PADDED, "window_max": ("1", "largest share of a bank that a kernel takes")},
     "transposed": {
         "kernel_per_stride": ("1", "kernel / stride, rounded down and up"),
         "output_padding": ("px", "largest output padding"),
@@ -101,13 +101,13 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
         "softmax_values_per_s": ("1/s", "likewise"),
         "sort_values_per_s": ("1/s", "likewise, for boxes and key points"),
         "image_values_per_s": ("1/s", "likewise, for an image"),
-        "overlap": ("1", "share of the shorter of computing and moving that is hidden behind the longer; assumed"),
-        "crowding": ("1", "how sharply the slower of DPU and host sets the rate; chosen by cross-validation"),
+        "overlap": ("1", "share of the shorter of computing and moving that is hidden; assumed"),
+        "crowding": ("1", "how sharply the slower of DPU and host sets the rate; cross-validated"),
         "width_host": ("1", "half width of the interval of ln(FPS) where the host sets the rate"),
         "width_small_maps": ("1", "the same for small maps"),
         "width_large_maps": ("1", "the same for large maps"),
         "width_outside": ("1", "the same for a network beyond those fitted"),
-        "families_held": ("1", "share of the families of networks, each left out of the fit, that intervals held"),
+        "families_held": ("1", "share of the families left out that intervals held"),
         "pair_width": ("1", "the same for ln of the ratio of two networks' rates"),
         "fitted_map_bytes": ("B", "range of the fitted networks"),
         "fitted_operations": ("operations", "range of the fitted networks"),
@@ -130,8 +130,8 @@ shows one with every source, `beers-deploy profiles zcu102 --toml` prints a file
 `--target my-board.toml` takes yours. [Boards](boards.md) has an example.
 
 Each constant is `{ value = ..., status = "...", source = "..." }`, a range is `value = [low, high]`, and a bare
-number has the status "stated". The statuses are published, measured, inferred, assumed and stated. A rule of the DPU
-applies where the file has the constants that the rule names, so leave out what your DPU does not limit.
+number has the status "stated"; other statuses are published, measured, inferred and assumed. A rule applies where the
+file has its constants, so leave out what your DPU does not limit.
 
 | key at the top | what it is |
 |---|---|

@@ -103,7 +103,7 @@ def test_every_number_of_the_readme_stands_where_it_says_how_it_is_known() -> No
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     page = (DOCS / "explanation" / "how-we-know.md").read_text(encoding="utf-8")
     told = re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", "", readme, flags=re.DOTALL)
-    numbers = set(re.findall(r"(?<![\w-])\d+(?:\.\d+)*", told))
+    numbers = set(re.findall(r"(?<![\w.-])\d+(?:\.\d+)*", told))
     assert len(numbers) > 10
     assert numbers - set(re.findall(r"\d+(?:\.\d+)*", page)) == set()
 
