@@ -30,7 +30,12 @@ MEASURE, HOST, README = (Path(__file__).parent / "kit" / name for name in ("meas
 
 
 class Board(TargetProfile):
-    """A processing board: its DPU's configurations, rules and cost constants, each with its source."""
+    """A processing board: its DPU's configurations, rules and cost constants, each with its source.
+
+    Examples:
+        >>> bd.Board.load("zcu104").default_configuration
+        'B4096'
+    """
 
     def kit(
         self, int8: NetworkLike, out: str | os.PathLike[str], *, tile: int = TILE_PX, record: bool = False
@@ -118,7 +123,12 @@ def _dtype(name: str) -> type[np.generic]:
 
 
 def boards() -> Table:
-    """The shipped boards with a DPU: its configurations, and where its rules come from."""
+    """The shipped boards with a DPU: its configurations, and where its rules come from.
+
+    Examples:
+        >>> bd.boards().to_pandas().index.to_list()
+        ['kv260', 'vck190', 'vek280', 'zcu102', 'zcu104']
+    """
     rows = []
     for name in board_names():
         board = Board.load(name)
@@ -128,7 +138,12 @@ def boards() -> Table:
 
 
 def sensors() -> Table:
-    """The shipped sensors: contrast at Nyquist, SNR, bits, and what each is."""
+    """The shipped sensors: contrast at Nyquist, SNR, bits, and what each is.
+
+    Examples:
+        >>> bd.sensors().to_pandas().index.to_list()[2:]
+        ['pleiades-degraded', 'pleiades-reference', 'pleiades-variable']
+    """
     return Table("sensors", {}, (), tuple(map(_sensor_row, map(Sensor.load, sensor_names()))))
 
 
@@ -150,7 +165,12 @@ def _figure(constant: Constant, unit: str) -> Figure:
 
 
 def networks() -> Table:
-    """The shipped networks, each in float32 and in INT8, told the middle of the sensors that they know."""
+    """The shipped networks, each in float32 and in INT8, told the middle of the sensors that they know.
+
+    Examples:
+        >>> "convbeers-s-int8" in bd.networks().to_pandas().index
+        True
+    """
     names = [each for name in shipped_names() for each in (name, f"{name}{INT8}")]
     rows = [Row("networks", each.name, {}, {"precision": each.precision}) for each in map(Network.load, names)]
     return Table("networks", {}, (), tuple(rows))

@@ -107,6 +107,12 @@ def restore(
         OptionError: options that do not go together.
         ProfileError: no such sensor.
         MachineError: a missing package, memory, or a disk that cannot be written.
+
+    Examples:
+        >>> pair = bd.simulate(size=96)
+        >>> restored = bd.restore(pair.degraded, "convbeers-xs", sensor=pair.profiles[0])
+        >>> bool(pair.psnr(restored) > pair.psnr(pair.degraded))
+        True
     """
     known = Sensor.load(sensor)
     options = _options(network, known, tile, halo, full_scale, runtime, threads)

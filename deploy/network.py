@@ -75,6 +75,10 @@ class Network:
         origin: the float network that it was quantised from, where that was done here.
         layers: of a network that was quantised here, a row for each integer layer.
         quantised: its integers and the graph that they were rounded from, where it was quantised here by itself.
+
+    Examples:
+        >>> bd.Network.load("convbeers-s-int8").precision
+        'int8'
     """
 
     model: onnx.ModelProto

@@ -36,6 +36,11 @@ class Pair:
         clean: the reference without noise and rounding, (H, W) float32.
         sensor: the sensor, every number settled.
         profiles: the two sensors that were drawn from.
+
+    Examples:
+        >>> pair = bd.simulate(size=96)
+        >>> bool(pair.psnr(pair.degraded) < pair.psnr(pair.reference))
+        True
     """
 
     degraded: np.ndarray
@@ -122,6 +127,11 @@ def simulate(
         ImageError: a scene that cannot be read, or too small for the margin that the blur needs.
         ProfileError: no such sensor or scene.
         OptionError: no such effect, or a size that is not simulated at once.
+
+    Examples:
+        >>> degraded, reference = bd.simulate(sensor="pleiades-degraded", size=96, seed=1)
+        >>> degraded.shape, degraded.dtype
+        ((96, 96), dtype('uint16'))
     """
     if not 1 <= size <= LARGEST_PX:
         remedy = "give another, or simulate a data set with beers-deploy simulate"

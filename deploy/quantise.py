@@ -78,6 +78,13 @@ def quantize(
         OptionError: a board without a DPU or NPU, samples that the network needs, or options that do not go together.
         ImageError: samples that the network does not take.
         ProfileError: no such board or sensor.
+
+    Examples:
+        >>> import torch
+        >>> network = torch.nn.Conv2d(1, 1, 3, padding=1)
+        >>> samples = np.random.default_rng(0).random((8, 1, 32, 32), np.float32)
+        >>> bd.quantize(bd.Network.load(network, example=(1, 1, 32, 32)), samples, board="zcu102").precision
+        'int8'
     """
     target, known, banked = TargetProfile.load(board), Sensor.load(sensor), _conditioned(network)
     _require_regime(regime)

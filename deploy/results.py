@@ -52,6 +52,13 @@ class Table:
         rows: the figures, each with its value, unit, mode, interval and source.
         checks: of a verb that judges, its verdict.
         notes: what a reader must know, a sentence each.
+
+    Examples:
+        >>> table = bd.check("convbeers-xs-int8", "vck190")
+        >>> table.save("check.json").name
+        'check.json'
+        >>> bool(table)
+        True
     """
 
     command: str

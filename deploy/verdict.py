@@ -142,6 +142,11 @@ def compare(
         ModelError: a file that is not what it should be.
         OptionError: no float network, or samples that were all calibrated on.
         ImageError: samples that the networks do not take.
+
+    Examples:
+        >>> found = bd.compare("convbeers-xs-int8", "convbeers-xs", patches=2)
+        >>> bool(found.rows[0].figures["MAE"].value < 0.001)  # of full scale
+        True
     """
     known = Sensor.load(sensor)
     if metric not in (None, *METRICS):
@@ -205,6 +210,12 @@ def gate(
         OptionError: as in `compare`, or limits or a baseline that do not fit.
         ImageError: samples that the networks do not take.
         ProfileError: no such board or sensor.
+
+    Examples:
+        >>> verdict = bd.gate("convbeers-xs-int8", "convbeers-xs", limits={"mae": 0.001}, patches=2)
+        >>> verdict.raise_if_failed()
+        >>> bool(verdict)
+        True
     """
     allowed, target, known = limits_of(limits), TargetProfile.load(board), Sensor.load(sensor)
     ours, theirs = _pair(int8, against, known)

@@ -29,6 +29,13 @@ class BeersError(Exception):
         expected: what a sound input looks like.
         got: what stood there instead.
         remedy: what the user can do.
+
+    Examples:
+        >>> try:
+        ...     bd.Board.load("my-board")
+        ... except bd.BeersError as error:
+        ...     print(type(error).__name__)
+        ProfileError
     """
 
     def __init__(self, where: str, *, expected: str, got: str, remedy: str) -> None:

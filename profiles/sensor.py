@@ -115,6 +115,11 @@ class Sensor:
 
     Its noise is stated by two SNRs, at `radiance_0` and `radiance_1`, or by `alpha` and `beta`. Its blur is that of a
     table or a point-spread function where `response` is one.
+
+    Examples:
+        >>> sensor = bd.Sensor.load("pleiades-degraded").replace(mtf_nyquist=0.05)
+        >>> sensor.mtf_nyquist.low
+        0.05
     """
 
     name: str

@@ -155,6 +155,10 @@ class Limits:
         metric_loss: what INT8 loses by the metric that is chosen.
         saturated: share of a layer's results at the ends of 8 bits, of the layer with most.
         mae_growth: how many times a stored baseline's MAE; 1.05 where there is a baseline and no such limit.
+
+    Examples:
+        >>> bd.Limits(psnr_drop_db=0.2).mae
+        0.0007
     """
 
     mae: float | None = 0.0007

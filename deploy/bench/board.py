@@ -89,6 +89,12 @@ def predict(
         ModelError: no network, or one that does not run on the DPU.
         ProfileError: no such board or configuration.
         OptionError: options that do not go together.
+
+    Examples:
+        >>> found = bd.predict("convbeers-xs-int8", ["kv260", "vck190"], size=(4000, 3000))
+        >>> slow, fast = (row.figures["fps"].value for row in found.rows)
+        >>> slow < fast
+        True
     """
     require_side(tile)
     if host_task not in (None, *TASKS):

@@ -99,7 +99,7 @@ def bench(
     ] = None,
     layers: Annotated[bool, typer.Option("--layers", help="Show where the time goes, layer by layer.")] = False,
     threads: Annotated[int, typer.Option(min=0, help="Threads of the host's runtime; 0 takes every core.")] = 0,
-    json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
 ) -> None:
     """Compare a network on the DPU with the traditional pipeline and with the paper's figures."""
     from beers_deploy.bench.board import bench_board

@@ -24,7 +24,7 @@ def demo(
     ] = SENSOR,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for report and files.")] = Path("demo"),
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
-    json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
 ) -> None:
     """Simulate, quantise, gate, check, restore and predict, on a drawn scene or your image; ends with report.html."""
     from beers_deploy.model.io.files import require_writable

@@ -47,7 +47,7 @@ def detect(
     drawn: Annotated[int, typer.Option(min=2, max=10_000, help="Synthetic scenes, without --images.")] = DRAWN,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for report.html.")] = Path("detection"),
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
-    json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
 ) -> None:
     """Show a detector the same scenes as the reference sees them, degraded and restored, and score what it finds.
 

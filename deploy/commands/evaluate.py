@@ -42,14 +42,13 @@ def evaluate(
         bool, typer.Option("--strict", help="Refuse pairs whose pixels contradict the sensor, instead of saying so.")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
-    json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
 ) -> None:
     """Compare restorations with the reference, on average and by site; the degraded input is always a row.
 
     PSNR leaves out clipped pixels; of simulated pairs it is also taken against the reference without its noise. MTF
-    and SNR are measured on restored slanted edges and flat fields. Traditional methods know both sensors' nominal
-    figures; so do shipped networks, unless their name ends with
-    @blind or with @ and another sensor.
+    and SNR are measured on restored slanted edges and flat fields. Traditional methods and shipped networks know the
+    sensors' nominal figures; NAME@blind is told no sensor, NAME@SENSOR another one.
     """
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.io.images import list_images

@@ -47,15 +47,12 @@ def export(
 ) -> None:
     """Write the network as ONNX, any height and width unless --tile fixes them.
 
-    Weights of your own are checked against torch; the project's tests do that with all shipped ones.
+    Weights of your own are checked against torch; the project's tests do that with all shipped ones. Conditioned
+    weights, as all shipped ones are, become the network of one sensor: of a profile with ranges, for the middle of
+    each. A value outside the trained range is taken as the nearest end of it, with a warning.
 
-    Weights that are conditioned on their sensor, as all shipped ones are, become the network for one, at no cost when
-    it runs: of a profile with ranges, for the middle of each. A value outside the range that was trained is taken as
-    the nearest end of it, with a warning.
-
-    An INT8 file of a network behind a bank (--network FILE.onnx) is told another sensor without being calibrated
-    anew. What the sensor changes can be sent by itself: --delta writes it, and --apply makes the file of any sensor
-    that sensor's, to the byte.
+    An INT8 file of conditioned weights (--network FILE.onnx) is told another sensor without being calibrated anew.
+    --delta writes what the sensor changes, and --apply makes the file of any sensor that sensor's, to the byte.
     """
     from beers_deploy.export import about, float_for, require_parity, to_onnx, torch_network
     from beers_deploy.model.io.files import require_writable

@@ -43,12 +43,12 @@ def gate(
     metric: Annotated[
         str | None, typer.Option(help="Hold results against references too: psnr, ssim, mae, top1 or iou.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of the patches.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     junit: Annotated[Path | None, typer.Option(help="Write the verdict here as JUnit XML.")] = None,
     record: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for a record of evidence: JSON, a page and an ML-BOM.")
     ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write verdict, checks and figures here.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
 ) -> None:
     """Compare a float and an INT8 network on simulated pairs neither was calibrated on.
 

@@ -26,13 +26,12 @@ def golden(
         int | None, typer.Option(min=1, max=4096, help="Tile side in pixels; the network's own, else 64.")
     ] = None,
     target: Annotated[str, typer.Option(help=f"Whose way to round ties is taken: {BOARDS}.")] = DEFAULT_TARGET,
-    json: Annotated[Path | None, typer.Option(help="Write the figures of a comparison here.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
 ) -> None:
     """Write the inputs and the exact int8 tensors of every layer, or compare with them what a board wrote.
 
     A comparison names the first layer that differs, by how much and where, and the fault that gives just these
-    numbers: rounding, saturation, padding, order of channels, a scale, a wrong bit. Any subset of the layers will do.
-    Exit code 1 if a layer differs.
+    numbers. Any subset of the layers will do. Exit code 1 if a layer differs.
     """
     from beers_deploy.kit.golden import compare_golden, write_golden
     from beers_deploy.model.io.files import require_writable

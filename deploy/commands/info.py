@@ -37,13 +37,13 @@ def info(
         bool, typer.Option("--strict", help="Refuse FILE whose pixels contradict --sensor, instead of saying so.")
     ] = False,
     measure: Annotated[bool, typer.Option("--measure", help="Time some tiles here, and predict the whole.")] = False,
-    json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
 ) -> None:
     """Say what an image is, how it would be cut and how long that would take.
 
-    Size, type, full scale and who states it, place on Earth, missing pixels; the plan of `restore` with its defaults.
-    With --sensor, windows of FILE are read and its noise and edges held against what the sensor states; else no pixel
-    is, but of PNG, JPEG and TIFFs of several pages. Time here is unavailable without --measure.
+    Shows size, type, full scale and who states it, place on Earth, missing pixels, and the plan of `restore`.
+    --sensor reads windows of FILE and holds their noise and edges against what the sensor states. No other pixel is
+    read, but of PNG, JPEG and TIFFs of several pages.
     """
     from beers_deploy.info import info_row
     from beers_deploy.model.io.files import require_writable

@@ -66,14 +66,12 @@ def quantize(
             min=0, max=100_000, help="Steps that train the INT8 numbers on --images or --samples; some 250, minutes."
         ),
     ] = 0,
-    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of the patches.")] = 0,
-    json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
+    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
+    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
 ) -> None:
     """Quantise to int8 with power-of-two scales: the correction on the DPU, the 12-bit add on the host.
 
-    Taken is any network that a DPU computes, of one band or several, with or without a global add; see
-    docs/reference/any-network.md. 'check' says of a float file whether it is one of these.
-
+    Taken is any network that a DPU computes; see docs/reference/any-network.md, and ask 'check' about a float file.
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
     from beers_deploy.model.io.files import require_writable

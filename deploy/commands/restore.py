@@ -75,20 +75,16 @@ def restore(
         bool, typer.Option("--strict", help="Refuse IN whose pixels contradict --sensor, instead of saying so.")
     ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped or killed.")] = False,
-    json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
 ) -> None:
     """Restore an image tile by tile; with the exact halo the result is the whole image's, bit for bit.
 
-    The image is read and written by rows, so memory does not grow with its height. Bands are restored one by one.
-    OUT has the scale of IN: 8-bit pixels with --full-scale 255 come out as 0..255, floats with 1 as 0..1.
-    A shipped network is told --sensor in a moment, in float32 (NAME) and in INT8 (NAME-int8). Without --sensor it is
-    taken to be in the middle of what it may be; with it IN's own noise and edges are held against what it states.
-    With --method traditional the image is stabilised, denoised and sharpened as its --sensor asks, in strips of rows:
-    one band, about a minute a megapixel on two cores, not resumable.
-    JPEG 2000, NITF and HFA files, VRT mosaics and DIMAP indexes need the extra 'gdal'.
-    Georeference, RPCs, missing pixels (NaN, the nodata value, or a mask) and alpha are kept. Until OUT is finished
-    its rows lie in .OUT.part beside it. With --scheduler this process reads and writes, and sends tiles to the
-    workers: where they are of one processor and the same versions, the bytes are those of a run without.
+    The image is read and written by rows, so memory does not grow with its height. OUT has the scale of IN. Bands are
+    restored one by one. Georeference, RPCs, missing pixels (NaN, the nodata value, or a mask) and alpha are kept.
+    A shipped network is told --sensor, in float32 (NAME) and in INT8 (NAME-int8); IN's own noise and edges are then
+    held against it. Without --sensor the middle of its range is assumed.
+    --method traditional restores one band, about a minute a megapixel on two cores, and is not resumable.
+    JPEG 2000, NITF, HFA, VRT and DIMAP need the extra 'gdal'. Until OUT is finished its rows lie in .OUT.part.
     """
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.io.images import require_image_file

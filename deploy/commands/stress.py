@@ -59,13 +59,12 @@ def stress(
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Tables as Markdown; with --bit-flips the curves beside it.")
     ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
 ) -> None:
     """Run hard cases through a network in float32, in INT8, in whole numbers alone and in tiles.
 
-    Prints what holds, the worst measures, the known limitations met, and which sums are proven not to overflow. With
-    --bit-flips: what bit flips in weights, shifts, maps and the image cost, what guards buy back, and what
-    these cost on the board.
+    Prints what holds, the worst measures, the known limitations met, and which sums are proven not to overflow.
+    --bit-flips: what flips in weights, shifts, maps and the image cost, and what guards gain and cost on the board.
     """
     from beers_deploy.model.io.files import require_writable, write_text
     from beers_deploy.quant.calibration import Calibration

@@ -68,7 +68,7 @@ def tradeoff(
     ] = DEFAULT_TARGET,
     size: Annotated[str, typer.Option(help="Width x height of the swath in pixels.")] = PAPER_SIZE,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
-    json: Annotated[Path | None, typer.Option(help="Write the figures here too.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
 ) -> None:
     """Measure networks and traditional chains on the same images, predict their runs on a board, recommend a point.
 

@@ -39,7 +39,8 @@ def train(
         typer.Option("--conditioned", help="Draw sensors of a wide range with that gain, and condition on each."),
     ] = False,
     reference: Annotated[
-        str | None, typer.Option(help="Profile of the wanted output, in the sensor's DN; pleiades-reference if none.")
+        str | None,
+        typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."),
     ] = None,
     drawn: Annotated[int, typer.Option(min=0, max=1000, help="Drawn scenes to add to the images.")] = 0,
     rough: Annotated[
@@ -68,7 +69,9 @@ def train(
     psnr_weight: Annotated[
         float, typer.Option(min=0, help="Weight of the patches' mean PSNR in the loss; 0.01 without L1.")
     ] = 0.0,
-    lpips: Annotated[Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS, or their folder.")] = None,
+    lpips: Annotated[
+        Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.")
+    ] = None,
     start: Annotated[
         Path | None, typer.Option(help="Weights to go on from; those of a smaller network grow.")
     ] = None,
@@ -76,7 +79,7 @@ def train(
     distil: Annotated[float, typer.Option(min=0, help="Weight of the distance to the teacher.")] = 1.0,
     validate_every: Annotated[int, typer.Option(min=0, help="Steps between validations; 0 for none.")] = 1000,
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard scalars too.")] = False,
-    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of weights and patches.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     device: Annotated[str, typer.Option(help="cpu, or cuda.")] = "cpu",
     precision: Annotated[
         Precision, typer.Option(help="Of the body's convolutions; bfloat16 is faster where there are units for it.")
@@ -86,10 +89,9 @@ def train(
     """Train a network on pairs simulated on the fly, or stored; resumable, the same weights for the same seed.
 
     The loss is the paper's: 1.0 L1 + 0.5 LPIPS + 0.1 L1 of spectra; without weights for LPIPS that term is left out,
-    which is said and kept in the recipe. Pairs bring sensor, reference and full scale in a recipe.json: others are
-    refused. A twentieth of the images, whole sites, is held out for validation. Several GPUs: start it with torchrun.
-    With --conditioned the weights become the network of any sensor in range: it sees the image through the sensor's
-    own filters. --start and --teacher then take such weights, and plain ones without.
+    which is said and kept in the recipe. A twentieth of the images, whole sites, is held out for validation. Several
+    GPUs: start it with torchrun. --conditioned weights become the network of any sensor in range; --start and
+    --teacher then take such weights, and plain ones without.
     """
     from typing import get_args
 

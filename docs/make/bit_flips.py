@@ -29,31 +29,27 @@ figures follow from the seed.
 
 ![PSNR against bit flips in a megabit, for weights, shifts, feature maps and the image](../assets/bit-flips.svg)
 
-A particle can flip a bit in a memory (a single-event upset). Bit flips are injected into four kinds of memory, one at
-a time: int8 weights and bias, six-bit shifts of each operation, int8 feature maps between the operation that writes
-them and those that read them, and 12-bit pixels. The DPU's arithmetic then runs in integers (`quant/integer/`).
-Instructions, addresses, accumulators, read shifts of adds and the processor's own memory get no flips.
+A particle can flip a bit in a memory (a single-event upset). Bit flips are injected into one kind of memory at a
+time: int8 weights and bias, six-bit shifts of each operation, int8 feature maps, and 12-bit pixels. The DPU's
+arithmetic then runs in integers (`quant/integer/`). Instructions, addresses, accumulators, read shifts of adds and
+the processor's own memory get no flips. The copy from which weights are loaded, and the checksums, count as intact.
 
 Guards:
 
 - **ReLU6** in place of ReLU where calibration stays below 96 units. The DPU fuses it.
 - **Limit of the correction**: the next power of two above what calibration reaches, on the host.
 - **Scrubbing**: CRC-32 of each convolution's weights before each tile; weights that differ are loaded again.
-- **Triple modular redundancy** of the shifts: three copies, each with its own flips, of which two must agree, bit by
-  bit.
-
-The copy from which weights are loaded, and the checksums, are assumed to be intact.
+- **Triple modular redundancy** of the shifts: three copies, of which two must agree, bit by bit.
 
 ## What is found
 
 """
 
-FINDINGS = """- Weights: one bit may cost nothing or 20 dB. CRC-32 finds every injection here, and scrubbing restores
-  the fault-free network.
+FINDINGS = """- Weights: one bit may cost nothing or 20 dB. CRC-32 finds every injection here.
 - Shifts are few and seldom hit, but a wrong one costs 10 dB in the mean and above 20 dB at worst. Triple modular
   redundancy corrects everything except two flips of the same bit, which occur at 10 000 in a megabit.
 - Feature maps and pixels: clamping gains 0.6 to 1.2 dB at 100 bits in a megabit of maps, as much for pixels, and next
-  to nothing below, because int8 values are bounded already. At such rates memory with error correction is needed.
+  to nothing below. At such rates memory with error correction is needed.
 """
 
 

@@ -49,15 +49,13 @@ has their table; `profiles/effects.toml` has typical values. In the picture they
 They apply in the order of the signal: one transfer function for MTF, anti-alias filter and smear; sampling; then haze
 (the table `veil`), full well, PRNU, noise, gain, DSNU, striping, offset, defects and digitising.
 
-The anti-alias filter is part of the MTF: blur and filter together have the MTF that the profile states, or the
-profile is refused. A tabulated MTF or a point-spread function already contains it. Motion smear is added along the
-track.
+The anti-alias filter is part of the MTF that the profile states; motion smear is added along the track.
 
 ## Which effects a scene gets
 
-`simulate --explain` prints the decision for each effect and its reason, before any pixel is computed. A bound is the
-largest change that any pixel could undergo, in DN before digitising. It is proven from the scene's darkest and
-brightest radiance, its steepest step along the track and the kernels' sizes. What a scene cannot show is left out:
+`simulate --explain` prints the decision for each effect and its reason. A bound is the largest change that any pixel
+could undergo, in DN before digitising, proven from the scene's radiances and the kernels' sizes. What a scene cannot
+show is left out:
 {tolerance:g} DN at most, for all such effects together.
 
 The four shipped scenes under `pleiades-degraded` ask for these effects, with these bounds in DN:

@@ -1,6 +1,6 @@
-"""What every option of every command takes and what it is refused with, for docs/make/commands.py.
+"""What every option of every command takes, for docs/make/commands.py, and what it is refused with, for tests.
 
-Types and ranges are read from the commands. The tables below hold what the commands do not say themselves. Tests give
+Types are read from the commands. The tables below hold what the commands do not say themselves. Tests give
 every command each combination of options that it is said to refuse, and fail for an option that is in no table.
 """
 
@@ -13,7 +13,6 @@ from typing import Any, get_args, get_origin, get_type_hints
 from typer.main import get_command
 
 from beers_deploy.cli import COMMANDS, app
-from beers_deploy.model.processor import SEEDS
 
 FILE, FOLDER = "file", "folder"
 
@@ -79,48 +78,48 @@ UNITS = {
     "draws": "draws",
     "fft_weight": "weight",
     "finetune": "steps",
-    "gain": "DN per W/m2/sr/um, above 0",
-    "gsd": "m, above 0",
-    "full_scale": "pixel value above 0",
+    "gain": "number",
+    "gsd": "m",
+    "full_scale": "number",
     "l1_weight": "weight",
     "l2_weight": "weight",
     "learning_rate": "per step",
     "lpips_weight": "weight",
     "max_mae": "of full scale",
     "memory": "GB",
-    "oversampling": "scene pixels per pixel",
+    "oversampling": "number",
     "patch": "px",
     "patches": "patches",
     "radiance_weight": "weight",
     "psnr_weight": "weight",
     "rough": "of patches",
-    "seed": "",
+    "seed": "integer",
     "side": "px",
     "steps": "steps",
-    "threads": "threads, at most the cores",
+    "threads": "threads",
     "tile": "px",
     "tolerance": "DN",
     "validate_every": "steps",
-    "workers": "processes, at most the cores",
+    "workers": "processes",
     "within": "s",
 }
 """Of numbers."""
 
 WORDS = {
     "add": "effect",
-    "budget": "limits such as latency<=20s",
-    "cases": "names with commas",
-    "classes": "pairs such as car=vehicle",
+    "budget": "limits",
+    "cases": "names",
+    "classes": "pairs",
     "device": "cpu, cuda",
     "dpu": "configuration",
-    "edge": "FILE:X,Y,WIDTH,HEIGHT in px",
-    "fail_on": "change such as PSNR<-0.05",
+    "edge": "box",
+    "fail_on": "change",
     "forbid": "effect",
-    "halo": "exact, or whole px from 0",
-    "methods": "names with commas",
-    "metric": "psnr, ssim, mae, top1, iou",
+    "halo": "px",
+    "methods": "names",
+    "metric": "name",
     "name": "profile",
-    "need": "limits such as psnr>=44",
+    "need": "limits",
     "network": "network",
     "optimiser": "adam, adamw",
     "preset": "data set",
@@ -128,11 +127,11 @@ WORDS = {
     "scene": "scene",
     "scheduler": "address",
     "sensor": "profile",
-    "size": "width x height in px",
-    "split": "name of a list",
-    "stages": "names with commas",
+    "size": "px",
+    "split": "list",
+    "stages": "names",
     "target": "board",
-    "tile": "px, several with commas",
+    "tile": "px",
     "variant": "network",
 }
 """Of what is read as text."""
@@ -233,7 +232,7 @@ class Parameter:
 
     @property
     def kind(self) -> str:
-        """What it takes: a path, a flag, one of several words, a number with its range and unit, or a text.
+        """What it takes: a path, a flag, one of several words, the unit of a number, or a text.
 
         Raises:
             KeyError: the tables above do not know it.
@@ -244,8 +243,7 @@ class Parameter:
         if self.hint is bool:
             return "flag"
         if self.hint in (int, float):
-            number, unit = "integer" if self.hint is int else "number", UNITS[self.name]
-            return f"{number}{_range(self.info)}{', ' if unit else ''}{unit}"
+            return UNITS[self.name]
         if issubclass(self.hint, StrEnum):
             return ", ".join(self.hint)
         return WORDS[self.name] + (" or file" if self.name in paths.also_read else "")
@@ -271,17 +269,3 @@ def _plain(hint: Any) -> Any:
     if not within:
         return hint
     return _plain(within[0]) if get_origin(hint) is list or len(within) == 1 else hint
-
-
-def _range(info: Any) -> str:
-    low, high = info.min, info.max
-    if low is None:
-        return ""
-    return f" from {low}" if high is None else f", {low} to {'2^62' if high == SEEDS else high}"
-
-
-def refusals(command: str) -> str:
-    """The combinations of options that a command refuses, as one sentence; empty where there are none."""
-    labels = {each.name: f"`{each.label}`" for each in parameters(command)}
-    cases = (f"{', '.join(labels[name] for name in case.options)} {case}" for case in REFUSED.get(command, ()))
-    return "; ".join(cases)

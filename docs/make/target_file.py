@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-from beers_deploy.dpu.board import CONFIGURATION, DIVISORS
+from beers_deploy.dpu.board import DIVISORS, SMALLEST
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.target import DOCUMENTS, FUSED, NPU, PLACES, board_names, load_target
 
@@ -22,9 +22,9 @@ PADDED = {
 }
 SIZES = {
     "input_channel_parallel": ("channels", "input channels read at a time"),
-    "pixel_parallel": ("px", "pixels computed at a time, or their rows where `column_parallel` is above 1"),
-    "feature_map_bytes": ("B", "size of one group of on-chip banks for maps"),
-    "weight_bytes": ("B", "size of the on-chip banks for weights"),
+    "pixel_parallel": ("px", "pixels at a time, or rows where `column_parallel` is above 1"),
+    "feature_map_bytes": ("B", "one group of on-chip banks for maps"),
+    "weight_bytes": ("B", "on-chip banks for weights"),
     "weight_banks": ("banks", "banks for weights"),
     "channels_per_cycle": ("channels", "channels per cycle of pools, depthwise convolutions and adds"),
     "pixels_per_cycle": ("px", "their pixels per cycle"),
@@ -33,11 +33,11 @@ SIZES = {
 
 KEYS: dict[str, dict[str, tuple[str, str]]] = {
     BUILD: {
-        "cores": ("cores", "compute units, each with its own weights"),
-        "batch_handlers": ("handlers", "images that a core computes at once, with the same weights"),
-        "cpb": ("channels", "output channels that a batch handler computes at a time"),
+        "cores": ("cores", "compute units"),
+        "batch_handlers": ("handlers", "images that a core computes at once"),
+        "cpb": ("channels", "output channels at a time"),
         "aie_cores": ("cores", "AI engines"),
-        "peak_tops": ("10^12/s", "int8 operations of all cores together; a multiply-accumulate counts as two"),
+        "peak_tops": ("10^12/s", "int8 operations of all cores; a multiply-accumulate is two"),
         **SIZES,
     },
     "array": {
@@ -56,12 +56,12 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "conv": {
         **WINDOW,
-        "weight_bias_depth": ("words", "depth that the bias takes in a bank for weights"),
+        "weight_bias_depth": ("words", "depth of the bias in a bank for weights"),
         "window_max": ("1", "largest kernel area x ceil(input channels / `window_channels`)"),
         "window_channels": ("channels", "see `window_max`"),
         "area_max": ("px", "largest kernel height x width"),
     },
-    "depthwise": {**WINDOW, **PADDED, "window_max": ("1", "largest share of a bank for weights that a kernel takes")},
+    "depthwise": {**WINDOW, **PADDED, "window_max": ("1", "largest share of a bank that a kernel takes")},
     "transposed": {
         "kernel_per_stride": ("1", "kernel / stride, rounded down and up"),
         "output_padding": ("px", "largest output padding"),
@@ -90,24 +90,24 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "tile": {"memory_bytes": ("B", "memory of the board, into which maps must fit")},
     "cost": {
-        "array_efficiency": ("1", "share of the peak that convolutions reach, at most 1; fitted"),
-        "port_bytes_per_cycle": ("B/cycle", "rate between a core and the memory; fitted"),
-        "memory_efficiency": ("1", "share of `ddr_bytes_per_s` that maps reach; fitted"),
-        "layer_s": ("s", "time added to each layer; fitted"),
-        "host_image_s": ("s", "time of the host for an image; fitted"),
-        "host_in_bytes_per_s": ("B/s", "rate of input from the host; fitted"),
-        "host_out_bytes_per_s": ("B/s", "rate of output to the host; fitted"),
-        "argmax_values_per_s": ("1/s", "rate of this task on the host; fitted"),
+        "array_efficiency": ("1", "share of the peak that convolutions reach, at most 1"),
+        "port_bytes_per_cycle": ("B/cycle", "rate between a core and the memory"),
+        "memory_efficiency": ("1", "share of `ddr_bytes_per_s` that maps reach"),
+        "layer_s": ("s", "time added to each layer"),
+        "host_image_s": ("s", "time of the host for an image"),
+        "host_in_bytes_per_s": ("B/s", "rate of input from the host"),
+        "host_out_bytes_per_s": ("B/s", "rate of output to the host"),
+        "argmax_values_per_s": ("1/s", "rate of this task on the host"),
         "softmax_values_per_s": ("1/s", "likewise"),
         "sort_values_per_s": ("1/s", "likewise, for boxes and key points"),
         "image_values_per_s": ("1/s", "likewise, for an image"),
-        "overlap": ("1", "share of the shorter of computing and moving that is hidden behind the longer; assumed"),
-        "crowding": ("1", "how sharply the slower of DPU and host sets the rate; chosen by cross-validation"),
+        "overlap": ("1", "share of the shorter of computing and moving that is hidden; assumed"),
+        "crowding": ("1", "how sharply the slower of DPU and host sets the rate; cross-validated"),
         "width_host": ("1", "half width of the interval of ln(FPS) where the host sets the rate"),
         "width_small_maps": ("1", "the same for small maps"),
         "width_large_maps": ("1", "the same for large maps"),
         "width_outside": ("1", "the same for a network beyond those fitted"),
-        "families_held": ("1", "share of the families of networks, each left out of the fit, that intervals held"),
+        "families_held": ("1", "share of the families left out that intervals held"),
         "pair_width": ("1", "the same for ln of the ratio of two networks' rates"),
         "fitted_map_bytes": ("B", "range of the fitted networks"),
         "fitted_operations": ("operations", "range of the fitted networks"),
@@ -130,8 +130,8 @@ shows one with every source, `beers-deploy profiles zcu102 --toml` prints a file
 `--target my-board.toml` takes yours. [Boards](boards.md) has an example.
 
 Each constant is `{ value = ..., status = "...", source = "..." }`, a range is `value = [low, high]`, and a bare
-number has the status "stated". The statuses are published, measured, inferred, assumed and stated. A rule of the DPU
-applies where the file has the constants that the rule names, so leave out what your DPU does not limit.
+number has the status "stated"; other statuses are published, measured, inferred and assumed. A rule applies where the
+file has its constants, so leave out what your DPU does not limit.
 
 | key at the top | what it is |
 |---|---|
@@ -152,20 +152,19 @@ def shipped() -> dict[str, dict[str, list[Constant]]]:
     return found
 
 
-def least(table: str, key: str) -> str:
-    """The smallest value that is taken, where one is asked for."""
-    asked = CONFIGURATION.get(key) if table == BUILD else DIVISORS.get(table)
-    if asked is None:
-        return ""
-    return f"{asked:g}" if asked >= 1 else "above 0"
+def least(table: str) -> str:
+    """The smallest values that a table takes, where they are asked for."""
+    if table == BUILD:
+        return "At least 1, `peak_tops` above 0.\n"
+    fitted = "Fitted, where nothing else is said. " if table == "cost" else ""
+    return {None: "", 1.0: "At least 1.\n", SMALLEST: f"{fitted}Above 0.\n"}[DIVISORS.get(table)]
 
 
-def line(table: str, key: str, constants: list[Constant]) -> str:
-    """A row of the page."""
-    unit, meaning = KEYS[table][key]
+def line(key: str, unit: str, meaning: str, constants: list[Constant]) -> str:
+    """A key: what it is, its unit, and the values among the shipped boards."""
     low, high = min(c.low for c in constants), max(c.high for c in constants)
     among = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
-    return f"| `[{table}] {key}` | {unit} | {least(table, key)} | {among} | {meaning} |"
+    return f"- `{key}`: {meaning} ({among}{f' {unit}' if unit != '1' else ''})"
 
 
 def document() -> str:
@@ -175,11 +174,14 @@ def document() -> str:
 
 def _constants() -> Iterator[str]:
     yield "## Constants\n"
-    yield f"A configuration may state these keys of other tables with its own value: {_names((*SIZES,))}.\n"
-    yield "| key | unit | at least | among shipped boards | what it is |\n|---|---|---|---|---|"
+    yield "Parentheses have the values among the shipped boards and the unit. A configuration may state these keys of"
+    yield f"other tables for itself: {_names((*SIZES,))}."
     found = shipped()
-    shown = ((table, key) for table, keys in KEYS.items() for key in keys if table != BUILD or key not in SIZES)
-    yield from (line(table, key, found[table][key]) for table, key in shown)
+    for table, keys in KEYS.items():
+        yield f"\n### [{table}]\n"
+        yield from filter(None, [least(table)])
+        shown = {key: stated for key, stated in keys.items() if table != BUILD or key not in SIZES}
+        yield from (line(key, *stated, found[table][key]) for key, stated in shown.items())
 
 
 def _words() -> Iterator[str]:

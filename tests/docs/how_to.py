@@ -26,11 +26,8 @@ INDENTED = re.compile(r"(?:^ {4}\S.*\n?)+", re.MULTILINE)
 Sitting = tuple[str, ...]
 
 LEFT_OUT = {
-    "beers-deploy demo --image raw.tif": "takes a minute: .ci/run has the demo, and a test of its own",
-    "beers-deploy evaluate --images aerial/ --methods network.onnx --sweep": "takes minutes: its own test does",
     "pip install 'beers-deploy[notebook]'": "fetches from a registry",
     "pip install 'beers-deploy[gdal]'": "fetches from a registry",
-    "pip install 'beers-deploy[dask]' rioxarray": "fetches from a registry",
     "apt-get install gdal-bin python3-qgis": "changes the system",
     "pytest tests/deploy/restoration/test_other_readers.py": "is a part of the suite",
     "xdputil query": "is a program of the board",
@@ -40,25 +37,17 @@ LEFT_OUT = {
 """Commands that are not run, and why."""
 
 SHORTER = {
-    r"(--variant) convbeers-s --tile 640": r"\1 convbeers-xs --tile 64",
     r"--provider Vitis\S+ --option \S+": "--provider CPUExecutionProvider --tile 64",
     r"--frames 300": "--frames 4",
-    r"(beers-deploy quantize)": r"\1 --patches 8 --patch 64",
     r"(beers-deploy gate)": r"\1 --patches 4",
-    r"--finetune 250": "--finetune 1",
     r"(characterise\.py .*convbeers-s)\.safetensors": r"\1.safetensors --sensors 1",
     r"raw1\.tif:412,300,28,34": "raw1.tif:114,82,28,34",
     r"raw1\.tif:440,330,34,28": "raw1.tif:140,114,34,28",
     r"(formats\.py)": r"\1 --size 320x256",
     r"IMAGE OUT": "raw.tif restored.tif",
-    r"(beers-deploy detect)$": r"\1 --drawn 2 --methods degraded",
     r"(beers-deploy detect) (--images)": r"\1 --methods degraded \2",
-    r"--network all ": "",
     r"(tradeoff)": r"\1 --images aerial --calibration aerial --network narrow.safetensors",
     r"(tradeoff .*)--out": r"\1--size 1500x1200 --out",
-    r"(beers-deploy train)": r"\1 --variant convbeers-xs --steps 2 --batch 2 --patch 24 --validate-every 0",
-    r"(stress float\.onnx int8\.onnx)$": r"\1 --side 32 --cases night,snow",
-    r"--bit-flips": "--bit-flips --draws 1",
 }
 """Patterns in a command, and what stands there instead so that a test takes seconds."""
 

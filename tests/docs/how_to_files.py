@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import tifffile
-import torch
 from PIL import Image
 
 from beers_deploy.board import MEASURE
@@ -15,8 +14,6 @@ from beers_deploy.model.convbeers import save_network
 from beers_deploy.model.shipped import SHIPPED
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.toml import HERE as PROFILES
-from beers_deploy.quant.onnx_file import save_onnx
-from examples.networks import build, to_onnx
 from tests.deploy.studies.detection.folders import Object, dior
 from tests.deploy.studies.detection.networks import detector, raw
 from tests.deploy.studies.test_characterise import acquisition
@@ -32,8 +29,6 @@ beers-deploy simulate scene.png --sensor pleiades-degraded --out made
 beers-deploy export --network narrow.safetensors --out float.onnx
 beers-deploy quantize float.onnx --patches 8 --patch 64 --out int8.onnx --board-file core.onnx
 beers-deploy gate float.onnx int8.onnx --patches 4 --json gate-main.json
-beers-deploy evaluate --pairs made --methods float.onnx --json old.json
-python -m examples.samples ffdnet --images aerial --count 2 --out samples.npz
 """
 
 
@@ -49,10 +44,7 @@ def prepare(folder: Path) -> None:
     for command in MADE.split("\n")[1:-1]:
         done = walk.run(command)
         assert done.returncode == 0, f"{command}\n{done.stdout}"
-    shutil.copy(folder / "old.json", folder / "new.json")
-    shutil.copy(folder / "float.onnx", folder / "mine.onnx")
     shutil.copy(next((folder / "made" / "degraded").glob("*.tif")), folder / "raw.tif")
-    tifffile.imwrite(folder / "share.tif", tifffile.imread(folder / "raw.tif").astype(np.float32) / 4095)
 
 
 def copied_files(folder: Path) -> None:
@@ -90,11 +82,8 @@ def scenes(folder: Path) -> None:
 
 
 def networks(folder: Path) -> None:
-    """Weights of a narrow network, two networks of other kinds, and a detector that always sees the same."""
+    """Weights of a narrow network, and a detector that always sees the same."""
     save_network(folder / "narrow.safetensors", plain(Variant(1, 4)), {"degraded": "pleiades-degraded"})
-    for file, name in (("network.onnx", "ffdnet"), ("resnet50.onnx", "classifier")):
-        network = build(name, torch.Generator().manual_seed(0))
-        save_onnx(to_onnx(name, network), folder / file)
     detector(folder / "yolo11n.onnx", raw((30, 20, 20, 10, 0.1, 0.9)))
 
 

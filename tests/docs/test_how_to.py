@@ -14,7 +14,6 @@ from tests.docs.walk import Walk
 pytestmark = pytest.mark.slow
 
 FOUND = {page.stem: [*sittings(page.read_text(encoding="utf-8"))] for page in PAGES}
-EVERY = {command for found in FOUND.values() for sitting in found for command in sitting}
 RUN = {
     f"{page}, {commands[0]}": commands
     for page, found in FOUND.items()

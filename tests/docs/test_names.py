@@ -31,18 +31,17 @@ def tracked() -> list[Path]:
 
 
 def test_paths_of_the_documentation_are_there() -> None:
-    """But for the change log, which tells of pages as they were."""
     named = {
         (path.relative_to(ROOT), word)
         for path in tracked()
-        if path.name not in {"CHANGELOG.md", Path(__file__).name}
+        if path.name != Path(__file__).name
         for word in PATH.findall(path.read_text(encoding="utf-8"))
     }
     assert len(named) > 100
     assert [(str(path), word) for path, word in sorted(named) if not (ROOT / word).exists()] == []
 
 
-@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "model/weights/convbeers-s.md"])
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "model/weights/convbeers-s.md"])
 def test_links_outside_of_the_site_lead_somewhere(name: str) -> None:
     page = ROOT / name
     targets = LINK.findall(page.read_text(encoding="utf-8"))
@@ -95,8 +94,17 @@ def test_the_commands_that_give_a_verdict_are_named() -> None:
 
 def test_the_glossary_has_the_words_of_the_pages() -> None:
     page = (DOCS / "reference" / "glossary.md").read_text(encoding="utf-8")
-    terms = " ".join(re.findall(r"^\| (.*?) \|", page, re.MULTILINE))
+    terms = " ".join(re.findall(r"^- \*\*(.*?)\*\*: ", page, re.MULTILINE))
     assert [term for term in TERMS if term not in terms] == []
+
+
+def test_every_number_of_the_readme_stands_where_it_says_how_it_is_known() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    page = (DOCS / "explanation" / "how-we-know.md").read_text(encoding="utf-8")
+    told = re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", "", readme, flags=re.DOTALL)
+    numbers = set(re.findall(r"(?<![\w.-])\d+(?:\.\d+)*", told))
+    assert len(numbers) > 10
+    assert numbers - set(re.findall(r"\d+(?:\.\d+)*", page)) == set()
 
 
 def test_the_citation_is_of_this_version() -> None:

@@ -166,8 +166,8 @@ def int8_bias(op: Operation, dpu: Dpu) -> Finding | None:
 def int32_bias(op: Operation, dpu: Dpu) -> Finding | None:
     """A QLinearConv's int32 bias is int8 << k, k at most {numbers[shift_bias_max]} ({documents[quantiser]}).
 
-    One k for all values: weight + input - bias fractional bits. A change that keeps this form no rule can see: one
-    more where k is 0 is another bias, and as legal. Judged where the products have a scale.
+    One k for all values: weight + input - bias fractional bits. Another bias of this form is as legal. Judged where
+    the products have a scale.
     """
     if "bias" not in op.constants or op.op_type != "QLinearConv" or product_frac_bits(op) is None:
         return None

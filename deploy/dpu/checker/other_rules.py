@@ -118,11 +118,11 @@ def pool_padding(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def activation_place(op: Operation, dpu: Dpu) -> Finding | None:
-    """An activation is fused with what it stands right behind, and each operation has a list of its own.
+    """Right behind a convolution are fused: {activations[conv]} ({activations[conv].source}).
 
-    A convolution: {activations[conv]} ({activations[conv].source}). A depthwise one: {activations[depthwise]}
-    ({activations[depthwise].source}). A pool: {activations[pool]} ({activations[pool].source}). Behind anything:
-    {activations[alone]} ({activations[alone].source}).
+    Behind a depthwise one: {activations[depthwise]} ({activations[depthwise].source}). Behind a pool:
+    {activations[pool]} ({activations[pool].source}). Behind anything: {activations[alone]}
+    ({activations[alone].source}).
     """
     place = PLACE.get(op.follows or "")
     fused = dpu.target.activations[place].value if place else ()

@@ -124,6 +124,10 @@ def check(
         ModelError: no ONNX network of images.
         ProfileError: no such board or configuration.
         OptionError: a board without a DPU or NPU, or a tile of no pixels.
+
+    Examples:
+        >>> bool(bd.check("convbeers-xs-int8", "kv260"))
+        True
     """
     read, asked = Network.load(network, sensor=SENSOR, to_run=False), ruled(TargetProfile.load(board), dpu)
     tile_px = own_tile_px(read.model) or TILE_PX if tile is None else require_side(tile)

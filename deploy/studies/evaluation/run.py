@@ -106,6 +106,12 @@ def evaluate(
         OptionError: no such method.
         ImageError: pairs that cannot be read, or differ in size.
         ProfileError: no such sensor.
+
+    Examples:
+        >>> pair = bd.simulate(size=96)
+        >>> found = bd.evaluate({"mine": lambda image: image, "convbeers-xs": "convbeers-xs"}, [pair])
+        >>> [row.name for row in found.mean][:3]
+        ['degraded', 'mine', 'convbeers-xs']
     """
     asked = {DEGRADED: DEGRADED, **(methods if isinstance(methods, Mapping) else {name: name for name in methods})}
     folder = Path(pairs) if isinstance(pairs, str | os.PathLike) else None

@@ -75,6 +75,11 @@ def tradeoff(
 
     Raises:
         BeersError: a network, an image, a profile or weights that cannot be used.
+
+    Examples:
+        >>> found = bd.tradeoff(["convbeers-xs"], budget="latency<=20s")
+        >>> found.best.network.precision
+        'int8'
     """
     boards, width_height = boards_of(board), parse_size(size) if isinstance(size, str) else size
     for each in boards:

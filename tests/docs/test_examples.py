@@ -1,0 +1,29 @@
+"""Every name of the library has an example in its docstring that gives what it shows; the README's cell runs."""
+
+import doctest
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import beers_deploy as bd
+from tests.deploy.studies.tradeoff.small import small_studies
+from tests.docs.walk import ROOT
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("name", vars(bd)["__all__"])
+def test_the_example_gives_what_it_shows(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    parser, text = doctest.DocTestParser(), getattr(bd, name).__doc__
+    example = parser.get_doctest(text, {"bd": bd, "np": np}, name, None, None)
+    assert example.examples
+    with small_studies():
+        assert doctest.DocTestRunner().run(example).failed == 0
+
+
+def test_the_cell_of_the_readme_runs() -> None:
+    (cell,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    exec(cell, {})  # noqa: S102 - our own page
