@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from beers_deploy import __version__
 from beers_deploy.cli import COMMANDS
 from beers_deploy.profiles.effects import TABLES
 from beers_deploy.profiles.scene_call import load_scene_call, scene_names
@@ -107,10 +108,12 @@ def test_every_number_of_the_readme_stands_where_it_says_how_it_is_known() -> No
     assert numbers - set(re.findall(r"\d+(?:\.\d+)*", page)) == set()
 
 
-def test_the_citation_is_of_this_version() -> None:
+def test_the_citation_and_the_changelog_are_of_this_version() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     cited = dict(re.findall(r"^([\w-]+): (.+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE))
-    assert (cited["cff-version"], cited["version"]) == ("1.2.0", project["version"])
+    assert (cited["cff-version"], cited["version"]) == ("1.2.0", __version__)
+    changes = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert changes[0] == f"{__version__} - {cited['date-released']}"
     assert cited["license"] == project["license"]
 
 
