@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from beers_deploy.dpu.checker.table import check
-from beers_deploy.kit.golden import write_golden
+from beers_deploy.kit.golden import save_array, write_golden
 from beers_deploy.kit.record import recorded, write_record
-from beers_deploy.model.io.files import whole_file, write_text
+from beers_deploy.model.io.files import write_text
 from beers_deploy.model.shipped import INT8, shipped_names
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.constant import Constant
@@ -68,8 +68,7 @@ class Board(TargetProfile):
         shape = [side if isinstance(side, int) else 1 for side in session.get_inputs()[0].shape]
         planes = np.random.default_rng(0).integers(-64, 64, shape).astype(_dtype(session.get_inputs()[0].type))
         for name, values in (("input", planes), ("expected", tensors_of(session, None, planes)[0])):
-            with whole_file(folder / f"{name}.npy") as temporary, temporary.open("wb") as stream:
-                np.save(stream, values)
+            save_array(folder / f"{name}.npy", values)
         shutil.copyfile(MEASURE, folder / "measure.py")
         if (said := host_constants(network, tile)) is not None:
             write_text(folder / "host.json", json.dumps(said, indent=1) + "\n")

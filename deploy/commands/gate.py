@@ -64,7 +64,12 @@ def gate(
     read = (float_model, int8_model, limits, baseline, images, samples, *map(Path, (target, sensor)))
     if junit == STDOUT:
         raise OptionError("--junit", expected="a file", got="-", remedy="name one: standard output is for --json -")
-    require_writable(json, junit, *_recorded(record), inputs=read, folders=(record,))
+    beside: list[Path] = []
+    if record is not None:  # for which more is loaded than a gate needs
+        from beers_deploy.kit.record import recorded, write_record
+
+        beside = recorded(record)
+    require_writable(json, junit, *beside, inputs=read, folders=(record,))
     against, int8 = pair_of(float_model, int8_model)
     allowed = read_limits(limits, max_mae)
     verdict = judged(
@@ -89,18 +94,7 @@ def gate(
     if junit is not None:
         write_text(junit, verdict.to_junit())
     if record is not None:
-        from beers_deploy.kit.record import write_record
-
         write_record(verdict, Network.load(int8, sensor=sensor), record)
     say(str(verdict))
     if not verdict:
         raise typer.Exit(1)
-
-
-def _recorded(folder: Path | None) -> list[Path]:
-    """The files of --record, for which more is loaded than a gate needs."""
-    if folder is None:
-        return []
-    from beers_deploy.kit.record import recorded
-
-    return recorded(folder)

@@ -1,7 +1,7 @@
 """`beers-deploy golden`: the integers that every layer must write on a board, and what is wrong where it does not."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 
@@ -40,17 +40,14 @@ def golden(
 
     inputs = given, compare, Path(target)
     require_writable(json, out / "golden.json" if out else None, inputs=inputs, folders=(out,))
-    if compare is None:
-        refuse(context, ("json",), expected="--compare beside it", got="none", remedy="leave it out, or compare")
-    else:
-        refuse(context, ("tile", "target"), expected="none with --compare", got="one", remedy="leave it out")
     if (out is None) == (compare is None):
         expected, remedy = "one of --out and --compare", "give the folder to write, or the folder to compare with"
         raise OptionError("out", expected=expected, got="both" if out else "none", remedy=remedy)
-    if out is not None:
-        say(f"wrote {write_golden(in_int8(given), out, tile=tile, board=target)}")
+    if compare is None:
+        refuse(context, ("json",), expected="--compare beside it", got="none", remedy="leave it out, or compare")
+        say(f"wrote {write_golden(in_int8(given), cast('Path', out), tile=tile, board=target)}")
         return
-    assert compare is not None  # noqa: S101
+    refuse(context, ("tile", "target"), expected="none with --compare", got="one", remedy="leave it out")
     found = compare_golden(compare, given)
     print_rows(f"{given.name} against {compare.name}", list(found.rows))
     save(found, json)

@@ -5,11 +5,10 @@ as .npy files (N, C, H, W), numbered in the order in which they are computed. Wh
 names in folders of the same names, as many of them as it can hand out.
 """
 
-import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ import numpy as np
 from beers_deploy import __version__
 from beers_deploy.model.io.files import whole_file, write_text
 from beers_deploy.network import Network, NetworkLike
-from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
+from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Check, Row, measured
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.profiles.toml import read_json
@@ -62,26 +61,22 @@ def write_golden(
     network, folder = Network.load(int8), Path(out)
     with faults_named(network.label):
         core = read_core(network.model)
-    half_even = rounds_to_even(TargetProfile.load(board))
-    names, said = files_of(core), {}
-    for case, image in _images(network, core, tile, np.random.default_rng(seed)).items():
-        planes = core.ends.split(image) if case != EXTREMES else image
-        tensors, _ = run_core(core, planes, half_even)
+    half_even, names = bool(TargetProfile.load(board).npu), files_of(core)  # AMD's kernel for its NPU rounds to even
+    generator = np.random.default_rng(seed)
+    images = _images(network, core.ends.image_channels, tile, generator)
+    planes = {case: core.ends.split(image) for case, image in images.items()}
+    planes[EXTREMES] = generator.choice(np.array([-128, 127], np.int8), planes["noise"].shape)
+    for case, seen in planes.items():
+        tensors, _ = run_core(core, seen, half_even)
         for name, file in names.items():
-            _save(folder / case / file, tensors[name].astype(np.int8))
-        if case != EXTREMES:
-            _save(folder / case / PICTURE, image)
-        said[case] = {names[name]: _digest(tensors[name]) for name in names}
+            save_array(folder / case / file, tensors[name].astype(np.int8))
+        if case in images:
+            save_array(folder / case / PICTURE, images[case])
     network.save(folder / NETWORK)
-    index = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "tool_version": __version__, "cases": said}
+    index = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "tool_version": __version__, "cases": list(planes)}
     index |= {"network": network.input._asdict(), "half_even": half_even, "layers": _layers(core, names)}
     write_text(folder / INDEX, json.dumps(index, indent=1) + "\n")
     return folder
-
-
-def rounds_to_even(board: TargetProfile) -> bool:
-    """Whether a board rounds ties to even, as the kernel does that AMD shows for its NPU; a DPU rounds them up."""
-    return bool(board.npu)
 
 
 def files_of(core: IntCore) -> dict[str, str]:
@@ -91,16 +86,12 @@ def files_of(core: IntCore) -> dict[str, str]:
 
 
 def _layers(core: IntCore, names: Mapping[str, str]) -> list[dict[str, object]]:
-    ops = {op.output: op for op in core.ops}
+    said: dict[str, dict[str, object]] = {
+        op.output: {"layer": op.name, "operator": type(op).__name__, "reads": list(op.inputs)} for op in core.ops
+    }
+    said[PLANES] = {"layer": "the planes that the core reads", "operator": "", "reads": []}
     return [
-        {
-            "file": file,
-            "tensor": name,
-            "layer": ops[name].name if name in ops else "the planes that the core reads",
-            "operator": type(ops[name]).__name__ if name in ops else "",
-            "reads": list(ops[name].inputs) if name in ops else [],
-            "fractional_bits": core.frac_bits[name],
-        }
+        {"file": file, "tensor": name, **said[name], "fractional_bits": core.frac_bits[name]}
         for name, file in names.items()
     ]
 
@@ -110,39 +101,29 @@ EXTREMES = "extremes"
 
 
 def _images(
-    network: Network, core: IntCore, tile: int | None, generator: np.random.Generator
+    network: Network, channels: int, tile: int | None, generator: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """The images (1, C, H, W) of the cases; of the last its planes, int8."""
-    fixed_px, lattice_px = fixed_tile_px(network.model), _lattice_px(network)
+    """The images (1, C, H, W) of the cases."""
+    fixed_px = fixed_tile_px(network.model)
+    lattice_px = fixed_px or network.tiling.lattice_px
     side = fixed_px or tile or -(-TILE_PX // lattice_px) * lattice_px
-    if (fixed_px and tile not in (None, fixed_px)) or side % lattice_px or side < 1:
+    if (tile or side) != side or side % lattice_px:
         expected = f"{fixed_px} px, to which the network is fixed" if fixed_px else f"a multiple of {lattice_px} px"
         raise OptionError("tile", expected=expected, got=f"{tile} px", remedy="choose another")
-    channels = core.ends.image_channels
     shape = 1, channels, side, side
-    square, spots = np.indices((side, side)).sum(0) // 8 % 2, np.zeros((side, side))
-    spots[3::11, 5::13] = 1
+    steps = np.indices((side, side)).sum(0) // 8 % 2
+    steps[3::11, 5::13] = 1
     found = {
         "scene": _scene(channels, side, side, generator),
         "noise": generator.random(shape, dtype=np.float32),
-        "steps": np.broadcast_to(np.maximum(square, spots).astype(np.float32), shape).copy(),
+        "steps": np.broadcast_to(steps.astype(np.float32), shape).copy(),
         "black": np.zeros(shape, np.float32),
         "white": np.ones(shape, np.float32),
     }
     if not fixed_px:
         rows, columns = (lattice_px * (side * part // (8 * lattice_px) | 1) for part in (5, 7))
         found["odd"] = _scene(channels, rows, columns, generator)
-    planes = core.ends.split(found["noise"])
-    return {**found, EXTREMES: generator.choice(np.array([-128, 127], np.int8), planes.shape)}
-
-
-def _lattice_px(network: Network) -> int:
-    try:
-        return network.tiling.lattice_px
-    except ModelError:
-        if fixed_tile_px(network.model) is None:
-            raise
-        return 1  # of one size, and never cut
+    return found
 
 
 def _scene(channels: int, rows: int, columns: int, generator: np.random.Generator) -> np.ndarray:
@@ -156,13 +137,10 @@ def _scene(channels: int, rows: int, columns: int, generator: np.random.Generato
     return np.asarray(np.clip(bright * darker, 0, 1)[None], np.float32)
 
 
-def _save(path: Path, values: np.ndarray) -> None:
+def save_array(path: Path, values: np.ndarray) -> None:
+    """Write an array as .npy, whole or not at all."""
     with whole_file(path) as temporary, temporary.open("wb") as stream:
         np.save(stream, values)
-
-
-def _digest(values: np.ndarray) -> str:
-    return hashlib.sha256(np.ascontiguousarray(values, np.int8).tobytes()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -183,27 +161,20 @@ class Golden:
 
 
 def read_golden(folder: Path) -> Golden:
-    """Read a folder that `write_golden` made; its tensors are computed again and held to their digests."""
-    remedy = "make it anew with 'beers-deploy golden'"
+    """Read a folder that `write_golden` made; of each case the planes, from which its tensors are computed again."""
     try:
         said: Any = read_json(folder / INDEX)
-        if said["schema"] != SCHEMA or said["schema_version"] != SCHEMA_VERSION:
+        if (said["schema"], said["schema_version"]) != (SCHEMA, SCHEMA_VERSION):
             raise ValueError(said["schema"])
-        digests = {str(case): dict(files) for case, files in said["cases"].items()}
-        half_even, network = bool(said["half_even"]), Input(**said["network"])
+        cases, half_even, network = list(said["cases"]), bool(said["half_even"]), Input(**said["network"])
     except (AttributeError, LookupError, OSError, TypeError, ValueError) as error:
-        expected = f"a folder of golden vectors with its {INDEX}"
+        expected, remedy = f"a folder of golden vectors with its {INDEX}", "make it anew with 'beers-deploy golden'"
         raise OptionError(str(folder), expected=expected, got="none", remedy=remedy) from error
     core = read_core(Network.load(folder / NETWORK).model)
-    names, cases = files_of(core), {}
-    for case, files in digests.items():
-        planes = _array(folder / case / names[PLANES])
-        cases[case], _ = run_core(core, planes, half_even)
-        wrong = [file for name, file in names.items() if files.get(file) != _digest(cases[case][name])]
-        if wrong:
-            got = f"other numbers in {case}/{wrong[0]}"
-            raise OptionError(str(folder), expected="the vectors that were written", got=got, remedy=remedy)
-    return Golden(core, half_even, cases, network)
+    planes = {case: _array(folder / case / files_of(core)[PLANES]) for case in cases}
+    return Golden(
+        core, half_even, {case: run_core(core, each, half_even)[0] for case, each in planes.items()}, network
+    )
 
 
 def _array(path: Path) -> np.ndarray:
@@ -228,37 +199,39 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
     """
     golden, given = read_golden(Path(folder)), Path(results)
     seen = _results(golden, given)
-    wrong = [
-        name
-        for name in files_of(golden.core)
-        if any(not np.array_equal(case[name], golden.cases[key][name]) for key, case in seen.items() if name in case)
-    ]
-    verdict = _verdict(golden, seen, wrong[0]) if wrong else ""
-    rows = tuple(_row(golden, seen, name, verdict if name in wrong[:1] else "") for name in _compared(golden, seen))
+    wrong = [name for name, cases in seen.items() if _differing(name, cases)]
+    verdict = _verdict(golden.core, seen, wrong[0], golden.half_even) if wrong else ""
+    first = {wrong[0]: {"first": verdict}} if wrong else {}
+    rows = tuple(_row(golden.core, name, cases, first.get(name, {})) for name, cases in seen.items())
     checks = (Check("layers that differ", len(wrong), 0, "layer", detail=verdict),)
     return Table("golden", {"results": given.name}, (golden.network, Path(folder) / INDEX), rows, checks)
 
 
-Results = Mapping[str, Mapping[str, np.ndarray]]
-"""By case and tensor."""
+Results = Mapping[str, list[Seen]]
+"""Of each tensor that a board handed out, in the order in which they are computed, what it wrote in each case."""
 
 
 def _results(golden: Golden, given: Path) -> Results:
-    files = {file: name for name, file in files_of(golden.core).items()}
-    found: dict[str, dict[str, np.ndarray]] = {}
-    for path in sorted(given.glob("*/*.npy")):
-        case, name = path.parent.name, files.get(path.name)
-        if path.name == PICTURE:
-            continue
-        if case not in golden.cases or name is None:
-            expected, remedy = "the names of the golden vectors", "name cases and layers as they are named there"
-            raise OptionError(str(given), expected=expected, got=f"{case}/{path.name}", remedy=remedy)
-        meant = golden.cases[case][name]
-        found.setdefault(case, {})[name] = _integers(path, meant.shape, golden.core.frac_bits[name])
-    if not found:
+    files, paths = files_of(golden.core), [path for path in given.glob("*/*.npy") if path.name != PICTURE]
+    unknown = [path for path in paths if path.parent.name not in golden.cases or path.name not in files.values()]
+    if unknown or not paths:
+        got = f"{unknown[0].parent.name}/{unknown[0].name}" if unknown else "none"
         expected, remedy = "results as CASE/LAYER.npy", f"name them as in {INDEX}"
-        raise OptionError(str(given), expected=expected, got="none", remedy=remedy)
-    return found
+        raise OptionError(str(given), expected=expected, got=got, remedy=remedy)
+    found = {name: sorted(path for path in paths if path.name == file) for name, file in files.items()}
+    return {
+        name: [_seen(golden, name, golden.cases[path.parent.name], path) for path in here]
+        for name, here in found.items()
+        if here
+    }
+
+
+def _seen(golden: Golden, name: str, sound: Mapping[str, np.ndarray], path: Path) -> Seen:
+    return Seen(sound, _integers(path, sound[name].shape, golden.core.frac_bits[name]))
+
+
+def _differing(name: str, cases: list[Seen]) -> list[Seen]:
+    return [case for case in cases if not np.array_equal(case.tensors[name], case.seen)]
 
 
 def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
@@ -280,26 +253,20 @@ def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
     return np.rint(whole).astype(np.int16)
 
 
-def _compared(golden: Golden, seen: Results) -> Iterator[str]:
-    return (name for name in files_of(golden.core) if any(name in case for case in seen.values()))
-
-
-def _verdict(golden: Golden, seen: Results, name: str) -> str:
+def _verdict(core: IntCore, seen: Results, name: str, half_even: bool) -> str:
     """The first layer that differs, and the fault that gives just that."""
-    given = ((golden.cases[key], case[name]) for key, case in seen.items() if name in case)
-    cases = [Seen(sound, found) for sound, found in given if not np.array_equal(sound[name], found)]
-    between = _unseen_before(golden.core, name, {each for case in seen.values() for each in case})
-    fault = explain(golden.core, between, cases, golden.half_even)
+    between = _unseen_before(core, name, seen)
+    fault = explain(core, between, _differing(name, seen[name]), half_even)
     unseen = f" ({len(between) - 1} layers before it were not handed out)" if len(between) > 1 else ""
     why = f"as if {fault}" if fault else "by no fault that is known"
-    return f"the first to differ is {_layer(golden.core, name)}{unseen}, {why}"
+    return f"the first to differ is {_layer(core, name)}{unseen}, {why}"
 
 
 def _layer(core: IntCore, name: str) -> str:
     return next((op.name for op in core.ops if op.output == name), PLANES)
 
 
-def _unseen_before(core: IntCore, name: str, seen: set[str]) -> list[IntConv | Op]:
+def _unseen_before(core: IntCore, name: str, seen: Collection[str]) -> list[IntConv | Op]:
     """The operations between tensors that a board handed out and the one of that name, which is the last."""
     wanted, found = {name}, list[IntConv | Op]()
     for op in reversed(core.ops):
@@ -309,16 +276,15 @@ def _unseen_before(core: IntCore, name: str, seen: set[str]) -> list[IntConv | O
     return found
 
 
-def _row(golden: Golden, seen: Results, name: str, verdict: str) -> Row:
-    pairs = {key: (case[name], golden.cases[key][name]) for key, case in seen.items() if name in case}
-    values = sum(meant.size for _, meant in pairs.values())
-    by = [np.abs(found - meant) for found, meant in pairs.values()]
-    source = f"{len(pairs)} cases, {values} values, against the integer reference"
+def _row(core: IntCore, name: str, cases: list[Seen], first: dict[str, str]) -> Row:
+    by = [np.abs(case.seen - case.tensors[name]) for case in cases]
+    values = sum(each.size for each in by)
+    source = f"{len(by)} cases, {values} values, against the integer reference"
     figures = {
         "differing": measured(100 * sum(int((each > 0).sum()) for each in by) / values, "%", source),
         "at most by": measured(max(int(each.max()) for each in by), "LSB", source),
     }
-    wrong = [pair for pair in pairs.values() if not np.array_equal(*pair)]
-    alike = [pair for pair in wrong if pair[0].shape == wrong[0][0].shape]  # the odd case has a size of its own
+    wrong = _differing(name, cases)
+    alike = [(case.seen, case.tensors[name]) for case in wrong if case.seen.shape == wrong[0].seen.shape]
     text = {"where": where(*map(np.concatenate, zip(*alike, strict=True)))} if wrong else {}
-    return Row("golden", _layer(golden.core, name), figures, text | ({"first": verdict} if verdict else {}))
+    return Row("golden", _layer(core, name), figures, text | first)

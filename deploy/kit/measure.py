@@ -13,7 +13,6 @@ It has been run with onnxruntime's CPU provider only, never on a board: see docs
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import os
 import statistics
@@ -28,8 +27,7 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # before it is loaded: from
 import onnxruntime as ort
 
 POWER_SAMPLE_S = 0.05
-WARM_UP_CALLS = 5
-LATENCY_CALLS = 20
+WARM_UP_CALLS, LATENCY_CALLS = 5, 20
 
 
 def main() -> int:
@@ -48,25 +46,19 @@ def main() -> int:
 def arguments() -> argparse.Namespace:
     """What the user asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model", type=Path, help="QDQ ONNX: the file of 'beers-deploy quantize --board-file'")
-    parser.add_argument("--out", type=Path, default=Path("board.json"), help="JSON list; a new run is added to it")
-    parser.add_argument("--provider", default="VitisAIExecutionProvider", help="onnxruntime's execution provider")
-    parser.add_argument(
-        "--option", action="append", default=[], metavar="KEY=VALUE", help="of the provider; repeatable"
-    )
-    parser.add_argument("--configuration", default="C32B3", help="DPU in the board's bitstream, C32B1 to C64B5")
-    parser.add_argument("--tile", type=int, default=640, help="tile side in pixels")
-    parser.add_argument("--batch", type=int, default=1, help="tiles in one call")
-    parser.add_argument("--frames", type=int, default=300, help="tiles to time, after a warm-up")
-    parser.add_argument("--threads", type=int, default=1, help="calls in flight; try 1, 2, 3, ... batch handlers")
-    parser.add_argument(
-        "--power-file",
-        type=Path,
-        action="append",
-        default=[],
-        help="microwatts, such as hwmon's power1_input; repeatable, summed",
-    )
-    parser.add_argument("--no-compare", action="store_true", help="skip the comparison with the CPU provider")
+    add = parser.add_argument
+    add("model", type=Path, help="QDQ ONNX: the file of 'beers-deploy quantize --board-file'")
+    add("--out", type=Path, default=Path("board.json"), help="JSON list; a new run is added to it")
+    add("--provider", default="VitisAIExecutionProvider", help="onnxruntime's execution provider")
+    add("--option", action="append", default=[], metavar="KEY=VALUE", help="of the provider; repeatable")
+    add("--configuration", default="C32B3", help="DPU in the board's bitstream, C32B1 to C64B5")
+    add("--tile", type=int, default=640, help="tile side in pixels")
+    add("--batch", type=int, default=1, help="tiles in one call")
+    add("--frames", type=int, default=300, help="tiles to time, after a warm-up")
+    add("--threads", type=int, default=1, help="calls in flight; try 1, 2, 3, ... batch handlers")
+    power = "microwatts, such as hwmon's power1_input; repeatable, summed"
+    add("--power-file", type=Path, action="append", default=[], help=power)
+    add("--no-compare", action="store_true", help="skip the comparison with the CPU provider")
     return parser.parse_args()
 
 
@@ -76,22 +68,16 @@ def measure(given: argparse.Namespace) -> dict[str, object]:
     feed = make_feed(session, given.batch, given.tile)
     if not given.no_compare:
         compare(given.model, session, feed)
-    latency_s = time_calls(session, feed)
-    print(
-        f"latency of a call of {given.batch}: median {1e3 * latency_s:.2f} ms over {LATENCY_CALLS} calls, one thread"
-    )
-    with PowerMeter(given.power_file) as meter:
-        stamps = run_threads(session, feed, -(-given.frames // given.batch), given.threads)
+    stamps, _ = run_threads(session, feed, 1 + WARM_UP_CALLS + LATENCY_CALLS, 1, [])
+    latency_ms = 1e3 * statistics.median(np.diff(stamps)[WARM_UP_CALLS:])
+    print(f"latency of a call of {given.batch}: median {latency_ms:.2f} ms over {LATENCY_CALLS} calls, one thread")
+    stamps, power_w = run_threads(session, feed, -(-given.frames // given.batch), given.threads, given.power_file)
     fps = throughput(stamps, given.batch)
     print(f"throughput: {fps:.3f} frame/s over {len(stamps) * given.batch} frames, {given.threads} threads")
-    entry: dict[str, object] = {
-        "model": given.model.name,
-        "configuration": given.configuration,
-        "tile_px": given.tile,
-        "fps": round(fps, 4),
-    }
-    if meter.samples_w:
-        entry["power_w"] = round(statistics.fmean(meter.samples_w), 3)
+    entry: dict[str, object] = {"model": given.model.name, "configuration": given.configuration}
+    entry.update(tile_px=given.tile, fps=round(fps, 4))
+    if power_w:
+        entry["power_w"] = round(statistics.fmean(power_w), 3)
     return entry
 
 
@@ -134,37 +120,28 @@ def compare(model: Path, session: ort.InferenceSession, feed: dict[str, np.ndarr
         )
 
 
-def time_calls(session: ort.InferenceSession, feed: dict[str, np.ndarray]) -> float:
-    """Median seconds of a call, one at a time, after a warm-up."""
-    for _ in range(WARM_UP_CALLS):
-        session.run(None, feed)
-    times_s = []
-    for _ in range(LATENCY_CALLS):
-        start = time.perf_counter()
-        session.run(None, feed)
-        times_s.append(time.perf_counter() - start)
-    return statistics.median(times_s)
-
-
-def run_threads(session: ort.InferenceSession, feed: dict[str, np.ndarray], calls: int, threads: int) -> list[float]:
-    """When each of so many calls ended, in seconds, several in flight at a time."""
+def run_threads(
+    session: ort.InferenceSession, feed: dict[str, np.ndarray], calls: int, threads: int, power_files: list[Path]
+) -> tuple[list[float], list[float]]:
+    """When each of so many calls ended, in seconds, several in flight at a time; and watts meanwhile."""
     stamps: list[float] = []
-    numbers, lock = itertools.count(), threading.Lock()
+    numbers = iter(range(calls))  # one step of it is not interrupted by another thread
 
     def work() -> None:
-        while True:
-            with lock:
-                if next(numbers) >= calls:
-                    return
+        for _ in numbers:
             session.run(None, feed)
             stamps.append(time.perf_counter())
 
     workers = [threading.Thread(target=work) for _ in range(threads)]
     for worker in workers:
         worker.start()
+    power_w: list[float] = []
+    while power_files and (not power_w or workers[0].is_alive()):
+        power_w.append(sum(int(file.read_text(encoding="utf-8")) for file in power_files) / 1e6)
+        time.sleep(POWER_SAMPLE_S)
     for worker in workers:
         worker.join()
-    return sorted(stamps)
+    return sorted(stamps), power_w
 
 
 def throughput(stamps: list[float], batch: int) -> float:
@@ -176,33 +153,6 @@ def throughput(stamps: list[float], batch: int) -> float:
     if len(stamps) < 2:
         raise ValueError(f"expected at least two calls, got {len(stamps)}: give more --frames")
     return batch * (len(stamps) - 1) / (stamps[-1] - stamps[0])
-
-
-class PowerMeter:
-    """Samples the sum of some power files while a block runs."""
-
-    def __init__(self, files: list[Path]) -> None:
-        self.samples_w: list[float] = []
-        self._files, self._done = files, threading.Event()
-        self._thread = threading.Thread(target=self._sample, daemon=True)
-
-    def __enter__(self) -> PowerMeter:
-        if self._files:
-            self.samples_w.append(self._read_w())
-            self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._done.set()
-        if self._files:
-            self._thread.join()
-
-    def _sample(self) -> None:
-        while not self._done.wait(POWER_SAMPLE_S):
-            self.samples_w.append(self._read_w())
-
-    def _read_w(self) -> float:
-        return sum(int(file.read_text(encoding="utf-8")) for file in self._files) / 1e6
 
 
 def write_entry(entry: dict[str, object], path: Path) -> None:

@@ -39,22 +39,21 @@ def recorded(folder: Path) -> list[Path]:
     return [folder / name for name in NAMES]
 
 
-def write_record(judged: Table, network: Network, folder: Path) -> Path:
-    """Write what is known of a network, and what a verb found of it, to a folder; return the folder.
+def write_record(judged: Table, network: Network, folder: Path) -> None:
+    """Write what is known of a network, and what a verb found of it, as JSON, a page and CycloneDX 1.6.
 
     Args:
         judged: figures and checks, with the inputs that they rest on.
         network: that they speak of.
-        folder: gets record.json, record.html and record.cdx.json (CycloneDX 1.6).
+        folder: of the three files.
 
     Raises:
         MissingExtraError: cyclonedx-python-lib is not installed.
     """
-    said = record_of(judged, network)
-    write_text(folder / NAMES[0], json.dumps(said, indent=1) + "\n")
-    write_report(_page(judged, said), folder / NAMES[1])
-    write_text(folder / NAMES[2], bill_of(said))
-    return folder
+    said, (document, page, bill) = record_of(judged, network), recorded(folder)
+    write_text(document, json.dumps(said, indent=1) + "\n")
+    write_report(_page(judged, said), page)
+    write_text(bill, bill_of(said))
 
 
 def record_of(judged: Table, network: Network) -> dict[str, Any]:
@@ -92,8 +91,8 @@ def _training(weights: str | None) -> dict[str, Any] | None:
 
 
 def _page(judged: Table, said: dict[str, Any]) -> Report:
-    words = {key: said[key] for key in ("weights_sha256", "training", "sensors_in_range", "licence")}
-    facts = said["network"] | said["says"] | words
+    facts = said["network"] | said["says"]
+    facts |= {key: said[key] for key in ("weights_sha256", "training", "sensors_in_range", "licence")}
     rows = [Row("network", key, {}, {"said": str(value)}) for key, value in facts.items()]
     checks = [
         Row("checks", each.name, {}, {"found": each.found, "allowed": each.allowed, "passed": str(each.passed)})
@@ -115,15 +114,15 @@ def bill_of(said: dict[str, Any]) -> str:
         hashes = [HashType(alg=HashAlgorithm.SHA_256, content=digest)]
         return Component(type=kind, name=name, bom_ref=f"{kind.value}:{name}", hashes=hashes, **more)
 
-    facts = {**said["says"], "training": said["training"], "sensors_in_range": said["sensors_in_range"]}
-    facts |= {"limitations": said["limitations"], "passed": said["passed"], "licence": said["licence"]}
+    network, tool, bom = said["network"], said["tool"], Bom(serial_number=uuid5(NAMESPACE_URL, json.dumps(said)))
+    facts = said["says"] | {
+        key: said[key] for key in ("training", "sensors_in_range", "limitations", "passed", "licence")
+    }
     properties = [Property(name=f"beers-deploy:{key}", value=json.dumps(value)) for key, value in facts.items()]
-    network, bom = said["network"], Bom(serial_number=uuid5(NAMESPACE_URL, json.dumps(said)))
     kind = ComponentType.MACHINE_LEARNING_MODEL
     bom.metadata.component = component(kind, network["name"], network["sha256"], properties=properties)
-    bom.metadata.tools.components.add(
-        component(ComponentType.APPLICATION, "beers-deploy", said["tool"]["code_sha256"], version=__version__)
-    )
+    maker = component(ComponentType.APPLICATION, tool["name"], tool["code_sha256"], version=tool["version"])
+    bom.metadata.tools.components.add(maker)
     files = [component(ComponentType.FILE, each["name"], each["sha256"]) for each in said["results"]["inputs"]]
     bom.components.update(files)
     bom.register_dependency(bom.metadata.component, files)

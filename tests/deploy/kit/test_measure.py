@@ -65,7 +65,7 @@ def test_throughput_leaves_the_first_calls_latency_out(script: ModuleType) -> No
 
 def test_calls_in_flight_end_as_often_as_asked(script: ModuleType, tmp_path: Path) -> None:
     session = script.open_session(board_convbeers(tmp_path / "core.onnx", 1, 8), "CPUExecutionProvider", {})
-    stamps = script.run_threads(session, script.make_feed(session, 1, 16), calls=11, threads=4)
+    stamps, _ = script.run_threads(session, script.make_feed(session, 1, 16), 11, 4, [])
     assert len(stamps) == 11
     assert stamps == sorted(stamps)
 
