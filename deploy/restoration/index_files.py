@@ -1,8 +1,7 @@
 """Untrusted indexes: an XML file that names an image's tiles is read here before GDAL follows it anywhere.
 
-A VRT may hold only what a mosaic needs (an element or attribute that is not listed is refused, and with it code in
-Python, pansharpening, warping and open options). A DIMAP is followed by the two paths that GDAL's driver takes from
-it. Whatever an index names must be an image that lies in its folder or below, unless the user trusts it.
+Whatever a VRT or a DIMAP names must be an image that lies in its folder or below, unless the user trusts it. Code in
+Python is never run: GDAL is told so when it opens one.
 
 Sources: https://gdal.org/en/stable/drivers/raster/vrt.html, and GDAL's frmts/dimap/dimapdataset.cpp.
 """
@@ -17,8 +16,6 @@ from beers_deploy.profiles.toml import read_whole
 INDEX_SUFFIXES = {".vrt", ".xml"}
 INDEX_BYTES = 1 << 23
 """A tile takes some 500 bytes of a VRT: over ten thousand tiles."""
-ELEMENTS, LEVELS, HEAD_BYTES = 200_000, 4, 1000
-"""Of one index, of indexes that name indexes, and of what GDAL tells a file's kind from."""
 
 MAGIC = (
     *(b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"),  # TIFF and BigTIFF
@@ -27,18 +24,7 @@ MAGIC = (
 )
 """How the files begin that an index may name: none of them names others."""
 
-VRT_ELEMENTS = {
-    "VRTDataset", "VRTRasterBand", "SRS", "GeoTransform", "GCPList", "GCP", "Metadata", "MDI", "ColorInterp",
-    "NoDataValue", "HideNoDataValue", "Description", "UnitType", "Scale", "Offset", "SimpleSource", "ComplexSource",
-    "SourceFilename", "SourceBand", "SourceProperties", "SrcRect", "DstRect", "NODATA", "ScaleOffset", "ScaleRatio",
-}  # fmt: skip
-VRT_ATTRIBUTES = {
-    "rasterXSize", "rasterYSize", "dataType", "band", "blockXSize", "blockYSize", "dataAxisToSRSAxisMapping",
-    "coordinateEpoch", "domain", "key", "Projection", "Id", "Info", "Pixel", "Line", "X", "Y", "Z", "relativeToVRT",
-    "relativetoVRT", "shared", "xOff", "yOff", "xSize", "ySize", "RasterXSize", "RasterYSize", "DataType",
-    "BlockXSize", "BlockYSize", "resampling",
-}  # fmt: skip
-VRT = "VRTDataset"
+VRT, VRT_PATHS = "VRTDataset", {"sourcefilename", "sourcedataset"}
 MOST_BITS = 16
 PIXELS = "data_file_path"
 DIMAP_PATHS = {PIXELS, "component_path"}
@@ -67,16 +53,13 @@ def index_files(path: Path, trusted: bool = False) -> tuple[Path, ...]:
     """
     if not is_index(path):
         return ()
-    home, found, pending = path.resolve().parent, dict[Path, None](), [(path.resolve(), LEVELS)]
+    home, found, pending = path.resolve().parent, dict[Path, None](), [path.resolve()]
     while pending:
-        index, levels = pending.pop()
+        index = pending.pop()
         found[index] = None
         for file in dict.fromkeys(_named(index, home, trusted)):  # once each, in order
-            if file.suffix.lower() == ".vrt" and (levels == 0 or file in found):
-                got = "one that comes back to itself" if file in found else "deeper ones"
-                raise _refused(path, f"mosaics of mosaics, {LEVELS} deep at most", got, "flatten it")
-            if is_index(file) and file not in found and levels:
-                pending.append((file, levels - 1))
+            if is_index(file) and file not in found:
+                pending.append(file)
             found[file] = None
     return tuple(found)[1:]
 
@@ -107,14 +90,10 @@ def _require_pixels(index: Path, text: str, file: Path) -> None:
 
 def _parsed(path: Path) -> ET.Element:
     try:
-        content = read_whole(path, INDEX_BYTES)
         parser = ET.XMLParser(target=NoDoctype())  # noqa: S314 - without a document type there are no entities
-        root = ET.fromstring(content, parser)  # noqa: S314
-        if sum(1 for _ in root.iter()) > ELEMENTS:
-            raise ValueError(f"more than {ELEMENTS} elements")
-        # GDAL looks for this word in the first bytes, and gives what lacks it to the next of its drivers.
-        if path.suffix.lower() == ".vrt" and not (root.tag == VRT and b"<VRTDataset" in content[:HEAD_BYTES]):
-            raise ValueError(f"a document that does not begin as a {VRT}")
+        root = ET.fromstring(read_whole(path, INDEX_BYTES), parser)  # noqa: S314
+        if path.suffix.lower() == ".vrt" and root.tag != VRT:
+            raise ValueError(f"a document that is no {VRT}")
     except (ET.ParseError, ValueError, LookupError, OSError, RecursionError) as error:  # lookup: of an encoding
         got = getattr(error, "strerror", None) or str(error)
         raise _refused(path, "a VRT or a DIMAP, plain XML", got, "write it again") from error
@@ -126,15 +105,13 @@ Named = Iterator[tuple[str, Path, bool]]
 
 
 def _of_vrt(path: Path, root: ET.Element) -> Named:
+    """Paths by element or by attribute, which are the same to GDAL."""
     for element in root.iter():
-        unknown = [element.tag] if element.tag not in VRT_ELEMENTS else sorted(set(element.attrib) - VRT_ATTRIBUTES)
-        if unknown:
-            remedy = "make it a file with gdal_translate if you trust it"
-            raise _refused(path, "a VRT that is a plain mosaic", f"{unknown[0]} in it", remedy)
-        if element.tag == "SourceFilename":
-            relative = element.get("relativeToVRT", element.get("relativetoVRT", "0"))
-            # Where it is not 1, GDAL looks from the working directory.
-            yield (element.text or "").strip(), path.parent if relative == "1" else Path.cwd(), True
+        for key, text in ((element.tag, element.text or ""), *element.attrib.items()):
+            if key.lower() in VRT_PATHS:
+                relative = element.get("relativeToVRT", element.get("relativetoVRT", "0"))
+                # Where it is not 1, GDAL looks from the working directory.
+                yield text.strip(), path.parent if relative == "1" else Path.cwd(), True
 
 
 def _of_dimap(path: Path, root: ET.Element) -> Named:

@@ -60,22 +60,13 @@ REFUSED = {
     "network path": (vrt(naming("/vsicurl/http://localhost/a.tif")), "vsicurl"),
     "part of a file": (vrt(naming("GTIFF_DIR:1:tile.tif")), "GTIFF_DIR"),
     "XML in a name": (vrt(naming("&lt;GDAL_WMS/&gt;")), "GDAL_WMS"),
-    "as an attribute": (vrt('<SimpleSource SourceFilename="/vsicurl/http://a"/>'), "SourceFilename in it"),
+    "as an attribute": (vrt('<SimpleSource SourceFilename="/vsicurl/http://a"/>'), "/vsicurl/http://a"),
     "no image": (vrt(naming("notes.txt")), "another file, notes.txt"),
     "a service": (vrt(naming("service.xml")), "another file, service.xml"),
-    "itself": (vrt(naming("a.vrt")), "comes back to itself"),
-    "a circle": (vrt(naming("b.vrt")), "comes back to itself"),
-    "code": (vrt("<PixelFunctionCode>import os</PixelFunctionCode>"), "PixelFunctionCode in it"),
-    "open options": (
-        vrt('<SimpleSource><OpenOptions><OOI key="A">B</OOI></OpenOptions></SimpleSource>'),
-        "OpenOptions",
-    ),
-    "pansharpening": (vrt("", ' subClass="VRTPansharpenedDataset"'), "subClass in it"),
     "bomb": (BOMB + vrt("<Description>&b;</Description>"), "a document type"),
     "no XML": ("<VRTDataset", "plain XML"),
     "unknown letters": ('<?xml version="1.0" encoding="UTFZ8"?>' + vrt(""), "unknown encoding: UTFZ8"),
-    "another root": ("<!--<VRTDataset>--><vrtdataset/>", "does not begin"),
-    "a late root": (f"<!--{' ' * 2000}-->" + vrt(ONE), "does not begin"),
+    "another root": ("<vrtdataset/>", "is no VRTDataset"),
 }
 
 
@@ -109,20 +100,32 @@ def test_a_bomb_in_utf_16_is_seen(tmp_path: Path) -> None:
         index_files(folder / "a.vrt")
 
 
-def test_large_and_deep_indexes_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_circle_ends_and_a_large_index_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = folder_of(tmp_path)
-    for k in range(indexes.LEVELS + 1):
-        (folder / f"{k}.vrt").write_text(vrt(naming(f"{k + 1}.vrt")))
-    (folder / f"{k + 1}.vrt").write_text(vrt(ONE))
-    with pytest.raises(ImageError, match="deeper"):
-        index_files(folder / "0.vrt")
-    assert len(index_files(folder / "1.vrt")) == indexes.LEVELS + 1
-    monkeypatch.setattr(indexes, "ELEMENTS", 3)
-    with pytest.raises(ImageError, match="more than 3 elements"):
-        index_files(folder / "1.vrt")
+    (folder / "a.vrt").write_text(vrt(naming("b.vrt")))
+    (folder / "b.vrt").write_text(vrt(naming("a.vrt") + ONE))
+    assert set(index_files(folder / "a.vrt")) == {folder / "b.vrt", folder / "tile.tif"}
     monkeypatch.setattr(indexes, "INDEX_BYTES", 30)
     with pytest.raises(ImageError, match="more than 30 bytes"):
-        index_files(folder / "1.vrt")
+        index_files(folder / "a.vrt")
+
+
+CODE = """<VRTDataset rasterXSize="9" rasterYSize="9">
+<VRTRasterBand dataType="UInt16" band="1" subClass="VRTDerivedRasterBand"><PixelFunctionType>run</PixelFunctionType>
+<PixelFunctionLanguage>Python</PixelFunctionLanguage>
+<PixelFunctionCode><![CDATA[
+def run(in_ar, out_ar, *rest, **more):
+    open({made!r}, "w").close()
+]]></PixelFunctionCode>{source}</VRTRasterBand></VRTDataset>"""
+
+
+@pytest.mark.parametrize("trusted", [False, True])
+def test_code_in_an_index_is_never_run(trusted: bool, tmp_path: Path) -> None:
+    index, made = folder_of(tmp_path) / "a.vrt", tmp_path / "made"
+    index.write_text(CODE.format(made=str(made), source=ONE))
+    with pytest.raises(ImageError), open_source(index, trusted=trusted) as source:
+        source.read(0, 9)
+    assert not made.exists()
 
 
 @pytest.mark.parametrize(
@@ -164,8 +167,8 @@ class Silent(http.server.SimpleHTTPRequestHandler):
         pass
 
 
-def test_a_trusted_index_reaches_outside_and_to_urls_and_never_runs_code(tmp_path: Path) -> None:
-    folder, index = folder_of(tmp_path), tmp_path / "product" / "a.vrt"
+def test_a_trusted_index_reaches_outside_and_to_urls(tmp_path: Path) -> None:
+    index = folder_of(tmp_path) / "a.vrt"
     index.write_text(vrt(naming("../outside.tif")))
     with open_source(index, trusted=True) as source:
         assert source.read(0, 9).sum() == 81
@@ -178,8 +181,6 @@ def test_a_trusted_index_reaches_outside_and_to_urls_and_never_runs_code(tmp_pat
         with pytest.raises(ImageError, match="trust_index"), open_source(index):
             pass
         server.shutdown()
-    for body in ("<PixelFunctionLanguage>Python</PixelFunctionLanguage>", naming("no.tif")):
-        index.write_text(vrt(body))
-        with pytest.raises(ImageError), open_source(index, trusted=True):
-            pass
-    assert folder.is_dir()
+    index.write_text(vrt(naming("no.tif")))
+    with pytest.raises(ImageError), open_source(index, trusted=True):
+        pass
