@@ -1,4 +1,4 @@
-"""LPIPS and DISTS, differentiable, over a backbone that the user brings: SqueezeNet 1.1, AlexNet or VGG16.
+"""LPIPS and DISTS, differentiable, over a backbone that the user brings: SqueezeNet 1.1 or VGG16.
 
 Both follow the arithmetic of their authors' packages, `lpips` 0.1.4 with the v0.1 weights and `DISTS-pytorch` 0.1,
 whose published channel weights lie in `weights/`. The paper this project reproduces does not say which LPIPS it used,
@@ -37,7 +37,6 @@ class BackboneSpec:
 
 BACKBONES: Mapping[str, BackboneSpec] = {
     "squeeze": BackboneSpec("squeezenet1_1", (1, 4, 7, 9, 10, 11, 12), min_side_px=17),
-    "alex": BackboneSpec("alexnet", (1, 4, 7, 9, 11), min_side_px=31),
     "vgg": BackboneSpec("vgg16", (3, 8, 15, 22, 29), min_side_px=16),
 }
 
@@ -72,14 +71,14 @@ class Backbone(nn.Module):
     """The feature layers of one network, with random weights until some are loaded.
 
     Args:
-        network: "squeeze", "alex" or "vgg".
+        network: "squeeze" or "vgg".
         l2_pool: DISTS's pooling in the place of the max pooling.
     """
 
     def __init__(self, network: str, *, l2_pool: bool = False) -> None:
         super().__init__()
         self.network, self.spec = network, BACKBONES[network]
-        layers = {"squeeze": _squeezenet, "alex": _alexnet, "vgg": _vgg16}[network]()
+        layers = {"squeeze": _squeezenet, "vgg": _vgg16}[network]()
         if l2_pool:
             layers = [L2Pool() if isinstance(layer, nn.MaxPool2d) else layer for layer in layers]
         self.features = nn.Sequential(*layers)
@@ -103,16 +102,6 @@ def _squeezenet() -> list[nn.Module]:
         *(Fire(64, 16, 64), Fire(128, 16, 64), pool()),
         *(Fire(128, 32, 128), Fire(256, 32, 128), pool()),
         *(Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256)),
-    ]
-
-
-def _alexnet() -> list[nn.Module]:
-    return [
-        *(nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, stride=2)),
-        *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, stride=2)),
-        *(nn.Conv2d(192, 384, 3, padding=1), nn.ReLU()),
-        *(nn.Conv2d(384, 256, 3, padding=1), nn.ReLU()),
-        *(nn.Conv2d(256, 256, 3, padding=1), nn.ReLU()),
     ]
 
 
@@ -141,7 +130,7 @@ def find_backbone(network: str, place: Path | None = None) -> Path | None:
     """The weights file of a backbone, or None: then `not_found(network)` is the reason to show.
 
     Args:
-        network: "squeeze", "alex" or "vgg" (DISTS uses "vgg").
+        network: "squeeze" or "vgg" (DISTS uses "vgg").
         place: a file, which is taken at its word, or a folder. Without it the environment variable
             BEERS_LPIPS_WEIGHTS is asked; it may name a file or a folder, and a file counts only for the network
             its name begins with.
@@ -166,7 +155,7 @@ def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbon
     """A backbone with its parameters from a file, by name; whatever else the file holds is left aside.
 
     Args:
-        network: "squeeze", "alex" or "vgg".
+        network: "squeeze" or "vgg".
         path: .safetensors or .npz.
         l2_pool: DISTS's pooling in the place of the max pooling.
     """
@@ -250,7 +239,7 @@ class Lpips(nn.Module):
         """The metric with its published heads, over the backbone in a file (see `find_backbone`).
 
         Args:
-            network: "squeeze", "alex" or "vgg".
+            network: "squeeze" or "vgg".
             path: .safetensors or .npz, parameters named as in torchvision.
         """
         backbone = load_backbone(network, path)
@@ -262,7 +251,7 @@ class Lpips(nn.Module):
         """The distance of each pair, (N,); its gradient is finite everywhere.
 
         Args:
-            image: (N, 1, H, W), 0 to 1 of full scale; at least 17 px a side for squeeze, 31 for alex, 16 for vgg.
+            image: (N, 1, H, W), 0 to 1 of full scale; at least 17 px a side for squeeze, 16 for vgg.
             reference: the same shape.
         """
         _check_pair(self.label, self.backbone, image, reference)

@@ -35,13 +35,13 @@ Perceptual = Callable[[np.ndarray, np.ndarray], float]
 
 
 def perceptual_distances(place: Path | None) -> dict[str, Perceptual | str]:
-    """LPIPS-squeeze or the reason why not, and LPIPS-alex, LPIPS-vgg and DISTS where their backbones are found.
+    """LPIPS-squeeze or the reason why not, and LPIPS-vgg and DISTS where VGG16 is found.
 
     Args:
         place: a file with SqueezeNet 1.1, or a folder with any of the backbones; None asks the environment.
     """
     found: dict[str, Perceptual | str] = {"LPIPS-squeeze": not_found("squeeze")}
-    networks = ("squeeze", "alex", "vgg") if place is None or place.is_dir() else ("squeeze",)
+    networks = ("squeeze", "vgg") if place is None or place.is_dir() else ("squeeze",)
     for network in networks:
         if file := find_backbone(network, place):
             found[f"LPIPS-{network}"] = partial(_distance, Lpips.load(network, file))

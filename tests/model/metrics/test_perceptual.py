@@ -28,7 +28,7 @@ from beers_deploy.profiles.errors import ImageError, ModelError
 Weights = dict[str, np.ndarray]
 Maps = list[Tensor]
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-STEMS = {"squeeze": "squeezenet1_1", "alex": "alexnet", "vgg": "vgg16"}
+STEMS = {"squeeze": "squeezenet1_1", "vgg": "vgg16"}
 
 
 def made_up(network: str) -> Weights:
@@ -102,14 +102,6 @@ def squeeze_maps(x: Tensor, weights: Weights) -> Maps:
     return maps
 
 
-def alex_maps(x: Tensor, weights: Weights) -> Maps:
-    first = convolve(x, weights, "features.0", stride=4, padding=2)
-    second = convolve(max_pool2d(first, 3, 2), weights, "features.3", padding=2)
-    third = convolve(max_pool2d(second, 3, 2), weights, "features.6", padding=1)
-    fourth = convolve(third, weights, "features.8", padding=1)
-    return [first, second, third, fourth, convolve(fourth, weights, "features.10", padding=1)]
-
-
 def hanning_pooled(x: Tensor) -> Tensor:
     window = torch.from_numpy(np.outer(*[np.hanning(5)[1:-1]] * 2))
     cells = pad(x**2, (1, 1, 1, 1)).unfold(2, 3, 2).unfold(3, 3, 2)
@@ -129,7 +121,7 @@ def vgg_maps(x: Tensor, weights: Weights, pool: Callable[[Tensor], Tensor] = lam
 def plain_lpips(network: str, image: np.ndarray, reference: np.ndarray) -> float:
     shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
     weights, heads = made_up(network), load_file(PUBLISHED / f"lpips-{network}.safetensors")
-    maps = {"squeeze": squeeze_maps, "alex": alex_maps, "vgg": vgg_maps}[network]
+    maps = {"squeeze": squeeze_maps, "vgg": vgg_maps}[network]
     colours = [(2 * np.stack([a] * 3) - 1 - shift[:, None, None]) / scale[:, None, None] for a in (image, reference)]
     total = 0.0
     pairs = zip(*(maps(torch.from_numpy(colour)[None], weights) for colour in colours), strict=True)
@@ -158,9 +150,8 @@ def plain_dists(image: np.ndarray, reference: np.ndarray) -> float:
 
 @pytest.mark.parametrize(
     ("name", "sides"),
-    [("squeeze", (64, 64)), ("squeeze", (67, 53)), ("alex", (64, 64)), ("alex", (67, 53)), ("vgg", (37, 32)),
-     ("dists", (37, 32))],
-)  # fmt: skip
+    [("squeeze", (64, 64)), ("squeeze", (67, 53)), ("vgg", (37, 32)), ("dists", (37, 32))],
+)
 def test_agrees_with_a_plain_computation(name: str, sides: tuple[int, int], folder: Path) -> None:
     image, reference = pair(*sides)
     metric, planes = load(name, folder), [a[0, 0].double().numpy() for a in (image, reference)]
@@ -192,7 +183,7 @@ def test_each_pair_of_a_batch_has_its_own_value(metric: Lpips | Dists) -> None:
 def test_the_gradient_is_that_of_the_value(folder: Path) -> None:
     image, reference = (a.double() for a in pair(33, 33))
     step = torch.from_numpy(np.random.default_rng(1).standard_normal(image.shape)) * 1e-6
-    for name in ("alex", "dists"):
+    for name in ("squeeze", "dists"):
         metric, at = load(name, folder).double(), image.clone().requires_grad_()
         metric(at, reference).sum().backward()
         assert at.grad is not None
@@ -232,7 +223,7 @@ def test_dead_features_keep_the_gradient_finite(metric: Lpips | Dists) -> None:
     assert value.isfinite().all()
 
 
-@pytest.mark.parametrize(("network", "smallest"), [("squeeze", 17), ("alex", 31), ("vgg", 16), ("dists", 16)])
+@pytest.mark.parametrize(("network", "smallest"), [("squeeze", 17), ("vgg", 16), ("dists", 16)])
 def test_the_smallest_image(network: str, smallest: int, folder: Path) -> None:
     metric = load(network, folder)
     assert metric(*pair(smallest, smallest)).isfinite().all()
@@ -249,7 +240,7 @@ def test_images_of_different_shapes_are_refused(metric: Lpips | Dists) -> None:
 
 @pytest.mark.parametrize(
     ("file", "total"),
-    [("lpips-squeeze", 173.4387), ("lpips-alex", 105.2754), ("lpips-vgg", 131.8555), ("dists", 1.0)],
+    [("lpips-squeeze", 173.4387), ("lpips-vgg", 131.8555), ("dists", 1.0)],
 )
 def test_published_weights_are_whole(file: str, total: float) -> None:
     tensors = load_file(PUBLISHED / f"{file}.safetensors").values()
@@ -319,7 +310,7 @@ def test_a_pickle_inside_npz_is_refused_and_never_run(tmp_path: Path) -> None:
     assert not (tmp_path / "trace").exists()
 
 
-@pytest.mark.parametrize("name", ["vgg16-397923af.pth", "alexnet.pt"])
+@pytest.mark.parametrize("name", ["vgg16-397923af.pth", "vgg16.pt"])
 def test_a_pickled_file_is_refused_with_the_way_out(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"PK")
     with pytest.raises(ModelError, match=r"convert it where you trust it: .*save_file") as error:
@@ -337,9 +328,9 @@ def test_where_a_backbone_is_looked_for(tmp_path: Path, folder: Path, monkeypatc
         monkeypatch.setenv(WEIGHTS_VARIABLE, str(place))
         assert find_backbone("vgg") == file
         assert find_backbone("vgg", tmp_path) is None
-    assert find_backbone("alex") is None  # the variable names VGG16's file
+    assert find_backbone("squeeze") is None  # the variable names VGG16's file
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "nowhere"))
-    assert [find_backbone(network) for network in BACKBONES] == [None] * 3
+    assert [find_backbone(network) for network in BACKBONES] == [None] * 2
     for network, stem in STEMS.items():
         assert not_found(network).startswith(f"weights not found: no {stem}*.safetensors or {stem}*.npz")
 
