@@ -53,15 +53,6 @@ def rows(path: Path) -> np.ndarray:
         return source.read(0, source.raster.height_px)
 
 
-def test_bytes_that_unpack_to_more_than_their_place_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where imagecodecs is missing: with it, the decoder is told the size."""
-    monkeypatch.setattr("beers_deploy.model.io.tiff.find_spec", lambda _: None)
-    path = tiff(tmp_path / "bomb.tif", zlib.compress(bytes(50_000_000), 9), compression=8)
-    refused(path, ImageError, "unpack to more")
-
-
 @pytest.mark.parametrize("compression", [34712, 50002, 34925, 34887, 50001])
 def test_compressions_that_size_themselves_are_refused(compression: int, tmp_path: Path) -> None:
     refused(tiff(tmp_path / "a.tif", GREY.tobytes(), compression=compression), ImageError, "compression known")
@@ -84,11 +75,11 @@ def test_a_size_that_is_no_whole_number_is_refused(tmp_path: Path) -> None:
     whole, broken = struct.pack("<HHII", 257, 4, 1, 16), struct.pack("<HHIf", 257, 11, 1, 16.0)
     assert whole in path.read_bytes()
     path.write_bytes(path.read_bytes().replace(whole, broken))
-    refused(path, ImageError, "whole numbers")
+    refused(path, ImageError, "readable|whole numbers")
     path = tiff(tmp_path / "b.tif", GREY.tobytes())
     many = struct.pack("<HHII", 257, 4, 20, 8)  # a list, of what stands at the file's begin
     path.write_bytes(path.read_bytes().replace(whole, many))
-    refused(path, ImageError, "whole numbers|readable")
+    refused(path, ImageError, "readable")
 
 
 def test_an_image_too_long_to_be_planned_is_refused(tmp_path: Path) -> None:
