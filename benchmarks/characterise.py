@@ -19,7 +19,6 @@ import numpy as np
 import tifffile
 import torch
 
-from beers_deploy.export import torch_network
 from beers_deploy.model.family import LEAST_ALONG, SensorFamily
 from beers_deploy.model.io.images import list_images
 from beers_deploy.model.metrics.edge_blur import AxisMtf
@@ -28,6 +27,7 @@ from beers_deploy.model.metrics.slanted_edge import slanted_edge
 from beers_deploy.model.simulator.acquire import acquire, fitting_oversampling
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.sampling import Scene, crop_divisible, read_scene, scene_spectrum
+from beers_deploy.parity import torch_network
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument

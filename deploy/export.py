@@ -4,7 +4,7 @@ Also how any float network is had as ONNX: from an ONNX file or from weights, wh
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 import onnx
@@ -13,16 +13,12 @@ from beers_deploy import __version__
 from beers_deploy.model.bank import FILTERS, LARGEST, in_places, network_bank
 from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.tensors import Arrays, Weights, read_conditioned, read_plain
-from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, load_onnx, make_model
-from beers_deploy.quant.session import open_session, run
 
 if TYPE_CHECKING:
-    from beers_deploy.model.convbeers import ConvBEERS, OfOneSensor
-
-MAX_DIFFERENCE = 1e-5
-"""Of full scale: a twentieth of a digital number, above what float32 summation order explains."""
+    from beers_deploy.model.convbeers import ConvBEERS
 
 
 def float_for(path: Path, name: str, sensor: Sensor, tile_px: int | None = None) -> onnx.ModelProto:
@@ -122,35 +118,6 @@ def _arrays(network: "Weights | ConvBEERS") -> Arrays:
     return {name: value.numpy() for name, value in network.state_dict().items()}
 
 
-def parity(network: "ConvBEERS | OfOneSensor", model: Path | onnx.ModelProto, side_px: int) -> float:
-    """Largest absolute difference between torch and onnxruntime on one random image, in [0, 1] of full scale.
-
-    The image's side is the next multiple of the network's scale.
-    """
-    import torch  # seconds to load, and a restoration begins with what this module writes
-
-    side_px += -side_px % network.variant.scale
-    image = np.random.default_rng(0).random((1, 1, side_px, side_px), dtype=np.float32)
-    with torch.inference_mode():
-        expected = network(torch.from_numpy(image)).numpy()
-    with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused
-        difference = float(np.abs(run(open_session(model), image) - expected).max())
-    if not np.isfinite(difference):
-        expected_text, remedy = "finite pixels on a random image", "train it again with a lower learning rate"
-        raise ModelError("network", expected=expected_text, got="NaN or infinity", remedy=remedy)
-    return difference
-
-
-def require_parity(network: "ConvBEERS | OfOneSensor", model: Path | onnx.ModelProto, side_px: int) -> float:
-    """As `parity`, and small."""
-    difference = parity(network, model, side_px)
-    if difference > MAX_DIFFERENCE:
-        expected = f"at most {MAX_DIFFERENCE:g} of full scale from torch"
-        remedy = "report it: the export is wrong"
-        raise ModelError("exported network", expected=expected, got=f"{difference:g}", remedy=remedy)
-    return difference
-
-
 def _conv(writer: GraphWriter, name: str, source: str) -> str:
     feeds = [source, f"{name}.weight", f"{name}.bias"]
     return writer.node("Conv", name, feeds, pads=[1] * 4, kernel_shape=[3, 3])
@@ -176,13 +143,3 @@ def about(variant: str, recipe: dict[str, object], sensor: str | None = None) ->
         "sensor": sensor if sensor is not None else str(recipe.get("degraded", "")),
         "reference": str(recipe.get("reference", "")),
     }
-
-
-def torch_network(path: Path, sensor: Instrument | None = None) -> "ConvBEERS | OfOneSensor":
-    """The network of torch that an exported one must compute as: of weights, for a sensor where they need one."""
-    from beers_deploy.model.convbeers import BankedConvBEERS, OfOneSensor, network_of, vector_tensor
-
-    network = network_of(read_plain(path) if sensor is None else read_conditioned(path))
-    if sensor is not None and isinstance(network, BankedConvBEERS):
-        return OfOneSensor(network, vector_tensor(sensor), network_bank(sensor))
-    return cast("ConvBEERS", network)  # what `read_plain` read

@@ -25,11 +25,11 @@ import onnx
 import onnxruntime as ort
 
 from beers_deploy.export import float_for, float_model, require_tile
-from beers_deploy.model.bank import REFERENCE, bank_of_vector, network_bank
-from beers_deploy.model.family import RANGES, sensor_vector
+from beers_deploy.model.bank import network_bank
+from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.files import sha256
-from beers_deploy.model.io.tensors import is_conditioned, read_conditioned
-from beers_deploy.model.progress import Log, no_log, progress
+from beers_deploy.model.io.tensors import is_conditioned
+from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
 from beers_deploy.profiles.errors import ModelError, OptionError, OutsideRangeWarning, optional
 from beers_deploy.profiles.figures import Row
@@ -37,8 +37,7 @@ from beers_deploy.profiles.sensor import Sensor, numbers_of
 from beers_deploy.profiles.sensor_file import BLIND, load_sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.profiles.toml import unreadable
-from beers_deploy.quant.banked.family import FAMILY, required_family, with_delta
-from beers_deploy.quant.core import SHIFTS, Shifts
+from beers_deploy.quant.banked.family import required_family, with_delta
 from beers_deploy.quant.encodings import board_model, host_model, read_core, vint8_model
 from beers_deploy.quant.onnx_file import fixed_tile_px, is_quantised, load_onnx, metadata, read_onnx, save_onnx
 from beers_deploy.quant.reading.external import network_sha256
@@ -52,13 +51,6 @@ if TYPE_CHECKING:
     import torch
 
     from beers_deploy.quant.quantise import Quantised
-
-WEIGHTS = "weights_sha256"
-"""In the metadata of an INT8 network behind a bank: the SHA-256 of its float weights."""
-
-SEED = 0
-"""Of calibration, on drawn scenes: what `quantize` takes where nothing else is asked for."""
-
 
 NetworkLike = Union["Network", onnx.ModelProto, "torch.nn.Module", str, os.PathLike[str]]
 SensorLike = Sensor | str | os.PathLike[str]
@@ -396,26 +388,3 @@ def told_by_delta(model: onnx.ModelProto, delta: Path) -> onnx.ModelProto:
         raise ModelError(str(delta), expected="a delta", got=got, remedy=remedy) from error
     core, name = with_delta(required_family(model).core, packed)
     return host_model(core, {**metadata(model), "sensor": name}, fixed_tile_px(model))
-
-
-def family_model(
-    network: Conditioned, images: Path | None = None, seed: int = SEED, shifts: Shifts = SHIFTS
-) -> onnx.ModelProto:
-    """The INT8 file of a network behind a bank, for the middle of the family; any sensor can be told to it.
-
-    Args:
-        network: of weights that 'train --conditioned' wrote.
-        images: folder of scenes that the family sees while it is calibrated; None draws some.
-        seed: of the patches.
-        shifts: the windows of the target.
-    """
-    from beers_deploy.model.simulator.procedural import load_scenes  # SciPy, which a restoration does without
-    from beers_deploy.quant.banked.calibrate import family_images, quantise_family
-
-    weights = read_conditioned(network.weights)
-    scenes, scale = load_scenes(images, load_sensor(REFERENCE).nominal(), seed), weights.variant.scale
-    with progress(f"calibrating {network.name} over the family of sensors") as log:
-        seen, middle = family_images(scenes, scale, seed), bank_of_vector((0.0,) * len(RANGES))
-        family = quantise_family(weights, middle, seen, shifts, log)
-    said = {"variant": network.name, "reference": REFERENCE, "precision": "int8 legal", "calibration_seed": str(seed)}
-    return host_model(family.core, {**said, FAMILY: family.to_words(), WEIGHTS: sha256(network.weights)})

@@ -9,16 +9,22 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import onnx
 
 from beers_deploy.dpu.board import BoardLike
+from beers_deploy.model.bank import REFERENCE, bank_of_vector
+from beers_deploy.model.family import RANGES
+from beers_deploy.model.io.files import sha256
+from beers_deploy.model.io.tensors import read_conditioned
 from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.model.progress import progress as begun
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.network import Conditioned, Network, NetworkLike, SensorLike, conditioned, family_model, told_int8
+from beers_deploy.network import Conditioned, Network, NetworkLike, SensorLike, conditioned, told_int8
 from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile, board_names, npu_names
-from beers_deploy.quant.core import IntCore, Shifts, target_shifts
-from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
+from beers_deploy.quant.core import SHIFTS, IntCore, Shifts, target_shifts
+from beers_deploy.quant.encodings import host_model, read_core
 from beers_deploy.quant.free import quantise_free
 from beers_deploy.quant.gate import compare, gate_row
 from beers_deploy.quant.integer.reference import integer_rows
@@ -200,3 +206,26 @@ def sensitivity_report(
     layers = layer_error_rows(result, held_out)
     rows = [gate_row(found), *layers, *(worst_row(k, held_out, spread) for k in worst), sizes_row(spread)]
     return rows, sensitivity_page(headline(found, layers), [*rows, *more], spread, held_out, sessions, worst)
+
+
+def family_model(
+    network: Conditioned, images: Path | None = None, seed: int = 0, shifts: Shifts = SHIFTS
+) -> onnx.ModelProto:
+    """The INT8 file of a network behind a bank, for the middle of the family; any sensor can be told to it.
+
+    Args:
+        network: of weights that 'train --conditioned' wrote.
+        images: folder of scenes that the family sees while it is calibrated; None draws some.
+        seed: of the patches.
+        shifts: the windows of the target.
+    """
+    from beers_deploy.model.simulator.procedural import load_scenes  # SciPy, which samples of one's own do without
+    from beers_deploy.quant.banked.calibrate import family_images, quantise_family
+
+    weights = read_conditioned(network.weights)
+    scenes, scale = load_scenes(images, load_sensor(REFERENCE).nominal(), seed), weights.variant.scale
+    with begun(f"calibrating {network.name} over the family of sensors") as log:
+        seen, middle = family_images(scenes, scale, seed), bank_of_vector((0.0,) * len(RANGES))
+        family = quantise_family(weights, middle, seen, shifts, log)
+    said = {"variant": network.name, "reference": REFERENCE, "precision": "int8 legal", "calibration_seed": str(seed)}
+    return host_model(family.core, {**said, FAMILY: family.to_words(), WEIGHTS: sha256(network.weights)})

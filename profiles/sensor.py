@@ -19,6 +19,8 @@ from beers_deploy.profiles.effects import Effect, Offset, Table, draw_effect, mi
 from beers_deploy.profiles.errors import ProfileError
 from beers_deploy.profiles.response import PointSpread, Response
 
+MAX_DN = 4095
+"""The largest digital number of 12 bits: full scale, unless a sensor says otherwise."""
 MTF_NYQUIST_MAX = 2 / math.pi
 """A perfect lens over a square detector: sinc(0.5). Nothing above it is a blur: its gamma would be negative."""
 

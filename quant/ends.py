@@ -10,7 +10,7 @@ import numpy as np
 from onnx import TensorProto, helper
 
 from beers_deploy.model.bank import SIDE_PX, UNIT_STEPS
-from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.quant.banked.filters import ANALYTIC_COPIES, BITS, MIDDLE_DN, PART, STEP_DN, split_planes
 from beers_deploy.quant.graph import (
     COARSE_MAX,

@@ -18,8 +18,9 @@ import numpy as np
 import onnx
 
 from beers_deploy.model.io.files import IMAGE_SUFFIXES
-from beers_deploy.model.io.images import MAX_DN, read_pixels
+from beers_deploy.model.io.images import read_pixels
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
+from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.profiles.toml import unreadable
 from beers_deploy.quant.onnx_file import fixed_tile_px
 from beers_deploy.quant.tiling.walk import tiling_of

@@ -14,9 +14,8 @@ import onnx
 import onnxruntime as ort
 from onnx import TensorProto, helper
 
-from beers_deploy.model.io.images import MAX_DN
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.sensor import MAX_DN, Instrument
 from beers_deploy.quant.core import IntConv, IntCore, dequantised, rounded_to
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.gate import GateResult

@@ -54,7 +54,7 @@ def export(
     An INT8 file of conditioned weights (--network FILE.onnx) is told another sensor without being calibrated anew.
     --delta writes what the sensor changes, and --apply makes the file of any sensor that sensor's, to the byte.
     """
-    from beers_deploy.export import about, float_for, require_parity, to_onnx, torch_network
+    from beers_deploy.export import about, float_for, to_onnx
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.io.tensors import is_conditioned, read_plain
     from beers_deploy.network import warn_outside, weights_file, weights_named
@@ -88,6 +88,8 @@ def export(
         save_onnx(model, out)
         say(f"wrote {out}")
         return
+    from beers_deploy.parity import require_parity, torch_network  # it takes torch, which shipped ones do without
+
     difference = require_parity(torch_network(path, known.nominal() if known else None), model, tile or 97)
     save_onnx(model, out)
     say(f"wrote {out}: largest difference from torch {difference:.2g} of full scale (measured)")

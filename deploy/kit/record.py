@@ -12,10 +12,10 @@ from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.io.tensors import read_conditioned
 from beers_deploy.model.shipped import shipped_names, shipped_weights
-from beers_deploy.network import WEIGHTS, Network
+from beers_deploy.network import Network
 from beers_deploy.profiles.errors import optional
 from beers_deploy.profiles.figures import Row
-from beers_deploy.quant.banked.family import FAMILY
+from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.samples import CALIBRATED_ON

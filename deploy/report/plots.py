@@ -18,8 +18,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from markupsafe import Markup
 
-from beers_deploy.model.io.images import MAX_DN
 from beers_deploy.profiles.figures import number
+from beers_deploy.profiles.sensor import MAX_DN
 
 if TYPE_CHECKING:
     from matplotlib.axis import Axis

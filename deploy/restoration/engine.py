@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beers_deploy.model.io.images import MAX_DN, remedy_outside
+from beers_deploy.model.io.images import remedy_outside
 from beers_deploy.profiles.errors import ImageError, ModelError
+from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.quant.tiling.walk import Tiling
 from beers_deploy.quant.untrusted import times
 from beers_deploy.restoration.outcome import Tally

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beers_deploy.model.io.images import MAX_DN, Extent, settled_scale
+from beers_deploy.model.io.images import Extent, settled_scale
 from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.restoration.source import Raster
 
 

@@ -16,7 +16,7 @@ from beers_deploy.dpu.checker.placement import Placement
 from beers_deploy.dpu.checker.table import check
 from beers_deploy.library import restore
 from beers_deploy.model.io.files import whole_file
-from beers_deploy.model.io.images import MAX_DN, read_acquisition, read_pixels
+from beers_deploy.model.io.images import read_acquisition, read_pixels
 from beers_deploy.model.io.pictures import busiest_windows, picture_url, stretch_of, strip
 from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.metrics.fidelity import fidelity_db, ssim
@@ -30,6 +30,7 @@ from beers_deploy.network import Network
 from beers_deploy.profiles import Sensor, load_sensor
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row, measured
+from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.profiles.sensor_file import reference_for
 from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
 from beers_deploy.quant.onnx_file import load_onnx

@@ -16,10 +16,9 @@ from PIL import Image
 from beers_deploy.model.io.files import IMAGE_SUFFIXES, TIFF_SUFFIXES
 from beers_deploy.model.io.tiff import check_page, image_pages, open_tiff
 from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, OptionError, sizes
+from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.profiles.toml import read_whole, unreadable
 
-MAX_DN = 4095
-"""The largest digital number of 12 bits: full scale, unless a sensor says otherwise."""
 FRAME_NUMBERS = re.compile(r"(_[0-9a-f]*\d[0-9a-f]*)+$")
 """What a name ends in that tells frames of one site apart: _0034, _5dded5bc_23."""
 

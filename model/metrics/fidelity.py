@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from beers_deploy.model.io.images import MAX_DN
 from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.sensor import MAX_DN
 
 SSIM_SIGMA_PX, SSIM_RADIUS_PX = 1.5, 5
 MIN_SIDE_PX = 2 * SSIM_RADIUS_PX + 1

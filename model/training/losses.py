@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from beers_deploy.model.io.images import MAX_DN
 from beers_deploy.model.metrics.perceptual import Lpips
+from beers_deploy.profiles.sensor import MAX_DN
 
 
 @dataclass(frozen=True)

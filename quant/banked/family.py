@@ -25,6 +25,8 @@ from beers_deploy.quant.graph import PLANES, Op
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.untrusted import contradictions
 
+WEIGHTS = "weights_sha256"
+"""In the metadata of an INT8 network behind a bank: the SHA-256 of its float weights."""
 FAMILY = "family"
 """In the metadata of an INT8 file: what tells it another sensor."""
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beers_deploy.model.bank import FILTERS, SIDE_PX, UNIT_STEPS, Bank, in_places
-from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.profiles.sensor import MAX_DN
 
 STEP_DN, MIDDLE_DN, PART = 16, 2048, 2
 """Of the planes: the coarse ones' step and their zero, and by what the last divides the remainder."""

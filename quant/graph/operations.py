@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.profiles.sensor import MAX_DN
 
 IMAGE, CORRECTION = "image", "correction"
 """What a network reads, and what its last operation writes."""

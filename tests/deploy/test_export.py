@@ -8,11 +8,12 @@ import torch
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import network_of
-from beers_deploy.export import banked_to_onnx, float_for, parity, require_parity, to_onnx, torch_network
+from beers_deploy.export import banked_to_onnx, float_for, to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, arrays, grow, load_network, save_network, vector_tensor
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.shipped import shipped_names, shipped_weights
 from beers_deploy.model.variants import VARIANTS, Variant
+from beers_deploy.parity import parity, require_parity, torch_network
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.onnx_file import fixed_tile_px, metadata, save_onnx

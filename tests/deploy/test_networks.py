@@ -15,7 +15,6 @@ from beers_deploy.model.io.files import sha256
 from beers_deploy.model.progress import once
 from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
 from beers_deploy.network import (
-    WEIGHTS,
     float_file,
     int8_file,
     network_file,
@@ -28,6 +27,7 @@ from beers_deploy.profiles.errors import ModelError, ProfileError
 from beers_deploy.profiles.sensor import numbers_of
 from beers_deploy.profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
 from beers_deploy.quant.banked import calibrate
+from beers_deploy.quant.banked.family import WEIGHTS
 from beers_deploy.quant.onnx_file import load_onnx, metadata
 from tests.deploy.command_line import done, refused
 from tests.profiles.own_sensor import own_sensor

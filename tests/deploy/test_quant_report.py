@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from beers_deploy.export import to_onnx
-from beers_deploy.model.io.images import MAX_DN
 from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.profiles.sensor_file import reference_for
 from beers_deploy.quant.calibration import draw_patches
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx

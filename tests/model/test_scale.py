@@ -5,8 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from beers_deploy.model.io.images import MAX_DN, UNIT_MAX, Extent, extent_of, settled_scale
+from beers_deploy.model.io.images import UNIT_MAX, Extent, extent_of, settled_scale
 from beers_deploy.profiles.errors import BeersError, ImageError, OptionError
+from beers_deploy.profiles.sensor import MAX_DN
 
 
 def settled(kind: str, *largest: float, asked: float | None = None) -> float:

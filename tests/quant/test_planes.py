@@ -1,6 +1,6 @@
 import numpy as np
 
-from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.quant.graph import QUARTER, STEP, split
 
 

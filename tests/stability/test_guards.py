@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from beers_deploy.model.io.images import MAX_DN
+from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, split
 from beers_deploy.quant.integer.reference import SOUND, Faults, merged_correction, run_core

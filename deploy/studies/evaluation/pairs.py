@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from beers_deploy.model.dataset import PairsRecipe
-from beers_deploy.model.io.images import MAX_DN, read_acquisition, site_of
+from beers_deploy.model.io.images import read_acquisition, site_of
 from beers_deploy.model.simulator import acquire
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.patches import pair_files
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Instrument, Sensor
+from beers_deploy.profiles.sensor import MAX_DN, Instrument, Sensor
 
 OVERSAMPLINGS = (4, 2)
 

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from scipy.special import stdtrit
 
-from beers_deploy.model.io.images import MAX_DN
 from beers_deploy.model.metrics.bootstrap import site_interval
 from beers_deploy.model.metrics.fidelity import fidelity_db, ssim
 from beers_deploy.model.metrics.perceptual import Dists, Lpips, find_backbone, not_found
@@ -26,7 +25,7 @@ from beers_deploy.model.simulator.acquire import acquire
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.profiles.figures import Figure, Row, measured, published, unavailable
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.sensor import MAX_DN, Instrument
 from beers_deploy.studies.evaluation.methods import Method
 from beers_deploy.studies.evaluation.pairs import NamedPair
 

@@ -1,0 +1,53 @@
+"""An exported network held to the one of torch that it was made of."""
+
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import onnx
+import torch
+
+from beers_deploy.model.bank import network_bank
+from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, OfOneSensor, network_of, vector_tensor
+from beers_deploy.model.io.tensors import read_conditioned, read_plain
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.quant.session import open_session, run
+
+MAX_DIFFERENCE = 1e-5
+"""Of full scale: a twentieth of a digital number, above what float32 summation order explains."""
+
+
+def torch_network(path: Path, sensor: Instrument | None = None) -> ConvBEERS | OfOneSensor:
+    """The network of torch that an exported one must compute as: of weights, for a sensor where they need one."""
+    network = network_of(read_plain(path) if sensor is None else read_conditioned(path))
+    if sensor is not None and isinstance(network, BankedConvBEERS):
+        return OfOneSensor(network, vector_tensor(sensor), network_bank(sensor))
+    return cast(ConvBEERS, network)  # what `read_plain` read
+
+
+def parity(network: ConvBEERS | OfOneSensor, model: Path | onnx.ModelProto, side_px: int) -> float:
+    """Largest absolute difference between torch and onnxruntime on one random image, in [0, 1] of full scale.
+
+    The image's side is the next multiple of the network's scale.
+    """
+    side_px += -side_px % network.variant.scale
+    image = np.random.default_rng(0).random((1, 1, side_px, side_px), dtype=np.float32)
+    with torch.inference_mode():
+        expected = network(torch.from_numpy(image)).numpy()
+    with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused
+        difference = float(np.abs(run(open_session(model), image) - expected).max())
+    if not np.isfinite(difference):
+        expected_text, remedy = "finite pixels on a random image", "train it again with a lower learning rate"
+        raise ModelError("network", expected=expected_text, got="NaN or infinity", remedy=remedy)
+    return difference
+
+
+def require_parity(network: ConvBEERS | OfOneSensor, model: Path | onnx.ModelProto, side_px: int) -> float:
+    """As `parity`, and small."""
+    difference = parity(network, model, side_px)
+    if difference > MAX_DIFFERENCE:
+        expected = f"at most {MAX_DIFFERENCE:g} of full scale from torch"
+        remedy = "report it: the export is wrong"
+        raise ModelError("exported network", expected=expected, got=f"{difference:g}", remedy=remedy)
+    return difference
