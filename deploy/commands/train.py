@@ -43,29 +43,13 @@ def train(
         typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."),
     ] = None,
     drawn: Annotated[int, typer.Option(min=0, max=1000, help="Drawn scenes to add to the images.")] = 0,
-    rough: Annotated[
-        float,
-        typer.Option(
-            min=0,
-            max=0.5,
-            help="Share of patches of strong contrast between pixels, to be left as they are: keeps "
-            "a network calm on what no sensor makes.",
-        ),
-    ] = 0.0,
     steps: Annotated[int, typer.Option(min=1, help="Gradient steps.")] = 20_000,
     batch: Annotated[int, typer.Option(min=1, max=4096, help="Patches a step and worker.")] = 8,
     patch: Annotated[int, typer.Option(min=17, max=2048, help="Patch side in pixels.")] = 96,
     learning_rate: Annotated[float, typer.Option(min=0, help="Highest learning rate.")] = 1e-3,
-    optimiser: Annotated[str, typer.Option(help="adam or adamw.")] = "adam",
     l1_weight: Annotated[float, typer.Option(min=0, help="Weight of L1 in the loss.")] = 1.0,
-    l2_weight: Annotated[
-        float, typer.Option(min=0, help="Weight of L2 in the loss; some 100 for the highest PSNR.")
-    ] = 0.0,
     lpips_weight: Annotated[float, typer.Option(min=0, help="Weight of LPIPS in the loss.")] = 0.5,
     fft_weight: Annotated[float, typer.Option(min=0, help="Weight of the L1 of spectra in the loss.")] = 0.1,
-    radiance_weight: Annotated[
-        float, typer.Option(min=0, help="Weight of the error of patches' means in the loss.")
-    ] = 0.0,
     psnr_weight: Annotated[
         float, typer.Option(min=0, help="Weight of the patches' mean PSNR in the loss; 0.01 without L1.")
     ] = 0.0,
@@ -75,8 +59,6 @@ def train(
     start: Annotated[
         Path | None, typer.Option(help="Weights to go on from; those of a smaller network grow.")
     ] = None,
-    teacher: Annotated[Path | None, typer.Option(help="Weights of a network to imitate (distilling).")] = None,
-    distil: Annotated[float, typer.Option(min=0, help="Weight of the distance to the teacher.")] = 1.0,
     validate_every: Annotated[int, typer.Option(min=0, help="Steps between validations; 0 for none.")] = 1000,
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard scalars too.")] = False,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
@@ -93,12 +75,10 @@ def train(
     GPUs: start it with torchrun. --conditioned weights become the network of any sensor in range; --start and
     --teacher then take such weights, and plain ones without.
     """
-    from typing import get_args
-
     from beers_deploy.model.dataset import profiles_for, read_pairs_recipe
     from beers_deploy.model.family import SensorFamily
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.model.training.checkpoint import Optimiser, TrainingRecipe
+    from beers_deploy.model.training.checkpoint import TrainingRecipe
     from beers_deploy.model.training.losses import LossWeights
     from beers_deploy.model.training.patches import PatchRecipe
     from beers_deploy.model.training.run import FILES, Run
@@ -106,32 +86,28 @@ def train(
     from beers_deploy.model.training.trainer import joined
     from beers_deploy.network import weights_file
 
-    if optimiser not in get_args(Optimiser):
-        raise OptionError("--optimiser", expected="adam or adamw", got=repr(optimiser), remedy="pick one")
-    if pairs is not None and (images is not None or drawn or rough):
-        expected, remedy = "no --images, --drawn or --rough beside it", "leave one out"
+    if pairs is not None and (images is not None or drawn):
+        expected, remedy = "neither --images nor --drawn beside it", "leave one out"
         raise OptionError("--pairs", expected=expected, got="both", remedy=remedy)
     if conditioned and pairs is not None:
         remedy = "leave one out: stored pairs do not say what sensor each had"
         raise OptionError("--conditioned", expected="no --pairs beside it", got="both", remedy=remedy)
     _refuse_unused(context)
     stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
-    start, teacher = (weights_file(path) if path else None for path in (start, teacher))
-    read = (*stored, lpips, start, teacher, *(Path(name) for name in (sensor, reference) if name))
+    start = weights_file(start) if start else None
+    read = (*stored, lpips, start, *(Path(name) for name in (sensor, reference) if name))
     require_writable(*(out / name for name in (*FILES, f"{variant}.safetensors")), inputs=read)
     recipe = TrainingRecipe(
         steps=steps,
         batch=batch,
         learning_rate=learning_rate,
-        optimiser=optimiser,  # type: ignore[arg-type]
-        loss=LossWeights(l1_weight, l2_weight, lpips_weight, fft_weight, radiance_weight, psnr_weight),
-        distil=distil if teacher else 0.0,
+        loss=LossWeights(l1_weight, lpips_weight, fft_weight, psnr_weight),
         seed=seed,
     )
     made = read_pairs_recipe(pairs) if pairs else None
     degraded, wanted = profiles_for(sensor or (None if made else RANGE), reference, made, say)
     family = SensorFamily(degraded.nominal()) if conditioned else None
-    patches = PatchRecipe(degraded, wanted, patch_px=patch, rough=rough, family=family)
+    patches = PatchRecipe(degraded, wanted, patch_px=patch, family=family)
     run = Run(
         variant,
         recipe,
@@ -142,9 +118,7 @@ def train(
         drawn,
         lpips,
         start,
-        teacher,
         validate_every,
-        tensorboard,
         device,
         precision.value,
     )
@@ -160,9 +134,6 @@ def _refuse_unused(context: typer.Context) -> None:
     if context.params["images"] is None:
         expected = "--images, of which whole sites are held out, beside it"
         refuse(context, ["validate_every"], expected=expected, got="no images: nothing to validate on", remedy=remedy)
-    if context.params["teacher"] is None:
-        expected, got = "--teacher beside it", "no network to imitate"
-        refuse(context, ["distil"], expected=expected, got=got, remedy=remedy)
     if not context.params["lpips_weight"]:
         expected, got = "a weight of LPIPS in the loss", "--lpips-weight 0"
         refuse(context, ["lpips"], expected=expected, got=got, remedy="leave one of the two out")

@@ -6,7 +6,7 @@ That is safetensors, with all that an exact resume needs; nothing is unpickled.
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,8 +16,6 @@ from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.tensors import all_finite, read_tensors
 from beers_deploy.model.training.losses import PAPER, LossWeights
 from beers_deploy.profiles.errors import ModelError, OptionError
-
-Optimiser = Literal["adam", "adamw"]
 
 
 @dataclass(frozen=True)
@@ -31,10 +29,7 @@ class TrainingRecipe:
         warm_up_steps: of a linear rise from 0.
         gradient_norm: larger gradients are cut to it; the L1 loss of a restoration is small, far above is a burst.
         ema_decay: of the running average of the weights, which is what is shipped.
-        weight_decay: of AdamW.
-        optimiser: "adam" or "adamw".
         loss: weights of the loss's terms.
-        distil: weight of the L1 distance to a teacher's output; 0 without a teacher.
         seed: of the first weights and of the patches.
 
     Raises:
@@ -47,14 +42,11 @@ class TrainingRecipe:
     warm_up_steps: int = 200
     gradient_norm: float = 0.1
     ema_decay: float = 0.999
-    weight_decay: float = 1e-4
-    optimiser: Optimiser = "adam"
     loss: LossWeights = PAPER
-    distil: float = 0.0
     seed: int = 0
 
     def __post_init__(self) -> None:
-        numbers = {"learning rate": self.learning_rate, "weight of the teacher": self.distil}
+        numbers = {"learning rate": self.learning_rate}
         numbers |= {f"weight of {term} in the loss": weight for term, weight in asdict(self.loss).items()}
         for name, value in numbers.items():
             if not (math.isfinite(value) and value >= 0):

@@ -23,15 +23,13 @@ class LossWeights:
     """How much each term counts; a term of weight 0 is not computed."""
 
     l1: float = 1.0
-    l2: float = 0.0
     lpips: float = 0.5
     fft: float = 0.1
-    radiance: float = 0.0
     psnr: float = 0.0
 
     def total(self, perceptual: bool = True) -> float:
         """The sum of the weights, that of LPIPS only where it is computed."""
-        return self.l1 + self.l2 + self.fft + self.radiance + self.psnr + (self.lpips if perceptual else 0.0)
+        return self.l1 + self.fft + self.psnr + (self.lpips if perceptual else 0.0)
 
 
 PAPER = LossWeights()
@@ -61,7 +59,7 @@ class RestorationLoss:
             restored, reference = restored.float(), reference.float()
             terms = {"l1": (restored - reference).abs().mean()}
             total = weights.l1 * terms["l1"]
-            for name, term in {"l2": mse, "fft": fft_l1, "radiance": radiance_l1, "psnr": log_mse}.items():
+            for name, term in {"fft": fft_l1, "psnr": log_mse}.items():
                 if weight := getattr(weights, name):
                     terms[name] = term(restored, reference)
                     total = total + weight * terms[name]
@@ -69,11 +67,6 @@ class RestorationLoss:
                 terms["lpips"] = self.perceptual(restored, reference).mean()
                 total = total + weights.lpips * terms["lpips"]
         return total, {name: term.detach() for name, term in terms.items()}
-
-
-def mse(restored: Tensor, reference: Tensor) -> Tensor:
-    """Mean squared difference of images of one shape."""
-    return (restored - reference).square().mean()
 
 
 def log_mse(restored: Tensor, reference: Tensor) -> Tensor:
@@ -87,17 +80,6 @@ def log_mse(restored: Tensor, reference: Tensor) -> Tensor:
     """
     squares = ((restored - reference) * MAX_DN).square().mean((1, 2, 3))
     distance: Tensor = torch.log1p(squares).mean()
-    return distance
-
-
-def radiance_l1(restored: Tensor, reference: Tensor) -> Tensor:
-    """Mean over the batch of the distance between the means of two patches.
-
-    Args:
-        restored: (N, 1, H, W) float32.
-        reference: the same shape.
-    """
-    distance: Tensor = (restored - reference).mean((1, 2, 3)).abs().mean()
     return distance
 
 

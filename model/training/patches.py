@@ -32,7 +32,6 @@ class PatchRecipe:
         oversamplings: ratios to draw from; every ratio shows the same ground at another scale.
         exposures: darker and brighter days than the photograph's.
         margin_px: target pixels cropped on each side.
-        rough: share of patches that no sensor makes; see `roughened`.
         family: draws the sensors instead of `degraded`; each patch then comes with the vector of its sensor.
     """
 
@@ -42,7 +41,6 @@ class PatchRecipe:
     oversamplings: tuple[int, ...] = (2, 3, 4, 5)
     exposures: tuple[float, float] = (0.5, 1.25)
     margin_px: int = 16
-    rough: float = 0.0
     family: SensorFamily | None = None
 
     def __post_init__(self) -> None:
@@ -108,7 +106,7 @@ class PatchSource:
             if count >= wanted:
                 # Mixed, because neighbours of one scene would make a batch whose gradient knows one scene.
                 order = generator.permutation(count)[:wanted]
-                patches = roughened(np.concatenate(pieces)[order], self.recipe.rough, generator)
+                patches = np.concatenate(pieces)[order]
                 pair = np.ascontiguousarray(patches[:, :1]), np.ascontiguousarray(patches[:, 1:])
                 return (*pair, np.concatenate(vectors)[order]) if self.recipe.family else pair
         expected = f"scenes that hold a patch of {self.recipe.patch_px} target pixels"
@@ -189,31 +187,6 @@ def turned(patches: np.ndarray, quarter: int, mirrored: bool) -> np.ndarray:
     """Patches (..., P, P) turned by quarters, then mirrored."""
     rotated = np.rot90(patches, quarter, (-2, -1))
     return rotated[..., ::-1] if mirrored else rotated
-
-
-LEAST_CONTRAST = 0.25
-"""Between neighbouring pixels of a rough patch, of full scale: more than any sensor trained on lets through."""
-
-
-def roughened(patches: np.ndarray, share: float, generator: np.random.Generator) -> np.ndarray:
-    """Pairs (N, 2, P, P) of which a share, at random, became contrast between pixels that is to be left as it is.
-
-    No sensor makes such images, but faults do, and a network that never saw one may answer with black: at half
-    resolution a checkerboard is four even planes. Both images of such a pair are the same.
-    """
-    chosen = generator.permutation(len(patches))[: round(share * len(patches))]
-    if len(chosen):
-        patches[chosen] = np.stack([_rough_image(patches.shape[-1], generator) for _ in chosen])[:, None]
-    return patches
-
-
-def _rough_image(side_px: int, generator: np.random.Generator) -> np.ndarray:
-    """Checkerboard, rows, columns or noise of two values in [0, 1], (P, P) float32."""
-    rows, columns = np.indices((side_px, side_px))
-    kinds = (rows + columns) % 2, rows % 2, columns % 2, generator.integers(0, 2, rows.shape)
-    contrast = float(generator.uniform(LEAST_CONTRAST, 1))
-    low = float(generator.uniform(0, 1 - contrast))
-    return np.asarray(low + contrast * kinds[generator.integers(len(kinds))], np.float32)
 
 
 RESCALE = "rescale it to the digital numbers of the sensor that made the pairs"

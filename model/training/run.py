@@ -4,12 +4,10 @@ RUN/checkpoint.safetensors  RUN/log.csv  RUN/validation.csv  RUN/validation.png 
 """
 
 import csv
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -28,13 +26,10 @@ from beers_deploy.model.training.patches import PatchRecipe, PatchSource, Stored
 from beers_deploy.model.training.trainer import Batches, Precision, Schedule, Trainer, Worker
 from beers_deploy.model.training.validation import Validation, split_by_site
 from beers_deploy.model.variants import Variant, variant_named
-from beers_deploy.profiles.errors import MissingExtraError, ModelError, OptionError
+from beers_deploy.profiles.errors import ModelError, OptionError
 
 STEP = re.compile(r"[0-9]{1,18}(?=,)")
 """What a line of a log begins with."""
-
-if TYPE_CHECKING:
-    from torch.utils.tensorboard import SummaryWriter
 
 VALIDATION_CROP_PX, ZOOM = 96, 2
 
@@ -55,9 +50,7 @@ class Run:
     drawn: int = 0
     lpips: Path | None = None
     start: Path | None = None
-    teacher: Path | None = None
     validate_steps: int = 1000
-    tensorboard: bool = False
     device: str = "cpu"
     precision: Precision = "float32"
 
@@ -84,15 +77,15 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
             that are no multiple of the network's scale.
         KeyboardInterrupt: stopped; a checkpoint was written.
     """
-    teacher, variant = _given(run, run.teacher) if run.teacher else None, variant_named(run.variant)
-    require_whole_places(run, [variant, *([teacher.variant] if teacher else [])])
+    variant = variant_named(run.variant)
+    require_whole_places(run, variant)
     loss, said = loss_of(run)
     if said and worker.first:
         say(said)
     generator = torch.Generator().manual_seed(run.recipe.seed)
     start = grow(_given(run, run.start), variant, generator) if run.start else None
     conditioned = run.patches.family is not None
-    trainer = Trainer(variant, run.recipe, loss, worker, run.device, start, teacher, run.precision, conditioned)
+    trainer = Trainer(variant, run.recipe, loss, worker, run.device, start, run.precision, conditioned)
     if loss.perceptual is not None:
         loss.perceptual.to(trainer.device)
     if resume:
@@ -107,11 +100,10 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
         finish(trainer.averaged(), run.weights, recipe)
 
 
-def require_whole_places(run: Run, variants: Sequence[Variant]) -> None:
-    """Refuse patches that a network at a lower resolution, or a teacher at one, cannot rearrange."""
-    scale = math.lcm(*(variant.scale for variant in variants))
-    if run.patches.patch_px % scale:
-        expected = f"a multiple of {scale} px, for a network at 1/{scale} resolution"
+def require_whole_places(run: Run, variant: Variant) -> None:
+    """Refuse patches that a network at a lower resolution cannot rearrange."""
+    if run.patches.patch_px % variant.scale:
+        expected = f"a multiple of {variant.scale} px, for a network at 1/{variant.scale} resolution"
         raise OptionError("patch", expected=expected, got=f"{run.patches.patch_px} px", remedy="choose another")
 
 
@@ -177,13 +169,11 @@ def read_scenes(run: Run) -> list[Scene]:
 def _train(run: Run, trainer: Trainer, batches: Batches, validation: Validation) -> None:
     log = Log(run.out / "log.csv", trainer.step)
     scores = Log(run.out / "validation.csv", trainer.step)
-    board = tensorboard(run.out) if run.tensorboard and trainer.worker.first else None
     with steps("training", run.recipe.steps) as bar:
         bar.advance(trainer.step)
 
         def report(step: int, terms: Mapping[str, float], patches_per_s: float) -> None:
             log.write(step, {**terms, "patches_per_s": patches_per_s})
-            _scalars(board, step, terms)
             shown = ", ".join(f"{name} {value:.5f}" for name, value in terms.items())
             bar.advance(step - bar.done, f"{shown}, {patches_per_s:.0f} patches/s in {run.precision}")
 
@@ -191,7 +181,6 @@ def _train(run: Run, trainer: Trainer, batches: Batches, validation: Validation)
             require_finite_output(network, f"training step {step}")
             judged = validation.judge(network)
             scores.write(step, judged)
-            _scalars(board, step, judged)
             write_picture(validation, network, run.out / "validation.png")
 
         every = run.validate_steps if validation.pairs else 0
@@ -218,22 +207,6 @@ class Log:
             lines.writerow([step, *(f"{value:.6g}" for value in values.values())])
 
 
-def tensorboard(out: Path) -> "SummaryWriter":
-    """A writer of TensorBoard scalars in the run's folder."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        remedy = "pip install 'beers-deploy[tensorboard]'"
-        raise MissingExtraError("tensorboard", expected="TensorBoard", got="none installed", remedy=remedy) from error
-    return SummaryWriter(str(out / "tensorboard"))
-
-
-def _scalars(board: "SummaryWriter | None", step: int, values: Mapping[str, float]) -> None:
-    if board is not None:
-        for name, value in values.items():
-            board.add_scalar(name, value, step)
-
-
 def write_picture(validation: Validation, network: Network, path: Path) -> None:
     """The busiest crop of each validation image: degraded, restored, reference."""
     rows: list[list[np.ndarray]] = []
@@ -256,13 +229,11 @@ def about(run: Run, images: Sequence[str], held_out: Sequence[str], loss: Restor
         "training": asdict(run.recipe),
         "lpips": "squeeze" if loss.perceptual is not None else "left out: no weights",
         "start": run.start.name if run.start else "drawn weights",
-        "teacher": run.teacher.name if run.teacher else "none",
         "degraded": patches.degraded.name if patches.family is None else "drawn over the ranges",
         "reference": patches.reference.name,
         "patch_px": patches.patch_px,
         "oversamplings": patches.oversamplings if run.pairs is None else "as stored",
         "exposures": patches.exposures if run.pairs is None else "as stored",
-        "rough": patches.rough,
         "images": list(images),
         "held_out": list(dict.fromkeys(held_out)),
     }

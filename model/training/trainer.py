@@ -1,4 +1,4 @@
-"""The steps of a run: Adam or AdamW, warm-up and cosine, clipped gradients, averaged weights, on several processes.
+"""The steps of a run: Adam, warm-up and cosine, clipped gradients, averaged weights, on several processes.
 
 Batches are keyed by (seed, step): a run that was killed and resumed ends with the same weights as one that was not.
 """
@@ -103,7 +103,6 @@ class Trainer:
         worker: this process among those of the run.
         device: where the steps are computed.
         start: a network of the same kind and size to go on from; None draws new weights.
-        teacher: a network of the same kind whose outputs the recipe's `distil` weighs.
         precision: what the body is computed in; it is the machine's, and a resumed run may take another.
         conditioned: whether the network is given the sensor of each patch.
     """
@@ -116,13 +115,12 @@ class Trainer:
         worker: Worker | None = None,
         device: str = "cpu",
         start: Network | None = None,
-        teacher: Network | None = None,
         precision: Precision = "float32",
         conditioned: bool = False,
     ) -> None:
         self.recipe, self.worker = recipe, worker or Worker()
         self.loss, self.device = loss or RestorationLoss(recipe.loss), self.worker.device(device)
-        require_loss(self.loss, recipe.distil if teacher is not None else 0.0)
+        require_loss(self.loss)
         self.step, self.guards = 0, Guards()
         self.network: Network = (BankedConvBEERS if conditioned else ConvBEERS)(variant)
         initialise(self.network, torch.Generator().manual_seed(recipe.seed))
@@ -132,9 +130,8 @@ class Trainer:
         self.bfloat16 = precision == "bfloat16"
         # Gradients are averaged over the workers.
         self.forward: nn.Module = self.network if self.worker.count == 1 else DistributedDataParallel(self.network)
-        self.teacher = teacher.to(self.device) if teacher is not None else None
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
-        self.optimiser = _optimiser(self.network, recipe)
+        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=recipe.learning_rate)
 
     def run(self, batches: Batches, checkpoint: Path, schedule: Schedule) -> None:
         """Train to the last step. Ctrl-C leaves a checkpoint of the last whole step.
@@ -197,14 +194,7 @@ class Trainer:
         return terms
 
     def _loss(self, degraded: Tensor, reference: Tensor, *vectors: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-        restored = self.forward(degraded, *vectors, bfloat16=self.bfloat16)
-        total, terms = self.loss(restored, reference)
-        if self.teacher is None:
-            return total, terms
-        with torch.no_grad():
-            wanted = self.teacher(degraded, *vectors, bfloat16=self.bfloat16)
-        distance = (restored - wanted).abs().mean()
-        return total + self.recipe.distil * distance, {**terms, "teacher": distance.detach()}
+        return self.loss(self.forward(degraded, *vectors, bfloat16=self.bfloat16), reference)
 
     def _average(self) -> None:
         # Early on the average follows fast, or the first random weights would stay in it for long.
@@ -244,16 +234,10 @@ class Trainer:
             self.optimiser.state[parameter] = {"step": tensors[f"moment.{name}.step"], **moments}
 
 
-def require_loss(loss: RestorationLoss, distil: float) -> None:
+def require_loss(loss: RestorationLoss) -> None:
     """Refuse a loss that is 0 whatever the network gives: such a run learns nothing."""
-    if loss.weights.total(loss.perceptual is not None) + distil > 0:
+    if loss.weights.total(loss.perceptual is not None) > 0:
         return
     left_out = ", and none but LPIPS, which lacks its weights" if loss.weights.lpips else ""
-    remedy = "raise one of `l1_weight`, `l2_weight`, `fft_weight`, `radiance_weight`, `psnr_weight`"
+    remedy = "raise one of `l1_weight`, `fft_weight`, `psnr_weight`"
     raise OptionError("loss", expected="a term of weight above 0", got=f"weights of 0{left_out}", remedy=remedy)
-
-
-def _optimiser(network: Network, recipe: TrainingRecipe) -> torch.optim.Optimizer:
-    if recipe.optimiser == "adamw":
-        return torch.optim.AdamW(network.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
-    return torch.optim.Adam(network.parameters(), lr=recipe.learning_rate)

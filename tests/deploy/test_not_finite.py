@@ -38,7 +38,6 @@ TRAINING = f"--variant {VARIANT} --drawn 1 --steps 2 --batch 1 --patch 24 --vali
 OF_WEIGHTS = [
     "export --network {0} --out {1}/float.onnx",
     f"train --start {{0}} {TRAINING}",
-    f"train --teacher {{0}} {TRAINING}",
     "quantize {0} --out {1}/int8.onnx",
     f"gate {{0}} {INT8} --json {{1}}/g.json",
 ]

@@ -16,7 +16,7 @@ from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.response import MtfTable, PointSpread, packed
 from beers_deploy.profiles.sensor import Instrument
-from tests.model.training.sources import small_scene, source
+from tests.model.training.sources import source
 
 
 def test_the_same_seed_gives_the_same_batches_from_anywhere() -> None:
@@ -112,24 +112,6 @@ def test_the_pair_shows_the_same_ground() -> None:
     degraded, reference = next(source().batches())
     for one, other in zip(degraded, reference, strict=True):
         assert np.corrcoef(one.ravel(), other.ravel())[0, 1] > 0.7
-
-
-def test_rough_patches_are_a_share_of_strong_contrast_left_as_it_is() -> None:
-    recipe, scene = replace(source().recipe, rough=0.25), small_scene()
-    made, again = (PatchSource([scene], recipe, batch=4, seed=0).batches() for _ in range(2))
-    batches = [next(made) for _ in range(PatchSource.SHARD_BATCHES)]
-    assert all(np.array_equal(a, b) for pair in batches[:2] for a, b in zip(pair, next(again), strict=True))
-    degraded, reference = map(np.concatenate, zip(*batches, strict=True))
-    same = (degraded == reference).all((1, 2, 3))
-    assert int(same.sum()) == len(degraded) / 4
-    rough, natural = degraded[same], degraded[~same]
-    assert ((rough >= 0) & (rough <= 1)).all()
-    assert (np.ptp(rough, (1, 2, 3)) > 0.2499).all()
-    assert all(len(np.unique(patch)) == 2 for patch in rough)
-    assert all(len(np.unique(patch)) > 2 for patch in natural)
-    plain, _ = next(PatchSource([scene], replace(recipe, rough=0.0), batch=4, seed=0).batches())
-    unchanged = (batches[0][0] == plain).all((1, 2, 3))
-    assert np.array_equal(~unchanged, same[:4]), "the others are as they were"
 
 
 def test_scenes_too_small_for_a_patch_are_refused() -> None:
