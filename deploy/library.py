@@ -171,12 +171,9 @@ def _restore_path(image: Path, options: Options, job: Job, out: str | os.PathLik
         raise OptionError("out", expected="a path beside an image file", got="none", remedy=remedy)
     path = Path(out)
     if job.method == TRADITIONAL:
-        from beers_deploy.restoration.traditional import Request, restore_file_traditionally  # it takes torch
+        from beers_deploy.restoration.traditional import restore_file_traditionally  # it takes torch
 
-        request = Request(
-            job.sensor, job.sensor.reference, options.full_scale, again=options.again, strict=options.strict
-        )
-        row = restore_file_traditionally(image, path, request, no_log)
+        row = restore_file_traditionally(image, path, replace(options, sensors={"": job.sensor}), no_log)
     else:
         row = restore_file(image, path, options, no_log)
     arguments = {"method": job.method, "sensor": job.sensor.name, "tile": options.tile_px, "halo": options.halo}

@@ -1,5 +1,6 @@
 """`beers-deploy restore`: a raw image in, the restored one out, of any size."""
 
+from dataclasses import replace
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -10,7 +11,8 @@ import typer
 from beers_deploy.commands.shared import arguments, refuse, save, say
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.sensor_file import BLIND, reference_for
+from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.restoration.options import TILE_PX, Compression, Options, Runtime
 
 EXAMPLE = "restore raw.tif restored.tif"
@@ -99,10 +101,20 @@ def restore(
     sensors = parse_sensors(sensor or BLIND)
     profiles = (Path(each) for each in sensors.values()) if sensor else ()
     require_writable(out, json, stac, inputs=(image, network, *profiles))
+    how = Options(
+        full_scale=full_scale,
+        compression=compression,
+        memory_bytes=budget_bytes,
+        trust_index=trust_index,
+        strict=strict,
+        again=again,
+    )
     if method is Method.traditional:
         expected, remedy = "none with --method traditional", "leave it out"
         refuse(context, NETWORK_ONLY, expected=expected, got="one", remedy=remedy)
-        _by_the_chain(image, out, sensor, full_scale, compression, budget_bytes, trust_index, again, strict, json)
+        row = _by_the_chain(image, out, sensor, how, json)
+        print_rows(f"wrote {out}", [row])
+        save(Table("restore", arguments(), (image,), (row,)), json)
         return
     if stac is not None:
         if not cog:
@@ -122,24 +134,19 @@ def restore(
     if len(bits) > 1 and full_scale is None:
         remedy = "give --full-scale, or restore such bands apart"
         raise OptionError("--sensor", expected="sensors of equal bits", got=f"{sorted(bits)}", remedy=remedy)
-    options = Options(
-        path,
-        tile,
-        halo,
-        full_scale,
-        runtime,
-        threads,
-        compression,
-        budget_bytes,
-        resume,
-        scheduler,
-        trust_index,
-        known if sensor else {},
-        strict,
-        cog,
-        again,
-        any_result,
-        {} if "" in paths else paths,
+    options = replace(
+        how,
+        model=path,
+        tile_px=tile,
+        halo=halo,
+        runtime=runtime,
+        threads=threads,
+        resume=resume,
+        scheduler=scheduler,
+        sensors=known if sensor else {},
+        cog=cog,
+        any_result=any_result,
+        bands={} if "" in paths else paths,
     )
     row = restore_file(image, out, options, say, (json, stac))
     if stac is not None:
@@ -148,27 +155,10 @@ def restore(
     save(Table("restore", arguments(sensor=sensor or BLIND), (*paths.values(), image), (row,)), json)
 
 
-def _by_the_chain(
-    image: Path,
-    out: Path,
-    sensor: str | None,
-    full_scale: float | None,
-    compression: Compression,
-    memory_bytes: int | None,
-    trust_index: bool,
-    again: bool,
-    strict: bool,
-    json: Path | None,
-) -> None:
-    from beers_deploy.restoration.traditional import Request, restore_file_traditionally
-    from beers_deploy.results import Table, print_rows
+def _by_the_chain(image: Path, out: Path, sensor: str | None, how: Options, json: Path | None) -> Row:
+    from beers_deploy.restoration.traditional import restore_file_traditionally
 
     if sensor is None:
         remedy = "name a profile ('beers-deploy profiles' lists them) or give your .toml file"
         raise OptionError("--sensor", expected="the sensor that acquired IN", got="none", remedy=remedy)
-    degraded = load_sensor(sensor)
-    how = full_scale, compression, memory_bytes, trust_index, again, strict
-    request = Request(degraded, reference_for(degraded), *how)
-    row = restore_file_traditionally(image, out, request, say, (json,))
-    print_rows(f"wrote {out}", [row])
-    save(Table("restore", arguments(), (image,), (row,)), json)
+    return restore_file_traditionally(image, out, replace(how, sensors={"": load_sensor(sensor)}), say, (json,))

@@ -42,10 +42,10 @@ class Compression(StrEnum):
 
 @dataclass(frozen=True)
 class Options:
-    """What a user can choose of a restoration by a network.
+    """What a user can choose of a restoration.
 
     Attributes:
-        model: the network's file.
+        model: the network's file; none of the traditional chain.
         tile_px: longest side of a tile.
         halo: 'exact', or pixels of context around a tile.
         full_scale: the pixel value that is 1.0 to the network; None leaves it to deploy.restoration.radiometry.
@@ -64,7 +64,7 @@ class Options:
         trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
     """
 
-    model: Path
+    model: Path = Path()
     tile_px: int = TILE_PX
     halo: str = "exact"
     full_scale: float | None = None

@@ -7,7 +7,6 @@ scale of the input.
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,7 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Row, measured
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.engine import RestoredRow, as_stored, checked_strip
-from beers_deploy.restoration.options import Compression
+from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.output import Checkpoint, only_run, require_codec, require_tiff_name, write_output
 from beers_deploy.restoration.plan import Span, check_memory
@@ -39,71 +38,47 @@ FIXED_BYTES, BYTES_PER_COLUMN = 100_000_000, 40_000
 Measured at 400 and 1200 columns: 75 MB and 30 kB."""
 
 
-@dataclass(frozen=True)
-class Request:
-    """What a user can choose of a restoration by the traditional chain.
-
-    Attributes:
-        sensor: the one that acquired the image, of which the middle of every range is taken.
-        reference: the one to imitate.
-        full_scale: the pixel value that is the sensor's highest digital number; None lets type and values decide.
-        compression: of the output.
-        memory_bytes: budget of the process; None is what is free.
-        trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
-        again: whether the image may be one that was restored already.
-        strict: whether an image is refused that contradicts its sensor.
-    """
-
-    sensor: Sensor
-    reference: Sensor
-    full_scale: float | None = None
-    compression: Compression = Compression.zlib
-    memory_bytes: int | None = None
-    trust_index: bool = False
-    again: bool = False
-    strict: bool = False
-
-    def chain(self) -> Chain:
-        """The chain from the sensor to the reference, both in the sensor's digital numbers."""
-        return Chain(self.sensor.nominal(), self.reference.in_units_of(self.sensor).nominal())
+def chain_of(sensor: Sensor) -> Chain:
+    """The chain from a sensor to its reference, in the middle of every range."""
+    return Chain(sensor.nominal(), sensor.reference.nominal())
 
 
 def restore_file_traditionally(
-    image: Path, out: Path, request: Request, log: Log, beside: Sequence[Path | None] = ()
+    image: Path, out: Path, options: Options, log: Log, beside: Sequence[Path | None] = ()
 ) -> Row:
-    """As `deploy.restoration.run.restore_file`, of a mono image and by the traditional chain."""
+    """As `deploy.restoration.run.restore_file`, of a mono image, by the traditional chain of its one sensor."""
     require_image_file(image)
     require_writable(out, inputs=(image,))
     require_tiff_name(out)
-    require_codec(request.compression)
+    require_codec(options.compression)
     with only_run(out):
-        return _restore(image, out, request, log, beside)
+        return _restore(image, out, options, log, beside)
 
 
-def _restore(image: Path, out: Path, request: Request, log: Log, beside: Sequence[Path | None]) -> Row:
-    started, chain = time.perf_counter(), request.chain()
-    with open_source(image, request.trust_index) as source:
+def _restore(image: Path, out: Path, options: Options, log: Log, beside: Sequence[Path | None]) -> Row:
+    started, sensor = time.perf_counter(), options.sensors[""]
+    chain = chain_of(sensor)
+    with open_source(image, options.trust_index) as source:
         require_writable(out, *beside, inputs=source.files)
         raster = source.raster
-        require_raw(str(image), raster.restored, request.again)
+        require_raw(str(image), raster.restored, options.again)
         if raster.bands > 1:
             remedy = "extract the band that the profile describes"
             raise ImageError(str(image), expected="one band", got=f"{raster.bands} bands", remedy=remedy)
         needed = FIXED_BYTES + BYTES_PER_COLUMN * raster.width_px + source.held_bytes(STRIP_PX)
-        check_memory(needed, request.memory_bytes, bulky=False)
+        check_memory(needed, options.memory_bytes, bulky=False)
         extents = (raster.extent(source.read(*rows)) for rows in _strips(raster.height_px))
-        bits = int(chain.degraded.max_dn).bit_length()
-        scale = full_scale_of(str(image), raster, extents, request.full_scale, bits)
-        check = told_sensor(source, {"": request.sensor}, scale.value, str(image), request.strict, log)
+        scale = full_scale_of(str(image), raster, extents, options.full_scale, options.sensor_bits)
+        check = told_sensor(source, options.sensors, scale.value, str(image), options.strict, log)
         job = {"image": list(fingerprint(source.files)), "method": "traditional"}
         checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, resume=False)
         try:
             _fill(checkpoint, source, chain, scale.value, str(image))
-            write_output(checkpoint, source, raster.tags, request.compression)
+            write_output(checkpoint, source, raster.tags, options.compression)
         except BaseException:  # a strip is no place to go on from: the chain looks hundreds of rows back
             checkpoint.remove()
             raise
-    return _row(image.name, raster, time.perf_counter() - started, request, scale, check)
+    return _row(image.name, raster, time.perf_counter() - started, sensor, scale, check)
 
 
 def _fill(checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: float, name: str) -> None:
@@ -139,7 +114,7 @@ def _strips(height_px: int) -> Iterator[tuple[int, int]]:
         yield start, min(start + STRIP_PX, height_px)
 
 
-def _row(name: str, raster: Raster, time_s: float, request: Request, scale: FullScale, check: SensorCheck) -> Row:
+def _row(name: str, raster: Raster, time_s: float, sensor: Sensor, scale: FullScale, check: SensorCheck) -> Row:
     source = f"from opening the image to the finished file, {torch.get_num_threads()} threads"
     figures = {
         "time": measured(time_s, "s", source),
@@ -147,5 +122,5 @@ def _row(name: str, raster: Raster, time_s: float, request: Request, scale: Full
         "peak memory": peak_memory(),
         **check.figures,
     }
-    text = {"method": "traditional", "sensor": request.sensor.name, **scale.text, **check.text}
+    text = {"method": "traditional", "sensor": sensor.name, **scale.text, **check.text}
     return Row("restore", name, figures, text)

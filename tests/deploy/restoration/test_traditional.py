@@ -1,7 +1,7 @@
 """The traditional chain on files: the pixels of the chain on the whole array, whatever the sensor."""
 
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,26 +12,27 @@ from beers_deploy.model.progress import no_log
 from beers_deploy.model.traditional.pipeline import restore_traditional
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError, MachineError
-from beers_deploy.restoration.traditional import Request, restore_file_traditionally
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.traditional import chain_of, restore_file_traditionally
 from tests.deploy.command_line import done, refused
 from tests.profiles.own_sensor import own_sensor
 
 SHAPE = (151, 67)
 
 
-def request() -> Request:
-    return Request(load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"))
+def request(**more: Any) -> Options:
+    return Options(**{"sensors": {"": load_sensor("pleiades-degraded")}, **more})
 
 
 def noise(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(300, 1500, SHAPE).astype(np.uint16)
 
 
-def of_array(pixels: np.ndarray, asked: Request) -> np.ndarray:
-    return restore_traditional(torch.from_numpy(pixels.astype(np.float32)), asked.chain()).numpy()
+def of_array(pixels: np.ndarray, asked: Options) -> np.ndarray:
+    return restore_traditional(torch.from_numpy(pixels.astype(np.float32)), chain_of(asked.sensors[""])).numpy()
 
 
-def of_file(folder: Path, pixels: np.ndarray, asked: Request, **written: object) -> np.ndarray:
+def of_file(folder: Path, pixels: np.ndarray, asked: Options, **written: object) -> np.ndarray:
     tifffile.imwrite(folder / "in.tif", pixels, **written)  # type: ignore[arg-type]
     row = restore_file_traditionally(folder / "in.tif", folder / "out.tif", asked, no_log)
     assert row.text["method"] == "traditional"
@@ -66,12 +67,12 @@ def test_missing_pixels_stay(tmp_path: Path) -> None:
 
 
 def test_the_output_has_the_scale_of_the_input_whatever_the_gain(tmp_path: Path) -> None:
-    mine = replace(request(), sensor=load_sensor(str(other_sensor(tmp_path))))
+    mine = request(sensors={"": load_sensor(str(other_sensor(tmp_path)))})
     (tmp_path / "files").mkdir()
     flat = np.full(SHAPE, 8000, np.uint16)
     restored = of_file(tmp_path / "files", flat, mine)
     assert abs(float(restored.mean()) / 8000 - 1) < 0.01
-    share = of_file(tmp_path / "files", (noise() / 4095).astype(np.float32), replace(request(), full_scale=1.0))
+    share = of_file(tmp_path / "files", (noise() / 4095).astype(np.float32), request(full_scale=1.0))
     np.testing.assert_allclose(share * 4095, of_array(noise(), request()), atol=0.5)
 
 
@@ -96,7 +97,7 @@ def test_what_it_cannot_restore_leaves_the_old_output(pixels: np.ndarray, words:
 
 def test_a_budget_that_does_not_suffice_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MachineError, match="memory"):
-        of_file(tmp_path, noise(), replace(request(), memory_bytes=1000))
+        of_file(tmp_path, noise(), request(memory_bytes=1000))
 
 
 def test_the_command_needs_a_sensor_and_no_option_of_a_network(tmp_path: Path) -> None:
