@@ -115,9 +115,6 @@ def optional(package: str, where: str) -> Any:
     Args:
         package: its module.
         where: the parameter or verb that needs it.
-
-    Raises:
-        MissingExtraError: it is not installed.
     """
     try:
         return import_module(package)

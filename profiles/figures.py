@@ -22,11 +22,7 @@ NOT_FINITE = "the result is not a finite number"
 
 @dataclass(frozen=True)
 class Figure:
-    """A finite number with its unit, its mode and its source, or none and the reason why.
-
-    Raises:
-        ValueError: NaN or infinity, which no reader could tell from a result.
-    """
+    """A finite number with its unit, its mode and its source, or none and the reason why."""
 
     value: float | None
     unit: str

@@ -30,11 +30,7 @@ def scene_names() -> list[str]:
 
 
 def load_scene_call(name: str) -> SceneCall:
-    """Read a shipped scene by name, or the user's own by the path of its .toml file.
-
-    Raises:
-        ProfileError: unknown name, wrong key or value, or an effect both added and forbidden.
-    """
+    """Read a shipped scene by name, or the user's own by the path of its .toml file."""
     label, raw = read_toml("scenes", name)
     check_keys(label, raw, required={"description", "radiance_scale"}, optional={"without", *TABLES})
     scale = read_constant(f"{label} radiance_scale", raw["radiance_scale"])

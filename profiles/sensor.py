@@ -52,9 +52,6 @@ class Instrument:
         radiance_1: of what is bright in its scenes, in W/m2/sr/um: the brighter point at which its SNR is stated.
         response: the blur in full, by a table or a point-spread function; its contrasts at Nyquist then stand in
             `mtf_nyquist` and `mtf_nyquist_along`. None for the formula's blur, which these two settle.
-
-    Raises:
-        ValueError: contrasts at Nyquist that are not those of the response.
     """
 
     mtf_nyquist: float

@@ -49,11 +49,7 @@ BLIND, BLIND_PROFILE = "blind", "pleiades-variable"
 
 
 def load_sensor(name: str) -> Sensor:
-    """Read a shipped sensor profile by name, or the user's own by the path of its .toml file; `blind` is one too.
-
-    Raises:
-        ProfileError: unknown name, wrong or missing key, or numbers that no instrument can have.
-    """
+    """Read a shipped sensor profile by name, or the user's own by the path of its .toml file; `blind` is one too."""
     shipped = BLIND_PROFILE if name == BLIND else name
     found = read_sensor(*read_toml("sensors", shipped), profile_path("sensors", shipped).parent)
     return replace(found, name=BLIND) if name == BLIND else found

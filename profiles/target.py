@@ -56,11 +56,7 @@ class TargetProfile:
 
     @classmethod
     def load(cls, board: "TargetProfile | str | os.PathLike[str]") -> Self:
-        """A shipped board by its name, the user's own by the path of its .toml file, or the board given.
-
-        Raises:
-            ProfileError: unknown name, or a table that is not made of constants.
-        """
+        """A shipped board by its name, the user's own by the path of its .toml file, or the board given."""
         if isinstance(board, cls):
             return board
         return cls(**vars(board if isinstance(board, TargetProfile) else load_target(os.fspath(board))))
@@ -70,19 +66,11 @@ class TargetProfile:
         return f"{type(self).__name__}({self.name!r}{builds})"
 
     def value(self, table: str, key: str) -> float:
-        """The single value of a constant that states no range.
-
-        Raises:
-            ProfileError: the profile lacks it.
-        """
+        """The single value of a constant that states no range."""
         return self.constant(table, key).low
 
     def constant(self, table: str, key: str) -> Constant:
-        """A constant with its range and source.
-
-        Raises:
-            ProfileError: the profile lacks it.
-        """
+        """A constant with its range and source."""
         try:
             return self.tables[table][key]
         except KeyError:
@@ -94,11 +82,7 @@ class TargetProfile:
             ) from None
 
     def configuration(self, name: str | None = None) -> tuple[str, dict[str, Constant]]:
-        """Name and constants of configuration `name`, or of the default one.
-
-        Raises:
-            ProfileError: no such configuration.
-        """
+        """Name and constants of configuration `name`, or of the default one."""
         chosen = name or self.default_configuration
         if chosen is None or chosen not in self.configurations:
             raise ProfileError(
@@ -134,9 +118,6 @@ def load_target(name: str) -> TargetProfile:
     """Read a shipped target profile by name, or the user's own by the path of its .toml file.
 
     A board's cost model has the name of the board: `vck190-model`, as `bench` calls it, is `vck190`.
-
-    Raises:
-        ProfileError: unknown name, or a table that is not made of constants.
     """
     label, raw = _with_base(*read_toml("targets", name.removesuffix(MODEL_SUFFIX)))
     special = {"description", "default_configuration", "configurations", "activations", "documents", "npu"}

@@ -53,10 +53,6 @@ def write_golden(
         tile: side of a tile in pixels; the network's own if it has one, else 64.
         board: whose way to round ties is taken.
         seed: of what is drawn.
-
-    Raises:
-        ModelError: a float network, or one that was not quantised under a DPU's rules here.
-        OptionError: a tile that the network does not take.
     """
     network, folder = Network.load(int8), Path(out)
     with faults_named(network.label):
@@ -192,10 +188,6 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
         folder: of the golden vectors.
         results: folders of the cases' names with files of the layers' names, any of them: int8, uint8 around 128,
             or float multiples of the tensor's scale; channels first, or last.
-
-    Raises:
-        OptionError: no golden vectors, or no results of theirs.
-        ImageError: results that are no such numbers, or of another shape.
     """
     golden, given = read_golden(Path(folder)), Path(results)
     seen = _results(golden, given)

@@ -46,9 +46,6 @@ def write_record(judged: Table, network: Network, folder: Path) -> None:
         judged: figures and checks, with the inputs that they rest on.
         network: that they speak of.
         folder: of the three files.
-
-    Raises:
-        MissingExtraError: cyclonedx-python-lib is not installed.
     """
     said, (document, page, bill) = record_of(judged, network), recorded(folder)
     write_text(document, json.dumps(said, indent=1) + "\n")

@@ -78,11 +78,7 @@ UNREAD = (".tfw", ".tifw", ".wld", ".jgw", ".pgw", ".j2w", ".RPB", ".rpb", "_RPC
 
 
 def of_sidecar(path: Path, raster: Raster) -> Raster:
-    """The raster with the nodata value that GDAL keeps in IMAGE.aux.xml, where the image has none of its own.
-
-    Raises:
-        ImageError: an offset there by which 0 is far from no light, bands of several nodata values, or no metadata.
-    """
+    """The raster with the nodata value that GDAL keeps in IMAGE.aux.xml, where the image has none of its own."""
     beside = path.with_name(f"{path.name}.aux.xml")
     if not beside.is_file():
         return raster

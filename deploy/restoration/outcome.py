@@ -128,11 +128,7 @@ class Tally:
         return found
 
     def require(self, name: str) -> None:
-        """Refuse what no restoration gives of an image, `name` in messages.
-
-        Raises:
-            ImageError: most results at an end of full scale, a mean far from the image's, or a constant result.
-        """
+        """Refuse what no restoration gives of an image, `name` in messages."""
         impossible = self.share_at_ends > MANY_AT_ENDS or abs(self.moved) > FAR or self.flat
         if self.known >= FEW and (impossible or self.clipped > MANY_AT_ENDS * max(self.compared, 1)):
             expected, got = "a network that restores this image", "; ".join(self.doubts)

@@ -90,9 +90,6 @@ class SensorCheck:
             sensor: its profile's name.
             strict: whether a contradiction is an error instead.
             log: is told of each.
-
-        Raises:
-            ImageError: with what was seen and what was told, where `strict`.
         """
         if self.doubts and strict:
             remedy = "name its own sensor, measure it with 'characterise', or leave `strict` out"
@@ -114,9 +111,6 @@ def told_sensor(
         name: of the image, for messages.
         strict: whether a contradiction is an error.
         log: is told of each otherwise.
-
-    Raises:
-        ImageError: a contradiction, where that is asked for.
     """
     if not sensors:
         return SensorCheck()

@@ -22,11 +22,7 @@ READ_SUFFIXES = IMAGE_SUFFIXES | {".onnx", ".safetensors", ".pth"}
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; rename it to `path` when the block ends well, else remove it.
-
-    Raises:
-        MachineError: no regular file stands there, the folder cannot be made or written to, or the disk is full.
-    """
+    """Yield a temporary path beside `path`; rename it to `path` when the block ends well, else remove it."""
     _require_regular(path)
     temporary = _part_of(path)
     try:
@@ -53,10 +49,6 @@ def require_writable(
         inputs: files that are read, and folders from which files are; what does not exist is passed over. A hard
             link or a symbolic link to an input is that input.
         folders: are to be filled with images whose names are not known yet: no image that is read may lie there.
-
-    Raises:
-        OptionError: an output that is an input, or another output.
-        MachineError: no regular file stands at a path, or its folder cannot be made or written to.
     """
     outputs, filled = ([path for path in given if path is not None] for given in (paths, folders))
     _require_apart(outputs, filled, inputs)

@@ -36,10 +36,6 @@ def read_pixels(path: Path) -> np.ndarray:
 
     scikit-image reads the same pixels through the same two libraries, but knows neither the free memory nor which
     formats start other programs, and answers damage with whatever error these libraries raise.
-
-    Raises:
-        ImageError: missing, empty, not an image, or holding NaN or infinity.
-        MachineError: too large for the free memory.
     """
     require_image_file(path)
     pixels = _read_tiff(path) if path.suffix.lower() in TIFF_SUFFIXES else _read_other(path)
@@ -94,11 +90,7 @@ def image_size_px(path: Path) -> tuple[int, int]:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files of a folder, sorted by name.
-
-    Raises:
-        ImageError: no such folder, or no image in it.
-    """
+    """The image files of a folder, sorted by name."""
     found = sorted(p for p in folder.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES) if folder.is_dir() else []
     if not found:
         got = "no image in it" if folder.is_dir() else "no such folder"
@@ -148,11 +140,7 @@ def _read_other(path: Path) -> np.ndarray:
 
 
 def read_alpha(path: Path) -> np.ndarray | None:
-    """The alpha (H, W) uint8 of a PNG; None where all of it is opaque.
-
-    Raises:
-        ImageError: a palette, whose numbers are no light, or colours of 16 bits, of which half would be lost.
-    """
+    """The alpha (H, W) uint8 of a PNG; None where all of it is opaque."""
     quiet = warnings.catch_warnings(action="ignore")
     with damage_in_a_sentence(path), quiet, Image.open(path, formats=("PNG", "JPEG")) as image:
         if image.mode in ("P", "PA"):
@@ -223,10 +211,6 @@ def settled_scale(
         asked: as the user gave it; None lets type and values decide.
         usual: the full scale of digital numbers.
         remedy: what to do about pixels that leave it open, where the caller has no --full-scale.
-
-    Raises:
-        ImageError: pixels that leave it open.
-        OptionError: a full scale that such pixels cannot have.
     """
     if asked is not None:
         check_scale(asked, dtype.kind)

@@ -45,11 +45,7 @@ OFFSET_DN = 40
 
 
 def image_pages(path: Path, file: tifffile.TiffFile) -> tuple[list[tifffile.TiffPage], tifffile.TiffPage | None]:
-    """The pages of the one image of a file, each of which holds bands of it, and the page of its mask, if any.
-
-    Raises:
-        ImageError: several images, or pixels that are no measure of light.
-    """
+    """The pages of the one image of a file, each of which holds bands of it, and the page of its mask, if any."""
     pages = [page for page in file.pages if isinstance(page, tifffile.TiffPage) and not page.subfiletype & REDUCED]
     masks = [page for page in pages if page.subfiletype & MASK or page.photometric == MASK_PHOTOMETRIC]
     images = [page for page in pages if page not in masks]

@@ -39,9 +39,6 @@ def ssim(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
         image: (H, W), at least 11 pixels a side.
         reference: (H, W).
         data_range: the span of legal values.
-
-    Raises:
-        ImageError: an image smaller than the window.
     """
     from skimage.metrics import structural_similarity  # here, for PSNR alone needs none of its half second
 

@@ -91,9 +91,6 @@ def simulate_pair(
 
     Returns:
         A pair of (..., H / r - 2 margin, W / r - 2 margin) images.
-
-    Raises:
-        ImageError: nothing would be left of the scene within the margin.
     """
     radiance = crop_divisible(radiance, oversampling)
     spectrum = scene_spectrum(radiance)

@@ -105,9 +105,6 @@ def read_scene(path: Path, sensor: Instrument) -> Scene:
        an assumption); white stands for the sensor's full scale.
     2. 16-bit mono TIFF or PNG: digital numbers, made radiance by the sensor's gain.
     3. float mono TIFF: radiance in W/m2/sr/um as it stands.
-
-    Raises:
-        ImageError: not an image, or pixels of another kind.
     """
     return scene_of(path.name, read_pixels(path), sensor)
 

@@ -68,9 +68,6 @@ def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Itera
     """Restore as `restore_traditional`, bit for bit, an image that comes and goes in strips of rows, (any, W) each.
 
     Holds some 700 rows of it, and the tallest strip.
-
-    Raises:
-        ImageError: infinite values; the stabiliser would make NaN of them, which means missing.
     """
     radiance = (to_radiance(strip, chain.degraded) for strip in finite_or_missing(strips))
     sensor, kernel, quality = with_rounding_noise(chain.degraded), chain.kernel(), quality_named(chain.quality)

@@ -31,9 +31,6 @@ class TrainingRecipe:
         ema_decay: of the running average of the weights, which is what is shipped.
         loss: weights of the loss's terms.
         seed: of the first weights and of the patches.
-
-    Raises:
-        OptionError: a number that is negative or not finite.
     """
 
     steps: int

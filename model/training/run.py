@@ -70,13 +70,7 @@ FILES = ("checkpoint.safetensors", "log.csv", "validation.csv", "validation.png"
 
 
 def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) -> None:
-    """Run or resume a training to its end; says first whether LPIPS is part of the loss.
-
-    Raises:
-        OptionError: the folder holds a run and `resume` is not asked for, there is nothing to train on, or patches
-            that are no multiple of the network's scale.
-        KeyboardInterrupt: stopped; a checkpoint was written.
-    """
+    """Run or resume a training to its end; says first whether LPIPS is part of the loss."""
     variant = variant_named(run.variant)
     require_whole_places(run, variant)
     loss, said = loss_of(run)
