@@ -101,11 +101,16 @@ def save_sensor(sensor: Sensor, path: Path) -> Path:
         np.save(samples, unpacked(response).astype(np.float32))
         psf = {"value": samples.name, **about}
         tables["mtf"] = {"psf": psf, "psf_samples_per_px": response.samples_per_px}
-    lines = [f"description = {_toml(sensor.description)}"]
+    path.write_text(sensor_toml(sensor.description, tables), encoding="utf-8")
+    return path
+
+
+def sensor_toml(description: str, tables: Mapping[str, Mapping[str, object]]) -> str:
+    """The text of a sensor's file, of its tables as plain values."""
+    lines = [f"description = {_toml(description)}"]
     for name, table in tables.items():
         lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in table.items())]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path
+    return "\n".join(lines) + "\n"
 
 
 def _toml(value: object) -> str:

@@ -4,7 +4,6 @@ What pixels tell is measured, with intervals: blur by straight edges, noise by t
 (gain, ground sampling distance, and bits unless pixels are clipped at full scale) is asked for or assumed.
 """
 
-import json
 import math
 import os
 import re
@@ -22,10 +21,11 @@ from beers_deploy.model.metrics.edge_blur import AxisMtf, EdgeBlur
 from beers_deploy.model.metrics.noise_line import Blocks, NoiseModel, cut_blocks, fit_noise_model, join
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.progress import Progress, reporting
+from beers_deploy.profiles.constant import Status
 from beers_deploy.profiles.errors import ImageError, OptionError, printable
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.sensor import Sensor, snr_0_bounds
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor_file import load_sensor, sensor_toml
 from beers_deploy.restoration.sensor_check import NOISE_KEPT
 from beers_deploy.restoration.source import open_source
 from beers_deploy.results import Table, input_of
@@ -342,67 +342,63 @@ def _rise(region: np.ndarray) -> float:
 
 
 def profile_toml(found: Characterised) -> str:
-    """The profile as its TOML file, intervals and doubts as comments."""
-    images, stated = _named(found.images), found.stated
-    source = "given" if stated["bits"] else f"pixels clipped at {2**found.bits - 1} in {images}"
-    ratio = f"full scale {2**found.bits - 1} DN = {FULL_SCALE_RADIANCE:g} W/m2/sr/um; state the gain"
-    doubt = "# pixels do not tell the gain; to a network only noise over full scale matters, which is measured"
-    lines = [
-        f"description = {_text(f'Measured on {images}.')}",
-        "",
-        "[grid]",
-        _given("gsd_m", stated["gsd_m"], GSD_M, "no pixel depends on it; state it"),
-        _constant("oversampling", f"{OVERSAMPLING}", "assumed", "for simulations alone: scene pixels a pixel"),
-        "",
-        "[mtf]",
-        *_mtf_lines(found, images),
-        "",
-        *_noise_lines(found, images),
-        "",
-        "[digitiser]",
-        _constant("bits", str(found.bits), "stated" if stated["bits"] else "measured", source),
-        *([doubt] if stated["gain"] is None else []),
-        _given("gain_dn_per_radiance", stated["gain"], found.gain, ratio),
-    ]
-    return "\n".join(lines) + "\n"
+    """The profile as its TOML file; the source of what was measured has its interval, and any doubt."""
+    images, stated, full_scale = printable(_named(found.images)), found.stated, 2**found.bits - 1
+    clipped = "given" if stated["bits"] else f"pixels clipped at {full_scale} in {images}"
+    gain = (
+        f"full scale {full_scale} DN = {FULL_SCALE_RADIANCE:g} W/m2/sr/um; pixels do not tell the gain, and to a "
+        "network only noise over full scale matters"
+    )
+    tables: dict[str, dict[str, object]] = {
+        "grid": {
+            "gsd_m": _given(stated["gsd_m"], GSD_M, "no pixel depends on it; state it"),
+            "oversampling": _said(OVERSAMPLING, "assumed", "for simulations alone: scene pixels a pixel"),
+        },
+        "mtf": _mtf_table(found, images),
+        "noise": _noise_table(found, images),
+        "digitiser": {
+            "bits": _said(found.bits, "stated" if stated["bits"] else "measured", clipped),
+            "gain_dn_per_radiance": _given(stated["gain"], found.gain, gain),
+        },
+    }
+    return sensor_toml(f"Measured on {images}.", tables)
 
 
-def _mtf_lines(found: Characterised, images: str) -> Iterator[str]:
-    if len(found.axes) == 1:
-        seen, missing = sorted(AXES, key=lambda name: name not in found.axes)
-        yield f"# measured {seen} the track alone: no edge shows the MTF {missing} it"
-    for key, axis in zip(("mtf_nyquist", "mtf_nyquist_along"), found.axes.values(), strict=False):
+def _mtf_table(found: Characterised, images: str) -> dict[str, object]:
+    """Of an axis that no edge shows there is nothing: it then has the other's."""
+    table = dict[str, object]()
+    for key, (name, axis) in zip(("mtf_nyquist", "mtf_nyquist_along"), found.axes.items(), strict=False):
         low, high = axis.interval
         edges = f"{axis.edges} edge{'' if axis.edges == 1 else 's'}"
-        yield f"# 95 % interval {low:.3g} to {high:.3g}, {edges}"
+        source = f"{edges} in {images} {name} the track, 95 % interval {low:.3g} to {high:.3g}"
+        if len(found.axes) == 1:
+            source += "; no edge shows the other axis"
         if not low <= axis.nearest <= high:
-            yield f"# the curve is not the profile's, whose nearest one has {axis.nearest:.3g}"
-        yield _constant(key, f"{axis.mtf_nyquist:.4g}", "measured", f"{edges} in {images}")
+            source += f"; the curve is not the profile's, whose nearest one has {axis.nearest:.3g}"
+        table[key] = _said(float(f"{axis.mtf_nyquist:.4g}"), "measured", source)
+    return table
 
 
-def _noise_lines(found: Characterised, images: str) -> Iterator[str]:
+def _noise_table(found: Characterised, images: str) -> dict[str, object]:
+    """The SNRs are linear ratios without the rounding to whole DN; the darker one is kept within physics."""
     dark, bright = (dn / found.gain for dn in found.noise.measured_dn)
-    yield "[noise] # SNR is the linear ratio L / sigma; the rounding to whole DN is not in it, and 0 DN is dark"
-    yield f"# measured on {found.noise.blocks} blocks of 16 x 16, from {dark:.3g} to {bright:.3g} W/m2/sr/um"
     low, high = found.snrs
     bounds = snr_0_bounds(low.radiance, high.radiance, high.value)
     inside = min(max(low.value, bounds[0] * (1 + MARGIN)), bounds[1] * (1 - MARGIN))
+    blocks, table = f"{found.noise.blocks} blocks of 16 x 16 in {images}", dict[str, object]()
     for number, (snr, value, part) in enumerate(zip(found.snrs, (inside, high.value), PARTS, strict=True)):
-        yield _constant(f"radiance_{number}", f"{snr.radiance:.10g}", "inferred", f"1/{part} of full scale")
-        beyond = "; extrapolated" if snr.extrapolated else ""
-        yield f"# 95 % interval {snr.interval[0]:.3g} to {snr.interval[1]:.3g}{beyond}"
-        yield _constant(f"snr_{number}", f"{value:.8g}", "measured", f"{found.noise.blocks} blocks of {images}")
+        beyond = f"; extrapolated from {dark:.3g} to {bright:.3g} W/m2/sr/um" if snr.extrapolated else ""
+        source = f"{blocks}, 95 % interval {snr.interval[0]:.3g} to {snr.interval[1]:.3g}{beyond}"
+        table[f"radiance_{number}"] = _said(float(f"{snr.radiance:.10g}"), "inferred", f"1/{part} of full scale")
+        table[f"snr_{number}"] = _said(float(f"{value:.8g}"), "measured", source)
+    return table
 
 
-def _given(key: str, given: float | None, otherwise: float, why: str) -> str:
-    status, source = ("assumed", why) if given is None else ("stated", "given on the command line")
-    return _constant(key, f"{otherwise if given is None else given:.10g}", status, source)
+def _given(given: float | None, otherwise: float, why: str) -> dict[str, object]:
+    if given is None:
+        return _said(float(f"{otherwise:.10g}"), "assumed", why)
+    return _said(given, "stated", "given on the command line")
 
 
-def _constant(key: str, value: str, status: str, source: str) -> str:
-    return f'{key} = {{ value = {value}, status = "{status}", source = {_text(source)} }}'
-
-
-def _text(words: str) -> str:
-    """A TOML string: JSON's are, as long as every character can be printed."""
-    return json.dumps(printable(words), ensure_ascii=False)
+def _said(value: float, status: Status, source: str) -> dict[str, object]:
+    return {"value": value, "status": status, "source": source}
