@@ -180,47 +180,21 @@ def _trimmed(samples: Samples) -> Samples:
 
 
 def _read_samples(where: str, path: Path) -> Samples:
-    """The samples of a .npy or TIFF file, (H, W)."""
-    reader = {".npy": _open_npy, ".tif": _open_tiff, ".tiff": _open_tiff}.get(path.suffix.lower())
-    reason = unreadable(path) if reader else f"one that ends in {path.suffix!r}"
-    if reader is None or reason:
+    """The samples of a .npy file, (H, W)."""
+    reason = unreadable(path) if path.suffix.lower() == ".npy" else f"one that ends in {path.suffix!r}"
+    if reason:
         remedy = "check the path, which counts from the profile's folder"
-        raise ProfileError(where, expected="a .npy or .tif file", got=str(reason), remedy=remedy)
+        raise ProfileError(where, expected="a .npy file", got=reason, remedy=remedy)
     try:
-        found = reader(path)
-        _check_shape(where, found)
+        found = np.load(path, mmap_mode="r", allow_pickle=False)  # nothing is read before its shape is known
+        if (
+            found.ndim != 2
+            or found.dtype.kind not in "iuf"
+            or not 1 <= min(found.shape) <= max(found.shape) <= FILE_SIDE
+        ):
+            raise ValueError(f"{found.dtype} of shape {found.shape}")
         return np.asarray(found, np.float64)
-    except ProfileError:
-        raise
     except Exception as error:  # whatever the bytes of a damaged file lead to
-        got, remedy = str(error) or type(error).__name__, "write it as a plain array of numbers, (rows, columns)"
-        raise ProfileError(where, expected="one array of samples", got=got, remedy=remedy) from error
-
-
-def _check_shape(where: str, found: NDArray[Any]) -> None:
-    if found.ndim != 2 or found.dtype.kind not in "iuf" or not 1 <= min(found.shape) <= max(found.shape) <= FILE_SIDE:
-        raise ProfileError(
-            where,
-            expected=f"real numbers, (rows, columns), of at most {FILE_SIDE} a side",
-            got=f"{found.dtype} of shape {found.shape}",
-            remedy="crop it, and leave one band and one plane",
-        )
-
-
-def _open_npy(path: Path) -> NDArray[Any]:
-    """Mapped, so that nothing is read before its shape is known."""
-    found: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
-    return found
-
-
-def _open_tiff(path: Path) -> NDArray[Any]:
-    """The only page, uncompressed and mapped: no directory leads on from it, and nothing has to be unpacked."""
-    import tifffile
-
-    with tifffile.TiffFile(path, is_ome=False) as file:
-        page = file.pages.first
-        if not page.is_memmappable or page.dtype is None:
-            raise ValueError("a TIFF that is compressed or tiled")
-        if len(file.pages) > 1:
-            raise ValueError("a TIFF of several pages")
-        return np.memmap(path, file.byteorder + page.dtype.str[1:], "r", page.dataoffsets[0], page.shape)
+        expected = f"one array of real numbers, (rows, columns), of at most {FILE_SIDE} a side"
+        got, remedy = str(error) or type(error).__name__, "crop it, leave one plane, and save it by numpy.save"
+        raise ProfileError(where, expected=expected, got=got, remedy=remedy) from error

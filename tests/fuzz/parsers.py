@@ -10,7 +10,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import tifffile
 
 from beers_deploy.differences import change_rows, changes, read_document
 from beers_deploy.dpu.board import load_dpu
@@ -91,12 +90,11 @@ def described_seeds(_: Path) -> list[bytes]:
     return [f"{head}[mtf]\n{mtf}\n\n[noise]\n{noise}\n\n[digitiser]{rest.split('[digitiser]')[1]}".encode()]
 
 
-def point_seeds(folder: Path, suffix: str) -> list[bytes]:
+def point_seeds(folder: Path) -> list[bytes]:
     """A small point-spread function."""
     x = np.arange(-6, 7) / 2
     samples = np.exp(-(x[:, None] ** 2) / 4 - x**2 / 3).astype(np.float32)
-    write = np.save if suffix == ".npy" else tifffile.imwrite
-    return [written(lambda path: write(path, samples), folder / f"a{suffix}")]
+    return [written(lambda path: np.save(path, samples), folder / "a.npy")]
 
 
 def read_point(path: Path) -> object:
@@ -234,8 +232,7 @@ PARSERS: tuple[Parser, ...] = (
     *(of_gdal(kind, name) for kind, name in GDAL.items()),
     Parser("sensor TOML", ".toml", lambda _: _files("sensors"), lambda p: load_sensor(str(p)).nominal()),
     Parser("sensor TOML, MTF table", ".toml", described_seeds, lambda p: load_sensor(str(p)).nominal()),
-    Parser("point spread, TIFF", ".tif", partial(point_seeds, suffix=".tif"), read_point, of_tiff),
-    Parser("point spread, npy", ".npy", partial(point_seeds, suffix=".npy"), read_point),
+    Parser("point spread, npy", ".npy", point_seeds, read_point),
     Parser("recipe of pairs", ".json", recipe_seeds, read_recipe, of_json),
     Parser("scene TOML", ".toml", lambda _: _files("scenes"), lambda p: load_scene_call(str(p))),
     Parser("target TOML", ".toml", lambda _: _files("targets"), board_of, share=0.3),

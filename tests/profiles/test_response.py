@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
@@ -123,13 +122,10 @@ def test_the_empty_rim_of_a_point_spread_is_cut_and_changes_nothing(tmp_path: Pa
     assert np.abs(tight.at(f[None], f[:, None]) - wide.at(f[None], f[:, None])).max() < 3e-6
 
 
-@pytest.mark.parametrize("dtype", ["<f4", ">f8", "<u2"])
-def test_npy_and_tiff_are_the_same_instrument(dtype: str, tmp_path: Path) -> None:
-    samples = np.rint(lopsided() * 4000).astype(dtype)
-    (tmp_path / "tiff").mkdir()
-    tifffile.imwrite(tmp_path / "tiff" / "psf.tif", samples, byteorder=">" if dtype[0] == ">" else "<")
-    other = load_sensor(str(sensor_file(tmp_path / "tiff", PSF.replace("npy", "tif"))))
-    assert same_instrument(with_psf(tmp_path, samples), other)
+@pytest.mark.parametrize("dtype", [">f8", "<u2"])
+def test_any_type_of_number_is_the_same_instrument(dtype: str, tmp_path: Path) -> None:
+    samples = np.rint(lopsided() * 4000)
+    assert same_instrument(with_psf(tmp_path, samples.astype("<f4")), with_psf(tmp_path, samples.astype(dtype)))
 
 
 @pytest.mark.parametrize("mtf", [TABLE, PSF])
@@ -182,8 +178,8 @@ def test_another_contrast_beside_a_response_is_refused(tmp_path: Path) -> None:
         (PSF.replace("4", "true"), ("2 to 64",)),
         (PSF.replace("4", '"x"'), ("2 to 64",)),
         (PSF.replace("psf.npy", "none.npy"), ("no such file", "none.npy")),
-        (PSF.replace("psf.npy", "psf.png"), (".npy or .tif", "'.png'")),
-        (PSF.replace("psf.npy", "."), (".npy or .tif",)),
+        (PSF.replace("psf.npy", "psf.png"), (".npy", "'.png'")),
+        (PSF.replace("psf.npy", "."), (".npy",)),
         (PSF.replace("psf.npy", "../psf.npy"), ("beneath",)),
         (PSF.replace("psf.npy", "/psf.npy"), ("beneath",)),
         (PSF.replace('"psf.npy"', "3"), ("beneath",)),
@@ -229,23 +225,10 @@ def test_samples_that_are_no_point_spread_get_one_sentence(
     assert all(word in str(error) for word in words)
 
 
-@pytest.mark.parametrize("suffix", ["npy", "tif"])
-@pytest.mark.parametrize(
-    "content", [b"", b"\x93NUMPY", b"II*\0\x08\0\0\0", b"version https://git-lfs.github.com", b"x" * 999]
-)
-def test_a_damaged_file_gets_one_sentence(suffix: str, content: bytes, tmp_path: Path) -> None:
-    (tmp_path / f"psf.{suffix}").write_bytes(content)
-    refusal(sensor_file(tmp_path, PSF.replace("npy", suffix)))
-
-
-def test_a_tiff_that_would_have_to_be_unpacked_or_paged_through_gets_one_sentence(tmp_path: Path) -> None:
-    path, mtf = tmp_path / "psf.tif", PSF.replace("npy", "tif")
-    tifffile.imwrite(path, lopsided().astype(np.float32), compression="zlib")
-    assert "compressed" in refusal(sensor_file(tmp_path, mtf)).got
-    with tifffile.TiffWriter(path) as writer:
-        for _ in range(2):
-            writer.write(lopsided().astype(np.float32), metadata=None)
-    assert "pages" in refusal(sensor_file(tmp_path, mtf)).got
+@pytest.mark.parametrize("content", [b"", b"\x93NUMPY", b"version https://git-lfs.github.com", b"x" * 999])
+def test_a_damaged_file_gets_one_sentence(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "psf.npy").write_bytes(content)
+    refusal(sensor_file(tmp_path, PSF))
 
 
 def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:

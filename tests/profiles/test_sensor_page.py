@@ -9,7 +9,6 @@ from typing import get_args
 
 import numpy as np
 import pytest
-import tifffile
 from typer.core import TyperGroup
 from typer.main import get_command
 
@@ -68,7 +67,7 @@ def test_each_other_way_of_the_page_fits_into_the_example(
     x = np.arange(-20, 21) / 8
     widths_px = (math.sqrt(-math.log(contrast) / 2) / (math.pi * 0.5) for contrast in (0.1, 0.2))
     down, right = (np.exp(-0.5 * (x / width) ** 2) for width in widths_px)
-    tifffile.imwrite(tmp_path / "psf.tif", (down[:, None] * right).astype(np.float32))
+    np.save(tmp_path / "psf.npy", (down[:, None] * right).astype(np.float32))
     (name,) = tomllib.loads(part)
     text = re.sub(rf"\[{name}\].*?(?=\n\[)", lambda _: part, WHOLE, flags=re.DOTALL)
     (tmp_path / "my-sensor.toml").write_text(text, encoding="utf-8")
