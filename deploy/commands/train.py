@@ -60,7 +60,6 @@ def train(
         Path | None, typer.Option(help="Weights to go on from; those of a smaller network grow.")
     ] = None,
     validate_every: Annotated[int, typer.Option(min=0, help="Steps between validations; 0 for none.")] = 1000,
-    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard scalars too.")] = False,
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     device: Annotated[str, typer.Option(help="cpu, or cuda.")] = "cpu",
     precision: Annotated[
@@ -72,8 +71,8 @@ def train(
 
     The loss is the paper's: 1.0 L1 + 0.5 LPIPS + 0.1 L1 of spectra; without weights for LPIPS that term is left out,
     which is said and kept in the recipe. A twentieth of the images, whole sites, is held out for validation. Several
-    GPUs: start it with torchrun. --conditioned weights become the network of any sensor in range; --start and
-    --teacher then take such weights, and plain ones without.
+    GPUs: start it with torchrun. --conditioned weights become the network of any sensor in range; --start then takes
+    such weights, and plain ones without.
     """
     from beers_deploy.model.dataset import profiles_for, read_pairs_recipe
     from beers_deploy.model.family import SensorFamily

@@ -89,7 +89,6 @@ UNITS = {
     "patch": "px",
     "patches": "patches",
     "psnr_weight": "weight",
-    "rough": "of patches",
     "seed": "integer",
     "side": "px",
     "steps": "steps",
