@@ -9,7 +9,7 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -117,8 +117,14 @@ def round_values(low: float, high: float, most: int, *, logarithmic: bool) -> li
 SVG, XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 
 
-def svg_of(figure: "Figure", name: str) -> Markup:
-    """A figure drawn within `look` as an SVG file, light or dark as its reader's screen is; `name` is read aloud."""
+def svg_of(figure: "Figure", name: str, titles: Mapping[str, str] | None = None) -> Markup:
+    """A figure as an SVG file, light or dark as its reader's screen is.
+
+    Args:
+        figure: drawn within `look`, in colours of LIGHT.
+        name: what a screen reader calls it.
+        titles: what appears when the pointer rests on the artists of a group id (`set_gid`).
+    """
     stream = io.BytesIO()
     with look():
         figure.savefig(stream, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
@@ -133,10 +139,20 @@ def svg_of(figure: "Figure", name: str) -> Markup:
     style = ET.Element(f"{{{SVG}}}style")
     style.text = plot_style()
     root.insert(0, style)
-    for group in root.iter(f"{{{SVG}}}g"):  # matplotlib's own ids have a _, and ours become classes
-        if "_" not in (kind := group.attrib.pop("id", "_")):
-            group.set("class", kind)
+    for group in root.iter(f"{{{SVG}}}g"):
+        _name(group, titles or {})
     return Markup(ET.tostring(root, encoding="unicode"))  # noqa: S704 - ElementTree escapes
+
+
+def _name(group: ET.Element, titles: Mapping[str, str]) -> None:
+    """A class for a group id of ours (matplotlib's own have a _), and its title."""
+    kind = group.attrib.pop("id", "_")
+    if "_" not in kind:
+        group.set("class", "dot" if kind in titles else kind)
+    if kind in titles:
+        words = ET.Element(f"{{{SVG}}}title")
+        words.text = printable(titles[kind])
+        group.insert(0, words)
 
 
 def printable(text: str) -> str:

@@ -1,4 +1,4 @@
-"""The locks hold what pyproject.toml asks for, each version once and by its hashes; the core's is part of the other."""
+"""The locks hold what pyproject.toml asks for, each version once, by its hashes; the core's is part of the other."""
 
 import re
 import tomllib
