@@ -103,7 +103,7 @@ def _images(
     fixed_px = fixed_tile_px(network.model)
     lattice_px = fixed_px or network.tiling.lattice_px
     side = fixed_px or tile or -(-TILE_PX // lattice_px) * lattice_px
-    if (tile or side) != side or side % lattice_px:
+    if (tile or side) != side or side < 1 or side % lattice_px:
         expected = f"{fixed_px} px, to which the network is fixed" if fixed_px else f"a multiple of {lattice_px} px"
         raise OptionError("tile", expected=expected, got=f"{tile} px", remedy="choose another")
     shape = 1, channels, side, side
