@@ -18,9 +18,10 @@ import numpy as np
 import onnx
 import tifffile
 
+from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.restoration.engine import restore_window
-from beers_deploy.restoration.options import TILE_PX, Options
+from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
 from beers_deploy.restoration.runtime import open_runtime
 

@@ -17,13 +17,12 @@ from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Figure, Mode, Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import sensor_names
-from beers_deploy.profiles.target import TargetProfile, board_names
+from beers_deploy.profiles.target import TILE_PX, TargetProfile, board_names
 from beers_deploy.quant.banked.filters import MIDDLE_DN, PART, STEP_DN
 from beers_deploy.quant.encodings import read_core, save_config
 from beers_deploy.quant.ends import FINE_MAX
 from beers_deploy.quant.graph import CORRECTION, QUARTER, STEP
 from beers_deploy.quant.session import open_session, tensors_of
-from beers_deploy.restoration.options import TILE_PX
 from beers_deploy.results import Table
 
 MEASURE, HOST, README = (Path(__file__).parent / "kit" / name for name in ("measure.py", "host.py", "readme.md"))

@@ -20,10 +20,11 @@ from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.profiles.errors import ImageError, OptionError, optional
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.tiling.walk import Tiling
 from beers_deploy.restoration.engine import NAME, Restorer, as_stored, checked_strip, restore_array
-from beers_deploy.restoration.options import TILE_PX, Options, Runtime
+from beers_deploy.restoration.options import Options, Runtime
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Plan, Span, plan_for
 from beers_deploy.restoration.radiometry import full_scale_of

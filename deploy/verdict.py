@@ -28,7 +28,7 @@ from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Check
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
+from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, TargetProfile
 from beers_deploy.profiles.toml import read_json, unreadable
 from beers_deploy.quant.gate import GateResult, Limits, judge, judge_saturation, limits_of, verdict_row
 from beers_deploy.quant.gate import compare as differences
@@ -37,7 +37,6 @@ from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px, metadata, 
 from beers_deploy.quant.samples import CALIBRATED_ON, OwnSamples, samples_of, without
 from beers_deploy.quant.session import open_any_size
 from beers_deploy.quant.structure import saturated_shares, structure_checks
-from beers_deploy.restoration.options import TILE_PX
 from beers_deploy.results import Input, Table, input_of
 
 if TYPE_CHECKING:

@@ -11,9 +11,11 @@ from dataclasses import dataclass, field
 from typing import Self
 
 from beers_deploy.profiles.constant import Constant, Words, check_keys, read_constant, read_words
-from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.errors import OptionError, ProfileError
 from beers_deploy.profiles.toml import profile_path, read_toml, shipped_names
 
+TILE_PX = 640
+"""Side of a tile unless somebody asks for another: what the paper's network was given on the board."""
 DEFAULT_TARGET = "vck190"
 """The board of the paper: what a command takes where no board is named."""
 
@@ -188,3 +190,10 @@ def _mapping(where: str, raw: object) -> Mapping[str, object]:
     if not isinstance(raw, Mapping):
         raise ProfileError(where, expected="a table of constants", got=repr(raw), remedy="write it as [table]")
     return raw
+
+
+def require_side(tile_px: int) -> int:
+    """The side of a tile, refused where it is none."""
+    if tile_px < 1:
+        raise OptionError("tile", expected="pixels, 1 or more", got=str(tile_px), remedy="choose another")
+    return tile_px

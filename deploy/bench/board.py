@@ -15,7 +15,6 @@ import onnx
 from beers_deploy.bench.tables import (
     PAPER_SIZE,
     PAPER_TARGET,
-    PAPER_TILE_PX,
     Swath,
     frame_row,
     host_words,
@@ -39,10 +38,10 @@ from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.target import DEFAULT_TARGET
+from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, require_side
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.tiling.walk import tiling_of
-from beers_deploy.restoration.options import parse_halo, require_side
+from beers_deploy.restoration.options import parse_halo
 from beers_deploy.results import Table
 
 FACE = {"throughput": "fps", "latency": "swath"}
@@ -66,7 +65,7 @@ def predict(
     *,
     size: tuple[int, int] | str = PAPER_SIZE,
     dpu: str | None = None,
-    tile: int = PAPER_TILE_PX,
+    tile: int = TILE_PX,
     halo: int | str = "exact",
     host_task: Task | None = None,
     measured: str | os.PathLike[str] | None = None,
@@ -166,7 +165,7 @@ def bench_board(
     image: Path | None = None,
     full_scale: float | None = None,
     size: str | None = None,
-    tiles_px: Sequence[int] = (PAPER_TILE_PX,),
+    tiles_px: Sequence[int] = (TILE_PX,),
     halo: str = "exact",
     config: str | None = None,
     measured: Path | None = None,
@@ -230,7 +229,7 @@ def _frames(
     task: Task | None,
 ) -> BoardBench:
     """The network on whole images; of one configuration each layer too."""
-    tile_px = None if own_tile_px(network) else PAPER_TILE_PX
+    tile_px = None if own_tile_px(network) else TILE_PX
     predictions = [predict_file(model, dpu, tile_px, task) for dpu in boards]
     rows = [frame_row(prediction, dpu) for prediction, dpu in zip(predictions, boards, strict=True)]
     sides = network.graph.input[0].type.tensor_type.shape.dim[2:]

@@ -26,6 +26,7 @@ from beers_deploy.dpu.reading import read_network
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Figure, Row, number, predicted, published, unavailable
+from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.restoration.plan import plan_side
 from beers_deploy.restoration.source import SIDE_PX
 
@@ -37,7 +38,7 @@ HELD = 0.9
 """Share of families left out of the fit that an interval is meant to hold."""
 ARITHMETIC = "arithmetic of the tile grid"
 PAPER = "ConvBEERS paper, table of the VCK190 benchmark, 13600 x 9016"
-PAPER_TILE_PX, PAPER_SIZE = 640, "13600x9016"
+PAPER_SIZE = "13600x9016"
 PAPER_TARGET = "vck190"
 """The board that the paper measured: its rows stand beside that one alone."""
 
@@ -48,7 +49,7 @@ class Swath:
 
     width_px: int
     height_px: int
-    tile_px: int = PAPER_TILE_PX
+    tile_px: int = TILE_PX
     halo_px: int = 0
 
     @property
@@ -75,7 +76,7 @@ class Swath:
         return tiles * self.tile_px**2 / self.pixels
 
 
-def predict_file(model: Path, dpu: Dpu, tile_px: int | None = PAPER_TILE_PX, task: Task | None = None) -> Prediction:
+def predict_file(model: Path, dpu: Dpu, tile_px: int | None = TILE_PX, task: Task | None = None) -> Prediction:
     """What the cost model says of an ONNX file, for tiles of that side or, with None, for the size it is fixed to.
 
     The `task` of the host is what the file tells, if none is given.

@@ -9,8 +9,8 @@ import typer
 from beers_deploy.commands.shared import arguments, save, say
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.sensor_file import BLIND
-from beers_deploy.profiles.target import DEFAULT_TARGET
-from beers_deploy.restoration.options import TILE_PX, Options
+from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX
+from beers_deploy.restoration.options import Options
 
 EXAMPLE = "info raw.jp2"
 

@@ -13,7 +13,8 @@ from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor_file import BLIND
-from beers_deploy.restoration.options import TILE_PX, Compression, Options, Runtime
+from beers_deploy.profiles.target import TILE_PX
+from beers_deploy.restoration.options import Compression, Options, Runtime
 
 EXAMPLE = "restore raw.tif restored.tif"
 NETWORK_ONLY = ("network", "tile", "halo", "resume", "runtime", "threads", "scheduler", "cog", "stac", "any_result")

@@ -5,9 +5,10 @@ from collections.abc import Callable
 import numpy as np
 import onnx
 
+from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.restoration.engine import restore_dn
-from beers_deploy.restoration.options import TILE_PX, Runtime
+from beers_deploy.restoration.options import Runtime
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.runtime import open_runtime
 

@@ -7,16 +7,7 @@ from pathlib import Path
 
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Sensor
-
-TILE_PX = 640
-"""Side of a tile unless somebody asks for another: what the paper's network was given on the board."""
-
-
-def require_side(tile_px: int) -> int:
-    """The side of a tile, refused where it is none."""
-    if tile_px < 1:
-        raise OptionError("tile", expected="pixels, 1 or more", got=str(tile_px), remedy="choose another")
-    return tile_px
+from beers_deploy.profiles.target import TILE_PX
 
 
 class Runtime(StrEnum):

@@ -32,11 +32,10 @@ from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row, measured
 from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.profiles.sensor_file import reference_for
-from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
+from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, board_names
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.report.page import Picture, Report, Section
-from beers_deploy.restoration.options import TILE_PX
 from beers_deploy.verdict import gate
 
 BITS, SIDE_PX, GATE_PATCHES = 12, 640, 12

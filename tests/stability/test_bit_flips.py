@@ -13,11 +13,11 @@ from beers_deploy.dpu.board import load_dpu
 from beers_deploy.network import shipped_pair
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.quant.calibration import Calibration
 from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.graph import Activation
 from beers_deploy.quant.integer.reference import SOUND
-from beers_deploy.restoration.options import TILE_PX
 from beers_deploy.studies.stress.bit_flips import (
     FaultTarget,
     curve_rows,

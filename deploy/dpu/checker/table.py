@@ -11,9 +11,8 @@ from beers_deploy.dpu.reading import network_of, own_tile_px
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.figures import Check, Figure, Row, predicted, unavailable
-from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
+from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, TargetProfile, require_side
 from beers_deploy.quant.graph import refusal
-from beers_deploy.restoration.options import TILE_PX, require_side
 from beers_deploy.results import Table
 
 Remark = Callable[[Placement, Dpu, int], str | None]

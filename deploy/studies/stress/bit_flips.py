@@ -18,12 +18,12 @@ from beers_deploy.dpu.cost.model import Constants
 from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.model.progress import steps
 from beers_deploy.profiles.figures import Row, measured, predicted
+from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.quant.calibration import HELD_OUT_SEED, Calibration
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.graph import Activation
 from beers_deploy.quant.integer.reference import SOUND
 from beers_deploy.report.plots import Curve, Panel, curves_svg
-from beers_deploy.restoration.options import TILE_PX
 from beers_deploy.studies.stress import faults
 from beers_deploy.studies.stress.networks import Subject
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import onnx
 
 from beers_deploy.bench import tables
-from beers_deploy.bench.tables import PAPER_TILE_PX, Swath
+from beers_deploy.bench.tables import Swath
 from beers_deploy.dpu.board import Dpu, dpu_of
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import dpu_power, predict
@@ -29,7 +29,7 @@ from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Figure, predicted, unavailable
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
+from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, board_names
 from beers_deploy.quant.onnx_file import is_quantised, load_onnx
 from beers_deploy.quant.tiling.walk import Tiling, tiling_of
 
@@ -78,7 +78,7 @@ class Point:
     variant: Variant
     board: TargetProfile | None = None
     dpu: Dpu | None = None
-    tile_px: int = PAPER_TILE_PX
+    tile_px: int = TILE_PX
     halo_px: int | None = None
     reason: str = ""
 
@@ -190,7 +190,7 @@ def _on_board(variant: Variant, board: TargetProfile, whole: Swath, *, more: boo
     fastest_px = fastest_tile_px(variant, default, whole)
     points = [Point(variant, board, dpu, fastest_px) for dpu in [default, *others]]
     if more:
-        points.append(Point(variant, board, default, PAPER_TILE_PX))
+        points.append(Point(variant, board, default, TILE_PX))
         smaller = (halo for halo in HALOS_PX if halo < radius_px(variant))
         points += [Point(variant, board, default, fastest_px, halo) for halo in smaller]
     return list({point.name: point for point in points}.values())
@@ -199,10 +199,10 @@ def _on_board(variant: Variant, board: TargetProfile, whole: Swath, *, more: boo
 def fastest_tile_px(variant: Variant, dpu: Dpu, whole: Swath) -> int:
     """The tile with exact seams, no larger than the paper's, in which the swath is predicted to take least time."""
     radius = radius_px(variant)
-    sides = range(TILE_STEP_PX * (2 * radius // TILE_STEP_PX + 1), PAPER_TILE_PX + 1, TILE_STEP_PX)
+    sides = range(TILE_STEP_PX * (2 * radius // TILE_STEP_PX + 1), TILE_PX + 1, TILE_STEP_PX)
     swaths = [replace(whole, tile_px=side_px, halo_px=radius) for side_px in sides]
     times = {swath.tile_px: dpu_latency(variant, dpu, swath).value or math.inf for swath in swaths}
-    return min(times, key=lambda side_px: times[side_px], default=PAPER_TILE_PX)
+    return min(times, key=lambda side_px: times[side_px], default=TILE_PX)
 
 
 def dpu_latency(variant: Variant, dpu: Dpu, swath: Swath) -> Figure:

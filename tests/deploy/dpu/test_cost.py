@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from beers_deploy.bench.tables import PAPER_TILE_PX, predict_file
+from beers_deploy.bench.tables import predict_file
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import Prediction, counted_power, image_energy_j, layer_energy_j
@@ -11,6 +11,7 @@ from beers_deploy.dpu.cost.model import LARGE_MAP_BYTES, regime_of
 from beers_deploy.dpu.cost.work import BURST_BYTES, Work, count_work
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.target import TILE_PX
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 
 DPU = load_dpu("vck190")
@@ -25,7 +26,7 @@ def papers(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def papers_prediction(papers: Path) -> Prediction:
-    return predict_file(papers, DPU, PAPER_TILE_PX)
+    return predict_file(papers, DPU, TILE_PX)
 
 
 def test_the_papers_network(papers_prediction: Prediction) -> None:

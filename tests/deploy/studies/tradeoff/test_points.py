@@ -7,14 +7,14 @@ import onnx
 import pytest
 import torch
 
-from beers_deploy.bench.tables import PAPER_TILE_PX, Swath
+from beers_deploy.bench.tables import Swath
 from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import Variant as Shape
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ModelError, OptionError
-from beers_deploy.profiles.target import board_names
+from beers_deploy.profiles.target import TILE_PX, board_names
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.studies.tradeoff.points import (
     FLOAT,
@@ -107,7 +107,7 @@ def test_a_network_of_one_tile_size_is_refused(tmp_path: Path) -> None:
 def test_the_fastest_tile_is_a_multiple_of_the_step_and_no_other_is_faster(variant: Variant) -> None:
     found, radius = fastest_tile_px(variant, DPU, WHOLE), radius_px(variant)
     assert found % TILE_STEP_PX == 0
-    assert 2 * radius < found <= PAPER_TILE_PX
+    assert 2 * radius < found <= TILE_PX
 
     def seconds(side: int) -> float:
         return dpu_latency(variant, DPU, replace(WHOLE, tile_px=side, halo_px=radius)).value or 0.0
@@ -125,7 +125,7 @@ def test_int8_is_looked_at_on_every_configuration_and_on_the_first_board_in_more
     halos = {point.halo_px for point in points if point.board == boards[0]}
     assert halos == {None, *(halo for halo in HALOS_PX if halo < radius_px(variant))}
     assert {point.halo_px for point in points if point.board == boards[1]} == {None}
-    assert PAPER_TILE_PX in {point.tile_px for point in points}
+    assert TILE_PX in {point.tile_px for point in points}
 
 
 def test_float_and_what_a_board_refuses_have_no_board_and_the_reason(variant: Variant) -> None:
