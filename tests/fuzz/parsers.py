@@ -108,7 +108,7 @@ def recipe_seeds(folder: Path) -> list[bytes]:
     path = folder / "a.toml"
     path.write_bytes(described_seeds(folder)[0])
     profile = load_sensor(str(path))
-    (folder / "point.npy").write_bytes(point_seeds(folder, ".npy")[0])
+    (folder / "point.npy").write_bytes(point_seeds(folder)[0])
     point, *_ = read_response("a test", {"psf": "point.npy", "psf_samples_per_px": 4}, folder)
     across, along = (replace(profile.mtf_nyquist, value=value) for value in point.at_nyquist)
     other = replace(profile, response=point, mtf_nyquist=across, mtf_nyquist_along=along)
