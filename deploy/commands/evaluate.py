@@ -32,7 +32,7 @@ def evaluate(
         str, typer.Option(help="Names, separated by commas.")
     ] = "degraded,traditional,deconvolve-first,convbeers-s,convbeers-s-int8",
     lpips: Annotated[
-        Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS-squeeze, or their folder.")
+        Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.")
     ] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for report.html and pictures.")] = None,
     sweep: Annotated[

@@ -42,7 +42,7 @@ def tradeoff(
         str | None, typer.Option(help="What you must reach: 'psnr>=44'. Without a budget the least latency wins.")
     ] = None,
     lpips: Annotated[
-        Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS-squeeze, or their folder.")
+        Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.")
     ] = None,
     calibration: Annotated[
         Path | None, typer.Option(help="Folder of scenes to quantise your networks on; drawn ones if none.")

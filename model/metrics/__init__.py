@@ -1,6 +1,6 @@
 """Instruments: what an image is worth beside its reference, and what it shows by itself.
 
-- with a reference: `fidelity` (PSNR, SSIM), `perceptual` (LPIPS);
+- with a reference: `fidelity` (PSNR, SSIM), `perceptual` (LPIPS and DISTS);
 - from an image of a target: `slanted_edge` (MTF of an edge drawn at a known angle);
 - from raw images of a sensor, for its profile: `edge_blur` (MTF by many short edges) and `noise_line` (the noise
   under texture); they refuse (`refusal`) rather than guess;

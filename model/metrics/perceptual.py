@@ -1,15 +1,17 @@
-"""LPIPS, differentiable, over SqueezeNet 1.1, which the user brings.
+"""LPIPS and DISTS, differentiable, over a backbone that the user brings: SqueezeNet 1.1 or VGG16.
 
-It follows the arithmetic of its authors' package, `lpips` 0.1.4 with the v0.1 weights, whose channel weights lie in
-`weights/`. The paper this project reproduces does not say which LPIPS it used, so no figure from here compares
-with its own.
+Both follow the arithmetic of their authors' packages, `lpips` 0.1.4 with the v0.1 weights and `DISTS-pytorch` 0.1,
+whose published channel weights lie in `weights/`. The paper this project reproduces does not say which LPIPS it used,
+so no figure from here compares with its own.
 
-The feature layers are named as in torchvision, and written here because that does not import beside the CPU build of
-torch. Their weights come from a user's file (`find_backbone`): ImageNet weights are never shipped or fetched.
+The backbones' feature layers are named as in torchvision, and written here because that does not import beside the
+CPU build of torch. Their weights come from a user's file (`find_backbone`): ImageNet weights are never shipped or
+fetched.
 """
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
@@ -23,13 +25,20 @@ from torch.nn import functional
 from beers_deploy.profiles.errors import ImageError, ModelError
 from beers_deploy.profiles.toml import unreadable
 
-LABEL = "LPIPS-squeeze"
-FILE_STEM = "squeezenet1_1"
-"""What torchvision calls it, and the start of its file's name."""
-TAPS = 1, 4, 7, 9, 10, 11, 12
-"""The feature layers that are compared."""
-MIN_SIDE_PX = 17
-"""A smaller image leaves nothing for the last pooling."""
+
+@dataclass(frozen=True)
+class BackboneSpec:
+    """What is known of a backbone before any weights are there."""
+
+    file_stem: str  # what torchvision calls it, and the start of its file's name
+    taps: tuple[int, ...]  # which feature layers are compared
+    min_side_px: int  # a smaller image leaves nothing for the last pooling
+
+
+BACKBONES: Mapping[str, BackboneSpec] = {
+    "squeeze": BackboneSpec("squeezenet1_1", (1, 4, 7, 9, 10, 11, 12), min_side_px=17),
+    "vgg": BackboneSpec("vgg16", (3, 8, 15, 22, 29), min_side_px=16),
+}
 
 
 class Fire(nn.Module):
@@ -47,30 +56,65 @@ class Fire(nn.Module):
         return functional.relu(torch.cat([self.expand1x1(x), self.expand3x3(x)], dim=1))
 
 
-class Backbone(nn.Module):
-    """The feature layers of SqueezeNet 1.1, with random weights until some are loaded."""
+class L2Pool(nn.Module):
+    """DISTS's pooling: root of the Hanning-weighted mean of squares, stride 2 (Hénaff and Simoncelli 2016)."""
 
-    def __init__(self) -> None:
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, C, H, W) to (N, C, ceil(H / 2), ceil(W / 2))."""
+        taps = x.new_tensor([0.25, 0.5, 0.25])
+        kernel = (taps[:, None] * taps[None, :]).expand(x.shape[1], 1, 3, 3)
+        energy = functional.conv2d(x * x, kernel, stride=2, padding=1, groups=x.shape[1])
+        return (energy + 1e-12).sqrt()
+
+
+class Backbone(nn.Module):
+    """The feature layers of one network, with random weights until some are loaded.
+
+    Args:
+        network: "squeeze" or "vgg".
+        l2_pool: DISTS's pooling in the place of the max pooling.
+    """
+
+    def __init__(self, network: str, *, l2_pool: bool = False) -> None:
         super().__init__()
-        self.features = nn.Sequential(
-            *(nn.Conv2d(3, 64, 3, stride=2), nn.ReLU(), _pool()),
-            *(Fire(64, 16, 64), Fire(128, 16, 64), _pool()),
-            *(Fire(128, 32, 128), Fire(256, 32, 128), _pool()),
-            *(Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256)),
-        )
+        self.network, self.spec = network, BACKBONES[network]
+        layers = {"squeeze": _squeezenet, "vgg": _vgg16}[network]()
+        if l2_pool:
+            layers = [L2Pool() if isinstance(layer, nn.MaxPool2d) else layer for layer in layers]
+        self.features = nn.Sequential(*layers)
 
     def forward(self, x: Tensor) -> list[Tensor]:
         """The compared feature maps of (N, 3, H, W), all of them after a ReLU."""
         found: list[Tensor] = []
         for index, layer in enumerate(self.features):
             x = layer(x)
-            if index in TAPS:
+            if index in self.spec.taps:
                 found.append(x)
         return found
 
 
-def _pool() -> nn.Module:
-    return nn.MaxPool2d(3, stride=2, ceil_mode=True)
+def _squeezenet() -> list[nn.Module]:
+    def pool() -> nn.Module:
+        return nn.MaxPool2d(3, stride=2, ceil_mode=True)
+
+    return [
+        *(nn.Conv2d(3, 64, 3, stride=2), nn.ReLU(), pool()),
+        *(Fire(64, 16, 64), Fire(128, 16, 64), pool()),
+        *(Fire(128, 32, 128), Fire(256, 32, 128), pool()),
+        *(Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256)),
+    ]
+
+
+def _vgg16() -> list[nn.Module]:
+    layers: list[nn.Module] = []
+    channels = 3
+    for width, convolutions in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
+        if layers:
+            layers.append(nn.MaxPool2d(2, stride=2))
+        for _ in range(convolutions):
+            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
+            channels = width
+    return layers
 
 
 WEIGHTS_VARIABLE = "BEERS_LPIPS_WEIGHTS"
@@ -82,32 +126,40 @@ CONVERT = (
 NAMED = "give the feature layers named as in torchvision (features.0.weight ...)"
 
 
-def find_backbone(place: Path | None = None) -> Path | None:
-    """The weights file of SqueezeNet, or None: then NOT_FOUND is the reason to show.
+def find_backbone(network: str, place: Path | None = None) -> Path | None:
+    """The weights file of a backbone, or None: then `not_found(network)` is the reason to show.
 
     Args:
+        network: "squeeze" or "vgg" (DISTS uses "vgg").
         place: a file, which is taken at its word, or a folder. Without it the environment variable
-            BEERS_LPIPS_WEIGHTS is asked; it may name a file or a folder, and a file counts only if its name begins
-            with the network's.
+            BEERS_LPIPS_WEIGHTS is asked; it may name a file or a folder, and a file counts only for the network
+            its name begins with.
     """
+    stem = BACKBONES[network].file_stem
     if place is not None and not place.is_dir():
         return place
     named = place or os.environ.get(WEIGHTS_VARIABLE)
     if not named:
         return None
     files = [Path(named)] if Path(named).is_file() else sorted(Path(named).glob("*"))
-    return next((file for file in files if file.name.startswith(FILE_STEM) and file.suffix in SUFFIXES), None)
+    return next((file for file in files if file.name.startswith(stem) and file.suffix in SUFFIXES), None)
 
 
-NOT_FOUND = (
-    f"weights not found: no {' or '.join(f'{FILE_STEM}*{suffix}' for suffix in SUFFIXES)}; "
-    f"set {WEIGHTS_VARIABLE} to the file or its folder"
-)
+def not_found(network: str) -> str:
+    """Why a metric is unavailable when `find_backbone` found nothing."""
+    names = " or ".join(f"{BACKBONES[network].file_stem}*{suffix}" for suffix in SUFFIXES)
+    return f"weights not found: no {names}; set {WEIGHTS_VARIABLE} to the file or its folder"
 
 
-def load_backbone(path: Path) -> Backbone:
-    """A backbone with its parameters from a .safetensors or .npz file; whatever else that holds is left aside."""
-    backbone = Backbone()
+def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbone:
+    """A backbone with its parameters from a file, by name; whatever else the file holds is left aside.
+
+    Args:
+        network: "squeeze" or "vgg".
+        path: .safetensors or .npz.
+        l2_pool: DISTS's pooling in the place of the max pooling.
+    """
+    backbone = Backbone(network, l2_pool=l2_pool)
     wanted = backbone.state_dict()
     tensors = read_tensors(path, wanted)
     for name, tensor in tensors.items():
@@ -167,8 +219,10 @@ MIN_NORM = 1e-3
 class Lpips(nn.Module):
     """Learned perceptual image patch similarity (Zhang et al. 2018, v0.1): 0 for identical images, no upper bound.
 
+    Name it with its network, "LPIPS-squeeze" (`label`): the networks' figures do not compare with each other.
+
     Args:
-        backbone: whose features are compared.
+        backbone: the network whose features are compared.
         heads: for each compared layer (C,), how much each channel counts.
     """
 
@@ -176,39 +230,81 @@ class Lpips(nn.Module):
 
     def __init__(self, backbone: Backbone, heads: Sequence[Tensor]) -> None:
         super().__init__()
-        self.backbone = backbone
+        self.backbone, self.label = backbone, f"LPIPS-{backbone.network}"
         self.register_buffer("heads", torch.cat(list(heads)))
         self.requires_grad_(False).eval()
 
     @classmethod
-    def load(cls, path: Path) -> Self:
-        """The metric with its published heads, over the backbone in a file (see `find_backbone`)."""
-        names = [f"lin{layer}" for layer in range(len(TAPS))]
-        heads = read_tensors(PUBLISHED / "lpips-squeeze.safetensors", names)
-        return cls(load_backbone(path), [heads[name] for name in names])
+    def load(cls, network: str, path: Path) -> Self:
+        """The metric with its published heads, over the backbone in a file (see `find_backbone`).
+
+        Args:
+            network: "squeeze" or "vgg".
+            path: .safetensors or .npz, parameters named as in torchvision.
+        """
+        backbone = load_backbone(network, path)
+        names = [f"lin{layer}" for layer in range(len(backbone.spec.taps))]
+        heads = read_tensors(PUBLISHED / f"lpips-{network}.safetensors", names)
+        return cls(backbone, [heads[name] for name in names])
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
         """The distance of each pair, (N,); its gradient is finite everywhere.
 
         Args:
-            image: (N, 1, H, W), 0 to 1 of full scale; at least 17 px a side.
+            image: (N, 1, H, W), 0 to 1 of full scale; at least 17 px a side for squeeze, 16 for vgg.
             reference: the same shape.
         """
-        _check_pair(image, reference)
+        _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):
-            pairs = zip(self._features(image), self._features(reference), strict=True)
+            pairs = zip(_features(self.backbone, image), _features(self.backbone, reference), strict=True)
             errors = [(_unit(a) - _unit(b)).square().mean(dim=(2, 3)) for a, b in pairs]
             return torch.cat(errors, dim=1) @ self.heads
 
-    def _features(self, image: Tensor) -> list[Tensor]:
-        """Of a grey image, as three equal channels in the backbone's own precision, whatever the caller's autocast.
 
-        The scaling layer of `lpips` is ImageNet's figures after [-1, 1].
+class Dists(nn.Module):
+    """Deep image structure and texture similarity (Ding et al. 2020) over VGG16: 0 for identical images, at most 1.
+
+    Args:
+        backbone: VGG16 with L2 pooling.
+        alpha: (1475,), how much the mean (texture) of the image and of each of its channels counts.
+        beta: (1475,), how much their covariance (structure) counts.
+    """
+
+    label = "DISTS"
+    alpha: Tensor
+    beta: Tensor
+
+    def __init__(self, backbone: Backbone, alpha: Tensor, beta: Tensor) -> None:
+        super().__init__()
+        self.backbone = backbone
+        total = alpha.sum() + beta.sum()
+        self.register_buffer("alpha", alpha / total)
+        self.register_buffer("beta", beta / total)
+        self.requires_grad_(False).eval()
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """The metric with its published weights, over the VGG16 in a file (`find_backbone("vgg")`)."""
+        backbone = load_backbone("vgg", path, l2_pool=True)
+        weights = read_tensors(PUBLISHED / "dists.safetensors", ["alpha", "beta"])
+        return cls(backbone, weights["alpha"], weights["beta"])
+
+    def forward(self, image: Tensor, reference: Tensor) -> Tensor:
+        """The distance of each pair, (N,); its gradient is finite everywhere.
+
+        Args:
+            image: (N, 1, H, W), 0 to 1 of full scale, at least 16 px a side.
+            reference: the same shape.
         """
-        colour = image.to(next(self.backbone.parameters()).dtype).expand(-1, 3, -1, -1)
-        mean, std = (colour.new_tensor(x)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
-        features: list[Tensor] = self.backbone((colour - mean) / std)
-        return features
+        _check_pair(self.label, self.backbone, image, reference)
+        with torch.autocast(image.device.type, enabled=False):
+            stages = zip(self._stages(image), self._stages(reference), strict=True)
+            apart = [_texture_and_structure(a, b) for a, b in stages]
+            texture, structure = (torch.cat(parts, dim=1) for parts in zip(*apart, strict=True))
+            return texture @ self.alpha + structure @ self.beta
+
+    def _stages(self, image: Tensor) -> list[Tensor]:
+        return [_as_colour(self.backbone, image), *_features(self.backbone, image)]
 
 
 def _unit(features: Tensor) -> Tensor:
@@ -220,9 +316,35 @@ def _unit(features: Tensor) -> Tensor:
     return features / features.square().sum(dim=1, keepdim=True).clamp(min=MIN_NORM**2).sqrt()
 
 
-def _check_pair(image: Tensor, reference: Tensor) -> None:
+def _texture_and_structure(a: Tensor, b: Tensor, small: float = 1e-6) -> tuple[Tensor, Tensor]:
+    """1 minus the similarity of the means, and of the covariances, of each channel: two (N, C).
+
+    Written as differences, not as 1 - (2 x y + c) / (x^2 + y^2 + c): identical images then give 0 to the last digit.
+    """
+    mean_a, mean_b = a.mean(dim=(2, 3), keepdim=True), b.mean(dim=(2, 3), keepdim=True)
+    a, b = a - mean_a, b - mean_b
+    texture = (mean_a - mean_b).square() / (mean_a.square() + mean_b.square() + small)
+    variances = a.square().mean(dim=(2, 3)) + b.square().mean(dim=(2, 3))
+    return texture.flatten(1), (a - b).square().mean(dim=(2, 3)) / (variances + small)
+
+
+def _as_colour(backbone: Backbone, image: Tensor) -> Tensor:
+    """Grey as three equal channels, in the backbone's own precision: float32, whatever the caller's autocast."""
+    return image.to(next(backbone.parameters()).dtype).expand(-1, 3, -1, -1)
+
+
+def _features(backbone: Backbone, image: Tensor) -> list[Tensor]:
+    """The compared features of a grey image; the scaling layer of `lpips` is ImageNet's figures after [-1, 1]."""
+    colour = _as_colour(backbone, image)
+    mean, std = (colour.new_tensor(x)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
+    features: list[Tensor] = backbone((colour - mean) / std)
+    return features
+
+
+def _check_pair(label: str, backbone: Backbone, image: Tensor, reference: Tensor) -> None:
+    smallest = backbone.spec.min_side_px
     grey = image.ndim == 4 and image.shape[1] == 1 and image.shape == reference.shape
-    if not grey or min(image.shape[2:]) < MIN_SIDE_PX:
-        expected = f"two images (N, 1, H, W) of at least {MIN_SIDE_PX} pixels a side"
+    if not grey or min(image.shape[2:]) < smallest:
+        expected = f"two images (N, 1, H, W) of at least {smallest} pixels a side"
         got = f"{tuple(image.shape)} and {tuple(reference.shape)}"
-        raise ImageError(LABEL, expected=expected, got=got, remedy="give larger images, grey and of one shape")
+        raise ImageError(label, expected=expected, got=got, remedy="give larger images, grey and of one shape")

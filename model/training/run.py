@@ -16,7 +16,7 @@ from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, gr
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.images import list_images
 from beers_deploy.model.io.pictures import busiest_windows, grid, stretch_of, strip_row
-from beers_deploy.model.metrics.perceptual import NOT_FOUND, Lpips, find_backbone
+from beers_deploy.model.metrics.perceptual import Lpips, find_backbone, not_found
 from beers_deploy.model.progress import steps
 from beers_deploy.model.simulator.procedural import draw_scenes
 from beers_deploy.model.simulator.sampling import Scene, read_scene
@@ -117,10 +117,10 @@ def loss_of(run: Run) -> tuple[RestorationLoss, str]:
     """The loss of the recipe, and a sentence on whether LPIPS is part of it."""
     if not run.recipe.loss.lpips:
         return RestorationLoss(run.recipe.loss), ""
-    found = find_backbone(run.lpips)
+    found = find_backbone("squeeze", run.lpips)
     if found is None:
-        return RestorationLoss(run.recipe.loss), f"trains WITHOUT the LPIPS term: {NOT_FOUND}"
-    perceptual = Lpips.load(found)
+        return RestorationLoss(run.recipe.loss), f"trains WITHOUT the LPIPS term: {not_found('squeeze')}"
+    perceptual = Lpips.load("squeeze", found)
     return RestorationLoss(run.recipe.loss, perceptual), f"LPIPS term over {found.name}"
 
 

@@ -95,7 +95,7 @@ def evaluate(
         images: folder of scenes to simulate pairs from; drawn ones if None.
         sensor: of the degraded images; of pairs the one that made them, else the default one.
         reference: the sensor that is aimed at.
-        lpips: weights of SqueezeNet 1.1, or their folder, for LPIPS.
+        lpips: weights of SqueezeNet 1.1, or a folder of backbones, for LPIPS.
         sweep: whether other blurs, noises and gains are looked at too.
         strict: whether pairs are refused whose degraded images contradict the sensor, instead of a note.
         seed: of every random draw.

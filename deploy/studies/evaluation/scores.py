@@ -17,7 +17,7 @@ from scipy.special import stdtrit
 
 from beers_deploy.model.metrics.bootstrap import site_interval
 from beers_deploy.model.metrics.fidelity import fidelity_db, ssim
-from beers_deploy.model.metrics.perceptual import LABEL, NOT_FOUND, Lpips, find_backbone
+from beers_deploy.model.metrics.perceptual import Dists, Lpips, find_backbone, not_found
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.metrics.slanted_edge import edge_mtf, slanted_edge
 from beers_deploy.model.progress import steps
@@ -34,16 +34,22 @@ Perceptual = Callable[[np.ndarray, np.ndarray], float]
 
 
 def perceptual_distances(place: Path | None) -> dict[str, Perceptual | str]:
-    """LPIPS-squeeze, or the reason why not.
+    """LPIPS-squeeze or the reason why not, and LPIPS-vgg and DISTS where VGG16 is found.
 
     Args:
-        place: a file with SqueezeNet 1.1, or its folder; None asks the environment.
+        place: a file with SqueezeNet 1.1, or a folder with any of the backbones; None asks the environment.
     """
-    file = find_backbone(place)
-    return {LABEL: partial(_distance, Lpips.load(file)) if file else NOT_FOUND}
+    found: dict[str, Perceptual | str] = {"LPIPS-squeeze": not_found("squeeze")}
+    networks = ("squeeze", "vgg") if place is None or place.is_dir() else ("squeeze",)
+    for network in networks:
+        if file := find_backbone(network, place):
+            found[f"LPIPS-{network}"] = partial(_distance, Lpips.load(network, file))
+            if network == "vgg":
+                found["DISTS"] = partial(_distance, Dists.load(file))
+    return found
 
 
-def _distance(metric: Lpips, image: np.ndarray, reference: np.ndarray) -> float:
+def _distance(metric: Lpips | Dists, image: np.ndarray, reference: np.ndarray) -> float:
     both = [torch.from_numpy(np.asarray(a, np.float32))[None, None] for a in (image, reference)]
     with torch.inference_mode():
         return float(metric(*both))

@@ -105,7 +105,7 @@ class Benchmark:
         pairs: held-out images, degraded and reference.
         degraded: sensor of the degraded images.
         reference: sensor of the reference images.
-        lpips: weights of SqueezeNet 1.1, or their folder; None asks the environment.
+        lpips: weights of SqueezeNet 1.1, or a folder of backbones; None asks the environment.
         seed: of the bootstrap.
     """
 
@@ -124,7 +124,7 @@ class Benchmark:
     def digest(self) -> str:
         """Of everything that scores depend on besides the method."""
         pairs = [(pair.name, pair.site, pair.degraded, pair.reference) for pair in self.pairs]
-        weights = find_backbone(self.lpips)
+        weights = find_backbone("squeeze", self.lpips)
         return key_of(pairs=pairs, weights=weights and sha256(weights))
 
     @property

@@ -63,7 +63,7 @@ def tradeoff(
         size: (width, height) of the swath in pixels, or as text.
         budget: what can be afforded, such as "latency<=20s".
         need: what must be reached, such as "psnr>=44".
-        lpips: weights of SqueezeNet 1.1, or their folder, for LPIPS.
+        lpips: weights of SqueezeNet 1.1, or a folder of backbones, for LPIPS.
         calibration: folder of scenes to quantise networks on; drawn ones if None.
         labelled: folder of labelled pictures for a detector, whose mAP50 is then a figure of each point.
         detector: ONNX file; the embedded one if None.

@@ -9,29 +9,33 @@ import torch
 from safetensors.numpy import load_file, save_file
 from skimage.filters import gaussian
 from torch import Tensor
-from torch.nn.functional import conv2d, max_pool2d
+from torch.nn.functional import conv2d, max_pool2d, pad
 
 from beers_deploy.model.metrics.perceptual import (
+    BACKBONES,
     MIN_NORM,
-    NOT_FOUND,
     PUBLISHED,
     WEIGHTS_VARIABLE,
     Backbone,
+    Dists,
     Lpips,
     _unit,
     find_backbone,
+    not_found,
 )
 from beers_deploy.profiles.errors import ImageError, ModelError
 
 Weights = dict[str, np.ndarray]
 Maps = list[Tensor]
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+STEMS = {"squeeze": "squeezenet1_1", "vgg": "vgg16"}
 
 
-def made_up() -> Weights:
+def made_up(network: str) -> Weights:
     """Random weights that keep the features' size from layer to layer."""
-    rng = np.random.default_rng(7)
+    rng = np.random.default_rng(len(network))
     weights = {}
-    for name, tensor in Backbone().state_dict().items():
+    for name, tensor in Backbone(network).state_dict().items():
         fan_in = tensor[0].numel() if name.endswith("weight") else 200
         weights[name] = (rng.standard_normal(tuple(tensor.shape)) * np.sqrt(2 / fan_in)).astype(np.float32)
     return weights
@@ -49,19 +53,20 @@ def one_thread() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("weights")
-    save_file(made_up(), folder / "squeezenet1_1-made-up.safetensors")
+    for network, stem in STEMS.items():
+        save_file(made_up(network), folder / f"{stem}-made-up.safetensors")
     return folder
 
 
-@pytest.fixture
-def metric(folder: Path) -> Lpips:
-    return load(folder)
+@pytest.fixture(params=[*STEMS, "dists"])
+def metric(request: pytest.FixtureRequest, folder: Path) -> Lpips | Dists:
+    return load(request.param, folder)
 
 
-def load(folder: Path) -> Lpips:
-    path = find_backbone(folder)
+def load(name: str, folder: Path) -> Lpips | Dists:
+    path = find_backbone("vgg" if name == "dists" else name, folder)
     assert path is not None
-    return Lpips.load(path)
+    return Dists.load(path) if name == "dists" else Lpips.load(name, path)
 
 
 def pair(height: int, width: int, sigma: float = 0.1, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -74,7 +79,7 @@ def as_batch(plane: np.ndarray) -> Tensor:
     return torch.from_numpy(plane).float()[None, None]
 
 
-# The same metric once more, plainly, in float64, layer by layer; an image is (1, C, H, W).
+# The same metrics once more, plainly, in float64, layer by layer; an image is (1, C, H, W).
 
 
 def convolve(x: Tensor, weights: Weights, name: str, stride: int = 1, padding: int = 0) -> Tensor:
@@ -97,27 +102,65 @@ def squeeze_maps(x: Tensor, weights: Weights) -> Maps:
     return maps
 
 
-def plain_lpips(image: np.ndarray, reference: np.ndarray) -> float:
+def hanning_pooled(x: Tensor) -> Tensor:
+    window = torch.from_numpy(np.outer(*[np.hanning(5)[1:-1]] * 2))
+    cells = pad(x**2, (1, 1, 1, 1)).unfold(2, 3, 2).unfold(3, 3, 2)
+    return ((cells * window).sum((-2, -1)) / window.sum() + 1e-12).sqrt()
+
+
+def vgg_maps(x: Tensor, weights: Weights, pool: Callable[[Tensor], Tensor] = lambda x: max_pool2d(x, 2)) -> Maps:
+    maps: Maps = []
+    for names in ("0 2", "5 7", "10 12 14", "17 19 21", "24 26 28"):
+        x = pool(maps[-1]) if maps else x
+        for index in names.split():
+            x = convolve(x, weights, f"features.{index}", padding=1)
+        maps.append(x)
+    return maps
+
+
+def plain_lpips(network: str, image: np.ndarray, reference: np.ndarray) -> float:
     shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
-    weights, heads = made_up(), load_file(PUBLISHED / "lpips-squeeze.safetensors")
+    weights, heads = made_up(network), load_file(PUBLISHED / f"lpips-{network}.safetensors")
+    maps = {"squeeze": squeeze_maps, "vgg": vgg_maps}[network]
     colours = [(2 * np.stack([a] * 3) - 1 - shift[:, None, None]) / scale[:, None, None] for a in (image, reference)]
     total = 0.0
-    pairs = zip(*(squeeze_maps(torch.from_numpy(colour)[None], weights) for colour in colours), strict=True)
+    pairs = zip(*(maps(torch.from_numpy(colour)[None], weights) for colour in colours), strict=True)
     for layer, both in enumerate(pairs):
         a, b = (m.numpy()[0] / (np.sqrt((m.numpy()[0] ** 2).sum(0)) + 1e-10) for m in both)
         total += float(np.mean(np.tensordot(heads[f"lin{layer}"].astype(np.float64), (a - b) ** 2, axes=1)))
     return total
 
 
-@pytest.mark.parametrize("sides", [(64, 64), (67, 53)])
-def test_agrees_with_a_plain_computation(sides: tuple[int, int], metric: Lpips) -> None:
+def plain_dists(image: np.ndarray, reference: np.ndarray) -> float:
+    weights, published = made_up("vgg"), load_file(PUBLISHED / "dists.safetensors")
+    alpha, beta = (published[name].astype(np.float64) for name in ("alpha", "beta"))
+    mean, std = (torch.tensor(x, dtype=torch.float64)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
+    colours = [torch.from_numpy(np.stack([a] * 3))[None] for a in (image, reference)]
+    stages = [[c, *vgg_maps((c - mean) / std, weights, hanning_pooled)] for c in colours]
+    channels = [
+        (a, b) for stage in zip(*stages, strict=True) for a, b in zip(*(x.numpy()[0] for x in stage), strict=True)
+    ]
+    similar = 0.0
+    for channel, (a, b) in enumerate(channels):
+        means = (2 * a.mean() * b.mean() + 1e-6) / (a.mean() ** 2 + b.mean() ** 2 + 1e-6)
+        covariance = np.mean((a - a.mean()) * (b - b.mean()))
+        similar += alpha[channel] * means + beta[channel] * (2 * covariance + 1e-6) / (a.var() + b.var() + 1e-6)
+    return float(1 - similar / (alpha.sum() + beta.sum()))
+
+
+@pytest.mark.parametrize(
+    ("name", "sides"),
+    [("squeeze", (64, 64)), ("squeeze", (67, 53)), ("vgg", (37, 32)), ("dists", (37, 32))],
+)
+def test_agrees_with_a_plain_computation(name: str, sides: tuple[int, int], folder: Path) -> None:
     image, reference = pair(*sides)
-    plain = plain_lpips(*(a[0, 0].double().numpy() for a in (image, reference)))
+    metric, planes = load(name, folder), [a[0, 0].double().numpy() for a in (image, reference)]
+    plain = plain_dists(*planes) if name == "dists" else plain_lpips(name, *planes)
     assert float(metric(image, reference)) == pytest.approx(plain, rel=1e-5)
     assert float(metric.double()(image.double(), reference.double())) == pytest.approx(plain, rel=1e-7)
 
 
-def test_identical_images_are_0_with_no_gradient(metric: Lpips) -> None:
+def test_identical_images_are_0_with_no_gradient(metric: Lpips | Dists) -> None:
     _, reference = pair(64, 48)
     image = reference.clone().requires_grad_()
     value = metric(image, reference)
@@ -128,7 +171,7 @@ def test_identical_images_are_0_with_no_gradient(metric: Lpips) -> None:
     assert not image.grad.any()
 
 
-def test_each_pair_of_a_batch_has_its_own_value(metric: Lpips) -> None:
+def test_each_pair_of_a_batch_has_its_own_value(metric: Lpips | Dists) -> None:
     pairs = [pair(40, 36, sigma) for sigma in (0.02, 0.3)]
     images, references = (torch.cat(parts) for parts in zip(*pairs, strict=True))
     singly = [float(metric(*one)) for one in pairs]
@@ -140,12 +183,13 @@ def test_each_pair_of_a_batch_has_its_own_value(metric: Lpips) -> None:
 def test_the_gradient_is_that_of_the_value(folder: Path) -> None:
     image, reference = (a.double() for a in pair(33, 33))
     step = torch.from_numpy(np.random.default_rng(1).standard_normal(image.shape)) * 1e-6
-    metric, at = load(folder).double(), image.clone().requires_grad_()
-    metric(at, reference).sum().backward()
-    assert at.grad is not None
-    with torch.no_grad():
-        change = float(metric(image + step, reference) - metric(image - step, reference)) / 2
-    assert float((at.grad * step).sum()) == pytest.approx(change, rel=1e-3)
+    for name in ("squeeze", "dists"):
+        metric, at = load(name, folder).double(), image.clone().requires_grad_()
+        metric(at, reference).sum().backward()
+        assert at.grad is not None
+        with torch.no_grad():
+            change = float(metric(image + step, reference) - metric(image - step, reference)) / 2
+        assert float((at.grad * step).sum()) == pytest.approx(change, rel=1e-3)
 
 
 def gradient_at(features: Tensor, unit: Callable[[Tensor], Tensor]) -> Tensor:
@@ -167,7 +211,7 @@ def test_the_packages_own_arithmetic_fails_on_features_that_are_all_zero() -> No
     assert torch.allclose(_unit(features), naive(features), rtol=1e-8)
 
 
-def test_dead_features_keep_the_gradient_finite(metric: Lpips) -> None:
+def test_dead_features_keep_the_gradient_finite(metric: Lpips | Dists) -> None:
     for parameter in metric.backbone.parameters():
         parameter.data.zero_()
     image, reference = pair(40, 40)
@@ -179,23 +223,30 @@ def test_dead_features_keep_the_gradient_finite(metric: Lpips) -> None:
     assert value.isfinite().all()
 
 
-def test_the_smallest_image(metric: Lpips) -> None:
-    assert metric(*pair(17, 17)).isfinite().all()
-    with pytest.raises(ImageError, match="at least 17 pixels a side"):
-        metric(*pair(16, 16))
+@pytest.mark.parametrize(("network", "smallest"), [("squeeze", 17), ("vgg", 16), ("dists", 16)])
+def test_the_smallest_image(network: str, smallest: int, folder: Path) -> None:
+    metric = load(network, folder)
+    assert metric(*pair(smallest, smallest)).isfinite().all()
+    with pytest.raises(ImageError, match=f"at least {smallest} pixels a side"):
+        metric(*pair(smallest - 1, smallest))
 
 
-def test_images_of_different_shapes_are_refused(metric: Lpips) -> None:
+def test_images_of_different_shapes_are_refused(metric: Lpips | Dists) -> None:
     image, reference = pair(40, 40)
     for wrong in (image[0], image[..., 1:], image.expand(-1, 3, -1, -1)):
         with pytest.raises(ImageError, match="of one shape"):
             metric(wrong, wrong if wrong.shape == image[0].shape or wrong.shape[1] == 3 else reference)
 
 
-def test_published_weights_are_whole() -> None:
-    tensors = load_file(PUBLISHED / "lpips-squeeze.safetensors").values()
+@pytest.mark.parametrize(
+    ("file", "total"),
+    [("lpips-squeeze", 173.4387), ("lpips-vgg", 131.8555), ("dists", 1.0)],
+)
+def test_published_weights_are_whole(file: str, total: float) -> None:
+    tensors = load_file(PUBLISHED / f"{file}.safetensors").values()
     assert all(tensor.min() >= 0 for tensor in tensors)
-    assert sum(float(tensor.sum()) for tensor in tensors) == pytest.approx(173.4387, rel=1e-5)
+    assert sum(float(tensor.sum()) for tensor in tensors) == pytest.approx(total, rel=1e-5)
+    assert f"`{file}.safetensors`" in (PUBLISHED / "README.md").read_text()
 
 
 # The files a user brings.
@@ -212,12 +263,12 @@ class Bomb:
 
 
 def test_npz_loads_like_safetensors_at_half_precision_and_with_other_entries(tmp_path: Path, folder: Path) -> None:
-    halves = {name: array.astype(np.float16) for name, array in made_up().items()}
+    halves = {name: array.astype(np.float16) for name, array in made_up("squeeze").items()}
     np.savez(tmp_path / "mine.npz", **halves, **{"classifier.1.weight": np.zeros(3)})  # type: ignore[arg-type]
     images = pair(40, 40)
-    mine = Lpips.load(tmp_path / "mine.npz")
+    mine = Lpips.load("squeeze", tmp_path / "mine.npz")
     assert mine.heads.dtype == torch.float32
-    assert float(mine(*images)) == pytest.approx(float(load(folder)(*images)), rel=3e-3)
+    assert float(mine(*images)) == pytest.approx(float(load("squeeze", folder)(*images)), rel=3e-3)
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
@@ -237,49 +288,51 @@ def test_npz_loads_like_safetensors_at_half_precision_and_with_other_entries(tmp
 def test_a_file_that_is_not_that_network_is_refused(
     tmp_path: Path, suffix: str, change: dict[str, np.ndarray | None], message: str
 ) -> None:
-    arrays = {name: a for name, a in (made_up() | change).items() if a is not None}
+    arrays = {name: a for name, a in (made_up("squeeze") | change).items() if a is not None}
     path = tmp_path / f"weights{suffix}"
     if suffix == ".npz":
         np.savez(path, **arrays)  # type: ignore[arg-type]
     else:
         save_file(arrays, path)
     with pytest.raises(ModelError, match=message):
-        Lpips.load(path)
+        Lpips.load("squeeze", path)
 
 
 def test_a_pickle_inside_npz_is_refused_and_never_run(tmp_path: Path) -> None:
-    arrays: dict[str, np.ndarray] = dict(made_up())
+    arrays: dict[str, np.ndarray] = dict(made_up("squeeze"))
     arrays["features.0.bias"] = np.array([Bomb(tmp_path / "trace")], dtype=object)
     np.savez(tmp_path / "weights.npz", **arrays)  # type: ignore[arg-type]
     with (tmp_path / "bare.npz").open("wb") as file:
         np.save(file, arrays["features.0.bias"])
     for name in ("weights.npz", "bare.npz"):
         with pytest.raises(ModelError, match="none pickled"):
-            Lpips.load(tmp_path / name)
+            Lpips.load("squeeze", tmp_path / name)
     assert not (tmp_path / "trace").exists()
 
 
-def test_a_pickled_file_is_refused_with_the_way_out(tmp_path: Path) -> None:
-    (tmp_path / "squeezenet1_1.pth").write_bytes(b"PK")
+@pytest.mark.parametrize("name", ["vgg16-397923af.pth", "vgg16.pt"])
+def test_a_pickled_file_is_refused_with_the_way_out(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"PK")
     with pytest.raises(ModelError, match=r"convert it where you trust it: .*save_file") as error:
-        Lpips.load(tmp_path / "squeezenet1_1.pth")
+        Dists.load(tmp_path / name)
     assert "\n" not in str(error.value)
 
 
 def test_where_a_backbone_is_looked_for(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(WEIGHTS_VARIABLE, raising=False)
-    assert find_backbone() is None
-    assert find_backbone(tmp_path) is None
-    assert find_backbone(tmp_path / "mine.npz") == tmp_path / "mine.npz"
-    file = folder / "squeezenet1_1-made-up.safetensors"
+    assert find_backbone("squeeze") is None
+    assert find_backbone("squeeze", tmp_path) is None
+    assert find_backbone("squeeze", tmp_path / "mine.npz") == tmp_path / "mine.npz"
+    file = folder / "vgg16-made-up.safetensors"
     for place in (folder, file):
         monkeypatch.setenv(WEIGHTS_VARIABLE, str(place))
-        assert find_backbone() == file
-        assert find_backbone(tmp_path) is None
-    for name in ("nowhere", "vgg16.npz"):
-        monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / name))
-        assert find_backbone() is None
-    assert NOT_FOUND.startswith("weights not found: no squeezenet1_1*.safetensors or squeezenet1_1*.npz")
+        assert find_backbone("vgg") == file
+        assert find_backbone("vgg", tmp_path) is None
+    assert find_backbone("squeeze") is None  # the variable names VGG16's file
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "nowhere"))
+    assert [find_backbone(network) for network in BACKBONES] == [None] * 2
+    for network, stem in STEMS.items():
+        assert not_found(network).startswith(f"weights not found: no {stem}*.safetensors or {stem}*.npz")
 
 
 # The real SqueezeNet, where it lies beside the repository.
@@ -287,10 +340,10 @@ def test_where_a_backbone_is_looked_for(tmp_path: Path, folder: Path, monkeypatc
 
 @pytest.fixture(scope="module")
 def squeeze(shared_data: Path) -> Lpips:
-    path = find_backbone(shared_data / "lpips")
+    path = find_backbone("squeeze", shared_data / "lpips")
     if path is None:
-        pytest.skip(NOT_FOUND)
-    return Lpips.load(path)
+        pytest.skip(not_found("squeeze"))
+    return Lpips.load("squeeze", path)
 
 
 def test_known_values_on_a_photograph(squeeze: Lpips) -> None:
