@@ -5,6 +5,7 @@ as .npy files (N, C, H, W), numbered in the order in which they are computed. Wh
 names in folders of the same names, as many of them as it can hand out.
 """
 
+import hashlib
 import json
 import os
 import re
@@ -62,14 +63,16 @@ def write_golden(
     images = _images(network, core.ends.image_channels, tile, generator)
     planes = {case: core.ends.split(image) for case, image in images.items()}
     planes[EXTREMES] = generator.choice(np.array([-128, 127], np.int8), planes["noise"].shape)
+    digests = dict[str, dict[str, str]]()
     for case, seen in planes.items():
         tensors, _ = run_core(core, seen, half_even)
+        digests[case] = {file: _digest(tensors[name]) for name, file in names.items()}
         for name, file in names.items():
             save_array(folder / case / file, tensors[name].astype(np.int8))
         if case in images:
             save_array(folder / case / PICTURE, images[case])
     network.save(folder / NETWORK)
-    index = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "tool_version": __version__, "cases": list(planes)}
+    index = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "tool_version": __version__, "cases": digests}
     index |= {"network": network.input._asdict(), "half_even": half_even, "layers": _layers(core, names)}
     write_text(folder / INDEX, json.dumps(index, indent=1) + "\n")
     return folder
@@ -139,6 +142,10 @@ def save_array(path: Path, values: np.ndarray) -> None:
         np.save(stream, values)
 
 
+def _digest(values: np.ndarray) -> str:
+    return hashlib.sha256(np.ascontiguousarray(values, np.int8).tobytes()).hexdigest()
+
+
 @dataclass(frozen=True)
 class Golden:
     """A folder of golden vectors, read.
@@ -157,20 +164,26 @@ class Golden:
 
 
 def read_golden(folder: Path) -> Golden:
-    """Read a folder that `write_golden` made; of each case the planes, from which its tensors are computed again."""
+    """Read a folder that `write_golden` made; its tensors are computed again and held to their digests."""
+    remedy = "make it anew with 'beers-deploy golden'"
     try:
         said: Any = read_json(folder / INDEX)
         if (said["schema"], said["schema_version"]) != (SCHEMA, SCHEMA_VERSION):
             raise ValueError(said["schema"])
-        cases, half_even, network = list(said["cases"]), bool(said["half_even"]), Input(**said["network"])
+        digests = {str(case): dict(files) for case, files in said["cases"].items()}
+        half_even, network = bool(said["half_even"]), Input(**said["network"])
     except (AttributeError, LookupError, OSError, TypeError, ValueError) as error:
-        expected, remedy = f"a folder of golden vectors with its {INDEX}", "make it anew with 'beers-deploy golden'"
+        expected = f"a folder of golden vectors with its {INDEX}"
         raise OptionError(str(folder), expected=expected, got="none", remedy=remedy) from error
     core = read_core(Network.load(folder / NETWORK).model)
-    planes = {case: _array(folder / case / files_of(core)[PLANES]) for case in cases}
-    return Golden(
-        core, half_even, {case: run_core(core, each, half_even)[0] for case, each in planes.items()}, network
-    )
+    names, cases = files_of(core), {}
+    for case, files in digests.items():
+        cases[case], _ = run_core(core, _array(folder / case / names[PLANES]), half_even)
+        wrong = [file for name, file in names.items() if files.get(file) != _digest(cases[case][name])]
+        if wrong:
+            got = f"other numbers in {case}/{wrong[0]}"
+            raise OptionError(str(folder), expected="the vectors that were written", got=got, remedy=remedy)
+    return Golden(core, half_even, cases, network)
 
 
 def _array(path: Path) -> np.ndarray:

@@ -204,3 +204,5 @@ def test_the_command_writes_and_compares(tmp_path: Path) -> None:
     assert "expected one of --out and --compare" in refused("golden", seen)
     assert "expected a folder of golden vectors" in refused("golden", seen, "--compare", seen)
     assert "multiple of 2 px" in refused("golden", "convbeers-half-xs", "--tile", 33, "--out", tmp_path / "x")
+    np.save(out / "noise" / "00-planes.npy", np.zeros((1, 4, 38, 38), np.int8))
+    assert "other numbers in noise" in refused("golden", seen, "--compare", out)
