@@ -8,7 +8,7 @@ shifts stay, so the core stays as legal as it was.
 
 import math
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,21 +16,28 @@ import torch
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.quant.core import IntCore
+from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.ends import Ends
-from beers_deploy.quant.graph import CORRECTION, Conv, Graph, graph_to_onnx
+from beers_deploy.quant.graph import CORRECTION, Graph, graph_to_onnx
 from beers_deploy.quant.integer.trainable import Tensor, TrainableCore
 from beers_deploy.quant.samples import Pair, Remade
-from beers_deploy.quant.session import open_session, tensor_values
+from beers_deploy.quant.session import open_session, result_of, tensor_values
 from beers_deploy.quant.untrusted import times
 
 HELD_OUT_EVERY = 8
 """One pair of so many is not trained on, but judges what is kept."""
-JUDGEMENTS = 20
+MOST_HELD_OUT = 16
 BATCH_PIXELS = 4 * 128**2
 """Of the planes that one step looks at."""
 BORDER_PX = 8
 """Not held against a reference in a result of at least four times as many a side: there a patch ends, and its image
 goes on. The float network has the same border."""
+STEPS_MOST = 1000
+"""Where held-out pairs are to end the training."""
+JUDGED_EVERY = 20
+STALE_STEPS = 100
+"""So many without a better core, and the rate begins to fall."""
+FALLING_STEPS = 200
 
 
 @dataclass(frozen=True)
@@ -39,28 +46,30 @@ class Tuning:
 
     Attributes:
         pairs: images (1, C, H, W) in [0, 1] and their references, which may be empty.
-        steps: gradient steps.
+        steps: gradient steps; None goes on until pairs that are held out err no less.
         rate: the highest rate of learning, in units of each number's scale.
         seed: of the order of the pairs.
     """
 
     pairs: Remade[Pair]
-    steps: int
+    steps: int | None = None
     rate: float = 0.015
     seed: int = 0
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What a pair is to the core: planes (1, P, H, W) as float32 in, corrections (1, C, H', W') wanted out.
+    """What a pair is to the core: an image in, corrections (1, C, H', W') wanted out.
 
     Attributes:
-        planes: of the image.
+        image: (1, C, H, W) in [0, 1].
+        planes: of the image, (1, P, H, W) as float32.
         floats: what the float network makes of it.
         reference: the correction that would restore it wholly, or None.
         weight: of its errors: over the float network's own, so that dark and busy patches count alike.
     """
 
+    image: np.ndarray
     planes: Tensor
     floats: Tensor
     reference: Tensor | None
@@ -74,48 +83,73 @@ class Sample:
         return self.weight * error
 
 
+class Schedule:
+    """The rate of learning as a share of the highest: a half cosine down to 0 over all steps, or over the last ones.
+
+    Attributes:
+        steps: that are taken, as far as is known.
+        falls_from: the step from which on the rate falls.
+    """
+
+    def __init__(self, steps: int | None) -> None:
+        self.steps, self.falls_from = (STEPS_MOST, STEPS_MOST - FALLING_STEPS) if steps is None else (steps, 0)
+
+    def stale(self, step: int) -> None:
+        """Let the rate fall from this step on, unless it does."""
+        if step < self.falls_from:
+            self.falls_from, self.steps = step, step + FALLING_STEPS
+
+    def share(self, step: int) -> float:
+        """Of the highest rate, after so many steps."""
+        fallen = max(step - self.falls_from, 0) / (self.steps - self.falls_from)
+        return 0.5 * (1 + math.cos(math.pi * fallen))
+
+
 def tune(
-    core: IntCore, rounded: Graph, full: Graph, tuning: Tuning, still: Collection[str] = (), log: Log = no_log
-) -> IntCore:
-    """The core with the numbers that erred least on pairs that they were not trained on.
+    core: IntCore, full: Graph, tuning: Tuning, still: Collection[str] = (), log: Log = no_log
+) -> tuple[IntCore, int]:
+    """The core with the numbers that erred least on pairs that they were not trained on, and the steps taken.
 
     Args:
         core: to start from; it comes back as it is where training finds nothing better.
-        rounded: the float operations that it was rounded from.
         full: the float network that reads all planes.
         tuning: on what, how long, how fast.
         still: the tensors whose convolutions are not trained.
-        log: is told now and then how many steps are done.
+        log: is told now and then how many steps are done, and what they gained.
     """
     samples = list(_samples(core.ends, full, tuning.pairs))
-    held = samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples
+    held = (samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples)[:MOST_HELD_OUT]
     seen = [sample for k, sample in enumerate(samples) if (k + 1) % HELD_OUT_EVERY] or samples
-    trainable = TrainableCore(core, [op for op in rounded if isinstance(op, Conv)], still)
-    least, kept, every = _cost(trainable, held), core, max(tuning.steps // JUDGEMENTS, 1)
-    for step in _descend(trainable, seen, tuning):
-        if step % every and step < tuning.steps:
+    trainable = TrainableCore(core, still)
+    schedule, begun = Schedule(tuning.steps), cost_of(core, held)
+    kept, least, found_at = core, begun, 0
+    for step in _descend(trainable, seen, tuning, schedule):
+        if step % JUDGED_EVERY and step < schedule.steps:
             continue
-        log(f"fine-tuning, step {step} of {tuning.steps}")
-        cost = _cost(trainable, held)
+        cost = cost_of(trainable.core(), held)
         if cost < least:
-            least, kept = cost, trainable.core()
-    return kept
+            kept, least, found_at = trainable.core(), cost, step
+        if step - found_at >= STALE_STEPS:
+            schedule.stale(step)
+        log(f"fine-tuning, step {step} of {schedule.steps}: error {least / begun:.3f} of the first on held-out pairs")
+    return kept, schedule.steps
 
 
 def _samples(ends: Ends, full: Graph, pairs: Remade[Pair]) -> Iterator[Sample]:
     session = open_session(graph_to_onnx(full, [CORRECTION], ends.planes * ends.channels))
     for image, reference in pairs:
         ((floats,),) = tensor_values(session, [CORRECTION], image, None, ends)
-        planes, result = torch.from_numpy(ends.split(image).astype(np.float32)), torch.from_numpy(floats)
+        planes = torch.from_numpy(ends.split(image).astype(np.float32)).to(memory_format=torch.channels_last)
+        result = torch.from_numpy(floats)
         if not (reference.size and ends.is_image):
-            yield Sample(planes, result, None, 1.0)
+            yield Sample(image, planes, result, None, 1.0)
             continue
         given, made = times(reference.shape), times(ends.finished(image, floats).shape)
         if given != made:
             remedy = "give references of the size that the network makes"
             raise ImageError("reference", expected=f"one of {made}", got=given, remedy=remedy)
         wanted = torch.from_numpy(ends.correction_of(image, reference))
-        yield Sample(planes, result, wanted, 1 / max(float(_inner_error(result, wanted)), LEAST_ERROR))
+        yield Sample(image, planes, result, wanted, 1 / max(float(_inner_error(result, wanted)), LEAST_ERROR))
 
 
 LEAST_ERROR = 1e-9
@@ -130,25 +164,27 @@ def _inner_error(result: Tensor, wanted: Tensor) -> Tensor:
     return inner.square().mean()
 
 
-def _descend(trainable: TrainableCore, samples: list[Sample], tuning: Tuning) -> Iterator[int]:
-    """Step after step by Adam, the rate falling to 0 as a half cosine; yields the steps done."""
+def _descend(trainable: TrainableCore, samples: list[Sample], tuning: Tuning, schedule: Schedule) -> Iterator[int]:
+    """Step after step by Adam; yields the steps done."""
     generator = torch.Generator().manual_seed(tuning.seed)
     optimiser = torch.optim.Adam(trainable.parameters(), lr=tuning.rate)
-    falling = torch.optim.lr_scheduler.LambdaLR(
-        optimiser, lambda step: 0.5 * (1 + math.cos(math.pi * step / tuning.steps))
-    )
     batch = max(BATCH_PIXELS // math.prod(samples[0].planes.shape[2:]), 1)
-    for step in range(1, tuning.steps + 1):
+    step = 0
+    while step < schedule.steps:
+        for group in optimiser.param_groups:
+            group["lr"] = tuning.rate * schedule.share(step)
         optimiser.zero_grad()
         for number in torch.randint(len(samples), (batch,), generator=generator).tolist():
             sample = samples[number]
             (sample.error(trainable(sample.planes)) / batch).backward()
         optimiser.step()
-        falling.step()
+        step += 1
         yield step
 
 
-@torch.no_grad()
-def _cost(trainable: TrainableCore, samples: list[Sample]) -> float:
-    """The mean error of the whole numbers as they stand."""
-    return float(np.mean([float(sample.error(trainable(sample.planes))) for sample in samples]))
+def cost_of(core: IntCore, samples: list[Sample]) -> float:
+    """The mean error of a core's correction as the host computes it."""
+    ends = replace(core.ends, back=(), adds_image=False, last=(), flat=False, softmax=False, tail=None)
+    session = open_session(host_model(replace(core, ends=ends), {}))
+    found = ((sample, torch.from_numpy(result_of(session, sample.image))) for sample in samples)
+    return float(np.mean([float(sample.error(result)) for sample, result in found]))
