@@ -32,12 +32,11 @@ BATCH_PIXELS = 4 * 128**2
 BORDER_PX = 8
 """Not held against a reference in a result of at least four times as many a side: there a patch ends, and its image
 goes on. The float network has the same border."""
-STEPS_MOST = 1000
-"""Where held-out pairs are to end the training."""
+ROUNDS = (200, 400, 800, 1600)
+"""Steps of each round of "auto"."""
+LEAST_GAIN = 0.02
+"""Of what INT8 lost at first: a round that wins back less is the last one."""
 JUDGED_EVERY = 20
-STALE_STEPS = 100
-"""So many without a better core, and the rate begins to fall."""
-FALLING_STEPS = 200
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class Tuning:
 
     Attributes:
         pairs: images (1, C, H, W) in [0, 1] and their references, which may be empty.
-        steps: gradient steps; None goes on until pairs that are held out err no less.
+        steps: gradient steps; None adds rounds of them until pairs that are held out err no less.
         rate: the highest rate of learning, in units of each number's scale.
         seed: of the order of the pairs.
     """
@@ -83,26 +82,53 @@ class Sample:
         return self.weight * error
 
 
-class Schedule:
-    """The rate of learning as a share of the highest: a half cosine down to 0 over all steps, or over the last ones.
+class Judge:
+    """Keeps the core whose results, as the host computes them, lose least on samples that it is not trained on.
 
-    Attributes:
-        steps: that are taken, as far as is known.
-        falls_from: the step from which on the rate falls.
+    What is lost is the mean error beyond the float network's own.
     """
 
-    def __init__(self, steps: int | None) -> None:
-        self.steps, self.falls_from = (STEPS_MOST, STEPS_MOST - FALLING_STEPS) if steps is None else (steps, 0)
+    def __init__(self, core: IntCore, held: list[Sample]) -> None:
+        self._held = held
+        self._in_float = float(np.mean([float(sample.error(sample.floats)) for sample in held]))
+        self.core, self.first = core, self.loss(core)
+        self.least = self.first
 
-    def stale(self, step: int) -> None:
-        """Let the rate fall from this step on, unless it does."""
-        if step < self.falls_from:
-            self.falls_from, self.steps = step, step + FALLING_STEPS
+    def loss(self, core: IntCore) -> float:
+        """What a core loses."""
+        ends = replace(core.ends, back=(), adds_image=False, last=(), flat=False, softmax=False, tail=None)
+        session = open_session(host_model(replace(core, ends=ends), {}))
+        results = (torch.from_numpy(result_of(session, sample.image)) for sample in self._held)
+        errors = [float(sample.error(result)) for sample, result in zip(self._held, results, strict=True)]
+        return float(np.mean(errors)) - self._in_float
 
-    def share(self, step: int) -> float:
-        """Of the highest rate, after so many steps."""
-        fallen = max(step - self.falls_from, 0) / (self.steps - self.falls_from)
-        return 0.5 * (1 + math.cos(math.pi * fallen))
+    def see(self, core: IntCore) -> None:
+        """Keep a core that loses less than all before."""
+        loss = self.loss(core)
+        if loss < self.least:
+            self.core, self.least = core, loss
+
+
+class Descent:
+    """The steps by Adam; in each round the rate of learning falls to 0 as a half cosine."""
+
+    def __init__(self, trainable: TrainableCore, samples: list[Sample], tuning: Tuning) -> None:
+        self._trainable, self._samples, self._rate, self.done = trainable, samples, tuning.rate, 0
+        self._generator = torch.Generator().manual_seed(tuning.seed)
+        self._optimiser = torch.optim.Adam(trainable.parameters())
+        self._batch = max(BATCH_PIXELS // math.prod(samples[0].planes.shape[2:]), 1)
+
+    def round(self, steps: int) -> Iterator[int]:
+        """So many steps; yields how many of them are left."""
+        for step in range(steps):
+            self._optimiser.param_groups[0]["lr"] = self._rate * 0.5 * (1 + math.cos(math.pi * step / steps))
+            self._optimiser.zero_grad()
+            for number in torch.randint(len(self._samples), (self._batch,), generator=self._generator).tolist():
+                sample = self._samples[number]
+                (sample.error(self._trainable(sample.planes)) / self._batch).backward()
+            self._optimiser.step()
+            self.done += 1
+            yield steps - step - 1
 
 
 def tune(
@@ -120,19 +146,20 @@ def tune(
     samples = list(_samples(core.ends, full, tuning.pairs))
     held = (samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples)[:MOST_HELD_OUT]
     seen = [sample for k, sample in enumerate(samples) if (k + 1) % HELD_OUT_EVERY] or samples
-    trainable = TrainableCore(core, still)
-    schedule, begun = Schedule(tuning.steps), cost_of(core, held)
-    kept, least, found_at = core, begun, 0
-    for step in _descend(trainable, seen, tuning, schedule):
-        if step % JUDGED_EVERY and step < schedule.steps:
-            continue
-        cost = cost_of(trainable.core(), held)
-        if cost < least:
-            kept, least, found_at = trainable.core(), cost, step
-        if step - found_at >= STALE_STEPS:
-            schedule.stale(step)
-        log(f"fine-tuning, step {step} of {schedule.steps}: error {least / begun:.3f} of the first on held-out pairs")
-    return kept, schedule.steps
+    trainable, judge = TrainableCore(core, still), Judge(core, held)
+    descent, rounds = Descent(trainable, seen, tuning), (tuning.steps,) if tuning.steps else ROUNDS
+    for steps in rounds:
+        before = judge.least
+        for left in descent.round(steps):
+            if left % JUDGED_EVERY == 0:
+                judge.see(trainable.core())
+                share = judge.least / max(judge.first, LEAST_ERROR)
+                log(
+                    f"fine-tuning, step {descent.done} of {sum(rounds)}: held-out pairs lose {share:.2f} of the first"
+                )
+        if before - judge.least < LEAST_GAIN * judge.first:
+            break
+    return judge.core, descent.done
 
 
 def _samples(ends: Ends, full: Graph, pairs: Remade[Pair]) -> Iterator[Sample]:
@@ -162,29 +189,3 @@ def _inner_error(result: Tensor, wanted: Tensor) -> Tensor:
     height, width = result.shape[2:]
     inner = (result - wanted)[..., border_px : height - border_px, border_px : width - border_px]
     return inner.square().mean()
-
-
-def _descend(trainable: TrainableCore, samples: list[Sample], tuning: Tuning, schedule: Schedule) -> Iterator[int]:
-    """Step after step by Adam; yields the steps done."""
-    generator = torch.Generator().manual_seed(tuning.seed)
-    optimiser = torch.optim.Adam(trainable.parameters(), lr=tuning.rate)
-    batch = max(BATCH_PIXELS // math.prod(samples[0].planes.shape[2:]), 1)
-    step = 0
-    while step < schedule.steps:
-        for group in optimiser.param_groups:
-            group["lr"] = tuning.rate * schedule.share(step)
-        optimiser.zero_grad()
-        for number in torch.randint(len(samples), (batch,), generator=generator).tolist():
-            sample = samples[number]
-            (sample.error(trainable(sample.planes)) / batch).backward()
-        optimiser.step()
-        step += 1
-        yield step
-
-
-def cost_of(core: IntCore, samples: list[Sample]) -> float:
-    """The mean error of a core's correction as the host computes it."""
-    ends = replace(core.ends, back=(), adds_image=False, last=(), flat=False, softmax=False, tail=None)
-    session = open_session(host_model(replace(core, ends=ends), {}))
-    found = ((sample, torch.from_numpy(result_of(session, sample.image))) for sample in samples)
-    return float(np.mean([float(sample.error(result)) for sample, result in found]))

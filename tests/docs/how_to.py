@@ -45,7 +45,7 @@ SHORTER = {
     r"--frames 300": "--frames 4",
     r"(beers-deploy quantize)": r"\1 --patches 8 --patch 64",
     r"(beers-deploy gate)": r"\1 --patches 4",
-    r"--finetune 250": "--finetune 1",
+    r"--finetune auto": "--finetune 1",
     r"(characterise\.py .*convbeers-s)\.safetensors": r"\1.safetensors --sensors 1",
     r"raw1\.tif:412,300,28,34": "raw1.tif:114,82,28,34",
     r"raw1\.tif:440,330,34,28": "raw1.tif:140,114,34,28",

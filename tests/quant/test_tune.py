@@ -144,6 +144,20 @@ def test_what_comes_out_worse_is_not_kept(
     assert found is quantised.core
 
 
+@pytest.mark.parametrize(("rate", "steps"), [(0.0, 12), (0.3, 14)])
+def test_it_goes_on_by_itself_while_held_out_pairs_gain(
+    quantised: Quantised,
+    float_onnx: onnx.ModelProto,
+    patches: Patches,
+    monkeypatch: pytest.MonkeyPatch,
+    rate: float,
+    steps: int,
+) -> None:
+    monkeypatch.setattr("beers_deploy.quant.passes.tune.ROUNDS", (12, 2))
+    graph, tuning = read_planes(correction_graph(float_onnx)), Tuning(alone(patches), None, rate)
+    assert tune(spoilt(quantised.core), graph, tuning)[1] == steps
+
+
 def test_a_reference_of_another_size_is_one_sentence(
     quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
