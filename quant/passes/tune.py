@@ -32,7 +32,7 @@ BATCH_PIXELS = 4 * 128**2
 BORDER_PX = 8
 """Not held against a reference in a result of at least four times as many a side: there a patch ends, and its image
 goes on. The float network has the same border."""
-ROUNDS = (200, 400, 800, 1600)
+ROUNDS = (400, 800, 1600)
 """Steps of each round of "auto"."""
 LEAST_GAIN = 0.02
 """Of what INT8 lost at first: a round that wins back less is the last one."""
@@ -52,7 +52,7 @@ class Tuning:
 
     pairs: Remade[Pair]
     steps: int | None = None
-    rate: float = 0.015
+    rate: float = 0.05
     seed: int = 0
 
 
@@ -102,6 +102,11 @@ class Judge:
         errors = [float(sample.error(result)) for sample, result in zip(self._held, results, strict=True)]
         return float(np.mean(errors)) - self._in_float
 
+    @property
+    def share(self) -> float:
+        """Of what was lost at first, what still is."""
+        return self.least / max(self.first, LEAST_ERROR)
+
     def see(self, core: IntCore) -> None:
         """Keep a core that loses less than all before."""
         loss = self.loss(core)
@@ -110,12 +115,15 @@ class Judge:
 
 
 class Descent:
-    """The steps by Adam; in each round the rate of learning falls to 0 as a half cosine."""
+    """The steps by Adam; in each round the rate of learning falls to 0 as a half cosine.
+
+    While the rate is high, numbers turn to and fro at the thresholds of their rounding, and no judgement is of use.
+    """
 
     def __init__(self, trainable: TrainableCore, samples: list[Sample], tuning: Tuning) -> None:
         self._trainable, self._samples, self._rate, self.done = trainable, samples, tuning.rate, 0
         self._generator = torch.Generator().manual_seed(tuning.seed)
-        self._optimiser = torch.optim.Adam(trainable.parameters())
+        self._optimiser = torch.optim.Adam(trainable.parameters(), eps=1e-15)  # errors are small without references
         self._batch = max(BATCH_PIXELS // math.prod(samples[0].planes.shape[2:]), 1)
 
     def round(self, steps: int) -> Iterator[int]:
@@ -148,15 +156,13 @@ def tune(
     seen = [sample for k, sample in enumerate(samples) if (k + 1) % HELD_OUT_EVERY] or samples
     trainable, judge = TrainableCore(core, still), Judge(core, held)
     descent, rounds = Descent(trainable, seen, tuning), (tuning.steps,) if tuning.steps else ROUNDS
+    most = f"{'' if tuning.steps else 'at most '}{sum(rounds)}"
     for steps in rounds:
         before = judge.least
         for left in descent.round(steps):
             if left % JUDGED_EVERY == 0:
                 judge.see(trainable.core())
-                share = judge.least / max(judge.first, LEAST_ERROR)
-                log(
-                    f"fine-tuning, step {descent.done} of {sum(rounds)}: held-out pairs lose {share:.2f} of the first"
-                )
+                log(f"fine-tuning, step {descent.done} of {most}: held-out pairs lose {judge.share:.2f} of the first")
         if before - judge.least < LEAST_GAIN * judge.first:
             break
     return judge.core, descent.done
