@@ -36,7 +36,7 @@ class Added(nn.Sequential):
 
     def forward(self, image: Tensor) -> Tensor:
         """(N, 1, H, W) to the same."""
-        corrected: Tensor = image + super().forward(image)
+        corrected: Tensor = image + super().forward(image)  # type: ignore[no-untyped-call]
         return corrected
 
 
