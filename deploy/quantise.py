@@ -55,7 +55,7 @@ def quantize(
     images: str | os.PathLike[str] | None = None,
     patches: int = 64,
     patch_px: int = 128,
-    finetune: int = 0,
+    finetune: int | str = 0,
     seed: int = 0,
     progress: Progress = None,
 ) -> Network:
@@ -72,7 +72,7 @@ def quantize(
         images: folder of scenes for the simulated patches; None for drawn ones.
         patches: how many are simulated.
         patch_px: their side.
-        finetune: for how many steps the whole numbers are trained.
+        finetune: for how many steps the whole numbers are trained; "auto" trains until held-out pairs err no less.
         seed: of the patches.
         progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
 
@@ -94,7 +94,8 @@ def quantize(
     """
     target, known, banked = TargetProfile.load(board), Sensor.load(sensor), _conditioned(network)
     _require_regime(regime)
-    if banked and (regime == "free" or finetune or samples is not None):
+    steps = steps_of(finetune)
+    if banked and (regime == "free" or steps != 0 or samples is not None):
         remedy = "leave it out: such a network is calibrated over the whole family of sensors at once"
         expected = "no other regime, samples or fine-tuning"
         raise OptionError("a network behind a bank", expected=expected, got="one", remedy=remedy)
@@ -107,8 +108,18 @@ def quantize(
             simulated = _simulated(known, scenes, patches, patch_px, seed)
             return replace(_banked(banked, simulated, known, target), origin=origin)
         calibration: Source = own or _simulated(known, scenes, patches, patch_px, seed)
-        made = _free(origin, calibration) if regime == "free" else _legal(origin, calibration, target, finetune)
+        made = _free(origin, calibration) if regime == "free" else _legal(origin, calibration, target, steps)
     return replace(made, origin=origin)
+
+
+def steps_of(finetune: int | str) -> int | None:
+    """Steps of fine-tuning, None for "auto"."""
+    if finetune == "auto":
+        return None
+    if not str(finetune).isdecimal():
+        expected, remedy = "auto, or whole steps from 0", "choose auto"
+        raise OptionError("finetune", expected=expected, got=repr(finetune), remedy=remedy)
+    return int(finetune)
 
 
 def _require_regime(regime: str) -> None:
@@ -132,9 +143,9 @@ def _free(origin: Network, calibration: Source) -> Network:
     return Network(made, f"{origin.name}-int8")
 
 
-def _legal(origin: Network, calibration: Source, target: TargetProfile, finetune: int) -> Network:
+def _legal(origin: Network, calibration: Source, target: TargetProfile, steps: int | None) -> Network:
     shifts = _shifts_of(target)
-    tuning = _tuning(calibration, finetune) if finetune else None
+    tuning = None if steps == 0 else _tuning(calibration, steps)
     with begun("calibrating") as step:
         about = {**calibration.about, "target": target.name}
         result = quantise_model(origin.model, calibration.drawn, about, shifts, tuning, log=step)
@@ -142,7 +153,7 @@ def _legal(origin: Network, calibration: Source, target: TargetProfile, finetune
     return Network(result.host, f"{origin.name}-int8", layers=layers, quantised=result)
 
 
-def _tuning(calibration: Source, steps: int) -> "Tuning":
+def _tuning(calibration: Source, steps: int | None) -> "Tuning":
     optional("torch", "finetune")
     from beers_deploy.quant.passes.tune import Tuning
 

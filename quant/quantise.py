@@ -191,11 +191,11 @@ def quantise_model(
         from beers_deploy.quant.passes.tune import tune  # torch, which no other step takes
 
         # Patches that hold few roofs would train the last sum's room away.
-        core = tune(core, final, plan.graph, tuning, still=last_sum, log=log)
+        core, steps = tune(core, plan.graph, tuning, still=last_sum, log=log)
     about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
     about["passes"] = PASSES
     if tuning:
-        about["finetune"] = f"{tuning.steps} steps on {len(tuning.pairs)} patches"
+        about["finetune"] = f"{steps} steps on {len(tuning.pairs)} patches"
     tile_px = fixed_tile_px(model)
     return Quantised(
         host_model(core, about, tile_px), board_model(core, about, tile_px), core, relu_count(plan.graph), final

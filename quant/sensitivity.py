@@ -273,7 +273,7 @@ def _costliest(result: Quantised, patches: Patches) -> str:
     layers.sort(key=lambda layer: layer.network.squared, reverse=True)
     named = ", ".join(f"{layer.name} ({100 * layer.network.squared / whole:.0f} %)" for layer in layers[:MOST])
     add = "" if result.core.ends.adds_image else ", or a network that ends with a global add, of which INT8 errs less"
-    return f"most of it in {named}; try --finetune 250{add}"
+    return f"most of it in {named}; try --finetune auto{add}"
 
 
 MOST = 3

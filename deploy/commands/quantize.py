@@ -61,11 +61,11 @@ def quantize(
         typer.Option(help="Folder for report.html and report.json: which layers and patches err, and how."),
     ] = None,
     finetune: Annotated[
-        int,
+        str,
         typer.Option(
-            min=0, max=100_000, help="Steps that train the INT8 numbers on --images or --samples; some 250, minutes."
+            help="Steps that train the INT8 numbers on --images or --samples; 'auto': minutes, while it helps."
         ),
-    ] = 0,
+    ] = "0",
     seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
     json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
 ) -> None:
@@ -79,14 +79,14 @@ def quantize(
     from beers_deploy.profiles.figures import by_table
     from beers_deploy.quant.encodings import read_core
     from beers_deploy.quant.onnx_file import require_onnx_name
-    from beers_deploy.quantise import losses_of, sensitivity_report
+    from beers_deploy.quantise import losses_of, sensitivity_report, steps_of
     from beers_deploy.quantise import quantize as quantised
     from beers_deploy.report.page import write_report
     from beers_deploy.results import Table, print_rows
     from beers_deploy.verdict import compare
 
     free = regime is Regime.free
-    _require_legal(free and bool(board_file or report or finetune))
+    _require_legal(free and bool(board_file or report or steps_of(finetune) != 0))
     if report and conditioned(model):
         expected, remedy = "a network that is calibrated by itself", "leave it out"
         raise OptionError("--report", expected=expected, got="one behind a bank", remedy=remedy)

@@ -1,8 +1,13 @@
 """The integer core in torch, so that its numbers can be trained: whole numbers forwards, slopes backwards.
 
 Forwards every tensor holds the very whole numbers of `quant.integer.reference`. Backwards rounding counts as the
-identity, and clipping as what it is (the straight-through estimator, Bengio et al. 2013). Sums are of float32,
-which holds them exactly up to 2^24.
+identity, and clipping as what it is (the straight-through estimator, Bengio et al. 2013). A step costs about what one
+of the float network does: weights carry the shift to the result's unit, biases what makes ties round up, and one pass
+over the sums clips them, another rounds them. Sums are of float32, which holds them exactly up to 2^22, behind
+LeakyReLU 2^19.
+
+A result in windows or two gains is trained as one copy of it, which is not rounded: it differs from what the host
+computes by up to half a unit. `TrainableCore.core` makes the other copies.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -14,7 +19,7 @@ import torch
 from torch.nn import functional
 
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from beers_deploy.quant.ends import FINE_MAX, GAIN, Ends
+from beers_deploy.quant.ends import GAIN, Ends
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
@@ -22,7 +27,6 @@ from beers_deploy.quant.graph import (
     Add,
     AveragePool,
     Concat,
-    Conv,
     MaxPool,
     Mul,
     Pointwise,
@@ -30,20 +34,22 @@ from beers_deploy.quant.graph import (
     Shuffle,
     Window,
 )
-from beers_deploy.quant.graph.operations import LEAKY_SLOPE, SIX, SIXTH
-from beers_deploy.quant.integer.arithmetic import activation_table, mean_factor
+from beers_deploy.quant.graph.operations import LEAKY_SLOPE
+from beers_deploy.quant.integer.arithmetic import activation_table, bilinear_weights, mean_factor, six_in_units
 
 Tensor = torch.Tensor
+Bits = Mapping[str, int]
 
 
-def rounded(values: Tensor) -> Tensor:
-    """Half up, as the DPU rounds; its slope is 1."""
-    return values + (torch.floor(values + 0.5) - values).detach()
+NEAR = 0.49
+"""How far from int8's ends a value may lie and is not clipped: what is rounded to them."""
 
 
-def to_int8(values: Tensor) -> Tensor:
-    """Rounded and clipped to int8's range; what is clipped has no slope."""
-    return rounded(values).clamp(INT8_MIN, INT8_MAX)
+def to_int8(values: Tensor, low: int = INT8_MIN, high: int = INT8_MAX) -> Tensor:
+    """Rounded, ties to even, and clipped; the slope is 1, and 0 where it is clipped."""
+    clipped = functional.hardtanh(values, low - NEAR, high + NEAR)
+    clipped.data.round_()  # unseen by autograd
+    return clipped
 
 
 class TrainableCore(torch.nn.Module):
@@ -52,178 +58,168 @@ class TrainableCore(torch.nn.Module):
     They may lie between whole numbers while they are trained; forwards the nearest whole numbers count.
     """
 
-    def __init__(self, core: IntCore, origins: Sequence[Conv], still: Collection[str] = ()) -> None:
-        """Parameters where the float numbers lie, as near as they round to the core's whole ones.
+    def __init__(self, core: IntCore, still: Collection[str] = ()) -> None:
+        """Parameters that begin at the core's whole numbers.
 
         Args:
             core: in whole numbers.
-            origins: the float convolution that each of the core's was rounded from, in their order.
             still: the tensors whose convolutions stay as they are.
         """
         super().__init__()
-        self._core = core
-        both = list(zip(core.convolutions, origins, strict=True))
-        self.weights = torch.nn.ParameterList(_begin(a.weight, b.weight, a.weight_frac_bits) for a, b in both)
-        self.biases = torch.nn.ParameterList(_begin(a.bias, b.bias, a.bias_frac_bits) for a, b in both)
-        for op, *numbers in zip(core.convolutions, self.weights, self.biases, strict=True):
+        self._core, self._convs = core, [_one_copy(op, core.ends) for op in core.convolutions]
+        self.weights = torch.nn.ParameterList(torch.tensor(op.weight).float() for op in self._convs)
+        self.biases = torch.nn.ParameterList(torch.tensor(op.bias).float() for op in self._convs)
+        for op, *numbers in zip(self._convs, self.weights, self.biases, strict=True):
             for parameter in numbers:
                 parameter.requires_grad_(op.output not in still)
+        if core.ends.offsets:
+            self.biases[-1].data.copy_(torch.from_numpy(_window_bias(self._convs[-1], core.ends)))
 
     def core(self) -> IntCore:
         """The core with its weights and biases as they stand, in whole numbers."""
-        found = zip(self._core.convolutions, map(_whole, self.weights), map(_whole, self.biases), strict=True)
+        found = zip(self._convs, map(_whole, self.weights), map(_whole, self.biases), strict=True)
         trained = {op.name: replace(op, weight=weight, bias=bias) for op, weight, bias in found}
-        return replace(self._core, ops=tuple(trained.get(op.name, op) for op in self._core.ops))
+        ops, ends, last = [trained.get(op.name, op) for op in self._core.ops], self._core.ends, self._core.ops[-1]
+        if ends.copies > 1 and isinstance(last, IntConv):
+            one = trained[last.name]
+            bias = self.biases[-1].detach().numpy() if ends.offsets else one.bias
+            ops[-1], ends = _all_copies(last, ends, one.weight, bias)
+        return replace(self._core, ops=tuple(ops), ends=ends)
 
     def forward(self, planes: Tensor) -> Tensor:
         """The one correction (N, C, H, W) in float, of int8 planes (N, P, H, W) as float32."""
-        scale = self._core.scale(CORRECTION)
-        return merged(self._core.ends, self.tensors(planes)[CORRECTION] * scale, scale)
+        return self.tensors(planes)[CORRECTION] * self._core.scale(CORRECTION)
 
     def tensors(self, planes: Tensor) -> dict[str, Tensor]:
-        """Every tensor (N, C, H, W) by its name, in whole numbers."""
-        found, numbers = {PLANES: planes}, iter(zip(self.weights, self.biases, strict=True))
+        """Every tensor (N, C, H, W) by its name in whole numbers; of a correction in copies one, unrounded."""
+        found, numbers = {PLANES: planes}, iter(zip(self._convs, self.weights, self.biases, strict=True))
         for op in self._core.ops:
             read = [found[name] for name in op.inputs]
             if isinstance(op, IntConv):
-                weight, bias = next(numbers)
-                sums, finer = _conv(op, read[0], to_int8(weight), to_int8(bias), self._core.frac_bits[op.input])
+                found[op.output] = self._convolved(*next(numbers), read[0])
             else:
-                sums, finer = _OPERATIONS[type(op)](op, read, self._core.frac_bits)
-            found[op.output] = to_int8(sums * 2.0 ** (self._core.frac_bits[op.output] - finer))
+                found[op.output] = _OPERATIONS[type(op)](op, read, self._core.frac_bits)
         return found
 
-
-NEAR = 0.49
-"""How far from a whole number a value may begin that stands for it."""
-
-
-def _begin(whole: np.ndarray, origin: np.ndarray, frac_bits: int) -> Tensor:
-    """The float numbers in units of the scale, drawn to where they round to the whole ones."""
-    return torch.tensor(np.clip(origin * 2.0**frac_bits, whole - NEAR, whole + NEAR), dtype=torch.float32)
+    def _convolved(self, op: IntConv, weight: Tensor, bias: Tensor, image: Tensor) -> Tensor:
+        """A convolution's result, of its parameters and what it reads."""
+        ends, frac_bits = self._core.ends, self._core.frac_bits[op.output]
+        unit = 2.0 ** (frac_bits - op.weight_frac_bits - self._core.frac_bits[op.input])
+        bias_unit = 2.0 ** (frac_bits - op.bias_frac_bits)
+        if op.output == CORRECTION and ends.copies > 1:
+            return _products(op, image, to_int8(weight) * unit, (bias if ends.offsets else to_int8(bias)) * bias_unit)
+        lifted = _products(op, image, to_int8(weight) * unit, to_int8(bias) * bias_unit + _lift(op.activation) * unit)
+        return _rounded(lifted, op.activation, frac_bits)
 
 
 def _whole(values: Tensor) -> np.ndarray:
     return np.asarray(to_int8(values.detach()).numpy().astype(np.int8))
 
 
-def merged(ends: Ends, correction: Tensor, scale: float) -> Tensor:
-    """As `Ends.merge`: one correction (N, C, H, W) from its gains or windows."""
-    if ends.copies == 1:
-        return correction
-    limit = (FINE_MAX + 0.5) * scale
-    if not ends.offsets:
-        fine, coarse, *analytic = correction.chunk(ends.copies, dim=1)
-        value = torch.where(fine.abs() <= limit, fine, coarse * GAIN)
-        return value + torch.stack(analytic).sum(0) * ends.analytic_gain(scale) if analytic else value
-    coarse, *windows = correction.chunk(ends.copies, dim=1)
-    value = coarse * GAIN
-    for window, offset in zip(windows, ends.offsets, strict=True):
-        value = torch.where(window.abs() <= limit, window + torch.tensor(offset)[:, None, None], value)
-    return value
-
-
-Sums = tuple[Tensor, int]
-"""What an operation computes (N, C, H, W) before it is rounded, and how many fractional bits it has."""
-Bits = Mapping[str, int]
-
-
-def _conv(op: IntConv, image: Tensor, weight: Tensor, bias: Tensor, frac_bits: int) -> Sums:
-    product = op.weight_frac_bits + frac_bits
-    bias = bias * 2.0 ** (product - op.bias_frac_bits)
-    return _activated(_products(op, image, weight) + bias[:, None, None], op.activation, product), product
-
-
-def _products(op: IntConv, image: Tensor, weight: Tensor) -> Tensor:
-    window = op.window
+def _products(op: IntConv, image: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """The sums of a convolution, padding inside it as far as it is the same on both sides."""
+    window, (top, left, bottom, right) = op.window, op.window.pads
+    within = min(top, bottom), min(left, right)
+    around = left - within[1], right - within[1], top - within[0], bottom - within[0]
     if not op.transposed:
-        return functional.conv2d(_padded(image, window), weight, None, window.strides, 0, window.dilations, op.groups)
-    outputs, inner, rows, columns = weight.shape
-    weight = weight.reshape(op.groups, outputs // op.groups, inner, rows, columns).transpose(1, 2)
-    weight = weight.reshape(op.groups * inner, outputs // op.groups, rows, columns)
-    wide = functional.conv_transpose2d(image, weight, None, window.strides, groups=op.groups)
-    top, left, bottom, right = window.pads
-    return wide[:, :, top : wide.shape[2] - bottom, left : wide.shape[3] - right]
+        image = functional.pad(image, around) if any(around) else image
+        return functional.conv2d(image, weight, bias, window.strides, within, window.dilations, op.groups)
+    outputs, inner, *kernel = weight.shape
+    weight = weight.reshape(op.groups, outputs // op.groups, inner, *kernel).transpose(1, 2)
+    weight = weight.reshape(op.groups * inner, outputs // op.groups, *kernel)
+    wide = functional.conv_transpose2d(image, weight, bias, window.strides, within, groups=op.groups)
+    return wide[:, :, around[2] : wide.shape[2] - around[3], around[0] : wide.shape[3] - around[1]]
+
+
+def _lift(activation: Activation = Activation.none) -> float:
+    """What sums are raised by, in their unit, so that ties to even become ties up and nothing else moves.
+
+    LeakyReLU divides the unit by 128 and what is added by ten.
+    """
+    return 2.0**-5 if activation is Activation.leaky_relu else 2.0**-2
+
+
+def _rounded(lifted: Tensor, activation: Activation, frac_bits: int) -> Tensor:
+    """Lifted sums behind their activation, in int8."""
+    if activation is Activation.leaky_relu:
+        lifted = functional.leaky_relu(lifted, LEAKY_SLOPE)
+    low = 0 if activation in (Activation.relu, Activation.relu6) else INT8_MIN
+    return to_int8(lifted, low, six_in_units(frac_bits) if activation is Activation.relu6 else INT8_MAX)
+
+
+def _add(op: Add, read: Sequence[Tensor], bits: Bits) -> Tensor:
+    """Nothing is rounded, nor lifted, where the result is as fine as what is added."""
+    frac_bits, finest = bits[op.output], max(bits[name] for name in op.inputs)
+    one, other = (_times(values, frac_bits - bits[name]) for name, values in zip(op.inputs, read, strict=True))
+    sums = one + other
+    if finest > frac_bits or op.activation is Activation.leaky_relu:
+        sums = sums + _lift(op.activation) * 2.0 ** (frac_bits - finest)
+    return _rounded(sums, op.activation, frac_bits)
+
+
+def _times(values: Tensor, power: int) -> Tensor:
+    return values * 2.0**power if power else values
+
+
+def _mul(op: Mul, read: Sequence[Tensor], bits: Bits) -> Tensor:
+    unit = 2.0 ** (bits[op.output] - sum(bits[name] for name in op.inputs))
+    return to_int8(read[0] * read[1] * unit + _lift() * unit)
+
+
+def _max_pool(op: MaxPool, read: Sequence[Tensor], _: Bits) -> Tensor:
+    wide = _padded(read[0], op.window, INT8_MIN)
+    return functional.max_pool2d(wide, op.kernel, op.window.strides, 0, op.window.dilations)
+
+
+def _average_pool(op: AveragePool, read: Sequence[Tensor], _: Bits) -> Tensor:
+    assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
+    factor, shift = mean_factor(op.kernel)
+    sums = functional.avg_pool2d(_padded(read[0], op.window), op.kernel, op.window.strides, divisor_override=1)
+    return to_int8((sums * factor + _lift()) * 2.0**-shift)
 
 
 def _padded(image: Tensor, window: Window, fill: float = 0.0) -> Tensor:
     top, left, bottom, right = window.pads
-    return functional.pad(image, (left, right, top, bottom), value=fill)
+    return functional.pad(image, (left, right, top, bottom), value=fill) if any(window.pads) else image
 
 
-def _activated(sums: Tensor, activation: Activation, frac_bits: int) -> Tensor:
-    """The sums behind what is computed on the accumulator."""
-    if activation is Activation.relu6:
-        return sums.clamp(0, SIX * 2.0**frac_bits)
-    return _SLOPES[activation](sums)
+def _resize(op: Resize, read: Sequence[Tensor], _: Bits) -> Tensor:
+    if not op.bilinear:
+        return functional.interpolate(read[0], scale_factor=op.factor, mode="nearest")
+    wide = functional.interpolate(read[0], scale_factor=op.factor, mode="bilinear", align_corners=False)
+    return to_int8(wide + _lift() * 2.0 ** -bilinear_weights(op.factor)[1])
 
 
-_SLOPES: Mapping[Activation, Callable[[Tensor], Tensor]] = MappingProxyType(
-    {
-        Activation.none: lambda values: values,
-        Activation.relu: functional.relu,
-        Activation.relu6: functional.relu6,
-        Activation.leaky_relu: lambda values: functional.leaky_relu(values, LEAKY_SLOPE),
-        Activation.hard_sigmoid: lambda values: functional.relu6(values + 3) * SIXTH,
-        Activation.hard_swish: lambda values: values * functional.relu6(values + 3) * SIXTH,
-    }
-)
+def _shuffle(op: Shuffle, read: Sequence[Tensor], _: Bits) -> Tensor:
+    image, squares = read[0], op.block**2
+    if op.up:
+        return functional.pixel_shuffle(image if op.columns_first else _turned(image, squares), op.block)
+    moved = functional.pixel_unshuffle(image, op.block)
+    return moved if op.columns_first else _turned(moved, moved.shape[1] // squares)
 
 
-def _add(op: Add, read: Sequence[Tensor], bits: Bits) -> Sums:
-    finest = max(bits[name] for name in op.inputs)
-    sums = sum(values * 2.0 ** (finest - bits[name]) for name, values in zip(op.inputs, read, strict=True))
-    return _activated(torch.as_tensor(sums), op.activation, finest), finest
+def _turned(image: Tensor, outer: int) -> Tensor:
+    """Channels of so many groups, their places in the groups counted first."""
+    count, channels, height, width = image.shape
+    groups = image.reshape(count, outer, channels // outer, height, width)
+    return groups.transpose(1, 2).reshape(count, channels, height, width)
 
 
-def _mul(op: Mul, read: Sequence[Tensor], bits: Bits) -> Sums:
-    return read[0] * read[1], sum(bits[name] for name in op.inputs)
+def _pointwise(op: Pointwise, read: Sequence[Tensor], bits: Bits) -> Tensor:
+    """Its table's values, with the function's slope between neighbours."""
+    units = np.arange(INT8_MIN, INT8_MAX + 1)
+    smooth = op.activation(units * 2.0 ** -bits[op.input]) * 2.0 ** bits[op.output]
+    places = (read[0].detach() - INT8_MIN).int()
+    tables = activation_table(op, bits), np.gradient(smooth)
+    result, slope = (torch.from_numpy(table.astype(np.float32))[places] for table in tables)
+    return torch.addcmul(result, read[0] - read[0].detach(), slope)
 
 
-def _concat(op: Concat, read: Sequence[Tensor], bits: Bits) -> Sums:
-    return torch.cat(list(read), dim=1), bits[op.output]
-
-
-def _max_pool(op: MaxPool, read: Sequence[Tensor], bits: Bits) -> Sums:
-    window = op.window
-    wide = _padded(read[0], window, float(INT8_MIN))
-    return functional.max_pool2d(wide, op.kernel, window.strides, 0, window.dilations), bits[op.output]
-
-
-def _average_pool(op: AveragePool, read: Sequence[Tensor], bits: Bits) -> Sums:
-    assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
-    factor, shift = mean_factor(op.kernel)
-    sums = functional.avg_pool2d(_padded(read[0], op.window), op.kernel, op.window.strides, divisor_override=1)
-    return sums * factor, bits[op.output] + shift
-
-
-def _resize(op: Resize, read: Sequence[Tensor], bits: Bits) -> Sums:
-    if op.bilinear:
-        wide = functional.interpolate(read[0], scale_factor=op.factor, mode="bilinear", align_corners=False)
-    else:
-        wide = functional.interpolate(read[0], scale_factor=op.factor, mode="nearest")
-    return wide, bits[op.output]
-
-
-def _shuffle(op: Shuffle, read: Sequence[Tensor], bits: Bits) -> Sums:
-    """By the places that the values come from, which numpy moves as it would move the values."""
-    places = op(np.arange(read[0][0].numel()).reshape(1, *read[0].shape[1:]))
-    moved = read[0].flatten(1)[:, torch.from_numpy(places.ravel())]
-    return moved.reshape(len(moved), *places.shape[1:]), bits[op.output]
-
-
-def _pointwise(op: Pointwise, read: Sequence[Tensor], bits: Bits) -> Sums:
-    """Its table's values, with the function's slope."""
-    table = torch.from_numpy(activation_table(op, bits).astype(np.float32))
-    smooth = _SLOPES[op.activation](read[0] * 2.0 ** -bits[op.input]) * 2.0 ** bits[op.output]
-    return smooth + (table[(read[0].detach() - INT8_MIN).long()] - smooth).detach(), bits[op.output]
-
-
-_OPERATIONS: Mapping[type, Callable[..., Sums]] = MappingProxyType(
+_OPERATIONS: Mapping[type, Callable[..., Tensor]] = MappingProxyType(
     {
         Add: _add,
         Mul: _mul,
-        Concat: _concat,
+        Concat: lambda _, read, __: torch.cat(list(read), dim=1),
         MaxPool: _max_pool,
         AveragePool: _average_pool,
         Resize: _resize,
@@ -231,3 +227,42 @@ _OPERATIONS: Mapping[type, Callable[..., Sums]] = MappingProxyType(
         Pointwise: _pointwise,
     }
 )
+
+
+def _one_copy(op: IntConv, ends: Ends) -> IntConv:
+    """Of a convolution that writes copies of the result the first fine one; any other as it is."""
+    if op.output != CORRECTION or ends.copies == 1:
+        return op
+    first = ends.outputs if ends.offsets else 0
+    return replace(op, weight=op.weight[first : first + ends.outputs], bias=op.bias[first : first + ends.outputs])
+
+
+def _all_copies(last: IntConv, ends: Ends, weight: np.ndarray, bias: np.ndarray) -> tuple[IntConv, Ends]:
+    """All copies moved as one was trained, the coarse one by an eighth; a window's bias moves the host's offsets.
+
+    Args:
+        last: the convolution that writes the copies, as it was.
+        ends: of the core, as they were.
+        weight: of the copy that was trained, (O, I, kh, kw) in whole numbers.
+        bias: of that copy, (O,), in whole numbers; of a window in units of its scale with the offset.
+    """
+    one, coarse = _one_copy(last, ends), np.arange(ends.copies) == (0 if ends.offsets else 1)
+    shares = np.where(coarse, 1 / GAIN, 1)
+    weights = _moved(last.weight, shares, weight.astype(float) - one.weight)
+    if not ends.offsets:
+        return replace(last, weight=weights, bias=_moved(last.bias, shares, bias.astype(float) - one.bias)), ends
+    moved = bias - _window_bias(one, ends)
+    offsets = np.array(ends.offsets) + moved * 2.0**-one.bias_frac_bits
+    ends = replace(ends, offsets=tuple(tuple(map(float, window)) for window in offsets))
+    return replace(last, weight=weights, bias=_moved(last.bias, coarse / GAIN, moved)), ends
+
+
+def _window_bias(one: IntConv, ends: Ends) -> np.ndarray:
+    """What the DPU and the host add to a result in windows, (O,) in units of the bias."""
+    return np.asarray(one.bias + np.array(ends.offsets[0]) * 2.0**one.bias_frac_bits, np.float32)
+
+
+def _moved(copies: np.ndarray, shares: np.ndarray, move: np.ndarray) -> np.ndarray:
+    """Copies one behind the other, each moved by its share, in whole numbers."""
+    moves = np.rint(np.multiply.outer(shares, move)).reshape(copies.shape)
+    return np.asarray(np.clip(copies + moves, INT8_MIN, INT8_MAX), np.int8)

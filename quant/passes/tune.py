@@ -8,7 +8,7 @@ shifts stay, so the core stays as legal as it was.
 
 import math
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,21 +16,27 @@ import torch
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.quant.core import IntCore
+from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.ends import Ends
-from beers_deploy.quant.graph import CORRECTION, Conv, Graph, graph_to_onnx
+from beers_deploy.quant.graph import CORRECTION, Graph, graph_to_onnx
 from beers_deploy.quant.integer.trainable import Tensor, TrainableCore
 from beers_deploy.quant.samples import Pair, Remade
-from beers_deploy.quant.session import open_session, tensor_values
+from beers_deploy.quant.session import open_session, result_of, tensor_values
 from beers_deploy.quant.untrusted import times
 
 HELD_OUT_EVERY = 8
 """One pair of so many is not trained on, but judges what is kept."""
-JUDGEMENTS = 20
+MOST_HELD_OUT = 16
 BATCH_PIXELS = 4 * 128**2
 """Of the planes that one step looks at."""
 BORDER_PX = 8
 """Not held against a reference in a result of at least four times as many a side: there a patch ends, and its image
 goes on. The float network has the same border."""
+ROUNDS = (400, 800, 1600)
+"""Steps of each round of "auto"."""
+LEAST_GAIN = 0.02
+"""Of what INT8 lost at first: a round that wins back less is the last one."""
+JUDGED_EVERY = 20
 
 
 @dataclass(frozen=True)
@@ -39,28 +45,30 @@ class Tuning:
 
     Attributes:
         pairs: images (1, C, H, W) in [0, 1] and their references, which may be empty.
-        steps: gradient steps.
+        steps: gradient steps; None adds rounds of them until pairs that are held out err no less.
         rate: the highest rate of learning, in units of each number's scale.
         seed: of the order of the pairs.
     """
 
     pairs: Remade[Pair]
-    steps: int
-    rate: float = 0.015
+    steps: int | None = None
+    rate: float = 0.05
     seed: int = 0
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What a pair is to the core: planes (1, P, H, W) as float32 in, corrections (1, C, H', W') wanted out.
+    """What a pair is to the core: an image in, corrections (1, C, H', W') wanted out.
 
     Attributes:
-        planes: of the image.
+        image: (1, C, H, W) in [0, 1].
+        planes: of the image, (1, P, H, W) as float32.
         floats: what the float network makes of it.
         reference: the correction that would restore it wholly, or None.
         weight: of its errors: over the float network's own, so that dark and busy patches count alike.
     """
 
+    image: np.ndarray
     planes: Tensor
     floats: Tensor
     reference: Tensor | None
@@ -74,48 +82,107 @@ class Sample:
         return self.weight * error
 
 
+class Judge:
+    """Keeps the core whose results, as the host computes them, lose least on samples that it is not trained on.
+
+    What is lost is the mean error beyond the float network's own.
+    """
+
+    def __init__(self, core: IntCore, held: list[Sample]) -> None:
+        self._held = held
+        self._in_float = float(np.mean([float(sample.error(sample.floats)) for sample in held]))
+        self.core, self.first = core, self.loss(core)
+        self.least = self.first
+
+    def loss(self, core: IntCore) -> float:
+        """What a core loses."""
+        ends = replace(core.ends, back=(), adds_image=False, last=(), flat=False, softmax=False, tail=None)
+        session = open_session(host_model(replace(core, ends=ends), {}))
+        results = (torch.from_numpy(result_of(session, sample.image)) for sample in self._held)
+        errors = [float(sample.error(result)) for sample, result in zip(self._held, results, strict=True)]
+        return float(np.mean(errors)) - self._in_float
+
+    @property
+    def share(self) -> float:
+        """Of what was lost at first, what still is."""
+        return self.least / max(self.first, LEAST_ERROR)
+
+    def see(self, core: IntCore) -> None:
+        """Keep a core that loses less than all before."""
+        loss = self.loss(core)
+        if loss < self.least:
+            self.core, self.least = core, loss
+
+
+class Descent:
+    """The steps by Adam; in each round the rate of learning falls to 0 as a half cosine.
+
+    While the rate is high, numbers turn to and fro at the thresholds of their rounding, and no judgement is of use.
+    """
+
+    def __init__(self, trainable: TrainableCore, samples: list[Sample], tuning: Tuning) -> None:
+        self._trainable, self._samples, self._rate, self.done = trainable, samples, tuning.rate, 0
+        self._generator = torch.Generator().manual_seed(tuning.seed)
+        self._optimiser = torch.optim.Adam(trainable.parameters(), eps=1e-15)  # errors are small without references
+        self._batch = max(BATCH_PIXELS // math.prod(samples[0].planes.shape[2:]), 1)
+
+    def round(self, steps: int) -> Iterator[int]:
+        """So many steps; yields how many of them are left."""
+        for step in range(steps):
+            self._optimiser.param_groups[0]["lr"] = self._rate * 0.5 * (1 + math.cos(math.pi * step / steps))
+            self._optimiser.zero_grad()
+            for number in torch.randint(len(self._samples), (self._batch,), generator=self._generator).tolist():
+                sample = self._samples[number]
+                (sample.error(self._trainable(sample.planes)) / self._batch).backward()
+            self._optimiser.step()
+            self.done += 1
+            yield steps - step - 1
+
+
 def tune(
-    core: IntCore, rounded: Graph, full: Graph, tuning: Tuning, still: Collection[str] = (), log: Log = no_log
-) -> IntCore:
-    """The core with the numbers that erred least on pairs that they were not trained on.
+    core: IntCore, full: Graph, tuning: Tuning, still: Collection[str] = (), log: Log = no_log
+) -> tuple[IntCore, int]:
+    """The core with the numbers that erred least on pairs that they were not trained on, and the steps taken.
 
     Args:
         core: to start from; it comes back as it is where training finds nothing better.
-        rounded: the float operations that it was rounded from.
         full: the float network that reads all planes.
         tuning: on what, how long, how fast.
         still: the tensors whose convolutions are not trained.
-        log: is told now and then how many steps are done.
+        log: is told now and then how many steps are done, and what they gained.
     """
     samples = list(_samples(core.ends, full, tuning.pairs))
-    held = samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples
+    held = (samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples)[:MOST_HELD_OUT]
     seen = [sample for k, sample in enumerate(samples) if (k + 1) % HELD_OUT_EVERY] or samples
-    trainable = TrainableCore(core, [op for op in rounded if isinstance(op, Conv)], still)
-    least, kept, every = _cost(trainable, held), core, max(tuning.steps // JUDGEMENTS, 1)
-    for step in _descend(trainable, seen, tuning):
-        if step % every and step < tuning.steps:
-            continue
-        log(f"fine-tuning, step {step} of {tuning.steps}")
-        cost = _cost(trainable, held)
-        if cost < least:
-            least, kept = cost, trainable.core()
-    return kept
+    trainable, judge = TrainableCore(core, still), Judge(core, held)
+    descent, rounds = Descent(trainable, seen, tuning), (tuning.steps,) if tuning.steps else ROUNDS
+    most = f"{'' if tuning.steps else 'at most '}{sum(rounds)}"
+    for steps in rounds:
+        before = judge.least
+        for left in descent.round(steps):
+            if left % JUDGED_EVERY == 0:
+                judge.see(trainable.core())
+                log(f"fine-tuning, step {descent.done} of {most}: held-out pairs lose {judge.share:.2f} of the first")
+        if before - judge.least < LEAST_GAIN * judge.first:
+            break
+    return judge.core, descent.done
 
 
 def _samples(ends: Ends, full: Graph, pairs: Remade[Pair]) -> Iterator[Sample]:
     session = open_session(graph_to_onnx(full, [CORRECTION], ends.planes * ends.channels))
     for image, reference in pairs:
         ((floats,),) = tensor_values(session, [CORRECTION], image, None, ends)
-        planes, result = torch.from_numpy(ends.split(image).astype(np.float32)), torch.from_numpy(floats)
+        planes = torch.from_numpy(ends.split(image).astype(np.float32)).to(memory_format=torch.channels_last)
+        result = torch.from_numpy(floats)
         if not (reference.size and ends.is_image):
-            yield Sample(planes, result, None, 1.0)
+            yield Sample(image, planes, result, None, 1.0)
             continue
         given, made = times(reference.shape), times(ends.finished(image, floats).shape)
         if given != made:
             remedy = "give references of the size that the network makes"
             raise ImageError("reference", expected=f"one of {made}", got=given, remedy=remedy)
         wanted = torch.from_numpy(ends.correction_of(image, reference))
-        yield Sample(planes, result, wanted, 1 / max(float(_inner_error(result, wanted)), LEAST_ERROR))
+        yield Sample(image, planes, result, wanted, 1 / max(float(_inner_error(result, wanted)), LEAST_ERROR))
 
 
 LEAST_ERROR = 1e-9
@@ -128,27 +195,3 @@ def _inner_error(result: Tensor, wanted: Tensor) -> Tensor:
     height, width = result.shape[2:]
     inner = (result - wanted)[..., border_px : height - border_px, border_px : width - border_px]
     return inner.square().mean()
-
-
-def _descend(trainable: TrainableCore, samples: list[Sample], tuning: Tuning) -> Iterator[int]:
-    """Step after step by Adam, the rate falling to 0 as a half cosine; yields the steps done."""
-    generator = torch.Generator().manual_seed(tuning.seed)
-    optimiser = torch.optim.Adam(trainable.parameters(), lr=tuning.rate)
-    falling = torch.optim.lr_scheduler.LambdaLR(
-        optimiser, lambda step: 0.5 * (1 + math.cos(math.pi * step / tuning.steps))
-    )
-    batch = max(BATCH_PIXELS // math.prod(samples[0].planes.shape[2:]), 1)
-    for step in range(1, tuning.steps + 1):
-        optimiser.zero_grad()
-        for number in torch.randint(len(samples), (batch,), generator=generator).tolist():
-            sample = samples[number]
-            (sample.error(trainable(sample.planes)) / batch).backward()
-        optimiser.step()
-        falling.step()
-        yield step
-
-
-@torch.no_grad()
-def _cost(trainable: TrainableCore, samples: list[Sample]) -> float:
-    """The mean error of the whole numbers as they stand."""
-    return float(np.mean([float(sample.error(trainable(sample.planes))) for sample in samples]))

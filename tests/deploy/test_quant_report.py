@@ -15,11 +15,13 @@ from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.profiles.sensor_file import reference_for
 from beers_deploy.quant.calibration import draw_patches
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
 from beers_deploy.quant.sensitivity import Spread, kind_of_error, worst_row
+from beers_deploy.quantise import steps_of
 from beers_deploy.report.plots import FONT_PX, MOST_BARS, bins, histogram_url
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
@@ -49,6 +51,13 @@ def test_the_free_regime_writes_a_file_of_its_own_kind(tmp_path: Path) -> None:
     ):
         assert "--regime legal" in refused(*free, "--out", tmp_path / "no.onnx", *option)
     assert not (tmp_path / "no.onnx").exists()
+
+
+@pytest.mark.parametrize("given", ["-1", "many", "2.5"])
+def test_steps_of_fine_tuning_are_whole_or_auto(given: str) -> None:
+    assert (steps_of("auto"), steps_of(20), steps_of("0")) == (None, 20, 0)
+    with pytest.raises(OptionError, match="finetune: expected auto, or whole steps from 0"):
+        steps_of(given)
 
 
 @pytest.mark.slow

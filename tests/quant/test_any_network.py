@@ -20,9 +20,8 @@ from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN
 from beers_deploy.quant.encodings import as_on_board, encoding_faults, read_core
 from beers_deploy.quant.encodings.description import KEY
-from beers_deploy.quant.graph import Conv, correction_graph
-from beers_deploy.quant.integer.reference import agreement, merged_correction, run_core
-from beers_deploy.quant.integer.trainable import TrainableCore
+from beers_deploy.quant.graph import correction_graph
+from beers_deploy.quant.integer.reference import agreement, run_core
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.quantise import Quantised, quantise_model
 from beers_deploy.quant.reading.folding import simplest
@@ -30,6 +29,7 @@ from beers_deploy.quant.session import open_any_size, open_session, result_of
 from beers_deploy.quant.tiling.walk import tiling_of
 from examples.networks import NETWORKS, build, to_onnx
 from tests.quant.quick import copied, patches_of, quickly
+from tests.quant.trained import hold_to_reference, moved
 
 SIDE_PX = 48
 
@@ -77,15 +77,7 @@ def test_the_integer_reference_is_the_runtime_bit_for_bit(name: str) -> None:
 @pytest.mark.parametrize("name", NETWORKS)
 def test_what_is_trained_computes_the_reference_s_whole_numbers(name: str) -> None:
     made = quantised(name)
-    trainable = TrainableCore(made.core, [op for op in made.graph if isinstance(op, Conv)])
-    planes = made.core.ends.split(images(name, 4)[3])
-    with torch.no_grad():
-        found = trainable.tensors(torch.from_numpy(planes.astype(np.float32)))
-        result = trainable(torch.from_numpy(planes.astype(np.float32)))
-    wanted, _ = run_core(made.core, planes)
-    for tensor, values in wanted.items():
-        np.testing.assert_array_equal(found[tensor].numpy(), values, err_msg=tensor)
-    np.testing.assert_allclose(result.numpy(), merged_correction(made.core, wanted), rtol=1e-6)
+    hold_to_reference(moved(made.core), made.core.ends.split(images(name, 4)[3]))
 
 
 @pytest.mark.parametrize("name", NETWORKS)

@@ -16,6 +16,7 @@ from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.structure import saturated_shares, structure_checks
 from tests.quant.quick import patches_of
+from tests.quant.trained import hold_to_reference, moved
 
 SLOPE = 26 / 256
 
@@ -139,6 +140,7 @@ def test_near_float_equal_to_the_reference_and_without_faults(
     found = result_of(open_session(made.host), seen[1])
     assert np.abs(found - wanted).mean() < 0.06 * wanted.std()
     assert not any(layer.unequal for layer in agreement(made.core, made.host, seen[2]).layers)
+    hold_to_reference(moved(made.core), made.core.ends.split(seen[2]))
     assert [str(check) for check in structure_checks(model, made.host) if not check.passed] == []
     assert saturated_shares(made.host, seen).get("correction", 0) < 0.01
 

@@ -1,6 +1,7 @@
 """Whole numbers trained with their roundings: nearer to what is wanted, never worse, as legal as before."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import onnx
@@ -10,18 +11,31 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.quant.core import IntConv, IntCore, shift_faults
+from beers_deploy.quant.core import IntConv, IntCore, build_core, shift_faults
 from beers_deploy.quant.ends import Ends
-from beers_deploy.quant.graph import Conv, Shuffle, correction_graph, read_planes
+from beers_deploy.quant.graph import (
+    CORRECTION,
+    PLANES,
+    Activation,
+    Add,
+    AveragePool,
+    Conv,
+    Graph,
+    MaxPool,
+    Mul,
+    Pointwise,
+    Resize,
+    Shuffle,
+    Window,
+    correction_graph,
+    read_planes,
+)
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.integer.trainable import TrainableCore
 from beers_deploy.quant.passes.tune import BORDER_PX, Sample, Tuning, tune
 from beers_deploy.quant.quantise import Quantised, quantise_model
 from beers_deploy.quant.samples import Patches, Remade
-
-
-def origins(made: Quantised) -> list[Conv]:
-    return [op for op in made.graph if isinstance(op, Conv)]
+from tests.quant.trained import hold_to_reference, moved
 
 
 def spoilt(core: IntCore) -> IntCore:
@@ -51,8 +65,8 @@ def alone(patches: Patches) -> Remade[tuple[np.ndarray, np.ndarray]]:
     return Remade(lambda k: (patches.pairs[k][0], nothing), len(patches.pairs))
 
 
-def trained(made: Quantised, core: IntCore, model: onnx.ModelProto, tuning: Tuning) -> IntCore:
-    return tune(core, made.graph, read_planes(correction_graph(model)), tuning)
+def trained(core: IntCore, model: onnx.ModelProto, tuning: Tuning) -> IntCore:
+    return tune(core, read_planes(correction_graph(model)), tuning)[0]
 
 
 def difference(core: IntCore, other: IntCore, patches: Patches) -> float:
@@ -65,10 +79,51 @@ def difference(core: IntCore, other: IntCore, patches: Patches) -> float:
 
 
 def test_it_begins_with_the_core_s_own_numbers(quantised: Quantised) -> None:
-    again = TrainableCore(quantised.core, origins(quantised)).core()
+    again = TrainableCore(quantised.core).core()
     for one, other in zip(quantised.core.convolutions, again.convolutions, strict=True):
         np.testing.assert_array_equal(one.weight, other.weight)
         np.testing.assert_array_equal(one.bias, other.bias)
+
+
+def odd_operations(generator: np.random.Generator) -> Graph:
+    """Pads that differ from side to side, groups, dilation, shuffles, poolings, adds and products of other scales."""
+
+    def conv(name: str, source: str, shape: tuple[int, ...], window: Window, groups: int = 1, **more: Any) -> Conv:
+        weight = generator.normal(0, 0.3, shape).astype(np.float32)
+        return Conv(
+            name,
+            source,
+            name,
+            weight,
+            generator.normal(0, 0.2, shape[0]).astype(np.float32),
+            window=window,
+            groups=groups,
+            **more,
+        )
+
+    return (
+        conv("a", PLANES, (8, 3, 3, 2), Window((2, 1), (1, 0, 2, 1)), activation=Activation.leaky_relu),
+        conv("b", "a", (8, 4, 3, 3), Window((1, 1), (2, 2, 2, 2), (2, 2)), 2, activation=Activation.relu6),
+        Add("c", ("a", "b"), "c", Activation.leaky_relu),
+        Shuffle("d", "c", "d", 2, True, False),
+        MaxPool("e", "d", "e", (3, 2), Window((1, 2), (2, 0, 1, 1))),
+        AveragePool("f", "e", "f", (2, 3), Window((1, 1), (0, 1, 1, 2))),
+        conv("g", "f", (4, 1, 3, 4), Window((2, 3), (0, 2, 1, 1)), 2, transposed=True),
+        Shuffle("h", "g", "h", 1, False, True),
+        Pointwise("i", "h", "i", Activation.hard_swish),
+        Mul("j", ("i", "h"), "j"),
+        conv("k", "j", (1, 4, 1, 1), Window()),
+        Resize("l", "k", CORRECTION, 2, True),
+    )
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_odd_operations_are_the_reference_s(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    graph = odd_operations(generator)
+    bits = {op.output: int(generator.integers(4, 7)) for op in graph} | {PLANES: 7}
+    core = build_core(graph, bits)
+    hold_to_reference(moved(core), generator.integers(-128, 128, (1, 3, 12, 10)).astype(np.int8))
 
 
 @pytest.mark.slow
@@ -76,7 +131,7 @@ def test_without_references_it_comes_back_towards_the_float_network(
     quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
     bad = spoilt(quantised.core)
-    found = trained(quantised, bad, float_onnx, Tuning(alone(patches), 40, rate=0.3))
+    found = trained(bad, float_onnx, Tuning(alone(patches), 40, rate=0.3))
     assert difference(found, quantised.core, unseen) < 0.7 * difference(bad, quantised.core, unseen)
     assert shift_faults(found) == []
     assert found.frac_bits == quantised.core.frac_bits
@@ -85,8 +140,22 @@ def test_without_references_it_comes_back_towards_the_float_network(
 def test_what_comes_out_worse_is_not_kept(
     quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
-    found = trained(quantised, quantised.core, float_onnx, Tuning(alone(patches), 2, rate=60.0))
+    found = trained(quantised.core, float_onnx, Tuning(alone(patches), 2, rate=60.0))
     assert found is quantised.core
+
+
+@pytest.mark.parametrize(("rate", "steps"), [(0.0, 12), (0.3, 14)])
+def test_it_goes_on_by_itself_while_held_out_pairs_gain(
+    quantised: Quantised,
+    float_onnx: onnx.ModelProto,
+    patches: Patches,
+    monkeypatch: pytest.MonkeyPatch,
+    rate: float,
+    steps: int,
+) -> None:
+    monkeypatch.setattr("beers_deploy.quant.passes.tune.ROUNDS", (12, 2))
+    graph, tuning = read_planes(correction_graph(float_onnx)), Tuning(alone(patches), None, rate)
+    assert tune(spoilt(quantised.core), graph, tuning)[1] == steps
 
 
 def test_a_reference_of_another_size_is_one_sentence(
@@ -95,7 +164,7 @@ def test_a_reference_of_another_size_is_one_sentence(
     seen, meant = patches.pairs[0]
     short = Remade(lambda _: (seen, meant[..., :-2]), 2)
     with pytest.raises(ImageError, match=r"reference: expected one of 1 x 1 x 128 x 128, got 1 x 1 x 128 x 126"):
-        trained(quantised, quantised.core, float_onnx, Tuning(short, 1))
+        trained(quantised.core, float_onnx, Tuning(short, 1))
 
 
 @pytest.mark.slow
@@ -104,7 +173,7 @@ def test_the_same_seed_gives_the_same_numbers(float_onnx: onnx.ModelProto, patch
         told: list[str] = []
         tuning = Tuning(patches.pairs, 3, rate=0.3, seed=seed)
         model = quantise_model(float_onnx, patches, {}, tuning=tuning, log=told.append)
-        assert told[-1] == "fine-tuning, step 3 of 3"
+        assert told[-1].startswith("fine-tuning, step 3 of 3: ")
         assert {each.key: each.value for each in model.host.metadata_props}["finetune"].startswith("3 steps")
         return bytes(model.host.SerializeToString())
 
@@ -125,12 +194,13 @@ def test_the_border_is_the_float_network_s_where_the_reference_cannot_know(side:
     inner = torch.rand((1, 1, side, side + 9), generator=torch.Generator().manual_seed(1))
     edge = inner.clone()
     edge[..., 0, :] += 1
-    assert (float(Sample(inner, inner, edge, 1.0).error(inner)) > 0) is looked_at
-    assert float(Sample(inner, edge, inner, 1.0).error(inner)) > 0
+    image = inner.numpy()
+    assert (float(Sample(image, inner, inner, edge, 1.0).error(inner)) > 0) is looked_at
+    assert float(Sample(image, inner, edge, inner, 1.0).error(inner)) > 0
 
 
 def test_slopes_pass_roundings_and_stop_where_int8_ends(quantised: Quantised, patches: Patches) -> None:
-    trainable = TrainableCore(quantised.core, origins(quantised))
+    trainable = TrainableCore(quantised.core)
     planes = torch.from_numpy(quantised.core.ends.split(patches.degraded[0]).astype(np.float32))
     trainable(planes).square().mean().backward()
     assert all(bool(weight.grad.abs().max() > 0) for weight in trainable.weights)
@@ -159,5 +229,5 @@ def test_the_correction_of_a_result_makes_it(backs: list[tuple[int, bool]], adds
 def test_training_on_references_pays_on_others(
     quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
-    found = trained(quantised, quantised.core, float_onnx, Tuning(patches.pairs, 20, rate=0.3))
+    found = trained(quantised.core, float_onnx, Tuning(patches.pairs, 20, rate=0.3))
     assert error(found, unseen) < 0.97 * error(quantised.core, unseen)

@@ -1,0 +1,119 @@
+"""What a step of fine-tuning costs against a plain float step of the same network on the same patches, in one run.
+
+    python benchmarks/finetune.py
+
+Three networks with drawn weights, four patches of 128 x 128 a step. The float step is forward, loss, backward and
+Adam in torch, in whichever of its two memory layouts is faster. Both are interleaved, so that what else the machine
+does falls on each of them.
+"""
+
+import argparse
+import io
+import time
+import warnings
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import onnx
+import torch
+from torch import Tensor, nn
+
+from beers_deploy import quantize
+from beers_deploy.model.processor import processor_name
+from beers_deploy.quant.core import IntCore
+from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.integer.trainable import TrainableCore
+from beers_deploy.quant.passes.tune import Descent, Sample, Tuning
+from beers_deploy.quant.samples import Remade
+from examples.networks import UNet
+
+PATCHES, SIDE_PX = 4, 128
+
+
+class Added(nn.Sequential):
+    """The image plus what a network makes of it."""
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(N, 1, H, W) to the same."""
+        corrected: Tensor = image + super().forward(image)  # type: ignore[no-untyped-call]
+        return corrected
+
+
+def depthwise(features: int = 32) -> nn.Module:
+    """A depthwise and a pointwise convolution between two others, ReLU6 behind each, without a global add."""
+    filters = nn.Conv2d(features, features, 3, padding=1, groups=features)
+    middle = (filters, nn.ReLU6(), nn.Conv2d(features, features, 1), nn.ReLU6())
+    return nn.Sequential(_conv(1, features), nn.ReLU6(), *middle, _conv(features, 1))
+
+
+def dncnn(layers: int = 8, features: int = 32) -> nn.Module:
+    """Convolutions with ReLU whose result is added to the image."""
+    middle = (each for _ in range(layers - 2) for each in (_conv(features, features), nn.ReLU()))
+    return Added(_conv(1, features), nn.ReLU(), *middle, _conv(features, 1))
+
+
+def _conv(inputs: int, outputs: int) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, 3, padding=1)
+
+
+NETWORKS: dict[str, Callable[[], nn.Module]] = {"depthwise": depthwise, "unet": UNet, "dncnn": dncnn}
+
+
+def exported(network: nn.Module) -> onnx.ModelProto:
+    """The network as ONNX for images of any size."""
+    file, axes = io.BytesIO(), {0: "batch", 2: "rows", 3: "columns"}
+    names = {"input_names": ["input"], "output_names": ["output"], "dynamic_axes": {"input": axes, "output": axes}}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.onnx.export(network, (torch.zeros(1, 1, 64, 64),), file, dynamo=False, opset_version=17, **names)  # type: ignore[arg-type]
+    return onnx.load_model_from_string(file.getvalue())
+
+
+def float_step(network: nn.Module, layout: torch.memory_format) -> Callable[[], None]:
+    """What anybody would write."""
+    network, images = network.to(memory_format=layout), torch.rand(PATCHES, 1, SIDE_PX, SIDE_PX)  # type: ignore[call-overload]
+    optimiser, images = torch.optim.Adam(network.parameters(), lr=1e-4), images.to(memory_format=layout)
+
+    def step() -> None:
+        optimiser.zero_grad()
+        (network(images) - images).square().mean().backward()
+        optimiser.step()
+
+    return step
+
+
+def tuning_step(core: IntCore) -> Callable[[], None]:
+    """A step of `quantize --finetune`."""
+    generator, samples = np.random.default_rng(0), []
+    for _ in range(PATCHES):
+        image = generator.random((1, 1, SIDE_PX, SIDE_PX)).astype(np.float32)
+        planes = torch.from_numpy(core.ends.split(image).astype(np.float32)).to(memory_format=torch.channels_last)
+        samples.append(Sample(image, planes, torch.zeros(1, 1, SIDE_PX, SIDE_PX), None, 1.0))
+    descent = Descent(TrainableCore(core), samples, Tuning(Remade(lambda _: (image, image), 1)))
+    return partial(next, descent.round(10**6))
+
+
+def main() -> None:
+    """Print the times and the ratio of each network."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--turns", type=int, default=8)
+    turns = parser.parse_args().turns
+    print(f"{processor_name()}, {torch.get_num_threads()} threads, processor time of the fastest of {turns} steps")
+    for name, make in NETWORKS.items():
+        core = read_core(quantize(exported(make()), patches=2, patch_px=64, progress=False).model)
+        layouts = torch.contiguous_format, torch.channels_last
+        steps = [tuning_step(core), *(float_step(make(), layout) for layout in layouts)]
+        taken = [[_seconds(step) for step in steps] for _ in range(turns)]
+        tuned, *both = 1e3 * np.min(taken, axis=0)
+        print(f"{name}: float {min(both):.0f} ms, tuning {tuned:.0f} ms, ratio {tuned / min(both):.2f}", flush=True)
+
+
+def _seconds(step: Callable[[], None]) -> float:
+    begun = time.process_time()
+    step()
+    return time.process_time() - begun
+
+
+if __name__ == "__main__":
+    main()
