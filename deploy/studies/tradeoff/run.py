@@ -105,7 +105,7 @@ def tradeoff(
     notes = (*_notes(benchmark, boards[0].name), *(pictures.notes if pictures else ()), *said)
     files = [path for path in map(Path, names) if path.is_file()]
     files += [path for folder in (scenes, calibrated) if folder for path in list_images(folder)]
-    files += [path for path in (find_backbone(weights), detector) if path]
+    files += [path for path in (find_backbone("squeeze", weights), detector) if path]
     files += [scene.path for scene in pictures.scenes if scene.path] if pictures else []
     arguments: dict[str, object] = {"images": images, "sensor": degraded.name, "reference": aim.name, "need": need}
     arguments |= {"size": "x".join(map(str, width_height)), "budget": budget, "calibration": calibration}
