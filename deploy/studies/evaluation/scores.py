@@ -232,6 +232,7 @@ PAPER_UNITS = {
     "PSNR": "dB",
     "SSIM": "ratio",
     "LPIPS, network not stated": DISTANCE,
+    "DISTS": DISTANCE,
     "MTF at Nyquist": "%",
     **{snr_name(radiance): "ratio" for radiance in RADIANCES},
 }
