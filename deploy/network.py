@@ -365,7 +365,7 @@ def _file_stem(name: str) -> str:
 def told_int8(
     model: onnx.ModelProto, sensor: Sensor, more: Mapping[str, str] | None = None, log: Log = no_log
 ) -> onnx.ModelProto:
-    """An INT8 network behind a bank told another sensor: its filters, unit and head's bias written anew.
+    """An INT8 network behind a bank told another sensor: its filters, unit and biases written anew.
 
     Args:
         model: of whatever sensor.

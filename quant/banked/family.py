@@ -3,8 +3,10 @@
     planes -> bank 7 x 7 (the sensor's) -> head, blocks, end, tail -> correction, fine and coarse
                                         -> analytic restoration, in four copies
 
-All scales are one for the family. A sensor's filters, its unit and the bias of its head are written in milliseconds;
-the host adds both results, times the unit, to the image.
+All weights and scales behind the bank are one for the family. What the body reads and makes of a sensor is finer by its
+gain (`filters.gain_of`), so its biases are multiplied with that, and the unit is divided by it: ReLU and sums pass a
+factor on. A sensor's filters, its unit and the biases are written in milliseconds; the host adds both results, times the
+unit, to the image.
 """
 
 import json
@@ -14,11 +16,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import onnx
+from numpy.typing import NDArray
 
 from beers_deploy.model.bank import Bank
 from beers_deploy.model.variants import SENSOR_VALUES
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.banked.filters import BITS, whole_bank
+from beers_deploy.quant.banked.filters import BITS, gain_of, whole_bank
 from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantise_bias
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import PLANES, Op
@@ -40,8 +43,8 @@ class Family:
 
     Attributes:
         core: it begins with the bank.
-        biases: of the convolutions that read the bank, by name: (O, 5), their biases for the middle of the family,
-            and what each of a sensor's values adds.
+        biases: of the body's convolutions, by name, at a gain of 1: (O, 1), and of those that read the bank (O, 5),
+            the bias for the middle of the family and what each of a sensor's values adds.
         shifts: the windows of the target.
     """
 
@@ -51,16 +54,18 @@ class Family:
 
     def for_sensor(self, bank: Bank, vector: Sequence[float]) -> IntCore:
         """The core for one sensor, of its bank and its sensor vector (4,)."""
-        ops = tuple(self._told(op, bank, vector) for op in self.core.ops)
-        return replace(self.core, ops=ops, ends=replace(self.core.ends, unit=float(np.float32(bank.unit))))
+        gain = gain_of(bank)
+        ops = tuple(self._told(op, bank, gain * np.array([1.0, *vector])) for op in self.core.ops)
+        return replace(self.core, ops=ops, ends=replace(self.core.ends, unit=float(np.float32(bank.unit / gain))))
 
-    def _told(self, op: IntConv | Op, bank: Bank, vector: Sequence[float]) -> IntConv | Op:
+    def _told(self, op: IntConv | Op, bank: Bank, values: NDArray[np.float64]) -> IntConv | Op:
         if isinstance(op, IntConv) and op.input == PLANES:
             return bank_layer(bank, self.core.ends.place_px, self.shifts)
         if not (isinstance(op, IntConv) and op.name in self.biases):
             return op
-        bias = self.biases[op.name] @ np.array([1.0, *vector])
-        whole, bits = quantise_bias(bias, op.weight_frac_bits + BITS, self.shifts)
+        added = self.biases[op.name]
+        product = op.weight_frac_bits + self.core.frac_bits[op.input]
+        whole, bits = quantise_bias(added @ values[: added.shape[1]], product, self.shifts)
         return replace(op, bias=whole, bias_frac_bits=bits)
 
     def to_words(self) -> str:
@@ -76,10 +81,9 @@ def family_of(model: onnx.ModelProto) -> Family | None:
     with contradictions("INT8 model"):
         core, said = read_core(model), json.loads(words)
         biases = {str(name): np.array(values, np.float64) for name, values in said.items()}
-        read = {op.name: len(op.bias) for op in core.convolutions if op.name in biases}
-        if {name: values.shape for name, values in biases.items()} != {
-            n: (o, 1 + SENSOR_VALUES) for n, o in read.items()
-        }:
+        body = {op.name: op for op in core.convolutions if op.name in biases}
+        wanted = {name: (len(op.bias), 1 + SENSOR_VALUES * (op.input == BANK)) for name, op in body.items()}
+        if {name: values.shape for name, values in biases.items()} != wanted:
             raise ValueError("biases that are not its convolutions'")
         return Family(core, biases)
 
@@ -95,7 +99,7 @@ def required_family(model: onnx.ModelProto) -> Family:
 
 def bank_layer(bank: Bank, scale: int, shifts: Shifts) -> IntConv:
     """The first convolution of a network of that scale, for one sensor."""
-    whole = whole_bank(bank, scale)
+    whole = whole_bank(bank, scale, gain_of(bank))
     bias = quantise_bias(whole.offsets * 2.0**-BITS, whole.frac_bits + BITS, shifts)
     return IntConv("bank", PLANES, BANK, whole.weight, whole.frac_bits, *bias)
 

@@ -5,8 +5,10 @@ that for finer weights. The first two share a filter's weights, which may be twi
 Weights are rounded so that they sum to exactly 0, for flat ground must leave nothing, and so that their errors lie
 where natural images hold little.
 
-What the filters give is int8 in steps of 1/24 of a unit. Each comes several times, rounded at other places of
-a step: together the copies hold what one cannot. The image itself comes in steps of 32, about the middle.
+What the filters give is int8 in steps of 1/24 of a unit of a sensor whose noise is `SIGMA`. A sensor's own steps are
+the same share of full scale, within limits (`gain`): the strongest edges are a share of full scale, not of noise, so
+that noisy sensors can have finer steps in their units. Each result comes several times, rounded at other places of
+a step: together the copies hold what one cannot. The image itself comes in steps of 32 / gain, about the middle.
 """
 
 from collections.abc import Sequence
@@ -26,6 +28,12 @@ PLANE_ENDS = (-128, -128, -8, -4), (127, 127, 15, 8)
 """The smallest and the largest number of each: at full scale the coarse ones are at their end, and more remains."""
 
 IMAGE_STEP_DN = 32
+
+SIGMA = 0.0019
+"""Noise over full scale of sensors with a gain of 1: what training photographs lost least with."""
+
+GAINS = 0.5, 2.0
+"""The smallest and the largest: with more, the image itself would not fit int8."""
 
 BITS = 7
 """Fractional bits that a result is said to have: int8 then stands for -1 to 1, 5.3 units or half of full scale."""
@@ -80,9 +88,17 @@ def spread_over_a_step(count: int) -> list[float]:
     return [(k + 0.5) / count - 0.5 for k in range(count)]
 
 
-def whole_bank(bank: Bank, scale: int) -> WholeBank:
-    """The whole numbers of a bank, for a network of that scale."""
-    wanted = bank.kernels * (UNIT_STEPS / MAX_DN)  # steps for one digital number
+def gain_of(bank: Bank) -> float:
+    """How many times finer than 1/24 of a unit a sensor's steps are, and than 32 the image's: whole eighths.
+
+    The image's one weight, which no copy corrects, is a whole number so.
+    """
+    return float(np.clip(np.rint(8 * bank.sigma / SIGMA) / 8, *GAINS))
+
+
+def whole_bank(bank: Bank, scale: int, gain: float) -> WholeBank:
+    """The whole numbers of a bank, for a network of that scale, in steps finer by `gain`."""
+    wanted = bank.kernels * (gain * UNIT_STEPS / MAX_DN)  # steps for one digital number
     wanted[0] *= MAX_DN / UNIT_STEPS / IMAGE_STEP_DN
     frac_bits = int(np.floor(np.log2(LARGEST / np.abs(STEP_DN * wanted).max())))
     kernels, offsets = zip(*channels(), strict=True)

@@ -15,6 +15,7 @@ from beers_deploy.quant.banked.filters import (
     PLANE_ENDS,
     STEP_DN,
     channels,
+    gain_of,
     split_planes,
     whole_bank,
 )
@@ -26,7 +27,7 @@ VECTOR = st.tuples(*[st.floats(-1, 1)] * 4)
 
 def sums(image: np.ndarray, own: Bank) -> np.ndarray:
     """What the first convolution makes of an image (1, 1, H, W), in steps, before anything is rounded or added."""
-    whole = whole_bank(own, 1)
+    whole = whole_bank(own, 1, gain_of(own))
     return convolve(split_planes(image), whole.weight, Window()) / 2.0**whole.frac_bits
 
 
@@ -58,20 +59,24 @@ def test_the_planes_hold_every_number(dn: int) -> None:
 @given(VECTOR, st.integers(0, MAX_DN))
 def test_flat_ground_leaves_nothing_but_its_own_brightness(vector: tuple[float, ...], dn: int) -> None:
     flat = np.full((1, 1, SIDE_PX, SIDE_PX), dn / MAX_DN, np.float32)
-    found = sums(flat, bank_of_vector(vector))[0, :, 0, 0]
+    own = bank_of_vector(vector)
+    found = sums(flat, own)[0, :, 0, 0]
     np.testing.assert_array_equal(found[COPIES[0] :], 0)
-    assert abs(found[0] - (dn - MIDDLE_DN) / IMAGE_STEP_DN) <= 0.5
+    assert abs(found[0] - (dn - MIDDLE_DN) * gain_of(own) / IMAGE_STEP_DN) <= 0.5 * gain_of(own)
 
 
 @settings(max_examples=15)
 @given(VECTOR)
 def test_the_weights_are_int8_and_near_the_filters(vector: tuple[float, ...]) -> None:
-    own, whole = bank_of_vector(vector), whole_bank(bank_of_vector(vector), 1)
+    own = bank_of_vector(vector)
+    gain = gain_of(own)
+    whole = whole_bank(own, 1, gain)
     coarse_pair = whole.weight[:, :2].astype(int)
     assert 62 <= np.abs(coarse_pair).max() < 127  # no finer scale would hold them, and none is cut off
     assert np.ptp(coarse_pair, axis=1).max() <= 1
     for channel, (kernel, _) in enumerate(channels()):
-        wanted = own.kernels[kernel] * (UNIT_STEPS / MAX_DN if kernel else 1 / IMAGE_STEP_DN) * 2.0**whole.frac_bits
+        steps_per_dn = gain * (UNIT_STEPS / MAX_DN if kernel else 1 / IMAGE_STEP_DN)
+        wanted = own.kernels[kernel] * steps_per_dn * 2.0**whole.frac_bits
         one, two, fine, part = whole.weight[channel].astype(float)
         assert np.abs((one + two) / STEP_DN - wanted).max() < 5 / STEP_DN
         assert kernel == 0 or np.abs(fine + part / PART - wanted).max() < 5 / PART
@@ -85,7 +90,7 @@ def test_the_mean_of_the_copies_is_what_the_filter_gives(vector: tuple[float, ..
     centred = np.lib.stride_tricks.sliding_window_view(image[0, 0].astype(np.float64), (SIDE_PX, SIDE_PX))
     found, read = sums(image, own)[0], [kernel for kernel, _ in channels()]
     for kernel in range(1, 2 + FILTERS):
-        wanted = UNIT_STEPS * np.einsum("ijkl,kl->ij", centred, own.kernels[kernel])
+        wanted = gain_of(own) * UNIT_STEPS * np.einsum("ijkl,kl->ij", centred, own.kernels[kernel])
         mean = found[[place for place, each in enumerate(read) if each == kernel]].mean(0)
         assert np.sqrt(np.square(mean - wanted).mean()) < 0.3 + 0.05 * np.sqrt(np.square(wanted).mean())
 
@@ -99,7 +104,7 @@ def test_copies_are_rounded_at_places_spread_over_a_step() -> None:
 
 def test_at_half_resolution_the_same_filters_meet_the_same_pixels() -> None:
     own, image = bank_of_vector((0.3, -0.4, 0.1, 0.2)), textured(32, 36)
-    fine, coarse = whole_bank(own, 1), whole_bank(own, 2)
+    fine, coarse = whole_bank(own, 1, 1), whole_bank(own, 2, 1)
     assert fine.frac_bits == coarse.frac_bits
     planes = split_planes(image)
     blocks = planes.reshape(1, 4, 16, 2, 18, 2).transpose(0, 1, 3, 5, 2, 4).reshape(1, 16, 16, 18)
