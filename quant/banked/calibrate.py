@@ -171,8 +171,9 @@ def _biases(op: IntConv) -> np.ndarray:
 
 
 def _without_values(op: IntConv | Op) -> IntConv | Op:
-    told = isinstance(op, IntConv) and op.input == PLANES
-    return replace(op, weight=op.weight[:, :-SENSOR_VALUES]) if told else op
+    if isinstance(op, IntConv) and op.input == PLANES:
+        return replace(op, weight=op.weight[:, :-SENSOR_VALUES])
+    return op
 
 
 def _plan(weights: Weights, shifts: Shifts) -> Plan:

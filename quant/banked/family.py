@@ -3,10 +3,10 @@
     planes -> bank 7 x 7 (the sensor's) -> head, blocks, end, tail -> correction, fine and coarse
                                         -> analytic restoration, in four copies
 
-All weights and scales behind the bank are one for the family. What the body reads and makes of a sensor is finer by its
-gain (`filters.gain_of`), so its biases are multiplied with that, and the unit is divided by it: ReLU and sums pass a
-factor on. A sensor's filters, its unit and the biases are written in milliseconds; the host adds both results, times the
-unit, to the image.
+All weights and scales behind the bank are one for the family. What the body reads and makes of a sensor is finer by
+its gain (`filters.gain_of`), so its biases are multiplied with that, and the unit is divided by it: ReLU and sums
+pass a factor on. A sensor's filters, its unit and the biases are written in milliseconds; the host adds both results,
+times the unit, to the image.
 """
 
 import json
