@@ -49,6 +49,7 @@ from beers_deploy.quant.passes.equalise import (
 )
 from beers_deploy.quant.passes.fit_weights import fit_weights
 from beers_deploy.quant.passes.level import Chain, chain_ranges, level
+from beers_deploy.quant.passes.lower import lower
 from beers_deploy.quant.passes.stream import (
     MAX_CHANNELS,
     STREAM_FRAC_BITS,
@@ -81,6 +82,7 @@ FINER = GAIN.bit_length() - 1
 
 
 PASSES = "fine_planes, least_squares, shared_residual_scale, equalise, half_lsb_pair, fit_weights, dual_gain"
+LOWERED = "full_range_relu"
 """What a file says was done beyond rounding each tensor: see `quant.passes`, `quant.graph` and `quant.core`."""
 
 
@@ -193,7 +195,7 @@ def quantise_model(
         # Patches that hold few roofs would train the last sum's room away.
         core = tune(core, final, plan.graph, tuning, still=last_sum, log=log)
     about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
-    about["passes"] = PASSES
+    about["passes"] = f"{PASSES}, {LOWERED}" if any(getattr(op, "offset", 0.0) for op in final) else PASSES
     if tuning:
         about["finetune"] = f"{tuning.steps} steps on {len(tuning.pairs)} patches"
     tile_px = fixed_tile_px(model)
@@ -251,25 +253,36 @@ def rounded(plan: Plan, images: Remade[np.ndarray], log: Log = no_log) -> tuple[
 
 
 def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], log: Log) -> Graph:
-    """The plan's graph, its streams equalised and then its chain levelled."""
+    """The plan's graph, its streams equalised, its chain levelled, and what gains by it stored from -128 on."""
     graph = plan.chain.scaled(plan.graph, plan.chain.unscaled(frac_bits))
     if not (plan.streams or plan.chain.tensors):
         return graph
     targets = search_targets(plan.graph, plan.ends, images)
 
-    def trial(tried: Graph) -> Costs:
+    def built(tried: Graph) -> tuple[Graph, IntCore]:
         final = plan.ended(plan.paired(tried))
-        return crop_costs(host_model(plan.core(final, frac_bits), {}), targets)
+        return final, plan.core(final, frac_bits)
+
+    def trial(tried: Graph) -> Costs:
+        return crop_costs(host_model(built(tried)[1], {}), targets)
+
+    def fitted(tried: Graph) -> Costs:
+        return crop_costs(host_model(fit_weights(*built(tried), images, plan.shifts), {}), targets)
 
     graph = _equalised(graph, plan, trial, images, log) if plan.streams else graph
-    if plan.chain.tensors:
-        log(f"equalising the channels of {len(plan.chain.tensors)} tensors")
-        ranges = chain_ranges(graph, plan.chain, images, plan.ends)
-        graph = plan.chain.scaled(graph, level(graph, plan.chain, ranges, np.ones(len(ranges)), trial))
-    if plan.ends.offsets and plan.chain.tensors:  # the image itself passes through: what is clipped is lost
-        largest = chain_ranges(graph, plan.chain, images, plan.ends, quantile=1.0)
-        graph = plan.chain.scaled(graph, FULL / np.maximum(largest, FULL))
-    return graph
+    graph = _levelled(graph, plan, trial, images, log) if plan.chain.tensors else graph
+    return lower(graph, frac_bits | dict.fromkeys(plan.chain.tensors, STREAM_FRAC_BITS), fitted)
+
+
+def _levelled(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], log: Log) -> Graph:
+    """The graph, its chain levelled; what the image itself passes through clips nothing that calibration sees."""
+    log(f"equalising the channels of {len(plan.chain.tensors)} tensors")
+    ranges = chain_ranges(graph, plan.chain, images, plan.ends)
+    graph = plan.chain.scaled(graph, level(graph, plan.chain, ranges, np.ones(len(ranges)), trial))
+    if not plan.ends.offsets:
+        return graph
+    largest = chain_ranges(graph, plan.chain, images, plan.ends, quantile=1.0)
+    return plan.chain.scaled(graph, FULL / np.maximum(largest, FULL))
 
 
 def _equalised(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], log: Log) -> Graph:

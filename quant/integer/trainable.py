@@ -64,7 +64,7 @@ class TrainableCore(torch.nn.Module):
         self._core = core
         both = list(zip(core.convolutions, origins, strict=True))
         self.weights = torch.nn.ParameterList(_begin(a.weight, b.weight, a.weight_frac_bits) for a, b in both)
-        self.biases = torch.nn.ParameterList(_begin(a.bias, b.bias, a.bias_frac_bits) for a, b in both)
+        self.biases = torch.nn.ParameterList(_begin(a.bias, b.stored_bias, a.bias_frac_bits) for a, b in both)
         for op, *numbers in zip(core.convolutions, self.weights, self.biases, strict=True):
             for parameter in numbers:
                 parameter.requires_grad_(op.output not in still)
@@ -166,6 +166,7 @@ _SLOPES: Mapping[Activation, Callable[[Tensor], Tensor]] = MappingProxyType(
         Activation.leaky_relu: lambda values: functional.leaky_relu(values, LEAKY_SLOPE),
         Activation.hard_sigmoid: lambda values: functional.relu6(values + 3) * SIXTH,
         Activation.hard_swish: lambda values: values * functional.relu6(values + 3) * SIXTH,
+        Activation.saturated_relu: lambda values: values,
     }
 )
 

@@ -61,6 +61,11 @@ def equalise(graph: Graph, stream: Stream, factors: np.ndarray) -> Graph:
     ]
     for op in clipped:
         factors = np.maximum(factors, FULL / op.ceilings)
+    return rescaled(graph, stream, factors)
+
+
+def rescaled(graph: Graph, stream: Stream, factors: np.ndarray) -> Graph:
+    """The same network with channel c of a stream scaled by factors[c], and of a ReLU6 there the six."""
     return tuple(_scaled(op, factors, stream) if isinstance(op, Conv) else op for op in graph)
 
 
