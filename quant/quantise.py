@@ -25,6 +25,7 @@ from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
     PLANES_FRAC_BITS,
+    Conv,
     Graph,
     channels_of,
     graph_to_onnx,
@@ -54,6 +55,7 @@ from beers_deploy.quant.passes.stream import (
     MAX_CHANNELS,
     STREAM_FRAC_BITS,
     Stream,
+    exceeds_six,
     half_lsb_pair,
     lone_tensors,
     share_stream_scale,
@@ -129,6 +131,13 @@ class Plan:
         found = tuple(tuple(float(each) for each in window) for window in offsets)
         return replace(self, ends=replace(self.ends, offsets=found))
 
+    def without_large_sums(self, frac_bits: Mapping[str, int]) -> "Plan":
+        """Without the streams in which sums exceed a ReLU6's six, where int8 could not end for both."""
+        kept = [stream for stream in self.streams if not exceeds_six(self.graph, stream, frac_bits)]
+        if len(kept) == len(self.streams):
+            return self
+        return replace(self, streams=kept, chain=_chain(self.graph, self.ends, kept))
+
     def paired(self, graph: Graph) -> Graph:
         """The graph with the half-LSB pair where that is wanted and possible; else itself."""
         return half_lsb_pair(graph, STREAM_STEP) if self.pairs and self.streams else graph
@@ -155,10 +164,15 @@ def _plan(model: onnx.ModelProto, shifts: Shifts, pairs: bool) -> Plan:
     network = read_network(model)
     graph = read_planes(network.graph)
     ends, found = ends_of(network, 2 if network.adds_image and takes_gains(graph) else 1), streams(graph)
+    return Plan(graph, ends, found, _chain(graph, ends, found), network.tail, shifts, pairs)
+
+
+def _chain(graph: Graph, ends: Ends, streams: list[Stream]) -> Chain:
+    """What is levelled besides these streams: nothing where there are some, and no depthwise convolutions."""
     widths = channels_of(graph, {PLANES: ends.planes * ends.channels})
-    alone = [] if found else lone_tensors(graph)
-    chain = Chain(tuple(alone), tuple(widths[name] for name in alone))
-    return Plan(graph, ends, found, chain, network.tail, shifts, pairs)
+    depthwise = any(isinstance(op, Conv) and op.groups > 1 for op in graph)
+    alone = lone_tensors(graph) if depthwise or not streams else []
+    return Chain(tuple(alone), tuple(widths[name] for name in alone))
 
 
 def quantise_model(
@@ -240,6 +254,7 @@ def rounded(plan: Plan, images: Remade[np.ndarray], log: Log = no_log) -> tuple[
     """A plan's graph in whole numbers, the float graph that was rounded, and the tensors of its last sum."""
     log("scale of each tensor")
     frac_bits = choose_frac_bits(plan.graph, images, plan.ends)
+    plan = plan.without_large_sums(frac_bits)
     if plan.takes_windows:
         plan = plan.with_windows(frac_bits[CORRECTION], images)
     graph = _balanced(plan, frac_bits, images, log)
@@ -287,14 +302,14 @@ def _levelled(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray]
 
 def _equalised(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], log: Log) -> Graph:
     """Stream after stream, the others levelled by a first guess until their turn comes."""
-    ranges = {stream: channel_ranges(plan.graph, stream, images, plan.ends) for stream in plan.streams}
-    for stream in plan.streams[1:]:
-        graph = equalise(graph, stream, first_guess(ranges[stream], LEVELLING[0], 1.0))
+    ranges = [channel_ranges(plan.graph, stream, images, plan.ends) for stream in plan.streams]
+    for stream, of_it in list(zip(plan.streams, ranges, strict=True))[1:]:
+        graph = equalise(graph, stream, first_guess(of_it, LEVELLING[0], 1.0))
     for number, stream in enumerate(plan.streams):
         log(f"equalising the channels of residual stream {number + 1} of {len(plan.streams)}")
         if number:
-            graph = equalise(graph, stream, 1 / first_guess(ranges[stream], LEVELLING[0], 1.0))
-        graph = equalise(graph, stream, search(graph, stream, ranges[stream], trial))
+            graph = equalise(graph, stream, 1 / first_guess(ranges[number], LEVELLING[0], 1.0))
+        graph = equalise(graph, stream, search(graph, stream, ranges[number], trial))
     return graph
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from beers_deploy.quant.core import INT8_MIN
 from beers_deploy.quant.graph import Activation, Conv, Graph
 from beers_deploy.quant.passes.equalise import Trial, rescaled
-from beers_deploy.quant.passes.stream import lone_tensors
+from beers_deploy.quant.passes.stream import lone_tensors, only
 
 SPAN = 255
 """Units of int8 from its one end to the other."""
@@ -43,7 +43,7 @@ def lowered(graph: Graph, name: str, frac_bits: int) -> Graph:
     writer = next(op for op in graph if isinstance(op, Conv) and op.output == name)
     short = SPAN * 2.0**-frac_bits / writer.ceilings
     if writer.activation is Activation.relu6 and short.max() > 1:
-        graph = rescaled(graph, frozenset([name]), np.maximum(short, 1))
+        graph = rescaled(graph, only(name), np.maximum(short, 1))
     return tuple(_lowered(op, name, offset) if isinstance(op, Conv) else op for op in graph)
 
 
