@@ -37,6 +37,7 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.graph.tail import Tail
 from beers_deploy.quant.onnx_file import fixed_tile_px, metadata
+from beers_deploy.quant.passes.copies import Copies, ranges_apart, with_copies
 from beers_deploy.quant.passes.equalise import (
     FULL,
     LEVELLING,
@@ -268,10 +269,12 @@ def rounded(plan: Plan, images: Remade[np.ndarray], log: Log = no_log) -> tuple[
 
 
 def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], log: Log) -> Graph:
-    """The plan's graph, its streams equalised, its chain levelled, and what gains by it stored from -128 on."""
-    graph = plan.chain.scaled(plan.graph, plan.chain.unscaled(frac_bits))
+    """The plan's graph, its streams equalised, its chain levelled, and what gains by it stored from -128 on.
+
+    Where the image itself passes through, also with copies in its dead channels, if that costs less.
+    """
     if not (plan.streams or plan.chain.tensors):
-        return graph
+        return plan.graph
     targets = search_targets(plan.graph, plan.ends, images)
 
     def built(tried: Graph) -> tuple[Graph, IntCore]:
@@ -284,15 +287,25 @@ def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray],
     def fitted(tried: Graph) -> Costs:
         return crop_costs(host_model(fit_weights(*built(tried), images, plan.shifts), {}), targets)
 
-    graph = _equalised(graph, plan, trial, images, log) if plan.streams else graph
-    graph = _levelled(graph, plan, trial, images, log) if plan.chain.tensors else graph
-    return lower(graph, frac_bits | dict.fromkeys(plan.chain.tensors, STREAM_FRAC_BITS), fitted)
+    def searched(graph: Graph, copies: Copies) -> Graph:
+        graph = plan.chain.scaled(graph, plan.chain.unscaled(frac_bits))
+        graph = _equalised(graph, plan, trial, images, log) if plan.streams else graph
+        graph = _levelled(graph, plan, trial, images, log, copies) if plan.chain.tensors else graph
+        return lower(graph, frac_bits | dict.fromkeys(plan.chain.tensors, STREAM_FRAC_BITS), fitted)
+
+    graph = searched(plan.graph, {})
+    if plan.ends.offsets:
+        other, copies = with_copies(plan.graph, plan.chain.tensors, images, plan.ends)
+        if copies:
+            graph = min((graph, searched(other, copies)), key=lambda tried: float(fitted(tried)(None).sum()))
+    return graph
 
 
-def _levelled(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], log: Log) -> Graph:
+def _levelled(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], log: Log, copies: Copies) -> Graph:
     """The graph, its chain levelled; what the image itself passes through clips nothing that calibration sees."""
     log(f"equalising the channels of {len(plan.chain.tensors)} tensors")
-    ranges = chain_ranges(graph, plan.chain, images, plan.ends)
+    places = dict(zip(plan.chain.tensors, plan.chain.parts, strict=True))
+    ranges = ranges_apart(chain_ranges(graph, plan.chain, images, plan.ends), places, copies)
     graph = plan.chain.scaled(graph, level(graph, plan.chain, ranges, np.ones(len(ranges)), trial))
     if not plan.ends.offsets:
         return graph

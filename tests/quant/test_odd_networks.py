@@ -124,6 +124,14 @@ def skip_past_a_pool(w: Sketch) -> onnx.ModelProto:
     return w.model(1)
 
 
+def dead_channels(w: Sketch) -> onnx.ModelProto:
+    first = w.node("Relu", "r", [w.conv("first", "in", (5, 1, 3, 3), 0.6, pads=[1] * 4)])
+    w.constant("inner.b", np.array([0.1, -9, 0.2, -9, 0.1], np.float32))
+    inner = w.node("Relu", "s", [w.conv("inner", first, (5, 1, 3, 3), 0.6, pads=[1] * 4, group=5)])
+    w.conv("out", w.node("Relu", "t", [w.conv("point", inner, (4, 5, 1, 1))]), (1, 4, 3, 3), pads=[1] * 4)
+    return w.model(1)
+
+
 def many_classes(w: Sketch) -> onnx.ModelProto:
     w.conv("out", "in", (1200, 1, 3, 3), 40.0, strides=[3, 3])
     return w.model(1200)
@@ -136,7 +144,7 @@ def shares_of_classes(w: Sketch) -> onnx.ModelProto:
 
 SOUND = [
     features_beside_the_image, pooled_image, preactivation, leaking_upwards, one_tensor_twice, sum_of_two, separable,
-    names_of_ours, thirds, products, skip_past_a_pool, many_classes, shares_of_classes,
+    names_of_ours, thirds, products, skip_past_a_pool, dead_channels, many_classes, shares_of_classes,
 ]  # fmt: skip
 
 
