@@ -112,7 +112,8 @@ def products(w: Sketch) -> onnx.ModelProto:
 
 def skip_past_a_pool(w: Sketch) -> onnx.ModelProto:
     first = w.conv("first", "in", (3, 1, 3, 3), pads=[1] * 4)
-    head = w.node("Clip", "head", [first, w.constant("zero", np.float32(0)), w.constant("six", np.float32(6))])
+    limits = [w.constant(f"limit_{end}", np.array(end, np.float32)) for end in (0, 6)]
+    head = w.node("Clip", "head", [first, *limits])
     inner = w.conv("inner", head, (3, 1, 3, 3), 0.2, pads=[1] * 4, group=3)
     fine = w.node("Add", "fine", [head, w.conv("point", w.node("Relu", "r", [inner]), (3, 3, 1, 1))])
     deep = w.conv("deep", w.node("MaxPool", "down", [fine], kernel_shape=[2, 2], strides=[2, 2]), (2, 3, 1, 1))
