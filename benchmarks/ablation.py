@@ -34,6 +34,8 @@ def ablations() -> Iterator[tuple[str, AbstractContextManager[object]]]:
     yield "without dual-range output", patch("beers_deploy.quant.quantise.takes_gains", lambda _graph: False)
     yield "without fitted weights", patch("beers_deploy.quant.quantise.fit_weights", lambda _graph, core, *_: core)
     yield "without least-squares scales", patch("beers_deploy.quant.calibration._errors", lambda *_: np.zeros(1))
+    yield "without tensors from -128 on", patch("beers_deploy.quant.quantise.lower", lambda graph, *_: graph)
+    yield "without copies", patch("beers_deploy.quant.quantise.with_copies", lambda graph, *_: (graph, {}))
     yield (
         "without equalising",  # one factor for all channels, with which the largest range fits
         patch(

@@ -4,6 +4,7 @@ A tensor with n fractional bits holds whole multiples of 2^-n, its scale, in [-1
 vai_q). `frac_bits` is n everywhere; a finer scale has more of them.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -132,7 +133,7 @@ class IntCore:
 def dequantised(op: Conv, whole: IntConv) -> Conv:
     """The same convolution in float, with the values that its int8 weights and bias stand for."""
     weight = (whole.weight * 2.0**-whole.weight_frac_bits).astype(np.float32)
-    return replace(op, weight=weight, bias=whole.float_bias.astype(np.float32))
+    return replace(op, weight=weight, bias=(whole.float_bias + op.offset).astype(np.float32))
 
 
 def rounded_to(values: np.ndarray, frac_bits: int) -> np.ndarray:
@@ -152,7 +153,8 @@ def build_core(
         shifts: the windows of the target.
         ends: what the host does around; by default an image of one channel and a correction of it.
     """
-    legal = dict(frac_bits)
+    lowered = {op.output: op.offset for op in graph if isinstance(op, Conv) and op.offset}
+    legal = dict(frac_bits) | {name: round(math.log2(-INT8_MIN / offset)) for name, offset in lowered.items()}
     for _ in range(ROUNDS):
         core = _in_one_round(graph, legal, shifts, ends or Ends())
         faults = shift_faults(core, shifts)
@@ -167,7 +169,19 @@ def _with_biases_left(core: IntCore, graph: Graph) -> IntCore:
     last, whole = graph[-1], core.ops[-1]
     if not (core.ends.offsets and isinstance(last, Conv) and isinstance(whole, IntConv)):
         return core
-    return replace(core, ends=core.ends.moved(last.bias - whole.float_bias))
+    wanted = nearest_bias(last, whole.weight, whole.weight_frac_bits, graph)
+    return replace(core, ends=core.ends.moved(wanted - whole.float_bias))
+
+
+def nearest_bias(op: Conv, weight: np.ndarray, weight_frac_bits: int, graph: Graph) -> np.ndarray:
+    """(O,) the bias to be rounded, beside weights (O, I, kh, kw) that each are rounded to the nearest whole number.
+
+    Where what it reads is stored less an offset, those weights give back another amount than the float ones.
+    """
+    offset = next((each.offset for each in graph if isinstance(each, Conv) and each.output == op.input), 0.0)
+    if not offset:
+        return op.stored_bias
+    return np.asarray(op.stored_bias + offset * (weight * 2.0**-weight_frac_bits - op.weight).sum((1, 2, 3)))
 
 
 def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends: Ends) -> IntCore:
@@ -175,7 +189,7 @@ def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends:
     ops: list[IntConv | Op] = []
     for op in graph:
         if isinstance(op, Conv):
-            ops.append(_quantise_conv(op, frac_bits, shifts))
+            ops.append(_quantise_conv(op, frac_bits, shifts, graph))
             continue
         if isinstance(op, Add):
             _move_add(op, frac_bits, shifts)
@@ -188,22 +202,24 @@ def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends:
     return IntCore(tuple(ops), dict(frac_bits), ends)
 
 
-def _quantise_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntConv:
+def _quantise_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts, graph: Graph) -> IntConv:
     finest = shifts.cut[1] + frac_bits[op.output] - frac_bits[op.input]  # finer weights would make the result clip
     weight_frac_bits = min(best_frac_bits(op.weight), finest)
-    if op.ceiling is not None:  # the result keeps its scale, for it clips where int8 ends
+    if op.ceiling is not None or op.offset:  # the result keeps its scale, for it clips where int8 ends
         weight_frac_bits = max(weight_frac_bits, frac_bits[op.output] - frac_bits[op.input])
     product = weight_frac_bits + frac_bits[op.input]
     cut = clamp(product - frac_bits[op.output], shifts.cut)
     frac_bits[op.output] = product - cut
     weight = quantise(op.weight, weight_frac_bits)
-    bias, bias_frac_bits = quantise_bias(op.bias, product, shifts)
+    bias, bias_frac_bits = quantise_bias(nearest_bias(op, weight, weight_frac_bits, graph), product, shifts)
     kind = (_activation(op, frac_bits[op.output]), op.window, op.groups, op.transposed)
     return IntConv(op.name, op.input, op.output, weight, weight_frac_bits, bias, bias_frac_bits, *kind)
 
 
 def _activation(op: Conv, frac_bits: int) -> Activation:
     """Of whole numbers: ReLU6 is ReLU where int8 ends no later than the six, as it does once `equalise` scaled."""
+    if op.offset:
+        return Activation.saturated_relu
     ends_first = op.ceiling is not None or INT8_MAX * 2.0**-frac_bits <= SIX
     return Activation.relu if op.activation is Activation.relu6 and ends_first else op.activation
 

@@ -25,6 +25,7 @@ from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
     PLANES_FRAC_BITS,
+    Conv,
     Graph,
     channels_of,
     graph_to_onnx,
@@ -36,6 +37,7 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.graph.tail import Tail
 from beers_deploy.quant.onnx_file import fixed_tile_px, metadata
+from beers_deploy.quant.passes.copies import Copies, ranges_apart, with_copies
 from beers_deploy.quant.passes.equalise import (
     FULL,
     LEVELLING,
@@ -49,10 +51,12 @@ from beers_deploy.quant.passes.equalise import (
 )
 from beers_deploy.quant.passes.fit_weights import fit_weights
 from beers_deploy.quant.passes.level import Chain, chain_ranges, level
+from beers_deploy.quant.passes.lower import lower
 from beers_deploy.quant.passes.stream import (
     MAX_CHANNELS,
     STREAM_FRAC_BITS,
     Stream,
+    exceeds_six,
     half_lsb_pair,
     lone_tensors,
     share_stream_scale,
@@ -81,6 +85,7 @@ FINER = GAIN.bit_length() - 1
 
 
 PASSES = "fine_planes, least_squares, shared_residual_scale, equalise, half_lsb_pair, fit_weights, dual_gain"
+LOWERED = "full_range_relu"
 """What a file says was done beyond rounding each tensor: see `quant.passes`, `quant.graph` and `quant.core`."""
 
 
@@ -127,6 +132,13 @@ class Plan:
         found = tuple(tuple(float(each) for each in window) for window in offsets)
         return replace(self, ends=replace(self.ends, offsets=found))
 
+    def without_large_sums(self, frac_bits: Mapping[str, int]) -> "Plan":
+        """Without the streams in which sums exceed a ReLU6's six, where int8 could not end for both."""
+        kept = [stream for stream in self.streams if not exceeds_six(self.graph, stream, frac_bits)]
+        if len(kept) == len(self.streams):
+            return self
+        return replace(self, streams=kept, chain=_chain(self.graph, self.ends, kept))
+
     def paired(self, graph: Graph) -> Graph:
         """The graph with the half-LSB pair where that is wanted and possible; else itself."""
         return half_lsb_pair(graph, STREAM_STEP) if self.pairs and self.streams else graph
@@ -153,10 +165,15 @@ def _plan(model: onnx.ModelProto, shifts: Shifts, pairs: bool) -> Plan:
     network = read_network(model)
     graph = read_planes(network.graph)
     ends, found = ends_of(network, 2 if network.adds_image and takes_gains(graph) else 1), streams(graph)
+    return Plan(graph, ends, found, _chain(graph, ends, found), network.tail, shifts, pairs)
+
+
+def _chain(graph: Graph, ends: Ends, streams: list[Stream]) -> Chain:
+    """What is levelled besides these streams: nothing where there are some, and no depthwise convolutions."""
     widths = channels_of(graph, {PLANES: ends.planes * ends.channels})
-    alone = [] if found else lone_tensors(graph)
-    chain = Chain(tuple(alone), tuple(widths[name] for name in alone))
-    return Plan(graph, ends, found, chain, network.tail, shifts, pairs)
+    depthwise = any(isinstance(op, Conv) and op.groups > 1 for op in graph)
+    alone = lone_tensors(graph) if depthwise or not streams else []
+    return Chain(tuple(alone), tuple(widths[name] for name in alone))
 
 
 def quantise_model(
@@ -193,7 +210,7 @@ def quantise_model(
         # Patches that hold few roofs would train the last sum's room away.
         core, steps = tune(core, plan.graph, tuning, still=last_sum, log=log)
     about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
-    about["passes"] = PASSES
+    about["passes"] = f"{PASSES}, {LOWERED}" if any(getattr(op, "offset", 0.0) for op in final) else PASSES
     if tuning:
         about["finetune"] = f"{steps} steps on {len(tuning.pairs)} patches"
     tile_px = fixed_tile_px(model)
@@ -238,6 +255,7 @@ def rounded(plan: Plan, images: Remade[np.ndarray], log: Log = no_log) -> tuple[
     """A plan's graph in whole numbers, the float graph that was rounded, and the tensors of its last sum."""
     log("scale of each tensor")
     frac_bits = choose_frac_bits(plan.graph, images, plan.ends)
+    plan = plan.without_large_sums(frac_bits)
     if plan.takes_windows:
         plan = plan.with_windows(frac_bits[CORRECTION], images)
     graph = _balanced(plan, frac_bits, images, log)
@@ -251,37 +269,60 @@ def rounded(plan: Plan, images: Remade[np.ndarray], log: Log = no_log) -> tuple[
 
 
 def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], log: Log) -> Graph:
-    """The plan's graph, its streams equalised and then its chain levelled."""
-    graph = plan.chain.scaled(plan.graph, plan.chain.unscaled(frac_bits))
+    """The plan's graph, its streams equalised, its chain levelled, and what gains by it stored from -128 on.
+
+    Where the image itself passes through, also with copies in its dead channels, if that costs less.
+    """
     if not (plan.streams or plan.chain.tensors):
-        return graph
+        return plan.graph
     targets = search_targets(plan.graph, plan.ends, images)
 
-    def trial(tried: Graph) -> Costs:
+    def built(tried: Graph) -> tuple[Graph, IntCore]:
         final = plan.ended(plan.paired(tried))
-        return crop_costs(host_model(plan.core(final, frac_bits), {}), targets)
+        return final, plan.core(final, frac_bits)
 
-    graph = _equalised(graph, plan, trial, images, log) if plan.streams else graph
-    if plan.chain.tensors:
-        log(f"equalising the channels of {len(plan.chain.tensors)} tensors")
-        ranges = chain_ranges(graph, plan.chain, images, plan.ends)
-        graph = plan.chain.scaled(graph, level(graph, plan.chain, ranges, np.ones(len(ranges)), trial))
-    if plan.ends.offsets and plan.chain.tensors:  # the image itself passes through: what is clipped is lost
-        largest = chain_ranges(graph, plan.chain, images, plan.ends, quantile=1.0)
-        graph = plan.chain.scaled(graph, FULL / np.maximum(largest, FULL))
+    def trial(tried: Graph) -> Costs:
+        return crop_costs(host_model(built(tried)[1], {}), targets)
+
+    def fitted(tried: Graph) -> Costs:
+        return crop_costs(host_model(fit_weights(*built(tried), images, plan.shifts), {}), targets)
+
+    def searched(graph: Graph, copies: Copies) -> Graph:
+        graph = plan.chain.scaled(graph, plan.chain.unscaled(frac_bits))
+        graph = _equalised(graph, plan, trial, images, log) if plan.streams else graph
+        graph = _levelled(graph, plan, trial, images, log, copies) if plan.chain.tensors else graph
+        return lower(graph, frac_bits | dict.fromkeys(plan.chain.tensors, STREAM_FRAC_BITS), fitted)
+
+    graph = searched(plan.graph, {})
+    if plan.ends.offsets:
+        other, copies = with_copies(plan.graph, plan.chain.tensors, images, plan.ends)
+        if copies:
+            graph = min((graph, searched(other, copies)), key=lambda tried: float(fitted(tried)(None).sum()))
     return graph
+
+
+def _levelled(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], log: Log, copies: Copies) -> Graph:
+    """The graph, its chain levelled; what the image itself passes through clips nothing that calibration sees."""
+    log(f"equalising the channels of {len(plan.chain.tensors)} tensors")
+    places = dict(zip(plan.chain.tensors, plan.chain.parts, strict=True))
+    ranges = ranges_apart(chain_ranges(graph, plan.chain, images, plan.ends), places, copies)
+    graph = plan.chain.scaled(graph, level(graph, plan.chain, ranges, np.ones(len(ranges)), trial))
+    if not plan.ends.offsets:
+        return graph
+    largest = chain_ranges(graph, plan.chain, images, plan.ends, quantile=1.0)
+    return plan.chain.scaled(graph, FULL / np.maximum(largest, FULL))
 
 
 def _equalised(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], log: Log) -> Graph:
     """Stream after stream, the others levelled by a first guess until their turn comes."""
-    ranges = {stream: channel_ranges(plan.graph, stream, images, plan.ends) for stream in plan.streams}
-    for stream in plan.streams[1:]:
-        graph = equalise(graph, stream, first_guess(ranges[stream], LEVELLING[0], 1.0))
+    ranges = [channel_ranges(plan.graph, stream, images, plan.ends) for stream in plan.streams]
+    for stream, of_it in list(zip(plan.streams, ranges, strict=True))[1:]:
+        graph = equalise(graph, stream, first_guess(of_it, LEVELLING[0], 1.0))
     for number, stream in enumerate(plan.streams):
         log(f"equalising the channels of residual stream {number + 1} of {len(plan.streams)}")
         if number:
-            graph = equalise(graph, stream, 1 / first_guess(ranges[stream], LEVELLING[0], 1.0))
-        graph = equalise(graph, stream, search(graph, stream, ranges[stream], trial))
+            graph = equalise(graph, stream, 1 / first_guess(ranges[number], LEVELLING[0], 1.0))
+        graph = equalise(graph, stream, search(graph, stream, ranges[number], trial))
     return graph
 
 

@@ -16,7 +16,7 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Check
 from beers_deploy.quant.encodings import encoding_faults, read_core
 from beers_deploy.quant.ends import ZERO
-from beers_deploy.quant.graph import CORRECTION
+from beers_deploy.quant.graph import CORRECTION, Activation
 from beers_deploy.quant.graph.nodes import Node, OnnxGraph
 from beers_deploy.quant.graph.quantised import Scale, stated
 from beers_deploy.quant.onnx_file import any_size, with_outputs
@@ -81,12 +81,21 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
 def rounded_tensors(model: onnx.ModelProto) -> list[Rounded]:
     """What the graph's nodes round to 8 bits, in the graph's order."""
     with contradictions("INT8 model"):
-        return _rounded(OnnxGraph(model), _coarse(model))
+        return _rounded(OnnxGraph(model), _saturated_relus(model), _coarse(model))
 
 
-def _rounded(graph: OnnxGraph, coarse: slice) -> list[Rounded]:
+def _saturated_relus(model: onnx.ModelProto) -> set[str]:
+    """The tensors of a file of ours whose ReLU is int8's lower end."""
+    try:
+        convolutions = read_core(model).convolutions
+    except ModelError:  # another's file
+        return set()
+    return {op.output for op in convolutions if op.activation is Activation.saturated_relu}
+
+
+def _rounded(graph: OnnxGraph, relus: set[str], coarse: slice) -> list[Rounded]:
     read_as = {node.outputs[0]: node.inputs[0] for node in graph.nodes if node.op_type == "DequantizeLinear"}
-    relus = {name for node in graph.nodes if node.op_type in RELUS for name in node.inputs}
+    relus = relus | {name for node in graph.nodes if node.op_type in RELUS for name in node.inputs}
     relus |= {read_as[name] for name in relus & set(read_as)}
     found = []
     for node in graph.nodes:
@@ -114,7 +123,8 @@ class Relus:
 
     Attributes:
         explicit: nodes that are one: Relu, or the larger of a value and zero.
-        folded: convolutions whose 8 bits begin at zero, which is a ReLU, unless their results were never below zero.
+        folded: convolutions whose 8 bits begin at zero, which is a ReLU, unless their results were never below zero;
+            and those of which our file says that saturation is their ReLU.
     """
 
     explicit: int
@@ -131,11 +141,12 @@ class Relus:
 def count_relus(model: onnx.ModelProto) -> Relus:
     """The ReLUs of a file."""
     with contradictions("model"):
-        graph = OnnxGraph(model)
-        rounded = {tensor.name: tensor for tensor in _rounded(graph, slice(None))}
+        graph, saturated = OnnxGraph(model), _saturated_relus(model)
+        rounded = {tensor.name: tensor for tensor in _rounded(graph, saturated, slice(None))}
         convolved = {name for node in graph.nodes if "Conv" in node.op_type for name in node.outputs}
         explicit = sum(_is_relu(node, graph, rounded) for node in graph.nodes)
-        return Relus(explicit, sum(_begins_at_zero(node, rounded, convolved) for node in graph.nodes))
+        folded = sum(_begins_at_zero(node, rounded, convolved) for node in graph.nodes)
+        return Relus(explicit, folded + len(saturated))
 
 
 def _is_relu(node: Node, graph: OnnxGraph, rounded: dict[str, Rounded]) -> bool:

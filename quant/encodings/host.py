@@ -95,14 +95,14 @@ def _qlinear(
     # One a weight: where onnxruntime rewrites weights (see quant.session), it trips over a shared one.
     feeds += [w.constant(f"{op.name}.weight_zero_point", np.array(0, np.int8))]
     feeds += [w.unit(core.frac_bits[op.output]), w.zero_point(), w.constant(f"{op.name}.bias", bias)]
-    result = output if op.activation is Activation.none else f"{output}.linear"
+    result = output if op.activation.written is Activation.none else f"{output}.linear"
     w.node("QLinearConv", result, feeds, name=op.name, **attributes)
     _clamp(w, core, op, result, output)
 
 
 def _clamp(w: HostWriter, core: IntCore, op: IntConv | Add, source: str, output: str) -> None:
     """ReLU and ReLU6 of what is rounded already: they only clip."""
-    if op.activation is Activation.none:
+    if op.activation.written is Activation.none:
         return
     relu = output if op.activation is Activation.relu else f"{output}.above_0"
     w.node("Max", relu, [source, w.zero_point()], name=f"{op.name}.relu")

@@ -33,6 +33,8 @@ class Activation(StrEnum):
     leaky_relu = "LeakyRelu"
     hard_sigmoid = "HardSigmoid"
     hard_swish = "HardSwish"
+    saturated_relu = "SaturatedRelu"
+    """ReLU by int8's lower end, of whole numbers alone: the result is stored less 128 units."""
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Of values of any shape, as the DPU computes it, in their own type."""
@@ -42,6 +44,11 @@ class Activation(StrEnum):
     def fused(self) -> bool:
         """Whether it is computed on the accumulator, before anything is rounded."""
         return self not in (Activation.hard_sigmoid, Activation.hard_swish)
+
+    @property
+    def written(self) -> "Activation":
+        """What a file has an operator for: none where rounding to int8 does it."""
+        return Activation.none if self is Activation.saturated_relu else self
 
     @property
     def homogeneous(self) -> bool:
@@ -60,6 +67,7 @@ _FUNCTIONS: Mapping[Activation, Callable[[np.ndarray], np.ndarray]] = {
     Activation.leaky_relu: lambda values: np.where(values < 0, values * values.dtype.type(LEAKY_SLOPE), values),
     Activation.hard_sigmoid: _hard_sigmoid,
     Activation.hard_swish: lambda values: values * _hard_sigmoid(values),
+    Activation.saturated_relu: lambda values: values,
 }
 
 
@@ -152,11 +160,17 @@ class Conv(OneInput):
     groups: int = 1
     transposed: bool = False
     ceiling: np.ndarray | None = None  # (O,) where ReLU6 clips each channel once they are scaled; None at 6
+    offset: float = 0.0  # taken off the result behind its ReLU: 128 units of int8, or nothing
 
     @property
     def ceilings(self) -> np.ndarray:
         """(O,) where ReLU6 clips each channel."""
         return np.full(len(self.bias), float(SIX)) if self.ceiling is None else self.ceiling
+
+    @property
+    def stored_bias(self) -> np.ndarray:
+        """(O,) the bias of the result as it is stored, its offset taken off."""
+        return np.asarray(self.bias - np.float32(self.offset)) if self.offset else self.bias
 
 
 @dataclass(frozen=True)

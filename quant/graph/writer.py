@@ -67,7 +67,10 @@ def write_float(w: GraphWriter, op: Op, feeds: Sequence[str], output: str) -> No
         feeds: the names of what it reads; of a convolution with those of its weights and bias.
         output: the name of its result.
     """
-    activation = Activation.none if isinstance(op, Pointwise) else getattr(op, "activation", Activation.none)
+    activation = Activation.none if isinstance(op, Pointwise) else getattr(op, "activation", Activation.none).written
+    offset, end = getattr(op, "offset", 0.0), output
+    if offset:
+        output = f"{end}.whole"
     result = output if activation is Activation.none else f"{op.output}.linear"
     _WRITERS[type(op)](w, op, list(feeds), result)
     if isinstance(op, Conv) and op.ceiling is not None:
@@ -76,6 +79,10 @@ def write_float(w: GraphWriter, op: Op, feeds: Sequence[str], output: str) -> No
         w.node("Min", output, [f"{output}.above_0", ceiling], f"{op.name}.{activation.name}")
     elif activation is not Activation.none:
         _activation(w, activation, result, output, f"{op.name}.{activation.name}")
+    if offset:
+        w.node(
+            "Sub", end, [output, w.constant(f"{op.name}.offset", np.array(offset, np.float32))], f"{op.name}.lowered"
+        )
 
 
 def _conv(w: GraphWriter, op: Conv, feeds: list[str], output: str) -> None:

@@ -127,7 +127,7 @@ class Faulty:
                 self.sound(op, bias_frac_bits=op.bias_frac_bits - by),
             )
         yield "its bias is not added", self.sound(op, bias=np.zeros_like(op.bias))
-        if op.activation is not Activation.none:
+        if op.activation.written is not Activation.none:
             yield f"its activation {op.activation} is missing", self.sound(op, activation=Activation.none)
         yield "its kernels are turned by half a turn", self.sound(op, weight=op.weight[:, :, ::-1, ::-1])
         if not op.transposed and any(op.window.pads):

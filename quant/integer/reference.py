@@ -19,6 +19,7 @@ from beers_deploy.quant.ends import ZERO
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
+    Activation,
     Add,
     AveragePool,
     Concat,
@@ -99,7 +100,8 @@ def run_core(
         whole, ties = rounded(sums, shift, half_even)
         result = saturated(whole)
         tensors[op.output] = faults.touch(op.output, result)
-        ends = (result == INT8_MAX) | (result == INT8_MIN)
+        relu = getattr(op, "activation", None) is Activation.saturated_relu  # at whose lower end nothing is lost
+        ends = (result == INT8_MAX) | ((result == INT8_MIN) & (not relu))
         peak = max(float(np.log2(max(int(np.abs(sums).max()), 1))) - finer, 0.0)
         reports.append(LayerReport(op.name, peak, bound, float(ends.mean()), ties))
     return tensors, reports

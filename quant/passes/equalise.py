@@ -59,18 +59,27 @@ def equalise(graph: Graph, stream: Stream, factors: np.ndarray) -> Graph:
     clipped = [
         op for op in graph if isinstance(op, Conv) and op.output in stream and op.activation is Activation.relu6
     ]
+    factors = np.array(factors, np.float64)
     for op in clipped:
-        factors = np.maximum(factors, FULL / op.ceilings)
+        own = stream[op.output]
+        factors[own] = np.maximum(factors[own], FULL / op.ceilings)
+    return rescaled(graph, stream, factors)
+
+
+def rescaled(graph: Graph, stream: Stream, factors: np.ndarray) -> Graph:
+    """The same network with channel c of a stream scaled by factors[c], and of a ReLU6 there the six."""
     return tuple(_scaled(op, factors, stream) if isinstance(op, Conv) else op for op in graph)
 
 
 def _scaled(op: Conv, factors: np.ndarray, stream: Stream) -> Conv:
     weight, bias, ceiling = op.weight.astype(np.float64), op.bias.astype(np.float64), op.ceiling
     if op.output in stream:
-        weight, bias = weight * factors[:, None, None, None], bias * factors
-        ceiling = op.ceilings * factors if op.activation is Activation.relu6 else None
+        own = factors[stream[op.output]]
+        weight, bias = weight * own[:, None, None, None], bias * own
+        ceiling = op.ceilings * own if op.activation is Activation.relu6 else None
     if op.input in stream:
-        weight = weight / (factors[None, :, None, None] if op.groups == 1 else factors[:, None, None, None])
+        own = factors[stream[op.input]]
+        weight = weight / (own[None, :, None, None] if op.groups == 1 else own[:, None, None, None])
     return replace(op, weight=weight.astype(np.float32), bias=bias.astype(np.float32), ceiling=ceiling)
 
 
@@ -78,9 +87,14 @@ def channel_ranges(
     graph: Graph, stream: Stream, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL
 ) -> np.ndarray:
     """(C,) range of each stream channel over images (1, C', H, W), the widest of all the stream's tensors."""
-    total, count = np.zeros(1), 0
-    for sizes in channel_sizes(graph, sorted(stream), images, ends):
-        total, count = total + np.stack(sizes), count + 1
+    names, total, count = sorted(stream), np.zeros(1), 0
+    for sizes in channel_sizes(graph, names, images, ends):
+        wide = np.zeros(
+            (len(names), max(stream[name].stop or len(size) for name, size in zip(names, sizes, strict=True)))
+        )
+        for row, name, size in zip(wide, names, sizes, strict=True):
+            row[stream[name]] = size
+        total, count = total + wide, count + 1
     return above_dead(np.asarray(total / max(count, 1)).max(axis=0))
 
 
@@ -105,7 +119,7 @@ def with_room(graph: Graph, step: float, images: Iterable[np.ndarray], ends: End
         ends: what the host does to the images.
     """
     add = graph[-2]
-    last, largest = frozenset((*add.inputs, add.output)), np.zeros(1)
+    last, largest = dict.fromkeys((*add.inputs, add.output), slice(None)), np.zeros(1)
     for sizes in channel_sizes(graph, sorted(last), images, ends, quantile=1.0):
         largest = np.maximum(largest, np.max(sizes, axis=0))
     limit = INT8_MAX * step

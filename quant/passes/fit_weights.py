@@ -24,6 +24,7 @@ from beers_deploy.quant.core import (
     IntCore,
     Shifts,
     dequantised,
+    nearest_bias,
     quantise_bias,
     rounded_to,
 )
@@ -145,9 +146,10 @@ def fit_weights(graph: Graph, core: IntCore, images: Remade[np.ndarray], shifts:
     for op, nearest in zip(graph, core.ops, strict=True):
         whole = nearest
         if isinstance(op, Conv) and isinstance(nearest, IntConv):
-            whole, shifted = _fit(op, nearest, core.frac_bits[op.input], _moments(op, seen), shifts)
+            raised = op.stored_bias - nearest_bias(op, nearest.weight, nearest.weight_frac_bits, graph)
+            whole, shifted = _fit(op, nearest, core.frac_bits[op.input], _moments(op, seen), shifts, raised)
             if op.output == CORRECTION and ends.offsets:  # the biases left over are others now
-                ends = ends.moved(nearest.float_bias - shifted - whole.float_bias)
+                ends = ends.moved(nearest.float_bias + raised - shifted - whole.float_bias)
         ops.append(whole)
         _compute(op, whole, core.frac_bits[op.output], seen)
         for crop in seen:
@@ -184,16 +186,16 @@ def _compute(op: Op, whole: IntConv | Op, frac_bits: int, seen: list[Crop]) -> N
 
 
 def _fit(
-    op: Conv, whole: IntConv, input_frac_bits: int, moments: Moments, shifts: Shifts
+    op: Conv, whole: IntConv, input_frac_bits: int, moments: Moments, shifts: Shifts, raised: np.ndarray
 ) -> tuple[IntConv, np.ndarray]:
     """The fitted convolution, and by how much its weights raise the mean results, (O,): what its bias takes off.
 
     Fewer windows than weights say nothing of how errors add up.
     """
     if moments.count <= op.weight[0].size:
-        return whole, np.zeros(len(op.bias))
+        return whole, raised
     weight, shifted = fit(op.weight, np.array([2.0**-whole.weight_frac_bits]), moments)
-    bias, bias_frac_bits = quantise_bias(op.bias - shifted, whole.weight_frac_bits + input_frac_bits, shifts)
+    bias, bias_frac_bits = quantise_bias(op.stored_bias - shifted, whole.weight_frac_bits + input_frac_bits, shifts)
     return replace(whole, weight=weight, bias=bias, bias_frac_bits=bias_frac_bits), shifted
 
 

@@ -3,8 +3,9 @@
 Between two convolutions each channel may be scaled by a factor of its own, as `quant.passes.equalise` does with a
 stream: then one scale suits all channels, and because a factor is any number, the tensor's own scale and that of the
 weights that read it are no longer bound to powers of two. Where there is a stream it is what counts, and levelling
-the rest too made no network better that is made for one sensor. Behind a bank it does: one file serves sensors of
-little noise and of much, and what lies inside a block is then small in most channels.
+the rest too made no network of dense convolutions better that is made for one sensor. Those with depthwise ones it
+does, and those behind a bank: one file serves sensors of little noise and of much, and what lies inside a block is
+then small in most channels.
 
 All tensors are levelled together first, for what the worst of them errs hides the others; then one after the other
 from the last, for what is rounded late reaches the result.
@@ -30,7 +31,7 @@ from beers_deploy.quant.passes.equalise import (
     first_guess,
     stepped,
 )
-from beers_deploy.quant.passes.stream import STREAM_FRAC_BITS
+from beers_deploy.quant.passes.stream import STREAM_FRAC_BITS, only
 
 LEVELLING = (0.0, 0.25, 0.5, 1.0)
 HEADROOM = (0.8, 1.0, 1.25, 1.6, 2.2)
@@ -92,7 +93,7 @@ class Chain:
     def scaled(self, graph: Graph, factors: np.ndarray) -> Graph:
         """The same network with each channel scaled by its factor."""
         for name, part in zip(self.tensors, self.parts, strict=True):
-            graph = equalise(graph, frozenset([name]), factors[part])
+            graph = equalise(graph, only(name), factors[part])
         return graph
 
     def unscaled(self, frac_bits: Mapping[str, int]) -> np.ndarray:

@@ -6,52 +6,111 @@ strongest edges. Windows for a result that nothing is added to: fine ones side b
 coarse one for what lies outside.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import accumulate, repeat
 
 import numpy as np
 
+from beers_deploy.quant.core import INT8_MAX
 from beers_deploy.quant.ends import FINE_MAX, GAIN
-from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Add, Conv, Graph
-from beers_deploy.quant.graph.operations import united
+from beers_deploy.quant.graph import (
+    CORRECTION,
+    PLANES,
+    Activation,
+    Add,
+    AveragePool,
+    Concat,
+    Conv,
+    Graph,
+    MaxPool,
+    Op,
+    Resize,
+    channels_of,
+)
+from beers_deploy.quant.graph.operations import SIX, united
 
 STREAM_FRAC_BITS = 8
 """Any would do: `equalise` scales the stream to it."""
 
 
-Stream = frozenset[str]
-"""Tensors that adds read and write: each is added to another of them, or is such a sum."""
+Stream = Mapping[str, slice]
+"""Tensors that have the same factors, channel by channel: each is added to another of them, or is such a sum, or what
+a pool, an enlargement or a concat makes of them. And where in the factors the channels of each stand."""
+PASSING = (Concat, MaxPool, AveragePool, Resize)
+"""What hands channels on without mixing them."""
+
+
+def only(name: str) -> Stream:
+    """A tensor by itself."""
+    return {name: slice(None)}
 
 
 def streams(graph: Graph) -> list[Stream]:
     """The streams that can share a scale and be equalised, in the order of the graph.
 
-    Those that convolutions and adds alone write and read, with nothing between that a factor does not pass; so not
-    where a pool, a concat or the network's end reads them.
+    Those that convolutions and adds alone write and read, and what hands channels on, with nothing between that a
+    factor does not pass; so not where a product, a pixel shuffle or the network's end reads them.
     """
-    leader = united((*op.inputs, op.output) for op in graph if isinstance(op, Add))
-    groups = [frozenset(name for name in leader if leader[name] == first) for first in dict.fromkeys(leader.values())]
-    return [group for group in groups if _passes_factors(graph, group)]
+    linking = [op for op in graph if isinstance(op, (Add, *PASSING))]
+    leader = united((*op.inputs, op.output) for op in linking)
+    sums = {leader[op.output] for op in linking if isinstance(op, Add)}
+    groups = [[name for name in leader if leader[name] == first] for first in dict.fromkeys(leader.values())]
+    placed = [_placed(linking, group, graph) for group in groups if leader[group[0]] in sums]
+    return [group for group in placed if group and _passes_factors(graph, group)]
+
+
+def _placed(linking: Sequence[Op], names: Sequence[str], graph: Graph) -> Stream:
+    """Where the channels of these tensors stand; nowhere where one would have to stand in two places."""
+    own = [op for op in linking if op.output in names]
+    if not any(isinstance(op, Concat) for op in own):
+        return dict.fromkeys(names, slice(None))
+    widths = channels_of(graph, {PLANES: next(op.weight.shape[1] for op in graph if isinstance(op, Conv))})
+    links, first = [link for op in own for link in _links(op, widths)], {names[0]: 0}
+    while len(first) < len(names):
+        for part, whole, by in links:
+            if whole in first:
+                first.setdefault(part, first[whole] + by)
+            elif part in first:
+                first[whole] = first[part] - by
+    if any(first[part] != first[whole] + by for part, whole, by in links):
+        return {}
+    least = min(first.values())
+    return {name: slice(start - least, start - least + widths[name]) for name, start in first.items()}
+
+
+def _links(op: Op, widths: Mapping[str, int]) -> list[tuple[str, str, int]]:
+    """What an operation reads, what it writes, and where in that the channels of the one stand."""
+    before = accumulate((widths[name] for name in op.inputs[:-1]), initial=0)
+    offsets = before if isinstance(op, Concat) else repeat(0, len(op.inputs))
+    return [(name, op.output, by) for name, by in zip(op.inputs, offsets, strict=True)]
+
+
+def exceeds_six(graph: Graph, stream: Stream, frac_bits: Mapping[str, int]) -> bool:
+    """Whether a ReLU6 writes to it, and int8 ends beyond the six in one of its tensors."""
+    clipped = any(isinstance(op, Conv) and op.activation is Activation.relu6 and op.output in stream for op in graph)
+    return clipped and any(INT8_MAX * 2.0 ** -frac_bits[name] > SIX for name in stream)
 
 
 def lone_tensors(graph: Graph) -> list[str]:
     """Tensors of no stream that convolutions alone write and read: each of their channels may have a factor."""
     added = {name for op in graph if isinstance(op, Add) for name in (*op.inputs, op.output)}
     written = [op.output for op in graph if isinstance(op, Conv) and op.output not in added]
-    return [name for name in written if _passes_factors(graph, frozenset([name]))]
+    passing = {name for op in graph if isinstance(op, PASSING) for name in op.inputs}
+    return [name for name in written if name not in passing and _passes_factors(graph, only(name))]
 
 
 def _passes_factors(graph: Graph, stream: Stream) -> bool:
-    touching = [op for op in graph if stream.intersection((*op.inputs, op.output))]
-    known = all(isinstance(op, Conv | Add) for op in touching)
-    writers = [op for op in touching if op.output in stream]
-    homogeneous = all(isinstance(op, Conv | Add) and _passes(op.activation, len(stream) == 1) for op in writers)
-    return known and homogeneous and not stream & {PLANES, CORRECTION}
+    touching = [op for op in graph if stream.keys() & {*op.inputs, op.output}]
+    known = all(isinstance(op, (Conv, Add, *PASSING)) for op in touching)
+    writers = [op for op in touching if op.output in stream and isinstance(op, Conv | Add)]
+    homogeneous = all(_passes(op.activation, isinstance(op, Conv)) for op in writers)
+    return known and homogeneous and not stream.keys() & {PLANES, CORRECTION}
 
 
-def _passes(activation: Activation, lone: bool) -> bool:
-    """Whether factors pass; ReLU6 where `equalise` may make int8's end its clip, so not of sums that exceed six."""
-    return activation.homogeneous or (lone and activation is Activation.relu6)
+def _passes(activation: Activation, of_conv: bool) -> bool:
+    """Whether factors pass; ReLU6 where `equalise` may make int8's end its clip, so not behind an add."""
+    return activation.homogeneous or (of_conv and activation is Activation.relu6)
 
 
 def share_stream_scale(streams: Iterable[Stream], frac_bits: Mapping[str, int]) -> dict[str, int]:

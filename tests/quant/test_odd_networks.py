@@ -111,6 +111,29 @@ def products(w: Sketch) -> onnx.ModelProto:
     return w.model(2)
 
 
+def skip_past_a_pool(w: Sketch) -> onnx.ModelProto:
+    first = w.conv("first", "in", (3, 1, 3, 3), pads=[1] * 4)
+    limits = [w.constant(f"limit_{end}", np.array(end, np.float32)) for end in (0, 6)]
+    head = w.node("Clip", "head", [first, *limits])
+    inner = w.conv("inner", head, (3, 1, 3, 3), 0.2, pads=[1] * 4, group=3)
+    fine = w.node("Add", "fine", [head, w.conv("point", w.node("Relu", "r", [inner]), (3, 3, 1, 1))])
+    deep = w.conv("deep", w.node("MaxPool", "down", [fine], kernel_shape=[2, 2], strides=[2, 2]), (2, 3, 1, 1))
+    sizes = w.constant("twice", np.array([1, 1, 2, 2], np.float32))
+    how = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+    up = w.node("Resize", "up", [deep, "", sizes], **how)
+    last = w.conv("last", w.node("Concat", "both", [up, fine], axis=1), (1, 5, 3, 3), 0.1, pads=[1] * 4)
+    w.node("Add", "out", ["in", last])
+    return w.model(1)
+
+
+def dead_channels(w: Sketch) -> onnx.ModelProto:
+    first = w.node("Relu", "r", [w.conv("first", "in", (5, 1, 3, 3), 0.6, pads=[1] * 4)])
+    w.constant("inner.b", np.array([0.1, -9, 0.2, -9, 0.1], np.float32))
+    inner = w.node("Relu", "s", [w.conv("inner", first, (5, 1, 3, 3), 0.6, pads=[1] * 4, group=5)])
+    w.conv("out", w.node("Relu", "t", [w.conv("point", inner, (4, 5, 1, 1))]), (1, 4, 3, 3), pads=[1] * 4)
+    return w.model(1)
+
+
 def many_classes(w: Sketch) -> onnx.ModelProto:
     w.conv("out", "in", (1200, 1, 3, 3), 40.0, strides=[3, 3])
     return w.model(1200)
@@ -123,7 +146,7 @@ def shares_of_classes(w: Sketch) -> onnx.ModelProto:
 
 SOUND = [
     features_beside_the_image, pooled_image, preactivation, leaking_upwards, one_tensor_twice, sum_of_two, separable,
-    names_of_ours, thirds, products, many_classes, shares_of_classes,
+    names_of_ours, thirds, products, skip_past_a_pool, dead_channels, many_classes, shares_of_classes,
 ]  # fmt: skip
 
 

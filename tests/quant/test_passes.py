@@ -1,5 +1,7 @@
 """The passes: each leaves the float network as it was, and does to the integer one what it says."""
 
+from dataclasses import replace
+
 import numpy as np
 import onnx
 import pytest
@@ -11,9 +13,14 @@ from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
     PLANES_FRAC_BITS,
+    Activation,
     Add,
+    Concat,
     Conv,
     Graph,
+    MaxPool,
+    Resize,
+    Window,
     graph_to_onnx,
     split,
 )
@@ -31,6 +38,7 @@ from beers_deploy.quant.passes.equalise import (
 from beers_deploy.quant.passes.stream import (
     STREAM_FRAC_BITS,
     Stream,
+    exceeds_six,
     half_lsb_pair,
     streams,
     two_gains,
@@ -82,6 +90,49 @@ def test_a_dead_channel_is_not_blown_up(graph: Graph, patches: Patches) -> None:
     assert ranges[3] >= 1e-4 * ranges.max()
 
 
+def skipping(seed: int = 0) -> Graph:
+    """A sum that a pool, an enlargement and a concat hand on, behind a ReLU6; and what is pooled and written anew."""
+    generator = np.random.default_rng(seed)
+
+    def conv(source: str, output: str, outputs: int, inputs: int, activation: Activation = Activation.none) -> Conv:
+        weight = generator.normal(0, 0.5, (outputs, inputs, 1, 1)).astype(np.float32)
+        bias = generator.normal(0, 0.5, outputs).astype(np.float32)
+        return Conv(f"{output}.conv", source, output, weight, bias, activation)
+
+    block = conv(PLANES, "head", 3, 3, Activation.relu6), conv("head", "inner", 3, 3)
+    down = Add("add", ("head", "inner"), "sum"), MaxPool("max", "sum", "pooled", (2, 2), Window((2, 2)))
+    deep = conv("pooled", "deep", 2, 3), Resize("resize", "deep", "up", 2)
+    return *block, *down, *deep, Concat("join", ("up", "sum"), "both"), conv("both", CORRECTION, 1, 5)
+
+
+def test_a_stream_goes_through_pools_enlargements_and_concats() -> None:
+    graph, fine, coarse = skipping(), slice(2, 5), slice(0, 2)
+    wanted = {"head": fine, "inner": fine, "sum": fine, "pooled": fine, "deep": coarse, "up": coarse}
+    assert stream_of(graph) == wanted | {"both": slice(0, 5)}
+    image = {PLANES: np.random.default_rng(1).normal(0, 3, (1, 3, 6, 10)).astype(np.float32)}
+    found = [
+        open_session(graph_to_onnx(each, [CORRECTION])).run(None, image)[0]
+        for each in (graph, equalise(graph, stream_of(graph), np.random.default_rng(2).lognormal(-1, 1, 5)))
+    ]
+    np.testing.assert_allclose(found[1], found[0], atol=1e-4)
+
+
+def test_a_tensor_that_would_have_two_places_is_in_no_stream() -> None:
+    *before, join, last = skipping()
+    assert isinstance(last, Conv)
+    twice = replace(join, inputs=("sum", "sum"))  # type: ignore[type-var]
+    assert streams((*before, twice, replace(last, weight=np.ones((1, 6, 1, 1), np.float32)))) == []
+
+
+@pytest.mark.parametrize(("bits", "beyond"), [(5, False), (4, True)])
+def test_sums_beyond_a_relu6_are_told_by_their_scale(bits: int, beyond: bool) -> None:
+    graph = skipping()
+    known = dict.fromkeys(stream_of(graph), 5) | {"sum": bits}
+    assert exceeds_six(graph, stream_of(graph), known) is beyond
+    plain = tuple(replace(op, activation=Activation.relu) if op.output == "head" else op for op in graph)  # type: ignore[type-var]
+    assert not exceeds_six(plain, stream_of(plain), known)
+
+
 def largest(graph: Graph, images: list[np.ndarray]) -> np.ndarray:
     """(C,) of the last sum."""
     sizes = channel_sizes(graph, [graph[-2].output], images, quantile=1.0)
@@ -99,7 +150,9 @@ def test_the_last_sum_has_room_for_the_largest_values(graph: Graph, patches: Pat
     before, after = largest(paired, images), largest(roomy, images)
     assert (after * ROOM <= 127 * step * (1 + 1e-5)).all()
     assert (after <= before * (1 + 1e-5)).all()
-    for name in sorted(stream_of(graph) & {name for op in roomy for name in op.inputs}):  # the blocks keep their step
+    for name in sorted(
+        stream_of(graph).keys() & {name for op in roomy for name in op.inputs}
+    ):  # the blocks keep their step
         first, second = ([op for op in each if op.output == name] for each in (paired, roomy))
         assert all(a is b or np.array_equal(a.weight, b.weight) for a, b in zip(first, second, strict=True))  # type: ignore[attr-defined]
     if loud < 1:

@@ -1,0 +1,262 @@
+"""What INT8 costs twelve small networks that are trained briefly, with AMD Quark beside it.
+
+    python -m benchmarks.small_networks --images aerial-train/ --held-out aerial-test/ --quark-python quark/bin/python
+
+Prints a Markdown table: what is lost on samples that neither training nor calibration saw, of PSNR on average and on
+the worst sample, of the classifier in points of the share of right answers. The samples are those of
+`examples.samples`, the environment of Quark that of `int8_peers.py`. Trained networks stay in the folder of --keep,
+where a later run finds them.
+"""
+
+import argparse
+import re
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from beers_deploy.model.metrics.fidelity import psnr_db
+from beers_deploy.quant.ends import ends_of
+from beers_deploy.quant.graph import read_network
+from beers_deploy.quant.onnx_file import load_onnx, save_onnx
+from benchmarks.int8_peers import OURS, QUARK, Peered, Restore, Way, quantise
+from examples.networks import ESPCN, Classifier, DnCNN
+from examples.samples import batches_of
+
+SIDE_PX = {"dncnn": 64, "espcn": 64, "classifier": 32}
+SEPARABLE, DENSE = 32, 16
+"""Features of networks with depthwise convolutions, and of those without."""
+BATCH, RATE, FAST = 4, 2e-3, 5e-3
+"""Learning rates: of all networks, and of those that the image itself passes, which are slow to learn it."""
+
+
+def conv(inputs: int, outputs: int, act: nn.Module, kernel: int = 3, dilation: int = 1, groups: int = 1) -> nn.Module:
+    """A convolution that keeps the size, and an activation."""
+    padding = dilation * (kernel // 2)
+    inner = nn.Conv2d(inputs, outputs, kernel, padding=padding, dilation=dilation, groups=groups)
+    return nn.Sequential(inner, act)
+
+
+def depthwise(act: nn.Module, dilation: int = 1) -> nn.Module:
+    """A depthwise convolution with one of 1 x 1 behind it, without a global add."""
+    separable = (
+        conv(SEPARABLE, SEPARABLE, act, dilation=dilation, groups=SEPARABLE),
+        conv(SEPARABLE, SEPARABLE, act, 1),
+    )
+    return nn.Sequential(conv(1, SEPARABLE, act), *separable, nn.Conv2d(SEPARABLE, 1, 3, padding=1))
+
+
+def plain(layers: int, dilation: int = 1) -> nn.Module:
+    """Convolutions with ReLU, without a global add."""
+    middle = [conv(DENSE, DENSE, nn.ReLU(), dilation=dilation) for _ in range(layers - 2)]
+    return nn.Sequential(conv(1, DENSE, nn.ReLU()), *middle, nn.Conv2d(DENSE, 1, 3, padding=1))
+
+
+class Added(nn.Module):
+    """What a network gives, added to what it gets."""
+
+    def __init__(self, *inner: nn.Module) -> None:
+        super().__init__()
+        self.inner = nn.Sequential(*inner)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The same shape."""
+        found: Tensor = self.inner(x)
+        return x + found
+
+
+def inverted(inputs: int, outputs: int) -> nn.Module:
+    """MobileNetV2's block: widened twofold, filtered channel by channel, narrowed without an activation."""
+    wide = 2 * inputs
+    block = [
+        conv(inputs, wide, nn.ReLU6(), kernel=1),
+        conv(wide, wide, nn.ReLU6(), groups=wide),
+        conv(wide, outputs, nn.Identity(), kernel=1),
+    ]
+    return Added(*block) if inputs == outputs else nn.Sequential(*block)
+
+
+class MobileUNet(nn.Module):
+    """Two levels of inverted residuals, pooled down, enlarged up, the skip concatenated; a global add."""
+
+    def __init__(self, features: int = 8) -> None:
+        super().__init__()
+        self.head = conv(1, features, nn.ReLU6())
+        self.fine, self.down = inverted(features, features), inverted(features, 2 * features)
+        self.deep = nn.Sequential(*(inverted(2 * features, 2 * features) for _ in range(2)))
+        self.join, self.tail = inverted(3 * features, features), nn.Conv2d(features, 1, 3, padding=1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Images (N, 1, H, W) of even sides to the same."""
+        fine = self.fine(self.head(image))
+        deep = self.deep(self.down(functional.max_pool2d(fine, 2)))
+        up = functional.interpolate(deep, scale_factor=2.0, mode="nearest")
+        correction: Tensor = self.tail(self.join(torch.cat([up, fine], 1)))
+        return image + correction
+
+
+def transposed() -> nn.Module:
+    """Down by a stride, up by a transposed convolution, with a global add."""
+    down = nn.Sequential(nn.Conv2d(1, DENSE, 4, stride=2, padding=1), nn.ReLU())
+    up = nn.ConvTranspose2d(DENSE, DENSE, 4, stride=2, padding=1)
+    inner = [conv(DENSE, DENSE, nn.ReLU()) for _ in range(2)]
+    return Added(down, *inner, up, nn.ReLU(), nn.Conv2d(DENSE, 1, 3, padding=1))
+
+
+def residual() -> nn.Module:
+    """Four residual blocks, with a global add."""
+    blocks = [Added(conv(DENSE, DENSE, nn.ReLU()), conv(DENSE, DENSE, nn.Identity())) for _ in range(4)]
+    return Added(nn.Conv2d(1, DENSE, 3, padding=1), *blocks, nn.Conv2d(DENSE, 1, 3, padding=1))
+
+
+NETWORKS: dict[str, tuple[str, Callable[[], nn.Module]]] = {
+    "depthwise, ReLU6": ("dncnn", lambda: depthwise(nn.ReLU6())),
+    "depthwise, ReLU": ("dncnn", lambda: depthwise(nn.ReLU())),
+    "depthwise, HardSwish": ("dncnn", lambda: depthwise(nn.Hardswish())),
+    "depthwise, dilated": ("dncnn", lambda: depthwise(nn.ReLU(), 2)),
+    "U-Net of inverted residuals": ("dncnn", MobileUNet),
+    "plain": ("dncnn", lambda: plain(5)),
+    "plain, dilated": ("dncnn", lambda: plain(5, 2)),
+    "transposed": ("dncnn", transposed),
+    "residual": ("dncnn", residual),
+    "DnCNN": ("dncnn", lambda: DnCNN(6)),
+    "ESPCN": ("espcn", ESPCN),
+    "classifier": ("classifier", Classifier),
+}
+"""By name, what each learns from (`examples.samples`) and how it is made."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Samples: images (K, C, H, W) in [0, 1], and their references or classes."""
+
+    images: np.ndarray
+    wanted: np.ndarray
+
+    @classmethod
+    def of(cls, kind: str, folder: Path | None, seed: int, batches: int) -> "Drawn":
+        """So many batches of what the examples learn from."""
+        found = list(islice(batches_of(kind, folder, seed), batches))
+        images, wanted = (torch.cat(each).numpy() for each in zip(*found, strict=True))
+        return cls(images, wanted)
+
+
+@torch.no_grad()
+def drawn(network: nn.Module, generator: torch.Generator) -> nn.Module:
+    """The network with weights and biases drawn as torch draws them, from a generator."""
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
+            bound = module.weight[0].numel() ** -0.5
+            for numbers in module.parameters():
+                numbers.uniform_(-bound, bound, generator=generator)
+    return network
+
+
+def trained(name: str, folder: Path | None, count: int) -> nn.Module:
+    """The network of that name after so many steps of Adam."""
+    kind, make = NETWORKS[name]
+    network = drawn(make(), torch.Generator().manual_seed([*NETWORKS].index(name))).train()
+    error = functional.cross_entropy if kind == "classifier" else functional.l1_loss
+    optimiser = torch.optim.Adam(network.parameters(), lr=FAST if name.startswith(("depthwise", "plain")) else RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, count)
+    for image, wanted in islice(batches_of(kind, folder, 0), count):
+        optimiser.zero_grad()
+        error(network(image[:BATCH]), wanted[:BATCH]).backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+    return network.eval()
+
+
+def save(network: nn.Module, side_px: int, path: Path) -> None:
+    """Export as users do, for one size of image, and fold."""
+    names: dict[str, Any] = {"input_names": ["input"], "output_names": ["output"]}
+    names["dynamic_axes"] = {"input": {0: "batch"}}
+    image = torch.zeros(1, 1, side_px, side_px)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.onnx.export(network, (image,), str(path), opset_version=17, dynamo=False, **names)
+    save_onnx(load_onnx(path), path)
+
+
+def losses(in_float: Restore, in_int8: Restore, held: Drawn) -> np.ndarray:
+    """(K,) what each sample loses: dB of PSNR, or of one that was classified rightly all, 100 points."""
+    found = []
+    for image, wanted in zip(held.images, held.wanted, strict=True):
+        results = [run(image[None]) for run in (in_float, in_int8)]
+        if wanted.ndim:
+            scores = [psnr_db(np.clip(result, 0, 1), wanted[None], 1.0) for result in results]
+        else:
+            scores = [100.0 * (result.argmax() == wanted) for result in results]
+        found.append(scores[0] - scores[1])
+    return np.array(found)
+
+
+def cells(name: str, way: Way, python: str, folder: Path, calibration: Drawn, held: Drawn) -> str:
+    """What a way loses: the mean, and the worst sample's of images."""
+    path = folder / f"{slug(name)}.onnx"
+    model = load_onnx(path)
+    network = Peered(model, ends_of(read_network(model)))
+    patches, out = path.with_suffix(".npy"), path.with_suffix(f".{slug(way.name)}.onnx")
+    np.save(patches, calibration.images)
+    seconds, _ = quantise(way, {False: (path, patches)}, out, python)
+    lost = losses(network.runner(path), network.runner(out), held)
+    print(name, way.name, f"{seconds:.0f} s", file=sys.stderr)
+    return f"{lost.mean():.2f}, {lost.max():.2f}" if held.wanted.ndim > 1 else f"{lost.mean():.1f} points"
+
+
+def slug(name: str) -> str:
+    """For the name of a file."""
+    return name.lower().replace(",", "").replace(" ", "-")
+
+
+def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
+    """Line by line, as each network is judged."""
+    ways = [(Way("beers-deploy", False, OURS, ("legal",)), sys.executable)]
+    if arguments.quark_python:
+        ways.append((Way("Quark XINT8", False, QUARK, (), ("0",)), arguments.quark_python))
+    yield f"| network | {' | '.join(way.name for way, _ in ways)} |"
+    yield "|---" * (len(ways) + 1) + "|"
+    for name, (kind, _) in NETWORKS.items():
+        if not re.search(arguments.only, name):
+            continue
+        path = folder / f"{slug(name)}.onnx"
+        if not path.exists():
+            save(
+                trained(name, arguments.images, arguments.steps), SIDE_PX[kind] // (2 if kind == "espcn" else 1), path
+            )
+        calibration = Drawn.of(kind, arguments.images, 5, arguments.batches)
+        held = Drawn.of(kind, arguments.held_out, 6, arguments.batches)
+        found = [cells(name, way, python, folder, calibration, held) for way, python in ways]
+        yield f"| {name} | {' | '.join(found)} |"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--images", type=Path, help="folder of scenes to train and calibrate on; drawn ones if none")
+    parser.add_argument("--held-out", type=Path, help="folder of scenes to judge on; drawn ones if none")
+    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--batches", type=int, default=8, help="of eight samples: to calibrate on, and to judge on")
+    parser.add_argument("--quark-python", help="interpreter of the environment that AMD Quark is installed in")
+    parser.add_argument("--only", default="", help="networks whose names this regular expression finds")
+    parser.add_argument("--keep", type=Path, help="folder for the networks")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = (arguments.keep or Path(temporary)).resolve()
+        folder.mkdir(parents=True, exist_ok=True)
+        for line in table(arguments, folder):
+            print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+"""Let dead channels carry copies of the others, so that each of these is rounded twice, at no cost on a board.
+
+A channel behind ReLU that is zero on all calibration patches does nothing. The channel whose rounding costs most may
+be computed there once more: what reads the two takes half of each, and their errors, at scales a little apart, partly
+cancel. Where depthwise convolutions follow one another the copy goes through all of them. A network without a global
+add has its image in such tensors, and training with ReLU leaves a third of their channels dead and more.
+"""
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from beers_deploy.quant.ends import Ends
+from beers_deploy.quant.graph import Conv, Graph
+from beers_deploy.quant.session import values_of
+
+APART = 0.87
+"""The range of a copy is divided by it, so that levelling gives it another scale than its channel has."""
+
+Copies = Mapping[str, np.ndarray]
+"""The channels of each tensor that are copies."""
+
+
+def with_copies(
+    graph: Graph, names: Collection[str], images: Iterable[np.ndarray], ends: Ends
+) -> tuple[Graph, Copies]:
+    """The graph with as many copies as it has dead channels, and which these are.
+
+    Args:
+        graph: plane-reading.
+        names: the tensors that may have factors by channel (`quant.passes.stream.lone_tensors`).
+        images: (1, C, H, W) on which a dead channel is zero.
+        ends: what the host does to the images.
+    """
+    found, last = dict[str, np.ndarray](), runs(graph, names)
+    sizes = _largest(graph, [run[-1] for run in last], images, ends)
+    for run, size in zip(last, sizes, strict=True):
+        sources, copies = _pairs(graph, run[-1], size)
+        if len(copies):
+            graph = tuple(_copied(op, run, sources, copies) if isinstance(op, Conv) else op for op in graph)
+            found |= dict.fromkeys(run, copies)
+    return graph, found
+
+
+def runs(graph: Graph, names: Collection[str]) -> list[list[str]]:
+    """Of these, tensors one behind the other, depthwise convolutions between: from a dense one to dense ones."""
+    readers = {name: [op for op in graph if isinstance(op, Conv) and op.input == name] for name in names}
+    begun = [op.output for op in graph if isinstance(op, Conv) and op.output in readers and op.groups == 1]
+    found = []
+    for name in begun:
+        run = [name]
+        while [op.groups > 1 and op.output in readers for op in readers[run[-1]]] == [True]:
+            run.append(readers[run[-1]][0].output)
+        if all(op.groups == 1 for op in readers[run[-1]]):
+            found.append(run)
+    return found
+
+
+def _largest(graph: Graph, names: list[str], images: Iterable[np.ndarray], ends: Ends) -> list[np.ndarray]:
+    """(C,) the largest size of each channel of the named tensors."""
+    found = [np.zeros(1) for _ in names]
+    for results in values_of(graph, names, images, ends) if names else ():
+        found = [np.maximum(most, np.abs(r[0]).max((1, 2))) for most, r in zip(found, results, strict=True)]
+    return found
+
+
+def _pairs(graph: Graph, name: str, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The channels that are copied, those first whose rounding weighs most in what reads them, and where to."""
+    weights = sum(
+        np.square(op.weight, dtype=np.float64).sum((0, 2, 3))
+        for op in graph
+        if isinstance(op, Conv) and op.input == name
+    )
+    order, dead = np.argsort(-np.square(sizes) * weights, kind="stable"), np.flatnonzero(sizes == 0)
+    count = min(len(dead), len(sizes) - len(dead))
+    return order[:count], dead[:count]
+
+
+def _copied(op: Conv, run: list[str], sources: np.ndarray, copies: np.ndarray) -> Conv:
+    weight, bias = op.weight.copy(), op.bias.copy()
+    if op.output in run:
+        weight[copies], bias[copies] = weight[sources], bias[sources]
+    if op.input == run[-1]:
+        weight[:, sources] /= 2
+        weight[:, copies] = weight[:, sources]
+    return replace(op, weight=weight, bias=bias)
+
+
+def ranges_apart(ranges: np.ndarray, tensors: Mapping[str, slice], copies: Copies) -> np.ndarray:
+    """Ranges (channels of all tensors,) with those of the copies apart from their channels'."""
+    apart = ranges.copy()
+    for name, channels in copies.items():
+        apart[tensors[name]][channels] /= APART
+    return apart
