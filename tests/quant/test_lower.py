@@ -95,7 +95,7 @@ def test_every_file_holds_the_references_integers(seed: int) -> None:
         (found,) = open_session(model).run(None, {PLANES: planes_of(seen, core.ends)})
         np.testing.assert_array_equal(found, wanted)
     tensors, _ = run_core(core, core.ends.split(seen))
-    trained = TrainableCore(core, [op for op in both_lowered(network(seed)) if isinstance(op, Conv)])
+    trained = TrainableCore(core)
     found = trained.tensors(torch.from_numpy(core.ends.split(seen).astype(np.float32)))[CORRECTION]
     np.testing.assert_array_equal(found.detach().numpy(), tensors[CORRECTION])
 
