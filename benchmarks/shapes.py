@@ -27,7 +27,7 @@ from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import Patches, Remade
 from beers_deploy.quant.tiling.walk import tiling_of
 
-SHAPES = "4x16,8x32,16x32,16x64,2x32@2,4x32@2,8x32@2,4x48@2,8x48@2,3x64@2,4x64@2,2x64@4,4x96@4,4x128@4"
+SHAPES = "4x16,8x32,16x64,2x32@2,8x32@2,4x48@2,4x64@2,2x64@4,4x128@4"
 SHAPE = re.compile(r"(\d+)x(\d+)(?:@(\d+))?")
 SIDE_PX = 48
 
@@ -36,7 +36,7 @@ def main() -> None:
     """Print a row a shape."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shapes", default=SHAPES)
-    parser.add_argument("--boards", default="vck190:C32B3,vck190:C32B6", help="each with its configuration")
+    parser.add_argument("--boards", default="vck190:C32B3", help="each with its configuration")
     parser.add_argument("--tile", type=int, default=640)
     arguments = parser.parse_args()
     boards = [load_dpu(*board.split(":")) for board in arguments.boards.split(",")]
