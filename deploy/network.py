@@ -7,6 +7,7 @@ and NAME-int8 in INT8, each told one sensor: its filters, written in millisecond
 is needed it lies in a folder of this process, which goes with it.
 """
 
+import atexit
 import hashlib
 import io
 import json
@@ -181,7 +182,7 @@ class Network:
         """A file that holds it: its own, or one that goes with this process."""
         if self.path is not None:
             return self.path
-        path = Path(_folder().name) / f"{_file_stem(self.name)}-{self.sha256[:12]}.onnx"
+        path = _folder() / f"{_file_stem(self.name)}-{self.sha256[:12]}.onnx"
         return path if path.is_file() else self.save(path)
 
     def __eq__(self, other: object) -> bool:
@@ -342,9 +343,11 @@ def _warn(sentence: str) -> None:
 
 
 @cache
-def _folder() -> TemporaryDirectory[str]:
-    """Where the files of this process lie."""
-    return TemporaryDirectory(prefix="beers-deploy-", ignore_cleanup_errors=True)
+def _folder() -> Path:
+    """Where the files of this process lie, until it ends."""
+    folder = TemporaryDirectory(prefix="beers-deploy-", ignore_cleanup_errors=True)
+    atexit.register(folder.cleanup)
+    return Path(folder.name)
 
 
 def _written(network: Conditioned, sensor: Sensor, int8: bool, log: Log) -> Path:
@@ -352,7 +355,7 @@ def _written(network: Conditioned, sensor: Sensor, int8: bool, log: Log) -> Path
     stem = network.name + (INT8 if int8 else "")
     known = _file_stem(sensor.name)
     told = json.dumps({"weights": sha256(network.weights), "sensor": numbers_of(sensor)}, sort_keys=True, default=str)
-    path = Path(_folder().name) / f"{stem}-{known}-{hashlib.sha256(told.encode()).hexdigest()[:12]}.onnx"
+    path = _folder() / f"{stem}-{known}-{hashlib.sha256(told.encode()).hexdigest()[:12]}.onnx"
     if not path.is_file():
         save_onnx(network.model(sensor, int8), path)
     return path
