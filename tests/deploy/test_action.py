@@ -134,7 +134,7 @@ def test_the_action_says_what_it_takes() -> None:
     for kind in ("inputs", "outputs"):
         for name, about in action[kind].items():
             assert about["description"].endswith(".")
-            assert f"| `{name}` |" in page, f"docs/how-to/gate.md lacks the {kind[:-1]} {name}"
+            assert f"- `{name}`" in page, f"docs/how-to/gate.md lacks the {kind[:-1]} {name}"
 
 
 def test_installing_puts_the_command_alone_on_the_path(tmp_path: Path) -> None:

@@ -60,7 +60,6 @@ def test_int8_is_calibrated_once_and_then_told_any_sensor(
     conditioned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(calibrate, "PATCHES", 3)
-    monkeypatch.setattr(calibrate, "QUIET_PATCHES", 1)
     monkeypatch.chdir(tmp_path)
     done("quantize", conditioned, "--sensor", SENSOR, "--patches", "1", "--out", "base.onnx")
     base, sensor = load_onnx(Path("base.onnx")), own_sensor(tmp_path, ("value = 0.07", "value = 0.05"))
