@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from beers_deploy.dpu.checker.table import check
-from beers_deploy.kit.golden import save_array, write_golden
+from beers_deploy.kit.golden import PICTURE, save_array, write_golden
 from beers_deploy.kit.record import recorded, write_record
 from beers_deploy.model.io.files import write_text
 from beers_deploy.model.shipped import INT8, shipped_names
@@ -72,7 +72,8 @@ class Board(TargetProfile):
         if (said := host_constants(network, tile)) is not None:
             write_text(folder / "host.json", json.dumps(said, indent=1) + "\n")
             shutil.copyfile(HOST, folder / "host.py")
-        write_golden(network, folder / "golden", board=self)
+        vectors = write_golden(network, folder / "golden", board=self)
+        network.core(self, np.load(vectors / "noise" / PICTURE).shape[-1]).save(vectors / "core.onnx")
         if record:
             write_record(check(network, self, tile=tile), network, folder / "record")
         words = {"network": network.name, "board": self.name, "tile": tile}

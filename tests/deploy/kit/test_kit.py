@@ -44,6 +44,10 @@ def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> 
     whole = int8(wide[None])[0][:, : 131 * scale, : 203 * scale]
     assert np.array_equal(np.load(tmp_path / "out.npy"), whole)
     assert {"core.onnx", "measure.py", "README.md", "golden"} < {path.name for path in folder.iterdir()}
+    read = onnx.load(folder / "golden" / "core.onnx").graph.input[0].type.tensor_type.shape.dim
+    assert [side.dim_value for side in read][1:] == [
+        *np.load(folder / "golden" / "noise" / "00-planes.npy").shape[1:]
+    ]
     assert len((folder / "host.py").read_text(encoding="utf-8").replace("\n\n", "\n").splitlines()) < 65
 
 
