@@ -249,7 +249,11 @@ def main() -> None:
     parser.add_argument("--adaround-iterations", type=int, default=60, help="a layer; Quark's own default is 1000")
     parser.add_argument("--only", default="", help='rows whose "tool, graph" this regular expression finds')
     parser.add_argument("--keep", type=Path, help="folder for the quantised files")
-    arguments = parser.parse_args()
+    print_lines(table, parser.parse_args())
+
+
+def print_lines(table: Callable[[argparse.Namespace, Path], Iterator[str]], arguments: argparse.Namespace) -> None:
+    """Print each line of a table as it comes, the files of its networks in the folder of --keep if there is one."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = (arguments.keep or Path(temporary)).resolve()
         folder.mkdir(parents=True, exist_ok=True)

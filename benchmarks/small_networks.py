@@ -11,7 +11,6 @@ where a later run finds them.
 import argparse
 import re
 import sys
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -28,7 +27,7 @@ from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.quant.ends import ends_of
 from beers_deploy.quant.graph import read_network
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
-from benchmarks.int8_peers import OURS, QUARK, Peered, Restore, Way, quantise
+from benchmarks.int8_peers import OURS, QUARK, Peered, Restore, Way, print_lines, quantise
 from examples.networks import ESPCN, Classifier, DnCNN
 from examples.samples import batches_of
 
@@ -36,7 +35,7 @@ SIDE_PX = {"dncnn": 64, "espcn": 64, "classifier": 32}
 SEPARABLE, DENSE = 32, 16
 """Features of networks with depthwise convolutions, and of those without."""
 BATCH, RATE, FAST = 4, 2e-3, 5e-3
-"""Learning rates: of all networks, and of those that the image itself passes, which are slow to learn it."""
+"""Samples of a step, and learning rates: of all networks, and of those that the image itself passes through."""
 
 
 def conv(inputs: int, outputs: int, act: nn.Module, kernel: int = 3, dilation: int = 1, groups: int = 1) -> nn.Module:
@@ -250,12 +249,7 @@ def main() -> None:
     parser.add_argument("--quark-python", help="interpreter of the environment that AMD Quark is installed in")
     parser.add_argument("--only", default="", help="networks whose names this regular expression finds")
     parser.add_argument("--keep", type=Path, help="folder for the networks")
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = (arguments.keep or Path(temporary)).resolve()
-        folder.mkdir(parents=True, exist_ok=True)
-        for line in table(arguments, folder):
-            print(line, flush=True)
+    print_lines(table, parser.parse_args())
 
 
 if __name__ == "__main__":

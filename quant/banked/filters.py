@@ -6,8 +6,8 @@ Weights are rounded so that they sum to exactly 0, for flat ground must leave no
 where natural images hold little.
 
 What the filters give is int8 in steps of 1/24 of a unit of a sensor whose noise is `SIGMA`. A sensor's own steps are
-the same share of full scale, within limits (`gain`): the strongest edges are a share of full scale, not of noise, so
-that noisy sensors can have finer steps in their units. Each result comes several times, rounded at other places of
+the same share of full scale, within limits (`gain_of`): the strongest edges are a share of full scale, not of noise,
+so that noisy sensors can have finer steps in their units. Each result comes several times, rounded at other places of
 a step: together the copies hold what one cannot. The image itself comes in steps of 32 / gain, about the middle.
 """
 

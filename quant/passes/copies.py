@@ -13,7 +13,7 @@ import numpy as np
 
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import Conv, Graph
-from beers_deploy.quant.session import values_of
+from beers_deploy.quant.passes.equalise import channel_sizes
 
 APART = 0.87
 """The range of a copy is divided by it, so that levelling gives it another scale than its channel has."""
@@ -60,8 +60,8 @@ def runs(graph: Graph, names: Collection[str]) -> list[list[str]]:
 def _largest(graph: Graph, names: list[str], images: Iterable[np.ndarray], ends: Ends) -> list[np.ndarray]:
     """(C,) the largest size of each channel of the named tensors."""
     found = [np.zeros(1) for _ in names]
-    for results in values_of(graph, names, images, ends) if names else ():
-        found = [np.maximum(most, np.abs(r[0]).max((1, 2))) for most, r in zip(found, results, strict=True)]
+    for sizes in channel_sizes(graph, names, images, ends, quantile=1.0) if names else ():
+        found = [np.maximum(most, size) for most, size in zip(found, sizes, strict=True)]
     return found
 
 
