@@ -3,7 +3,8 @@
     python -m benchmarks.small_networks --images aerial-train/ --held-out aerial-test/ --quark-python quark/bin/python
 
 Prints a Markdown table: what is lost on samples that neither training nor calibration saw, of PSNR on average and on
-the worst sample, of the classifier in points of the share of right answers. The samples are those of
+the worst sample, of the classifier in points of the share of right answers. With --tuned, also once our whole numbers
+are fine-tuned on more samples, and Quark's weights are rounded by AdaRound. The samples are those of
 `examples.samples`, the environment of Quark that of `int8_peers.py`. Trained networks stay in the folder of --keep,
 where a later run finds them.
 """
@@ -11,6 +12,7 @@ where a later run finds them.
 import argparse
 import re
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -23,6 +25,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from beers_deploy import quantize
 from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.quant.ends import ends_of
 from beers_deploy.quant.graph import read_network
@@ -36,6 +39,10 @@ SEPARABLE, DENSE = 32, 16
 """Features of networks with depthwise convolutions, and of those without."""
 BATCH, RATE, FAST = 4, 2e-3, 5e-3
 """Samples of a step, and learning rates: of all networks, and of those that the image itself passes through."""
+TUNED, MORE = Way("beers-deploy, fine-tuned", False, OURS), 8
+"""Quantised and fine-tuned, in this process, on so many times the samples."""
+ADAROUND_STEPS = "1000"
+"""A layer's, Quark's own default."""
 
 
 def conv(inputs: int, outputs: int, act: nn.Module, kernel: int = 3, dilation: int = 1, groups: int = 1) -> nn.Module:
@@ -200,17 +207,28 @@ def losses(in_float: Restore, in_int8: Restore, held: Drawn) -> np.ndarray:
     return np.array(found)
 
 
-def cells(name: str, way: Way, python: str, folder: Path, calibration: Drawn, held: Drawn) -> str:
-    """What a way loses: the mean, and the worst sample's of images."""
+def cells(name: str, way: Way, python: str, folder: Path, drawn: dict[bool, Drawn], held: Drawn) -> str:
+    """What a way loses: the mean, and the worst sample's of images. `drawn[True]` is what it tunes on."""
     path = folder / f"{slug(name)}.onnx"
     model = load_onnx(path)
     network = Peered(model, ends_of(read_network(model)))
     patches, out = path.with_suffix(".npy"), path.with_suffix(f".{slug(way.name)}.onnx")
-    np.save(patches, calibration.images)
-    seconds, _ = quantise(way, {False: (path, patches)}, out, python)
+    if way is TUNED:
+        seconds = fine_tune(path, drawn[True], out)
+    else:
+        np.save(patches, drawn[False].images)
+        seconds, _ = quantise(way, {False: (path, patches)}, out, python)
     lost = losses(network.runner(path), network.runner(out), held)
     print(name, way.name, f"{seconds:.0f} s", file=sys.stderr)
     return f"{lost.mean():.2f}, {lost.max():.2f}" if held.wanted.ndim > 1 else f"{lost.mean():.1f} points"
+
+
+def fine_tune(path: Path, drawn: Drawn, out: Path) -> float:
+    """Quantise and fine-tune a network, with references where they are images; the processor time in seconds."""
+    begun = time.process_time()
+    samples = (drawn.images, drawn.wanted) if drawn.wanted.ndim > 1 else drawn.images
+    save_onnx(quantize(path, samples, finetune="auto", progress=False).model, out)
+    return time.process_time() - begun
 
 
 def slug(name: str) -> str:
@@ -220,9 +238,13 @@ def slug(name: str) -> str:
 
 def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
     """Line by line, as each network is judged."""
-    ways = [(Way("beers-deploy", False, OURS, ("legal",)), sys.executable)]
+    ours, quark = [Way("beers-deploy", False, OURS, ("legal",))], [Way("Quark XINT8", False, QUARK, (), ("0",))]
+    if arguments.tuned:
+        ours.append(TUNED)
+        quark.append(Way("Quark XINT8, AdaRound", False, QUARK, (), (ADAROUND_STEPS,)))
+    ways = [(way, sys.executable) for way in ours]
     if arguments.quark_python:
-        ways.append((Way("Quark XINT8", False, QUARK, (), ("0",)), arguments.quark_python))
+        ways += [(way, arguments.quark_python) for way in quark]
     yield f"| network | {' | '.join(way.name for way, _ in ways)} |"
     yield "|---" * (len(ways) + 1) + "|"
     for name, (kind, _) in NETWORKS.items():
@@ -233,9 +255,11 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
             save(
                 trained(name, arguments.images, arguments.steps), SIDE_PX[kind] // (2 if kind == "espcn" else 1), path
             )
-        calibration = Drawn.of(kind, arguments.images, 5, arguments.batches)
+        drawn = {False: Drawn.of(kind, arguments.images, 5, arguments.batches)}
+        if arguments.tuned:
+            drawn[True] = Drawn.of(kind, arguments.images, 5, MORE * arguments.batches)
         held = Drawn.of(kind, arguments.held_out, 6, arguments.batches)
-        found = [cells(name, way, python, folder, calibration, held) for way, python in ways]
+        found = [cells(name, way, python, folder, drawn, held) for way, python in ways]
         yield f"| {name} | {' | '.join(found)} |"
 
 
@@ -246,6 +270,7 @@ def main() -> None:
     parser.add_argument("--held-out", type=Path, help="folder of scenes to judge on; drawn ones if none")
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--batches", type=int, default=8, help="of eight samples: to calibrate on, and to judge on")
+    parser.add_argument("--tuned", action="store_true", help="fine-tune as well; minutes a network")
     parser.add_argument("--quark-python", help="interpreter of the environment that AMD Quark is installed in")
     parser.add_argument("--only", default="", help="networks whose names this regular expression finds")
     parser.add_argument("--keep", type=Path, help="folder for the networks")
