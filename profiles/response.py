@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 NYQUIST = 0.5
+"""Cycles per pixel."""
 Frequencies = NDArray[np.floating]
 
 

@@ -32,14 +32,7 @@ Arrays = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Weights:
-    """What a file of weights holds.
-
-    Attributes:
-        tensors: arrays by name.
-        variant: the network that they make.
-        recipe: what made them.
-        conditioned: whether the network is told its sensor, and stands behind the bank of it.
-    """
+    """What a file of weights holds; a conditioned network is told its sensor, and stands behind the bank of it."""
 
     tensors: Arrays
     variant: Variant

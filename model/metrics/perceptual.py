@@ -68,11 +68,9 @@ class L2Pool(nn.Module):
 
 
 class Backbone(nn.Module):
-    """The feature layers of one network, with random weights until some are loaded.
+    """The feature layers of "squeeze" or "vgg", with random weights until some are loaded.
 
-    Args:
-        network: "squeeze" or "vgg".
-        l2_pool: DISTS's pooling in the place of the max pooling.
+    `l2_pool` puts DISTS's pooling in the place of the max pooling.
     """
 
     def __init__(self, network: str, *, l2_pool: bool = False) -> None:
@@ -127,13 +125,10 @@ NAMED = "give the feature layers named as in torchvision (features.0.weight ...)
 
 
 def find_backbone(network: str, place: Path | None = None) -> Path | None:
-    """The weights file of a backbone, or None: then `not_found(network)` is the reason to show.
+    """The weights file of "squeeze" or "vgg" (DISTS's), or None: then `not_found(network)` is the reason to show.
 
-    Args:
-        network: "squeeze" or "vgg" (DISTS uses "vgg").
-        place: a file, which is taken at its word, or a folder. Without it the environment variable
-            BEERS_LPIPS_WEIGHTS is asked; it may name a file or a folder, and a file counts only for the network
-            its name begins with.
+    A file as `place` is taken at its word. Without a place, a file or a folder, the environment variable
+    BEERS_LPIPS_WEIGHTS is asked; a file that it names counts only for the network its name begins with.
     """
     stem = BACKBONES[network].file_stem
     if place is not None and not place.is_dir():
@@ -152,13 +147,7 @@ def not_found(network: str) -> str:
 
 
 def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbone:
-    """A backbone with its parameters from a file, by name; whatever else the file holds is left aside.
-
-    Args:
-        network: "squeeze" or "vgg".
-        path: .safetensors or .npz.
-        l2_pool: DISTS's pooling in the place of the max pooling.
-    """
+    """A `Backbone` with its parameters from a file, by name; whatever else the file holds is left aside."""
     backbone = Backbone(network, l2_pool=l2_pool)
     wanted = backbone.state_dict()
     tensors = read_tensors(path, wanted)
@@ -219,11 +208,8 @@ MIN_NORM = 1e-3
 class Lpips(nn.Module):
     """Learned perceptual image patch similarity (Zhang et al. 2018, v0.1): 0 for identical images, no upper bound.
 
-    Name it with its network, "LPIPS-squeeze" (`label`): the networks' figures do not compare with each other.
-
-    Args:
-        backbone: the network whose features are compared.
-        heads: for each compared layer (C,), how much each channel counts.
+    Name it with its network, "LPIPS-squeeze" (`label`): the networks' figures do not compare with each other. The
+    heads (C,), one for each compared layer, say how much each channel counts.
     """
 
     heads: Tensor
@@ -236,24 +222,14 @@ class Lpips(nn.Module):
 
     @classmethod
     def load(cls, network: str, path: Path) -> Self:
-        """The metric with its published heads, over the backbone in a file (see `find_backbone`).
-
-        Args:
-            network: "squeeze" or "vgg".
-            path: .safetensors or .npz, parameters named as in torchvision.
-        """
+        """The metric with its published heads, over the backbone in a file (see `find_backbone`)."""
         backbone = load_backbone(network, path)
         names = [f"lin{layer}" for layer in range(len(backbone.spec.taps))]
         heads = read_tensors(PUBLISHED / f"lpips-{network}.safetensors", names)
         return cls(backbone, [heads[name] for name in names])
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """The distance of each pair, (N,); its gradient is finite everywhere.
-
-        Args:
-            image: (N, 1, H, W), 0 to 1 of full scale; at least 17 px a side for squeeze, 16 for vgg.
-            reference: the same shape.
-        """
+        """The distance (N,) of each pair (N, 1, H, W), 0 to 1 of full scale; its gradient is finite everywhere."""
         _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):
             pairs = zip(_features(self.backbone, image), _features(self.backbone, reference), strict=True)
@@ -262,12 +238,10 @@ class Lpips(nn.Module):
 
 
 class Dists(nn.Module):
-    """Deep image structure and texture similarity (Ding et al. 2020) over VGG16: 0 for identical images, at most 1.
+    """Deep image structure and texture similarity (Ding et al. 2020): 0 for identical images, at most 1.
 
-    Args:
-        backbone: VGG16 with L2 pooling.
-        alpha: (1475,), how much the mean (texture) of the image and of each of its channels counts.
-        beta: (1475,), how much their covariance (structure) counts.
+    Over VGG16 with L2 pooling. `alpha` (1475,) says how much the mean (texture) of the image and of each of its
+    channels counts, `beta` (1475,) how much their covariance (structure).
     """
 
     label = "DISTS"
@@ -290,12 +264,7 @@ class Dists(nn.Module):
         return cls(backbone, weights["alpha"], weights["beta"])
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """The distance of each pair, (N,); its gradient is finite everywhere.
-
-        Args:
-            image: (N, 1, H, W), 0 to 1 of full scale, at least 16 px a side.
-            reference: the same shape.
-        """
+        """The distance (N,) of each pair (N, 1, H, W), 0 to 1 of full scale; its gradient is finite everywhere."""
         _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):
             stages = zip(self._stages(image), self._stages(reference), strict=True)

@@ -11,9 +11,6 @@ from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.response import PointSpread, Response
 from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX, Instrument, mtf_limit
 
-NYQUIST = 0.5
-"""Cycles per target pixel."""
-
 
 def gamma_from_mtf(mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> float:
     """Solve MTF(0.5, 0) = mtf_nyquist for gamma: gamma = -2 ln(mtf_nyquist * pi / (2 G)) (paper, section 3.3).
@@ -60,7 +57,11 @@ def mtf(fx: ArrayLike, fy: ArrayLike, blur: Blur, antialias_sigma_px: float = 0.
     """
     fx, fy = np.asarray(fx, np.float64), np.asarray(fy, np.float64)
     if isinstance(blur, Response):
-        return _whole_response(fx, fy, blur, antialias_sigma_px)
+        if antialias_sigma_px:
+            expected, got = "none beside a whole response", f"one of {antialias_sigma_px:g} px beside the {blur}"
+            remedy = "leave it out: it is part of that"
+            raise OptionError("anti-alias filter", expected=expected, got=got, remedy=remedy)
+        return np.asarray(blur.at(fx, fy))
     across, along = blur if isinstance(blur, tuple) else (blur, blur)
     gamma_x, gamma_y = (gamma_from_mtf(value, antialias_sigma_px) for value in (across, along))
     radius = np.hypot(fx, fy)
@@ -68,15 +69,6 @@ def mtf(fx: ArrayLike, fy: ArrayLike, blur: Blur, antialias_sigma_px: float = 0.
     optics = np.exp(-gamma_x * radius if gamma_x == gamma_y else -np.hypot(gamma_x * fx, gamma_y * fy))
     response = np.asarray(optics * np.sinc(fx) * np.sinc(fy))
     return response * gaussian_response(radius, antialias_sigma_px) if antialias_sigma_px else response
-
-
-def _whole_response(
-    fx: NDArray[np.float64], fy: NDArray[np.float64], response: Response, antialias_sigma_px: float
-) -> NDArray[np.inexact]:
-    if antialias_sigma_px:
-        expected, got = "none beside a whole response", f"one of {antialias_sigma_px:g} px beside the {response}"
-        raise OptionError("anti-alias filter", expected=expected, got=got, remedy="leave it out: it is part of that")
-    return np.asarray(response.at(fx, fy))
 
 
 def gaussian_response(frequency: ArrayLike, sigma_px: float) -> NDArray[np.float64]:

@@ -36,23 +36,13 @@ PAPER = LossWeights()
 
 
 class RestorationLoss:
-    """The weighted sum of the terms, in float32 whatever the autocast around it.
-
-    Args:
-        weights: of the terms.
-        perceptual: LPIPS on the device of the images; None leaves the term out.
-    """
+    """The weighted sum of the terms, in float32 whatever the autocast around it; that of LPIPS where it is given."""
 
     def __init__(self, weights: LossWeights = PAPER, perceptual: Lpips | None = None) -> None:
         self.weights, self.perceptual = weights, perceptual if weights.lpips else None
 
     def __call__(self, restored: Tensor, reference: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """The loss, and its terms before weighting.
-
-        Args:
-            restored: (N, 1, H, W) in [0, 1] of full scale, not clipped.
-            reference: the same shape.
-        """
+        """The loss, and its terms before weighting, of images (N, 1, H, W) in [0, 1] of full scale, not clipped."""
         weights = self.weights
         # In bfloat16 the differences of nearly equal images would lose most of their digits.
         with torch.autocast(restored.device.type, enabled=False):
@@ -72,11 +62,7 @@ class RestorationLoss:
 def log_mse(restored: Tensor, reference: Tensor) -> Tensor:
     """Mean over the batch of ln(1 + mean squared error in DN^2 of 12 bits): 10 / ln 10 of it is lost PSNR in dB.
 
-    The 1 keeps it above 0, and forgives what rounding does to a patch.
-
-    Args:
-        restored: (N, 1, H, W) float32.
-        reference: the same shape.
+    Of (N, 1, H, W) float32. The 1 keeps it above 0, and forgives what rounding does to a patch.
     """
     squares = ((restored - reference) * MAX_DN).square().mean((1, 2, 3))
     distance: Tensor = torch.log1p(squares).mean()
@@ -86,12 +72,8 @@ def log_mse(restored: Tensor, reference: Tensor) -> Tensor:
 def fft_l1(restored: Tensor, reference: Tensor) -> Tensor:
     """Mean size of the difference of the spectra, orthonormal: about 1.1 times the L1, whatever the patch size.
 
-    Without that normalisation it would be 142 times the L1 at 128 pixels, and twice that at 256. The size is taken by
-    abs(), whose gradient at 0 is 0; that of sqrt(re^2 + im^2) is NaN.
-
-    Args:
-        restored: (N, 1, H, W) float32.
-        reference: the same shape.
+    Of (N, 1, H, W) float32. Without that normalisation it would be 142 times the L1 at 128 pixels, and twice that at
+    256. The size is taken by abs(), whose gradient at 0 is 0; that of sqrt(re^2 + im^2) is NaN.
     """
     size: Tensor = torch.fft.rfft2(restored - reference, norm="ortho").abs().mean()
     return size

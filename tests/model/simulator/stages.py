@@ -57,6 +57,11 @@ def _apply(image: np.ndarray, name: str, sensor: Instrument, draw: Draw, skip: C
     return apply_effect(image, sensor.effects[name], sensor, partial(draw.generator, f"{name}-degraded"))
 
 
+def alone(effect: Effect, image: np.ndarray, seed: int = 0) -> np.ndarray:
+    """One effect of the target grid on an image (..., H, W)."""
+    return apply_effect(image, effect, plain_sensor(), partial(Draw(seed).generator, "alone"))
+
+
 def with_response(sensor: Instrument, response: Response) -> Instrument:
     """The sensor with another blur."""
     across, along = response.at_nyquist

@@ -6,15 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.model.simulator.acquire import prepare_scene, simulate_planned
-from beers_deploy.model.simulator.detector import (
-    Draw,
-    add_defects,
-    add_haze,
-    apply_dsnu,
-    apply_prnu,
-    apply_striping,
-    saturate,
-)
+from beers_deploy.model.simulator.detector import Draw, add_defects, saturate
 from beers_deploy.model.simulator.mtf import gamma_from_mtf, mtf, transfer_function
 from beers_deploy.model.simulator.plan import TOLERANCE_DN, Plan, make_plan
 from beers_deploy.model.simulator.sampling import sample, scene_spectrum
@@ -73,29 +65,25 @@ def test_leaving_one_effect_out_changes_no_other_draw(name: str) -> None:
 
 
 def test_the_pattern_of_a_column_is_the_same_in_every_row() -> None:
-    flat = np.full((31, 47), 50.0, np.float32)
-    for image in (
-        apply_prnu(flat, Prnu(0.02), Draw(1).generator("p")),
-        apply_dsnu(flat, Dsnu(4.0), Draw(1).generator("d")),
-    ):
+    for effect in (Prnu(0.02), Dsnu(4.0)):
+        image = stages.alone(effect, np.full((31, 47), 50.0, np.float32))
         assert (image == image[:1]).all()
         assert float(image[0].std()) > 0.3
 
 
 def test_prnu_has_its_spread_and_its_limit() -> None:
-    flat = np.full((1, 40_000), 100.0, np.float32)
-    gain = apply_prnu(flat, Prnu(0.01), Draw(0).generator("p")) / 100 - 1
+    gain = stages.alone(Prnu(0.01), np.full((1, 40_000), 100.0, np.float32)) / 100 - 1
     assert float(gain.std()) == pytest.approx(0.01, rel=0.02)
     assert np.abs(gain).max() <= 0.04 + 1e-6
 
 
 def test_stripes_alternate_and_keep_the_mean() -> None:
-    striped = apply_striping(np.full((5, 8), 100.0, np.float32), Striping(6.0))
+    striped = stages.alone(Striping(6.0), np.full((5, 8), 100.0, np.float32))
     assert striped[0].tolist() == [103.0, 97.0] * 4
 
 
 def test_haze_is_affine() -> None:
-    assert add_haze(np.array([0.0, 100.0], np.float32), Haze(0.6, 25.0)).tolist() == [25.0, 85.0]
+    assert stages.alone(Haze(0.6, 25.0), np.array([0.0, 100.0], np.float32)).tolist() == [25.0, 85.0]
 
 
 def test_below_the_well_nothing_changes_and_share_zero_is_a_clip() -> None:

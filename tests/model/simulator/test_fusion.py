@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from beers_deploy.model.simulator.detector import add_haze
 from beers_deploy.model.simulator.mtf import mtf, smear_response, transfer_function
 from beers_deploy.model.simulator.sampling import sample, scene_spectrum
 from beers_deploy.profiles.effects import Haze
@@ -64,6 +63,6 @@ def test_haze_after_sampling_equals_haze_before_the_blur(ratio: int) -> None:
     """An affine change of the light commutes with a blur that keeps the mean: so it may wait for the small grid."""
     haze, radiance = Haze(0.7, 15.0), 300 * np.random.default_rng(0).random((17 * ratio, 23 * ratio), np.float32)
     transfer = transfer_function(*radiance.shape, ratio, 0.07, 0.2, 1.5)
-    fused = add_haze(sample(scene_spectrum(radiance), transfer, radiance.shape[1], ratio), haze)
-    expected = one_after_the_other(add_haze(radiance.astype(np.float64), haze), ratio, 0.07, 0.2, 1.5)
+    fused = stages.alone(haze, sample(scene_spectrum(radiance), transfer, radiance.shape[1], ratio))
+    expected = one_after_the_other(stages.alone(haze, radiance.astype(np.float64)), ratio, 0.07, 0.2, 1.5)
     assert np.abs(fused - expected).max() * GAIN < 0.02
