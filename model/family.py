@@ -95,6 +95,7 @@ class SensorFamily:
     """
 
     like: Instrument
+    snr_bright: tuple[float, float] = SNR_BRIGHT
 
     def draw(self, generator: np.random.Generator) -> Instrument:
         """One sensor. The MTF along the track is more often near that across than far below it."""
@@ -102,7 +103,7 @@ class SensorFamily:
         # The square draws more sensors with axes that are nearly alike, as real ones have.
         along = max(mtf * LEAST_ALONG ** float(generator.uniform() ** 2), RANGES["mtf_along"][0])
         full_scale = self.like.max_dn / self.like.gain_dn_per_radiance
-        sigma = full_scale / 4 / _log_uniform(generator, *SNR_BRIGHT)
+        sigma = full_scale / 4 / _log_uniform(generator, *self.snr_bright)
         # Variance alpha L + beta: all of it in alpha halves sigma at a quarter of the radiance, all in beta keeps it.
         dark = sigma * _log_uniform(generator, 0.5, 1.0)
         alpha = max(sigma**2 - dark**2, 0.0) / (full_scale * 3 / 16)
