@@ -242,13 +242,13 @@ class Sensor:
         """The middle of every range (the SNR at radiance_0 moved to the nearest physical value)."""
         alpha, beta = self._middle_noise()
         effects = {name: middle_effect(name, table) for name, table in self.effects.items()}
-        mtf_along = None if self.mtf_nyquist_along is None else _middle(self.mtf_nyquist_along)
-        return self._sensor(_middle(self.mtf_nyquist), alpha, beta, effects, mtf_along)
+        mtf_along = None if self.mtf_nyquist_along is None else self.mtf_nyquist_along.middle
+        return self._sensor(self.mtf_nyquist.middle, alpha, beta, effects, mtf_along)
 
     def _middle_noise(self) -> tuple[float, float]:
         if self.alpha is not None and self.beta is not None:
-            return _middle(self.alpha), _middle(self.beta)
-        snr_0, snr_1 = map(_middle, self.snr_pair)
+            return self.alpha.middle, self.beta.middle
+        snr_0, snr_1 = (snr.middle for snr in self.snr_pair)
         low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, snr_1)
         alpha, beta = noise_from_snr(self.radiance_0.low, min(max(snr_0, low), high), self.radiance_1.low, snr_1)
         return max(alpha, 0.0), max(beta, 0.0)
@@ -306,10 +306,6 @@ def mtf_limit(antialias_sigma_px: float = 0.0) -> float:
     A Gaussian filter of sigma target pixels keeps exp(-2 pi^2 sigma^2 f^2) at f = 0.5 cycles per pixel.
     """
     return MTF_NYQUIST_MAX * math.exp(-2 * (math.pi * antialias_sigma_px * 0.5) ** 2)
-
-
-def _middle(constant: Constant) -> float:
-    return (constant.low + constant.high) / 2
 
 
 def _uniform(generator: np.random.Generator, constant: Constant) -> float:

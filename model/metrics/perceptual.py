@@ -39,6 +39,7 @@ BACKBONES: Mapping[str, BackboneSpec] = {
     "squeeze": BackboneSpec("squeezenet1_1", (1, 4, 7, 9, 10, 11, 12), min_side_px=17),
     "vgg": BackboneSpec("vgg16", (3, 8, 15, 22, 29), min_side_px=16),
 }
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class Fire(nn.Module):
@@ -81,9 +82,15 @@ class Backbone(nn.Module):
             layers = [L2Pool() if isinstance(layer, nn.MaxPool2d) else layer for layer in layers]
         self.features = nn.Sequential(*layers)
 
-    def forward(self, x: Tensor) -> list[Tensor]:
-        """The compared feature maps of (N, 3, H, W), all of them after a ReLU."""
-        found: list[Tensor] = []
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """Grey (N, 1, H, W), 0 to 1, as three equal channels, and its compared feature maps, each after a ReLU.
+
+        In the precision of the parameters, whatever the caller's autocast. The scaling layer of `lpips` is ImageNet's
+        figures after [-1, 1].
+        """
+        colour = image.to(next(self.parameters()).dtype).expand(-1, 3, -1, -1)
+        mean, std = (colour.new_tensor(x)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
+        x, found = (colour - mean) / std, [colour]
         for index, layer in enumerate(self.features):
             x = layer(x)
             if index in self.spec.taps:
@@ -201,7 +208,6 @@ def _error(path: Path, expected: str, got: str, remedy: str) -> ModelError:
 
 
 PUBLISHED = Path(__file__).parent / "weights"
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 MIN_NORM = 1e-3
 
 
@@ -232,7 +238,7 @@ class Lpips(nn.Module):
         """The distance (N,) of each pair (N, 1, H, W), 0 to 1 of full scale; its gradient is finite everywhere."""
         _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):
-            pairs = zip(_features(self.backbone, image), _features(self.backbone, reference), strict=True)
+            pairs = zip(self.backbone(image)[1:], self.backbone(reference)[1:], strict=True)
             errors = [(_unit(a) - _unit(b)).square().mean(dim=(2, 3)) for a, b in pairs]
             return torch.cat(errors, dim=1) @ self.heads
 
@@ -267,13 +273,10 @@ class Dists(nn.Module):
         """The distance (N,) of each pair (N, 1, H, W), 0 to 1 of full scale; its gradient is finite everywhere."""
         _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):
-            stages = zip(self._stages(image), self._stages(reference), strict=True)
+            stages = zip(self.backbone(image), self.backbone(reference), strict=True)
             apart = [_texture_and_structure(a, b) for a, b in stages]
             texture, structure = (torch.cat(parts, dim=1) for parts in zip(*apart, strict=True))
             return texture @ self.alpha + structure @ self.beta
-
-    def _stages(self, image: Tensor) -> list[Tensor]:
-        return [_as_colour(self.backbone, image), *_features(self.backbone, image)]
 
 
 def _unit(features: Tensor) -> Tensor:
@@ -295,19 +298,6 @@ def _texture_and_structure(a: Tensor, b: Tensor, small: float = 1e-6) -> tuple[T
     texture = (mean_a - mean_b).square() / (mean_a.square() + mean_b.square() + small)
     variances = a.square().mean(dim=(2, 3)) + b.square().mean(dim=(2, 3))
     return texture.flatten(1), (a - b).square().mean(dim=(2, 3)) / (variances + small)
-
-
-def _as_colour(backbone: Backbone, image: Tensor) -> Tensor:
-    """Grey as three equal channels, in the backbone's own precision: float32, whatever the caller's autocast."""
-    return image.to(next(backbone.parameters()).dtype).expand(-1, 3, -1, -1)
-
-
-def _features(backbone: Backbone, image: Tensor) -> list[Tensor]:
-    """The compared features of a grey image; the scaling layer of `lpips` is ImageNet's figures after [-1, 1]."""
-    colour = _as_colour(backbone, image)
-    mean, std = (colour.new_tensor(x)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
-    features: list[Tensor] = backbone((colour - mean) / std)
-    return features
 
 
 def _check_pair(label: str, backbone: Backbone, image: Tensor, reference: Tensor) -> None:

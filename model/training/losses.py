@@ -2,8 +2,7 @@
 
 Besides, an L2 term for who wants the highest PSNR, which is a mean of squares: L1 forgives the strongest edges; and a
 PSNR term, its mean over the patches, in which a sharp and quiet sensor's small errors count as much as a blurred and
-noisy one's large ones (as in NAFNet, Chen et al., ECCV 2022). And a radiance term, the distance of the patches'
-means: L1 aims at medians, and the skewed errors of a blind network then leave the mean off.
+noisy one's large ones (as in NAFNet, Chen et al., ECCV 2022).
 
 LPIPS needs weights that are not shipped; without them the loss is L1 + FFT-L1, and the recipe says so.
 """
@@ -26,10 +25,6 @@ class LossWeights:
     lpips: float = 0.5
     fft: float = 0.1
     psnr: float = 0.0
-
-    def total(self, perceptual: bool = True) -> float:
-        """The sum of the weights, that of LPIPS only where it is computed."""
-        return self.l1 + self.fft + self.psnr + (self.lpips if perceptual else 0.0)
 
 
 PAPER = LossWeights()
