@@ -47,17 +47,6 @@ def test_fused_equals_sequential(
     assert np.abs(fused - expected).max() * GAIN < 0.02
 
 
-@pytest.mark.parametrize("sigma", [0.0, 0.25])
-@pytest.mark.parametrize("mtf_nyquist", [0.01, 0.03, 0.05, 0.07, 0.25])
-def test_a_slanted_edge_shows_the_mtf_of_the_profile(mtf_nyquist: float, sigma: float) -> None:
-    """With and without anti-aliasing."""
-    ratio, side = 8, 160
-    scene, distance = stages.slanted_edge(side, ratio, slope=1 / 16)
-    transfer = transfer_function(*scene.shape, ratio, mtf_nyquist, sigma)
-    image = sample(scene_spectrum(scene), transfer, side * ratio, ratio)
-    assert stages.edge_contrast(image, distance, ratio) == pytest.approx(mtf_nyquist, abs=0.005)
-
-
 @pytest.mark.parametrize("ratio", [1, 2, 3, 5, 8])
 def test_haze_after_sampling_equals_haze_before_the_blur(ratio: int) -> None:
     """An affine change of the light commutes with a blur that keeps the mean: so it may wait for the small grid."""

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from beers_deploy.model.simulator import plan as plan_module
 from beers_deploy.model.simulator.acquire import prepare_scene, simulate_planned, without
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.plan import TOLERANCE_DN, Plan, effect_bounds, make_plan, ringing_of, scene_stats
@@ -140,20 +139,6 @@ def test_a_table_that_rings_is_bounded_by_its_own_ringing() -> None:
     assert ringing_of(sensor, stats) > 1.1 * ringing_of(replace(sensor, response=None), stats)
 
 
-@pytest.mark.parametrize("wrong", ["smear_bound_dn", "effect_bound_dn"])
-def test_a_bound_that_is_too_small_would_be_caught(wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same check on a scene of full contrast, with one bound function giving a hundredth of the truth."""
-    radiance = np.zeros((60, 60), np.float32)
-    radiance[20:44, 10:50] = 200.0
-    tight: dict[str, Effect] = {"smear": Smear(2.0), "veil": Haze(0.5, 20.0), "offset": Offset(50.0)}
-    sensor = stages.plain_sensor(**tight)
-    sound = getattr(plan_module, wrong)
-    monkeypatch.setattr(f"beers_deploy.model.simulator.plan.{wrong}", lambda *a: sound(*a) / 100)
-    found = effect_bounds(sensor, scene_stats(radiance, 2))
-    broken = [name for name, bound in found.items() if change(radiance, sensor, 2, name, 0) > bound + ROUNDING_DN]
-    assert broken
-
-
 STRONG: dict[str, Effect] = {
     "smear": Smear(2.0),
     "veil": Haze(0.5, 20.0),
@@ -168,7 +153,7 @@ STRONG: dict[str, Effect] = {
 
 @pytest.mark.parametrize("name", ["mtf", "noise", *STRONG])
 def test_a_quarter_of_any_bound_would_be_caught(name: str) -> None:
-    """The same check again, for each effect by itself: the bounds are not kept only because they are loose."""
+    """The bounds are not kept only because they are loose."""
     radiance = np.zeros((90, 75), np.float32)
     radiance[10, :] = radiance[20:70, 10:50] = 200.0
     sensor = stages.plain_sensor(**{name: STRONG[name]} if name in STRONG else {})

@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.model.simulator.mtf import transfer_function
-from beers_deploy.model.simulator.sampling import crop_divisible, sample, scene_spectrum
-from tests.model.simulator.stages import blob, centroid
+from beers_deploy.model.simulator.sampling import crop_divisible, resample, sample, scene_spectrum
+from beers_deploy.profiles.response import centroid
+from tests.model.simulator.stages import blob
 
 RATIOS = list(range(1, 9))
 
@@ -35,13 +36,13 @@ def test_nothing_is_shifted(ratio: int, smear: float) -> None:
     side = 32 * ratio
     transfer = transfer_function(side, side, ratio, 0.1, 0.2, smear)
     result = sample(scene_spectrum(blob(side, 3.0 * ratio)), transfer, side, ratio)
-    assert max(map(abs, centroid(result))) < 1e-3
+    assert max(map(abs, centroid(result.astype(np.float64)))) < 1e-3
 
 
 @pytest.mark.parametrize("ratio", [2, 4, 6])
 def test_plain_slicing_would_shift_at_even_ratios(ratio: int) -> None:
     sliced = blob(32 * ratio, 3.0 * ratio)[ratio // 2 :: ratio, ratio // 2 :: ratio]
-    assert abs(centroid(sliced)[0]) == pytest.approx(0.5 / ratio, rel=0.05)
+    assert abs(centroid(sliced.astype(np.float64))[0]) == pytest.approx(0.5 / ratio, rel=0.05)
 
 
 @given(st.integers(1, 8), st.integers(3, 15), st.integers(3, 15), st.integers(0, 1000))
@@ -78,3 +79,27 @@ def test_a_stack_of_scenes_is_sampled_one_by_one() -> None:
     assert stack.shape == (3, 13, 21)
     for one, image in zip(scenes, stack, strict=True):
         np.testing.assert_allclose(sample(scene_spectrum(one), transfer, 63, 3), image, rtol=0, atol=1e-4)
+
+
+def wave(height: int, width: int, cycles: tuple[int, int]) -> np.ndarray:
+    """A plane wave over the whole scene, sampled at pixel centres."""
+    y, x = ((np.arange(n) + 0.5) / n for n in (height, width))
+    phase = 2 * math.pi * (cycles[0] * y[:, None] + cycles[1] * x) + 0.7
+    return (100 + 30 * np.cos(phase)).astype(np.float32)
+
+
+@pytest.mark.parametrize(("height", "width"), [(48, 70), (75, 90), (31, 41), (60, 84)])
+@pytest.mark.parametrize("cycles", [(0, 0), (3, 5), (11, 2), (0, 13)])
+def test_a_wave_that_both_grids_hold_is_the_same_wave(height: int, width: int, cycles: tuple[int, int]) -> None:
+    result = resample(wave(60, 84, cycles), height, width)
+    np.testing.assert_allclose(result, wave(height, width, cycles), rtol=0, atol=1e-3, strict=True)
+
+
+def test_what_the_new_grid_cannot_hold_is_cut_not_aliased() -> None:
+    result = resample(wave(60, 84, (0, 30)), 40, 40)
+    np.testing.assert_allclose(result, np.full((40, 40), 100.0, np.float32), rtol=0, atol=1e-3, strict=True)
+
+
+def test_the_mean_is_kept() -> None:
+    scene = 50 + 100 * np.random.default_rng(0).random((57, 83), np.float32)
+    assert float(resample(scene, 91, 64).mean()) == pytest.approx(float(scene.mean()), rel=1e-6)

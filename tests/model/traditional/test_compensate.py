@@ -14,7 +14,8 @@ from beers_deploy.model.traditional.compensate import (
 )
 from beers_deploy.model.traditional.rows import fill_with_local_means, mirrored
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.response import PointSpread, packed
+from beers_deploy.profiles.response import PointSpread
+from tests.model.simulator.stages import point_spread
 from tests.model.traditional.whole import compensate
 
 EPSILON = 3e-3
@@ -43,7 +44,7 @@ def lopsided_point() -> PointSpread:
     """A hill with a second one beside it, whose response is complex, and nowhere 0."""
     y, x = (np.arange(-12, 13)[:, None] / 4, np.arange(-12, 13) / 4)
     samples = np.exp(-2 * y**2 - 2 * x**2) + 0.3 * np.exp(-2 * (y - 0.5) ** 2 - 2 * (x - 0.75) ** 2)
-    return PointSpread(25, 25, 4.0, packed(samples))
+    return point_spread(samples, 4.0)
 
 
 def test_without_regularisation_a_point_spread_is_undone_whole() -> None:
