@@ -103,14 +103,11 @@ def test_a_truncated_file_is_refused(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["none.tif", "none.png", "none/none.tif"])
-def test_a_missing_file_is_refused(name: str, tmp_path: Path) -> None:
+def test_a_missing_file_and_a_folder_are_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(ImageError, match="no such file"):
         read_pixels(tmp_path / name)
     with pytest.raises(ImageError, match="no such folder"):
         list_images(tmp_path / name)
-
-
-def test_a_folder_is_named_as_one(tmp_path: Path) -> None:
     with pytest.raises(ImageError, match="got a folder"):
         read_pixels(tmp_path)
 

@@ -125,12 +125,6 @@ def test_bounds_are_where_a_coefficient_changes_sign(snr_1: float, share: float)
     assert noise_from_snr(25, high * 1.01, 100, snr_1)[1] < 0
 
 
-def test_the_noise_of_the_paper() -> None:
-    alpha, beta = noise_from_snr(25, 50, 100, 110)
-    assert alpha == pytest.approx(0.007686, abs=1e-6)
-    assert beta == pytest.approx(0.0579, abs=1e-4)
-
-
 def with_table(folder: Path, table: str) -> Path:
     text = (HERE / "sensors" / "pleiades-reference.toml").read_text(encoding="utf-8")
     return own_sensor(folder, text=f"{text}\n{table}")
