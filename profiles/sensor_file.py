@@ -13,8 +13,7 @@ from beers_deploy.profiles.constant import Constant, Number, check_keys, read_co
 from beers_deploy.profiles.effects import TABLES as EFFECT_TABLES
 from beers_deploy.profiles.effects import Table, read_effect
 from beers_deploy.profiles.errors import ProfileError
-from beers_deploy.profiles.response import MtfTable, unpacked
-from beers_deploy.profiles.response_file import axes_of, read_response, response_from_json
+from beers_deploy.profiles.response import MtfTable, axes_of, read_response, response_from_json, unpacked
 from beers_deploy.profiles.sensor import (
     MTF_NYQUIST_MAX,
     OFFSET,

@@ -6,7 +6,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beers_deploy.profiles.effects import AntiAlias, Smear
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.response import PointSpread, Response
 from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX, Instrument, mtf_limit
@@ -83,20 +82,13 @@ def smear_response(fy: ArrayLike, length_px: float) -> NDArray[np.float64]:
 
 def sensor_mtf(fx: ArrayLike, fy: ArrayLike, sensor: Instrument) -> NDArray[np.inexact]:
     """What a sensor's blur and smear leave of each frequency, fx (1, W) and fy (H, 1) as in `mtf`: (H, W)."""
-    antialias_sigma_px, smear_px = _filter_and_smear(sensor)
-    found = mtf(fx, fy, sensor.blur, antialias_sigma_px)
-    return found * smear_response(fy, smear_px) if smear_px else found
-
-
-def _filter_and_smear(sensor: Instrument) -> tuple[float, float]:
-    antialias, smear = sensor.effects.get("antialias"), sensor.effects.get("smear")
-    sigma_px = antialias.sigma_px if isinstance(antialias, AntiAlias) else 0.0
-    return sigma_px, smear.length_px if isinstance(smear, Smear) else 0.0
+    found = mtf(fx, fy, sensor.blur, sensor.antialias_px)
+    return found * smear_response(fy, sensor.smear_px) if sensor.smear_px else found
 
 
 def sensor_transfer(height: int, width: int, oversampling: int, sensor: Instrument) -> NDArray[np.inexact]:
     """All the linear, shift-invariant effects of a sensor as one transfer function (H, W // 2 + 1)."""
-    return transfer_function(height, width, oversampling, sensor.blur, *_filter_and_smear(sensor))
+    return transfer_function(height, width, oversampling, sensor.blur, sensor.antialias_px, sensor.smear_px)
 
 
 @lru_cache(maxsize=64)
