@@ -22,8 +22,9 @@ from beers_deploy.model.family import RANGES, noise_over_full_scale, sensor_vect
 from beers_deploy.model.traditional.compensate import compensation_kernel
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import Smear
+from beers_deploy.profiles.response import unpacked
 from beers_deploy.profiles.sensor import Instrument
-from tests.model.simulator.stages import point_spread, with_response
+from tests.model.simulator.stages import lopsided_point, point_spread, with_response
 
 REFERENCE = load_sensor("pleiades-reference").nominal()
 NOMINAL = load_sensor("pleiades-degraded").nominal()
@@ -33,12 +34,6 @@ CONTRAST = st.floats(0.015, 0.15)
 def sensor(across: float, along: float, snr: float = 110.0) -> Instrument:
     """Of noise that does not grow with the light, with that SNR at a quarter of full scale."""
     return replace(NOMINAL, mtf_nyquist=across, mtf_nyquist_along=along, alpha=0.0, beta=(100 / snr) ** 2)
-
-
-def lopsided() -> np.ndarray:
-    """A hill with a second one to its lower right, 17 rows by 19 columns, two samples to a pixel."""
-    y, x = np.mgrid[-8:9, -9:10] / 2
-    return np.asarray(np.exp(-(x**2 + y**2)) + 0.4 * np.exp(-((x - 1.2) ** 2 + (y - 0.7) ** 2)))
 
 
 @settings(max_examples=40)
@@ -63,9 +58,9 @@ def test_a_sensor_whose_axes_change_places_has_its_kernels_transposed(
 
 
 def test_a_lopsided_point_spread_transposed_has_its_kernels_transposed() -> None:
-    upright, turned = (
-        network_bank(with_response(NOMINAL, point_spread(values, 2))) for values in (lopsided(), lopsided().T)
-    )
+    point = lopsided_point()
+    other = point_spread(unpacked(point).T, point.samples_per_px)
+    upright, turned = (network_bank(with_response(NOMINAL, each)) for each in (point, other))
     np.testing.assert_allclose(turned.details.transpose(0, 2, 1), upright.details, atol=1e-6)
     assert np.abs(upright.details - upright.details[:, ::-1, ::-1]).max() > 0.01  # it does lean
 

@@ -228,11 +228,13 @@ def test_infinity_is_refused() -> None:
 
 def test_threads_change_nothing(camera: Tensor) -> None:
     noisy = with_noise(camera[96:205, 160:273], SIGMA)
-    alone = nl_bayes(noisy, WHITE)
-    torch.set_num_threads(2)
-    together = nl_bayes(noisy, WHITE)
-    assert torch.get_num_threads() == 2
-    assert torch.equal(together, alone)
+    before, results = torch.get_num_threads(), list[Tensor]()
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        results.append(nl_bayes(noisy, WHITE))
+        assert torch.get_num_threads() == threads
+    torch.set_num_threads(before)
+    assert torch.equal(*results)
 
 
 def image(height: int, width: int) -> torch.Tensor:

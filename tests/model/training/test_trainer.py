@@ -139,9 +139,6 @@ def test_one_nan_batch_is_skipped_and_the_run_goes_on(tmp_path: Path) -> None:
     moved = [not all(map(torch.equal, one, other)) for one, other in pairwise(seen)]
     assert moved == [True, False, True, True, True]
     assert trainer.guards.bad_steps == 1
-    again = Trainer(VARIANT, TrainingRecipe(steps=6, batch=3))
-    again.resume(tmp_path / "c")
-    assert again.guards.bad_steps == 1
 
 
 @pytest.mark.parametrize("level", [0.0, 80.0, 4000.0])
