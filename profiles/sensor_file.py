@@ -33,9 +33,9 @@ REFERENCE = "pleiades-reference"
 """The shipped profile of the image that restoration aims at, unless another is named."""
 
 
-def reference_for(degraded: Sensor, name: str = REFERENCE) -> Sensor:
-    """The profile called `name` in the digital numbers of `degraded`: what a restoration of its images is held to."""
-    return load_sensor(name).in_units_of(degraded)
+def reference_for(degraded: Sensor) -> Sensor:
+    """The default reference in the digital numbers of `degraded`: what a restoration of its images is held to."""
+    return load_sensor(REFERENCE).in_units_of(degraded)
 
 
 def sensor_names() -> list[str]:

@@ -56,10 +56,9 @@ class Chain:
 
 
 def restore_traditional(dn: Tensor, chain: Chain) -> Tensor:
-    """Restore (H, W) float32 digital numbers of the degraded sensor; NaN marks missing pixels, and stays.
+    """Digital numbers (H, W) float32 of the degraded sensor to those of the reference, clipped and not rounded.
 
-    Returns:
-        (H, W) float32 digital numbers of the reference sensor, clipped to 0..max_dn, not rounded.
+    NaN marks missing pixels, and stays.
     """
     return torch.cat(list(restore_strips([dn], dn.shape[0], chain)))
 
