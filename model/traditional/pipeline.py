@@ -32,13 +32,8 @@ Order = Literal["denoise-first", "deconvolve-first"]
 class Chain:
     """How to restore what `degraded` acquired to what `reference` would have, without its noise.
 
-    Attributes:
-        degraded: the sensor that acquired the image.
-        reference: the sensor to imitate; of its noise nothing is imitated.
-        quality: "fast", "standard" or "best" (see `nl_bayes.QUALITIES`).
-        order: see above.
-        epsilon: regularisation of the MTF compensation; None lets the noise of
-            `degraded` at the brighter stated radiance decide.
+    `quality` is one of `nl_bayes.QUALITIES`. Without an `epsilon`, the regularisation of the MTF compensation, the
+    noise of `degraded` at the brighter stated radiance decides.
     """
 
     degraded: Instrument

@@ -16,9 +16,8 @@ from beers_deploy.model.simulator.detector import (
     to_radiance,
     to_uint16,
 )
-from beers_deploy.model.simulator.mtf import gamma_from_mtf, transfer_function
+from beers_deploy.model.simulator.mtf import gamma_from_mtf
 from beers_deploy.model.simulator.plan import TOLERANCE_DN, Plan, make_plan
-from beers_deploy.model.simulator.sampling import sample, scene_spectrum
 from beers_deploy.profiles.effects import (
     AntiAlias,
     Defects,
@@ -111,18 +110,6 @@ def test_defects_come_at_their_rate_and_at_the_ends_of_the_range() -> None:
     for count, expected in ((dead, 2002), (hot, 3003)):
         assert abs(count - expected) < 5 * math.sqrt(expected)
     assert int((dn == 700).sum()) == dn.size - dead - hot
-
-
-def test_smear_averages_along_the_track_and_nothing_across() -> None:
-    ratio, side = 4, 160
-    y = (np.arange(side) + 0.5) / ratio
-    along = np.tile((100 + 30 * np.cos(2 * math.pi * 0.1 * y)).astype(np.float32)[:, None], side)
-    for image, factor in ((along, float(np.sinc(3.0 * 0.1))), (along.T, 1.0)):
-        contrasts = []
-        for smear_px in (0.0, 3.0):
-            transfer = transfer_function(side, side, ratio, 0.2, 0.0, smear_px)
-            contrasts.append(float(sample(scene_spectrum(image), transfer, side, ratio).std()))
-        assert contrasts[1] / contrasts[0] == pytest.approx(factor, rel=1e-4)
 
 
 def test_an_infeasible_budget_is_refused_with_its_numbers() -> None:

@@ -30,6 +30,7 @@ from beers_deploy.profiles.errors import ModelError
 from tests.model.training.sources import small_scene, source
 
 VARIANT = Variant(blocks=1, features=4)
+RECIPE = TrainingRecipe(steps=8, batch=3, warm_up_steps=2)
 
 
 def train(
@@ -59,11 +60,10 @@ def test_a_conditioned_run_moves_every_part_and_what_it_makes_of_a_sensor(tmp_pa
 
 
 def test_plain_and_conditioned_checkpoints_are_not_taken_for_one_another(tmp_path: Path) -> None:
-    recipe = TrainingRecipe(steps=8, batch=3, warm_up_steps=2)
     for conditioned in (False, True):
         train(tmp_path, conditioned=conditioned)
         with pytest.raises(ModelError, match="checkpoint of this network"):
-            Trainer(VARIANT, recipe, conditioned=not conditioned).resume(tmp_path / "checkpoint.safetensors")
+            Trainer(VARIANT, RECIPE, conditioned=not conditioned).resume(tmp_path / "checkpoint.safetensors")
 
 
 @pytest.mark.parametrize(("conditioned", "kill_at"), [(False, 2), (False, 5), (False, 8), (True, 5)])
@@ -84,7 +84,7 @@ def test_killed_and_resumed_equals_unbroken_in_every_bit(conditioned: bool, kill
 def test_a_resumed_run_goes_on_where_the_killed_one_was_saved(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         train(tmp_path, kill_at=5)
-    later = Trainer(VARIANT, TrainingRecipe(steps=8, batch=3, warm_up_steps=2))
+    later = Trainer(VARIANT, RECIPE)
     later.resume(tmp_path / "checkpoint.safetensors")
     assert later.step == 4
 
@@ -156,7 +156,7 @@ def test_ctrl_c_finishes_the_step_and_leaves_a_checkpoint_of_it(number: int, tmp
         if step == 4:
             signal.raise_signal(number)
 
-    trainer = Trainer(VARIANT, TrainingRecipe(steps=8, batch=3, warm_up_steps=2))
+    trainer = Trainer(VARIANT, RECIPE)
     with pytest.raises(KeyboardInterrupt):
         trainer.run(source().batches, tmp_path / "checkpoint.safetensors", Schedule(1, report=report))
     assert trainer.step == 4
