@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import onnx
 
 from beers_deploy.dpu.board import BoardLike
-from beers_deploy.model.bank import REFERENCE, bank_of_vector
+from beers_deploy.model.bank import bank_of_vector
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.io.tensors import read_conditioned
@@ -20,7 +20,7 @@ from beers_deploy.network import Conditioned, Network, NetworkLike, SensorLike, 
 from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile, board_names, npu_names
 from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
 from beers_deploy.quant.core import SHIFTS, IntCore, Shifts, target_shifts

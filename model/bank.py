@@ -22,12 +22,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beers_deploy.model.family import RANGES, noise_over_full_scale
-from beers_deploy.model.simulator.mtf import NYQUIST, sensor_mtf
-from beers_deploy.profiles import load_sensor
+from beers_deploy.model.simulator.mtf import sensor_mtf
+from beers_deploy.profiles.response import NYQUIST
 from beers_deploy.profiles.sensor import Instrument
-
-REFERENCE = "pleiades-reference"
-"""The profile of what networks are trained to restore."""
+from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
 
 FILTERS, SIDE_PX = 4, 7
 """7 x 7 holds 98.6 to 99.95 % of a filter's energy, and is the largest square that the window of a DPU takes."""
@@ -52,12 +50,7 @@ as checkerboards, must not."""
 
 @dataclass(frozen=True)
 class Bank:
-    """The filters of one sensor.
-
-    Attributes:
-        details: D_k, (4, 7, 7) float64, each of sum 0.
-        sigma: noise over full scale at a quarter of full scale.
-    """
+    """The filters of one sensor: D_k, (4, 7, 7) float64, and its noise over full scale at a quarter of full scale."""
 
     details: NDArray[np.float64]
     sigma: float
@@ -90,35 +83,29 @@ class Bank:
         return UNIT * self.sigma * float(np.linalg.norm(self.analytic))
 
 
-def bank_of(sensor: Instrument, reference: Instrument) -> Bank:
-    """The filters from what `sensor` sees to what `reference` would have seen; rounding alone is noise enough."""
-    return _bank(sensor, reference, noise_over_full_scale(sensor))
-
-
 def network_bank(sensor: Instrument) -> Bank:
     """The filters in front of a network: noise outside the range that was trained counts as the nearest end of it."""
-    sigma = min(max(noise_over_full_scale(sensor), RANGES["sigma_bright"][0]), RANGES["sigma_bright"][1])
-    return _bank(sensor, load_sensor(REFERENCE).nominal(), sigma)
+    return _bank(sensor, float(np.clip(noise_over_full_scale(sensor), *RANGES["sigma_bright"])))
 
 
 @lru_cache(maxsize=4096)
 def bank_of_vector(vector: tuple[float, ...]) -> Bank:
     """As `network_bank`, of the sensor that a sensor vector (4,) tells of."""
-    reference = load_sensor(REFERENCE).nominal()
     ends = zip(vector, RANGES.values(), strict=True)
     across, along, _, sigma = (low * (high / low) ** ((entry + 1) / 2) for entry, (low, high) in ends)
-    axes = replace(reference, mtf_nyquist=across, mtf_nyquist_along=along, effects={}, response=None)
-    return _bank(axes, reference, sigma)
+    axes = replace(load_sensor(REFERENCE).nominal(), mtf_nyquist=across, mtf_nyquist_along=along, effects={})
+    return _bank(axes, sigma)
 
 
-def _bank(sensor: Instrument, reference: Instrument, sigma: float) -> Bank:
+def _bank(sensor: Instrument, sigma: float) -> Bank:
     fy, fx = np.fft.fftfreq(GRID)[:, None], np.fft.fftfreq(GRID)[None, :]
-    blur, target = sensor_mtf(fx, fy, sensor), sensor_mtf(fx, fy, reference)
+    blur, target = (sensor_mtf(fx, fy, each) for each in (sensor, load_sensor(REFERENCE).nominal()))
     r_squared = (fx**2 + fy**2) / NYQUIST**2
     epsilons = [EPSILON_PER_SIGMA * sigma * STEP ** (k - 1) for k in range(FILTERS)]
     gains = [restoring_gain(blur, target, r_squared, epsilon) for epsilon in epsilons]
     falling = np.stack([*gains, np.ones_like(blur)])
-    return Bank(np.stack([_cut(gain) for gain in falling[:-1] - falling[1:]]), sigma)
+    filters = np.fft.ifft2(falling[:-1] - falling[1:]).real
+    return Bank(np.stack([cut_filter(each, SIDE_PX // 2, total=0) for each in filters]), sigma)
 
 
 def in_places(kernels: NDArray[np.float64], scale: int) -> NDArray[np.float64]:
@@ -150,11 +137,13 @@ def restoring_gain(
     return np.asarray(target * np.conj(blur) / (np.abs(blur) ** 2 + epsilon * np.asarray(r_squared)))
 
 
-def _cut(gain: NDArray[np.inexact]) -> NDArray[np.float64]:
-    """The middle 7 x 7 of the filter with this gain (64, 64), its sum taken off as a smooth hill: sum 0."""
-    radius = SIDE_PX // 2
-    whole = np.roll(np.fft.ifft2(gain).real, (radius, radius), (0, 1))
-    kernel = whole[:SIDE_PX, :SIDE_PX]
-    window = np.hanning(SIDE_PX + 2)[1:-1]
+def cut_filter(whole: NDArray[np.float64], radius_px: int, total: float) -> NDArray[np.float64]:
+    """The middle (2 R + 1, 2 R + 1) of a filter (H, W) around its first pixel, brought to a sum by a smooth hill.
+
+    So what is cut off comes back at frequencies near 0 alone; dividing by the sum would raise every other one.
+    """
+    side_px = 2 * radius_px + 1
+    kernel = np.roll(whole, (radius_px, radius_px), (0, 1))[:side_px, :side_px]
+    window = np.hanning(side_px + 2)[1:-1]
     hill = np.outer(window, window)
-    return np.asarray(kernel - kernel.sum() * hill / hill.sum())
+    return np.asarray(kernel + (total - kernel.sum()) * hill / hill.sum())

@@ -111,12 +111,9 @@ class BankedConvBEERS(Layers):
 
 
 class OfOneSensor(nn.Module):
-    """A network behind a bank, told one sensor: (N, 1, H, W) in [0, 1] of full scale to the same.
+    """A network behind a bank, told one sensor's vector (4,): (N, 1, H, W) in [0, 1] of full scale to the same.
 
-    Args:
-        network: whose weights it shares.
-        vector: of the sensor, (4,).
-        bank: of the sensor; None makes it of the vector.
+    It shares the network's weights. Without a bank the sensor's is made of the vector.
     """
 
     def __init__(self, network: BankedConvBEERS, vector: Tensor, bank: Bank | None = None) -> None:
@@ -124,7 +121,7 @@ class OfOneSensor(nn.Module):
         self.network, self.vector, self.bank, self.variant = network, vector, bank, network.variant
 
     def forward(self, image: Tensor) -> Tensor:
-        """(N, 1, H, W) to the same."""
+        """Restore (N, 1, H, W)."""
         banks = [self.bank] * len(image) if self.bank else None
         restored: Tensor = self.network(image, self.vector.expand(len(image), -1), banks)
         return restored

@@ -252,17 +252,11 @@ def _read_summary(path: Path) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class PairsRecipe:
-    """The sensors that made a folder of pairs, and the scenes that they saw.
-
-    Attributes:
-        degraded: profile of the degraded images.
-        reference: profile of the reference images.
-        scenes: file names in their order; None for a drawn scene.
-    """
+    """The sensors that made a folder of pairs, and the scenes that they saw."""
 
     degraded: Sensor
     reference: Sensor
-    scenes: tuple[str | None, ...]
+    scenes: tuple[str | None, ...]  # file names in their order; None for a drawn scene
 
     def site(self, stem: str) -> str:
         """The site of the pair NUMBER-SCENE or NUMBER-SCENE-PATCH: two frames of a site, or two patches, are one.

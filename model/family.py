@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beers_deploy.profiles.effects import Smear
 from beers_deploy.profiles.sensor import Instrument
 
 RANGES: Mapping[str, tuple[float, float]] = {
@@ -53,9 +52,8 @@ class SensorVector:
 
 def sensor_values(sensor: Instrument) -> dict[str, float]:
     """The four values of `RANGES`, smear and rounding noise counted."""
-    smear = sensor.effects.get("smear")
     # A network knows no smear of its own: what that leaves of the contrast along the track is counted there.
-    kept = abs(float(np.sinc(0.5 * smear.length_px))) if isinstance(smear, Smear) else 1.0
+    kept = abs(float(np.sinc(0.5 * sensor.smear_px)))
     sigmas = [noise_over_full_scale(sensor, part) for part in (16, 4)]
     across, along = sensor.mtf_axes
     return dict(zip(RANGES, (across, along * kept, *sigmas), strict=True))
@@ -91,9 +89,7 @@ def sensor_vector(sensor: Instrument) -> SensorVector:
 class SensorFamily:
     """The sensors that a network is trained on: every number log-uniform over its range.
 
-    Attributes:
-        like: gives gain and bits; its MTF and noise do not matter.
-        snr_bright: at 1/4 of full scale; at 1/16 all that physics allows for it.
+    `like` gives gain and bits; its MTF and noise do not matter.
     """
 
     like: Instrument

@@ -32,6 +32,11 @@ class Constant:
         """The largest value it can take."""
         return self.value[1] if isinstance(self.value, tuple) else self.value
 
+    @property
+    def middle(self) -> float:
+        """The middle of what it can be."""
+        return (self.low + self.high) / 2
+
     def __str__(self) -> str:
         return f"{self.low:g}" if self.low == self.high else f"{self.low:g} to {self.high:g}"
 
@@ -72,21 +77,12 @@ def read_stated(where: str, raw: object) -> tuple[object, Status, str]:
     if not isinstance(raw, Mapping):
         return raw, "stated", "stated by the profile without a source"
     check_keys(where, raw, required={"value", "status", "source"})
-    status, source = raw["status"], raw["source"]
+    status, source, remedy = raw["status"], raw["source"], "say where the number comes from"
     if status not in get_args(Status):
-        raise ProfileError(
-            f"{where}.status",
-            expected="one of " + ", ".join(get_args(Status)),
-            got=repr(status),
-            remedy="say where the number comes from",
-        )
+        expected = "one of " + ", ".join(get_args(Status))
+        raise ProfileError(f"{where}.status", expected=expected, got=repr(status), remedy=remedy)
     if not isinstance(source, str) or not source.strip():
-        raise ProfileError(
-            f"{where}.source",
-            expected="a text naming a document",
-            got=repr(source),
-            remedy="say where the number comes from",
-        )
+        raise ProfileError(f"{where}.source", expected="a text naming a document", got=repr(source), remedy=remedy)
     return raw["value"], status, source
 
 

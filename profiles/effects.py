@@ -136,4 +136,4 @@ def draw_effect(name: str, table: Table, generator: np.random.Generator) -> Effe
 
 def middle_effect(name: str, table: Table) -> Effect:
     """The middle of every range."""
-    return TABLES[name](**{key: (c.low + c.high) / 2 for key, c in table.items()})
+    return TABLES[name](**{key: constant.middle for key, constant in table.items()})

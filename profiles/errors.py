@@ -110,12 +110,7 @@ EXTRAS = {"cyclonedx": "record", "matplotlib": "study", "pandas": "notebook", "s
 
 
 def optional(package: str, where: str) -> Any:
-    """An optional package, imported.
-
-    Args:
-        package: its module.
-        where: the parameter or verb that needs it.
-    """
+    """The module of an optional package, imported for `where`, the parameter or verb that needs it."""
     try:
         return import_module(package)
     except ModuleNotFoundError as error:

@@ -8,14 +8,13 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beers_deploy.profiles.constant import Constant, Number
-from beers_deploy.profiles.effects import TABLES as EFFECT_TABLES
-from beers_deploy.profiles.effects import Effect, Offset, Table, draw_effect, middle_effect
+from beers_deploy.profiles.effects import Effect, Table, draw_effect, middle_effect
 from beers_deploy.profiles.errors import ProfileError
 from beers_deploy.profiles.response import PointSpread, Response
 
@@ -25,6 +24,8 @@ MTF_NYQUIST_MAX = 2 / math.pi
 """A perfect lens over a square detector: sinc(0.5). Nothing above it is a blur: its gamma would be negative."""
 
 MAX_DRAWS = 10_000
+
+E = TypeVar("E", Effect, Table)
 
 
 OFFSET = "offset"
@@ -94,13 +95,21 @@ class Instrument:
     @property
     def offset_dn(self) -> float:
         """The digital number of the dark; 0 without an offset."""
-        offset = self.effects.get(OFFSET)
-        return offset.offset_dn if isinstance(offset, Offset) else 0.0
+        return float(getattr(self.effects.get(OFFSET), "offset_dn", 0))
+
+    @property
+    def antialias_px(self) -> float:
+        """Standard deviation of the anti-alias filter in target pixels; 0 without one."""
+        return float(getattr(self.effects.get("antialias"), "sigma_px", 0))
+
+    @property
+    def smear_px(self) -> float:
+        """Length of the motion along the track in target pixels; 0 without smear."""
+        return float(getattr(self.effects.get("smear"), "length_px", 0))
 
     def in_units_of(self, other: "Instrument") -> "Instrument":
         """This sensor's blur and noise in the digital numbers of `other`: its gain, bits and offset."""
-        effects = {name: effect for name, effect in self.effects.items() if name != OFFSET}
-        effects |= {name: effect for name, effect in other.effects.items() if name == OFFSET}
+        effects = _with_offset_of(other.effects, self.effects)
         return replace(self, gain_dn_per_radiance=other.gain_dn_per_radiance, bits=other.bits, effects=effects)
 
     def noise_sigma(self, radiance: float) -> float:
@@ -209,8 +218,7 @@ class Sensor:
         """
         if self.units == other.units:
             return self
-        both = {**self.effects, **other.effects}
-        effects = {n: both[n] for n in EFFECT_TABLES if n in (other.effects if n == OFFSET else self.effects)}
+        effects = _with_offset_of(other.effects, self.effects)
         return replace(self, gain_dn_per_radiance=other.gain_dn_per_radiance, bits=other.bits, effects=effects)
 
     def draw(self, generator: np.random.Generator) -> Instrument:
@@ -242,13 +250,13 @@ class Sensor:
         """The middle of every range (the SNR at radiance_0 moved to the nearest physical value)."""
         alpha, beta = self._middle_noise()
         effects = {name: middle_effect(name, table) for name, table in self.effects.items()}
-        mtf_along = None if self.mtf_nyquist_along is None else _middle(self.mtf_nyquist_along)
-        return self._sensor(_middle(self.mtf_nyquist), alpha, beta, effects, mtf_along)
+        mtf_along = None if self.mtf_nyquist_along is None else self.mtf_nyquist_along.middle
+        return self._sensor(self.mtf_nyquist.middle, alpha, beta, effects, mtf_along)
 
     def _middle_noise(self) -> tuple[float, float]:
         if self.alpha is not None and self.beta is not None:
-            return _middle(self.alpha), _middle(self.beta)
-        snr_0, snr_1 = map(_middle, self.snr_pair)
+            return self.alpha.middle, self.beta.middle
+        snr_0, snr_1 = (snr.middle for snr in self.snr_pair)
         low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, snr_1)
         alpha, beta = noise_from_snr(self.radiance_0.low, min(max(snr_0, low), high), self.radiance_1.low, snr_1)
         return max(alpha, 0.0), max(beta, 0.0)
@@ -283,6 +291,13 @@ class Sensor:
         )
 
 
+def _with_offset_of(others: Mapping[str, E], own: Mapping[str, E]) -> dict[str, E]:
+    """The own effects, but the offset of others."""
+    return {name: effect for name, effect in own.items() if name != OFFSET} | {
+        name: effect for name, effect in others.items() if name == OFFSET
+    }
+
+
 def require_same_units(degraded: Sensor, reference: Sensor) -> None:
     """Refuse a reference that another digitiser made: its images differ from the degraded ones by a factor."""
     if degraded.units != reference.units:
@@ -306,10 +321,6 @@ def mtf_limit(antialias_sigma_px: float = 0.0) -> float:
     A Gaussian filter of sigma target pixels keeps exp(-2 pi^2 sigma^2 f^2) at f = 0.5 cycles per pixel.
     """
     return MTF_NYQUIST_MAX * math.exp(-2 * (math.pi * antialias_sigma_px * 0.5) ** 2)
-
-
-def _middle(constant: Constant) -> float:
-    return (constant.low + constant.high) / 2
 
 
 def _uniform(generator: np.random.Generator, constant: Constant) -> float:

@@ -13,8 +13,7 @@ from beers_deploy.profiles.constant import Constant, Number, check_keys, read_co
 from beers_deploy.profiles.effects import TABLES as EFFECT_TABLES
 from beers_deploy.profiles.effects import Table, read_effect
 from beers_deploy.profiles.errors import ProfileError
-from beers_deploy.profiles.response import MtfTable, unpacked
-from beers_deploy.profiles.response_file import axes_of, read_response, response_from_json
+from beers_deploy.profiles.response import MtfTable, axes_of, read_response, response_from_json, unpacked
 from beers_deploy.profiles.sensor import (
     MTF_NYQUIST_MAX,
     OFFSET,
@@ -34,9 +33,9 @@ REFERENCE = "pleiades-reference"
 """The shipped profile of the image that restoration aims at, unless another is named."""
 
 
-def reference_for(degraded: Sensor, name: str = REFERENCE) -> Sensor:
-    """The profile called `name` in the digital numbers of `degraded`: what a restoration of its images is held to."""
-    return load_sensor(name).in_units_of(degraded)
+def reference_for(degraded: Sensor) -> Sensor:
+    """The default reference in the digital numbers of `degraded`: what a restoration of its images is held to."""
+    return load_sensor(REFERENCE).in_units_of(degraded)
 
 
 def sensor_names() -> list[str]:
@@ -154,15 +153,15 @@ def read_sensor(label: str, raw: Mapping[str, Any], folder: Path = Path()) -> Se
     effects = {name: read_effect(f"{label} [{name}]", name, raw[name]) for name in EFFECT_TABLES if name in raw}
     _check_single(label, constants, effects)
     _check_each(label, constants)
+    # Two radiances that only name where noise is spoken of, unless SNRs are stated there.
+    constants = {**_default_radiances(constants), **constants}
     _check_noise(label, constants)
     blur: dict[str, Any] = {}
     if "mtf_nyquist" not in constants:
         response, status, source = read_response(f"{label} [mtf]", stated["mtf"], folder)
         blur = {"response": response, **axes_of(response, status, source)}
     name, description = label.removesuffix(".toml"), str(raw["description"])
-    # Two radiances that only name where noise is spoken of, unless SNRs are stated there.
-    values = {**_default_radiances(constants), **constants, **blur}
-    profile = Sensor(name=name, description=description, effects=effects, **values)
+    profile = Sensor(name=name, description=description, effects=effects, **{**constants, **blur})
     _check_budget(label, profile)
     _check_snr(profile)
     return profile
@@ -245,7 +244,7 @@ def _check_each(label: str, constants: Mapping[str, Constant]) -> None:
 
 def _check_noise(label: str, constants: Mapping[str, Constant]) -> None:
     """Two radiances in order, and noise that alpha and beta, not both 0, can have."""
-    dark, bright = ({**_default_radiances(constants), **constants}[key].low for key in ("radiance_0", "radiance_1"))
+    dark, bright = (constants[key].low for key in ("radiance_0", "radiance_1"))
     if not dark < bright:
         raise ProfileError(
             f"{label} [noise] radiance_0",

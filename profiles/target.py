@@ -33,8 +33,6 @@ NPU = frozenset({"device", "int8", "no_int8"})
 
 WATTS = "_w"
 """How the names of measured powers end, which no board takes from another."""
-ABSENT = {"cost": ("no cost constants yet", "take those of a board with the same DPU: base = its name")}
-"""What the lack of a whole table means, and the remedy."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -76,9 +74,9 @@ class TargetProfile:
         try:
             return self.tables[table][key]
         except KeyError:
-            got, remedy = ("none", "add it to the file")
-            if table not in self.tables:
-                got, remedy = ABSENT.get(table, (got, remedy))
+            got, remedy = "none", "add it to the file"
+            if table == "cost" and table not in self.tables:
+                got, remedy = "no cost constants yet", "take those of a board with the same DPU: base = its name"
             raise ProfileError(
                 f"target profile {self.name}", expected=f"[{table}] {key}", got=got, remedy=remedy
             ) from None

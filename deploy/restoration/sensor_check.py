@@ -16,9 +16,10 @@ from beers_deploy.model.metrics import edge_blur
 from beers_deploy.model.metrics.noise_line import ROUNDING, Blocks, NoiseModel, cut_blocks, fit_noise_model, join
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.progress import Log
-from beers_deploy.model.simulator.mtf import NYQUIST, sensor_mtf
+from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Figure, measured, unavailable
+from beers_deploy.profiles.response import NYQUIST
 from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.source import Source

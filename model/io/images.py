@@ -168,8 +168,6 @@ def _check_memory(path: Path, samples: int) -> None:
         raise MachineError(str(path), expected=expected, got=got, remedy="cut it into pieces")
 
 
-"""Of 12 bits."""
-
 UNIT_MAX = 2.0
 """Floats no larger may be shares of full scale, or reflectances, which pass 1 on snow and glint. A raw image has a
 pixel above 2 DN wherever it sees anything at all."""

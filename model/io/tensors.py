@@ -32,14 +32,7 @@ Arrays = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Weights:
-    """What a file of weights holds.
-
-    Attributes:
-        tensors: arrays by name.
-        variant: the network that they make.
-        recipe: what made them.
-        conditioned: whether the network is told its sensor, and stands behind the bank of it.
-    """
+    """What a file of weights holds; a conditioned network is told its sensor, and stands behind the bank of it."""
 
     tensors: Arrays
     variant: Variant
@@ -105,8 +98,7 @@ def read_conditioned(path: Path) -> Weights:
     """The weights of a network that is told its sensor."""
     found = read_weights(path)
     if not found.conditioned:
-        error = ValueError("a network that is told no sensor")
-        raise _not_weights(path, "weights that 'train --conditioned' wrote", error) from error
+        raise _not_weights(path, "weights that 'train --conditioned' wrote", "a network that is told no sensor")
     return found
 
 
@@ -120,8 +112,8 @@ def all_finite(tensors: Arrays) -> bool:
     return all(bool(np.isfinite(tensor).all()) for tensor in tensors.values())
 
 
-def _not_weights(path: Path, expected: str, error: Exception) -> ModelError:
-    got = " ".join(str(error).split())[:120]
+def _not_weights(path: Path, expected: str, reason: object) -> ModelError:
+    got = " ".join(str(reason).split())[:120]
     return ModelError(str(path), expected=expected, got=got, remedy="give a file written by 'beers-deploy train'")
 
 

@@ -150,11 +150,7 @@ class NoiseModel:
 
 
 def fit_noise_model(blocks: Blocks, generator: np.random.Generator) -> NoiseModel | Refusal:
-    """Fit the line to blocks of any number of images of one instrument.
-
-    Returns:
-        The line, or why there is none.
-    """
+    """Fit the line to blocks of any number of images of one instrument; or say why there is none."""
     if blocks.mean.size < LEAST:
         return Refusal(f"{blocks.mean.size} blocks of 16 x 16 unclipped pixels, {LEAST} are needed")
     quietest = float(np.percentile(blocks.fine, QUIET_PERCENT))

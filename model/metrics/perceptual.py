@@ -39,6 +39,7 @@ BACKBONES: Mapping[str, BackboneSpec] = {
     "squeeze": BackboneSpec("squeezenet1_1", (1, 4, 7, 9, 10, 11, 12), min_side_px=17),
     "vgg": BackboneSpec("vgg16", (3, 8, 15, 22, 29), min_side_px=16),
 }
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class Fire(nn.Module):
@@ -68,11 +69,9 @@ class L2Pool(nn.Module):
 
 
 class Backbone(nn.Module):
-    """The feature layers of one network, with random weights until some are loaded.
+    """The feature layers of "squeeze" or "vgg", with random weights until some are loaded.
 
-    Args:
-        network: "squeeze" or "vgg".
-        l2_pool: DISTS's pooling in the place of the max pooling.
+    `l2_pool` puts DISTS's pooling in the place of the max pooling.
     """
 
     def __init__(self, network: str, *, l2_pool: bool = False) -> None:
@@ -83,9 +82,15 @@ class Backbone(nn.Module):
             layers = [L2Pool() if isinstance(layer, nn.MaxPool2d) else layer for layer in layers]
         self.features = nn.Sequential(*layers)
 
-    def forward(self, x: Tensor) -> list[Tensor]:
-        """The compared feature maps of (N, 3, H, W), all of them after a ReLU."""
-        found: list[Tensor] = []
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """Grey (N, 1, H, W), 0 to 1, as three equal channels, and its compared feature maps, each after a ReLU.
+
+        In the precision of the parameters, whatever the caller's autocast. The scaling layer of `lpips` is ImageNet's
+        figures after [-1, 1].
+        """
+        colour = image.to(next(self.parameters()).dtype).expand(-1, 3, -1, -1)
+        mean, std = (colour.new_tensor(x)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
+        x, found = (colour - mean) / std, [colour]
         for index, layer in enumerate(self.features):
             x = layer(x)
             if index in self.spec.taps:
@@ -127,13 +132,10 @@ NAMED = "give the feature layers named as in torchvision (features.0.weight ...)
 
 
 def find_backbone(network: str, place: Path | None = None) -> Path | None:
-    """The weights file of a backbone, or None: then `not_found(network)` is the reason to show.
+    """The weights file of "squeeze" or "vgg" (DISTS's), or None: then `not_found(network)` is the reason to show.
 
-    Args:
-        network: "squeeze" or "vgg" (DISTS uses "vgg").
-        place: a file, which is taken at its word, or a folder. Without it the environment variable
-            BEERS_LPIPS_WEIGHTS is asked; it may name a file or a folder, and a file counts only for the network
-            its name begins with.
+    A file as `place` is taken at its word. Without a place, a file or a folder, the environment variable
+    BEERS_LPIPS_WEIGHTS is asked; a file that it names counts only for the network its name begins with.
     """
     stem = BACKBONES[network].file_stem
     if place is not None and not place.is_dir():
@@ -152,13 +154,7 @@ def not_found(network: str) -> str:
 
 
 def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbone:
-    """A backbone with its parameters from a file, by name; whatever else the file holds is left aside.
-
-    Args:
-        network: "squeeze" or "vgg".
-        path: .safetensors or .npz.
-        l2_pool: DISTS's pooling in the place of the max pooling.
-    """
+    """A `Backbone` with its parameters from a file, by name; whatever else the file holds is left aside."""
     backbone = Backbone(network, l2_pool=l2_pool)
     wanted = backbone.state_dict()
     tensors = read_tensors(path, wanted)
@@ -212,18 +208,14 @@ def _error(path: Path, expected: str, got: str, remedy: str) -> ModelError:
 
 
 PUBLISHED = Path(__file__).parent / "weights"
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 MIN_NORM = 1e-3
 
 
 class Lpips(nn.Module):
     """Learned perceptual image patch similarity (Zhang et al. 2018, v0.1): 0 for identical images, no upper bound.
 
-    Name it with its network, "LPIPS-squeeze" (`label`): the networks' figures do not compare with each other.
-
-    Args:
-        backbone: the network whose features are compared.
-        heads: for each compared layer (C,), how much each channel counts.
+    Name it with its network, "LPIPS-squeeze" (`label`): the networks' figures do not compare with each other. The
+    heads (C,), one for each compared layer, say how much each channel counts.
     """
 
     heads: Tensor
@@ -236,38 +228,26 @@ class Lpips(nn.Module):
 
     @classmethod
     def load(cls, network: str, path: Path) -> Self:
-        """The metric with its published heads, over the backbone in a file (see `find_backbone`).
-
-        Args:
-            network: "squeeze" or "vgg".
-            path: .safetensors or .npz, parameters named as in torchvision.
-        """
+        """The metric with its published heads, over the backbone in a file (see `find_backbone`)."""
         backbone = load_backbone(network, path)
         names = [f"lin{layer}" for layer in range(len(backbone.spec.taps))]
         heads = read_tensors(PUBLISHED / f"lpips-{network}.safetensors", names)
         return cls(backbone, [heads[name] for name in names])
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """The distance of each pair, (N,); its gradient is finite everywhere.
-
-        Args:
-            image: (N, 1, H, W), 0 to 1 of full scale; at least 17 px a side for squeeze, 16 for vgg.
-            reference: the same shape.
-        """
+        """The distance (N,) of each pair (N, 1, H, W), 0 to 1 of full scale; its gradient is finite everywhere."""
         _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):
-            pairs = zip(_features(self.backbone, image), _features(self.backbone, reference), strict=True)
+            pairs = zip(self.backbone(image)[1:], self.backbone(reference)[1:], strict=True)
             errors = [(_unit(a) - _unit(b)).square().mean(dim=(2, 3)) for a, b in pairs]
             return torch.cat(errors, dim=1) @ self.heads
 
 
 class Dists(nn.Module):
-    """Deep image structure and texture similarity (Ding et al. 2020) over VGG16: 0 for identical images, at most 1.
+    """Deep image structure and texture similarity (Ding et al. 2020): 0 for identical images, at most 1.
 
-    Args:
-        backbone: VGG16 with L2 pooling.
-        alpha: (1475,), how much the mean (texture) of the image and of each of its channels counts.
-        beta: (1475,), how much their covariance (structure) counts.
+    Over VGG16 with L2 pooling. `alpha` (1475,) says how much the mean (texture) of the image and of each of its
+    channels counts, `beta` (1475,) how much their covariance (structure).
     """
 
     label = "DISTS"
@@ -290,21 +270,13 @@ class Dists(nn.Module):
         return cls(backbone, weights["alpha"], weights["beta"])
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """The distance of each pair, (N,); its gradient is finite everywhere.
-
-        Args:
-            image: (N, 1, H, W), 0 to 1 of full scale, at least 16 px a side.
-            reference: the same shape.
-        """
+        """The distance (N,) of each pair (N, 1, H, W), 0 to 1 of full scale; its gradient is finite everywhere."""
         _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):
-            stages = zip(self._stages(image), self._stages(reference), strict=True)
+            stages = zip(self.backbone(image), self.backbone(reference), strict=True)
             apart = [_texture_and_structure(a, b) for a, b in stages]
             texture, structure = (torch.cat(parts, dim=1) for parts in zip(*apart, strict=True))
             return texture @ self.alpha + structure @ self.beta
-
-    def _stages(self, image: Tensor) -> list[Tensor]:
-        return [_as_colour(self.backbone, image), *_features(self.backbone, image)]
 
 
 def _unit(features: Tensor) -> Tensor:
@@ -326,19 +298,6 @@ def _texture_and_structure(a: Tensor, b: Tensor, small: float = 1e-6) -> tuple[T
     texture = (mean_a - mean_b).square() / (mean_a.square() + mean_b.square() + small)
     variances = a.square().mean(dim=(2, 3)) + b.square().mean(dim=(2, 3))
     return texture.flatten(1), (a - b).square().mean(dim=(2, 3)) / (variances + small)
-
-
-def _as_colour(backbone: Backbone, image: Tensor) -> Tensor:
-    """Grey as three equal channels, in the backbone's own precision: float32, whatever the caller's autocast."""
-    return image.to(next(backbone.parameters()).dtype).expand(-1, 3, -1, -1)
-
-
-def _features(backbone: Backbone, image: Tensor) -> list[Tensor]:
-    """The compared features of a grey image; the scaling layer of `lpips` is ImageNet's figures after [-1, 1]."""
-    colour = _as_colour(backbone, image)
-    mean, std = (colour.new_tensor(x)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
-    features: list[Tensor] = backbone((colour - mean) / std)
-    return features
 
 
 def _check_pair(label: str, backbone: Backbone, image: Tensor, reference: Tensor) -> None:

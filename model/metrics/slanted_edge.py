@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.profiles.response import NYQUIST
 
 WINDOW_PX = 10
 """Half width of the Hamming window around the edge."""
@@ -27,9 +28,6 @@ HALF = WINDOW_PX * BINS_PER_PX + 1
 """Bins on each side: one more than the window, for the derivative."""
 MIN_CONTRAST_SIGMA, MAX_CLIPPED, MAX_SHIFT_PX = 10, 0.01, 2.0
 PASSES = 3
-
-NYQUIST = 0.5
-"""Cycles per pixel along the edge's normal."""
 
 
 def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -> float | Refusal:

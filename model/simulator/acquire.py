@@ -60,11 +60,7 @@ def simulate_planned(
     role: str = "degraded",
     margin_px: int = MARGIN_PX,
 ) -> np.ndarray:
-    """Acquire a scene with only the effects that its plan calls for.
-
-    Returns:
-        Digital numbers (H / r - 2 margin, W / r - 2 margin), float32.
-    """
+    """A scene with only the effects that its plan calls for: digital numbers (H / r - 2 margin, W / r - 2 margin)."""
     if "mtf" not in plan.skipped:
         kept, width, ratio = without(sensor, plan.skipped), scene.radiance.shape[-1], scene.oversampling
         return acquire(scene.spectrum, width, kept, ratio, draw, role, margin_px=margin_px, skip=plan.skipped)
@@ -87,11 +83,7 @@ def simulate_pair(
     draw: Draw,
     margin_px: int = MARGIN_PX,
 ) -> Pair:
-    """Acquire a scene (..., H, W) in W/m2/sr/um twice, each acquisition with its own noise.
-
-    Returns:
-        A pair of (..., H / r - 2 margin, W / r - 2 margin) images.
-    """
+    """A scene (..., H, W) in W/m2/sr/um twice, each (..., H / r - 2 margin, W / r - 2 margin) with its own noise."""
     radiance = crop_divisible(radiance, oversampling)
     spectrum = scene_spectrum(radiance)
     pair = (
@@ -141,19 +133,15 @@ def acquire_three(
     return by(degraded, "degraded"), by(reference, "reference"), by(reference, "reference", NOISE)
 
 
-def acquire_padded(
-    radiance: np.ndarray, sensor: Instrument, oversampling: int, draw: Draw, role: str, skip: Collection[str] = ()
-) -> np.ndarray:
-    """Acquire a scene (H, W) whole: what the margin would cut off is a mirror image around it.
+def acquire_padded(radiance: np.ndarray, sensor: Instrument, oversampling: int, draw: Draw, role: str) -> np.ndarray:
+    """Acquire a scene (H, W) whole, (ceil(H / r), ceil(W / r)): a mirror image lies where the margin is cut off.
 
-    Returns:
-        Digital numbers (ceil(H / r), ceil(W / r)). Pixel n covers scene pixels r*n to r*n + r - 1: a place x of the
-        scene, with pixel i from i to i + 1, lies at x / r.
+    Pixel n covers scene pixels r*n to r*n + r - 1: a place x of the scene, pixel i from i to i + 1, lies at x / r.
     """
     margin_px = MARGIN_PX * oversampling
     after = [margin_px - size % -oversampling for size in radiance.shape]
     scene = np.pad(radiance, [(margin_px, each) for each in after], mode="reflect")
-    return acquire(scene_spectrum(scene), scene.shape[1], sensor, oversampling, draw, role, skip=skip)
+    return acquire(scene_spectrum(scene), scene.shape[1], sensor, oversampling, draw, role)
 
 
 def fitting_oversampling(radiance: np.ndarray, oversamplings: Iterable[int], side_px: int) -> int | None:

@@ -46,22 +46,6 @@ PATTERN_LIMIT = 4.0
 """Detectors further out are rejected at the factory: draws are clipped here, so that bounds can be proven."""
 
 
-def apply_prnu(radiance: np.ndarray, prnu: Prnu, generator: np.random.Generator) -> np.ndarray:
-    """L' = (1 + rms * n) * L for L (..., H, W), n standard normal per column, clipped at 4; rms 0 changes nothing."""
-    return radiance * (1 + prnu.rms * _columns(radiance, generator))
-
-
-def apply_dsnu(dn: np.ndarray, dsnu: Dsnu, generator: np.random.Generator) -> np.ndarray:
-    """DN' = DN + rms_dn * n for DN (..., H, W), n normal per column, clipped at 4; rms_dn 0 changes nothing."""
-    return dn + dsnu.rms_dn * _columns(dn, generator)
-
-
-def apply_striping(dn: np.ndarray, striping: Striping) -> np.ndarray:
-    """Add half of odd_even_dn to even columns of DN (..., H, W) and take it from odd ones; 0 changes nothing."""
-    columns = np.arange(dn.shape[-1]) % 2
-    return dn + striping.odd_even_dn * (0.5 - columns.astype(dn.dtype))
-
-
 def _columns(image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """One clipped standard normal number a column, (W,) float32."""
     draw = generator.standard_normal(image.shape[-1], dtype=np.float32)
@@ -102,15 +86,6 @@ def add_defects(dn: np.ndarray, defects: Defects, max_dn: int, generator: np.ran
     dn = np.where(draw < dead, np.float32(0), dn)
     # One draw decides both, so a pixel is never dead and hot.
     return np.where(draw >= 1 - hot, np.float32(max_dn), dn) if hot > 0 else dn
-
-
-def add_haze(radiance: np.ndarray, haze: Haze) -> np.ndarray:
-    """L' = transmittance * L + path radiance, in W/m2/sr/um, for L of any shape.
-
-    Limits: (1, 0) changes nothing; transmittance 0 leaves the path radiance alone. It is the same before and after
-    the blur, whose gain at zero frequency is 1: so it is applied on the small target grid.
-    """
-    return radiance * haze.transmittance + haze.path_radiance
 
 
 def digitise(dn: np.ndarray, sensor: Instrument) -> np.ndarray:
@@ -183,16 +158,16 @@ def apply_effect(
 ) -> np.ndarray:
     """Apply one effect of the target grid to an image (..., H, W); the generator is made only for those that draw."""
     match effect:
-        case Haze():
-            return add_haze(image, effect)
+        case Haze():  # the same before and after the blur, whose gain at frequency 0 is 1
+            return image * effect.transmittance + effect.path_radiance
         case FullWell():
             return saturate(image, effect)
         case Prnu():
-            return apply_prnu(image, effect, generator())
+            return image * (1 + effect.rms * _columns(image, generator()))
         case Dsnu():
-            return apply_dsnu(image, effect, generator())
-        case Striping():
-            return apply_striping(image, effect)
+            return image + effect.rms_dn * _columns(image, generator())
+        case Striping():  # half of it added to even columns and taken from odd ones
+            return image + effect.odd_even_dn * (0.5 - (np.arange(image.shape[-1]) % 2).astype(image.dtype))
         case Offset():
             return image + effect.offset_dn
         case Defects():

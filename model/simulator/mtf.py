@@ -6,13 +6,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beers_deploy.profiles.effects import AntiAlias, Smear
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.response import PointSpread, Response
 from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX, Instrument, mtf_limit
-
-NYQUIST = 0.5
-"""Cycles per target pixel."""
 
 
 def gamma_from_mtf(mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> float:
@@ -60,7 +56,11 @@ def mtf(fx: ArrayLike, fy: ArrayLike, blur: Blur, antialias_sigma_px: float = 0.
     """
     fx, fy = np.asarray(fx, np.float64), np.asarray(fy, np.float64)
     if isinstance(blur, Response):
-        return _whole_response(fx, fy, blur, antialias_sigma_px)
+        if antialias_sigma_px:
+            expected, got = "none beside a whole response", f"one of {antialias_sigma_px:g} px beside the {blur}"
+            remedy = "leave it out: it is part of that"
+            raise OptionError("anti-alias filter", expected=expected, got=got, remedy=remedy)
+        return np.asarray(blur.at(fx, fy))
     across, along = blur if isinstance(blur, tuple) else (blur, blur)
     gamma_x, gamma_y = (gamma_from_mtf(value, antialias_sigma_px) for value in (across, along))
     radius = np.hypot(fx, fy)
@@ -68,15 +68,6 @@ def mtf(fx: ArrayLike, fy: ArrayLike, blur: Blur, antialias_sigma_px: float = 0.
     optics = np.exp(-gamma_x * radius if gamma_x == gamma_y else -np.hypot(gamma_x * fx, gamma_y * fy))
     response = np.asarray(optics * np.sinc(fx) * np.sinc(fy))
     return response * gaussian_response(radius, antialias_sigma_px) if antialias_sigma_px else response
-
-
-def _whole_response(
-    fx: NDArray[np.float64], fy: NDArray[np.float64], response: Response, antialias_sigma_px: float
-) -> NDArray[np.inexact]:
-    if antialias_sigma_px:
-        expected, got = "none beside a whole response", f"one of {antialias_sigma_px:g} px beside the {response}"
-        raise OptionError("anti-alias filter", expected=expected, got=got, remedy="leave it out: it is part of that")
-    return np.asarray(response.at(fx, fy))
 
 
 def gaussian_response(frequency: ArrayLike, sigma_px: float) -> NDArray[np.float64]:
@@ -91,20 +82,13 @@ def smear_response(fy: ArrayLike, length_px: float) -> NDArray[np.float64]:
 
 def sensor_mtf(fx: ArrayLike, fy: ArrayLike, sensor: Instrument) -> NDArray[np.inexact]:
     """What a sensor's blur and smear leave of each frequency, fx (1, W) and fy (H, 1) as in `mtf`: (H, W)."""
-    antialias_sigma_px, smear_px = _filter_and_smear(sensor)
-    found = mtf(fx, fy, sensor.blur, antialias_sigma_px)
-    return found * smear_response(fy, smear_px) if smear_px else found
-
-
-def _filter_and_smear(sensor: Instrument) -> tuple[float, float]:
-    antialias, smear = sensor.effects.get("antialias"), sensor.effects.get("smear")
-    sigma_px = antialias.sigma_px if isinstance(antialias, AntiAlias) else 0.0
-    return sigma_px, smear.length_px if isinstance(smear, Smear) else 0.0
+    found = mtf(fx, fy, sensor.blur, sensor.antialias_px)
+    return found * smear_response(fy, sensor.smear_px) if sensor.smear_px else found
 
 
 def sensor_transfer(height: int, width: int, oversampling: int, sensor: Instrument) -> NDArray[np.inexact]:
     """All the linear, shift-invariant effects of a sensor as one transfer function (H, W // 2 + 1)."""
-    return transfer_function(height, width, oversampling, sensor.blur, *_filter_and_smear(sensor))
+    return transfer_function(height, width, oversampling, sensor.blur, sensor.antialias_px, sensor.smear_px)
 
 
 @lru_cache(maxsize=64)

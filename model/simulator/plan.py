@@ -21,7 +21,6 @@ from beers_deploy.model.simulator.detector import DN_EFFECTS, NOISE_LIMIT, PATTE
 from beers_deploy.model.simulator.mtf import Blur, smear_response, transfer_function
 from beers_deploy.profiles.effects import (
     TABLES,
-    AntiAlias,
     Defects,
     Dsnu,
     Effect,
@@ -29,7 +28,6 @@ from beers_deploy.profiles.effects import (
     Haze,
     Offset,
     Prnu,
-    Smear,
     Striping,
 )
 from beers_deploy.profiles.sensor import Instrument, mtf_limit
@@ -62,14 +60,11 @@ def ringing_of(sensor: Instrument, stats: SceneStats) -> float:
     MTF is rounded up to the next whole percent, and sensors share what was computed once. Of two axes rounded each by
     itself that would not hold, nor of a table or a point-spread function: they are taken as they are.
     """
-    antialias = sensor.effects.get("antialias")
-    sigma_px = antialias.sigma_px if isinstance(antialias, AntiAlias) else 0.0
-    size = stats.height, stats.width, stats.oversampling
     across, along = sensor.mtf_axes
-    if sensor.response is not None or across != along:
-        return _kernel_sum(*size, sensor.blur, sigma_px)
-    rounded = min(math.ceil(across * 100) / 100, mtf_limit(sigma_px))
-    return _kernel_sum(*size, max(rounded, across), sigma_px)
+    blur: Blur = sensor.blur
+    if sensor.response is None and across == along:
+        blur = max(min(math.ceil(across * 100) / 100, mtf_limit(sensor.antialias_px)), across)
+    return _kernel_sum(stats.height, stats.width, stats.oversampling, blur, sensor.antialias_px)
 
 
 @lru_cache(maxsize=256)
@@ -86,15 +81,6 @@ def smear_moments(height: int, oversampling: int, length_px: float) -> tuple[flo
     kernel[0] -= 1
     distance = np.minimum(np.arange(height), height - np.arange(height))
     return float(np.abs(kernel).sum()) / 2, float((np.abs(kernel) * distance).sum())
-
-
-def smear_bound_dn(smear: Smear, stats: SceneStats, ringing: float, gain: float) -> float:
-    """The smear's kernel less a pulse sums to 0: it sees at most half its size times the span, or steps times moment.
-
-    The blur behind it enlarges that by its ringing.
-    """
-    size, moment = smear_moments(stats.height, stats.oversampling, smear.length_px)
-    return gain * ringing * min(size * (stats.high - stats.low), moment * stats.step_along)
 
 
 def effect_bound_dn(effect: Effect, sensor: Instrument, low: float, high: float) -> float:
@@ -210,14 +196,17 @@ def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
     span = stats.high - stats.low
     middle, reach = (stats.low + stats.high) / 2, ringing * span / 2
     low, high = middle - reach, middle + reach
-    smear, total, bounds = sensor.effects.get("smear"), ringing, {}
-    if isinstance(smear, Smear):
-        direct = smear_bound_dn(smear, stats, ringing, gain)
+    total, bounds = ringing, {}
+    if "smear" in sensor.effects:
+        # The smear's kernel less a pulse sums to 0: it sees at most half its size times the span, or steps times
+        # moment; the blur behind it enlarges that by its ringing.
+        size, moment = smear_moments(stats.height, stats.oversampling, sensor.smear_px)
+        direct = gain * ringing * min(size * span, moment * stats.step_along)
         bounds["smear"] = behind("smear", direct, sensor)
         # The smear widens the range that every later effect may meet, whether it is applied or left out.
         low, high = low - direct / gain, high + direct / gain
         # Its kernel is a unit pulse and all that differs from it.
-        total *= 1 + 2 * smear_moments(stats.height, stats.oversampling, smear.length_px)[0]
+        total *= 1 + 2 * size
     # The blurred pixel and the plain mean of its scene pixels lie in one range: they differ by its width at most.
     bounds["mtf"] = behind("mtf", gain * (1 + total) / 2 * span, sensor)
     for name in RADIANCE_EFFECTS:

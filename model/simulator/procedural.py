@@ -29,11 +29,7 @@ SHADOW, ASPHALT, GRASS, SOIL, CONCRETE, WHITE, WATER = 12.0, 30.0, 45.0, 75.0, 1
 
 
 def procedural_scene(height_px: int, width_px: int, generator: np.random.Generator) -> Scene:
-    """Draw a scene of that many pixels, a 10 cm world: a car is some 40 pixels long.
-
-    Returns:
-        A scene of (H, W) radiance; the same for the same generator state.
-    """
+    """Draw a scene of that many pixels, a 10 cm world: a car is some 40 pixels long."""
     canvas = Image.new("F", (width_px, height_px), GRASS)
     draw = ImageDraw.Draw(canvas)
     _fields(draw, canvas.size, generator)

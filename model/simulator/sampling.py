@@ -67,9 +67,6 @@ def resample(radiance: np.ndarray, height: int, width: int) -> np.ndarray:
     grid lies at (n + 1/2) H / height - 1/2 of the old: the ground does not shift. The borders wrap.
 
     Not scikit-image's `resize`: its splines blur and alias, on a photograph by 26 of 255 and more (measured).
-
-    Returns:
-        (height, width) float32, in the unit of the scene.
     """
     old_height, old_width = radiance.shape[-2:]
     fy, fx = np.fft.fftfreq(old_height), np.fft.rfftfreq(old_width)

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 from torch import Tensor
 
-from beers_deploy.model.bank import restoring_gain
-from beers_deploy.model.simulator.mtf import NYQUIST, Blur, mtf
+from beers_deploy.model.bank import cut_filter, restoring_gain
+from beers_deploy.model.simulator.mtf import Blur, mtf
 from beers_deploy.model.traditional.rows import Rows, fill_with_local_means, map_tiles, mirrored
 from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.response import NYQUIST
 
 EPSILON_PER_PERCENT = 3.3e-3
 """Regularisation at Nyquist per per cent of noise at the brighter radiance that a profile states (100 W/m2/sr/um in
@@ -68,30 +69,22 @@ def _block(rows: Tensor, kernel: Tensor, left: int) -> Tensor:
     return (filtered[inside] + mean).where(known[core], torch.nan)
 
 
-def compensation_kernel(blur_from: Blur, blur_to: Blur, epsilon: float, radius_px: int = RADIUS_PX) -> Tensor:
-    """The filter whose gain is `compensation_gain`, cut at `radius_px`: (2 R + 1, 2 R + 1) float64, of sum 1.
+def compensation_kernel(blur_from: Blur, blur_to: Blur, epsilon: float) -> Tensor:
+    """The filter whose gain is `compensation_gain`, cut at RADIUS_PX: (2 R + 1, 2 R + 1) float64, of sum 1.
 
-    The weight that is cut off comes back as a smooth hill over the whole filter. So the gain is exact at DC, and
-    away from it by more than some cycles per 2 R pixels; dividing by the sum would raise every other frequency.
+    The gain is exact at DC, and away from it by more than some cycles per 2 R pixels.
     """
     # Sampled this finely, the slow tail folds back onto the filter little.
-    side = 8 * radius_px
+    side = 8 * RADIUS_PX
     gain = compensation_gain(side, side, blur_from, blur_to, epsilon)
-    whole = np.roll(np.fft.irfft2(gain, (side, side)), (radius_px, radius_px), (0, 1))
-    kernel = torch.from_numpy(whole[: 2 * radius_px + 1, : 2 * radius_px + 1].copy())
-    window = torch.hann_window(2 * radius_px + 3, periodic=False, dtype=torch.float64)[1:-1]
-    # Smooth, so that what it adds lies at frequencies near 0 alone.
-    hill = window[:, None] * window
-    kernel += (1 - kernel.sum()) * hill / hill.sum()
-    return kernel
+    return torch.from_numpy(cut_filter(np.fft.irfft2(gain, (side, side)), RADIUS_PX, total=1))
 
 
 def compensation_gain(height: int, width: int, blur_from: Blur, blur_to: Blur, epsilon: float) -> NDArray[np.inexact]:
     """G = T H* / (|H|^2 + epsilon r^2) on the half spectrum, (height, width // 2 + 1) float64.
 
     Complex128 where H or T is that of a point-spread function, H* its conjugate. H is the MTF to undo, T the one to
-    reach, r = |f| / f_Nyquist. Weighted by r^2, epsilon leaves G(0) at exactly 1; a constant epsilon would scale the
-    image by 1 / (1 + epsilon). Limits: epsilon = 0 gives T / H, with up to 20 times the noise at the corner of the
+    reach, r = |f| / f_Nyquist. Limits: epsilon = 0 gives T / H, with up to 20 times the noise at the corner of the
     spectrum for 3 to 25 %; a large epsilon blurs.
 
     Args:

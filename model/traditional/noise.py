@@ -8,15 +8,15 @@ from torch import Tensor
 
 from beers_deploy.profiles.sensor import Instrument
 
+LAG_PX = 6
+"""The largest between two pixels of a patch, whose side is 7 at most."""
+
 
 @dataclass(frozen=True)
 class Noise:
-    """Stationary Gaussian noise on an image.
+    """Stationary Gaussian noise on an image: a pixel's standard deviation, and the correlation of two; None if white.
 
-    Attributes:
-        sigma: standard deviation of a pixel, 0 or more.
-        correlation: (2 L + 1, 2 L + 1) correlation of two pixels by their lag (dy + L, dx + L), 1 in the middle,
-            L at least a patch's side less one; None for white noise.
+    The latter by their lag (dy + L, dx + L), (2 L + 1, 2 L + 1), L at least a patch's side less one.
     """
 
     sigma: float
@@ -32,16 +32,16 @@ class Noise:
         return self.correlation.double()[dy, dx] * self.sigma**2
 
 
-def coloured_by(kernel: Tensor, sigma: float, most_lag_px: int = 6) -> Noise:
+def coloured_by(kernel: Tensor, sigma: float) -> Noise:
     """Noise that filtering by `kernel` (K, K), K odd, makes of white noise of standard deviation `sigma`.
 
     The autocorrelation of the kernel: r(d) = sum over p of k(p) k(p + d), sigma times the root of r(0).
     """
-    size = kernel.shape[-1] + 2 * most_lag_px  # no lag wraps around
+    size = kernel.shape[-1] + 2 * LAG_PX  # no lag wraps around
     power = torch.fft.rfft2(kernel.double(), s=(size, size)).abs().square()
-    full = torch.fft.irfft2(power, s=(size, size)).roll((most_lag_px, most_lag_px), (0, 1))
-    autocorrelation = full[: 2 * most_lag_px + 1, : 2 * most_lag_px + 1]
-    energy = autocorrelation[most_lag_px, most_lag_px]
+    full = torch.fft.irfft2(power, s=(size, size)).roll((LAG_PX, LAG_PX), (0, 1))
+    autocorrelation = full[: 2 * LAG_PX + 1, : 2 * LAG_PX + 1]
+    energy = autocorrelation[LAG_PX, LAG_PX]
     return Noise(sigma * float(energy.sqrt()), autocorrelation / energy)
 
 
@@ -50,11 +50,8 @@ def stabilise(radiance: Tensor, sensor: Instrument) -> Tensor:
 
     Written without the difference, that vanishes in float32 for small alpha. f is monotone, with f' = 1 / sigma(L).
     Limits: alpha = 0 gives L / sqrt(beta); beta = 0 gives 2 sqrt(L / alpha); below L = 0 the noise is that of the
-    dark, and f goes on as L / sqrt(beta) (as 0 where beta = 0).
-
-    Args:
-        radiance: any shape, W/m2/sr/um.
-        sensor: the instrument, alpha and beta at least 0 and not both 0.
+    dark, and f goes on as L / sqrt(beta) (as 0 where beta = 0). L has any shape and is in W/m2/sr/um; alpha and beta
+    are at least 0 and not both 0.
     """
     dark = math.sqrt(sensor.beta)
     denominator = (sensor.alpha * radiance.clamp(min=0) + sensor.beta).sqrt() + dark

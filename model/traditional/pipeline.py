@@ -32,13 +32,8 @@ Order = Literal["denoise-first", "deconvolve-first"]
 class Chain:
     """How to restore what `degraded` acquired to what `reference` would have, without its noise.
 
-    Attributes:
-        degraded: the sensor that acquired the image.
-        reference: the sensor to imitate; of its noise nothing is imitated.
-        quality: "fast", "standard" or "best" (see `nl_bayes.QUALITIES`).
-        order: see above.
-        epsilon: regularisation of the MTF compensation; None lets the noise of
-            `degraded` at the brighter stated radiance decide.
+    `quality` is one of `nl_bayes.QUALITIES`. Without an `epsilon`, the regularisation of the MTF compensation, the
+    noise of `degraded` at the brighter stated radiance decides.
     """
 
     degraded: Instrument
@@ -56,10 +51,9 @@ class Chain:
 
 
 def restore_traditional(dn: Tensor, chain: Chain) -> Tensor:
-    """Restore (H, W) float32 digital numbers of the degraded sensor; NaN marks missing pixels, and stays.
+    """Digital numbers (H, W) float32 of the degraded sensor to those of the reference, clipped and not rounded.
 
-    Returns:
-        (H, W) float32 digital numbers of the reference sensor, clipped to 0..max_dn, not rounded.
+    NaN marks missing pixels, and stays.
     """
     return torch.cat(list(restore_strips([dn], dn.shape[0], chain)))
 

@@ -2,7 +2,8 @@
 
 - `patches` simulates pairs on the fly or takes stored ones; both are keyed by (seed, step), so any batch can be made
   again;
-- `losses` holds the terms, `validation` judges on sites held out;
+- `losses` holds the terms;
 - `trainer` runs the steps, on one process or several; `checkpoint` keeps them with the recipe, and holds what stops a
-  run gone wrong; `run` is a whole run from options to a folder.
+  run gone wrong; `run` is a whole run from options to a folder, judged on
+  sites held out.
 """

@@ -104,10 +104,7 @@ class Guards:
 def require_finite_output(network: Network, where: str, remedy: str = "lower the learning rate") -> None:
     """Refuse a network that makes NaN or infinity of an image in [0, 1]: its weights may be finite all the same.
 
-    Args:
-        network: on the CPU; a conditioned one is told the middle of every range.
-        where: what to name in the message.
-        remedy: what to do about it.
+    It lies on the CPU; a conditioned one is told the middle of every range.
     """
     side_px = network.variant.scale * TEST_PLACES
     image = torch.rand((1, 1, side_px, side_px), generator=torch.Generator().manual_seed(0))

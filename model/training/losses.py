@@ -2,8 +2,7 @@
 
 Besides, an L2 term for who wants the highest PSNR, which is a mean of squares: L1 forgives the strongest edges; and a
 PSNR term, its mean over the patches, in which a sharp and quiet sensor's small errors count as much as a blurred and
-noisy one's large ones (as in NAFNet, Chen et al., ECCV 2022). And a radiance term, the distance of the patches'
-means: L1 aims at medians, and the skewed errors of a blind network then leave the mean off.
+noisy one's large ones (as in NAFNet, Chen et al., ECCV 2022).
 
 LPIPS needs weights that are not shipped; without them the loss is L1 + FFT-L1, and the recipe says so.
 """
@@ -27,32 +26,18 @@ class LossWeights:
     fft: float = 0.1
     psnr: float = 0.0
 
-    def total(self, perceptual: bool = True) -> float:
-        """The sum of the weights, that of LPIPS only where it is computed."""
-        return self.l1 + self.fft + self.psnr + (self.lpips if perceptual else 0.0)
-
 
 PAPER = LossWeights()
 
 
 class RestorationLoss:
-    """The weighted sum of the terms, in float32 whatever the autocast around it.
-
-    Args:
-        weights: of the terms.
-        perceptual: LPIPS on the device of the images; None leaves the term out.
-    """
+    """The weighted sum of the terms, in float32 whatever the autocast around it; that of LPIPS where it is given."""
 
     def __init__(self, weights: LossWeights = PAPER, perceptual: Lpips | None = None) -> None:
         self.weights, self.perceptual = weights, perceptual if weights.lpips else None
 
     def __call__(self, restored: Tensor, reference: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """The loss, and its terms before weighting.
-
-        Args:
-            restored: (N, 1, H, W) in [0, 1] of full scale, not clipped.
-            reference: the same shape.
-        """
+        """The loss, and its terms before weighting, of images (N, 1, H, W) in [0, 1] of full scale, not clipped."""
         weights = self.weights
         # In bfloat16 the differences of nearly equal images would lose most of their digits.
         with torch.autocast(restored.device.type, enabled=False):
@@ -72,11 +57,7 @@ class RestorationLoss:
 def log_mse(restored: Tensor, reference: Tensor) -> Tensor:
     """Mean over the batch of ln(1 + mean squared error in DN^2 of 12 bits): 10 / ln 10 of it is lost PSNR in dB.
 
-    The 1 keeps it above 0, and forgives what rounding does to a patch.
-
-    Args:
-        restored: (N, 1, H, W) float32.
-        reference: the same shape.
+    Of (N, 1, H, W) float32. The 1 keeps it above 0, and forgives what rounding does to a patch.
     """
     squares = ((restored - reference) * MAX_DN).square().mean((1, 2, 3))
     distance: Tensor = torch.log1p(squares).mean()
@@ -86,12 +67,8 @@ def log_mse(restored: Tensor, reference: Tensor) -> Tensor:
 def fft_l1(restored: Tensor, reference: Tensor) -> Tensor:
     """Mean size of the difference of the spectra, orthonormal: about 1.1 times the L1, whatever the patch size.
 
-    Without that normalisation it would be 142 times the L1 at 128 pixels, and twice that at 256. The size is taken by
-    abs(), whose gradient at 0 is 0; that of sqrt(re^2 + im^2) is NaN.
-
-    Args:
-        restored: (N, 1, H, W) float32.
-        reference: the same shape.
+    Of (N, 1, H, W) float32. Without that normalisation it would be 142 times the L1 at 128 pixels, and twice that at
+    256. The size is taken by abs(), whose gradient at 0 is 0; that of sqrt(re^2 + im^2) is NaN.
     """
     size: Tensor = torch.fft.rfft2(restored - reference, norm="ortho").abs().mean()
     return size

@@ -210,16 +210,8 @@ def pair_files(folder: Path) -> list[Files]:
 class StoredPairs:
     """Endless batches of (degraded, reference) patches, (N, 1, P, P) in [0, 1]; the same for the same seed.
 
-    Attributes:
-        files: the pairs.
-        patch_px: side of a patch.
-        max_dn: the largest digital number of the sensor that made the pairs.
-        batch: patches of a batch.
-        seed: of what is drawn.
-        rank: which of the workers this is.
-        workers: how many there are.
-        quarters: whether patches may be turned by quarters: not those of a sensor whose two axes differ.
-        mirrors: whether they may be mirrored: not those of a sensor whose blur is lopsided.
+    `max_dn` is the largest digital number of the sensor that made the pairs. Patches may be turned by `quarters`
+    unless its two axes differ, and they have `mirrors` unless its blur is lopsided.
     """
 
     files: Sequence[Files]

@@ -178,7 +178,8 @@ class Trainer:
             group["lr"] = self.recipe.rate_at(self.step)
         degraded = degraded.to(self.device, memory_format=torch.channels_last)
         known = (vector.to(self.device) for vector in vectors)
-        total, terms = self._loss(degraded, reference.to(self.device), *known)
+        restored = self.forward(degraded, *known, bfloat16=self.bfloat16)
+        total, terms = self.loss(restored, reference.to(self.device))
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.gradient_norm)
@@ -192,9 +193,6 @@ class Trainer:
         self._average()
         self.guards.passed(self.step, float(total.detach()))
         return terms
-
-    def _loss(self, degraded: Tensor, reference: Tensor, *vectors: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-        return self.loss(self.forward(degraded, *vectors, bfloat16=self.bfloat16), reference)
 
     def _average(self) -> None:
         # Early on the average follows fast, or the first random weights would stay in it for long.
@@ -236,8 +234,9 @@ class Trainer:
 
 def require_loss(loss: RestorationLoss) -> None:
     """Refuse a loss that is 0 whatever the network gives: such a run learns nothing."""
-    if loss.weights.total(loss.perceptual is not None) > 0:
+    weights = loss.weights
+    if loss.perceptual is not None or weights.l1 + weights.fft + weights.psnr > 0:
         return
-    left_out = ", and none but LPIPS, which lacks its weights" if loss.weights.lpips else ""
+    left_out = ", and none but LPIPS, which lacks its weights" if weights.lpips else ""
     remedy = "raise one of `l1_weight`, `fft_weight`, `psnr_weight`"
     raise OptionError("loss", expected="a term of weight above 0", got=f"weights of 0{left_out}", remedy=remedy)

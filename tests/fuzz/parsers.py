@@ -26,7 +26,7 @@ from beers_deploy.model.metrics.perceptual import read_tensors
 from beers_deploy.model.training.run import Log
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.figures import Check, Row, measured, predicted, unavailable
-from beers_deploy.profiles.response_file import read_response
+from beers_deploy.profiles.response import read_response
 from beers_deploy.profiles.scene_call import load_scene_call
 from beers_deploy.quant.gate import read_limits
 from beers_deploy.restoration.output import Checkpoint, part_folder

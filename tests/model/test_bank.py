@@ -14,16 +14,17 @@ from beers_deploy.model.bank import (
     FILTERS,
     SIDE_PX,
     UNIT,
-    bank_of,
     bank_of_vector,
     in_places,
+    network_bank,
 )
-from beers_deploy.model.family import noise_over_full_scale, sensor_vector
+from beers_deploy.model.family import RANGES, noise_over_full_scale, sensor_vector
 from beers_deploy.model.traditional.compensate import compensation_kernel
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import Smear
+from beers_deploy.profiles.response import unpacked
 from beers_deploy.profiles.sensor import Instrument
-from tests.model.simulator.stages import point_spread, with_response
+from tests.model.simulator.stages import lopsided_point, point_spread, with_response
 
 REFERENCE = load_sensor("pleiades-reference").nominal()
 NOMINAL = load_sensor("pleiades-degraded").nominal()
@@ -35,16 +36,10 @@ def sensor(across: float, along: float, snr: float = 110.0) -> Instrument:
     return replace(NOMINAL, mtf_nyquist=across, mtf_nyquist_along=along, alpha=0.0, beta=(100 / snr) ** 2)
 
 
-def lopsided() -> np.ndarray:
-    """A hill with a second one to its lower right, 17 rows by 19 columns, two samples to a pixel."""
-    y, x = np.mgrid[-8:9, -9:10] / 2
-    return np.asarray(np.exp(-(x**2 + y**2)) + 0.4 * np.exp(-((x - 1.2) ** 2 + (y - 0.7) ** 2)))
-
-
 @settings(max_examples=40)
 @given(CONTRAST, CONTRAST, st.floats(35, 220))
 def test_details_have_sum_0_and_noise_makes_planes_of_one_size(across: float, along: float, snr: float) -> None:
-    bank = bank_of(sensor(across, along, snr), REFERENCE)
+    bank = network_bank(sensor(across, along, snr))
     assert bank.details.shape == (FILTERS, SIDE_PX, SIDE_PX)
     assert np.abs(bank.details.sum((1, 2))).max() < 1e-12  # so every restoration, and the image beside it, is 1 at DC
     noise = bank.sigma * np.sqrt(np.square(bank.planes).sum((1, 2)))
@@ -57,21 +52,21 @@ def test_details_have_sum_0_and_noise_makes_planes_of_one_size(across: float, al
 def test_a_sensor_whose_axes_change_places_has_its_kernels_transposed(
     across: float, along: float, snr: float
 ) -> None:
-    upright, turned = (bank_of(sensor(*axes, snr), REFERENCE) for axes in ((across, along), (along, across)))
+    upright, turned = (network_bank(sensor(*axes, snr)) for axes in ((across, along), (along, across)))
     np.testing.assert_allclose(turned.details.transpose(0, 2, 1), upright.details, atol=1e-12)
     assert turned.unit == pytest.approx(upright.unit)
 
 
 def test_a_lopsided_point_spread_transposed_has_its_kernels_transposed() -> None:
-    upright, turned = (
-        bank_of(with_response(NOMINAL, point_spread(values, 2)), REFERENCE) for values in (lopsided(), lopsided().T)
-    )
+    point = lopsided_point()
+    other = point_spread(unpacked(point).T, point.samples_per_px)
+    upright, turned = (network_bank(with_response(NOMINAL, each)) for each in (point, other))
     np.testing.assert_allclose(turned.details.transpose(0, 2, 1), upright.details, atol=1e-6)
     assert np.abs(upright.details - upright.details[:, ::-1, ::-1]).max() > 0.01  # it does lean
 
 
 def test_smear_is_undone_along_the_track_alone() -> None:
-    plain, smeared = (bank_of(each, REFERENCE) for each in (NOMINAL, replace(NOMINAL, effects={"smear": Smear(0.9)})))
+    plain, smeared = (network_bank(each) for each in (NOMINAL, replace(NOMINAL, effects={"smear": Smear(0.9)})))
     down, across = (np.abs(smeared.analytic.sum(axis) - plain.analytic.sum(axis)).max() for axis in (1, 0))
     assert down > 10 * across
 
@@ -83,26 +78,25 @@ def test_the_analytic_restoration_is_that_of_the_traditional_chain_cut_small(con
     middle, radius = len(whole) // 2, SIDE_PX // 2
     near = whole[middle - radius : middle + radius + 1, middle - radius : middle + radius + 1].copy()
     near[radius, radius] -= 1
-    lost = np.square(bank_of(made, REFERENCE).analytic - near).sum() / np.square(near).sum()
+    lost = np.square(network_bank(made).analytic - near).sum() / np.square(near).sum()
     assert lost < 0.015
 
 
-def test_without_noise_but_that_of_rounding_it_stays_finite() -> None:
-    silent = bank_of(replace(NOMINAL, alpha=0.0, beta=0.0), REFERENCE)
-    assert silent.sigma == pytest.approx(1 / (12**0.5 * 4095))
-    assert np.isfinite(silent.planes).all()
+@pytest.mark.parametrize(("alpha", "end"), [(0.0, 0), (1.0, 1)])
+def test_noise_beyond_what_was_trained_counts_as_the_nearest_end_of_it(alpha: float, end: int) -> None:
+    assert network_bank(replace(NOMINAL, alpha=alpha, beta=0.0)).sigma == RANGES["sigma_bright"][end]
 
 
 def test_more_noise_asks_for_less_sharpening() -> None:
     row = np.tile([-1.0, 1.0], 4)[:SIDE_PX][None].repeat(SIDE_PX, 0)  # Nyquist across, -1 in the middle
-    gains = [abs((bank_of(sensor(0.07, 0.07, snr), REFERENCE).analytic * row).sum()) for snr in (220, 110, 35)]
+    gains = [abs((network_bank(sensor(0.07, 0.07, snr)).analytic * row).sum()) for snr in (220, 110, 35)]
     assert gains == sorted(gains, reverse=True)
     assert gains[0] > 2 * gains[2]
 
 
 @pytest.mark.parametrize("scale", [1, 2, 3])
 def test_in_places_of_pixels_the_filters_give_the_same(scale: int) -> None:
-    kernels = bank_of(sensor(0.08, 0.05), REFERENCE).kernels
+    kernels = network_bank(sensor(0.08, 0.05)).kernels
     image = torch.rand(1, 1, 10 * scale, 12 * scale, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     places = torch.from_numpy(in_places(kernels, scale))
     around = places.shape[-1] // 2
@@ -116,6 +110,6 @@ def test_in_places_of_pixels_the_filters_give_the_same(scale: int) -> None:
 @given(CONTRAST, CONTRAST, st.floats(36, 219))
 def test_a_sensor_vector_tells_the_bank_of_its_sensor(across: float, along: float, snr: float) -> None:
     made = sensor(across, along, snr)
-    told, own = bank_of_vector(sensor_vector(made).values), bank_of(made, REFERENCE)
+    told, own = bank_of_vector(sensor_vector(made).values), network_bank(made)
     assert told.sigma == pytest.approx(own.sigma)
     np.testing.assert_allclose(told.details, own.details, atol=1e-9)

@@ -44,14 +44,13 @@ def test_what_is_found_writable_can_be_written_and_the_asking_leaves_nothing(bel
     assert (tmp_path / below).read_text(encoding="utf-8") == "text"
 
 
-def test_a_folder_is_no_file_to_write(tmp_path: Path) -> None:
+def test_a_folder_is_no_file_to_write_and_a_relative_path_lies_where_the_run_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(MachineError, match="a folder"):
         require_writable(tmp_path)
     require_writable(None)
-
-
-def test_a_relative_path_is_looked_for_where_the_run_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
     require_writable(Path("new/out"))
     assert list(tmp_path.iterdir()) == []
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from beers_deploy.model.io.images import UNIT_MAX, Extent, extent_of, settled_scale
-from beers_deploy.profiles.errors import BeersError, ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.sensor import MAX_DN
 
 
@@ -39,22 +39,21 @@ def test_black_says_nothing() -> None:
     assert settled("float32") == settled("float32", 0.0, 0.0) == MAX_DN
 
 
-@pytest.mark.parametrize(("kind", "asked"), [("uint8", 255), ("float32", 1.0), ("float32", 4095), ("uint16", 1023)])
+@pytest.mark.parametrize(("kind", "asked"), [("uint8", 255), ("float32", 0.5), ("float32", 4095), ("uint16", 1023)])
 def test_what_was_asked_for_settles_it(kind: str, asked: float) -> None:
     assert settled(kind, 0.7, asked=asked) == asked
 
 
-@pytest.mark.parametrize("asked", [0, -1, float("nan"), float("inf")])
-@pytest.mark.parametrize("kind", ["uint16", "float32"])
-def test_no_image_has_such_a_full_scale(kind: str, asked: float) -> None:
-    with pytest.raises(OptionError, match="full_scale"):
-        settled(kind, 1000, asked=asked)
+IMPOSSIBLE = (0, -1, float("nan"), float("inf"))
 
 
-def test_integers_have_a_whole_full_scale() -> None:
-    with pytest.raises(OptionError, match="whole number"):
-        settled("uint8", 200, asked=0.5)
-    assert settled("float32", 0.2, asked=0.5) == 0.5
+@pytest.mark.parametrize(
+    ("kind", "words", "asked"), [("uint16", "whole number", (*IMPOSSIBLE, 0.5)), ("float32", "above 0", IMPOSSIBLE)]
+)
+def test_no_image_has_such_a_full_scale(kind: str, words: str, asked: tuple[float, ...]) -> None:
+    for full_scale in asked:
+        with pytest.raises(OptionError, match=f"full_scale.*{words}"):
+            settled(kind, 1000, asked=full_scale)
 
 
 def test_no_more_is_looked_at_than_decides() -> None:
@@ -82,5 +81,5 @@ def test_floats_that_may_be_radiances_leave_it_open() -> None:
 
 
 def test_who_has_no_such_option_says_what_else_to_do() -> None:
-    with pytest.raises(BeersError, match=r"; rescale it\.$"):
+    with pytest.raises(ImageError, match=r"; rescale it\.$"):
         settled_scale("x", np.dtype("uint8"), (), remedy="rescale it")

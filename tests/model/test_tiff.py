@@ -4,7 +4,8 @@ import struct
 import subprocess
 import tracemalloc
 import zlib
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -36,16 +37,22 @@ def tiff(path: Path, data: bytes, **changed: int) -> Path:
     return path
 
 
-def refused(path: Path, error: type[BeersError], word: str) -> None:
-    """By both readers, in a sentence and without memory."""
+@contextmanager
+def little_memory() -> Iterator[None]:
     tracemalloc.start()
     try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < 10e6
+    finally:
+        tracemalloc.stop()
+
+
+def refused(path: Path, error: type[BeersError], word: str) -> None:
+    """By both readers, in a sentence and without memory."""
+    with little_memory():
         for read in (read_pixels, rows):
             with pytest.raises(error, match=word):
                 read(path)
-        assert tracemalloc.get_traced_memory()[1] < 16e6
-    finally:
-        tracemalloc.stop()
 
 
 def rows(path: Path) -> np.ndarray:
@@ -130,10 +137,25 @@ def test_a_chunk_stated_longer_than_the_file_takes_no_memory(tmp_path: Path) -> 
     at = content.find(b"IDAT")
     content[at - 4 : at] = struct.pack(">I", 2**31 - 1)
     path.write_bytes(content)
-    tracemalloc.start()
-    try:
-        with suppress(ImageError):
-            read_pixels(path)
-        assert tracemalloc.get_traced_memory()[1] < 16e6
-    finally:
-        tracemalloc.stop()
+    with little_memory(), suppress(ImageError):
+        read_pixels(path)
+
+
+@pytest.mark.parametrize("side", [2_000_000, 2**31 - 1])
+def test_a_gigantic_png_header_allocates_nothing(side: int, tmp_path: Path) -> None:
+    """A small file whose header claims another size."""
+    path, header = tmp_path / "huge.png", struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
+    Image.fromarray(GREY).save(path)
+    content = bytearray(path.read_bytes())
+    content[16:33] = header + struct.pack(">I", zlib.crc32(b"IHDR" + header))
+    path.write_bytes(content)
+    with little_memory(), pytest.raises(MachineError, match="free memory"):
+        read_pixels(path)
+
+
+@pytest.mark.parametrize("side", [2_000_000, 2**31, 2**32 - 1])
+def test_a_gigantic_tiff_header_allocates_nothing(side: int, tmp_path: Path) -> None:
+    """The last two: the number of pixels does not fit 63 bits, or only just."""
+    path = tiff(tmp_path / "huge.tif", bytes(4), width=side, height=side, rows=side, bits=16)
+    with little_memory(), pytest.raises(MachineError, match="free memory"):
+        read_pixels(path)

@@ -27,10 +27,6 @@ def refusal(path: Path) -> ProfileError:
     return error
 
 
-def test_the_file_that_is_edited_here_is_sound(tmp_path: Path) -> None:
-    assert load_sensor(str(own_sensor(tmp_path))).mtf_nyquist.value == 0.07
-
-
 @pytest.mark.parametrize(("table", "key"), KEYS)
 def test_a_missing_key_is_named_with_its_table(table: str, key: str, tmp_path: Path) -> None:
     kept = [line for line in SHIPPED.splitlines() if not line.startswith(f"{key} =")]

@@ -125,12 +125,6 @@ def test_bounds_are_where_a_coefficient_changes_sign(snr_1: float, share: float)
     assert noise_from_snr(25, high * 1.01, 100, snr_1)[1] < 0
 
 
-def test_the_noise_of_the_paper() -> None:
-    alpha, beta = noise_from_snr(25, 50, 100, 110)
-    assert alpha == pytest.approx(0.007686, abs=1e-6)
-    assert beta == pytest.approx(0.0579, abs=1e-4)
-
-
 def with_table(folder: Path, table: str) -> Path:
     text = (HERE / "sensors" / "pleiades-reference.toml").read_text(encoding="utf-8")
     return own_sensor(folder, text=f"{text}\n{table}")
@@ -157,3 +151,12 @@ def test_a_table_calls_for_its_effect(tmp_path: Path) -> None:
 def test_a_wrong_effect_gets_one_sentence(table: str, words: tuple[str, ...], tmp_path: Path) -> None:
     message = str(refusal(with_table(tmp_path, table)))
     assert all(word in message for word in words)
+
+
+def test_the_units_of_another_sensor_bring_its_offset_and_no_other_effect(tmp_path: Path) -> None:
+    own = load_sensor(str(with_table(tmp_path, "[smear]\nlength_px = 0.5\n")))
+    other = load_sensor(
+        str(with_table(tmp_path, "[smear]\nlength_px = 2\n[prnu]\nrms = 0.1\n[offset]\noffset_dn = 64"))
+    )
+    for found in (own.in_units_of(other).nominal(), own.nominal().in_units_of(other.nominal())):
+        assert (found.smear_px, found.offset_dn, set(found.effects)) == (0.5, 64, {"smear", "offset"})

@@ -66,10 +66,6 @@ def test_the_zcu104_is_the_zcu102_but_for_cores_clock_and_memory() -> None:
         assert changed == {"cores", "peak_tops"}
 
 
-def test_check_takes_the_pages_board(tmp_path: Path) -> None:
-    assert "B2304" in done("check", "--tile", "64", "--target", written(tmp_path, EXAMPLE))
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

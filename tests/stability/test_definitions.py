@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from numpy.lib.stride_tricks import sliding_window_view
 
 from beers_deploy.model.metrics.fidelity import SSIM_RADIUS_PX, SSIM_SIGMA_PX, ssim
-from beers_deploy.model.simulator.mtf import NYQUIST, mtf
+from beers_deploy.model.simulator.mtf import mtf
 from beers_deploy.model.traditional.compensate import compensation_gain
+from beers_deploy.profiles.response import NYQUIST
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings import board_model, host_model
 from beers_deploy.quant.ends import Ends

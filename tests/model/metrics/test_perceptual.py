@@ -1,5 +1,5 @@
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -39,15 +39,6 @@ def made_up(network: str) -> Weights:
         fan_in = tensor[0].numel() if name.endswith("weight") else 200
         weights[name] = (rng.standard_normal(tuple(tensor.shape)) * np.sqrt(2 / fan_in)).astype(np.float32)
     return weights
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    """Maps this small are slower on several threads, far slower on a busy machine."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Sensors and scenes for the simulator's tests, the signal before digitising, and the contrast of a slanted edge."""
+"""Sensors and scenes for the simulator's tests, and the signal before digitising."""
 
 import math
 from collections.abc import Collection
@@ -57,6 +57,11 @@ def _apply(image: np.ndarray, name: str, sensor: Instrument, draw: Draw, skip: C
     return apply_effect(image, sensor.effects[name], sensor, partial(draw.generator, f"{name}-degraded"))
 
 
+def alone(effect: Effect, image: np.ndarray, seed: int = 0) -> np.ndarray:
+    """One effect of the target grid on an image (..., H, W)."""
+    return apply_effect(image, effect, plain_sensor(), partial(Draw(seed).generator, "alone"))
+
+
 def with_response(sensor: Instrument, response: Response) -> Instrument:
     """The sensor with another blur."""
     across, along = response.at_nyquist
@@ -106,36 +111,3 @@ def blob(side: int, sigma: float) -> np.ndarray:
     x = np.arange(side) - (side - 1) / 2
     line = np.exp(-0.5 * (x / sigma) ** 2)
     return np.asarray(line[:, None] * line, np.float32)
-
-
-def centroid(image: np.ndarray) -> tuple[float, float]:
-    """(row, column) from the middle of the image, in its own pixels."""
-    image = image.astype(np.float64)
-    rows, columns = (np.arange(n) - (n - 1) / 2 for n in image.shape)
-    return float((image.sum(1) * rows).sum() / image.sum()), float((image.sum(0) * columns).sum() / image.sum())
-
-
-def slanted_edge(side: int, ratio: int, slope: float) -> tuple[np.ndarray, np.ndarray]:
-    """A scene with an edge that moves `slope` target pixels a row, and each target pixel's distance from it."""
-    x, middle = np.arange(side * ratio) + 0.5, side * ratio / 2
-    coverage = (0.5 + x - (middle + slope * (x[:, None] - middle))).clip(0, 1)  # of each scene pixel
-    pixels = (np.arange(side) + 0.5) - side / 2
-    return np.asarray(40 + 200 * coverage, np.float32), pixels - slope * pixels[:, None]
-
-
-def edge_contrast(image: np.ndarray, distance: np.ndarray, ratio: int) -> float:
-    """Contrast at Nyquist of an edge's image (160, 160), ISO 12233 in short.
-
-    Rows shifted onto one another, finely binned, differentiated, transformed.
-    """
-    bins, inner = 8, slice(40, 120)  # far from where the borders wrap
-    index = np.rint((distance[inner] + 36) * bins).astype(int).ravel()
-    wanted = (index >= 0) & (index < 72 * bins)
-    total = np.bincount(index[wanted], image[inner].ravel()[wanted], 72 * bins)
-    edge = total / np.bincount(index[wanted], minlength=72 * bins)
-    spread = np.diff(edge)
-    wave = np.exp(-2j * math.pi * 0.5 * np.arange(len(spread)) / bins)
-    measured = float(abs((spread * wave).sum()) / spread.sum())
-    steps = math.sin(math.pi * 0.5 / bins) / (math.pi * 0.5 / bins)  # of the bins' differences
-    raster = math.sin(math.pi * 0.5 / ratio) / (math.pi * 0.5 / ratio)  # of the scene's own pixels
-    return measured / (steps * raster)

@@ -1,15 +1,19 @@
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from beers_deploy.model.io.images import list_images
+from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.model.simulator.acquire import MARGIN_PX, acquire, acquire_padded, simulate_pair
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.model.simulator.sampling import scene_spectrum
+from beers_deploy.model.simulator.sampling import read_scene, scene_spectrum
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument
+from tests.model.simulator.stages import pixel_means
 
 DEGRADED, REFERENCE = (load_sensor(name).nominal() for name in ("pleiades-degraded", "pleiades-reference"))
 QUIET = Instrument(0.07, alpha=0.0, beta=0.0, gain_dn_per_radiance=10.0, bits=16)
@@ -111,3 +115,39 @@ def test_drawn_scenes_are_physical_and_repeatable() -> None:
     assert 200 < scene.radiance.max() < 1000
     assert np.array_equal(scene.radiance, procedural_scene(700, 913, np.random.default_rng(5)).radiance)
     assert not np.array_equal(scene.radiance, procedural_scene(700, 913, np.random.default_rng(6)).radiance)
+
+
+# On real images, where there are some beside the repository.
+
+
+@pytest.fixture(params=["aerial-test", "pleiades"])
+def radiance(request: pytest.FixtureRequest, shared_data: Path) -> np.ndarray:
+    """A corner of at most 700 x 610 pixels of a folder's first image."""
+    return read_scene(list_images(shared_data / request.param)[0], REFERENCE).radiance[:700, :610]
+
+
+def test_a_real_scene_is_radiance_of_a_day(radiance: np.ndarray) -> None:
+    assert radiance.dtype == np.float32
+    assert 0 <= float(radiance.min()) < float(radiance.max()) <= 400.001
+    assert 5 < float(radiance.mean()) < 300
+
+
+def test_a_real_pair_is_whole_numbers_of_the_same_ground(radiance: np.ndarray) -> None:
+    pair = simulate_pair(radiance, DEGRADED, REFERENCE, 3, Draw(0), margin_px=16)
+    ground = pixel_means(radiance, 3)[16:-16, 16:-16] * 10.2375
+    for image in (pair.degraded, pair.reference):
+        assert np.array_equal(image, np.rint(image))
+        assert 0 <= float(image.min()) <= float(image.max()) <= 4095
+        assert float(image.mean()) == pytest.approx(float(ground.mean()), rel=0.02)
+    closeness = [psnr_db(image, ground, 4095) for image in (pair.degraded, pair.reference)]
+    assert closeness[0] + 3 < closeness[1]
+
+
+def test_the_blur_takes_detail_from_a_real_scene(radiance: np.ndarray) -> None:
+    """Contrast between neighbours falls; the negative control is the pair of one sensor with itself."""
+    detail = []
+    for sensor in (DEGRADED, REFERENCE):
+        pair = simulate_pair(radiance, sensor, REFERENCE, 3, Draw(0), margin_px=16)
+        detail.append(float(np.diff(pair.degraded, axis=1).std() / np.diff(pair.reference, axis=1).std()))
+    assert detail[0] < 0.8
+    assert detail[1] == pytest.approx(1, rel=0.02)

@@ -9,15 +9,15 @@ from beers_deploy.model.simulator.acquire import prepare_scene, simulate_planned
 from beers_deploy.model.simulator.detector import (
     Draw,
     add_defects,
-    add_haze,
-    apply_dsnu,
-    apply_prnu,
-    apply_striping,
+    add_noise,
+    digitise,
+    noise_sigma,
     saturate,
+    to_radiance,
+    to_uint16,
 )
-from beers_deploy.model.simulator.mtf import gamma_from_mtf, mtf, transfer_function
+from beers_deploy.model.simulator.mtf import gamma_from_mtf
 from beers_deploy.model.simulator.plan import TOLERANCE_DN, Plan, make_plan
-from beers_deploy.model.simulator.sampling import sample, scene_spectrum
 from beers_deploy.profiles.effects import (
     AntiAlias,
     Defects,
@@ -31,6 +31,7 @@ from beers_deploy.profiles.effects import (
     Striping,
 )
 from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.sensor import Instrument
 from tests.model.simulator import stages
 
 NEUTRAL: dict[str, Effect] = {
@@ -63,39 +64,26 @@ def test_skipping_equals_applying_at_neutral_parameters_bit_for_bit(name: str) -
         assert np.array_equal(simulate_planned(prepared, neutral, draw, plan, margin_px=5), expected)
 
 
-@pytest.mark.parametrize("name", ["prnu", "dsnu", "defects", "veil"])
-def test_leaving_one_effect_out_changes_no_other_draw(name: str) -> None:
-    radiance, draw = np.full((120, 140), 80.0, np.float32), Draw(5)
-    sensor = stages.plain_sensor(dsnu=Dsnu(3.0), prnu=Prnu(0.01), defects=Defects(500, 500), veil=Haze(0.8, 10.0))
-    whole = stages.before_digitising(radiance, sensor, 2, draw, skip={name, "noise"})
-    other = stages.plain_sensor(**{k: v for k, v in sensor.effects.items() if k != name})
-    assert np.array_equal(whole, stages.before_digitising(radiance, other, 2, draw, skip={"noise"}))
-
-
 def test_the_pattern_of_a_column_is_the_same_in_every_row() -> None:
-    flat = np.full((31, 47), 50.0, np.float32)
-    for image in (
-        apply_prnu(flat, Prnu(0.02), Draw(1).generator("p")),
-        apply_dsnu(flat, Dsnu(4.0), Draw(1).generator("d")),
-    ):
+    for effect in (Prnu(0.02), Dsnu(4.0)):
+        image = stages.alone(effect, np.full((31, 47), 50.0, np.float32))
         assert (image == image[:1]).all()
         assert float(image[0].std()) > 0.3
 
 
 def test_prnu_has_its_spread_and_its_limit() -> None:
-    flat = np.full((1, 40_000), 100.0, np.float32)
-    gain = apply_prnu(flat, Prnu(0.01), Draw(0).generator("p")) / 100 - 1
+    gain = stages.alone(Prnu(0.01), np.full((1, 40_000), 100.0, np.float32)) / 100 - 1
     assert float(gain.std()) == pytest.approx(0.01, rel=0.02)
     assert np.abs(gain).max() <= 0.04 + 1e-6
 
 
 def test_stripes_alternate_and_keep_the_mean() -> None:
-    striped = apply_striping(np.full((5, 8), 100.0, np.float32), Striping(6.0))
+    striped = stages.alone(Striping(6.0), np.full((5, 8), 100.0, np.float32))
     assert striped[0].tolist() == [103.0, 97.0] * 4
 
 
 def test_haze_is_affine() -> None:
-    assert add_haze(np.array([0.0, 100.0], np.float32), Haze(0.6, 25.0)).tolist() == [25.0, 85.0]
+    assert stages.alone(Haze(0.6, 25.0), np.array([0.0, 100.0], np.float32)).tolist() == [25.0, 85.0]
 
 
 def test_below_the_well_nothing_changes_and_share_zero_is_a_clip() -> None:
@@ -124,36 +112,13 @@ def test_defects_come_at_their_rate_and_at_the_ends_of_the_range() -> None:
     assert int((dn == 700).sum()) == dn.size - dead - hot
 
 
-def test_smear_averages_along_the_track_and_nothing_across() -> None:
-    ratio, side = 4, 160
-    y = (np.arange(side) + 0.5) / ratio
-    along = np.tile((100 + 30 * np.cos(2 * math.pi * 0.1 * y)).astype(np.float32)[:, None], side)
-    for image, factor in ((along, float(np.sinc(3.0 * 0.1))), (along.T, 1.0)):
-        contrasts = []
-        for smear_px in (0.0, 3.0):
-            transfer = transfer_function(side, side, ratio, 0.2, 0.0, smear_px)
-            contrasts.append(float(sample(scene_spectrum(image), transfer, side, ratio).std()))
-        assert contrasts[1] / contrasts[0] == pytest.approx(factor, rel=1e-4)
-
-
-@pytest.mark.parametrize("sigma_px", [0.1, 0.3, 0.4])
-def test_the_anti_alias_filter_is_part_of_the_budget(sigma_px: float) -> None:
-    assert float(mtf(0.5, 0.0, 0.07, sigma_px)) == pytest.approx(0.07, rel=1e-9)
-    assert gamma_from_mtf(0.07, sigma_px) < gamma_from_mtf(0.07)
-
-
 def test_an_infeasible_budget_is_refused_with_its_numbers() -> None:
     with pytest.raises(OptionError, match=r"up to 0\.1854 behind an anti-alias filter that keeps 0\.291"):
         gamma_from_mtf(0.25, 0.5)
 
 
 def test_the_offset_lifts_every_pixel() -> None:
-    flat = np.full((20, 24), 10.0, np.float32)
-    dark, lifted = (
-        stages.before_digitising(flat, stages.plain_sensor(**e), 2, Draw(0), {"noise"})
-        for e in ({}, {"offset": Offset(64.0)})
-    )
-    np.testing.assert_allclose(lifted - dark, 64.0, rtol=1e-6)
+    assert (stages.alone(Offset(64.0), np.full((20, 24), 10.0, np.float32)) == 74.0).all()
 
 
 @pytest.mark.parametrize("name", ["dsnu", "striping", "offset"])
@@ -187,3 +152,53 @@ def test_defect_rates_of_zero_change_nothing_and_of_a_million_everything() -> No
         (Defects(0, 1e6), np.full_like(dn, 255.0)),
     ):
         assert np.array_equal(add_defects(dn, defects, 255, Draw(0).generator("x")), expected)
+
+
+SENSOR = stages.plain_sensor()
+GAIN = SENSOR.gain_dn_per_radiance
+
+
+@pytest.mark.parametrize("radiance", [2.0, 25.0, 60.0, 100.0, 300.0])
+def test_the_variance_is_alpha_l_plus_beta_and_digitising_adds_a_twelfth(radiance: float) -> None:
+    image = np.full((700, 701), radiance, np.float32)
+    noisy = add_noise(image, SENSOR, Draw(1).generator("noise"))
+    expected = SENSOR.alpha * radiance + SENSOR.beta
+    assert noisy.var(dtype=np.float64) == pytest.approx(expected, rel=0.01)
+    assert noisy.mean(dtype=np.float64) == pytest.approx(radiance, abs=4 * (expected / image.size) ** 0.5)
+    dn = digitise(noisy * GAIN, SENSOR)
+    assert dn.var(dtype=np.float64) == pytest.approx(expected * GAIN**2 + 1 / 12, rel=0.01)
+
+
+def test_snr_is_a_linear_ratio_not_decibels() -> None:
+    assert SENSOR.noise_sigma(25) == pytest.approx(0.5)
+    assert SENSOR.noise_sigma(100) == pytest.approx(0.909, abs=1e-3)
+
+
+def test_ringing_below_zero_is_harmless() -> None:
+    assert np.isfinite(noise_sigma(np.array([-50.0, 0.0], np.float32), SENSOR)).all()
+    assert float(noise_sigma(np.array(-50, np.float32), SENSOR)) == pytest.approx(SENSOR.beta**0.5)
+
+
+def test_an_impossible_hand_made_sensor_gives_no_nan() -> None:
+    sensor = Instrument(0.07, alpha=-0.01, beta=0.5, gain_dn_per_radiance=10.0, bits=12)
+    assert float(noise_sigma(np.array(300, np.float32), sensor)) == 0
+
+
+def test_clipping_comes_before_the_cast() -> None:
+    dn = digitise(np.array([[-5.0, 0.04, 399.99, 1e6]], np.float32) * GAIN, SENSOR)
+    assert dn.tolist() == [[0.0, 0.0, 4095.0, 4095.0]]
+    assert to_uint16(np.array([-1.0, 70000.0], np.float32)).tolist() == [0, 65535]
+
+
+def test_whole_numbers_survive_a_round_trip() -> None:
+    dn = np.arange(4096, dtype=np.float32)
+    np.testing.assert_array_equal(digitise(to_radiance(dn, SENSOR) * GAIN, SENSOR), dn, strict=True)
+
+
+def test_each_effect_has_its_own_draws() -> None:
+    def numbers(draw: Draw, effect: str) -> np.ndarray:
+        return draw.generator(effect).standard_normal(1000)
+
+    np.testing.assert_array_equal(numbers(Draw(3, 7), "a"), numbers(Draw(3, 7), "a"))
+    for other in (numbers(Draw(3, 7), "b"), numbers(Draw(3, 8), "a"), numbers(Draw(4, 7), "a")):
+        assert abs(np.corrcoef(numbers(Draw(3, 7), "a"), other)[0, 1]) < 0.15

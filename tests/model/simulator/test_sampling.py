@@ -1,13 +1,17 @@
+"""One fused pass computes what the effects would, one after the other, at full resolution; nothing is shifted."""
+
 import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from beers_deploy.model.simulator.mtf import transfer_function
-from beers_deploy.model.simulator.sampling import crop_divisible, sample, scene_spectrum
-from tests.model.simulator.stages import blob, centroid
+from beers_deploy.model.simulator.mtf import mtf, smear_response, transfer_function
+from beers_deploy.model.simulator.sampling import crop_divisible, resample, sample, scene_spectrum
+from beers_deploy.profiles.effects import Haze
+from beers_deploy.profiles.response import centroid
+from tests.model.simulator import stages
 
 RATIOS = list(range(1, 9))
 
@@ -16,17 +20,46 @@ def scene(height: int, width: int, seed: int = 0) -> np.ndarray:
     return 20 + 100 * np.random.default_rng(seed).random((height, width), np.float32)
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(13, 8), (13, 21), (2, 1)])
-@pytest.mark.parametrize("ratio", RATIOS)
-def test_folding_equals_blurring_then_picking(ratio: int, rows: int, columns: int) -> None:
-    height, width = rows * ratio, columns * ratio
-    radiance, transfer = scene(height, width), transfer_function(height, width, ratio, 0.25)
-    shift = (ratio - 1) / 2
-    ramps = [np.exp(2j * math.pi * f * shift) for f in (np.fft.fftfreq(height), np.fft.rfftfreq(width))]
-    blurred = np.fft.rfft2(radiance.astype(np.float64)) * transfer * ramps[0][:, None] * ramps[1]
-    expected = np.fft.irfft2(blurred, s=(height, width))[::ratio, ::ratio]
-    result = sample(scene_spectrum(radiance), transfer, width, ratio)
-    np.testing.assert_allclose(result, expected, rtol=0, atol=5e-4)
+def one_after_the_other(
+    radiance: np.ndarray, ratio: int, mtf_nyquist: float, sigma: float, smear: float
+) -> np.ndarray:
+    """Blur, then smear, then shift, each with a transform of its own in float64; then pick every r-th pixel."""
+    height, width = radiance.shape
+    fy, fx = np.fft.fftfreq(height, 1 / ratio)[:, None], np.fft.rfftfreq(width, 1 / ratio)[None]
+    shift = 2j * math.pi * (ratio - 1) / 2 / ratio
+    image = radiance.astype(np.float64)
+    for response in (
+        mtf(fx, fy, mtf_nyquist, sigma),
+        smear_response(fy, smear),
+        np.exp(shift * fy) * np.exp(shift * fx),
+    ):
+        image = np.fft.irfft2(np.fft.rfft2(image) * response, s=(height, width))
+    return image[::ratio, ::ratio]
+
+
+@settings(max_examples=40)
+@given(
+    st.integers(1, 8), st.floats(0.01, 0.3), st.floats(0, 0.3), st.floats(0, 3),
+    st.integers(2, 23), st.integers(1, 21), st.integers(0, 99),
+)  # fmt: skip
+def test_fused_equals_sequential(
+    ratio: int, mtf_nyquist: float, sigma: float, smear: float, rows: int, columns: int, seed: int
+) -> None:
+    radiance = 300 * np.random.default_rng(seed).random((rows * ratio, columns * ratio), np.float32)
+    transfer = transfer_function(*radiance.shape, ratio, mtf_nyquist, sigma, smear)
+    fused = sample(scene_spectrum(radiance), transfer, radiance.shape[1], ratio)
+    expected = one_after_the_other(radiance, ratio, mtf_nyquist, sigma, smear)
+    assert np.abs(fused - expected).max() < 5e-4
+
+
+@pytest.mark.parametrize("ratio", [1, 2, 3, 5, 8])
+def test_haze_after_sampling_equals_haze_before_the_blur(ratio: int) -> None:
+    """An affine change of the light commutes with a blur that keeps the mean: so it may wait for the small grid."""
+    haze, radiance = Haze(0.7, 15.0), 300 * np.random.default_rng(0).random((17 * ratio, 23 * ratio), np.float32)
+    transfer = transfer_function(*radiance.shape, ratio, 0.07, 0.2, 1.5)
+    fused = stages.alone(haze, sample(scene_spectrum(radiance), transfer, radiance.shape[1], ratio))
+    expected = one_after_the_other(stages.alone(haze, radiance.astype(np.float64)), ratio, 0.07, 0.2, 1.5)
+    assert np.abs(fused - expected).max() < 5e-4
 
 
 @pytest.mark.parametrize("smear", [0.0, 0.7, 2.0])
@@ -34,14 +67,14 @@ def test_folding_equals_blurring_then_picking(ratio: int, rows: int, columns: in
 def test_nothing_is_shifted(ratio: int, smear: float) -> None:
     side = 32 * ratio
     transfer = transfer_function(side, side, ratio, 0.1, 0.2, smear)
-    result = sample(scene_spectrum(blob(side, 3.0 * ratio)), transfer, side, ratio)
-    assert max(map(abs, centroid(result))) < 1e-3
+    result = sample(scene_spectrum(stages.blob(side, 3.0 * ratio)), transfer, side, ratio)
+    assert max(map(abs, centroid(result.astype(np.float64)))) < 1e-3
 
 
 @pytest.mark.parametrize("ratio", [2, 4, 6])
 def test_plain_slicing_would_shift_at_even_ratios(ratio: int) -> None:
-    sliced = blob(32 * ratio, 3.0 * ratio)[ratio // 2 :: ratio, ratio // 2 :: ratio]
-    assert abs(centroid(sliced)[0]) == pytest.approx(0.5 / ratio, rel=0.05)
+    sliced = stages.blob(32 * ratio, 3.0 * ratio)[ratio // 2 :: ratio, ratio // 2 :: ratio]
+    assert abs(centroid(sliced.astype(np.float64))[0]) == pytest.approx(0.5 / ratio, rel=0.05)
 
 
 @given(st.integers(1, 8), st.integers(3, 15), st.integers(3, 15), st.integers(0, 1000))
@@ -78,3 +111,27 @@ def test_a_stack_of_scenes_is_sampled_one_by_one() -> None:
     assert stack.shape == (3, 13, 21)
     for one, image in zip(scenes, stack, strict=True):
         np.testing.assert_allclose(sample(scene_spectrum(one), transfer, 63, 3), image, rtol=0, atol=1e-4)
+
+
+def wave(height: int, width: int, cycles: tuple[int, int]) -> np.ndarray:
+    """A plane wave over the whole scene, sampled at pixel centres."""
+    y, x = ((np.arange(n) + 0.5) / n for n in (height, width))
+    phase = 2 * math.pi * (cycles[0] * y[:, None] + cycles[1] * x) + 0.7
+    return (100 + 30 * np.cos(phase)).astype(np.float32)
+
+
+@pytest.mark.parametrize(("height", "width"), [(48, 70), (75, 90), (31, 41), (60, 84)])
+@pytest.mark.parametrize("cycles", [(0, 0), (3, 5), (11, 2), (0, 13)])
+def test_a_wave_that_both_grids_hold_is_the_same_wave(height: int, width: int, cycles: tuple[int, int]) -> None:
+    result = resample(wave(60, 84, cycles), height, width)
+    np.testing.assert_allclose(result, wave(height, width, cycles), rtol=0, atol=1e-3, strict=True)
+
+
+def test_what_the_new_grid_cannot_hold_is_cut_not_aliased() -> None:
+    result = resample(wave(60, 84, (0, 30)), 40, 40)
+    np.testing.assert_allclose(result, np.full((40, 40), 100.0, np.float32), rtol=0, atol=1e-3, strict=True)
+
+
+def test_the_mean_is_kept() -> None:
+    scene = 50 + 100 * np.random.default_rng(0).random((57, 83), np.float32)
+    assert float(resample(scene, 91, 64).mean()) == pytest.approx(float(scene.mean()), rel=1e-6)

@@ -14,7 +14,7 @@ from beers_deploy.model.traditional.compensate import (
 )
 from beers_deploy.model.traditional.rows import fill_with_local_means, mirrored
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.response import PointSpread, packed
+from tests.model.simulator.stages import lopsided_point
 from tests.model.traditional.whole import compensate
 
 EPSILON = 3e-3
@@ -37,13 +37,6 @@ def test_gain_is_one_at_dc_and_finite_everywhere(mtf_from: float, mtf_to: float,
 def test_without_regularisation_it_is_the_ratio_of_the_mtfs() -> None:
     gain = compensation_gain(26, 34, 0.07, 0.25, epsilon=0)
     assert float(gain[0, 17]) == pytest.approx(0.25 / 0.07)
-
-
-def lopsided_point() -> PointSpread:
-    """A hill with a second one beside it, whose response is complex, and nowhere 0."""
-    y, x = (np.arange(-12, 13)[:, None] / 4, np.arange(-12, 13) / 4)
-    samples = np.exp(-2 * y**2 - 2 * x**2) + 0.3 * np.exp(-2 * (y - 0.5) ** 2 - 2 * (x - 0.75) ** 2)
-    return PointSpread(25, 25, 4.0, packed(samples))
 
 
 def test_without_regularisation_a_point_spread_is_undone_whole() -> None:

@@ -33,9 +33,3 @@ def test_any_shape_comes_back_within_range(name: str, shape: tuple[int, int], pa
     assert restored.shape == shape
     assert bool(torch.isfinite(restored).all())
     assert 0 <= float(restored.min()) <= float(restored.max()) <= 4095
-
-
-@pytest.mark.parametrize("name", PEERS)
-def test_the_brightness_is_kept(name: str, pair: Seen) -> None:
-    restored = PEERS[name](pair.degraded, CHAIN)
-    assert float(restored.mean() / pair.degraded.mean()) == pytest.approx(1, abs=5e-3)

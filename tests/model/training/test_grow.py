@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, grow
+from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, N, grow
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
 from tests.model.networks import plain
@@ -22,17 +22,23 @@ LARGER += [Variant(2, 24, 2), Variant(3, 48, 2), Variant(2, 54, 3)]
 """Coarser ones too: at scale S a feature becomes S x S."""
 
 
+def image() -> torch.Tensor:
+    return torch.rand(2, 1, 18, 24, generator=torch.Generator().manual_seed(4))
+
+
+def grown(small: N, variant: Variant) -> N:
+    return grow(small, variant, torch.Generator().manual_seed(3))
+
+
 @pytest.mark.parametrize("variant", LARGER)
 def test_the_larger_network_computes_the_same(variant: Variant) -> None:
     small = network(6)
-    large = grow(small, variant, torch.Generator().manual_seed(3))
-    image = torch.rand(2, 1, 18, 24, generator=torch.Generator().manual_seed(4))
-    torch.testing.assert_close(large(image), small(image), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(grown(small, variant)(image()), small(image()), atol=1e-5, rtol=1e-5)
 
 
 def test_added_blocks_lie_between_the_others_and_can_learn() -> None:
-    large = grow(network(6), Variant(4, 6), torch.Generator().manual_seed(3))
-    large(torch.rand(1, 1, 13, 17, generator=torch.Generator().manual_seed(4))).square().sum().backward()
+    large = grown(network(6), Variant(4, 6))
+    large(image()).square().sum().backward()
     weights = dict(large.named_parameters())
     seconds = [weights[f"body.{block}.second.weight"] for block in range(4)]
     assert [bool(second.any()) for second in seconds] == [True, False, True, False]
@@ -40,9 +46,8 @@ def test_added_blocks_lie_between_the_others_and_can_learn() -> None:
 
 
 def test_the_copies_of_a_feature_learn_different_things() -> None:
-    wide = grow(network(6), Variant(2, 12), torch.Generator().manual_seed(3))
-    image = torch.rand(2, 1, 13, 17, generator=torch.Generator().manual_seed(4))
-    wide(image).abs().sum().backward()
+    wide = grown(network(6), Variant(2, 12))
+    wide(image()).abs().sum().backward()
     gradient = wide.body[0].first.weight.grad  # type: ignore[union-attr]
     assert isinstance(gradient, torch.Tensor)
     assert (gradient[:6] - gradient[6:]).abs().max() > 1e-3 * gradient.abs().max()
@@ -53,39 +58,30 @@ def test_a_network_behind_a_bank_grows_for_every_sensor(variant: Variant) -> Non
     small = BankedConvBEERS(Variant(2, 6))
     for seed, parameter in enumerate(small.parameters()):
         torch.nn.init.normal_(parameter, 0.0, 0.1, torch.Generator().manual_seed(seed))
-    large = grow(small, variant, torch.Generator().manual_seed(3))
-    image = torch.rand(1, 1, 18, 24, generator=torch.Generator().manual_seed(4))
-    for values in ([-1.0, -0.5, 0.2, 0.9], [0.7, 0.7, -1.0, -0.6]):
-        vector = torch.tensor([values])
-        torch.testing.assert_close(large(image, vector), small(image, vector), atol=1e-5, rtol=1e-5)
+    vectors = torch.tensor([[-1.0, -0.5, 0.2, 0.9], [0.7, 0.7, -1.0, -0.6]])
+    wanted = small(image(), vectors)
+    torch.testing.assert_close(grown(small, variant)(image(), vectors), wanted, atol=1e-5, rtol=1e-5)
 
 
 def test_a_coarser_network_grows_from_one_of_its_own_scale() -> None:
-    coarse = grow(network(6), Variant(2, 24, 2), torch.Generator().manual_seed(3))
-    wider = grow(coarse, Variant(3, 48, 2), torch.Generator().manual_seed(3))
-    image = torch.rand(2, 1, 18, 24, generator=torch.Generator().manual_seed(4))
-    torch.testing.assert_close(wider(image), network(6)(image), atol=1e-5, rtol=1e-5)
+    wider = grown(grown(network(6), Variant(2, 24, 2)), Variant(3, 48, 2))
+    torch.testing.assert_close(wider(image()), network(6)(image()), atol=1e-5, rtol=1e-5)
 
 
 def test_the_pixels_of_a_place_learn_different_things() -> None:
     """Else a coarser network would keep to what the finer one could have learnt."""
-    coarse = grow(network(6), Variant(2, 24, 2), torch.Generator().manual_seed(3))
-    image = torch.rand(2, 1, 18, 24, generator=torch.Generator().manual_seed(4))
-    coarse(image).abs().sum().backward()
+    coarse = grown(network(6), Variant(2, 24, 2))
+    coarse(image()).abs().sum().backward()
     weight = dict(coarse.named_parameters())["body.0.first.weight"]
     assert weight.grad is not None
     assert (weight == 0).any()
     assert weight.grad[weight == 0].any()
 
 
-def test_a_finer_network_is_refused() -> None:
-    coarse = grow(network(6), Variant(2, 24, 2), torch.Generator().manual_seed(3))
+def test_a_network_that_does_not_fit_is_refused() -> None:
+    for variant in (Variant(1, 12), Variant(2, 9), Variant(2, 3), Variant(2, 12, 2)):
+        with pytest.raises(ModelError, match="features"):
+            grown(network(6), variant)
     for variant in (Variant(2, 24), Variant(2, 96, 4)):
         with pytest.raises(ModelError, match="scale 2"):
-            grow(coarse, variant, torch.Generator().manual_seed(3))
-
-
-@pytest.mark.parametrize("variant", [Variant(1, 12), Variant(2, 9), Variant(2, 3), Variant(2, 12, 2)])
-def test_a_network_that_does_not_fit_is_refused(variant: Variant) -> None:
-    with pytest.raises(ModelError, match="features"):
-        grow(network(6), variant, torch.Generator().manual_seed(3))
+            grown(grown(network(6), Variant(2, 24, 2)), variant)

@@ -101,15 +101,11 @@ def test_a_lopsided_blur_is_neither_mirrored_nor_turned() -> None:
         assert sensor.symmetry == symmetry
 
 
-def test_patches_lie_within_full_scale() -> None:
+def test_patches_lie_within_full_scale_and_a_pair_shows_the_same_ground() -> None:
     degraded, reference = next(source().batches())
     assert degraded.shape == reference.shape == (3, 1, 32, 32)
     for image in (degraded, reference):
         assert 0 <= float(image.min()) <= float(image.max()) <= 1
-
-
-def test_the_pair_shows_the_same_ground() -> None:
-    degraded, reference = next(source().batches())
     for one, other in zip(degraded, reference, strict=True):
         assert np.corrcoef(one.ravel(), other.ravel())[0, 1] > 0.7
 
@@ -137,11 +133,12 @@ def test_two_workers_share_the_batches_of_one() -> None:
         assert all(np.array_equal(next(own)[0], batch) for batch in shards[rank])
 
 
-def stored(folder: Path, count: int = 3) -> StoredPairs:
-    for k in range(count):
-        reference = np.random.default_rng(k).integers(0, 4096, (41, 53)).astype(np.uint16)
-        write_tiff(folder / "reference" / f"p{k}.tif", reference)
-        write_tiff(folder / "degraded" / f"p{k}.tif", reference // 2)
+def stored(folder: Path, *degraded: np.ndarray) -> StoredPairs:
+    """Pairs of these images and such as are twice as bright; three of noise where none are given."""
+    noise = (np.random.default_rng(k).integers(0, 2048, (41, 53)).astype(np.uint16) for k in range(3))
+    for k, image in enumerate(degraded or noise):
+        write_tiff(folder / "degraded" / f"p{k}.tif", image)
+        write_tiff(folder / "reference" / f"p{k}.tif", 2 * image)
     return StoredPairs(pair_files(folder), 24, 4095, batch=4, seed=0)
 
 
@@ -151,7 +148,7 @@ def test_stored_pairs_are_cut_alike_and_the_same_from_anywhere(tmp_path: Path) -
     batches = [next(straight) for _ in range(4)]
     degraded, reference = batches[3]
     assert degraded.shape == reference.shape == (4, 1, 24, 24)
-    np.testing.assert_array_equal(np.rint(reference * 4095) // 2, np.rint(degraded * 4095))
+    np.testing.assert_array_equal(np.rint(reference * 4095), 2 * np.rint(degraded * 4095))
     assert np.array_equal(next(pairs.batches(first=3))[0], degraded)
     assert not np.array_equal(batches[0][0], degraded)
 
@@ -159,11 +156,8 @@ def test_stored_pairs_are_cut_alike_and_the_same_from_anywhere(tmp_path: Path) -
 @pytest.mark.parametrize("quarters", [True, False])
 def test_stored_pairs_of_two_different_axes_keep_them(quarters: bool, tmp_path: Path) -> None:
     """Rows of one brightness each stay rows, unless a patch may be turned by a quarter."""
-    rows = np.broadcast_to(np.arange(41, dtype=np.uint16)[:, None] * 90, (41, 53))
-    for role in ("degraded", "reference"):
-        write_tiff(tmp_path / role / "p.tif", np.ascontiguousarray(rows))
-    pairs = StoredPairs(pair_files(tmp_path), 24, 4095, batch=32, seed=0, quarters=quarters)
-    patches, _ = next(pairs.batches())
+    rows = np.repeat(np.arange(41, dtype=np.uint16)[:, None] * 45, 53, 1)
+    patches, _ = next(replace(stored(tmp_path, rows), batch=32, quarters=quarters).batches())
     kept = [bool((patch == patch[..., :1]).all()) for patch in patches]
     assert any(kept)
     assert all(kept) is not quarters
@@ -179,10 +173,8 @@ def test_stored_pairs_of_two_different_axes_keep_them(quarters: bool, tmp_path: 
     ],
 )
 def test_stored_pairs_of_another_scale_are_refused(pixels: np.ndarray, words: str, tmp_path: Path) -> None:
-    for role in ("degraded", "reference"):
-        write_tiff(tmp_path / role / "p.tif", pixels)
     with pytest.raises(ImageError, match=words):
-        next(StoredPairs(pair_files(tmp_path), 24, 4095, batch=1, seed=0).batches())
+        next(stored(tmp_path, pixels).batches())
 
 
 def test_stored_pairs_too_small_or_incomplete_are_refused(tmp_path: Path) -> None:
