@@ -250,15 +250,10 @@ def layer_energy_j(layer: LayerCost, dpu: Dpu) -> Interval:
     return products * product.low + moved * byte.low, products * product.high + moved * byte.high
 
 
-def image_energy_j(prediction: Prediction, dpu: Dpu) -> Interval:
-    """Least and most energy of all layers for one image."""
-    low_j, high_j = zip(*(layer_energy_j(layer, dpu) for layer in prediction.layers), strict=True)
-    return sum(low_j), sum(high_j)
-
-
 def counted_power(prediction: Prediction, dpu: Dpu) -> Figure:
     """Power of products and traffic at the predicted rate, in W; its range is that of the published figures."""
-    low, high = (energy * prediction.fps for energy in image_energy_j(prediction, dpu))
+    ends_j = zip(*(layer_energy_j(layer, dpu) for layer in prediction.layers), strict=True)
+    low, high = (sum(end_j) * prediction.fps for end_j in ends_j)
     return predicted((low + high) / 2, "W", (low, high), energy_source(dpu))
 
 

@@ -24,10 +24,8 @@ from beers_deploy.profiles.figures import Row, predicted, published
 from beers_deploy.profiles.toml import read_json
 
 EXAMPLE = 'write [{"model": "core.onnx", "configuration": "C32B3", "tile_px": 640, "fps": 9.5}]'
-RUNS, TILE_PX, FPS = 1000, (16, 1 << 16), (1e-9, 1e9)
-"""Most runs; least and most of a tile's side and of a rate."""
-POWER_W, FAR = (0.01, 1000.0), 10_000
-"""Of a board; and how many times off a rate may be predicted that is one of this network on this board."""
+RUNS, TILE_PX, FAR = 1000, (16, 1 << 16), 10_000
+"""Most runs; least and most of a tile's side; and how many times off a rate of this network may be predicted."""
 SCATTER = 3
 """Variance of networks over that of boards, of ln(predicted / published): 0.13^2 and 0.07^2."""
 KEYS = {"model", "configuration", "tile_px", "fps", "power_w"}
@@ -111,7 +109,6 @@ def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run
     if "model" not in entry or set(entry) - KEYS:
         expected = "model, configuration, tile_px, fps"
         raise OptionError(where, expected=expected, got=str(sorted(entry)), remedy=EXAMPLE)
-    fps = _number(entry.get("fps"), "fps", FPS, where)
     tile_px = _number(entry.get("tile_px", 640), "tile_px", TILE_PX, where)
     if tile_px != int(tile_px):
         raise OptionError(where, expected="tile_px in whole pixels", got=str(tile_px), remedy=EXAMPLE)
@@ -119,9 +116,7 @@ def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run
     model = path.parent / str(entry["model"])
     placement = place(read_network(model, int(tile_px)), dpu)
     prediction = predict(placement, dpu)
-    if "power_w" in entry:
-        _number(entry["power_w"], "power_w", POWER_W, where)
-    _number(fps, "fps", (prediction.fps / FAR, prediction.fps * FAR), where)
+    fps = _number(entry.get("fps"), "fps", (prediction.fps / FAR, prediction.fps * FAR), where)
     return Run(f"{model.stem}, tiles of {tile_px:g}", placement, dpu, fps, prediction)
 
 

@@ -3,9 +3,8 @@ from pathlib import Path
 import onnx
 
 from beers_deploy.dpu.board import load_dpu
-from beers_deploy.dpu.checker.operators import rule_text
 from beers_deploy.dpu.checker.placement import FLOAT_NOTE, Placement, place
-from beers_deploy.dpu.checker.table import REMARKS, remarks_on
+from beers_deploy.dpu.checker.remarks import remarks_on
 from beers_deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import IntegerSketch, Sketch, board_convbeers, float_convbeers, integer_convbeers
 
@@ -130,8 +129,3 @@ def test_subgraphs_are_counted(tmp_path: Path) -> None:
     path = sketch.save(tmp_path / "s.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
     assert remarks_on(placed(path, 32), DPU, 32)["subgraphs"].startswith("2 DPU subgraphs")
     assert "subgraphs" not in remarks_on(placed(integer_convbeers(tmp_path / "i.onnx", 1, 8), 32), DPU, 32)
-
-
-def test_remarks_read_with_the_targets_limits() -> None:
-    texts = [rule_text(remark, DPU) for remark in REMARKS]
-    assert not [text for text in texts if "{" in text or "(" not in text]
