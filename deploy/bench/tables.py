@@ -71,10 +71,6 @@ class Swath:
         rows, columns = (plan_side(side, self.tile_px, self.halo_px) for side in (self.height_px, self.width_px))
         return len(rows) * len(columns)
 
-    def work_factor(self, tiles: float) -> float:
-        """Pixels computed over pixels of the image."""
-        return tiles * self.tile_px**2 / self.pixels
-
 
 def predict_file(model: Path, dpu: Dpu, tile_px: int | None = TILE_PX, task: Task | None = None) -> Prediction:
     """What the cost model says of an ONNX file, for tiles of that side or, with None, for the size it is fixed to.
@@ -91,19 +87,16 @@ def predicted_rows(name: str, prediction: Prediction, swath: Swath, dpu: Dpu) ->
         "as the paper counts": (swath.frames, swath.frames / prediction.batch),
         f"whole tiles, halo {swath.halo_px} px": (float(swath.tiles), float(batches)),
     }
-    return [
-        _predicted_row(f"{name}, INT8 on the DPU ({prediction.configuration}), {how}", prediction, swath, dpu, *count)
-        for how, count in counts.items()
-    ]
-
-
-def _predicted_row(name: str, prediction: Prediction, swath: Swath, dpu: Dpu, frames: float, batches: float) -> Row:
-    figures = _swath_figures(prediction, swath, dpu, frames, batches) | {
+    besides = {
         "one-thread latency": one_thread_latency(prediction),
         "host beside the DPU": host_time(prediction, "ms/tile"),
         "power of products and traffic": counted_power(prediction, dpu),
     }
-    return Row(TABLE, name, figures, {"fitted range": fitted_range(prediction)})
+    words, name = {"fitted range": fitted_range(prediction)}, f"{name}, INT8 on the DPU ({prediction.configuration})"
+    return [
+        Row(TABLE, f"{name}, {how}", _swath_figures(prediction, swath, dpu, *count) | besides, words)
+        for how, count in counts.items()
+    ]
 
 
 def _swath_figures(
@@ -112,7 +105,7 @@ def _swath_figures(
     power, latency = dpu_power(dpu), swath_latency(prediction, batches)
     return {
         "tiles": exact(frames, "tile", ARITHMETIC),
-        "work factor": exact(swath.work_factor(frames), "px/px", ARITHMETIC),
+        "work factor": exact(frames * swath.tile_px**2 / swath.pixels, "px/px", ARITHMETIC),
         "latency": latency,
         "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
         "power": power,
@@ -207,7 +200,10 @@ def published_rows() -> list[Row]:
 
 def processor_row(swath: Swath, board: TargetProfile) -> Row:
     """The traditional pipeline on the board's own processor, from the time of 10^6 pixels that its file states."""
-    cpu, mpx, power = board.tables.get("cpu", {}), swath.pixels / 1e6, _processor_power(board)
+    cpu, mpx, watts = board.tables.get("cpu", {}), swath.pixels / 1e6, board.tables.get("power", {}).get("cpu_run_w")
+    power = unavailable("W", "no power of a run on this board's processor is published")
+    if watts is not None:
+        power = published(watts.low, "W", watts.source)
     constant, cores = cpu.get(CHAIN), f", {cpu['cores']} cores" if "cores" in cpu else ""
     name = f"traditional pipeline on the processor of {board.name}{cores}"
     if constant is None:
@@ -226,17 +222,8 @@ def processor_row(swath: Swath, board: TargetProfile) -> Row:
 
 def chain_rate(swath: Swath, latency: Figure) -> Figure:
     """Tiles a second, as the paper counts them, of a predicted latency of the swath."""
-    low_s, high_s = latency.interval or (0.0, 0.0)
-    rate = swath.frames / (latency.value or math.inf)
-    return predicted(rate, "frame/s", (swath.frames / high_s, swath.frames / low_s), latency.source)
-
-
-def _processor_power(board: TargetProfile) -> Figure:
-    """Of the board while its processor runs the pipeline, where it is published."""
-    constant = board.tables.get("power", {}).get("cpu_run_w")
-    if constant is None:
-        return unavailable("W", "no power of a run on this board's processor is published")
-    return published(constant.low, "W", constant.source)
+    low, high = (swath.frames / end_s for end_s in reversed(_ends(latency)))
+    return predicted(swath.frames / (latency.value or math.inf), "frame/s", (low, high), latency.source)
 
 
 def layer_rows(prediction: Prediction, dpu: Dpu) -> list[Row]:
@@ -246,21 +233,21 @@ def layer_rows(prediction: Prediction, dpu: Dpu) -> list[Row]:
     """
     rows = [_layer_row(layer, prediction, dpu) for layer in prediction.layers]
     total = f"sum: one batch of {prediction.batch}"
-    return [*rows, Row(LAYERS, total, {"time": _time(prediction.batch_time_s, prediction)})]
+    return [*rows, Row(LAYERS, total, {"time": scaled(1e3 * prediction.batch_time_s, "ms/batch", prediction)})]
 
 
 def _layer_row(layer: LayerCost, prediction: Prediction, dpu: Dpu) -> Row:
     work, batch, low_high_j = layer.work, prediction.batch, layer_energy_j(layer, dpu)
-    moved = batch * (work.load_map_bytes + work.store_map_bytes) + work.weight_bytes
+    moved = batch * work.map_bytes + work.weight_bytes
     seconds = layer.time_s or math.inf  # a concat takes no time of its own
     figures = {
         "work": exact(work.operations / 1e9, "GOP"),
-        "time": _time(layer.time_s, prediction),
-        "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction, COST_SOURCE),
+        "time": scaled(1e3 * layer.time_s, "ms/batch", prediction),
+        "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction),
         "LdFM": exact(work.load_map_bytes / 1e6, "MB", "feature maps that an image loads, by the graph's shapes"),
         "LdWB": exact(work.weight_bytes / 1e6, "MB", "weights and biases that a batch loads, by the graph's shapes"),
         "StFM": exact(work.store_map_bytes / 1e6, "MB", "feature maps that an image stores, by the graph's shapes"),
-        "bandwidth": scaled(moved / seconds / 1e9, "GB/s", prediction, COST_SOURCE),
+        "bandwidth": scaled(moved / seconds / 1e9, "GB/s", prediction),
         "array use": exact(100 * work.array_use, "%"),
         "energy": predicted(
             500 * sum(low_high_j), "mJ", (1e3 * low_high_j[0], 1e3 * low_high_j[1]), energy_source(dpu)
@@ -269,18 +256,14 @@ def _layer_row(layer: LayerCost, prediction: Prediction, dpu: Dpu) -> Row:
     return Row(LAYERS, work.name, figures, {"bound": layer.bound})
 
 
-def _time(time_s: float, prediction: Prediction) -> Figure:
-    return scaled(1e3 * time_s, "ms/batch", prediction, COST_SOURCE)
-
-
 def exact(value: float, unit: str, source: str = "arithmetic of the graph's shapes, one image") -> Figure:
     """A number that follows from shapes alone."""
     return predicted(value, unit, (value, value), source)
 
 
-def scaled(value: float, unit: str, prediction: Prediction, source: str) -> Figure:
+def scaled(value: float, unit: str, prediction: Prediction) -> Figure:
     """A part of the prediction, with the relative error of the whole."""
-    return predicted(value, unit, (value / prediction.spread, value * prediction.spread), source)
+    return predicted(value, unit, (value / prediction.spread, value * prediction.spread), COST_SOURCE)
 
 
 MOST_TILE_PX = 8192
@@ -301,9 +284,10 @@ def sweep_rows(
 def swath_row(prediction: Prediction, swath: Swath, dpu: Dpu) -> Row:
     """A swath in whole tiles on one configuration."""
     batches = math.ceil(swath.tiles / prediction.batch)
+    kept = [not layer.work.map_bytes for layer in prediction.layers]
     figures = _swath_figures(prediction, swath, dpu, swath.tiles, batches) | {
         "maps through memory": exact(prediction.streamed_bytes / 1e6, "MB/tile"),
-        "layers on chip": exact(on_chip(prediction), "%"),
+        "layers on chip": exact(100 * sum(kept) / len(kept), "%"),
     }
     bound = Counter[str]()
     for layer in prediction.layers:
@@ -366,12 +350,6 @@ def host_words(prediction: Prediction, dpu: Dpu) -> list[str]:
             "best that is published of its cores to plain code"
         )
     return found
-
-
-def on_chip(prediction: Prediction) -> float:
-    """Share of layers that neither read nor write maps in memory, in percent."""
-    kept = [not (layer.work.load_map_bytes or layer.work.store_map_bytes) for layer in prediction.layers]
-    return 100 * sum(kept) / len(kept)
 
 
 def parse_tiles(text: str) -> list[int]:

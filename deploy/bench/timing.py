@@ -36,22 +36,16 @@ def _power(before: dict[Path, int] | str, after: dict[Path, int] | str, elapsed_
 
 def _advance(domain: Path, before: int, after: int) -> int:
     """Counts between two readings of a counter that starts again at its range; one turn at most (minutes)."""
-    return (
-        after - before
-        if after >= before
-        else after - before + int((domain / "max_energy_range_uj").read_text(encoding="utf-8"))
-    )
+    range_uj = 0 if after >= before else int((domain / "max_energy_range_uj").read_text(encoding="utf-8"))
+    return after - before + range_uj
 
 
 def _read(powercap: Path) -> dict[Path, int] | str:
     """Counters of the packages in microjoules, or why there are none."""
     try:
-        domains = [
-            d
-            for d in sorted(powercap.glob("*rapl*:*"))
-            if (d / "name").read_text(encoding="utf-8").startswith("package")
-        ]
-        counters = {domain: int((domain / "energy_uj").read_text(encoding="utf-8")) for domain in domains}
+        names = {domain: (domain / "name").read_text(encoding="utf-8") for domain in powercap.glob("*rapl*:*")}
+        packages = [domain for domain, name in names.items() if name.startswith("package")]
+        counters = {domain: int((domain / "energy_uj").read_text(encoding="utf-8")) for domain in packages}
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "no number in it"
         return f"RAPL energy counters cannot be read here ({reason})"

@@ -223,16 +223,13 @@ def _results(golden: Golden, given: Path) -> Results:
         got = f"{unknown[0].parent.name}/{unknown[0].name}" if unknown else "none"
         expected, remedy = "results as CASE/LAYER.npy", f"name them as in {INDEX}"
         raise OptionError(str(given), expected=expected, got=got, remedy=remedy)
-    found = {name: sorted(path for path in paths if path.name == file) for name, file in files.items()}
-    return {
-        name: [_seen(golden, name, golden.cases[path.parent.name], path) for path in here]
-        for name, here in found.items()
-        if here
-    }
-
-
-def _seen(golden: Golden, name: str, sound: Mapping[str, np.ndarray], path: Path) -> Seen:
-    return Seen(sound, _integers(path, sound[name].shape, golden.core.frac_bits[name]))
+    found: dict[str, list[Seen]] = {}
+    for name, file in files.items():
+        for path in sorted(path for path in paths if path.name == file):
+            sound = golden.cases[path.parent.name]
+            values = _integers(path, sound[name].shape, golden.core.frac_bits[name])
+            found.setdefault(name, []).append(Seen(sound, values))
+    return found
 
 
 def _differing(name: str, cases: list[Seen]) -> list[Seen]:

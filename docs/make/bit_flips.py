@@ -3,7 +3,6 @@
 It runs what `beers-deploy stress --bit-flips` runs, on three shipped networks. A test keeps its words and rows fresh.
 """
 
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -90,4 +89,4 @@ if __name__ == "__main__":
     studies = {variant: rows_of(variant) for variant in VARIANTS}
     write_text(PAGE, document(studies))
     write_text(PICTURE, flip_curves_svg(studies))
-    sys.stdout.write(f"wrote {PAGE} and {PICTURE}\n")
+    print(f"wrote {PAGE} and {PICTURE}")

@@ -4,7 +4,6 @@ The text comes from the commands' own help, what an option takes from docs/make/
 fresh.
 """
 
-import sys
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
@@ -78,4 +77,4 @@ def _line(parameter: Any, kind: str) -> str:
 
 if __name__ == "__main__":
     TARGET.write_text(reference(), encoding="utf-8", newline="\n")
-    sys.stdout.write(f"wrote {TARGET}\n")
+    print(f"wrote {TARGET}")

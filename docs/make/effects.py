@@ -3,7 +3,6 @@
 Run `python docs/make/effects.py` after a change to the simulator.
 """
 
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -70,7 +69,7 @@ def main() -> None:
     scene = procedural_scene(1500, 1500, np.random.default_rng(0)).radiance
     text = HEAD.format(shown=shown, tolerance=make_plan(plain(), scene_stats(scene, RATIO)).tolerance_dn)
     PAGE.write_text(text + "\n".join(bounds(scene)) + "\n", encoding="utf-8", newline="\n")
-    sys.stdout.write(f"wrote {PICTURE} and {PAGE}\n")
+    print(f"wrote {PICTURE} and {PAGE}")
 
 
 def plain() -> Instrument:

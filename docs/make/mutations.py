@@ -167,9 +167,9 @@ def main() -> int:
             found[mutation.name] = failures_of(copy, mutation)
             bar.advance(note=mutation.name)
     TARGET.write_text(document(found), encoding="utf-8", newline="\n")
-    sys.stdout.write(f"wrote {TARGET}\n")
+    print(f"wrote {TARGET}")
     for name in survivors(found):
-        sys.stdout.write(f"SURVIVED: {name}\n")
+        print(f"SURVIVED: {name}")
     return 1 if survivors(found) else 0
 
 

@@ -4,7 +4,6 @@ It takes two minutes. A test keeps its lists of cases, stages and limitations fr
 machine that made it.
 """
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -93,7 +92,7 @@ def main() -> None:
     """Run the battery on the shipped pair and write the page."""
     subject = open_subject(Path(VARIANT), None)
     write_text(TARGET, document(subject, run_battery(subject)))
-    sys.stdout.write(f"wrote {TARGET}\n")
+    print(f"wrote {TARGET}")
 
 
 if __name__ == "__main__":

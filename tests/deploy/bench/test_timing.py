@@ -19,38 +19,30 @@ def counter(root: Path, energy_uj: int, name: str = "package-0") -> Path:
 
 
 @counters
-def test_power_is_energy_over_time(tmp_path: Path) -> None:
-    energy = counter(tmp_path, 200_000)
-    _, elapsed_s, power = timed(lambda: energy.write_text("700000"), tmp_path)
+@pytest.mark.parametrize(("before", "after", "joules"), [(200_000, 700_000, 0.5), (900_000, 100_000, 0.2)])
+def test_power_is_energy_over_time_also_of_a_counter_that_starts_again(
+    before: int, after: int, joules: float, tmp_path: Path
+) -> None:
+    energy = counter(tmp_path, before)
+    _, elapsed_s, power = timed(lambda: energy.write_text(str(after)), tmp_path)
     assert power.mode == "measured"
-    assert power.value == pytest.approx(0.5 / elapsed_s)
+    assert power.value == pytest.approx(joules / elapsed_s)
 
 
 @counters
-def test_a_counter_that_starts_again_goes_on(tmp_path: Path) -> None:
-    energy = counter(tmp_path, 900_000)
-    _, elapsed_s, power = timed(lambda: energy.write_text("100000"), tmp_path)
-    assert power.value == pytest.approx(0.2 / elapsed_s)
-
-
-@counters
-def test_without_counters_power_is_unavailable_with_a_reason(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "text", "reason"),
+    [("", "", "no RAPL"), ("dram", "5", "no RAPL"), ("package-0", "?", "cannot be read")],
+)
+def test_without_counters_of_the_package_power_is_unavailable_with_a_reason(
+    name: str, text: str, reason: str, tmp_path: Path
+) -> None:
+    if name:
+        counter(tmp_path, 5, name).write_text(text)
     result, elapsed_s, power = timed(lambda: 7, tmp_path)
     assert (result, power.mode, power.value) == (7, "unavailable", None)
     assert elapsed_s > 0
-    assert "no RAPL" in power.reason
-
-
-@counters
-def test_counters_of_other_domains_are_not_the_package(tmp_path: Path) -> None:
-    counter(tmp_path, 5, name="dram")
-    assert timed(lambda: None, tmp_path)[2].mode == "unavailable"
-
-
-@counters
-def test_a_counter_that_holds_no_number_is_unavailable(tmp_path: Path) -> None:
-    counter(tmp_path, 5).write_text("?")
-    assert "cannot be read" in timed(lambda: None, tmp_path)[2].reason
+    assert reason in power.reason
 
 
 def test_calls_run_round_by_round_until_there_are_enough() -> None:
