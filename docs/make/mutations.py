@@ -134,21 +134,13 @@ def read_report(text: str) -> Failures:
     )
 
 
-def survivors(found: Mapping[str, Failures]) -> list[str]:
-    """Mutations, by name, of which a named test did not fail."""
-    return [m.name for m in MUTATIONS if set(m.tests) - set(found[m.name])]
-
-
 def document(found: Mapping[str, Failures]) -> str:
     """The page as Markdown."""
-    head = "| mutation | file | tests that fail |\n|---|---|---|\n"
-    return OPENING + "\n" + head + "".join(row(mutation, found[mutation.name]) for mutation in MUTATIONS)
-
-
-def row(mutation: Mutation, found: Failures) -> str:
-    """One line of the table."""
-    tests = ", ".join(f"`{name}` ({cases})" for name, cases in found.items())
-    return f"| {described(mutation)} | {tests or 'none'} |\n"
+    lines = [OPENING, "| mutation | file | tests that fail |", "|---|---|---|"]
+    for mutation in MUTATIONS:
+        tests = ", ".join(f"`{name}` ({cases})" for name, cases in found[mutation.name].items())
+        lines.append(f"| {described(mutation)} | {tests or 'none'} |")
+    return "\n".join([*lines, ""])
 
 
 def described(mutation: Mutation) -> str:
@@ -168,9 +160,10 @@ def main() -> int:
             bar.advance(note=mutation.name)
     TARGET.write_text(document(found), encoding="utf-8", newline="\n")
     print(f"wrote {TARGET}")
-    for name in survivors(found):
+    survivors = [m.name for m in MUTATIONS if set(m.tests) - set(found[m.name])]
+    for name in survivors:
         print(f"SURVIVED: {name}")
-    return 1 if survivors(found) else 0
+    return 1 if survivors else 0
 
 
 if __name__ == "__main__":

@@ -88,12 +88,7 @@ def limitation_lines() -> Iterator[str]:
         )
 
 
-def main() -> None:
-    """Run the battery on the shipped pair and write the page."""
-    subject = open_subject(Path(VARIANT), None)
-    write_text(TARGET, document(subject, run_battery(subject)))
-    print(f"wrote {TARGET}")
-
-
 if __name__ == "__main__":
-    main()
+    shipped = open_subject(Path(VARIANT), None)
+    write_text(TARGET, document(shipped, run_battery(shipped)))
+    print(f"wrote {TARGET}")

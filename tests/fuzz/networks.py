@@ -103,14 +103,7 @@ def go_on(path: Path) -> None:
     _step(trainer)
 
 
-def weights_seeds(folder: Path) -> list[bytes]:
-    """A network's weights."""
-    return [
-        written(partial(save_network, network=ConvBEERS(SMALL), recipe={"degraded": "x"}), folder / "w.safetensors")
-    ]
-
-
-def told_seeds(folder: Path) -> list[bytes]:
-    """The weights of a network that is told its sensor."""
-    network = BankedConvBEERS(SMALL)
-    return [written(partial(save_network, network=network, recipe={"degraded": "x"}), folder / "w.safetensors")]
+def weights_seeds(folder: Path, kind: type[BankedConvBEERS | ConvBEERS] = ConvBEERS) -> list[bytes]:
+    """A network's weights; a banked one is told its sensor."""
+    save = partial(save_network, network=kind(SMALL), recipe={"degraded": "x"})
+    return [written(save, folder / "w.safetensors")]

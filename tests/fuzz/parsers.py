@@ -19,7 +19,7 @@ from beers_deploy.dpu.cost.own_runs import read_own_runs
 from beers_deploy.dpu.cost.work import count_work
 from beers_deploy.dpu.graph import Network
 from beers_deploy.dpu.reading import read_network
-from beers_deploy.model.convbeers import load_network
+from beers_deploy.model.convbeers import BankedConvBEERS, load_network
 from beers_deploy.model.dataset import _read_summary, read_pairs_recipe
 from beers_deploy.model.io.images import read_pixels
 from beers_deploy.model.metrics.perceptual import read_tensors
@@ -45,7 +45,6 @@ from tests.fuzz.networks import (
     look_at_onnx,
     onnx_seeds,
     run_onnx,
-    told_seeds,
     understand_onnx,
     weights_seeds,
 )
@@ -245,7 +244,9 @@ PARSERS: tuple[Parser, ...] = (
     Parser("dataset manifest", ".jsonl", manifest_seeds, _read_summary, of_json),
     Parser("training log", ".csv", lambda _: [b"step,loss\n10,0.5\n20,0.25\n"], log_lines, share=0.5),
     Parser("weights", ".safetensors", weights_seeds, load_network, of_safetensors),
-    Parser("told weights", ".safetensors", told_seeds, load_network, of_safetensors),
+    Parser(
+        "told weights", ".safetensors", partial(weights_seeds, kind=BankedConvBEERS), load_network, of_safetensors
+    ),
     Parser("checkpoint", ".safetensors", checkpoint_seeds, go_on, of_safetensors),
     Parser("backbone npz", ".npz", partial(backbone_seeds, packed=True), lambda p: read_tensors(p, ["a", "b"])),
     Parser("labels of VOC", ".xml", partial(label_seeds, make=voc, suffix=".xml"), read_beside),
