@@ -106,11 +106,11 @@ def predict(
     try:
         exact_px = found.tiling.halo_px
     except ModelError:
-        rows = list(map(frame_row, predictions, boards))
+        rows = list(map(frame_row, predictions))
     else:
         swath = Swath(width_px, height_px, tile, parse_halo(str(halo), exact_px))
-        rows = [swath_row(prediction, swath, each) for prediction, each in zip(predictions, boards, strict=True)]
-    layers = layer_rows(predictions[0], boards[0]) if len(boards) == 1 else []
+        rows = [swath_row(prediction, swath) for prediction in predictions]
+    layers = layer_rows(predictions[0]) if len(boards) == 1 else []
     names = ", ".join(each.target.name for each in boards)
     arguments: dict[str, object] = {"target": names, "dpu": dpu, "size": f"{width_px}x{height_px}", "tile": tile}
     arguments |= {"halo": halo, "measured": measured, "host_task": host_task}
@@ -126,7 +126,7 @@ def _predictions(
     """A network on each board, of its own size where it is fixed to one; and what to say of its host."""
     size_px = None if own_tile_px(model) else tile_px
     found = [predict_file(file, dpu, size_px, task) for dpu in boards]
-    return found, [*dict.fromkeys(words for pair in zip(found, boards, strict=True) for words in host_words(*pair))]
+    return found, [*dict.fromkeys(words for each in found for words in host_words(each))]
 
 
 TRAFFIC = "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch"
@@ -206,9 +206,9 @@ def bench_board(
     title = f"{width_px} x {height_px} pixels"
     if len(boards) == len(tiles_px) == 1 and within_s is None:
         prediction = predict_file(model, boards[0], swath.tile_px, host_task)
-        rows = [*predicted_rows(model.stem, prediction, swath, boards[0]), *beside]
+        rows = [*predicted_rows(model.stem, prediction, swath), *beside]
         shown = [*corrected, (f"{title} in tiles of {swath.tile_px}", rows)]
-        notes, layers = host_words(prediction, boards[0]), [_layers(model, prediction, boards[0])]
+        notes, layers = host_words(prediction), [_layers(model, prediction)]
         return BoardBench(shown, notes, layers, swath, dn)
     swept = sweep_rows(model, swath, boards, tiles_px, host_task)
     whole = (f"{model.name}, {title} in whole tiles, halo {swath.halo_px} px", swept)
@@ -216,8 +216,9 @@ def bench_board(
     return BoardBench(shown, [] if within_s is None else [within_words(swept, boards, within_s)], [], swath, dn)
 
 
-def _layers(model: Path, prediction: Prediction, dpu: Dpu) -> tuple[str, list[Row]]:
-    return f"{model.name}, one batch on {dpu.target.name} {dpu.name}; {TRAFFIC}", layer_rows(prediction, dpu)
+def _layers(model: Path, prediction: Prediction) -> tuple[str, list[Row]]:
+    dpu = prediction.dpu
+    return f"{model.name}, one batch on {dpu.target.name} {dpu.name}; {TRAFFIC}", layer_rows(prediction)
 
 
 def _frames(
@@ -230,10 +231,10 @@ def _frames(
 ) -> BoardBench:
     """The network on whole images; of one configuration each layer too."""
     predictions, notes = _predictions(model, network, boards, TILE_PX, task)
-    rows = list(map(frame_row, predictions, boards))
+    rows = list(map(frame_row, predictions))
     sides = network.graph.input[0].type.tensor_type.shape.dim[2:]
     size = " x ".join(str(side.dim_value or TILE_PX) for side in sides)
-    layers = [_layers(model, predictions[0], boards[0])] if len(boards) == 1 else []
+    layers = [_layers(model, predictions[0])] if len(boards) == 1 else []
     whole = f"not tiled, but run on whole images: expected {why.expected}, got {why.got}"
     return BoardBench([*corrected, (f"{model.name}, frames of {size}", rows)], [whole, *notes], layers)
 

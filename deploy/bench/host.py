@@ -14,7 +14,7 @@ import numpy as np
 import onnx
 import psutil
 
-from beers_deploy.bench.timing import interleaved, timed
+from beers_deploy.bench.timing import interleaved
 from beers_deploy.dpu.reading import inputs_of
 from beers_deploy.host_state import cpu_load, resident_bytes
 from beers_deploy.model.processor import require_cores
@@ -48,11 +48,7 @@ def time_networks(runs: Sequence[Timed], tile_px: int, threads: int, min_time_s:
         run.held_bytes = resident_bytes() - before_bytes
         calls.append(partial(session.run, None, feed))
 
-    def enough(found: Sequence[Sequence[tuple[float, Figure]]]) -> bool:
-        shortest_s = min(sum(time_s for time_s, _ in taken) for taken in found)
-        return shortest_s >= min_time_s and len(found[0]) >= min_runs
-
-    for run, taken in zip(runs, interleaved(calls, lambda call: timed(call)[1:], enough), strict=True):
+    for run, taken in zip(runs, interleaved(calls, min_runs, min_time_s), strict=True):
         run.times_s += [time_s for time_s, _ in taken]
         run.powers += [power for _, power in taken]
 

@@ -80,7 +80,7 @@ def predict_file(model: Path, dpu: Dpu, tile_px: int | None = TILE_PX, task: Tas
     return predict(place(read_network(model, tile_px), dpu), dpu, task)
 
 
-def predicted_rows(name: str, prediction: Prediction, swath: Swath, dpu: Dpu) -> list[Row]:
+def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]:
     """A network on the DPU, twice: as the paper counts, and with whole tiles."""
     batches = math.ceil(swath.tiles / prediction.batch)
     counts = {
@@ -90,19 +90,17 @@ def predicted_rows(name: str, prediction: Prediction, swath: Swath, dpu: Dpu) ->
     besides = {
         "one-thread latency": one_thread_latency(prediction),
         "host beside the DPU": host_time(prediction, "ms/tile"),
-        "power of products and traffic": counted_power(prediction, dpu),
+        "power of products and traffic": counted_power(prediction),
     }
-    words, name = {"fitted range": fitted_range(prediction)}, f"{name}, INT8 on the DPU ({prediction.configuration})"
+    words, name = {"fitted range": fitted_range(prediction)}, f"{name}, INT8 on the DPU ({prediction.dpu.name})"
     return [
-        Row(TABLE, f"{name}, {how}", _swath_figures(prediction, swath, dpu, *count) | besides, words)
+        Row(TABLE, f"{name}, {how}", _swath_figures(prediction, swath, *count) | besides, words)
         for how, count in counts.items()
     ]
 
 
-def _swath_figures(
-    prediction: Prediction, swath: Swath, dpu: Dpu, frames: float, batches: float
-) -> dict[str, Figure]:
-    power, latency = dpu_power(dpu), swath_latency(prediction, batches)
+def _swath_figures(prediction: Prediction, swath: Swath, frames: float, batches: float) -> dict[str, Figure]:
+    power, latency = dpu_power(prediction.dpu), swath_latency(prediction, batches)
     return {
         "tiles": exact(frames, "tile", ARITHMETIC),
         "work factor": exact(frames * swath.tile_px**2 / swath.pixels, "px/px", ARITHMETIC),
@@ -123,7 +121,8 @@ def host_time(prediction: Prediction, unit: str) -> Figure:
 def one_thread_latency(prediction: Prediction) -> Figure:
     """From image to result where one thread runs one core's batch and does the host's work itself, in ms."""
     low_s, high_s = prediction.latency_interval_s
-    images = f"a batch of {prediction.handlers}" if prediction.handlers > 1 else "one image"
+    handlers = prediction.dpu.handlers
+    images = f"a batch of {handlers}" if handlers > 1 else "one image"
     source = f"{COST_SOURCE}, its fit to rates with one thread: {images} through one core, then the host"
     return predicted(1e3 * prediction.latency_s, "ms/batch", (1e3 * low_s, 1e3 * high_s), source)
 
@@ -138,8 +137,8 @@ def swath_latency(prediction: Prediction, batches: float) -> Figure:
 def fitted_range(prediction: Prediction) -> str:
     """Whether the fitted networks speak for this one, and how often the board's intervals held, if too rarely."""
     found = f"outside: {'; '.join(prediction.outside)}" if prediction.outside else "inside"
-    held = f"; intervals held {100 * prediction.held:.0f} % of families left out"
-    return found + held if prediction.held < HELD else found
+    share = prediction.dpu.value("cost", "families_held")
+    return found if share >= HELD else f"{found}; intervals held {100 * share:.0f} % of families left out"
 
 
 def energy(latency: Figure, power: Figure) -> Figure:
@@ -226,18 +225,19 @@ def chain_rate(swath: Swath, latency: Figure) -> Figure:
     return predicted(swath.frames / (latency.value or math.inf), "frame/s", (low, high), latency.source)
 
 
-def layer_rows(prediction: Prediction, dpu: Dpu) -> list[Row]:
+def layer_rows(prediction: Prediction) -> list[Row]:
     """One row a layer; their times add up to that of a batch, the last row.
 
     The columns are those of AMD's vaitrace, with what bounds the layer; bytes and energy are those of one image.
     """
-    rows = [_layer_row(layer, prediction, dpu) for layer in prediction.layers]
+    rows = [_layer_row(layer, prediction) for layer in prediction.layers]
     total = f"sum: one batch of {prediction.batch}"
     return [*rows, Row(LAYERS, total, {"time": scaled(1e3 * prediction.batch_time_s, "ms/batch", prediction)})]
 
 
-def _layer_row(layer: LayerCost, prediction: Prediction, dpu: Dpu) -> Row:
-    work, batch, low_high_j = layer.work, prediction.batch, layer_energy_j(layer, dpu)
+def _layer_row(layer: LayerCost, prediction: Prediction) -> Row:
+    work, batch, dpu = layer.work, prediction.batch, prediction.dpu
+    low_j, high_j = layer_energy_j(layer, dpu)
     moved = batch * work.map_bytes + work.weight_bytes
     seconds = layer.time_s or math.inf  # a concat takes no time of its own
     figures = {
@@ -249,9 +249,7 @@ def _layer_row(layer: LayerCost, prediction: Prediction, dpu: Dpu) -> Row:
         "StFM": exact(work.store_map_bytes / 1e6, "MB", "feature maps that an image stores, by the graph's shapes"),
         "bandwidth": scaled(moved / seconds / 1e9, "GB/s", prediction),
         "array use": exact(100 * work.array_use, "%"),
-        "energy": predicted(
-            500 * sum(low_high_j), "mJ", (1e3 * low_high_j[0], 1e3 * low_high_j[1]), energy_source(dpu)
-        ),
+        "energy": predicted(500 * (low_j + high_j), "mJ", (1e3 * low_j, 1e3 * high_j), energy_source(dpu)),
     }
     return Row(LAYERS, work.name, figures, {"bound": layer.bound})
 
@@ -275,17 +273,17 @@ def sweep_rows(
 ) -> list[Row]:
     """A row a configuration and tile size, for whole tiles with the swath's halo."""
     return [
-        swath_row(predict_file(model, dpu, tile_px, task), replace(swath, tile_px=tile_px), dpu)
+        swath_row(predict_file(model, dpu, tile_px, task), replace(swath, tile_px=tile_px))
         for dpu in boards
         for tile_px in tiles_px
     ]
 
 
-def swath_row(prediction: Prediction, swath: Swath, dpu: Dpu) -> Row:
+def swath_row(prediction: Prediction, swath: Swath) -> Row:
     """A swath in whole tiles on one configuration."""
     batches = math.ceil(swath.tiles / prediction.batch)
     kept = [not layer.work.map_bytes for layer in prediction.layers]
-    figures = _swath_figures(prediction, swath, dpu, swath.tiles, batches) | {
+    figures = _swath_figures(prediction, swath, swath.tiles, batches) | {
         "maps through memory": exact(prediction.streamed_bytes / 1e6, "MB/tile"),
         "layers on chip": exact(100 * sum(kept) / len(kept), "%"),
     }
@@ -293,7 +291,11 @@ def swath_row(prediction: Prediction, swath: Swath, dpu: Dpu) -> Row:
     for layer in prediction.layers:
         bound[layer.bound] += round(1e12 * layer.time_s)
     words = {"bound": bound.most_common(1)[0][0], "fitted range": fitted_range(prediction)}
-    return Row("sweep", f"{dpu.target.name} {prediction.configuration}, tiles of {swath.tile_px}", figures, words)
+    return Row("sweep", f"{_named(prediction)}, tiles of {swath.tile_px}", figures, words)
+
+
+def _named(prediction: Prediction) -> str:
+    return f"{prediction.dpu.target.name} {prediction.dpu.name}"
 
 
 def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) -> str:
@@ -322,9 +324,9 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
     return f"the smallest DPU that takes {within_s:g} s or less: {words}"
 
 
-def frame_row(prediction: Prediction, dpu: Dpu) -> Row:
+def frame_row(prediction: Prediction) -> Row:
     """A network that is run on whole images, on one configuration: frames instead of a swath."""
-    power, frame_s = dpu_power(dpu), swath_latency(prediction, 1 / prediction.batch)
+    power, frame_s = dpu_power(prediction.dpu), swath_latency(prediction, 1 / prediction.batch)
     figures = {
         "work": exact(prediction.operations / 1e9, "GOP"),
         "batch": exact(prediction.batch, "frame", "images in flight"),
@@ -334,20 +336,19 @@ def frame_row(prediction: Prediction, dpu: Dpu) -> Row:
         "power": power,
         "energy": energy(frame_s, power),
     }
-    name = f"{dpu.target.name} {prediction.configuration}, whole images"
     words = {"host's task": prediction.task, "fitted range": fitted_range(prediction)}
-    return Row("frames", name, figures, words)
+    return Row("frames", f"{_named(prediction)}, whole images", figures, words)
 
 
-def host_words(prediction: Prediction, dpu: Dpu) -> list[str]:
+def host_words(prediction: Prediction) -> list[str]:
     """What was assumed of the file, and what the processor runs because the DPU refuses it; a sentence each."""
     found = [prediction.note] if prediction.note else []
     if prediction.refused:
         low_ms, high_ms = (1e3 * end_s for end_s in prediction.refused_s)
         found.append(
-            f"the processor of {dpu.target.name} runs what its DPU refuses ('beers-deploy check' says why): "
-            f"{', '.join(prediction.refused)}; {number(low_ms, 2)} to {number(high_ms, 2)} ms an image, from the "
-            "best that is published of its cores to plain code"
+            f"the processor of {prediction.dpu.target.name} runs what its DPU refuses ('beers-deploy check' says "
+            f"why): {', '.join(prediction.refused)}; {number(low_ms, 2)} to {number(high_ms, 2)} ms an image, from "
+            "the best that is published of its cores to plain code"
         )
     return found
 

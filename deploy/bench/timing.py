@@ -13,7 +13,6 @@ from beers_deploy.profiles.figures import Figure, measured, unavailable
 POWERCAP = Path("/sys/class/powercap")
 
 Result = TypeVar("Result")
-Call = Callable[[], object]
 
 
 def timed(work: Callable[[], Result], powercap: Path = POWERCAP) -> tuple[Result, float, Figure]:
@@ -53,21 +52,20 @@ def _read(powercap: Path) -> dict[Path, int] | str:
 
 
 def interleaved(
-    calls: Sequence[Call], measure: Callable[[Call], Result], enough: Callable[[Sequence[Sequence[Result]]], bool]
-) -> list[list[Result]]:
-    """Run every call once a round until there are enough rounds, and so compare them fairly.
+    calls: Sequence[Callable[[], object]], rounds: int, least_s: float = 0.0
+) -> list[list[tuple[float, Figure]]]:
+    """Time and power of every call, each run once a round, and so compared fairly.
 
     Args:
         calls: what is timed, already warmed up.
-        measure: runs one call and says what it took.
-        enough: asked after each round, with what was measured so far of each call, in the order of `calls`.
+        rounds: the least of them.
+        least_s: what each call's runs take together, at least.
 
     Returns:
-        What was measured of each call, round by round.
+        Of each call, round by round.
     """
-    found: list[list[Result]] = [[] for _ in calls]
-    while True:
+    found: list[list[tuple[float, Figure]]] = [[] for _ in calls]
+    while len(found[0]) < rounds or min(sum(time_s for time_s, _ in taken) for taken in found) < least_s:
         for call, taken in zip(calls, found, strict=True):
-            taken.append(measure(call))
-        if enough(found):
-            return found
+            taken.append(timed(call)[1:])
+    return found

@@ -67,7 +67,7 @@ def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX m
         return _Reader(graph, _inputs(graph, tile_px, _places(model), where)).network()
 
 
-def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model") -> dict[str, Shape]:
+def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str) -> dict[str, Shape]:
     """The inputs of a file as it stands, by name: (C, H, W) in places, for a tile or as the file states them."""
     return _inputs(OnnxGraph(model), tile_px, _places(model), where)
 

@@ -22,7 +22,7 @@ from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Check, Row, measured
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
-from beers_deploy.profiles.toml import read_json
+from beers_deploy.profiles.toml import read_json, unreadable
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import PLANES, Op
@@ -44,7 +44,6 @@ def write_golden(
     *,
     tile: int | None = None,
     board: "TargetProfile | str" = DEFAULT_TARGET,
-    seed: int = 0,
 ) -> Path:
     """Write golden vectors of an INT8 network to a folder, and return it.
 
@@ -53,13 +52,12 @@ def write_golden(
         out: the folder.
         tile: side of a tile in pixels; the network's own if it has one, else 64.
         board: whose way to round ties is taken.
-        seed: of what is drawn.
     """
     network, folder = Network.load(int8), Path(out)
     with faults_named(network.label):
         core = read_core(network.model)
     half_even, names = bool(TargetProfile.load(board).npu), files_of(core)  # AMD's kernel for its NPU rounds to even
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     images = _images(network, core.ends.image_channels, tile, generator)
     planes = {case: core.ends.split(image) for case, image in images.items()}
     planes[EXTREMES] = generator.choice(np.array([-128, 127], np.int8), planes["noise"].shape)
@@ -190,7 +188,7 @@ def _array(path: Path) -> np.ndarray:
     try:
         return np.asarray(np.load(path, allow_pickle=False))
     except (OSError, ValueError, EOFError) as error:
-        got = "no such file" if not path.exists() else "another file"
+        got = unreadable(path) or "another file"
         raise ImageError(str(path), expected="an array (.npy)", got=got, remedy="write it with numpy.save") from error
 
 

@@ -81,7 +81,6 @@ def run_onnx(path: Path) -> None:
 
 
 def checkpoint_seeds(folder: Path) -> list[bytes]:
-    """A checkpoint after a step, and one before any."""
     return [written(partial(_checkpoint, steps=steps), folder / "c.safetensors") for steps in (0, 1)]
 
 
@@ -97,7 +96,6 @@ def _step(trainer: Trainer) -> None:
 
 
 def go_on(path: Path) -> None:
-    """Read a checkpoint, and take a step."""
     trainer = Trainer(SMALL, RECIPE)
     trainer.resume(path)
     _step(trainer)

@@ -130,7 +130,8 @@ def _file_checks(model: onnx.ModelProto, dpu: Dpu) -> list[Check]:
 
 
 def _crossings(placement: Placement) -> list[str]:
-    lines = [f"device subgraphs: {len(_subgraphs_of(placement))}, DPU subgraphs: {placement.dpu_subgraphs}"]
+    pieces = len({node.subgraph for node in placement.nodes})
+    lines = [f"device subgraphs: {pieces}, DPU subgraphs: {placement.dpu_subgraphs}"]
     for cut in placement.cuts:
         size = "a size unknown" if cut.size_bytes is None else f"{cut.size_bytes / 1e6:.2f} MB"
         lines.append(f"{'to' if cut.onto_dpu else 'from'} the DPU: {cut.tensor}, {size} an image as int8")
@@ -159,18 +160,14 @@ def _npu_words(node: PlacedNode, placement: Placement, dpu: Dpu) -> str:
 
 
 def _subgraph_rows(placement: Placement) -> list[Row]:
+    found: dict[int, list[PlacedNode]] = {}
+    for node in placement.nodes:
+        found.setdefault(node.subgraph, []).append(node)
     rows = []
-    for number, members in _subgraphs_of(placement).items():
+    for number, members in found.items():
         words = {"device": members[0].device, "first": members[0].op.name, "last": members[-1].op.name}
         rows.append(Row("subgraphs", f"subgraph {number}", {"nodes": _count(len(members), "node")}, words))
     return rows
-
-
-def _subgraphs_of(placement: Placement) -> dict[int, list[PlacedNode]]:
-    members: dict[int, list[PlacedNode]] = {}
-    for node in placement.nodes:
-        members.setdefault(node.subgraph, []).append(node)
-    return members
 
 
 def _cut_row(cut: Cut) -> Row:

@@ -32,7 +32,7 @@ DPU = load_dpu("vck190")
 def test_a_swath_is_predicted_as_the_paper_counts_and_in_whole_tiles(tmp_path: Path) -> None:
     prediction = predict_file(float_convbeers(tmp_path / "f.onnx", 16, 64), DPU)
     swath = Swath(13600, 9016, 640, 35)
-    fraction, whole = predicted_rows("ConvBEERS", prediction, swath, DPU)
+    fraction, whole = predicted_rows("ConvBEERS", prediction, swath)
     assert value(fraction, "latency") == pytest.approx(swath.frames / prediction.fps)
     assert value(whole, "tiles") == 384
     assert value(whole, "latency") == pytest.approx(128 * prediction.batch / prediction.fps)
@@ -48,7 +48,7 @@ def test_a_swath_is_predicted_as_the_paper_counts_and_in_whole_tiles(tmp_path: P
 
 def test_a_last_batch_that_is_not_full_still_takes_its_time(tmp_path: Path) -> None:
     prediction = predict_file(float_convbeers(tmp_path / "f.onnx", 1, 16), DPU, 64)
-    _, whole = predicted_rows("net", prediction, Swath(64, 64, 64, 5), DPU)
+    _, whole = predicted_rows("net", prediction, Swath(64, 64, 64, 5))
     assert value(whole, "latency") == pytest.approx(prediction.batch / prediction.fps)
 
 
@@ -93,7 +93,7 @@ def test_layers_are_shown_when_asked_for_and_written_always(tmp_path: Path) -> N
 
 
 def test_layer_rows_have_the_columns_of_vaitrace_and_sum_to_their_last(tmp_path: Path) -> None:
-    rows = layer_rows(predict_file(integer_convbeers(tmp_path / "i.onnx", 2, 64), DPU, 333), DPU)
+    rows = layer_rows(predict_file(integer_convbeers(tmp_path / "i.onnx", 2, 64), DPU, 333))
     columns = {"work", "time", "rate", "LdFM", "LdWB", "StFM", "bandwidth", "array use", "energy"}
     assert all(set(row.figures) == columns for row in rows[:-1])
     assert all(word in TRAFFIC for word in columns if word[:2] in ("Ld", "St"))

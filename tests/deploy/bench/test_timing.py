@@ -1,5 +1,5 @@
 import sys
-from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -45,23 +45,17 @@ def test_without_counters_of_the_package_power_is_unavailable_with_a_reason(
     assert reason in power.reason
 
 
-def test_calls_run_round_by_round_until_there_are_enough() -> None:
+@pytest.mark.parametrize(("rounds", "least_s"), [(3, 0.0), (2, 0.02)])
+def test_calls_run_round_by_round_until_there_are_enough_and_they_took_long_enough(
+    rounds: int, least_s: float
+) -> None:
     ran: list[str] = []
-
-    def call(name: str) -> Callable[[], str]:
-        def run() -> str:
-            ran.append(name)
-            return name
-
-        return run
-
-    asked: list[list[int]] = []
-
-    def enough(found: Sequence[Sequence[object]]) -> bool:
-        asked.append([len(taken) for taken in found])
-        return len(found[0]) == 3
-
-    found = interleaved([call("a"), call("b")], lambda work: f"{work()}{len(ran)}", enough)
-    assert ran == ["a", "b"] * 3
-    assert found == [["a1", "a3", "a5"], ["b2", "b4", "b6"]]
-    assert asked == [[1, 1], [2, 2], [3, 3]]
+    found = interleaved([partial(ran.append, name) for name in ("a", "b")], rounds, least_s)
+    count = len(found[0])
+    assert ran == ["a", "b"] * count
+    assert [len(taken) for taken in found] == [count, count]
+    assert count == rounds if least_s == 0 else count > rounds
+    for times in ([time_s for time_s, _ in taken] for taken in found):
+        assert sum(times) >= least_s
+    if least_s:
+        assert min(sum(time_s for time_s, _ in taken[:-1]) for taken in found) < least_s

@@ -16,7 +16,7 @@ from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.checker.remarks import REMARKS
 from beers_deploy.dpu.cost.latency import dpu_power
 from beers_deploy.dpu.graph import Operation, Window
-from beers_deploy.dpu.reading import network_of, read_network
+from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.network import shipped_pair
 from beers_deploy.profiles import load_target
@@ -211,16 +211,6 @@ def test_power_that_nobody_published_is_unavailable_and_so_is_what_follows() -> 
         found = (power, energy(latency, power), efficiency(100, latency, power))
         assert all((figure.value is not None) == known for figure in found)
         assert all(name in figure.reason for figure in found if not known)
-
-
-def test_a_pixel_shuffle_inside_is_taken_with_a_warning(tmp_path: Path) -> None:
-    sketch = Sketch(8)
-    shuffled = sketch.node("DepthToSpace", sketch.conv("image"), blocksize=2)
-    path = sketch.save(tmp_path / "p.onnx", sketch.conv(shuffled, (8, 2, 3, 3)))
-    for dpu in DPUS.values():
-        placement = place(read_network(path, 16), dpu)
-        assert placement.failed == ()
-        assert "depthtospace1" in str(REMARKS[-1](placement, dpu, 16))
 
 
 def test_pixels_become_channels_behind_a_convolution(tmp_path: Path) -> None:

@@ -177,7 +177,8 @@ def test_a_transposed_convolution_runs_over_the_zeros_between_its_pixels(tmp_pat
 
 def test_each_layer_names_its_bound(papers_prediction: Prediction) -> None:
     for layer in papers_prediction.layers:
-        parts = {"compute": layer.compute_s, "memory": layer.memory_s, "overhead": layer.start_s}
+        overhead_s = max(layer.time_s - layer.compute_s - layer.memory_s, 0.0)
+        parts = {"compute": layer.compute_s, "memory": layer.memory_s, "overhead": overhead_s}
         assert layer.bound == max(parts, key=lambda name: parts[name])
         assert max(parts.values()) <= layer.time_s <= math.fsum(parts.values()) * (1 + 1e-12)
 
@@ -210,13 +211,6 @@ def test_more_batch_handlers_gain_less_on_large_maps(papers: Path) -> None:
     assert 1.0 < six / three < 1.3
 
 
-def test_a_network_that_the_dpu_refuses_has_no_prediction(tmp_path: Path) -> None:
-    sketch = Sketch(8)
-    path = sketch.save(tmp_path / "s.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
-    with pytest.raises(ModelError, match="check"):
-        predict_file(path, DPU)
-
-
 def test_a_network_without_convolutions_has_no_prediction(tmp_path: Path) -> None:
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "p.onnx", sketch.node("MaxPool", "image", kernel_shape=[2, 2]))
@@ -245,11 +239,11 @@ def test_latency_is_that_of_one_core_and_one_thread(tmp_path: Path) -> None:
     path = float_convbeers(tmp_path / "n.onnx", 2, 16)
     three, one = load_dpu("zcu102"), load_dpu("kv260")
     found, single = predict_file(path, three), predict_file(path, one)
-    assert (found.handlers, single.handlers) == (1, 1)
+    assert (three.handlers, one.handlers) == (1, 1)
     assert found.alone_s <= found.batch_time_s
     assert single.alone_s == pytest.approx(single.batch_time_s)
     assert found.latency_s == pytest.approx(found.alone_s + found.host_s * three.whole("cpu", "cores"))
-    assert found.handlers / found.latency_s < found.fps
+    assert three.handlers / found.latency_s < found.fps
 
 
 def test_energy_counts_products_and_bytes(tmp_path: Path) -> None:
@@ -263,7 +257,7 @@ def test_energy_counts_products_and_bytes(tmp_path: Path) -> None:
 
 def test_counted_power_lies_below_the_published_run(papers_prediction: Prediction) -> None:
     """It leaves out control, clocks and leakage: more than the whole board's would be a fault."""
-    low, high = counted_power(papers_prediction, DPU).interval or (0, 0)
+    low, high = counted_power(papers_prediction).interval or (0, 0)
     assert 0 < low < high < DPU.value("power", "dpu_run_w")
     most_j = math.fsum(layer_energy_j(layer, DPU)[1] for layer in papers_prediction.layers)
     assert most_j == pytest.approx(high / papers_prediction.fps)
