@@ -33,6 +33,10 @@ KINDS = {"DPUCZDX8G": ZYNQ, "DPUCVDX8G": ("vck190",), "DPUCV2DX8G": ("vek280",)}
 ALPHA = 26 / 256
 
 
+def depthwise(height: int, width: int) -> Draw:
+    return conv(8, 1, height, width, group=8, pads=[0] * 4)
+
+
 def behind_depthwise(op_type: str, **attributes: float) -> Draw:
     return lambda s, x: s.node(op_type, s.conv(x, (8, 1, 3, 3), group=8), **attributes)
 
@@ -55,30 +59,12 @@ def in_two(first: Draw, second: Draw) -> Draw:
 
 # What only these boards refuse, with the rule, the network, the same with the remedy followed, and its channels.
 CASES: list[tuple[tuple[str, ...], str, Draw, Draw, int]] = [
-    (
-        ZYNQ,
-        "conv weight bank",
-        conv(8, 1312, 5, 5),
-        in_two(conv(1296, 1312, 1, 1), conv(8, 1296, 5, 5)),
-        1312,
-    ),
-    (
-        (*ZYNQ, "vek280"),
-        "depthwise kernel",
-        conv(8, 1, 64, 33, group=8, pads=[0] * 4),
-        in_two(conv(8, 1, 64, 1, group=8, pads=[0] * 4), conv(8, 1, 1, 33, group=8, pads=[0] * 4)),
-        8,
-    ),
+    (ZYNQ, "conv weight bank", conv(8, 1312, 5, 5), in_two(conv(1296, 1312, 1, 1), conv(8, 1296, 5, 5)), 1312),
+    ((*ZYNQ, "vek280"), "depthwise kernel", depthwise(64, 33), in_two(depthwise(64, 1), depthwise(1, 33)), 8),
     (ZYNQ, "activation place", behind_depthwise("LeakyRelu", alpha=ALPHA), behind_depthwise("Relu"), 8),
     (ZYNQ, "activation of sums", behind_sum("LeakyRelu", alpha=ALPHA), behind_sum("Relu"), 8),
     (("vek280",), "conv area", conv(8, 8, 8, 8, pads=[3] * 4), conv(8, 8, 7, 7), 8),
-    (
-        ("vek280",),
-        "depthwise kernel",
-        conv(8, 1, 21, 21, group=8, pads=[0] * 4),
-        in_two(conv(8, 1, 21, 1, group=8, pads=[0] * 4), conv(8, 1, 1, 21, group=8, pads=[0] * 4)),
-        8,
-    ),
+    (("vek280",), "depthwise kernel", depthwise(21, 21), in_two(depthwise(21, 1), depthwise(1, 21)), 8),
     (("vek280",), "activation place", prelu, behind_conv("Relu"), 8),
     (("vek280",), "activation of sums", in_two(added, prelu), behind_sum("Relu"), 8),
     (("vck190",), "conv window", conv(8, 8, 9, 8), conv(8, 8, 7, 7), 8),

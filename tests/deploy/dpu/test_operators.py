@@ -22,6 +22,7 @@ from tests.deploy.dpu.draws import (
     transposed,
 )
 from tests.deploy.dpu.graphs import IntegerSketch, Sketch
+from tests.deploy.dpu.test_number_graphs import CASES as NUMBER_CASES
 
 DPU = load_dpu("vck190")
 
@@ -77,21 +78,7 @@ WIDE |= {"elementwise channels", "shuffle channels"}
 OTHERS = {"conv area", "int8 operator", "int8 alone", "bias width"}
 """Rules of other boards: tests/deploy/dpu/test_boards.py, test_npu.py."""
 SIZES = {"map exists", "maps aligned", "map in memory"}
-NUMBERS = {
-    "int8 bias",
-    "int32 bias",
-    "int8 constants",
-    "one format",
-    "on integers",
-    "symmetric",
-    "per tensor",
-    "power of two",
-    "shift cut",
-    "shift bias",
-    "shift read",
-    "shift write",
-    "same scale",
-}
+NUMBERS = {case.split(":")[0] for case in NUMBER_CASES} | {"int32 bias", "on integers"}
 
 
 def test_every_rule_has_a_case() -> None:
