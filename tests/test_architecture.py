@@ -1,56 +1,29 @@
 """What docs/explanation/architecture.md says of the packages, held against the code."""
 
 import ast
-from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
-from docs.make import architecture
+from docs.make.architecture import PACKAGES, imports_of, modules
+from docs.make.architecture import page as drawn
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = {
-    "profiles": "beers_deploy.profiles",
-    "model": "beers_deploy.model",
-    "quant": "beers_deploy.quant",
-    "deploy": "beers_deploy",
-}
-"""The name under which each folder is installed."""
+INSIDE = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("__init__.py"))]
+"""What says what a package holds."""
 MOST_MODULES = 18
 
 
-@cache
-def modules() -> dict[str, Path]:
-    """Every module of ours by its name; a package goes by its own."""
-    files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
-    places = [path.relative_to(ROOT).with_suffix("").parts for path in files]
-    names = [".".join((PACKAGES[folder], *inside)).removesuffix(".__init__") for folder, *inside in places]
-    return dict(zip(names, files, strict=True))
-
-
-@cache
-def imported(path: Path) -> set[str]:
-    """What a module imports of ours as it is loaded; not what its functions import when they run."""
-    found: set[str] = set()
-    for node in ast.parse(path.read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.ImportFrom) and node.module:
-            found |= {f"{node.module}.{alias.name}" for alias in node.names} | {node.module}
-        elif isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-    known = modules()
-    return {name for name in found if name in known and known[name].name != "__init__.py"}
-
-
 def test_no_module_imports_itself_by_a_detour() -> None:
-    order = TopologicalSorter({name: imported(path) for name, path in modules().items()})
-    assert len(list(order.static_order())) == len(modules())  # a circle raises, and names its modules
+    known = modules()
+    order = TopologicalSorter({name: imports_of(path, known, late=False) for name, path in known.items()})
+    assert len(list(order.static_order())) == len(known)  # a circle raises, and names its modules
 
 
 def test_packages_stay_small_enough_to_look_through_and_say_what_is_inside() -> None:
-    for path in modules().values():
-        if path.name == "__init__.py":
-            beside = [each for each in path.parent.glob("*.py") if each != path]
-            assert len(beside) <= MOST_MODULES, path.parent
-            assert ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))), path
+    for path in INSIDE:
+        beside = [each for each in path.parent.glob("*.py") if each != path]
+        assert len(beside) <= MOST_MODULES, path.parent
+        assert ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))), path
 
 
 def test_the_page_names_files_that_are_there() -> None:
@@ -63,7 +36,7 @@ def test_the_page_names_files_that_are_there() -> None:
 def test_the_picture_is_drawn_from_the_imports_of_today() -> None:
     """Else run python docs/make/architecture.py."""
     page = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
-    assert architecture.page(page) == page
+    assert drawn(page) == page
 
 
 def listed(docstring: str) -> set[str]:
@@ -75,8 +48,7 @@ def listed(docstring: str) -> set[str]:
 
 
 def test_a_package_says_what_is_inside_by_names_that_are_there() -> None:
-    for path in modules().values():
-        if path.name == "__init__.py":
-            docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
-            here = {each.stem for each in path.parent.iterdir()}
-            assert listed(docstring) <= here, (path, listed(docstring) - here)
+    for path in INSIDE:
+        docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+        here = {each.stem for each in path.parent.iterdir()}
+        assert listed(docstring) <= here, (path, listed(docstring) - here)

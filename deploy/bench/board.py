@@ -102,31 +102,31 @@ def predict(
     found = Network.load(network, sensor=SENSOR, to_run=False)
     boards, corrected = _boards(board, dpu, None if measured is None else Path(measured))
     width_px, height_px = parse_size("x".join(map(str, size)) if isinstance(size, tuple | list) else str(size))
-    predictions = [(each, predict_file(found.file, each, _tile_px(found, tile), host_task)) for each in boards]
+    predictions, notes = _predictions(found.file, found.model, boards, tile, host_task)
     try:
         exact_px = found.tiling.halo_px
     except ModelError:
-        rows = [frame_row(prediction, each) for each, prediction in predictions]
+        rows = list(map(frame_row, predictions))
     else:
         swath = Swath(width_px, height_px, tile, parse_halo(str(halo), exact_px))
-        rows = [swath_row(prediction, swath, each) for each, prediction in predictions]
-    notes = [words for each, prediction in predictions for words in host_words(prediction, each)]
-    layers = layer_rows(predictions[0][1], boards[0]) if len(boards) == 1 else []
+        rows = [swath_row(prediction, swath) for prediction in predictions]
+    layers = layer_rows(predictions[0]) if len(boards) == 1 else []
     names = ", ".join(each.target.name for each in boards)
     arguments: dict[str, object] = {"target": names, "dpu": dpu, "size": f"{width_px}x{height_px}", "tile": tile}
     arguments |= {"halo": halo, "measured": measured, "host_task": host_task}
-    shown = [*(row for _, part in corrected for row in part), *map(_as_face, rows)]
+    shown = [row for _, part in corrected for row in part]
+    shown += [replace(row, figures={FACE.get(key, key): each for key, each in row.figures.items()}) for row in rows]
     about = ("predict", arguments, (found.input,))
-    return Predicted(*about, tuple(shown), notes=tuple(dict.fromkeys(notes)), layers=Table(*about, tuple(layers)))
+    return Predicted(*about, tuple(shown), notes=tuple(notes), layers=Table(*about, tuple(layers)))
 
 
-def _tile_px(network: Network, tile_px: int) -> int | None:
-    """The tile's side; None for a network that is fixed to one."""
-    return None if own_tile_px(network.model) else tile_px
-
-
-def _as_face(row: Row) -> Row:
-    return replace(row, figures={FACE.get(key, key): figure for key, figure in row.figures.items()})
+def _predictions(
+    file: Path, model: onnx.ModelProto, boards: Sequence[Dpu], tile_px: int, task: Task | None
+) -> tuple[list[Prediction], list[str]]:
+    """A network on each board, of its own size where it is fixed to one; and what to say of its host."""
+    size_px = None if own_tile_px(model) else tile_px
+    found = [predict_file(file, dpu, size_px, task) for dpu in boards]
+    return found, [*dict.fromkeys(words for each in found for words in host_words(each))]
 
 
 TRAFFIC = "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch"
@@ -206,9 +206,9 @@ def bench_board(
     title = f"{width_px} x {height_px} pixels"
     if len(boards) == len(tiles_px) == 1 and within_s is None:
         prediction = predict_file(model, boards[0], swath.tile_px, host_task)
-        rows = [*predicted_rows(model.stem, prediction, swath, boards[0]), *beside]
+        rows = [*predicted_rows(model.stem, prediction, swath), *beside]
         shown = [*corrected, (f"{title} in tiles of {swath.tile_px}", rows)]
-        notes, layers = host_words(prediction, boards[0]), [_layers(model, prediction, boards[0])]
+        notes, layers = host_words(prediction), [_layers(model, prediction)]
         return BoardBench(shown, notes, layers, swath, dn)
     swept = sweep_rows(model, swath, boards, tiles_px, host_task)
     whole = (f"{model.name}, {title} in whole tiles, halo {swath.halo_px} px", swept)
@@ -216,8 +216,9 @@ def bench_board(
     return BoardBench(shown, [] if within_s is None else [within_words(swept, boards, within_s)], [], swath, dn)
 
 
-def _layers(model: Path, prediction: Prediction, dpu: Dpu) -> tuple[str, list[Row]]:
-    return f"{model.name}, one batch on {dpu.target.name} {dpu.name}; {TRAFFIC}", layer_rows(prediction, dpu)
+def _layers(model: Path, prediction: Prediction) -> tuple[str, list[Row]]:
+    dpu = prediction.dpu
+    return f"{model.name}, one batch on {dpu.target.name} {dpu.name}; {TRAFFIC}", layer_rows(prediction)
 
 
 def _frames(
@@ -229,15 +230,13 @@ def _frames(
     task: Task | None,
 ) -> BoardBench:
     """The network on whole images; of one configuration each layer too."""
-    tile_px = None if own_tile_px(network) else TILE_PX
-    predictions = [predict_file(model, dpu, tile_px, task) for dpu in boards]
-    rows = [frame_row(prediction, dpu) for prediction, dpu in zip(predictions, boards, strict=True)]
+    predictions, notes = _predictions(model, network, boards, TILE_PX, task)
+    rows = list(map(frame_row, predictions))
     sides = network.graph.input[0].type.tensor_type.shape.dim[2:]
-    size = " x ".join(str(side.dim_value or tile_px) for side in sides)
-    layers = [_layers(model, predictions[0], boards[0])] if len(boards) == 1 else []
+    size = " x ".join(str(side.dim_value or TILE_PX) for side in sides)
+    layers = [_layers(model, predictions[0])] if len(boards) == 1 else []
     whole = f"not tiled, but run on whole images: expected {why.expected}, got {why.got}"
-    said = [words for found, dpu in zip(predictions, boards, strict=True) for words in host_words(found, dpu)]
-    return BoardBench([*corrected, (f"{model.name}, frames of {size}", rows)], [whole, *dict.fromkeys(said)], layers)
+    return BoardBench([*corrected, (f"{model.name}, frames of {size}", rows)], [whole, *notes], layers)
 
 
 def _boards(

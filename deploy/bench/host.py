@@ -14,7 +14,7 @@ import numpy as np
 import onnx
 import psutil
 
-from beers_deploy.bench.timing import interleaved, timed
+from beers_deploy.bench.timing import interleaved
 from beers_deploy.dpu.reading import inputs_of
 from beers_deploy.host_state import cpu_load, resident_bytes
 from beers_deploy.model.processor import require_cores
@@ -37,35 +37,20 @@ class Timed:
 
 
 def time_networks(runs: Sequence[Timed], tile_px: int, threads: int, min_time_s: float, min_runs: int) -> None:
-    """Time each for one tile, interleaved, until all have run for `min_time_s` and `min_runs` times."""
+    """Time each for a grey tile, interleaved, until all have run for `min_time_s` and `min_runs` times."""
     calls = []
     for run in runs:
-        feed = tile_feed(run.model, tile_px, run.name)
+        shapes = inputs_of(run.model, tile_px, run.name)
+        feed = {name: np.full((1, *shape), 0.25, np.float32) for name, shape in shapes.items()}
         before_bytes = resident_bytes()
         session = open_session(run.model, threads)
         require_finite(session.run(None, feed), run.name)  # warm-up, not counted
         run.held_bytes = resident_bytes() - before_bytes
         calls.append(partial(session.run, None, feed))
 
-    def enough(found: Sequence[Sequence[tuple[float, Figure]]]) -> bool:
-        shortest_s = min(sum(time_s for time_s, _ in taken) for taken in found)
-        return shortest_s >= min_time_s and len(found[0]) >= min_runs
-
-    for run, taken in zip(runs, interleaved(calls, lambda call: timed(call)[1:], enough), strict=True):
+    for run, taken in zip(runs, interleaved(calls, min_runs, min_time_s), strict=True):
         run.times_s += [time_s for time_s, _ in taken]
         run.powers += [power for _, power in taken]
-
-
-def tile_feed(model: onnx.ModelProto, tile_px: int, where: str = "ONNX model") -> dict[str, np.ndarray]:
-    """A grey tile (1, C, tile, tile) for every input."""
-    shapes = inputs_of(model, tile_px, where)
-    return {name: np.full((1, *shape), 0.25, np.float32) for name, shape in shapes.items()}
-
-
-def timed_rows(runs: Sequence[Timed], tile_px: int, conditions: Mapping[str, Figure]) -> list[Row]:
-    """One row a network, and for two of them how much faster INT8 is here."""
-    rows = [_row(run, tile_px, conditions) for run in runs]
-    return [*rows, _ratio_row(runs)] if len(runs) == 2 else rows
 
 
 def _row(run: Timed, tile_px: int, conditions: Mapping[str, Figure]) -> Row:
@@ -99,7 +84,7 @@ def _mean_power(run: Timed) -> Figure:
 
 
 def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0) -> list[Row]:
-    """A network's time for one tile through onnxruntime, float32 and INT8 interleaved.
+    """A network's time for one tile through onnxruntime, float32 and INT8 interleaved, and how much faster INT8 is.
 
     Each runs for the target's minimum time and count, one run for warm-up left out. Its pair in the other
     precision is the shipped network of the same variant; without one it runs alone.
@@ -114,7 +99,8 @@ def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0
     cpu_load()
     time_networks(runs, tile_px, threads, min_time_s, min_runs)
     conditions = conditions_of(threads or psutil.cpu_count(logical=False) or 1)
-    return timed_rows(runs, tile_px, conditions)
+    rows = [_row(run, tile_px, conditions) for run in runs]
+    return rows if other is None else [*rows, _ratio_row(runs)]
 
 
 def conditions_of(threads: int) -> dict[str, Figure]:

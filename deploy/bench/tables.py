@@ -71,10 +71,6 @@ class Swath:
         rows, columns = (plan_side(side, self.tile_px, self.halo_px) for side in (self.height_px, self.width_px))
         return len(rows) * len(columns)
 
-    def work_factor(self, tiles: float) -> float:
-        """Pixels computed over pixels of the image."""
-        return tiles * self.tile_px**2 / self.pixels
-
 
 def predict_file(model: Path, dpu: Dpu, tile_px: int | None = TILE_PX, task: Task | None = None) -> Prediction:
     """What the cost model says of an ONNX file, for tiles of that side or, with None, for the size it is fixed to.
@@ -84,35 +80,30 @@ def predict_file(model: Path, dpu: Dpu, tile_px: int | None = TILE_PX, task: Tas
     return predict(place(read_network(model, tile_px), dpu), dpu, task)
 
 
-def predicted_rows(name: str, prediction: Prediction, swath: Swath, dpu: Dpu) -> list[Row]:
+def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]:
     """A network on the DPU, twice: as the paper counts, and with whole tiles."""
     batches = math.ceil(swath.tiles / prediction.batch)
     counts = {
         "as the paper counts": (swath.frames, swath.frames / prediction.batch),
         f"whole tiles, halo {swath.halo_px} px": (float(swath.tiles), float(batches)),
     }
+    besides = {
+        "one-thread latency": one_thread_latency(prediction),
+        "host beside the DPU": host_time(prediction, "ms/tile"),
+        "power of products and traffic": counted_power(prediction),
+    }
+    words, name = {"fitted range": fitted_range(prediction)}, f"{name}, INT8 on the DPU ({prediction.dpu.name})"
     return [
-        _predicted_row(f"{name}, INT8 on the DPU ({prediction.configuration}), {how}", prediction, swath, dpu, *count)
+        Row(TABLE, f"{name}, {how}", _swath_figures(prediction, swath, *count) | besides, words)
         for how, count in counts.items()
     ]
 
 
-def _predicted_row(name: str, prediction: Prediction, swath: Swath, dpu: Dpu, frames: float, batches: float) -> Row:
-    figures = _swath_figures(prediction, swath, dpu, frames, batches) | {
-        "one-thread latency": one_thread_latency(prediction),
-        "host beside the DPU": host_time(prediction, "ms/tile"),
-        "power of products and traffic": counted_power(prediction, dpu),
-    }
-    return Row(TABLE, name, figures, {"fitted range": fitted_range(prediction)})
-
-
-def _swath_figures(
-    prediction: Prediction, swath: Swath, dpu: Dpu, frames: float, batches: float
-) -> dict[str, Figure]:
-    power, latency = dpu_power(dpu), swath_latency(prediction, batches)
+def _swath_figures(prediction: Prediction, swath: Swath, frames: float, batches: float) -> dict[str, Figure]:
+    power, latency = dpu_power(prediction.dpu), swath_latency(prediction, batches)
     return {
         "tiles": exact(frames, "tile", ARITHMETIC),
-        "work factor": exact(swath.work_factor(frames), "px/px", ARITHMETIC),
+        "work factor": exact(frames * swath.tile_px**2 / swath.pixels, "px/px", ARITHMETIC),
         "latency": latency,
         "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
         "power": power,
@@ -130,7 +121,8 @@ def host_time(prediction: Prediction, unit: str) -> Figure:
 def one_thread_latency(prediction: Prediction) -> Figure:
     """From image to result where one thread runs one core's batch and does the host's work itself, in ms."""
     low_s, high_s = prediction.latency_interval_s
-    images = f"a batch of {prediction.handlers}" if prediction.handlers > 1 else "one image"
+    handlers = prediction.dpu.handlers
+    images = f"a batch of {handlers}" if handlers > 1 else "one image"
     source = f"{COST_SOURCE}, its fit to rates with one thread: {images} through one core, then the host"
     return predicted(1e3 * prediction.latency_s, "ms/batch", (1e3 * low_s, 1e3 * high_s), source)
 
@@ -145,8 +137,8 @@ def swath_latency(prediction: Prediction, batches: float) -> Figure:
 def fitted_range(prediction: Prediction) -> str:
     """Whether the fitted networks speak for this one, and how often the board's intervals held, if too rarely."""
     found = f"outside: {'; '.join(prediction.outside)}" if prediction.outside else "inside"
-    held = f"; intervals held {100 * prediction.held:.0f} % of families left out"
-    return found + held if prediction.held < HELD else found
+    share = prediction.dpu.value("cost", "families_held")
+    return found if share >= HELD else f"{found}; intervals held {100 * share:.0f} % of families left out"
 
 
 def energy(latency: Figure, power: Figure) -> Figure:
@@ -207,7 +199,10 @@ def published_rows() -> list[Row]:
 
 def processor_row(swath: Swath, board: TargetProfile) -> Row:
     """The traditional pipeline on the board's own processor, from the time of 10^6 pixels that its file states."""
-    cpu, mpx, power = board.tables.get("cpu", {}), swath.pixels / 1e6, _processor_power(board)
+    cpu, mpx, watts = board.tables.get("cpu", {}), swath.pixels / 1e6, board.tables.get("power", {}).get("cpu_run_w")
+    power = unavailable("W", "no power of a run on this board's processor is published")
+    if watts is not None:
+        power = published(watts.low, "W", watts.source)
     constant, cores = cpu.get(CHAIN), f", {cpu['cores']} cores" if "cores" in cpu else ""
     name = f"traditional pipeline on the processor of {board.name}{cores}"
     if constant is None:
@@ -226,51 +221,37 @@ def processor_row(swath: Swath, board: TargetProfile) -> Row:
 
 def chain_rate(swath: Swath, latency: Figure) -> Figure:
     """Tiles a second, as the paper counts them, of a predicted latency of the swath."""
-    low_s, high_s = latency.interval or (0.0, 0.0)
-    rate = swath.frames / (latency.value or math.inf)
-    return predicted(rate, "frame/s", (swath.frames / high_s, swath.frames / low_s), latency.source)
+    low, high = (swath.frames / end_s for end_s in reversed(_ends(latency)))
+    return predicted(swath.frames / (latency.value or math.inf), "frame/s", (low, high), latency.source)
 
 
-def _processor_power(board: TargetProfile) -> Figure:
-    """Of the board while its processor runs the pipeline, where it is published."""
-    constant = board.tables.get("power", {}).get("cpu_run_w")
-    if constant is None:
-        return unavailable("W", "no power of a run on this board's processor is published")
-    return published(constant.low, "W", constant.source)
-
-
-def layer_rows(prediction: Prediction, dpu: Dpu) -> list[Row]:
+def layer_rows(prediction: Prediction) -> list[Row]:
     """One row a layer; their times add up to that of a batch, the last row.
 
     The columns are those of AMD's vaitrace, with what bounds the layer; bytes and energy are those of one image.
     """
-    rows = [_layer_row(layer, prediction, dpu) for layer in prediction.layers]
+    rows = [_layer_row(layer, prediction) for layer in prediction.layers]
     total = f"sum: one batch of {prediction.batch}"
-    return [*rows, Row(LAYERS, total, {"time": _time(prediction.batch_time_s, prediction)})]
+    return [*rows, Row(LAYERS, total, {"time": scaled(1e3 * prediction.batch_time_s, "ms/batch", prediction)})]
 
 
-def _layer_row(layer: LayerCost, prediction: Prediction, dpu: Dpu) -> Row:
-    work, batch, low_high_j = layer.work, prediction.batch, layer_energy_j(layer, dpu)
-    moved = batch * (work.load_map_bytes + work.store_map_bytes) + work.weight_bytes
+def _layer_row(layer: LayerCost, prediction: Prediction) -> Row:
+    work, batch, dpu = layer.work, prediction.batch, prediction.dpu
+    low_j, high_j = layer_energy_j(layer, dpu)
+    moved = batch * work.map_bytes + work.weight_bytes
     seconds = layer.time_s or math.inf  # a concat takes no time of its own
     figures = {
         "work": exact(work.operations / 1e9, "GOP"),
-        "time": _time(layer.time_s, prediction),
-        "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction, COST_SOURCE),
+        "time": scaled(1e3 * layer.time_s, "ms/batch", prediction),
+        "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction),
         "LdFM": exact(work.load_map_bytes / 1e6, "MB", "feature maps that an image loads, by the graph's shapes"),
         "LdWB": exact(work.weight_bytes / 1e6, "MB", "weights and biases that a batch loads, by the graph's shapes"),
         "StFM": exact(work.store_map_bytes / 1e6, "MB", "feature maps that an image stores, by the graph's shapes"),
-        "bandwidth": scaled(moved / seconds / 1e9, "GB/s", prediction, COST_SOURCE),
+        "bandwidth": scaled(moved / seconds / 1e9, "GB/s", prediction),
         "array use": exact(100 * work.array_use, "%"),
-        "energy": predicted(
-            500 * sum(low_high_j), "mJ", (1e3 * low_high_j[0], 1e3 * low_high_j[1]), energy_source(dpu)
-        ),
+        "energy": predicted(500 * (low_j + high_j), "mJ", (1e3 * low_j, 1e3 * high_j), energy_source(dpu)),
     }
     return Row(LAYERS, work.name, figures, {"bound": layer.bound})
-
-
-def _time(time_s: float, prediction: Prediction) -> Figure:
-    return scaled(1e3 * time_s, "ms/batch", prediction, COST_SOURCE)
 
 
 def exact(value: float, unit: str, source: str = "arithmetic of the graph's shapes, one image") -> Figure:
@@ -278,9 +259,9 @@ def exact(value: float, unit: str, source: str = "arithmetic of the graph's shap
     return predicted(value, unit, (value, value), source)
 
 
-def scaled(value: float, unit: str, prediction: Prediction, source: str) -> Figure:
+def scaled(value: float, unit: str, prediction: Prediction) -> Figure:
     """A part of the prediction, with the relative error of the whole."""
-    return predicted(value, unit, (value / prediction.spread, value * prediction.spread), source)
+    return predicted(value, unit, (value / prediction.spread, value * prediction.spread), COST_SOURCE)
 
 
 MOST_TILE_PX = 8192
@@ -292,24 +273,29 @@ def sweep_rows(
 ) -> list[Row]:
     """A row a configuration and tile size, for whole tiles with the swath's halo."""
     return [
-        swath_row(predict_file(model, dpu, tile_px, task), replace(swath, tile_px=tile_px), dpu)
+        swath_row(predict_file(model, dpu, tile_px, task), replace(swath, tile_px=tile_px))
         for dpu in boards
         for tile_px in tiles_px
     ]
 
 
-def swath_row(prediction: Prediction, swath: Swath, dpu: Dpu) -> Row:
+def swath_row(prediction: Prediction, swath: Swath) -> Row:
     """A swath in whole tiles on one configuration."""
     batches = math.ceil(swath.tiles / prediction.batch)
-    figures = _swath_figures(prediction, swath, dpu, swath.tiles, batches) | {
+    kept = [not layer.work.map_bytes for layer in prediction.layers]
+    figures = _swath_figures(prediction, swath, swath.tiles, batches) | {
         "maps through memory": exact(prediction.streamed_bytes / 1e6, "MB/tile"),
-        "layers on chip": exact(on_chip(prediction), "%"),
+        "layers on chip": exact(100 * sum(kept) / len(kept), "%"),
     }
     bound = Counter[str]()
     for layer in prediction.layers:
         bound[layer.bound] += round(1e12 * layer.time_s)
     words = {"bound": bound.most_common(1)[0][0], "fitted range": fitted_range(prediction)}
-    return Row("sweep", f"{dpu.target.name} {prediction.configuration}, tiles of {swath.tile_px}", figures, words)
+    return Row("sweep", f"{_named(prediction)}, tiles of {swath.tile_px}", figures, words)
+
+
+def _named(prediction: Prediction) -> str:
+    return f"{prediction.dpu.target.name} {prediction.dpu.name}"
 
 
 def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) -> str:
@@ -338,9 +324,9 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
     return f"the smallest DPU that takes {within_s:g} s or less: {words}"
 
 
-def frame_row(prediction: Prediction, dpu: Dpu) -> Row:
+def frame_row(prediction: Prediction) -> Row:
     """A network that is run on whole images, on one configuration: frames instead of a swath."""
-    power, frame_s = dpu_power(dpu), swath_latency(prediction, 1 / prediction.batch)
+    power, frame_s = dpu_power(prediction.dpu), swath_latency(prediction, 1 / prediction.batch)
     figures = {
         "work": exact(prediction.operations / 1e9, "GOP"),
         "batch": exact(prediction.batch, "frame", "images in flight"),
@@ -350,28 +336,21 @@ def frame_row(prediction: Prediction, dpu: Dpu) -> Row:
         "power": power,
         "energy": energy(frame_s, power),
     }
-    name = f"{dpu.target.name} {prediction.configuration}, whole images"
     words = {"host's task": prediction.task, "fitted range": fitted_range(prediction)}
-    return Row("frames", name, figures, words)
+    return Row("frames", f"{_named(prediction)}, whole images", figures, words)
 
 
-def host_words(prediction: Prediction, dpu: Dpu) -> list[str]:
+def host_words(prediction: Prediction) -> list[str]:
     """What was assumed of the file, and what the processor runs because the DPU refuses it; a sentence each."""
     found = [prediction.note] if prediction.note else []
     if prediction.refused:
         low_ms, high_ms = (1e3 * end_s for end_s in prediction.refused_s)
         found.append(
-            f"the processor of {dpu.target.name} runs what its DPU refuses ('beers-deploy check' says why): "
-            f"{', '.join(prediction.refused)}; {number(low_ms, 2)} to {number(high_ms, 2)} ms an image, from the "
-            "best that is published of its cores to plain code"
+            f"the processor of {prediction.dpu.target.name} runs what its DPU refuses ('beers-deploy check' says "
+            f"why): {', '.join(prediction.refused)}; {number(low_ms, 2)} to {number(high_ms, 2)} ms an image, from "
+            "the best that is published of its cores to plain code"
         )
     return found
-
-
-def on_chip(prediction: Prediction) -> float:
-    """Share of layers that neither read nor write maps in memory, in percent."""
-    kept = [not (layer.work.load_map_bytes or layer.work.store_map_bytes) for layer in prediction.layers]
-    return 100 * sum(kept) / len(kept)
 
 
 def parse_tiles(text: str) -> list[int]:

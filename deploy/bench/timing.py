@@ -13,7 +13,6 @@ from beers_deploy.profiles.figures import Figure, measured, unavailable
 POWERCAP = Path("/sys/class/powercap")
 
 Result = TypeVar("Result")
-Call = Callable[[], object]
 
 
 def timed(work: Callable[[], Result], powercap: Path = POWERCAP) -> tuple[Result, float, Figure]:
@@ -36,22 +35,16 @@ def _power(before: dict[Path, int] | str, after: dict[Path, int] | str, elapsed_
 
 def _advance(domain: Path, before: int, after: int) -> int:
     """Counts between two readings of a counter that starts again at its range; one turn at most (minutes)."""
-    return (
-        after - before
-        if after >= before
-        else after - before + int((domain / "max_energy_range_uj").read_text(encoding="utf-8"))
-    )
+    range_uj = 0 if after >= before else int((domain / "max_energy_range_uj").read_text(encoding="utf-8"))
+    return after - before + range_uj
 
 
 def _read(powercap: Path) -> dict[Path, int] | str:
     """Counters of the packages in microjoules, or why there are none."""
     try:
-        domains = [
-            d
-            for d in sorted(powercap.glob("*rapl*:*"))
-            if (d / "name").read_text(encoding="utf-8").startswith("package")
-        ]
-        counters = {domain: int((domain / "energy_uj").read_text(encoding="utf-8")) for domain in domains}
+        names = {domain: (domain / "name").read_text(encoding="utf-8") for domain in powercap.glob("*rapl*:*")}
+        packages = [domain for domain, name in names.items() if name.startswith("package")]
+        counters = {domain: int((domain / "energy_uj").read_text(encoding="utf-8")) for domain in packages}
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "no number in it"
         return f"RAPL energy counters cannot be read here ({reason})"
@@ -59,21 +52,20 @@ def _read(powercap: Path) -> dict[Path, int] | str:
 
 
 def interleaved(
-    calls: Sequence[Call], measure: Callable[[Call], Result], enough: Callable[[Sequence[Sequence[Result]]], bool]
-) -> list[list[Result]]:
-    """Run every call once a round until there are enough rounds, and so compare them fairly.
+    calls: Sequence[Callable[[], object]], rounds: int, least_s: float = 0.0
+) -> list[list[tuple[float, Figure]]]:
+    """Time and power of every call, each run once a round, and so compared fairly.
 
     Args:
         calls: what is timed, already warmed up.
-        measure: runs one call and says what it took.
-        enough: asked after each round, with what was measured so far of each call, in the order of `calls`.
+        rounds: the least of them.
+        least_s: what each call's runs take together, at least.
 
     Returns:
-        What was measured of each call, round by round.
+        Of each call, round by round.
     """
-    found: list[list[Result]] = [[] for _ in calls]
-    while True:
+    found: list[list[tuple[float, Figure]]] = [[] for _ in calls]
+    while len(found[0]) < rounds or min(sum(time_s for time_s, _ in taken) for taken in found) < least_s:
         for call, taken in zip(calls, found, strict=True):
-            taken.append(measure(call))
-        if enough(found):
-            return found
+            taken.append(timed(call)[1:])
+    return found

@@ -61,9 +61,14 @@ class Dpu:
         return int(self.constants["cores"].low)
 
     @property
+    def handlers(self) -> int:
+        """Images that a core takes at once."""
+        return int(self.constants["batch_handlers"].low)
+
+    @property
     def batch(self) -> int:
         """Images that go through at once, one a batch handler of every core."""
-        return self.cores * int(self.constants["batch_handlers"].low)
+        return self.cores * self.handlers
 
     @property
     def channels_max(self) -> int:

@@ -50,12 +50,10 @@ def own_tile_px(model: onnx.ModelProto) -> int | None:
 
 def _places(model: onnx.ModelProto) -> tuple[int, int]:
     """What a board's file says of its planes: a place's side in pixels, and how far they reach beyond the image."""
-    found = []
-    for key, least in ((PLACE_PX, 1), (BORDER_PX, 0)):
-        found.append(int(metadata(model).get(key, least)))
-        if not least <= found[-1] <= PLACE_MAX_PX:
-            raise ValueError(f"{key} {found[-1]}")
-    return found[0], found[1]
+    place_px, border_px = (int(metadata(model).get(key, least)) for key, least in ((PLACE_PX, 1), (BORDER_PX, 0)))
+    if not (1 <= place_px <= PLACE_MAX_PX and 0 <= border_px <= PLACE_MAX_PX):
+        raise ValueError(f"places of {place_px} px, {border_px} px around")
+    return place_px, border_px
 
 
 def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model") -> Network:
@@ -69,7 +67,7 @@ def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX m
         return _Reader(graph, _inputs(graph, tile_px, _places(model), where)).network()
 
 
-def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model") -> dict[str, Shape]:
+def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str) -> dict[str, Shape]:
     """The inputs of a file as it stands, by name: (C, H, W) in places, for a tile or as the file states them."""
     return _inputs(OnnxGraph(model), tile_px, _places(model), where)
 

@@ -22,7 +22,7 @@ from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Check, Row, measured
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
-from beers_deploy.profiles.toml import read_json
+from beers_deploy.profiles.toml import read_json, unreadable
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import PLANES, Op
@@ -44,7 +44,6 @@ def write_golden(
     *,
     tile: int | None = None,
     board: "TargetProfile | str" = DEFAULT_TARGET,
-    seed: int = 0,
 ) -> Path:
     """Write golden vectors of an INT8 network to a folder, and return it.
 
@@ -53,13 +52,12 @@ def write_golden(
         out: the folder.
         tile: side of a tile in pixels; the network's own if it has one, else 64.
         board: whose way to round ties is taken.
-        seed: of what is drawn.
     """
     network, folder = Network.load(int8), Path(out)
     with faults_named(network.label):
         core = read_core(network.model)
     half_even, names = bool(TargetProfile.load(board).npu), files_of(core)  # AMD's kernel for its NPU rounds to even
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     images = _images(network, core.ends.image_channels, tile, generator)
     planes = {case: core.ends.split(image) for case, image in images.items()}
     planes[EXTREMES] = generator.choice(np.array([-128, 127], np.int8), planes["noise"].shape)
@@ -190,7 +188,7 @@ def _array(path: Path) -> np.ndarray:
     try:
         return np.asarray(np.load(path, allow_pickle=False))
     except (OSError, ValueError, EOFError) as error:
-        got = "no such file" if not path.exists() else "another file"
+        got = unreadable(path) or "another file"
         raise ImageError(str(path), expected="an array (.npy)", got=got, remedy="write it with numpy.save") from error
 
 
@@ -223,16 +221,13 @@ def _results(golden: Golden, given: Path) -> Results:
         got = f"{unknown[0].parent.name}/{unknown[0].name}" if unknown else "none"
         expected, remedy = "results as CASE/LAYER.npy", f"name them as in {INDEX}"
         raise OptionError(str(given), expected=expected, got=got, remedy=remedy)
-    found = {name: sorted(path for path in paths if path.name == file) for name, file in files.items()}
-    return {
-        name: [_seen(golden, name, golden.cases[path.parent.name], path) for path in here]
-        for name, here in found.items()
-        if here
-    }
-
-
-def _seen(golden: Golden, name: str, sound: Mapping[str, np.ndarray], path: Path) -> Seen:
-    return Seen(sound, _integers(path, sound[name].shape, golden.core.frac_bits[name]))
+    found: dict[str, list[Seen]] = {}
+    for name, file in files.items():
+        for path in sorted(path for path in paths if path.name == file):
+            sound = golden.cases[path.parent.name]
+            values = _integers(path, sound[name].shape, golden.core.frac_bits[name])
+            found.setdefault(name, []).append(Seen(sound, values))
+    return found
 
 
 def _differing(name: str, cases: list[Seen]) -> list[Seen]:

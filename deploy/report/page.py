@@ -3,7 +3,6 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import jinja2
@@ -16,22 +15,14 @@ from beers_deploy.results import missing, unit_of
 INTERVAL = re.compile(r"\[[^\[\]]*\]")
 
 
-TEMPLATES = Path(__file__).parents[1]
-"""The folder whose packages hold the pages' templates."""
+def _template() -> jinja2.Template:
+    loader, strict = jinja2.FileSystemLoader(Path(__file__).parent), jinja2.StrictUndefined
+    made = jinja2.Environment(loader=loader, autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True)
+    made.filters["unbroken"] = _unbroken
+    return made.get_template("report.html")
 
 
-@cache
-def templates() -> jinja2.Environment:
-    """The environment, with the filter `unbroken`."""
-    loader = jinja2.FileSystemLoader(TEMPLATES)
-    made = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    made.filters["unbroken"] = unbroken
-    return made
-
-
-def unbroken(text: str) -> str:
+def _unbroken(text: str) -> str:
     """The text with each interval in brackets on one line."""
     return INTERVAL.sub(lambda found: found[0].replace(" ", "\N{NO-BREAK SPACE}"), text)
 
@@ -74,7 +65,7 @@ class Report:
 def render(report: Report) -> str:
     """The report as one HTML file, pictures embedded."""
     tables = [_grid(table, upright=report.sorts) for table in report.tables]
-    return templates().get_template("report/report.html").render(report=report, tables=tables, version=__version__)
+    return _template().render(report=report, tables=tables, version=__version__)
 
 
 def write_report(report: Report, path: Path) -> None:

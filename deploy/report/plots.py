@@ -171,9 +171,6 @@ def data_url(svg: str) -> str:
     return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
 
 
-Points = tuple[tuple[float, float], ...]
-
-
 @dataclass(frozen=True)
 class Curve:
     """Points (x, y), x above 0 on a logarithmic axis; curves of one name look alike in all panels."""
@@ -181,15 +178,7 @@ class Curve:
     name: str
     colour: int
     dashed: bool
-    points: Points
-
-
-@dataclass(frozen=True)
-class Panel:
-    """Curves that share axes, under a title."""
-
-    title: str
-    curves: Sequence[Curve]
+    points: tuple[tuple[float, float], ...]
 
 
 CURVES_PX = (960, 370)
@@ -200,11 +189,13 @@ LEGEND_NAMES, LEGEND_ROW_PX = 4, 22
 """In a row of the legend, at most, and how high a row is."""
 
 
-def curves_svg(panels: Sequence[Panel], x_title: str, y_title: str, *, logarithmic: bool = True) -> str:
+def curves_svg(
+    panels: Sequence[tuple[str, Sequence[Curve]]], x_title: str, y_title: str, *, logarithmic: bool = True
+) -> str:
     """Panels side by side that share the axis upwards, each with an axis of its own to the right.
 
     Args:
-        panels: what to draw.
+        panels: curves that share axes, under a title.
         x_title: of the axis to the right.
         y_title: of the axis upwards.
         logarithmic: whether the axis to the right is, with a dot at each point; else lines alone are drawn.
@@ -212,7 +203,7 @@ def curves_svg(panels: Sequence[Panel], x_title: str, y_title: str, *, logarithm
     Returns:
         An SVG file, light or dark as its reader's screen is.
     """
-    rows = math.ceil(len({curve.name for panel in panels for curve in panel.curves}) / LEGEND_NAMES)
+    rows = math.ceil(len({curve.name for _, curves in panels for curve in curves}) / LEGEND_NAMES)
     width_px, more_px = CURVES_PX[0], (rows - 1) * LEGEND_ROW_PX
     height_px = CURVES_PX[1] + more_px
     frame = CURVES_FRAME | {"top": 1 - ABOVE_PX / height_px, "bottom": (BELOW_PX + more_px) / height_px}
@@ -220,10 +211,10 @@ def curves_svg(panels: Sequence[Panel], x_title: str, y_title: str, *, logarithm
         figure = new_figure(width_px, height_px)
         all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False, gridspec_kw=frame)[0]
         named = {}
-        for axes, panel in zip(all_axes, panels, strict=True):
-            axes.set(xscale="log" if logarithmic else "linear", title=panel.title)
+        for axes, (title, curves) in zip(all_axes, panels, strict=True):
+            axes.set(xscale="log" if logarithmic else "linear", title=title)
             axes.margins(0.06)
-            for curve in panel.curves:
+            for curve in curves:
                 style = {"color": LIGHT[SERIES[curve.colour]], "ls": "--" if curve.dashed else "-"}
                 style["marker"] = "o" if logarithmic else ""
                 named[curve.name] = axes.plot(*zip(*curve.points, strict=True), **style, ms=5, lw=2, gid="curve")[0]

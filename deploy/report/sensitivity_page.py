@@ -18,7 +18,7 @@ Sessions = tuple[ort.InferenceSession, ort.InferenceSession]
 
 ZOOM = 2
 WHITE_SHARE = 0.999
-"""The size of error shown white is the one that this share of all pixels stays below."""
+"""The size of error shown white, the same in all patches, is the one that this share of all pixels stays below."""
 
 
 def sensitivity_page(
@@ -34,16 +34,11 @@ def sensitivity_page(
         sessions: the float and the INT8 network.
         worst: the numbers of the patches to show.
     """
-    white_dn = error_shown_white(spread)
+    white_dn = next(dn for dn in range(1, MAX_DN + 1) if spread.share_beyond(dn) <= 1 - WHITE_SHARE)
     pictures = [Picture("Errors by size", histogram_url(spread), HISTOGRAM_CAPTION)]
     pictures += [worst_picture(number, patches.degraded[number], sessions, white_dn) for number in worst]
     tables = [Section(name.capitalize(), found, CAPTIONS.get(name, "")) for name, found in by_table(rows).items()]
     return Report("Where INT8 errs", headline, tables, pictures, NOTES)
-
-
-def error_shown_white(spread: Spread) -> int:
-    """In DN, one for all patches, so that they compare."""
-    return next(dn for dn in range(1, MAX_DN + 1) if spread.share_beyond(dn) <= 1 - WHITE_SHARE)
 
 
 def worst_picture(number: int, degraded: np.ndarray, sessions: Sessions, white_dn: float) -> Picture:

@@ -148,7 +148,7 @@ def bench_tables(model: Path, dn: np.ndarray, sensors: tuple[Sensor, Sensor]) ->
     prediction, rows = tables.predict_file(model, dpu), []
     for width, height in ((dn.shape[1], dn.shape[0]), SWATH_PX):
         swath = tables.Swath(width, height, TILE_PX, halo_px)
-        network = tables.predicted_rows(VARIANT, prediction, swath, dpu)
+        network = tables.predicted_rows(VARIANT, prediction, swath)
         rows.append([chain.row(swath), tables.processor_row(swath, dpu.target), *network])
     dpus = [load_dpu(name) for name in board_names()]
     boards = tables.sweep_rows(model, swath, dpus, [TILE_PX])

@@ -3,7 +3,6 @@
 A test keeps it fresh: it names every object that the package's `__all__` has.
 """
 
-import sys
 from pathlib import Path
 
 import beers_deploy as bd
@@ -25,4 +24,4 @@ def document() -> str:
 
 if __name__ == "__main__":
     TARGET.write_text(document(), encoding="utf-8", newline="\n")
-    sys.stdout.write(f"wrote {TARGET}\n")
+    print(f"wrote {TARGET}")

@@ -30,10 +30,12 @@ def modules() -> dict[str, Path]:
     return {name: path for name, path in named.items() if path.name != "__init__.py"}
 
 
-def imports_of(path: Path, known: dict[str, Path]) -> set[str]:
-    """The modules of ours that a file imports, anywhere in it."""
-    found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+def imports_of(path: Path, known: dict[str, Path], *, late: bool = True) -> set[str]:
+    """The modules of ours that a file imports: anywhere in it, or as it is loaded alone."""
+    found, tree = set[str](), ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree) if late else tree.body:
+        if isinstance(node, ast.Import):
+            found |= {in_folder(alias.name) for alias in node.names}
         if isinstance(node, ast.ImportFrom) and node.module:
             found |= {in_folder(f"{node.module}.{alias.name}") for alias in node.names} | {in_folder(node.module)}
     return found & known.keys()

@@ -3,7 +3,6 @@
 It runs what `beers-deploy stress --bit-flips` runs, on three shipped networks. A test keeps its words and rows fresh.
 """
 
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -81,13 +80,8 @@ def table(networks: Mapping[str, Sequence[Row]]) -> Iterator[str]:
         yield f"| {rows[0].name} | {' | '.join(cells)} |"
 
 
-def rows_of(variant: str) -> list[Row]:
-    """The study of one shipped network."""
-    return flip_rows(open_subject(Path(variant), None), SOURCE, BOARD)
-
-
 if __name__ == "__main__":
-    studies = {variant: rows_of(variant) for variant in VARIANTS}
+    studies = {variant: flip_rows(open_subject(Path(variant), None), SOURCE, BOARD) for variant in VARIANTS}
     write_text(PAGE, document(studies))
     write_text(PICTURE, flip_curves_svg(studies))
-    sys.stdout.write(f"wrote {PAGE} and {PICTURE}\n")
+    print(f"wrote {PAGE} and {PICTURE}")

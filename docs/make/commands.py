@@ -4,7 +4,6 @@ The text comes from the commands' own help, what an option takes from docs/make/
 fresh.
 """
 
-import sys
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
@@ -56,9 +55,7 @@ def _section(name: str, lines: Mapping[str, str], once: Collection[str]) -> Iter
 
 def _lines(name: str) -> dict[str, str]:
     """The line of each argument and option of a command, by its name."""
-    kinds = {each.name: each.kind.removeprefix("flag") for each in parameters(name)}
-    found = [each for each in get_command(app).commands[name].params if each.name in kinds]  # type: ignore[attr-defined]
-    return {_label(each): _line(each, kinds[each.name]) for each in found}
+    return {_label(each.shown): _line(each.shown, each.kind.removeprefix("flag")) for each in parameters(name)}
 
 
 def _label(parameter: Any) -> str:
@@ -78,4 +75,4 @@ def _line(parameter: Any, kind: str) -> str:
 
 if __name__ == "__main__":
     TARGET.write_text(reference(), encoding="utf-8", newline="\n")
-    sys.stdout.write(f"wrote {TARGET}\n")
+    print(f"wrote {TARGET}")

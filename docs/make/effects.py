@@ -3,7 +3,6 @@
 Run `python docs/make/effects.py` after a change to the simulator.
 """
 
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -17,8 +16,8 @@ from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.plan import Plan, make_plan, scene_stats
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles import load_sensor
-from beers_deploy.profiles.effects import TABLES, Effect, middle_effect
-from beers_deploy.profiles.scene_call import SceneCall, calling_for, load_scene_call, scene_names, typical_effects
+from beers_deploy.profiles.effects import TABLES, middle_effect
+from beers_deploy.profiles.scene_call import calling_for, load_scene_call, scene_names, typical_effects
 from beers_deploy.profiles.sensor import Instrument
 
 DOCS = Path(__file__).parents[1]
@@ -63,14 +62,12 @@ The four shipped scenes under `pleiades-degraded` ask for these effects, with th
 """
 
 
-def main() -> None:
-    """Write both files."""
-    figure().save(PICTURE, optimize=True)
+def document() -> str:
+    """The page as Markdown."""
     shown = ", ".join(f"{key} {value:g}" for values in SHOWN.values() for key, value in values.items())
     scene = procedural_scene(1500, 1500, np.random.default_rng(0)).radiance
-    text = HEAD.format(shown=shown, tolerance=make_plan(plain(), scene_stats(scene, RATIO)).tolerance_dn)
-    PAGE.write_text(text + "\n".join(bounds(scene)) + "\n", encoding="utf-8", newline="\n")
-    sys.stdout.write(f"wrote {PICTURE} and {PAGE}\n")
+    head = HEAD.format(shown=shown, tolerance=make_plan(plain(), scene_stats(scene, RATIO)).tolerance_dn)
+    return head + "\n".join(bounds(scene)) + "\n"
 
 
 def plain() -> Instrument:
@@ -83,15 +80,16 @@ def figure() -> Image.Image:
     side = (SIDE_PX + 2 * MARGIN_PX) * RATIO
     radiance = procedural_scene(3520, 3520, np.random.default_rng(0)).radiance
     scene = prepare_scene(radiance[2000 : 2000 + side, 2300 : 2300 + side], RATIO)
-    effects = {name: stronger(name, middle_effect(name, table)) for name, table in typical_effects().items()}
+    typical = {name: middle_effect(name, table) for name, table in typical_effects().items()}
+    effects = {name: replace(effect, **SHOWN.get(name, {})) for name, effect in typical.items()}  # type: ignore[arg-type]
     sensors = {"blur and noise": plain()}
     sensors |= {f"+ {name}": replace(plain(), effects={name: effects[name]}) for name in TABLES}
     sensors["all"] = replace(plain(), effects=effects)
-    images = {}
-    for name, sensor in sensors.items():
-        images[name] = simulate_planned(scene, sensor, Draw(0), make_plan(sensor, scene.stats))
-    names = list(images)
-    rows = [{name: images[name] for name in names[k : k + COLUMNS]} for k in range(0, len(names), COLUMNS)]
+    images = [
+        (name, simulate_planned(scene, sensor, Draw(0), make_plan(sensor, scene.stats)))
+        for name, sensor in sensors.items()
+    ]
+    rows = [dict(images[k : k + COLUMNS]) for k in range(0, len(images), COLUMNS)]
     strips = [strip(row, [(0, 0)], SIDE_PX, 2, Stretch(0.0, 2600.0)) for row in rows]
     canvas = Image.new("L", (max(s.width for s in strips), sum(s.height for s in strips)), 255)
     for k, picture in enumerate(strips):
@@ -99,14 +97,13 @@ def figure() -> Image.Image:
     return canvas
 
 
-def stronger(name: str, effect: Effect) -> Effect:
-    """The effect as it is shown."""
-    return replace(effect, **SHOWN.get(name, {}))  # type: ignore[arg-type]
-
-
 def bounds(radiance: np.ndarray) -> Iterator[str]:
     """The effects that each scene asks for, as a Markdown table of their bounds."""
-    plans = {name: plan_of(load_scene_call(name), radiance) for name in scene_names()}
+    plans = dict[str, Plan]()
+    for name in scene_names():
+        call = load_scene_call(name)
+        sensor = calling_for(load_sensor("pleiades-degraded"), call).nominal()
+        plans[name] = make_plan(sensor, scene_stats(radiance * call.radiance_scale.low, RATIO))
     yield f"| effect | {' | '.join(plans)} |"
     yield "|---" * (len(plans) + 1) + "|"
     for number, effect in enumerate(decision.effect for decision in next(iter(plans.values())).decisions):
@@ -115,11 +112,7 @@ def bounds(radiance: np.ndarray) -> Iterator[str]:
             yield f"| {effect} | {' | '.join('-' if cell is None else f'{cell:.3g}' for cell in cells)} |"
 
 
-def plan_of(call: SceneCall, radiance: np.ndarray) -> Plan:
-    """The plan of one scene."""
-    sensor = calling_for(load_sensor("pleiades-degraded"), call).nominal()
-    return make_plan(sensor, scene_stats(radiance * call.radiance_scale.low, RATIO))
-
-
 if __name__ == "__main__":
-    main()
+    figure().save(PICTURE, optimize=True)
+    PAGE.write_text(document(), encoding="utf-8", newline="\n")
+    print(f"wrote {PICTURE} and {PAGE}")

@@ -134,21 +134,13 @@ def read_report(text: str) -> Failures:
     )
 
 
-def survivors(found: Mapping[str, Failures]) -> list[str]:
-    """Mutations, by name, of which a named test did not fail."""
-    return [m.name for m in MUTATIONS if set(m.tests) - set(found[m.name])]
-
-
 def document(found: Mapping[str, Failures]) -> str:
     """The page as Markdown."""
-    head = "| mutation | file | tests that fail |\n|---|---|---|\n"
-    return OPENING + "\n" + head + "".join(row(mutation, found[mutation.name]) for mutation in MUTATIONS)
-
-
-def row(mutation: Mutation, found: Failures) -> str:
-    """One line of the table."""
-    tests = ", ".join(f"`{name}` ({cases})" for name, cases in found.items())
-    return f"| {described(mutation)} | {tests or 'none'} |\n"
+    lines = [OPENING, "| mutation | file | tests that fail |", "|---|---|---|"]
+    for mutation in MUTATIONS:
+        tests = ", ".join(f"`{name}` ({cases})" for name, cases in found[mutation.name].items())
+        lines.append(f"| {described(mutation)} | {tests or 'none'} |")
+    return "\n".join([*lines, ""])
 
 
 def described(mutation: Mutation) -> str:
@@ -167,10 +159,11 @@ def main() -> int:
             found[mutation.name] = failures_of(copy, mutation)
             bar.advance(note=mutation.name)
     TARGET.write_text(document(found), encoding="utf-8", newline="\n")
-    sys.stdout.write(f"wrote {TARGET}\n")
-    for name in survivors(found):
-        sys.stdout.write(f"SURVIVED: {name}\n")
-    return 1 if survivors(found) else 0
+    print(f"wrote {TARGET}")
+    survivors = [m.name for m in MUTATIONS if set(m.tests) - set(found[m.name])]
+    for name in survivors:
+        print(f"SURVIVED: {name}")
+    return 1 if survivors else 0
 
 
 if __name__ == "__main__":

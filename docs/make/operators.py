@@ -4,7 +4,6 @@ A test keeps it fresh.
 """
 
 import re
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
@@ -12,8 +11,9 @@ from beers_deploy.dpu.board import Dpu, load_dpu, ruled
 from beers_deploy.dpu.checker.finding import Rule
 from beers_deploy.dpu.checker.operators import NUMBERS, RULES, SHIFTS, SIZES, all_rules, applies, rule_name, rule_text
 from beers_deploy.dpu.checker.other_rules import INSTEAD
-from beers_deploy.dpu.checker.table import REMARKS
+from beers_deploy.dpu.checker.remarks import REMARKS
 from beers_deploy.dpu.cost.latency import dpu_power
+from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.target import board_names, load_target, npu_names
 from beers_deploy.quant.graph.nodes import KINDS, Kind
 
@@ -62,7 +62,7 @@ FIGURES: dict[str, Callable[[Dpu], str]] = {
         f"{dpu.input_parallel} x {dpu.output_parallel} x {dpu.whole('array', 'pixel_parallel')}"
     ),
     "map kept on chip, KiB": lambda dpu: f"{dpu.value('memory', 'feature_map_bytes') / 2**10:g}",
-    "DDR, GB/s": lambda dpu: _scaled(dpu, "memory", "ddr_bytes_per_s", 1e9),
+    "DDR, GB/s": lambda dpu: _gigabytes(dpu.limit("memory", "ddr_bytes_per_s")),
     "power under the DPU, W": lambda dpu: str(dpu_power(dpu)),
 }
 """What a board's file states, in the words of a table."""
@@ -78,9 +78,8 @@ def _boards() -> Iterator[str]:
     yield ""
 
 
-def _scaled(dpu: Dpu, table: str, key: str, unit: float) -> str:
-    ends = dict.fromkeys(f"{end / unit:g}" for end in (dpu.limit(table, key).low, dpu.limit(table, key).high))
-    return " to ".join(ends)
+def _gigabytes(rate: Constant) -> str:
+    return " to ".join(dict.fromkeys(f"{end / 1e9:g}" for end in (rate.low, rate.high)))
 
 
 def _kinds() -> Iterator[str]:
@@ -108,13 +107,9 @@ def _npu(npu: Dpu) -> Iterator[str]:
     yield "AMD publishes no limits; numbers are its quantiser's. [The NPU's flow](npu.md) has what else is known."
     yield f"As for the DPUs: {', '.join(same)}. Otherwise ({npu.target.documents['quantiser']}):\n"
     rest = {name: text for name, (_, text) in texts.items() if name not in same}
-    yield from (f"- **{name}**: {_without_quantiser(text, npu)}" for name, text in rest.items())
+    above = f" ({npu.target.documents['quantiser']})"
+    yield from (f"- **{name}**: {text.replace(above, '')}" for name, text in rest.items())
     yield ""
-
-
-def _without_quantiser(text: str, npu: Dpu) -> str:
-    """A rule's text without the source that stands above all of them."""
-    return text.replace(f" ({npu.target.documents['quantiser']})", "")
 
 
 def _texts(rule: Callable[..., object]) -> dict[str, str]:
@@ -164,4 +159,4 @@ def _alike(texts: Mapping[str, str]) -> Iterator[tuple[str, str]]:
 
 if __name__ == "__main__":
     TARGET.write_text(document(), encoding="utf-8", newline="\n")
-    sys.stdout.write(f"wrote {TARGET}\n")
+    print(f"wrote {TARGET}")

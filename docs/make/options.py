@@ -215,7 +215,10 @@ REFUSED = {
 
 @dataclass(frozen=True)
 class Parameter:
-    """An argument or option of a command: its names in Python and on the command line, its type and range."""
+    """An argument or option of a command: its names in Python and on the command line, its type and range.
+
+    `shown` is what the command line makes of it: Click's parameter.
+    """
 
     command: str
     name: str
@@ -223,6 +226,7 @@ class Parameter:
     required: bool
     hint: Any
     info: Any
+    shown: Any
 
     @property
     def kind(self) -> str:
@@ -250,10 +254,9 @@ def parameters(command: str) -> list[Parameter]:
     for shown in get_command(app).commands[command].params:  # type: ignore[attr-defined]
         if shown.name in hints:
             hint, info = get_args(hints[shown.name])
-            label = (
-                max(shown.opts, key=len) if shown.param_type_name == "option" else shown.metavar or shown.name.upper()
-            )
-            found.append(Parameter(command, shown.name, label.strip("[]"), shown.required, _plain(hint), info))
+            is_option = shown.param_type_name == "option"
+            label = max(shown.opts, key=len) if is_option else (shown.metavar or shown.name.upper()).strip("[]")
+            found.append(Parameter(command, shown.name, label, shown.required, _plain(hint), info, shown))
     return found
 
 

@@ -4,7 +4,6 @@ It takes two minutes. A test keeps its lists of cases, stages and limitations fr
 machine that made it.
 """
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -89,12 +88,7 @@ def limitation_lines() -> Iterator[str]:
         )
 
 
-def main() -> None:
-    """Run the battery on the shipped pair and write the page."""
-    subject = open_subject(Path(VARIANT), None)
-    write_text(TARGET, document(subject, run_battery(subject)))
-    sys.stdout.write(f"wrote {TARGET}\n")
-
-
 if __name__ == "__main__":
-    main()
+    shipped = open_subject(Path(VARIANT), None)
+    write_text(TARGET, document(shipped, run_battery(shipped)))
+    print(f"wrote {TARGET}")

@@ -4,7 +4,6 @@ The keys, and the values among the shipped boards, are read from their files; un
 keeps the page fresh, and fails for a key that the tables below lack or that no board has.
 """
 
-import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -203,4 +202,4 @@ def _names(names: frozenset[str] | tuple[str, ...]) -> str:
 
 if __name__ == "__main__":
     TARGET.write_text(document(), encoding="utf-8", newline="\n")
-    sys.stdout.write(f"wrote {TARGET}\n")
+    print(f"wrote {TARGET}")

@@ -63,7 +63,7 @@ def test_the_fit_and_the_prediction_are_one_formula(board: str, name: str) -> No
     case = Cases((network_case(name, dpu, (1.0,)),), Structure.of(dpu))
     times = case.times(Constants.of(dpu))
     found = predict(place(written(name).network, dpu), dpu, NETWORKS[name].host)
-    assert found.handlers / found.latency_s == pytest.approx(1 / float(times.alone_s[0] + times.host_s[0]))
+    assert found.dpu.handlers / found.latency_s == pytest.approx(1 / float(times.alone_s[0] + times.host_s[0]))
     assert found.fps == pytest.approx(math.exp(float(case.predicted(times)[0])))
 
 

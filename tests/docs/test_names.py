@@ -69,16 +69,11 @@ def test_a_boards_keys_are_those_that_have_a_meaning() -> None:
     assert {table: {*keys} for table, keys in target_file.KEYS.items()} == shipped
 
 
-def test_the_scenes_page_is_true() -> None:
+def test_the_scenes_page_is_true_and_its_example_a_scene(tmp_path: Path) -> None:
     page = (DOCS / "reference" / "scene-file.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     assert {*tomllib.loads(example)} <= {"description", "radiance_scale", "without", *TABLES}
     assert re.findall(r"Shipped: (.*)\.", page) == [", ".join(f"`{name}`" for name in scene_names())]
-
-
-def test_the_scenes_example_is_a_scene(tmp_path: Path) -> None:
-    page = (DOCS / "reference" / "scene-file.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     (tmp_path / "mine.toml").write_text(example, encoding="utf-8")
     assert load_scene_call(str(tmp_path / "mine.toml")).without == ("striping",)
 

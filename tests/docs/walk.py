@@ -41,16 +41,10 @@ PROGRAMS = {
 PART = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$|^<!-- test: (.+?) -->$', re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r"(?<![\w.])-?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 RELATIVE = 0.02
+Done = subprocess.CompletedProcess[str]
+"""A command that ended: its code, and both streams as a terminal shows them."""
 STARTED = {"tradeoff"}
 """Commands that have been started as a shell starts them; a study is small in this process alone."""
-
-
-@dataclass(frozen=True)
-class Done:
-    """A command that ended: its code, and both streams as a terminal shows them."""
-
-    returncode: int
-    stdout: str
 
 
 class PageError(AssertionError):
@@ -141,12 +135,12 @@ class Walk:
             result = CliRunner().invoke(app, words, prog_name=OURS, env=environment(self.folder))
         if result.exception is not None and not isinstance(result.exception, SystemExit):
             raise PageError(f"{words} ended with a traceback") from result.exception
-        return Done(result.exit_code, result.output)
+        return Done(words, result.exit_code, result.output)
 
     def _started(self, words: list[str]) -> Done:
         kept = {name: os.environ[name] for name in ("SYSTEMROOT", "TEMP") if name in os.environ}
         ours = {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "PYTHONUTF8": "1", "OMP_NUM_THREADS": "1"}
-        done = subprocess.run(
+        return subprocess.run(
             [*PROGRAMS[words[0]], *words[1:]],
             cwd=self.folder,
             env=kept | ours | environment(self.folder),
@@ -155,7 +149,6 @@ class Walk:
             encoding="utf-8",
             check=False,
         )
-        return Done(done.returncode, done.stdout)
 
     def _compare(self, shown: str) -> None:
         lines, vary, self._vary = iter(plain(self._last)), self._vary, False
@@ -189,8 +182,5 @@ def agrees(shown: str, found: str, vary: bool) -> bool:
         return match is not None
     wanted = (number for part in parts for number in NUMBER.findall(part))
     pairs = zip(wanted, match.groups(), strict=True)
-    return all(math.isclose(_value(a), _value(b), rel_tol=RELATIVE) for a, b in pairs)
-
-
-def _value(number: str) -> float:
-    return float(number.replace(",", ""))
+    numbers = ([float(number.replace(",", "")) for number in pair] for pair in pairs)
+    return all(math.isclose(*pair, rel_tol=RELATIVE) for pair in numbers)

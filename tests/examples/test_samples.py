@@ -15,11 +15,6 @@ from examples.samples import GAINS, batches, bright, main
 from examples.train_network import criterion
 
 
-@pytest.fixture(scope="module")
-def scenes() -> list[Scene]:
-    return [procedural_scene(720, 720, np.random.default_rng(0))]
-
-
 # One network for each kind of batch: the others take what the first one takes.
 @pytest.mark.parametrize("name", ["dncnn", "espcn", "edsr4", "segment", "classifier"])
 def test_batches_fit_the_network_and_come_again_with_the_seed(name: str, scenes: list[Scene]) -> None:

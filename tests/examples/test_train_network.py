@@ -3,22 +3,15 @@
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
 import onnx
 import pytest
 import torch
 
 from beers_deploy.model.io.tensors import read_tensors
-from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene
 from examples.networks import build, to_onnx
 from examples.samples import batches
 from examples.train_network import judge, main, train
-
-
-@pytest.fixture(scope="module")
-def scenes() -> list[Scene]:
-    return [procedural_scene(720, 720, np.random.default_rng(0))]
 
 
 @pytest.mark.parametrize("name", ["espcn", "segment"])

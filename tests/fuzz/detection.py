@@ -38,7 +38,6 @@ def read_beside(path: Path) -> None:
 
 
 def read_names(path: Path) -> None:
-    """Names of classes."""
     with TemporaryDirectory() as made:
         yolo_names([Path(shutil.copy(path, made)).parent])
 
@@ -52,5 +51,4 @@ def detector_seeds(folder: Path) -> list[bytes]:
 
 
 def detect(path: Path) -> None:
-    """What is found on an image."""
     open_detector(path, 1).detect(GREY.astype(np.float32) / 255)

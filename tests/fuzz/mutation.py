@@ -31,7 +31,6 @@ TOKENS = (
 
 
 def pick(options: Sequence[T], rng: Rng) -> T:
-    """One of several, each as likely."""
     return options[int(rng.integers(len(options)))]
 
 

@@ -81,7 +81,6 @@ def run_onnx(path: Path) -> None:
 
 
 def checkpoint_seeds(folder: Path) -> list[bytes]:
-    """A checkpoint after a step, and one before any."""
     return [written(partial(_checkpoint, steps=steps), folder / "c.safetensors") for steps in (0, 1)]
 
 
@@ -97,20 +96,12 @@ def _step(trainer: Trainer) -> None:
 
 
 def go_on(path: Path) -> None:
-    """Read a checkpoint, and take a step."""
     trainer = Trainer(SMALL, RECIPE)
     trainer.resume(path)
     _step(trainer)
 
 
-def weights_seeds(folder: Path) -> list[bytes]:
-    """A network's weights."""
-    return [
-        written(partial(save_network, network=ConvBEERS(SMALL), recipe={"degraded": "x"}), folder / "w.safetensors")
-    ]
-
-
-def told_seeds(folder: Path) -> list[bytes]:
-    """The weights of a network that is told its sensor."""
-    network = BankedConvBEERS(SMALL)
-    return [written(partial(save_network, network=network, recipe={"degraded": "x"}), folder / "w.safetensors")]
+def weights_seeds(folder: Path, kind: type[BankedConvBEERS | ConvBEERS] = ConvBEERS) -> list[bytes]:
+    """A network's weights; a banked one is told its sensor."""
+    save = partial(save_network, network=kind(SMALL), recipe={"degraded": "x"})
+    return [written(save, folder / "w.safetensors")]

@@ -19,7 +19,7 @@ from beers_deploy.dpu.cost.own_runs import read_own_runs
 from beers_deploy.dpu.cost.work import count_work
 from beers_deploy.dpu.graph import Network
 from beers_deploy.dpu.reading import read_network
-from beers_deploy.model.convbeers import load_network
+from beers_deploy.model.convbeers import BankedConvBEERS, load_network
 from beers_deploy.model.dataset import _read_summary, read_pairs_recipe
 from beers_deploy.model.io.images import read_pixels
 from beers_deploy.model.metrics.perceptual import read_tensors
@@ -45,7 +45,6 @@ from tests.fuzz.networks import (
     look_at_onnx,
     onnx_seeds,
     run_onnx,
-    told_seeds,
     understand_onnx,
     weights_seeds,
 )
@@ -83,7 +82,6 @@ def _files(folder: str) -> list[bytes]:
 
 
 def described_seeds(_: Path) -> list[bytes]:
-    """A sensor with a tabulated MTF, alpha and beta."""
     head, rest = SHIPPED.split("[mtf]")
     mtf = "frequency = [0, 0.25, 0.5]\nacross = [1, 0.5, 0.12]\nalong = [1, 0.4, 0.1]"
     noise = "alpha = 0.01\nbeta = [0.1, 0.2]"
@@ -91,14 +89,12 @@ def described_seeds(_: Path) -> list[bytes]:
 
 
 def point_seeds(folder: Path) -> list[bytes]:
-    """A small point-spread function."""
     x = np.arange(-6, 7) / 2
     samples = np.exp(-(x[:, None] ** 2) / 4 - x**2 / 3).astype(np.float32)
     return [written(lambda path: np.save(path, samples), folder / "a.npy")]
 
 
 def read_point(path: Path) -> object:
-    """As a sensor's blur."""
     response, *_ = read_response("a test", {"psf": path.name, "psf_samples_per_px": 4}, path.parent)
     return response.at(np.ones((1, 1)), np.ones((1, 1)))
 
@@ -117,7 +113,6 @@ def recipe_seeds(folder: Path) -> list[bytes]:
 
 
 def read_recipe(path: Path) -> None:
-    """The sensors of a folder of pairs, drawn."""
     with TemporaryDirectory() as name:
         shutil.copy(path, Path(name) / "recipe.json")
         recipe = read_pairs_recipe(Path(name))
@@ -130,7 +125,6 @@ GATED = dict.fromkeys(PATCHES, 1)
 
 
 def document_seeds(_: Path) -> list[bytes]:
-    """Results as `--json` writes them, of the gate among them."""
     figures = {"MAE": measured(7e-4, "of full scale", "here"), "none": unavailable("W", "no counter")}
     figures["time"] = predicted(3.0, "s", (2.0, 4.0), "cost model")
     rows = (Row("gate", "int8", figures, {"word": "text"}), Row("gate", "other", figures))
@@ -149,19 +143,16 @@ def read_results(path: Path) -> None:
 
 
 def measurement_seeds(folder: Path) -> list[bytes]:
-    """What a study keeps."""
     kept = Measurements(folder / "measurements.json")
     kept.make("a", lambda: [{"PSNR": 30.0, "LPIPS": None}])
     return [kept.path.read_bytes()]
 
 
 def journal_seeds(_: Path) -> list[bytes]:
-    """What a stopped run leaves."""
     return [json.dumps({"job": JOB, "rows": 4, "known": 32}).encode()]
 
 
 def resume(path: Path) -> None:
-    """A run that goes on where a journal says."""
     with TemporaryDirectory() as name:
         out = Path(name) / "out.tif"
         part_folder(out).mkdir()
@@ -170,27 +161,23 @@ def resume(path: Path) -> None:
 
 
 def log_lines(path: Path) -> None:
-    """A training log that a resumed run goes on with."""
     with TemporaryDirectory() as name:
         Log(Path(shutil.copy(path, Path(name) / "log.csv")), 20)
 
 
 def backbone_seeds(_: Path, packed: bool) -> list[bytes]:
-    """An archive of arrays."""
     stream = io.BytesIO()
     (np.savez_compressed if packed else np.savez)(stream, a=np.ones((2, 3), np.float32), b=np.zeros(4, np.float16))
     return [stream.getvalue()]
 
 
 def runs_seeds(folder: Path) -> list[bytes]:
-    """A board's own measurements."""
     model = str(integer_convbeers(folder / "core.onnx", 1, 2))
     run = {"model": model, "configuration": "C32B3", "tile_px": 64, "fps": 95.0}
     return [json.dumps(runs).encode() for runs in ([run], [run, {**run, "fps": 5, "power_w": 30}])]
 
 
 def manifest_seeds(_: Path) -> list[bytes]:
-    """Lines of a dataset's manifest."""
     line = {role: {"rejected_snr_pairs": 1, "sensor": "x"} for role in ("degraded", "reference")}
     return [b"".join(json.dumps({"name": "a", **line}).encode() + b"\n" for _ in range(2))]
 
@@ -245,7 +232,9 @@ PARSERS: tuple[Parser, ...] = (
     Parser("dataset manifest", ".jsonl", manifest_seeds, _read_summary, of_json),
     Parser("training log", ".csv", lambda _: [b"step,loss\n10,0.5\n20,0.25\n"], log_lines, share=0.5),
     Parser("weights", ".safetensors", weights_seeds, load_network, of_safetensors),
-    Parser("told weights", ".safetensors", told_seeds, load_network, of_safetensors),
+    Parser(
+        "told weights", ".safetensors", partial(weights_seeds, kind=BankedConvBEERS), load_network, of_safetensors
+    ),
     Parser("checkpoint", ".safetensors", checkpoint_seeds, go_on, of_safetensors),
     Parser("backbone npz", ".npz", partial(backbone_seeds, packed=True), lambda p: read_tensors(p, ["a", "b"])),
     Parser("labels of VOC", ".xml", partial(label_seeds, make=voc, suffix=".xml"), read_beside),

@@ -44,7 +44,6 @@ def tiff_seeds(folder: Path) -> list[bytes]:
 
 
 def image_of(given: dict[str, str]) -> bytes:
-    """A small grey image as Pillow writes it."""
     stream, pixels = io.BytesIO(), np.random.default_rng(1).integers(0, 256, (17, 19)).astype(np.uint8)
     Image.fromarray(pixels).save(stream, **given)
     return stream.getvalue()
@@ -61,7 +60,6 @@ def read_rows(path: Path) -> None:
 
 
 def gdal_seeds(_: Path, name: str) -> list[bytes]:
-    """A small image of two bands in one of GDAL's formats."""
     return [_with_tiles(name)[name]]
 
 

@@ -6,16 +6,16 @@ state what its text names, so no rule knows a board's name.
 """
 
 import inspect
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 from beers_deploy.dpu.board import SIZED, Dpu
 from beers_deploy.dpu.checker import conv_rules, number_rules, other_rules
 from beers_deploy.dpu.checker.finding import Finding, Rule
-from beers_deploy.dpu.checker.forms import forms
-from beers_deploy.dpu.graph import Kind, Operation
+from beers_deploy.dpu.graph import Kind, Operation, Window
 from beers_deploy.profiles.constant import check_keys
 from beers_deploy.profiles.errors import MachineError
 
@@ -111,6 +111,31 @@ def _broken(op: Operation, dpu: Dpu, quantised: bool) -> tuple[Broken, ...]:
         rules += NUMBERS + SHIFTS.get(op.kind, ())
     findings = ((rule, rule(op, dpu)) for rule in rules if applies(rule, dpu))
     return tuple(Broken(rule_name(rule), rule_text(rule, dpu), found) for rule, found in findings if found)
+
+
+def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:
+    """The operation as it is written, then what else a compiler may take it as, each to be held against the rules.
+
+    A fully connected layer is a convolution as large as its map, and as well one of 1 x 1 over the flattened map:
+    a matrix product becomes a convolution once that fits the hardware (UG1414 1.4.1, Operators Supported by
+    TensorFlow). Its outputs do not meet, so they may be computed in parts. That they are is inferred from a rate:
+    Ultrafast lanes' last layer has 14472 outputs, and at 392 images a second with one thread (Vitis-AI 2.5,
+    model_zoo/README.md, VCK190) the DPU's batch of six leaves the processor 15 ms for 356 MFLOP, more than its two
+    cores can do.
+    """
+    yield op
+    if "array" in dpu.tables and fully_connected(op):  # an NPU's file does not state the array that it would fit
+        values, outputs = math.prod(op.in_shapes[0] or ()), min(op.channels[1], dpu.channels_max)
+        part = replace(op, channels=(op.channels[0], outputs), out_shape=(outputs, 1, 1))
+        yield part
+        yield replace(part, in_shapes=((values, 1, 1),), window=Window(), channels=(values, outputs))
+
+
+def fully_connected(op: Operation) -> bool:
+    """Whether a convolution is as large as its map, and so has a result of one pixel."""
+    shape, window = op.in_shapes[0] if op.in_shapes else None, op.window
+    whole = shape is not None and window.kernel == shape[1:] and window.dilation == (1, 1) and not any(window.pads)
+    return op.kind == "conv" and whole
 
 
 def all_rules() -> Iterator[Rule]:

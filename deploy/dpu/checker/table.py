@@ -1,76 +1,25 @@
-"""`check`: where each node of a network goes, as rows of results and as a few lines."""
+"""`check`: where each node of a network goes, as rows of results and as a few lines.
 
-import math
-from collections.abc import Callable
+Of an NPU AMD publishes a table of operators, Y or N/A, and no limits. Where its nodes would run is the table's word:
+nothing here has seen the compiler.
+"""
+
 from dataclasses import dataclass
 
+import onnx
+
 from beers_deploy.dpu.board import BoardLike, Dpu, ruled
-from beers_deploy.dpu.checker.npu import file_checks, notes_on, words_of
 from beers_deploy.dpu.checker.placement import Cut, PlacedNode, Placement, place
+from beers_deploy.dpu.checker.remarks import is_island, remarks_on
 from beers_deploy.dpu.reading import network_of, own_tile_px
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.figures import Check, Figure, Row, predicted, unavailable
 from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, TargetProfile, require_side
+from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.graph import refusal
+from beers_deploy.quant.onnx_file import is_quantised, metadata
 from beers_deploy.results import Table
-
-Remark = Callable[[Placement, Dpu, int], str | None]
-"""Looks at a placed network, the DPU and the tile's side; None where there is nothing to say."""
-
-
-def fix2float(placement: Placement, dpu: Dpu, tile_px: int) -> str | None:  # noqa: ARG001 - every remark takes all three
-    """The DPU's results are int8: the last conversion, fix2float, runs on the CPU (Vitis-AI 3.0, xcompiler)."""
-    leaving = [cut.tensor for cut in placement.cuts if not cut.onto_dpu]
-    if not leaving:
-        return None
-    return f"what leaves the DPU is int8 ({', '.join(leaving)}); making it float runs on the CPU, for every tile"
-
-
-def subgraphs(placement: Placement, dpu: Dpu, tile_px: int) -> str | None:  # noqa: ARG001
-    """Every DPU subgraph is started by the CPU, and its maps cross memory both ways (Vitis-AI 3.0, xcompiler)."""
-    count = placement.dpu_subgraphs
-    return None if count < 2 else f"{count} DPU subgraphs: the CPU starts each, and carries maps between them"
-
-
-def streaming(placement: Placement, dpu: Dpu, tile_px: int) -> str | None:
-    """A map above {memory[feature_map_bytes].low:.0f} bytes streams through memory, at every layer.
-
-    That is the room of one image on chip ({memory[feature_map_bytes].source}).
-    """
-    room = dpu.whole("memory", "feature_map_bytes")
-    sizes = [op.out_bytes for op in placement.core if op.out_shape is not None]
-    large = [size for size in sizes if size > room]
-    if not large:
-        return None
-    kept_px = math.isqrt(room * tile_px * tile_px // max(large))
-    return (
-        f"{len(large)} of {len(sizes)} maps exceed {room / 2**20:g} MiB, the largest has {max(large) / 1e6:.1f} MB: "
-        f"they stream through memory; tiles of {kept_px} px and less would keep every map on chip"
-    )
-
-
-def shuffles(placement: Placement, dpu: Dpu, tile_px: int) -> str | None:  # noqa: ARG001
-    """A pixel shuffle inside compiles, but has given wrong numbers on a board (Vitis-AI issues 1486, 1199).
-
-    Its inverse as torch writes it, PixelUnshuffle, has run on the CPU.
-    """
-    names = [node.op.name for node in placement.nodes if node.op.kind == "pixel shuffle" and node.device == "DPU"]
-    if not names:
-        return None
-    return f"{', '.join(names)}: has given wrong numbers on a board; compare the board's results with this file's"
-
-
-REMARKS: tuple[Remark, ...] = (fix2float, subgraphs, streaming, shuffles)
-
-
-def remarks_on(placement: Placement, dpu: Dpu, tile_px: int) -> dict[str, str]:
-    """Every remark that a placed network calls for, by name."""
-    if dpu.target.npu:
-        return notes_on(placement, dpu)
-    found = {remark.__name__: remark(placement, dpu, tile_px) for remark in REMARKS}
-    return {name: text for name, text in found.items() if text is not None}
-
 
 SOURCE = "operator rules of the target profile"
 
@@ -104,8 +53,15 @@ class Checked(Table):
     @property
     def lines(self) -> list[str]:
         """What a person wants to know, in a few lines."""
-        refused = refusal(self.network.model) if self.placement.note else ""
-        return summary(self, refused)
+        placement, npu = self.placement, self.dpu.target.npu
+        lines = [] if npu else _crossings(placement)
+        lines += [f"{name}: {text}" for name, text in remarks_on(placement, self.dpu, self.tile_px).items()]
+        if placement.note:
+            refused = refusal(self.network.model)
+            lines += [placement.note, f"'quantize' does not take it: {refused}" if refused else "'quantize' takes it"]
+        failed = "; ".join(str(check) for check in self.checks if not check.passed)
+        sound = "no rule is broken, not compiled" if npu else "the core runs whole on the DPU"
+        return [*lines, f"check FAILED: {failed}" if failed else f"check passed: {sound}"]
 
 
 def check(
@@ -132,13 +88,13 @@ def check(
     tile_px = own_tile_px(read.model) or TILE_PX if tile is None else require_side(tile)
     placement = place(network_of(read.model, tile_px, read.label), asked)
     arguments: dict[str, object] = {"target": asked.target.name, "dpu": asked.name, "tile": tile_px}
-    rows, npu = tuple(network_rows(placement, asked, tile_px)), bool(asked.target.npu)
-    checks = [legality(placement, npu=npu), *(file_checks(read.model, asked) if npu else [])]
+    rows, npu = tuple(_rows(placement, asked, tile_px)), bool(asked.target.npu)
+    checks = [legality(placement, npu=npu), *(_file_checks(read.model, asked) if npu else [])]
     about = ("check", arguments, (read.input,), rows, tuple(checks))
     return Checked(*about, placement=placement, dpu=asked, tile_px=tile_px, network=read)
 
 
-def network_rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
+def _rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
     """Every node, then the subgraphs, the tensors that cross, what else to know, and the counts."""
     npu = dpu.target.npu
     nodes = [row for node in placement.nodes for row in _node_rows(node, placement, dpu)]
@@ -160,21 +116,22 @@ def legality(placement: Placement, *, npu: bool = False) -> Check:
     return Check(name, len(failed), 0, "node", detail=first)
 
 
-def summary(checked: Checked, refusal: str = "") -> list[str]:
-    """What a person wants to know, in a few lines; `refusal` is why `quantize` does not take a float file."""
-    placement, dpu = checked.placement, checked.dpu
-    lines = [] if dpu.target.npu else _crossings(placement)
-    lines += [f"{name}: {text}" for name, text in remarks_on(placement, dpu, checked.tile_px).items()]
-    if placement.note:
-        lines.append(placement.note)
-        lines.append(f"'quantize' does not take it: {refusal}" if refusal else "'quantize' takes it")
-    failed = "; ".join(str(check) for check in checked.checks if not check.passed)
-    sound = "no rule is broken, not compiled" if dpu.target.npu else "the core runs whole on the DPU"
-    return [*lines, f"check FAILED: {failed}" if failed else f"check passed: {sound}"]
+def _file_checks(model: onnx.ModelProto, dpu: Dpu) -> list[Check]:
+    """What a VINT8 file must keep as a whole; none of a float file or a host's, which no compiler is given."""
+    if not is_quantised(model) or KEY in metadata(model):
+        return []
+    opset = max(each.version for each in model.opset_import if each.domain in ("", "ai.onnx"))
+    most, named = dpu.limit("file", "opset_max"), [*model.graph.input, *model.graph.output]
+    sides = [f"{v.name} {d.dim_param}" for v in named for d in v.type.tensor_type.shape.dim if not d.dim_value]
+    return [
+        Check("opset", opset, most.low, "opset", detail=most.source),
+        Check("sizes left open", len(sides), 0, "size", detail=", ".join(sides)),
+    ]
 
 
 def _crossings(placement: Placement) -> list[str]:
-    lines = [f"device subgraphs: {len(_subgraphs_of(placement))}, DPU subgraphs: {placement.dpu_subgraphs}"]
+    pieces = len({node.subgraph for node in placement.nodes})
+    lines = [f"device subgraphs: {pieces}, DPU subgraphs: {placement.dpu_subgraphs}"]
     for cut in placement.cuts:
         size = "a size unknown" if cut.size_bytes is None else f"{cut.size_bytes / 1e6:.2f} MB"
         lines.append(f"{'to' if cut.onto_dpu else 'from'} the DPU: {cut.tensor}, {size} an image as int8")
@@ -184,26 +141,33 @@ def _crossings(placement: Placement) -> list[str]:
 def _node_rows(node: PlacedNode, placement: Placement, dpu: Dpu) -> list[Row]:
     words = {"operator": node.op.op_type, "part": node.part, "device": node.device}
     if dpu.target.npu:
-        words |= {"part": node.part.removeprefix("dpu-"), "device": words_of(node, placement, dpu)}
+        words |= {"part": node.part.removeprefix("dpu-"), "device": _npu_words(node, placement, dpu)}
     if not node.broken:
         return [Row("nodes", node.op.name, {}, words)]
     broken = [{"rule": b.text, "reason": b.finding.reason, "remedy": b.finding.remedy} for b in node.broken]
     return [Row("nodes", node.op.name, {}, {**words, **why}) for why in broken]
 
 
+def _npu_words(node: PlacedNode, placement: Placement, dpu: Dpu) -> str:
+    """On which device of an NPU's board a node would be computed, as far as AMD's table says."""
+    if node.device == "host":
+        return "host"
+    if node.broken:
+        return "refused"
+    if is_island(node, placement):
+        return "float, BF16 by the compiler's default"
+    return "NPU by AMD's table" if node.op.op_type in dpu.target.npu["int8"].value else "not read in AMD's table"
+
+
 def _subgraph_rows(placement: Placement) -> list[Row]:
+    found: dict[int, list[PlacedNode]] = {}
+    for node in placement.nodes:
+        found.setdefault(node.subgraph, []).append(node)
     rows = []
-    for number, members in _subgraphs_of(placement).items():
+    for number, members in found.items():
         words = {"device": members[0].device, "first": members[0].op.name, "last": members[-1].op.name}
         rows.append(Row("subgraphs", f"subgraph {number}", {"nodes": _count(len(members), "node")}, words))
     return rows
-
-
-def _subgraphs_of(placement: Placement) -> dict[int, list[PlacedNode]]:
-    members: dict[int, list[PlacedNode]] = {}
-    for node in placement.nodes:
-        members.setdefault(node.subgraph, []).append(node)
-    return members
 
 
 def _cut_row(cut: Cut) -> Row:

@@ -48,14 +48,10 @@ class LayerCost:
     time_s: float
 
     @property
-    def start_s(self) -> float:
-        """What is neither compute nor memory."""
-        return max(self.time_s - self.compute_s - self.memory_s, 0.0)
-
-    @property
     def bound(self) -> str:
-        """What takes longest: compute, memory or overhead."""
-        parts = {"compute": self.compute_s, "memory": self.memory_s, "overhead": self.start_s}
+        """What takes longest: compute, memory or, as overhead, what is neither."""
+        overhead_s = self.time_s - self.compute_s - self.memory_s
+        parts = {"compute": self.compute_s, "memory": self.memory_s, "overhead": overhead_s}
         return max(parts, key=lambda name: parts[name])
 
 
@@ -64,39 +60,34 @@ class Prediction:
     """What the model says of one network on one configuration; `note` says what was assumed of the file.
 
     Attributes:
-        configuration: of the DPU.
-        batch: images in flight: batch handlers of all cores.
-        handlers: images of one core's batch.
-        alone_s: such a batch on the DPU while its other cores rest.
-        host_cores: of the board's processor.
+        dpu: the configuration, its constants corrected by a user's runs where there are any.
+        alone_s: one core's batch on the DPU while its other cores rest.
         layers: what each costs, for a batch.
         host_s: time of an image on the host's cores together.
         task: what the host does with the results.
         regime: what sets the rate.
         width: half that of the interval, in ln(FPS).
-        structure: what the board's kind decides.
-        held: share of left-out families that such intervals held.
         outside: what lies beyond the fitted networks; empty where nothing does.
         refused: names of nodes that the DPU refuses and the host runs.
         refused_s: what they take of `host_s`, least and most.
     """
 
-    configuration: str
-    batch: int
-    handlers: int
+    dpu: Dpu
     alone_s: float
-    host_cores: int
     layers: tuple[LayerCost, ...]
     host_s: float
     task: Task
     regime: Regime
     width: float
-    structure: Structure
-    held: float
     outside: tuple[str, ...] = ()
     note: str = ""
     refused: tuple[str, ...] = ()
     refused_s: Interval = (0.0, 0.0)
+
+    @property
+    def batch(self) -> int:
+        """Images in flight."""
+        return self.dpu.batch
 
     @cached_property
     def batch_time_s(self) -> float:
@@ -135,7 +126,7 @@ class Prediction:
         return low_s / self.spread, high_s * self.spread
 
     def _latency_s(self, host_s: float) -> float:
-        return self.alone_s + self.handlers * host_s * self.host_cores
+        return self.alone_s + self.dpu.handlers * host_s * self.dpu.whole("cpu", "cores")
 
     @property
     def spread(self) -> float:
@@ -150,7 +141,7 @@ class Prediction:
 
     def rate(self, batch_time_s: float, host_s: float) -> float:
         """Images a second if a batch took that long on the DPU, and an image that long on the host."""
-        return frame_rate(batch_time_s / self.batch, host_s, self.structure.crowding)
+        return frame_rate(batch_time_s / self.batch, host_s, self.dpu.value("cost", "crowding"))
 
     @property
     def operations(self) -> int:
@@ -195,18 +186,13 @@ def predict(placement: Placement, dpu: Dpu, task: Task | None = None) -> Predict
     outside = _outside(placement.core, map_bytes, dpu)
     width = dpu.value("cost", WIDTHS["outside" if outside else regime])
     return Prediction(
-        configuration=dpu.name,
-        batch=dpu.batch,
-        handlers=dpu.batch // dpu.cores,
+        dpu=dpu,
         alone_s=float(columns.time_s(constants, structure, alone=True).sum()) / speed,
-        host_cores=cores,
         layers=layers,
         host_s=host_s,
         task=task,
         regime=regime,
         width=width,
-        structure=structure,
-        held=dpu.value("cost", "families_held"),
         outside=outside,
         note=placement.note,
         refused=tuple(op.name for op in refused),
@@ -250,15 +236,11 @@ def layer_energy_j(layer: LayerCost, dpu: Dpu) -> Interval:
     return products * product.low + moved * byte.low, products * product.high + moved * byte.high
 
 
-def image_energy_j(prediction: Prediction, dpu: Dpu) -> Interval:
-    """Least and most energy of all layers for one image."""
-    low_j, high_j = zip(*(layer_energy_j(layer, dpu) for layer in prediction.layers), strict=True)
-    return sum(low_j), sum(high_j)
-
-
-def counted_power(prediction: Prediction, dpu: Dpu) -> Figure:
+def counted_power(prediction: Prediction) -> Figure:
     """Power of products and traffic at the predicted rate, in W; its range is that of the published figures."""
-    low, high = (energy * prediction.fps for energy in image_energy_j(prediction, dpu))
+    dpu = prediction.dpu
+    ends_j = zip(*(layer_energy_j(layer, dpu) for layer in prediction.layers), strict=True)
+    low, high = (sum(end_j) * prediction.fps for end_j in ends_j)
     return predicted((low + high) / 2, "W", (low, high), energy_source(dpu))
 
 

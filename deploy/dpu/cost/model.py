@@ -110,7 +110,7 @@ class Layers:
             (w.array_operations / array, w.lane_steps / lanes, w.weight_bytes, w.map_bytes, w.launched) for w in works
         ]
         clock_hz, memory = dpu.value("array", "pl_clock_hz"), dpu.limit("memory", "ddr_bytes_per_s").high
-        board = (clock_hz, memory, dpu.batch // dpu.cores, dpu.cores)
+        board = (clock_hz, memory, dpu.handlers, dpu.cores)
         return cls(*np.array([(*row, *board) for row in columns], dtype=np.float64).reshape(-1, 9).T)
 
     def compute_s(self, constants: Constants) -> Array:

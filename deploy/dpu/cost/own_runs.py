@@ -21,13 +21,11 @@ from beers_deploy.dpu.reading import read_network
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row, predicted, published
-from beers_deploy.profiles.toml import read_json
+from beers_deploy.profiles.toml import read_json, unreadable
 
 EXAMPLE = 'write [{"model": "core.onnx", "configuration": "C32B3", "tile_px": 640, "fps": 9.5}]'
-RUNS, TILE_PX, FPS = 1000, (16, 1 << 16), (1e-9, 1e9)
-"""Most runs; least and most of a tile's side and of a rate."""
-POWER_W, FAR = (0.01, 1000.0), 10_000
-"""Of a board; and how many times off a rate may be predicted that is one of this network on this board."""
+RUNS, TILE_PX, FAR = 1000, (16, 1 << 16), 10_000
+"""Most runs; least and most of a tile's side; and how many times off a rate of this network may be predicted."""
 SCATTER = 3
 """Variance of networks over that of boards, of ln(predicted / published): 0.13^2 and 0.07^2."""
 KEYS = {"model", "configuration", "tile_px", "fps", "power_w"}
@@ -39,7 +37,6 @@ class Run:
 
     name: str
     placement: Placement
-    dpu: Dpu
     fps: float
     predicted: Prediction
 
@@ -68,16 +65,17 @@ class OwnRuns:
 
     def run_rows(self) -> list[Row]:
         """The rate given for each run, and what was predicted before and after the correction."""
-        return [self._run_row(run) for run in self.runs]
-
-    def _run_row(self, run: Run) -> Row:
-        after = predict(run.placement, self.applied(run.dpu))
-        figures = {"given": published(run.fps, "frame/s", self.source)}
-        for key, prediction in {"shipped": run.predicted, "corrected": after}.items():
-            off = 100 * (prediction.fps / run.fps - 1)
-            figures[key] = predicted(prediction.fps, "frame/s", prediction.fps_interval, f"cost model, {key}")
-            figures[f"{key} is off by"] = predicted(off, "%", (off, off), "arithmetic")
-        return Row("runs", f"{run.name}, {run.dpu.name}", figures, {"bound": run.predicted.regime})
+        rows = []
+        for run in self.runs:
+            before = run.predicted
+            after = predict(run.placement, self.applied(before.dpu))
+            figures = {"given": published(run.fps, "frame/s", self.source)}
+            for key, prediction in {"shipped": before, "corrected": after}.items():
+                off = 100 * (prediction.fps / run.fps - 1)
+                figures[key] = predicted(prediction.fps, "frame/s", prediction.fps_interval, f"cost model, {key}")
+                figures[f"{key} is off by"] = predicted(off, "%", (off, off), "arithmetic")
+            rows.append(Row("runs", f"{run.name}, {before.dpu.name}", figures, {"bound": before.regime}))
+        return rows
 
 
 def read_own_runs(path: Path, dpu: Dpu) -> OwnRuns:
@@ -96,11 +94,9 @@ def _factor(ratios: Sequence[float]) -> float:
 def _read(path: Path) -> Sequence[Mapping[str, object]]:
     try:
         runs = read_json(path)
-    except OSError as error:
-        got = error.strerror or str(error)
-        raise OptionError(str(path), expected="a readable file", got=got, remedy="check the path") from error
-    except ValueError as error:
-        raise OptionError(str(path), expected="JSON", got=str(error), remedy="correct the file") from error
+    except (OSError, ValueError) as error:
+        got = unreadable(path) or str(error)
+        raise OptionError(str(path), expected="a file of JSON", got=got, remedy=EXAMPLE) from error
     if not isinstance(runs, list) or not 0 < len(runs) <= RUNS or not all(isinstance(run, dict) for run in runs):
         expected, got = f"a list of 1 to {RUNS} runs", type(runs).__name__
         raise OptionError(str(path), expected=expected, got=got, remedy=EXAMPLE)
@@ -111,7 +107,6 @@ def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run
     if "model" not in entry or set(entry) - KEYS:
         expected = "model, configuration, tile_px, fps"
         raise OptionError(where, expected=expected, got=str(sorted(entry)), remedy=EXAMPLE)
-    fps = _number(entry.get("fps"), "fps", FPS, where)
     tile_px = _number(entry.get("tile_px", 640), "tile_px", TILE_PX, where)
     if tile_px != int(tile_px):
         raise OptionError(where, expected="tile_px in whole pixels", got=str(tile_px), remedy=EXAMPLE)
@@ -119,10 +114,8 @@ def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run
     model = path.parent / str(entry["model"])
     placement = place(read_network(model, int(tile_px)), dpu)
     prediction = predict(placement, dpu)
-    if "power_w" in entry:
-        _number(entry["power_w"], "power_w", POWER_W, where)
-    _number(fps, "fps", (prediction.fps / FAR, prediction.fps * FAR), where)
-    return Run(f"{model.stem}, tiles of {tile_px:g}", placement, dpu, fps, prediction)
+    fps = _number(entry.get("fps"), "fps", (prediction.fps / FAR, prediction.fps * FAR), where)
+    return Run(f"{model.stem}, tiles of {tile_px:g}", placement, fps, prediction)
 
 
 def _number(value: object, key: str, ends: tuple[float, float], where: str) -> float:

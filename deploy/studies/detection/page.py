@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw
 from beers_deploy.model.io.pictures import grid, picture_url
 from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.report.page import Picture, Report, Section, write_report
-from beers_deploy.report.plots import SERIES, Curve, Panel, curves_svg, data_url
+from beers_deploy.report.plots import SERIES, Curve, curves_svg, data_url
 from beers_deploy.studies.detection.average_precision import ALL, RECALLS, match, mean_known, precisions
 from beers_deploy.studies.detection.boxes import Boxes
 from beers_deploy.studies.detection.study import REFERENCE, Comparison
@@ -52,7 +52,7 @@ def write_page(compared: Sequence[Comparison], rows: Sequence[Row], notes: Seque
 
 def curves(compared: Sequence[Comparison]) -> Picture:
     """Precision by recall at an overlap of one half, means over classes: a panel a sensor."""
-    panels = [Panel(found.name, [_curve(found, row) for row in found.hits]) for found in compared]
+    panels = [(found.name, [_curve(found, row) for row in found.hits]) for found in compared]
     svg = curves_svg(panels, "recall", "precision", logarithmic=False)
     caption = "At an overlap of 0.5, mean over the classes that are labelled."
     return Picture("Precision by recall", data_url(svg), caption)

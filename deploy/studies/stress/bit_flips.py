@@ -23,7 +23,7 @@ from beers_deploy.quant.calibration import HELD_OUT_SEED, Calibration
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.graph import Activation
 from beers_deploy.quant.integer.reference import SOUND
-from beers_deploy.report.plots import Curve, Panel, curves_svg
+from beers_deploy.report.plots import Curve, curves_svg
 from beers_deploy.studies.stress import faults
 from beers_deploy.studies.stress.networks import Subject
 
@@ -174,7 +174,7 @@ def _price_row(name: str, time_s: float, source: str, prediction: Prediction, sp
 
 def flip_curves_svg(networks: Mapping[str, Sequence[Row]]) -> str:
     """PSNR against bit flips, with all guards and with none; rows by the network's name."""
-    panels = [Panel(memory, _curves(networks, memory)) for memory in faults.MEMORIES]
+    panels = [(memory, _curves(networks, memory)) for memory in faults.MEMORIES]
     return curves_svg(panels, "bit flips in a megabit", "PSNR, dB (measured)")
 
 

@@ -17,7 +17,7 @@ import psutil
 
 from beers_deploy import __version__
 from beers_deploy.bench.tables import Swath
-from beers_deploy.bench.timing import interleaved, timed
+from beers_deploy.bench.timing import interleaved
 from beers_deploy.bench.traditional import drawn_acquisition
 from beers_deploy.export import float_model
 from beers_deploy.model.io.files import sha256, write_text
@@ -262,7 +262,7 @@ def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float
     calls = [partial(restore, tile) for restore in restores]
     for call in calls:
         call()
-    return interleaved(calls, lambda call: timed(call)[1], lambda found: len(found[0]) >= ROUNDS)
+    return [[time_s for time_s, _ in taken] for taken in interleaved(calls, ROUNDS)]
 
 
 def host_figures(times_s: Sequence[float], pixels: int) -> dict[str, Figure]:

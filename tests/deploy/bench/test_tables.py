@@ -1,4 +1,5 @@
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,8 @@ from beers_deploy.bench.tables import (
 )
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.figures import Row, measured, predicted, unavailable
+from beers_deploy.profiles.figures import measured, predicted, unavailable
+from tests.deploy.bench.test_host import value
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 from tests.deploy.dpu.graphs import float_convbeers, integer_convbeers
@@ -27,16 +29,10 @@ from tests.deploy.dpu.graphs import float_convbeers, integer_convbeers
 DPU = load_dpu("vck190")
 
 
-def value(row: Row, key: str) -> float:
-    number = row.figures[key].value
-    assert number is not None
-    return number
-
-
 def test_a_swath_is_predicted_as_the_paper_counts_and_in_whole_tiles(tmp_path: Path) -> None:
     prediction = predict_file(float_convbeers(tmp_path / "f.onnx", 16, 64), DPU)
     swath = Swath(13600, 9016, 640, 35)
-    fraction, whole = predicted_rows("ConvBEERS", prediction, swath, DPU)
+    fraction, whole = predicted_rows("ConvBEERS", prediction, swath)
     assert value(fraction, "latency") == pytest.approx(swath.frames / prediction.fps)
     assert value(whole, "tiles") == 384
     assert value(whole, "latency") == pytest.approx(128 * prediction.batch / prediction.fps)
@@ -52,14 +48,8 @@ def test_a_swath_is_predicted_as_the_paper_counts_and_in_whole_tiles(tmp_path: P
 
 def test_a_last_batch_that_is_not_full_still_takes_its_time(tmp_path: Path) -> None:
     prediction = predict_file(float_convbeers(tmp_path / "f.onnx", 1, 16), DPU, 64)
-    _, whole = predicted_rows("net", prediction, Swath(64, 64, 64, 5), DPU)
+    _, whole = predicted_rows("net", prediction, Swath(64, 64, 64, 5))
     assert value(whole, "latency") == pytest.approx(prediction.batch / prediction.fps)
-
-
-def test_rows_of_layers_sum_to_their_last(tmp_path: Path) -> None:
-    rows = layer_rows(predict_file(integer_convbeers(tmp_path / "i.onnx", 2, 24), DPU, 333), DPU)
-    *parts, total = (value(row, "time") for row in rows)
-    assert math.fsum(parts) == pytest.approx(total, rel=1e-12)
 
 
 def test_published_rows_are_the_papers_and_agree_with_each_other() -> None:
@@ -77,12 +67,6 @@ def test_efficiency_is_only_as_good_as_its_parts() -> None:
     assert efficiency(1000, time, unavailable("W", "no counter")).reason == "no counter"
     mixed = efficiency(1000, predicted(2.0, "s", (1.0, 4.0), "model"), power)
     assert (mixed.mode, mixed.value, mixed.interval) == ("predicted", 100.0, (50.0, 200.0))
-
-
-@pytest.mark.parametrize("text", ["13600", "0x5", "ax5", "13600x", "1x2x3", "-4x4"])
-def test_a_bad_size_is_refused(text: str) -> None:
-    with pytest.raises(OptionError, match="13600x9016"):
-        parse_size(text)
 
 
 def test_bench_writes_a_valid_document(tmp_path: Path) -> None:
@@ -108,13 +92,15 @@ def test_layers_are_shown_when_asked_for_and_written_always(tmp_path: Path) -> N
     assert {"bench", "layers"} <= {row["table"] for row in valid(out)["rows"]}
 
 
-def test_layer_rows_have_the_columns_of_vaitrace(tmp_path: Path) -> None:
-    rows = layer_rows(predict_file(integer_convbeers(tmp_path / "i.onnx", 2, 64), DPU, 333), DPU)
+def test_layer_rows_have_the_columns_of_vaitrace_and_sum_to_their_last(tmp_path: Path) -> None:
+    rows = layer_rows(predict_file(integer_convbeers(tmp_path / "i.onnx", 2, 64), DPU, 333))
     columns = {"work", "time", "rate", "LdFM", "LdWB", "StFM", "bandwidth", "array use", "energy"}
     assert all(set(row.figures) == columns for row in rows[:-1])
     assert all(word in TRAFFIC for word in columns if word[:2] in ("Ld", "St"))
     assert {row.text["bound"] for row in rows[:-1]} <= {"compute", "memory", "overhead"}
     assert any(row.name.startswith("qlinearadd") and value(row, "time") > 0 for row in rows[:-1])
+    *parts, total = (value(row, "time") for row in rows)
+    assert math.fsum(parts) == pytest.approx(total, rel=1e-12)
 
 
 def test_small_tiles_keep_maps_on_chip_and_cost_work(tmp_path: Path) -> None:
@@ -136,10 +122,17 @@ def test_all_configurations_are_swept(tmp_path: Path) -> None:
     assert swept == [f"vck190 {name}, tiles of {tile}" for name in DPU.target.configurations for tile in (64, 32)]
 
 
-@pytest.mark.parametrize("text", ["", "640,", "640,8", "640;320", "-64"])
-def test_bad_tiles_are_refused(text: str) -> None:
-    with pytest.raises(OptionError, match="tile"):
-        parse_tiles(text)
+@pytest.mark.parametrize(
+    ("parse", "said", "texts"),
+    [
+        (parse_size, "13600x9016", ["13600", "0x5", "ax5", "13600x", "1x2x3", "-4x4"]),
+        (parse_tiles, "tile", ["", "640,", "640,8", "640;320", "-64"]),
+    ],
+)
+def test_bad_sizes_and_tiles_are_refused(parse: Callable[[str], object], said: str, texts: list[str]) -> None:
+    for text in texts:
+        with pytest.raises(OptionError, match=said):
+            parse(text)
 
 
 def test_the_host_takes_one_tile_size(tmp_path: Path) -> None:
@@ -158,14 +151,11 @@ def test_bench_on_this_machine(tmp_path: Path) -> None:
 def test_bad_options_are_refused(tmp_path: Path) -> None:
     model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
     tifffile.imwrite(tmp_path / "colour.tif", np.zeros((8, 9, 3), np.uint8), photometric="rgb")
-    tifffile.imwrite(tmp_path / "mono.tif", np.zeros((8, 9), np.uint16))
     tifffile.imwrite(tmp_path / "half.tif", np.full((8, 9), 0.5, np.float32))
     for options, said in (
         ("--dpu C1B1", "--dpu"),
         ("--tile 16 --halo 8", "--tile"),
         ("--image colour.tif", "one band"),
-        ("--image mono.tif --size 3x4", "--size"),
-        ("--full-scale 255", "--full-scale"),
         ("--image half.tif", "0.5, which may be shares"),
         ("--target kv261", "kv261"),
     ):
@@ -196,14 +186,3 @@ def test_the_paper_counts_fractions() -> None:
 )
 def test_whole_tiles_of_the_published_swath(halo_px: int, tiles: int) -> None:
     assert Swath(13600, 9016, 640, halo_px).tiles == tiles
-
-
-@pytest.mark.parametrize(("size_px", "halo_px"), [(641, 0), (1000, 7), (13, 3), (9016, 35), (640, 100)])
-def test_one_side_is_the_formula(size_px: int, halo_px: int) -> None:
-    formula = max(1, -(-(size_px - 2 * halo_px) // (640 - 2 * halo_px)))
-    assert Swath(size_px, size_px, 640, halo_px).tiles == formula**2
-
-
-def test_a_halo_that_leaves_nothing_is_refused() -> None:
-    with pytest.raises(OptionError, match="tile"):
-        _ = Swath(1000, 1000, 64, 32).tiles

@@ -1,5 +1,5 @@
 import sys
-from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -19,57 +19,43 @@ def counter(root: Path, energy_uj: int, name: str = "package-0") -> Path:
 
 
 @counters
-def test_power_is_energy_over_time(tmp_path: Path) -> None:
-    energy = counter(tmp_path, 200_000)
-    _, elapsed_s, power = timed(lambda: energy.write_text("700000"), tmp_path)
+@pytest.mark.parametrize(("before", "after", "joules"), [(200_000, 700_000, 0.5), (900_000, 100_000, 0.2)])
+def test_power_is_energy_over_time_also_of_a_counter_that_starts_again(
+    before: int, after: int, joules: float, tmp_path: Path
+) -> None:
+    energy = counter(tmp_path, before)
+    _, elapsed_s, power = timed(lambda: energy.write_text(str(after)), tmp_path)
     assert power.mode == "measured"
-    assert power.value == pytest.approx(0.5 / elapsed_s)
+    assert power.value == pytest.approx(joules / elapsed_s)
 
 
 @counters
-def test_a_counter_that_starts_again_goes_on(tmp_path: Path) -> None:
-    energy = counter(tmp_path, 900_000)
-    _, elapsed_s, power = timed(lambda: energy.write_text("100000"), tmp_path)
-    assert power.value == pytest.approx(0.2 / elapsed_s)
-
-
-@counters
-def test_without_counters_power_is_unavailable_with_a_reason(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "text", "reason"),
+    [("", "", "no RAPL"), ("dram", "5", "no RAPL"), ("package-0", "?", "cannot be read")],
+)
+def test_without_counters_of_the_package_power_is_unavailable_with_a_reason(
+    name: str, text: str, reason: str, tmp_path: Path
+) -> None:
+    if name:
+        counter(tmp_path, 5, name).write_text(text)
     result, elapsed_s, power = timed(lambda: 7, tmp_path)
     assert (result, power.mode, power.value) == (7, "unavailable", None)
     assert elapsed_s > 0
-    assert "no RAPL" in power.reason
+    assert reason in power.reason
 
 
-@counters
-def test_counters_of_other_domains_are_not_the_package(tmp_path: Path) -> None:
-    counter(tmp_path, 5, name="dram")
-    assert timed(lambda: None, tmp_path)[2].mode == "unavailable"
-
-
-@counters
-def test_a_counter_that_holds_no_number_is_unavailable(tmp_path: Path) -> None:
-    counter(tmp_path, 5).write_text("?")
-    assert "cannot be read" in timed(lambda: None, tmp_path)[2].reason
-
-
-def test_calls_run_round_by_round_until_there_are_enough() -> None:
+@pytest.mark.parametrize(("rounds", "least_s"), [(3, 0.0), (2, 0.02)])
+def test_calls_run_round_by_round_until_there_are_enough_and_they_took_long_enough(
+    rounds: int, least_s: float
+) -> None:
     ran: list[str] = []
-
-    def call(name: str) -> Callable[[], str]:
-        def run() -> str:
-            ran.append(name)
-            return name
-
-        return run
-
-    asked: list[list[int]] = []
-
-    def enough(found: Sequence[Sequence[object]]) -> bool:
-        asked.append([len(taken) for taken in found])
-        return len(found[0]) == 3
-
-    found = interleaved([call("a"), call("b")], lambda work: f"{work()}{len(ran)}", enough)
-    assert ran == ["a", "b"] * 3
-    assert found == [["a1", "a3", "a5"], ["b2", "b4", "b6"]]
-    assert asked == [[1, 1], [2, 2], [3, 3]]
+    found = interleaved([partial(ran.append, name) for name in ("a", "b")], rounds, least_s)
+    count = len(found[0])
+    assert ran == ["a", "b"] * count
+    assert [len(taken) for taken in found] == [count, count]
+    assert count == rounds if least_s == 0 else count > rounds
+    for times in ([time_s for time_s, _ in taken] for taken in found):
+        assert sum(times) >= least_s
+    if least_s:
+        assert min(sum(time_s for time_s, _ in taken[:-1]) for taken in found) < least_s

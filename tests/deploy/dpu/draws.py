@@ -5,20 +5,20 @@ from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.board import Dpu, load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import Sketch, Value
 
 Draw = Callable[[Sketch, str], str]
-TILE_PX = 288
+DPU, TILE_PX = load_dpu("vck190"), 288
 
 
-def broken_rules(path: Path, dpu: Dpu, tile_px: int = TILE_PX) -> list[str]:
+def broken_rules(path: Path, dpu: Dpu = DPU, tile_px: int = TILE_PX) -> list[str]:
     return [broken.rule for node in place(read_network(path, tile_px), dpu).nodes for broken in node.broken]
 
 
-def between_convs(tmp_path: Path, draw: Draw, dpu: Dpu, channels: int = 8) -> list[str]:
+def between_convs(tmp_path: Path, draw: Draw, dpu: Dpu = DPU, channels: int = 8) -> list[str]:
     """Rules broken by what `draw` puts between two convolutions."""
     sketch = Sketch(channels)
     middle = draw(sketch, sketch.conv("image", (channels, channels, 1, 1)))

@@ -13,15 +13,15 @@ from beers_deploy.dpu.board import load_dpu, ruled
 from beers_deploy.dpu.checker.conv_rules import conv_area, conv_weight_bank
 from beers_deploy.dpu.checker.operators import all_rules, applies, rule_name, rule_text
 from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.checker.table import REMARKS
+from beers_deploy.dpu.checker.remarks import REMARKS
 from beers_deploy.dpu.cost.latency import dpu_power
 from beers_deploy.dpu.graph import Operation, Window
-from beers_deploy.dpu.reading import network_of, read_network
+from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.network import shipped_pair
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.figures import predicted
-from beers_deploy.profiles.target import DEFAULT_TARGET, board_names, npu_names
+from beers_deploy.profiles.target import board_names, npu_names
 from beers_deploy.quant.core import SHIFTS, target_shifts
 from beers_deploy.quant.onnx_file import load_onnx
 from tests.deploy.dpu.draws import Draw, behind_conv, behind_sum, between_convs, broken_rules, conv, node
@@ -31,6 +31,10 @@ DPUS = {name: load_dpu(name) for name in board_names()}
 ZYNQ = ("kv260", "zcu102", "zcu104")
 KINDS = {"DPUCZDX8G": ZYNQ, "DPUCVDX8G": ("vck190",), "DPUCV2DX8G": ("vek280",)}
 ALPHA = 26 / 256
+
+
+def depthwise(height: int, width: int) -> Draw:
+    return conv(8, 1, height, width, group=8, pads=[0] * 4)
 
 
 def behind_depthwise(op_type: str, **attributes: float) -> Draw:
@@ -55,30 +59,12 @@ def in_two(first: Draw, second: Draw) -> Draw:
 
 # What only these boards refuse, with the rule, the network, the same with the remedy followed, and its channels.
 CASES: list[tuple[tuple[str, ...], str, Draw, Draw, int]] = [
-    (
-        ZYNQ,
-        "conv weight bank",
-        conv(8, 1312, 5, 5),
-        in_two(conv(1296, 1312, 1, 1), conv(8, 1296, 5, 5)),
-        1312,
-    ),
-    (
-        (*ZYNQ, "vek280"),
-        "depthwise kernel",
-        conv(8, 1, 64, 33, group=8, pads=[0] * 4),
-        in_two(conv(8, 1, 64, 1, group=8, pads=[0] * 4), conv(8, 1, 1, 33, group=8, pads=[0] * 4)),
-        8,
-    ),
+    (ZYNQ, "conv weight bank", conv(8, 1312, 5, 5), in_two(conv(1296, 1312, 1, 1), conv(8, 1296, 5, 5)), 1312),
+    ((*ZYNQ, "vek280"), "depthwise kernel", depthwise(64, 33), in_two(depthwise(64, 1), depthwise(1, 33)), 8),
     (ZYNQ, "activation place", behind_depthwise("LeakyRelu", alpha=ALPHA), behind_depthwise("Relu"), 8),
     (ZYNQ, "activation of sums", behind_sum("LeakyRelu", alpha=ALPHA), behind_sum("Relu"), 8),
     (("vek280",), "conv area", conv(8, 8, 8, 8, pads=[3] * 4), conv(8, 8, 7, 7), 8),
-    (
-        ("vek280",),
-        "depthwise kernel",
-        conv(8, 1, 21, 21, group=8, pads=[0] * 4),
-        in_two(conv(8, 1, 21, 1, group=8, pads=[0] * 4), conv(8, 1, 1, 21, group=8, pads=[0] * 4)),
-        8,
-    ),
+    (("vek280",), "depthwise kernel", depthwise(21, 21), in_two(depthwise(21, 1), depthwise(1, 21)), 8),
     (("vek280",), "activation place", prelu, behind_conv("Relu"), 8),
     (("vek280",), "activation of sums", in_two(added, prelu), behind_sum("Relu"), 8),
     (("vck190",), "conv window", conv(8, 8, 9, 8), conv(8, 8, 7, 7), 8),
@@ -87,25 +73,15 @@ NOT_OF_VEK280 = {"conv window"}
 """Its conv area is tighter: it refuses the same network for that."""
 
 
-@pytest.mark.parametrize(
-    ("boards", "rule", "draw", "channels"), [(boards, rule, draw, n) for boards, rule, draw, _, n in CASES]
-)
-def test_a_rule_refuses_its_case_on_its_boards_alone(
-    boards: tuple[str, ...], rule: str, draw: Draw, channels: int, tmp_path: Path
+@pytest.mark.parametrize(("boards", "rule", "draw", "remedied", "channels"), CASES)
+def test_a_rule_refuses_its_case_on_its_boards_alone_and_the_remedy_passes_on_every_board(
+    boards: tuple[str, ...], rule: str, draw: Draw, remedied: Draw, channels: int, tmp_path: Path
 ) -> None:
-    found = {name: between_convs(tmp_path, draw, dpu, channels) for name, dpu in DPUS.items()}
-    for name, broken in found.items():
-        if name in boards:
-            assert broken == [rule]
-        elif not (name == "vek280" and rule in NOT_OF_VEK280):
-            assert broken == []
-
-
-@pytest.mark.parametrize(("remedied", "channels"), [(remedied, n) for *_, remedied, n in CASES])
-def test_the_remedy_passes_on_every_board(remedied: Draw, channels: int, tmp_path: Path) -> None:
-    assert {name: between_convs(tmp_path, remedied, dpu, channels) for name, dpu in DPUS.items()} == {
-        name: [] for name in DPUS
-    }
+    for name, dpu in DPUS.items():
+        broken, sound = (between_convs(tmp_path, each, dpu, channels) for each in (draw, remedied))
+        if not (name == "vek280" and rule in NOT_OF_VEK280):
+            assert broken == ([rule] if name in boards else [])
+        assert sound == []
 
 
 @pytest.mark.parametrize(
@@ -223,16 +199,6 @@ def test_power_that_nobody_published_is_unavailable_and_so_is_what_follows() -> 
         assert all(name in figure.reason for figure in found if not known)
 
 
-def test_a_pixel_shuffle_inside_is_taken_with_a_warning(tmp_path: Path) -> None:
-    sketch = Sketch(8)
-    shuffled = sketch.node("DepthToSpace", sketch.conv("image"), blocksize=2)
-    path = sketch.save(tmp_path / "p.onnx", sketch.conv(shuffled, (8, 2, 3, 3)))
-    for dpu in DPUS.values():
-        placement = place(read_network(path, 16), dpu)
-        assert placement.failed == ()
-        assert "depthtospace1" in str(REMARKS[-1](placement, dpu, 16))
-
-
 def test_pixels_become_channels_behind_a_convolution(tmp_path: Path) -> None:
     """The `reorg` of YOLOv2; 32 x 32 pixels into 8192 channels are too many but for the VEK280."""
     unshuffled = node("SpaceToDepth", blocksize=2)
@@ -242,7 +208,3 @@ def test_pixels_become_channels_behind_a_convolution(tmp_path: Path) -> None:
         assert between_convs(tmp_path, unshuffled, dpu) == []
         assert between_convs(tmp_path, behind, dpu) == ["shuffle place"]
         assert between_convs(tmp_path, deep, dpu) == ([] if name == "vek280" else ["shuffle channels"])
-
-
-def test_the_default_is_the_papers_board() -> None:
-    assert DEFAULT_TARGET in DPUS

@@ -1,6 +1,5 @@
 """The constants of integer kernels: whose int32 bias the DPU can hold, and who reads a tensor as it was written."""
 
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -59,12 +58,7 @@ def kept(values: list[int]) -> bool:
     return number_rules.int32_bias(op, DPU) is None
 
 
-@given(st.lists(st.integers(-128, 127)), st.integers(0, 16))
-def test_a_shifted_int8_bias_passes(values: list[int], shift: int) -> None:
-    assert kept([value << shift for value in values])
-
-
-@given(st.lists(st.integers(-300, 300), min_size=1), st.integers(0, 18))
+@given(st.one_of(st.lists(st.integers(-128, 127)), st.lists(st.integers(-300, 300))), st.integers(0, 18))
 def test_a_bias_passes_where_some_shift_makes_it_int8(values: list[int], shift: int) -> None:
     values = [value << shift for value in values]
     shifts = [k for k in range(17) if all(v % 2**k == 0 and -128 <= v >> k <= 127 for v in values)]
@@ -113,24 +107,16 @@ def test_a_bias_with_one_more_on_a_value_is_refused() -> None:
         assert rules(model) == {"int32 bias"}, name
 
 
-def reader(op_type: str, place: int) -> Callable[[onnx.ModelProto], None]:
-    """The last node of a kind, with 4 times the scale at a place, or a zero point one less."""
-
-    def spoil(model: onnx.ModelProto) -> None:
-        node = [n for n in model.graph.node if n.op_type == op_type][-1]
-        value = numpy_helper.to_array(next(t for t in model.graph.initializer if t.name == node.input[place]))
-        changed = value * 4 if value.dtype == np.float32 else value - 1
-        model.graph.initializer.append(numpy_helper.from_array(changed.astype(value.dtype), "spoilt"))
-        node.input[place] = "spoilt"
-
-    return spoil
-
-
 @pytest.mark.parametrize(
     ("op_type", "place"),
     [("QLinearConv", 1), ("QLinearConv", 2), ("QLinearAdd", 1), ("QLinearAdd", 4), ("DequantizeLinear", 1)],
 )
 def test_who_reads_a_tensor_otherwise_than_it_was_written_is_refused(op_type: str, place: int) -> None:
+    """The last node of a kind, with 4 times the scale at a place, or a zero point one less."""
     model = own_file()
-    reader(op_type, place)(model)
+    node = [n for n in model.graph.node if n.op_type == op_type][-1]
+    value = numpy_helper.to_array(next(t for t in model.graph.initializer if t.name == node.input[place]))
+    spoilt = value * 4 if value.dtype == np.float32 else value - 1
+    model.graph.initializer.append(numpy_helper.from_array(spoilt.astype(value.dtype), "spoilt"))
+    node.input[place] = "spoilt"
     assert "one format" in rules(model)

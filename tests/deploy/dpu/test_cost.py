@@ -6,7 +6,7 @@ import pytest
 from beers_deploy.bench.tables import predict_file
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.cost.latency import Prediction, counted_power, image_energy_j, layer_energy_j
+from beers_deploy.dpu.cost.latency import Prediction, counted_power, layer_energy_j
 from beers_deploy.dpu.cost.model import LARGE_MAP_BYTES, regime_of
 from beers_deploy.dpu.cost.work import BURST_BYTES, Work, count_work
 from beers_deploy.dpu.reading import read_network
@@ -110,7 +110,7 @@ def works_of(sketch: Sketch, result: str, path: Path, side_px: int) -> tuple[Wor
 
 def moved(works: tuple[Work, ...]) -> int:
     """Map bytes that an image moves."""
-    return sum(work.load_map_bytes + work.store_map_bytes for work in works)
+    return sum(work.map_bytes for work in works)
 
 
 def test_what_three_branches_read_passes_through_memory(tmp_path: Path) -> None:
@@ -169,18 +169,16 @@ def test_a_pixel_shuffle_costs_the_bursts_of_its_pieces(tmp_path: Path, block: i
 
 def test_a_transposed_convolution_runs_over_the_zeros_between_its_pixels(tmp_path: Path) -> None:
     grown, plain = Sketch(32), Sketch(32)
-    works = [
-        works_of(grown, grown.node("ConvTranspose", "image", grown.weight(32, 32, 2, 2), strides=[2, 2]), path, 64)[0]
-        for path in (tmp_path / "n.onnx",)
-    ]
-    result = plain.conv("image", (32, 32, 2, 2), pads=[0, 0, 1, 1])
-    works += works_of(plain, result, tmp_path / "p.onnx", 128)
-    assert works[0].array_operations == works[1].array_operations == 4 * works[0].operations
+    enlarged = grown.node("ConvTranspose", "image", grown.weight(32, 32, 2, 2), strides=[2, 2])
+    (work,) = works_of(grown, enlarged, tmp_path / "n.onnx", 64)
+    (other,) = works_of(plain, plain.conv("image", (32, 32, 2, 2), pads=[0, 0, 1, 1]), tmp_path / "p.onnx", 128)
+    assert work.array_operations == other.array_operations == 4 * work.operations
 
 
 def test_each_layer_names_its_bound(papers_prediction: Prediction) -> None:
     for layer in papers_prediction.layers:
-        parts = {"compute": layer.compute_s, "memory": layer.memory_s, "overhead": layer.start_s}
+        overhead_s = max(layer.time_s - layer.compute_s - layer.memory_s, 0.0)
+        parts = {"compute": layer.compute_s, "memory": layer.memory_s, "overhead": overhead_s}
         assert layer.bound == max(parts, key=lambda name: parts[name])
         assert max(parts.values()) <= layer.time_s <= math.fsum(parts.values()) * (1 + 1e-12)
 
@@ -213,13 +211,6 @@ def test_more_batch_handlers_gain_less_on_large_maps(papers: Path) -> None:
     assert 1.0 < six / three < 1.3
 
 
-def test_a_network_that_the_dpu_refuses_has_no_prediction(tmp_path: Path) -> None:
-    sketch = Sketch(8)
-    path = sketch.save(tmp_path / "s.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
-    with pytest.raises(ModelError, match="check"):
-        predict_file(path, DPU)
-
-
 def test_a_network_without_convolutions_has_no_prediction(tmp_path: Path) -> None:
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "p.onnx", sketch.node("MaxPool", "image", kernel_shape=[2, 2]))
@@ -248,11 +239,11 @@ def test_latency_is_that_of_one_core_and_one_thread(tmp_path: Path) -> None:
     path = float_convbeers(tmp_path / "n.onnx", 2, 16)
     three, one = load_dpu("zcu102"), load_dpu("kv260")
     found, single = predict_file(path, three), predict_file(path, one)
-    assert (found.handlers, single.handlers) == (1, 1)
+    assert (three.handlers, one.handlers) == (1, 1)
     assert found.alone_s <= found.batch_time_s
     assert single.alone_s == pytest.approx(single.batch_time_s)
     assert found.latency_s == pytest.approx(found.alone_s + found.host_s * three.whole("cpu", "cores"))
-    assert found.handlers / found.latency_s < found.fps
+    assert three.handlers / found.latency_s < found.fps
 
 
 def test_energy_counts_products_and_bytes(tmp_path: Path) -> None:
@@ -264,9 +255,9 @@ def test_energy_counts_products_and_bytes(tmp_path: Path) -> None:
     assert high == pytest.approx(products * 0.23e-12 + weights / 3 * 325e-12)
 
 
-def test_counted_power_lies_below_the_published_run(tmp_path: Path) -> None:
+def test_counted_power_lies_below_the_published_run(papers_prediction: Prediction) -> None:
     """It leaves out control, clocks and leakage: more than the whole board's would be a fault."""
-    prediction = predict_file(float_convbeers(tmp_path / "f.onnx", 16, 64), DPU)
-    low, high = counted_power(prediction, DPU).interval or (0, 0)
+    low, high = counted_power(papers_prediction).interval or (0, 0)
     assert 0 < low < high < DPU.value("power", "dpu_run_w")
-    assert image_energy_j(prediction, DPU)[1] == pytest.approx(high / prediction.fps)
+    most_j = math.fsum(layer_energy_j(layer, DPU)[1] for layer in papers_prediction.layers)
+    assert most_j == pytest.approx(high / papers_prediction.fps)

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from beers_deploy.dpu.board import load_dpu
-from beers_deploy.dpu.checker.forms import forms, fully_connected
+from beers_deploy.dpu.checker.operators import forms, fully_connected
 from beers_deploy.dpu.checker.placement import PlacedNode, place
 from beers_deploy.dpu.graph import Operation
 from beers_deploy.dpu.reading import read_network

@@ -21,6 +21,10 @@ def of_class(root: ET.Element, kind: str, tag: str) -> list[ET.Element]:
     return root.findall(f".//{SVG}g[@class='{kind}']/{SVG}{tag}")
 
 
+def drawn(placement: Placement, title: str = "net") -> ET.Element:
+    return ET.fromstring(draw(placement, title))  # noqa: S314 - our own output
+
+
 def placed(path: Path) -> Placement:
     return place(read_network(path, 40), load_dpu("vck190"))
 
@@ -29,7 +33,7 @@ def test_every_node_is_drawn_in_its_devices_colour_and_says_which(tmp_path: Path
     sketch = Sketch(8)
     middle = sketch.node("Sigmoid", sketch.conv("image"))
     placement = placed(sketch.save(tmp_path / "s.onnx", sketch.conv(middle)))
-    root = ET.fromstring(draw(placement, "a < b & c"))  # noqa: S314 - our own output
+    root = drawn(placement, "a < b & c")
     boxes = of_class(root, "dot", "path")
     labels = [text.text for text in of_class(root, "device", "text")][len(FILLS) :]
     devices = [node.device for node in placement.nodes]
@@ -52,8 +56,7 @@ def test_every_word_is_seen_on_a_phone(blocks: int, tmp_path: Path) -> None:
     broken = placed(sketch.save(tmp_path / "s.onnx", sketch.conv(conv)))
     deep = placed(float_convbeers(tmp_path / "f.onnx", blocks, 8))
     for placement in (broken, deep):
-        title = "a-network-with-quite-a-long-name.onnx on vck190 C32B3, tile 640"
-        root = ET.fromstring(draw(placement, title))  # noqa: S314
+        root = drawn(placement, "a-network-with-quite-a-long-name.onnx on vck190 C32B3, tile 640")
         assert float(root.get("width") or 0) <= 390
         texts = list(root.iter(f"{SVG}text"))
         for text in texts:
@@ -64,15 +67,14 @@ def test_every_word_is_seen_on_a_phone(blocks: int, tmp_path: Path) -> None:
         for path in of_class(root, "edge", "path"):
             assert all(float(number) >= 0 for number in re.findall(r"-?[0-9.]+", path.get("d") or ""))
     for node in broken.nodes:
-        assert node.op.name in ET.tostring(ET.fromstring(draw(broken, "net")), encoding="unicode")  # noqa: S314
+        assert node.op.name in draw(broken, "net")
 
 
 def test_edges_join_writers_to_readers(tmp_path: Path) -> None:
     placement = placed(float_convbeers(tmp_path / "f.onnx", 2, 8))
-    root = ET.fromstring(draw(placement, "net"))  # noqa: S314
     written = {name for node in placement.nodes for name in node.op.outputs}
     reads = sum(name in written for node in placement.nodes for name in node.op.inputs)
-    edges = of_class(root, "edge", "path")
+    edges = of_class(drawn(placement), "edge", "path")
     assert len(edges) == reads
     assert sum("C" in (edge.get("d") or "") for edge in edges) == 3  # two blocks' skips and the long one
 

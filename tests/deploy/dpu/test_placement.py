@@ -3,17 +3,26 @@ from pathlib import Path
 import onnx
 
 from beers_deploy.dpu.board import load_dpu
-from beers_deploy.dpu.checker.operators import rule_text
 from beers_deploy.dpu.checker.placement import FLOAT_NOTE, Placement, place
-from beers_deploy.dpu.checker.table import REMARKS, remarks_on
+from beers_deploy.dpu.checker.remarks import remarks_on
 from beers_deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import IntegerSketch, Sketch, board_convbeers, float_convbeers, integer_convbeers
 
 DPU = load_dpu("vck190")
 
 
+def placed(path: Path, tile_px: int = 21) -> Placement:
+    return place(read_network(path, tile_px), DPU)
+
+
+def cut_in_two(path: Path) -> Path:
+    """By an operator that the DPU does not have."""
+    sketch = Sketch(8)
+    return sketch.save(path, sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
+
+
 def test_the_integer_file_has_three_parts_and_one_subgraph(tmp_path: Path) -> None:
-    placement = place(read_network(integer_convbeers(tmp_path / "i.onnx", 2, 8), 53), DPU)
+    placement = placed(integer_convbeers(tmp_path / "i.onnx", 2, 8), 53)
     parts = [node.part for node in placement.nodes]
     assert parts[0] == "host-front"
     assert parts[-2:] == ["host-back", "host-back"]
@@ -21,10 +30,13 @@ def test_the_integer_file_has_three_parts_and_one_subgraph(tmp_path: Path) -> No
     assert placement.dpu_subgraphs == 1
     assert not placement.failed
     assert [(cut.size_bytes, cut.onto_dpu) for cut in placement.cuts] == [(53 * 53, True), (53 * 53, False)]
+    remarks = remarks_on(placement, DPU, 53)
+    assert placement.cuts[1].tensor in remarks["fix2float"]
+    assert "subgraphs" not in remarks
 
 
 def test_a_float_file_is_judged_as_if_quantised(tmp_path: Path) -> None:
-    placement = place(read_network(float_convbeers(tmp_path / "f.onnx", 2, 8), 53), DPU)
+    placement = placed(float_convbeers(tmp_path / "f.onnx", 2, 8))
     assert placement.note == FLOAT_NOTE
     assert [node.part for node in placement.nodes].count("host-back") == 1
     assert placement.nodes[-1].part == "host-back"
@@ -32,17 +44,15 @@ def test_a_float_file_is_judged_as_if_quantised(tmp_path: Path) -> None:
 
 
 def test_the_board_file_is_all_core_but_its_conversions(tmp_path: Path) -> None:
-    placement = place(read_network(board_convbeers(tmp_path / "b.onnx", 2, 8), 53), DPU)
+    placement = placed(board_convbeers(tmp_path / "b.onnx", 2, 8))
     assert [node.device for node in placement.nodes if node.part != "dpu-core"] == ["host", "host"]
     assert (placement.dpu_subgraphs, placement.failed) == (1, ())
 
 
 def test_an_operator_in_the_middle_cuts_the_core_in_two(tmp_path: Path) -> None:
-    sketch = Sketch(8)
-    middle = sketch.node("Sigmoid", sketch.conv("image"))
-    path = sketch.save(tmp_path / "s.onnx", sketch.conv(middle))
-    placement = place(read_network(path, 21), DPU)
+    placement = placed(cut_in_two(tmp_path / "s.onnx"))
     assert placement.dpu_subgraphs == 2
+    assert remarks_on(placement, DPU, 21)["subgraphs"].startswith("2 DPU subgraphs")
     assert [node.device for node in placement.nodes] == ["DPU", "CPU", "DPU"]
     assert len(placement.cuts) == 4
     assert {cut.size_bytes for cut in placement.cuts} == {8 * 21 * 21}
@@ -53,25 +63,23 @@ def test_a_branch_past_the_cpu_does_not_join_what_it_parts(tmp_path: Path) -> No
     sketch = Sketch(8)
     first = sketch.conv("image")
     end = sketch.node("Add", first, sketch.conv(sketch.node("Sigmoid", first)))
-    placement = place(read_network(sketch.save(tmp_path / "b.onnx", end), 21), DPU)
-    assert placement.dpu_subgraphs == 2
+    assert placed(sketch.save(tmp_path / "b.onnx", end)).dpu_subgraphs == 2
 
 
 def test_two_heads_of_one_input_are_two_subgraphs(tmp_path: Path) -> None:
     sketch = Sketch(8)
-    path = sketch.save(tmp_path / "t.onnx", sketch.conv("image"), sketch.conv("image"))
-    assert place(read_network(path, 21), DPU).dpu_subgraphs == 2
+    assert placed(sketch.save(tmp_path / "t.onnx", sketch.conv("image"), sketch.conv("image"))).dpu_subgraphs == 2
 
 
 def test_scaling_in_front_is_the_hosts_but_other_operators_are_refused(tmp_path: Path) -> None:
     sketch = Sketch(8)
     scaled = sketch.node("Div", "image", sketch.weight(1))
-    placement = place(read_network(sketch.save(tmp_path / "d.onnx", sketch.conv(scaled)), 20), DPU)
+    placement = placed(sketch.save(tmp_path / "d.onnx", sketch.conv(scaled)))
     assert [node.part for node in placement.nodes] == ["host-front", "dpu-core"]
 
     sketch = Sketch(8)
     apart = sketch.node("Softmax", "image", axis=1)
-    placement = place(read_network(sketch.save(tmp_path / "a.onnx", sketch.conv(apart)), 20), DPU)
+    placement = placed(sketch.save(tmp_path / "a.onnx", sketch.conv(apart)))
     assert [node.device for node in placement.nodes] == ["CPU", "DPU"]
 
 
@@ -79,8 +87,7 @@ def test_pixels_are_moved_to_channels_and_back_by_the_host_at_the_ends_alone(tmp
     sketch = Sketch(2)
     apart = sketch.conv(sketch.node("SpaceToDepth", "image", blocksize=2))
     inside = sketch.conv(sketch.node("DepthToSpace", apart, blocksize=2), (8, 2, 3, 3))
-    path = sketch.save(tmp_path / "p.onnx", sketch.node("DepthToSpace", inside, blocksize=2))
-    placement = place(read_network(path, 20), DPU)
+    placement = placed(sketch.save(tmp_path / "p.onnx", sketch.node("DepthToSpace", inside, blocksize=2)), 20)
     assert [node.part for node in placement.nodes] == ["host-front", *["dpu-core"] * 3, "host-back"]
     assert placement.failed == ()
     assert remarks_on(placement, DPU, 20)["shuffles"].startswith(placement.nodes[2].op.name)
@@ -93,7 +100,7 @@ def test_what_a_classifier_ends_in_is_the_hosts(tmp_path: Path) -> None:
     model = onnx.load_model(sketch.save(tmp_path / "c.onnx", sketch.node("Softmax", scores, axis=1)))
     del model.graph.output[0].type.tensor_type.shape.dim[2:]
     onnx.save_model(model, tmp_path / "c.onnx")
-    placement = place(read_network(tmp_path / "c.onnx", 20), DPU)
+    placement = placed(tmp_path / "c.onnx")
     kinds = [(node.op.op_type, node.part) for node in placement.nodes]
     assert kinds[:3] == [(kind, "dpu-core") for kind in ("Conv", "GlobalAveragePool", "Conv")]
     assert kinds[3:] == [("Softmax", "host-back"), ("Flatten", "host-back")]
@@ -103,12 +110,8 @@ def test_a_relu_behind_the_last_convolution_stays_on_the_dpu(tmp_path: Path) -> 
     sketch = IntegerSketch()
     last = sketch.node("Relu", sketch.qconv(sketch.quantised("image"), (4, 1, 3, 3)))
     path = sketch.save(tmp_path / "r.onnx", sketch.node("DequantizeLinear", last, *sketch.numbers))
-    devices = [node.device for node in place(read_network(path, 20), DPU).nodes]
+    devices = [node.device for node in placed(path).nodes]
     assert devices == ["host", "DPU", "DPU", "host"]
-
-
-def placed(path: Path, tile_px: int) -> Placement:
-    return place(read_network(path, tile_px), DPU)
 
 
 def test_maps_stream_from_the_tile_on_that_the_remark_names(tmp_path: Path) -> None:
@@ -117,21 +120,3 @@ def test_maps_stream_from_the_tile_on_that_the_remark_names(tmp_path: Path) -> N
     assert "tiles of 181 px and less" in text  # 32 channels at 181 x 181 are the last below 1 MiB
     assert "streaming" not in remarks_on(placed(path, 181), DPU, 181)
     assert "streaming" in remarks_on(placed(path, 182), DPU, 182)
-
-
-def test_the_last_conversion_runs_on_the_cpu(tmp_path: Path) -> None:
-    placement = placed(integer_convbeers(tmp_path / "i.onnx", 1, 8), 64)
-    (leaving,) = (cut.tensor for cut in placement.cuts if not cut.onto_dpu)
-    assert leaving in remarks_on(placement, DPU, 64)["fix2float"]
-
-
-def test_subgraphs_are_counted(tmp_path: Path) -> None:
-    sketch = Sketch(8)
-    path = sketch.save(tmp_path / "s.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
-    assert remarks_on(placed(path, 32), DPU, 32)["subgraphs"].startswith("2 DPU subgraphs")
-    assert "subgraphs" not in remarks_on(placed(integer_convbeers(tmp_path / "i.onnx", 1, 8), 32), DPU, 32)
-
-
-def test_remarks_read_with_the_targets_limits() -> None:
-    texts = [rule_text(remark, DPU) for remark in REMARKS]
-    assert not [text for text in texts if "{" in text or "(" not in text]

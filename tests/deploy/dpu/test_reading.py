@@ -8,7 +8,6 @@ from onnx import numpy_helper
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.graph import Operation
 from beers_deploy.dpu.reading import own_tile_px, read_network
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.encodings import PLACE_PX, board_model
@@ -20,14 +19,11 @@ from tests.quant.tiling.small_networks import quantised_half_resolution
 
 def core(path: Path) -> list[tuple[object, ...]]:
     """What the three encodings have in common."""
-    kinds = ("conv", "add", "activation")
-    names = {name: k for k, op in enumerate(read_network(path, 96).operations) for name in op.outputs}
-
-    def plain(op: Operation) -> tuple[object, ...]:
-        return (op.kind, op.in_shapes, op.out_shape, op.window, op.channels, op.weight_bytes, op.follows)
-
-    assert names
-    return [plain(op) for op in read_network(path, 96).operations if op.kind in kinds]
+    return [
+        (op.kind, op.in_shapes, op.out_shape, op.window, op.channels, op.weight_bytes, op.follows)
+        for op in read_network(path, 96).operations
+        if op.kind in ("conv", "add", "activation")
+    ]
 
 
 def test_three_encodings_are_one_network(tmp_path: Path) -> None:
@@ -43,16 +39,11 @@ def test_three_encodings_are_one_network(tmp_path: Path) -> None:
     assert [row[:-1] for row in spelt[0][:-1]] == [row[:-1] for row in spelt[2]]
 
 
-def test_board_file_keeps_only_the_conversions_at_its_border(tmp_path: Path) -> None:
-    kinds = [op.kind for op in read_network(board_convbeers(tmp_path / "b.onnx", 3, 8), 64).operations]
-    assert kinds.count("quantise") == 1
-    assert kinds.count("dequantise") == 1
-    assert (kinds[0], kinds[-1]) == ("quantise", "dequantise")
-
-
-def test_numbers_of_a_board_file_reach_its_operations(tmp_path: Path) -> None:
-    network = read_network(board_convbeers(tmp_path / "b.onnx", 1, 8), 64)
-    conv = next(op for op in network.operations if op.kind == "conv")
+def test_a_board_file_keeps_only_the_conversions_at_its_border_and_its_numbers(tmp_path: Path) -> None:
+    first, *middle, last = read_network(board_convbeers(tmp_path / "b.onnx", 3, 8), 64).operations
+    assert (first.kind, last.kind) == ("quantise", "dequantise")
+    assert {op.kind for op in middle}.isdisjoint(("quantise", "dequantise"))
+    conv = next(op for op in middle if op.kind == "conv")
     assert conv.integer
     assert {role: scale.frac_bits for role, scale in conv.scales.items()} == dict.fromkeys(
         ("input 0", "weight", "bias", "output"), 7

@@ -1,6 +1,7 @@
 """A report's tables lose nothing, and turn when their figures would not fit beside each other."""
 
-from html.parser import HTMLParser
+import re
+from html import unescape
 
 import pytest
 
@@ -8,33 +9,13 @@ from beers_deploy.profiles.figures import Row, measured, unavailable
 from beers_deploy.report.page import WIDE, Report, Section, render
 
 
-class Cells(HTMLParser):
-    """The texts of a page's tables, line by line, cell by cell."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.lines: list[list[str]] = []
-        self.inside = False
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:  # noqa: ARG002 - HTMLParser's
-        if tag == "tr":
-            self.lines.append([])
-        self.inside = tag in ("td", "th") or (self.inside and tag == "small")
-        if tag in ("td", "th"):
-            self.lines[-1].append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        self.inside = self.inside and tag not in ("td", "th")
-
-    def handle_data(self, data: str) -> None:
-        if self.inside:
-            self.lines[-1][-1] += f"{data} "
-
-
 def lines(rows: list[Row]) -> list[list[str]]:
-    reader = Cells()
-    reader.feed(render(Report("A page", "Its headline", [Section("A table", rows)], [], [])))
-    return [[cell.strip() for cell in line] for line in reader.lines]
+    """The texts of a page's table, line by line, cell by cell."""
+    page = render(Report("A page", "Its headline", [Section("A table", rows)], [], []))
+    cells = [
+        re.findall(r"<t[dh]\b[^>]*>(.*?)</t[dh]>", line, re.DOTALL) for line in re.findall(r"(?s)<tr>.*?</tr>", page)
+    ]
+    return [[" ".join(unescape(re.sub("<.*?>", " ", cell)).split()) for cell in line] for line in cells]
 
 
 def rows_of(figures: int, count: int) -> list[Row]:
