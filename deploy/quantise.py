@@ -23,7 +23,7 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile, board_names, npu_names
 from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
-from beers_deploy.quant.core import SHIFTS, IntCore, Shifts, target_shifts
+from beers_deploy.quant.core import SHIFTS, Shifts, target_shifts
 from beers_deploy.quant.encodings import host_model, read_core
 from beers_deploy.quant.free import quantise_free
 from beers_deploy.quant.gate import compare, gate_row
@@ -38,8 +38,6 @@ from beers_deploy.report.sensitivity_page import sensitivity_page
 
 if TYPE_CHECKING:
     from beers_deploy.quant.calibration import Calibration
-    from beers_deploy.quant.passes.tune import Tuning
-    from beers_deploy.quant.samples import Patches
 
 Source: TypeAlias = "Calibration | OwnSamples"
 """Where patches come from: simulated ones, or a user's own."""
@@ -92,8 +90,10 @@ def quantize(
         >>> bd.quantize(bd.Network.load(network, example=(1, 1, 32, 32)), samples, board="zcu102").precision
         'int8'
     """
-    target, known, banked = TargetProfile.load(board), Sensor.load(sensor), _conditioned(network)
-    _require_regime(regime)
+    target, known = TargetProfile.load(board), Sensor.load(sensor)
+    banked = conditioned(Path(network)) if isinstance(network, str | os.PathLike) else None
+    if regime not in ("legal", "free"):
+        raise OptionError("regime", expected="legal or free", got=repr(regime), remedy="choose one")
     steps = steps_of(finetune)
     if banked and (regime == "free" or steps != 0 or samples is not None):
         remedy = "leave it out: such a network is calibrated over the whole family of sensors at once"
@@ -122,15 +122,6 @@ def steps_of(finetune: int | str) -> int | None:
     return int(finetune)
 
 
-def _require_regime(regime: str) -> None:
-    if regime not in ("legal", "free"):
-        raise OptionError("regime", expected="legal or free", got=repr(regime), remedy="choose one")
-
-
-def _conditioned(network: NetworkLike) -> Conditioned | None:
-    return conditioned(Path(network)) if isinstance(network, str | os.PathLike) else None
-
-
 def _simulated(sensor: Sensor, images: Path | None, patches: int, patch_px: int, seed: int) -> "Calibration":
     from beers_deploy.quant.calibration import Calibration  # SciPy, which samples of one's own do without
 
@@ -144,34 +135,25 @@ def _free(origin: Network, calibration: Source) -> Network:
 
 
 def _legal(origin: Network, calibration: Source, target: TargetProfile, steps: int | None) -> Network:
-    shifts = _shifts_of(target)
-    tuning = None if steps == 0 else _tuning(calibration, steps)
+    shifts, tuning = _shifts_of(target), None
+    if steps != 0:
+        optional("torch", "finetune")
+        from beers_deploy.quant.passes.tune import Tuning
+
+        tuning = Tuning(calibration.for_tuning.pairs, steps)
     with begun("calibrating") as step:
         about = {**calibration.about, "target": target.name}
         result = quantise_model(origin.model, calibration.drawn, about, shifts, tuning, log=step)
-    layers = _layers(origin.model, result.core, result.host, calibration.drawn)
+    layers = integer_rows(origin.model, result.core, result.host, calibration.drawn.degraded)
     return Network(result.host, f"{origin.name}-int8", layers=layers, quantised=result)
-
-
-def _tuning(calibration: Source, steps: int | None) -> "Tuning":
-    optional("torch", "finetune")
-    from beers_deploy.quant.passes.tune import Tuning
-
-    return Tuning(calibration.for_tuning.pairs, steps)
 
 
 def _banked(network: Conditioned, calibration: "Calibration", sensor: Sensor, target: TargetProfile) -> Network:
     """A network behind a bank, told a sensor; each integer layer on its patches."""
     family = family_model(network, calibration.images, calibration.seed, _shifts_of(target))
     host = told_int8(family, sensor, {"target": target.name})
-    layers = _layers(network.model(sensor, int8=False), read_core(host), host, calibration.drawn)
+    layers = integer_rows(network.model(sensor, int8=False), read_core(host), host, calibration.drawn.degraded)
     return Network(host, f"{network.name}-int8", layers=layers)
-
-
-def _layers(model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, patches: "Patches") -> tuple[Row, ...]:
-    """Each integer layer, and what rounding ties up or to even makes of the result."""
-    layers, rounding = integer_rows(model, core, host, patches.degraded)
-    return (*layers, rounding)
 
 
 def _shifts_of(target: TargetProfile) -> Shifts:

@@ -192,7 +192,11 @@ def _samples(path: Path) -> Iterator[Named]:
     if path.is_dir():
         for file in sorted(path.iterdir()):
             if file.suffix.lower() == ".npy":
-                yield file.name, _one(file, _stored(file)[0]), NO_REFERENCE
+                image, _ = _stored(file)
+                if image.ndim != 3:
+                    got = times(image.shape)
+                    raise ImageError(str(file), expected="one image (C, H, W)", got=got, remedy=REMEDY)
+                yield file.name, image, NO_REFERENCE
             elif file.suffix.lower() in IMAGE_SUFFIXES:
                 yield file.name, _bands_first(file, read_pixels(file)), NO_REFERENCE
         return
@@ -202,12 +206,6 @@ def _samples(path: Path) -> Iterator[Named]:
         raise ImageError(str(path), expected="a batch of (N, C, H, W)", got=got, remedy=REMEDY)
     for number, image in enumerate(images):
         yield f"{path.name}[{number}]", image, references[number] if references.size else references
-
-
-def _one(file: Path, array: np.ndarray) -> np.ndarray:
-    if array.ndim != 3:
-        raise ImageError(str(file), expected="one image (C, H, W)", got=times(array.shape), remedy=REMEDY)
-    return array
 
 
 def _stored(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -314,23 +312,16 @@ class OwnSamples:
         return split_samples(self.all)[1]
 
     @property
-    def patches(self) -> int:
-        """How many it is calibrated on."""
-        return len(self.drawn.pairs)
-
-    @property
     def about(self) -> dict[str, str]:
         """What the file says of it."""
-        digests = " ".join(digest_of(image) for image in self.drawn.degraded)
-        return {
-            "calibration_data": self.given.name if isinstance(self.given, Path) else IN_MEMORY,
-            CALIBRATED_ON: digests,
-        }
+        name = self.given.name if isinstance(self.given, Path) else IN_MEMORY
+        return {"calibration_data": name, CALIBRATED_ON: " ".join(map(digest_of, self.drawn.degraded))}
 
 
 def samples_of(model: onnx.ModelProto, given: object) -> OwnSamples | None:
     """A user's samples for a network, None where none are given and it takes simulated ones."""
-    channels, fixed_px, multiple_px = _channels(model), fixed_tile_px(model), _multiple_px(model)
+    channels = int(model.graph.input[0].type.tensor_type.shape.dim[1].dim_value) or 1
+    fixed_px, multiple_px = fixed_tile_px(model), _multiple_px(model)
     if given is not None:
         found = Path(given) if isinstance(given, str | os.PathLike) else samples_in(given)
         return OwnSamples(found, channels, fixed_px, multiple_px or 1)
@@ -342,10 +333,6 @@ def samples_of(model: onnx.ModelProto, given: object) -> OwnSamples | None:
         remedy = "give a .npy or .npz file of (N, C, H, W) in [0, 1], or a folder of images"
         raise OptionError("samples", expected=expected, got="none", remedy=remedy)
     return None
-
-
-def _channels(model: onnx.ModelProto) -> int:
-    return int(model.graph.input[0].type.tensor_type.shape.dim[1].dim_value) or 1
 
 
 def _multiple_px(model: onnx.ModelProto) -> int | None:
