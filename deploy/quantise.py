@@ -165,13 +165,7 @@ def _shifts_of(target: TargetProfile) -> Shifts:
 
 
 def losses_of(network: Network, samples: object = None, **drawn: Any) -> str:
-    """What INT8 costs on patches or samples that calibration did not see, in one sentence.
-
-    Args:
-        network: what `quantize` made in the regime "legal".
-        samples: as given there.
-        drawn: sensor, images, patches, patch_px and seed as given there.
-    """
+    """What INT8 costs on what calibration did not see, in one sentence; all as in `sensitivity_report`."""
     assert network.origin is not None and network.quantised is not None  # noqa: S101, PT018
     model, result = network.origin.model, network.quantised
     held_out = (samples_of(model, samples) or _simulated(**drawn)).unseen

@@ -273,12 +273,7 @@ def _require_references(own: OwnSamples | None, wanted: str) -> None:
 
 
 def baseline_mae(path: Path, arguments: Mapping[str, Any]) -> float:
-    """The MAE in a document that an earlier `gate --json` wrote, of the same patches.
-
-    Args:
-        path: the document.
-        arguments: of this run of the gate.
-    """
+    """The MAE in a document that an earlier `gate --json` wrote, of the same patches as with these arguments."""
     try:
         document: Any = read_json(path)
         before = {name: _plain(name, dict(document["arguments"]).get(name)) for name in PATCHES}
@@ -328,12 +323,7 @@ def file_checks(float_model: onnx.ModelProto, int8: Network, target: TargetProfi
 
 
 def sentence(checks: Sequence[Check], passed: str) -> str:
-    """The line that ends a command: every check that failed, with its value and its limit, and no other.
-
-    Args:
-        checks: all that were made.
-        passed: what to say beside their number where none failed.
-    """
+    """The line that ends a command: all checks that failed, with value and limit; or their number and `passed`."""
     failed = [str(check) for check in checks if not check.passed]
     if not failed:
         return f"passed, all {len(checks)} checks: {passed}"

@@ -252,23 +252,19 @@ BREAKABLE = {
 """What limits may be: images in [0, 1] differ by no more, no layer saturates more, and no network is so far off."""
 
 
-def limits_of(given: "Limits | Mapping[str, float] | str | os.PathLike[str] | None") -> Limits:
-    """Limits by their names, of a TOML file such as `mae = 0.0007`, or the defaults for None.
+def limits_of(
+    given: "Limits | Mapping[str, float] | str | os.PathLike[str] | None", max_mae: float | None = None
+) -> Limits:
+    """Limits by their names, of a TOML file such as `mae = 0.0007`, or the defaults for None; `max_mae` overrides.
 
     Raises:
         OptionError: no limits, unknown ones, or some that no network breaks.
     """
-    if given is None:
-        return Limits()
-    if isinstance(given, Limits):
-        return _breakable("limits", given)
-    return _named("limits", given) if isinstance(given, Mapping) else _parse(Path(given))
-
-
-def read_limits(path: Path | None, mae: float | None) -> Limits:
-    """As `limits_of`; `mae` overrides."""
-    limits = limits_of(path)
-    return limits if mae is None else _breakable("max_mae", replace(limits, mae=mae))
+    if isinstance(given, str | os.PathLike):
+        limits = _parse(Path(given))
+    else:
+        limits = _named("limits", given) if isinstance(given, Mapping) else _breakable("limits", given or Limits())
+    return limits if max_mae is None else _breakable("max_mae", replace(limits, mae=max_mae))
 
 
 def _breakable(where: str, limits: Limits) -> Limits:
@@ -285,10 +281,8 @@ def _parse(path: Path) -> Limits:
     try:
         raw = read_toml_text(path)
     except (OSError, ValueError) as error:
-        got = unreadable(path) or str(error)
-        raise OptionError(
-            str(path), expected="a TOML file of limits", got=got, remedy="write mae = 0.0007"
-        ) from error
+        got, expected = unreadable(path) or str(error), "a TOML file of limits"
+        raise OptionError(str(path), expected=expected, got=got, remedy="write mae = 0.0007") from error
     return _named(str(path), raw)
 
 

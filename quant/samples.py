@@ -86,22 +86,19 @@ FULL_SCALE_8 = 255
 REMEDY = "see docs/reference/any-network.md for how samples are given"
 
 
-Named = tuple[str, np.ndarray, np.ndarray]
-"""A sample's name for messages, its image (C, H, W), and its reference, empty where there is none."""
-
-
-def read_samples(given: Path | Sequence[Named], channels: int, fixed_px: int | None, multiple_px: int = 1) -> Patches:
+def read_samples(given: Path | Sequence[Pair], channels: int, fixed_px: int | None, multiple_px: int = 1) -> Patches:
     """The samples of a file, a folder or arrays, cut to what the network takes: each (1, C, h, w) float32 in [0, 1].
 
     Args:
-        given: the file or folder, or the samples.
+        given: the file or folder, or the samples (C, H, W) with their references.
         channels: that the network reads.
         fixed_px: side of the image that the network is fixed to; None cuts large samples to patches.
         multiple_px: what sides must be multiples of; the rest is cut off.
     """
+    named = _samples(given) if isinstance(given, Path) else ((f"{IN_MEMORY}[{k}]", *p) for k, p in enumerate(given))
     pairs = [
         pair
-        for name, image, reference in (_samples(given) if isinstance(given, Path) else given)
+        for name, image, reference in named
         for pair in _cut(_sound(name, image, channels), reference, name, fixed_px, multiple_px)
     ]
     if not pairs:
@@ -113,7 +110,7 @@ def read_samples(given: Path | Sequence[Named], channels: int, fixed_px: int | N
 IN_MEMORY = "samples"
 
 
-def samples_in(given: object) -> list[Named]:
+def samples_in(given: object) -> list[Pair]:
     """The samples in an array, in a pair of arrays (images, references), or in what gives such one after the other.
 
     Args:
@@ -124,24 +121,22 @@ def samples_in(given: object) -> list[Named]:
         pair: Any = given
         largest = np.float32(pair.sensor.max_dn)
         images = [np.asarray(image, np.float32)[None] / largest for image in (pair.degraded, pair.reference)]
-        return [("pair", images[0], images[1])]
+        return [(images[0], images[1])]
     if hasattr(given, "ndim"):
-        return [(f"{IN_MEMORY}[{k}]", image, NO_REFERENCE) for k, image in enumerate(_batch(given))]
+        return [(image, NO_REFERENCE) for image in _batch(given)]
     if isinstance(given, tuple) and len(given) == 2 and all(hasattr(each, "ndim") for each in given):
         seen, meant = _batch(given[0]), _plain(given[1])  # a reference may be a class, or a class for each pixel
         meant = meant[None] if np.ndim(given[0]) == 3 else meant
         if len(seen) != len(meant):
             got = f"{len(seen)} images and {len(meant)} references"
             raise ImageError(IN_MEMORY, expected="a reference for each image", got=got, remedy=REMEDY)
-        return [(f"{IN_MEMORY}[{k}]", *pair) for k, pair in enumerate(zip(seen, meant, strict=True))]
+        return list(zip(seen, meant, strict=True))
     if not isinstance(given, Iterable) or isinstance(given, str | bytes | Mapping):
         got = type(given).__name__
         raise ImageError(IN_MEMORY, expected="arrays (N, C, H, W), or a path", got=got, remedy=REMEDY)
     items = (tuple(item) if isinstance(item, list) and len(item) == 2 else item for item in given)
     items = (item[0] if isinstance(item, list | tuple) and len(item) == 1 else item for item in items)
-    return [
-        (f"{IN_MEMORY}[{k}]", *sample[1:]) for k, sample in enumerate(s for item in items for s in samples_in(item))
-    ]
+    return [sample for item in items for sample in samples_in(item)]
 
 
 def _batch(array: Any) -> np.ndarray:
@@ -187,8 +182,8 @@ def split_samples(samples: Patches) -> tuple[Patches, Patches]:
     return _patches([pair for k, pair in enumerate(pairs) if (k + 1) % HELD_OUT_EVERY]), _patches(held_out)
 
 
-def _samples(path: Path) -> Iterator[Named]:
-    """(name, image (C, H, W), reference)."""
+def _samples(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Name, image (C, H, W) and reference of each."""
     if path.is_dir():
         for file in sorted(path.iterdir()):
             if file.suffix.lower() == ".npy":
@@ -281,7 +276,7 @@ def _cut(
 class OwnSamples:
     """Where a run's samples come from, in the place of `quant.calibration.Calibration`."""
 
-    given: Path | Sequence[Named]
+    given: Path | Sequence[Pair]
     channels: int
     fixed_px: int | None
     multiple_px: int

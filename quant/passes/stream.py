@@ -119,9 +119,7 @@ OFFSETS = np.array([-0.25, 0.25])
 def half_lsb_pair(graph: Graph, step: float) -> Graph:
     """The graph with two copies of what its last convolution reads, where that is the sum of two convolutions.
 
-    Args:
-        graph: that ends with an add and a convolution; any other is returned as it is.
-        step: the value of one unit of the tensors that the add reads and writes.
+    `step` is the value of one unit of the tensors that the add reads and writes.
     """
     *before, add, tail = graph if len(graph) > 1 else (None, None)
     if not (isinstance(add, Add) and isinstance(tail, Conv)):

@@ -22,7 +22,7 @@ from beers_deploy.profiles.figures import Bound, Check, Row, measured
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.free import quantise_free
-from beers_deploy.quant.gate import Limits, compare, judge, judge_saturation, limits_of, read_limits
+from beers_deploy.quant.gate import Limits, compare, judge, judge_saturation, limits_of
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, load_onnx, make_model, save_onnx
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session
@@ -138,12 +138,12 @@ def test_a_spoilt_file_is_stopped(
 def test_limits_come_from_a_file(tmp_path: Path) -> None:
     path = tmp_path / "gate.toml"
     path.write_text("mae = 0.0007\npsnr_drop_db = 0.25\n")
-    limits = read_limits(path, None)
+    limits = limits_of(path)
     assert (limits.mae, limits.psnr_drop_db, limits.p999) == (0.0007, 0.25, None)
-    assert read_limits(path, 0.001).mae == 0.001
-    assert read_limits(None, None) == Limits()
+    assert limits_of(path, 0.001).mae == 0.001
+    assert limits_of(None) == Limits()
     path.write_text("mae_growth = 1.2")
-    assert read_limits(path, None) == Limits(mae=None, mae_growth=1.2)
+    assert limits_of(path) == Limits(mae=None, mae_growth=1.2)
 
 
 UNBREAKABLE = ["mae = inf", "mae = 1e9", "p999 = 1.1", "saturated = 2", "mae_growth = inf", "std_over_mae = 1e300"]
@@ -158,7 +158,7 @@ def test_a_limit_that_no_network_breaks_is_refused(text: str, tmp_path: Path) ->
         with pytest.raises(OptionError, match="broken network"):
             limits_of(given)
     with pytest.raises(OptionError, match="max_mae"):
-        read_limits(None, float("inf"))
+        limits_of(None, float("inf"))
 
 
 NO_LIMITS = ["mae = 'small'", "mae = true", "mea = 0.1", "mae = -1", "mae = nan", "= 3", "[mae]", "", "# none"]
@@ -168,9 +168,9 @@ NO_LIMITS = ["mae = 'small'", "mae = true", "mea = 0.1", "mae = -1", "mae = nan"
 def test_limits_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "gate.toml").write_text(text)
     with pytest.raises(OptionError, match=r"gate\.toml"):
-        read_limits(tmp_path / "gate.toml", None)
+        limits_of(tmp_path / "gate.toml")
     with pytest.raises(OptionError, match="no such file"):
-        read_limits(tmp_path / "none.toml", None)
+        limits_of(tmp_path / "none.toml")
 
 
 def test_without_8_bit_results_no_limit_on_them_is_kept() -> None:
