@@ -99,7 +99,12 @@ def layer_errors(graph: Graph, core: IntCore, crops: Iterable[np.ndarray]) -> tu
         core: the same operations in whole numbers.
         crops: each passes through the network once for every layer.
     """
-    twins = tuple(_twin(op, whole) for op, whole in zip(graph, core.ops, strict=True) if isinstance(whole, IntConv))
+    # The same convolutions, by their side, with the values that their int8 weights and biases stand for.
+    twins = tuple(
+        replace(dequantised(op, whole), name=op.name + IN_INT8, output=op.output + IN_INT8)
+        for op, whole in zip(graph, core.ops, strict=True)
+        if isinstance(op, Conv) and isinstance(whole, IntConv)
+    )
     names, width = tensors((*graph, *twins)), core.ends.planes * core.ends.channels
     halo_px = None if halo_of(graph) is None else 0
     exact, int8 = open_session(graph_to_onnx((*graph, *twins), names, width)), open_session(host_model(core, {}))
@@ -126,12 +131,6 @@ def layer_errors(graph: Graph, core: IntCore, crops: Iterable[np.ndarray]) -> tu
             layer.network.add(found, restored, offset)
         together.add(result_of(int8, crop), restored, offset)
     return layers, together
-
-
-def _twin(op: Op, whole: IntConv) -> Conv:
-    """The same convolution, by its side, with the values that its int8 weights and bias stand for."""
-    assert isinstance(op, Conv)  # noqa: S101 - the core was built from the graph
-    return replace(dequantised(op, whole), name=op.name + IN_INT8, output=op.output + IN_INT8)
 
 
 def _rest(graph: Graph, given: str, width: int) -> onnx.ModelProto:

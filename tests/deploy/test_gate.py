@@ -194,12 +194,6 @@ def test_a_job_can_read_the_verdict() -> None:
     assert [case.find("failure") is not None for case in suite] == [False, True, True, False]
 
 
-def test_a_strangers_name_stays_on_its_line() -> None:
-    """A node's name may hold what a terminal or a CI's log would obey, or what ends a cell of a table."""
-    for text in (str(CHECKS[2]), sentence(CHECKS, ""), CHECKS[2].found):
-        assert text.isprintable()
-
-
 def test_the_action_s_summary_is_a_table_whatever_a_stranger_s_name_holds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -220,6 +214,7 @@ def test_the_action_s_summary_is_a_table_whatever_a_stranger_s_name_holds(
 def test_the_last_line_names_what_failed_and_nothing_else() -> None:
     assert sentence(CHECKS[:1], "MAE 0.0006") == "passed, all 1 checks: MAE 0.0006"
     text = sentence(CHECKS, "MAE 0.0006")
+    assert text.isprintable()  # a node's name may hold what a terminal or a CI's log would obey
     assert text.startswith("FAILED, 2 of 4 checks: PSNR drop 0.31 dB, allowed at most 0.25; nodes <all> 1 (tail")
     assert "MAE" not in text
     assert "float-INT8" not in text
@@ -241,10 +236,12 @@ def test_the_number_decides(value: float, limit: float, bound: Bound, passed: bo
     assert Check("x", value, limit, "dB", bound).passed == passed
 
 
-def test_one_file_alone_is_no_pair(tmp_path: Path) -> None:
+def test_options_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
     (tmp_path / "float.onnx").touch()
+    (tmp_path / "gate.toml").write_text("mae = 0.01\nmae_growth = 1.0001\n")
     assert "expected the INT8 network of float.onnx" in refused("gate", tmp_path / "float.onnx")
     assert "--junit: expected a file" in refused("gate", "--junit", "-")
+    assert "--baseline: expected one" in refused("gate", "--limits", tmp_path / "gate.toml")
 
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -289,11 +286,6 @@ def test_a_baseline_of_other_patches_is_refused_and_a_folder_may_lie_elsewhere(
     (name,) = other
     with pytest.raises(OptionError, match=f"same patches \\({name}"):
         baseline_mae(tmp_path / "before.json", {**same, **other})
-
-
-def test_growth_is_not_judged_without_a_baseline(tmp_path: Path) -> None:
-    (tmp_path / "gate.toml").write_text("mae = 0.01\nmae_growth = 1.0001\n")
-    assert "--baseline: expected one" in refused("gate", "--limits", tmp_path / "gate.toml")
 
 
 def test_the_baseline_of_another_float_network_is_refused(scenes: Path, tmp_path: Path) -> None:
@@ -391,13 +383,11 @@ def test_constants_may_be_nodes() -> None:
 
 @pytest.mark.parametrize("explicit", [["x", "zero"], ["zero", "x"]])
 def test_a_relu_is_the_larger_of_zero_whatever_comes_first(explicit: list[str]) -> None:
-    node_, zero = (
-        onnx.helper.make_node("Max", explicit, ["y"]),
-        numpy_helper.from_array(np.zeros((), np.float32), "zero"),
-    )
-    ends = image_info("x", 1, None), image_info("y", 1, None)
-    model = onnx.helper.make_model(onnx.helper.make_graph([node_], "g", [ends[0]], [ends[1]], [zero]))
-    assert count_relus(model) == Relus(1, 0)
+    w = GraphWriter()
+    w.constant("zero", np.zeros((), np.float32))
+    w.node("Max", "y", explicit)
+    ends = [image_info("x", 1, None)], [image_info("y", 1, None)]
+    assert count_relus(make_model(w.graph("g", *ends), {})) == Relus(1, 0)
 
 
 def test_results_that_are_never_below_zero_need_no_relu() -> None:
