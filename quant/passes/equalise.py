@@ -99,7 +99,8 @@ def channel_sizes(
 ) -> Iterator[list[np.ndarray]]:
     """A quantile of each channel's sizes, (C,) of each of the named tensors, for every tile of the images."""
     for results in values_of(graph, names, images, ends):
-        yield [np.quantile(np.abs(r[0]).reshape(r.shape[1], -1), quantile, axis=1) for r in results]
+        sizes = [np.abs(r[0]).reshape(r.shape[1], -1) for r in results]
+        yield [np.quantile(each, quantile, axis=1).astype(np.float64) for each in sizes]
 
 
 def largest_sizes(

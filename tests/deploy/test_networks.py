@@ -23,7 +23,7 @@ from beers_deploy.network import (
     told_int8,
     weights_file,
 )
-from beers_deploy.profiles.errors import ModelError, ProfileError
+from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import numbers_of
 from beers_deploy.profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
 from beers_deploy.quant.banked import calibrate
@@ -92,7 +92,9 @@ def test_the_shipped_int8_files_are_of_these_weights(name: str) -> None:
 def test_a_name_that_is_none_is_told_the_names_that_there_are() -> None:
     for name in ("convbeers-z", "convbeers-z-int8"):
         with pytest.raises(ModelError, match=r"shipped network \(convbeers, convbeers-half, .*convbeers-xs"):
-            network_file(Path(name), load_sensor(SENSOR))
+            network_file(Path(name), KNOWN)
+    with pytest.raises(ModelError, match="no such file"):
+        network_file(Path("none.safetensors"), KNOWN)
 
 
 def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
@@ -110,13 +112,6 @@ def test_what_lies_outside_is_said_each_time(conditioned: Path, tmp_path: Path) 
         float_file(conditioned, sensor, said.append)
     assert len(said) == 4
     assert all(re.match("warning: mtf_(across|along) 0.004 is outside 0.015 to 0.15", sentence) for sentence in said)
-
-
-def test_what_cannot_be_had_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(ProfileError, match="hubble"):
-        load_sensor("hubble")
-    with pytest.raises(ModelError, match="no such file"):
-        network_file(tmp_path / "none.safetensors", KNOWN)
 
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-xs-int8"])
