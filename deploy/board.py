@@ -65,7 +65,8 @@ class Board(TargetProfile):
             save_config(folder / "core.onnx", *self.npu["device"].value)
         session = open_session(core.model)
         shape = [side if isinstance(side, int) else 1 for side in session.get_inputs()[0].shape]
-        planes = np.random.default_rng(0).integers(-64, 64, shape).astype(_dtype(session.get_inputs()[0].type))
+        kind = np.int8 if "int8" in session.get_inputs()[0].type else np.float32
+        planes = np.random.default_rng(0).integers(-64, 64, shape).astype(kind)
         for name, values in (("input", planes), ("expected", tensors_of(session, None, planes)[0])):
             save_array(folder / f"{name}.npy", values)
         shutil.copyfile(MEASURE, folder / "measure.py")
@@ -85,11 +86,8 @@ def host_constants(network: Network, tile_px: int) -> dict[str, object] | None:
     """What host.py needs to know; None of a network whose result is no image, or whose pixels move otherwise."""
     core = read_core(network.model)
     ends = core.ends
-    shuffles = {
-        "front": (ends.front, ends.channels),
-        "back": (ends.back, ends.outputs),
-        "last": (ends.last, ends.outputs),
-    }
+    outputs = {"back": (ends.back, ends.outputs), "last": (ends.last, ends.outputs)}
+    shuffles = {"front": (ends.front, ends.channels), **outputs}
     # Of one band ONNX's order of the channels is that of torch, which host.py takes.
     plain = all(each.columns_first or wide == each.block**2 for found, wide in shuffles.values() for each in found)
     if not ends.is_image or ends.direct or not plain or any(len(found) > 1 for found, _ in shuffles.values()):
@@ -117,10 +115,6 @@ def host_constants(network: Network, tile_px: int) -> dict[str, object] | None:
     }
 
 
-def _dtype(name: str) -> type[np.generic]:
-    return np.int8 if "int8" in name else np.float32
-
-
 def boards() -> Table:
     """The shipped boards with a DPU: its configurations, and where its rules come from.
 
@@ -143,17 +137,14 @@ def sensors() -> Table:
         >>> bd.sensors().to_pandas().index.to_list()[2:]
         ['pleiades-degraded', 'pleiades-reference', 'pleiades-variable']
     """
-    return Table("sensors", {}, (), tuple(map(_sensor_row, map(Sensor.load, sensor_names()))))
-
-
-def _sensor_row(sensor: Sensor) -> Row:
-    stated = {
-        "MTF at Nyquist": (sensor.mtf_nyquist, "ratio"),
-        "SNR": (sensor.snr_1, "ratio"),
-        "bits": (sensor.bits, "bit"),
-    }
-    figures = {key: _figure(constant, unit) for key, (constant, unit) in stated.items() if constant is not None}
-    return Row("sensors", sensor.name, figures, {"description": sensor.description})
+    rows = []
+    for sensor in map(Sensor.load, sensor_names()):
+        figures = {"MTF at Nyquist": _figure(sensor.mtf_nyquist, "ratio")}
+        if sensor.snr_1 is not None:
+            figures["SNR"] = _figure(sensor.snr_1, "ratio")
+        figures["bits"] = _figure(sensor.bits, "bit")
+        rows.append(Row("sensors", sensor.name, figures, {"description": sensor.description}))
+    return Table("sensors", {}, (), tuple(rows))
 
 
 def _figure(constant: Constant, unit: str) -> Figure:

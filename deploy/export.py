@@ -12,7 +12,7 @@ import onnx
 from beers_deploy import __version__
 from beers_deploy.model.bank import FILTERS, LARGEST, in_places, network_bank
 from beers_deploy.model.family import sensor_vector
-from beers_deploy.model.io.tensors import Arrays, Weights, read_conditioned, read_plain
+from beers_deploy.model.io.tensors import Weights, read_conditioned, read_plain
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, load_onnx, make_model
@@ -39,8 +39,9 @@ def to_onnx(network: "Weights | ConvBEERS", about: dict[str, str], tile_px: int 
     scale = network.variant.scale
     require_tile(tile_px, scale)
     writer = GraphWriter()
-    for name, value in _arrays(network).items():
-        writer.constant(name, value)
+    arrays = network.tensors if isinstance(network, Weights) else network.state_dict()
+    for name, value in arrays.items():
+        writer.constant(name, np.asarray(value))
     deep = _deep(writer, network.variant.blocks, _moved(writer, "SpaceToDepth", "unshuffled", "image", scale))
     return _ended(writer, _conv(writer, "tail", deep), scale, about, tile_px)
 
@@ -110,12 +111,6 @@ def require_tile(tile_px: int | None, scale: int) -> None:
     if tile_px is not None and tile_px % scale:
         remedy = "choose another, or leave it out"
         raise OptionError("tile", expected=f"a multiple of {scale} px", got=f"{tile_px} px", remedy=remedy)
-
-
-def _arrays(network: "Weights | ConvBEERS") -> Arrays:
-    if isinstance(network, Weights):
-        return network.tensors
-    return {name: value.numpy() for name, value in network.state_dict().items()}
 
 
 def _conv(writer: GraphWriter, name: str, source: str) -> str:

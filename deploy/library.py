@@ -115,8 +115,12 @@ def restore(
         >>> bool(pair.psnr(restored) > pair.psnr(pair.degraded))
         True
     """
+    if method not in (NETWORK, TRADITIONAL):
+        raise OptionError("method", expected=f"{NETWORK} or {TRADITIONAL}", got=repr(method), remedy="choose one")
     known = Sensor.load(sensor)
-    options = _options(network, known, tile, halo, full_scale, runtime, threads)
+    found = Network.load(f"{VARIANT}{INT8}" if network is None else network, sensor=known)
+    told = {} if known.name == BLIND else {"": known}
+    options = Options(found.file, tile, str(halo), full_scale, _runtime(runtime), threads, sensors=told)
     job = Job(method, quality, known, nodata, replace(options, again=again, any_result=any_result, strict=strict))
     with reporting(progress):
         if isinstance(image, str | os.PathLike) or hasattr(image, "crs"):  # the latter of rasterio
@@ -150,20 +154,6 @@ class Run(Table):
 
     path: Path
     time_s: float
-
-
-def _options(
-    network: NetworkLike | None,
-    sensor: Sensor,
-    tile_px: int,
-    halo: int | str,
-    full_scale: float | None,
-    runtime: str,
-    threads: int,
-) -> Options:
-    found = Network.load(f"{VARIANT}{INT8}" if network is None else network, sensor=sensor)
-    told = {} if sensor.name == BLIND else {"": sensor}
-    return Options(found.file, tile_px, str(halo), full_scale, _runtime(runtime), threads, sensors=told)
 
 
 def _restore_path(image: Path, options: Options, job: Job, out: str | os.PathLike[str] | None) -> Run:
@@ -200,18 +190,15 @@ def _restore_labelled(image: Any, job: Job) -> Any:
         names = ", ".join(map(str, image.data_vars)) or "none"
         remedy = "choose one of its variables"
         raise ImageError(NAME, expected="an xarray.DataArray", got=f"a Dataset of {names}", remedy=remedy)
-    said = is_restored(str(image.attrs.get("TIFFTAG_SOFTWARE", "")), image.attrs)
-    require_raw(NAME, said, job.options.again)
-    own = image.attrs.get("full_scale")
-    options = (
-        job.options if job.options.full_scale is not None or own is None else replace(job.options, full_scale=own)
-    )
-    missing = image.attrs.get("_FillValue") if job.nodata is None else job.nodata
+    own, options = image.attrs, job.options
+    require_raw(NAME, is_restored(str(own.get("TIFFTAG_SOFTWARE", "")), own), options.again)
+    full_scale = own.get("full_scale") if options.full_scale is None else options.full_scale
+    missing = own.get("_FillValue") if job.nodata is None else job.nodata
     dims, bands = image.dims, next((dim for dim in image.dims if dim in BAND_DIMS), None)
     ordered = image if bands is None or image.ndim != 3 else image.transpose(bands, ...)
     if image.ndim == 3 and bands is None and ordered.shape[-1] <= FEW < min(ordered.shape[:-1]):
         raise _bands_last(ordered.shape, "name the dimension of the bands 'band'")
-    pixels = _restore(ordered.data, replace(job, options=options, nodata=missing))
+    pixels = _restore(ordered.data, replace(job, options=replace(options, full_scale=full_scale), nodata=missing))
     restored = _labelled(ordered, pixels)
     return restored if restored.ndim != len(dims) else restored.transpose(*dims)
 
@@ -233,17 +220,13 @@ def _restore(image: Any, job: Job) -> Any:
     if lazy and np.ma.isMaskedArray(getattr(image, "_meta", None)):
         remedy = "fill it, dask.array.ma.filled(image, 0), and give that value as `nodata`; or compute it first"
         raise ImageError(NAME, expected="a Dask array without a mask", got="a masked one", remedy=remedy)
-    if job.method == TRADITIONAL:
-        if lazy:
-            remedy = "compute it first, or take a network"
-            raise OptionError("method", expected="network for a Dask array", got=job.method, remedy=remedy)
-        restored = _restore_traditionally(bands, raster, job)
-    elif job.method != NETWORK:
-        raise OptionError("method", expected=f"{NETWORK} or {TRADITIONAL}", got=repr(job.method), remedy="choose one")
+    if job.method == NETWORK:
+        restored = (restore_lazily if lazy else _restore_now)(bands, raster, job.options)
     elif lazy:
-        restored = restore_lazily(bands, raster, job.options)
+        remedy = "compute it first, or take a network"
+        raise OptionError("method", expected="network for a Dask array", got=job.method, remedy=remedy)
     else:
-        restored = _restore_now(bands, raster, job.options)
+        restored = _restore_traditionally(bands, raster, job)
     return restored[0] if image.ndim == 2 and len(restored) == 1 else restored
 
 
@@ -352,12 +335,6 @@ class Task:
     full_scale: float | None
     tiling: Tiling
 
-    def restorer(self, window: np.ndarray) -> Restorer:
-        """For this process, at the full scale that was asked for or that the window's pixels tell."""
-        extent = self.raster.extent(window)._replace(whole=True)  # a tile alone is no proof of radiances
-        full_scale = settled_scale(NAME, self.raster.dtype, [extent], self.full_scale)
-        return Restorer(self.raster, open_packed(self.network), full_scale, self.tiling, NAME)
-
 
 def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
     """A lazy (bands, H, W) array of Dask; errors in options and model come at once, in pixels when it is computed."""
@@ -383,10 +360,11 @@ def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
 
 def restore_tile(task: Task, window: np.ndarray, top: int, left: int, row: Span, column: Span) -> np.ndarray:
     """The kept pixels (bands, h, w) of one tile, from a window (bands, ., .) whose first pixel is at (top, left)."""
-    restorer = task.restorer(window)
+    extent = task.raster.extent(window)._replace(whole=True)  # a tile alone is no proof of radiances
+    full_scale = settled_scale(NAME, task.raster.dtype, [extent], task.full_scale)
+    restorer = Restorer(task.raster, open_packed(task.network), full_scale, task.tiling, NAME)
     here = Span(*(side - left for side in (column.start, column.stop, column.keep_start, column.keep_stop)))
-    strip = checked_strip(task.raster, top, window, restorer.full_scale, NAME)
-    return restorer.tile(strip, 0, row, here).pixels
+    return restorer.tile(checked_strip(task.raster, top, window, full_scale, NAME), 0, row, here).pixels
 
 
 def _around(span: Span, raster: Raster, plan: Plan) -> slice:

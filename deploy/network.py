@@ -259,12 +259,6 @@ def weights_file(given: Path) -> Path:
     return SHIPPED / f"{given.name}.onnx" if given.name.endswith(INT8) else shipped_weights(given.name)
 
 
-def weights_named(given: Path) -> Path:
-    """As `weights_file`, of a name."""
-    shipped_weights(given.name.removesuffix(INT8))
-    return weights_file(given)
-
-
 def _is_shipped(given: Path) -> bool:
     """Whether a shipped network is meant by its name, with INT8 behind it or without."""
     named = given == Path(given.name) and given.name.removesuffix(INT8) in shipped_names()
@@ -314,10 +308,10 @@ def int8_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
     return _written(found, sensor, True, log) if found else given or Path()
 
 
-def shipped_pair(name: str = VARIANT, sensor: str = SENSOR, log: Log = no_log) -> tuple[Path, Path]:
+def shipped_pair(name: str = VARIANT, sensor: str = SENSOR) -> tuple[Path, Path]:
     """A shipped network in float32 and in INT8, told a sensor."""
     known, given = load_sensor(sensor), Path(shipped_weights(name).stem)
-    return float_file(given, known, log), int8_file(given, known, log)
+    return float_file(given, known), int8_file(given, known)
 
 
 def warn_outside(sensor: Sensor, log: Log) -> None:

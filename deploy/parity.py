@@ -26,10 +26,16 @@ def torch_network(path: Path, sensor: Instrument | None = None) -> ConvBEERS | O
     return cast(ConvBEERS, network)  # what `read_plain` read
 
 
-def parity(network: ConvBEERS | OfOneSensor, model: Path | onnx.ModelProto, side_px: int) -> float:
+def require_parity(network: ConvBEERS | OfOneSensor, model: Path | onnx.ModelProto, side_px: int) -> float:
     """Largest absolute difference between torch and onnxruntime on one random image, in [0, 1] of full scale.
 
-    The image's side is the next multiple of the network's scale.
+    Args:
+        network: of torch.
+        model: exported from it.
+        side_px: of the image, to be raised to the next multiple of the network's scale.
+
+    Raises:
+        ModelError: pixels that are not finite, or more than MAX_DIFFERENCE.
     """
     side_px += -side_px % network.variant.scale
     image = np.random.default_rng(0).random((1, 1, side_px, side_px), dtype=np.float32)
@@ -40,12 +46,6 @@ def parity(network: ConvBEERS | OfOneSensor, model: Path | onnx.ModelProto, side
     if not np.isfinite(difference):
         expected_text, remedy = "finite pixels on a random image", "train it again with a lower learning rate"
         raise ModelError("network", expected=expected_text, got="NaN or infinity", remedy=remedy)
-    return difference
-
-
-def require_parity(network: ConvBEERS | OfOneSensor, model: Path | onnx.ModelProto, side_px: int) -> float:
-    """As `parity`, and small."""
-    difference = parity(network, model, side_px)
     if difference > MAX_DIFFERENCE:
         expected = f"at most {MAX_DIFFERENCE:g} of full scale from torch"
         remedy = "report it: the export is wrong"

@@ -23,7 +23,7 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile, board_names, npu_names
 from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
-from beers_deploy.quant.core import SHIFTS, IntCore, Shifts, target_shifts
+from beers_deploy.quant.core import SHIFTS, Shifts, target_shifts
 from beers_deploy.quant.encodings import host_model, read_core
 from beers_deploy.quant.free import quantise_free
 from beers_deploy.quant.gate import compare, gate_row
@@ -39,8 +39,7 @@ from beers_deploy.report.sensitivity_page import sensitivity_page
 if TYPE_CHECKING:
     from beers_deploy.model.simulator.sampling import Scene
     from beers_deploy.quant.calibration import Calibration
-    from beers_deploy.quant.passes.tune import Tuning
-    from beers_deploy.quant.samples import Patches
+    from beers_deploy.quant.core import IntCore
 
 Source: TypeAlias = "Calibration | OwnSamples"
 """Where patches come from: simulated ones, or a user's own."""
@@ -93,8 +92,10 @@ def quantize(
         >>> bd.quantize(bd.Network.load(network, example=(1, 1, 32, 32)), samples, board="zcu102").precision
         'int8'
     """
-    target, known, banked = TargetProfile.load(board), Sensor.load(sensor), _conditioned(network)
-    _require_regime(regime)
+    target, known = TargetProfile.load(board), Sensor.load(sensor)
+    banked = conditioned(Path(network)) if isinstance(network, str | os.PathLike) else None
+    if regime not in ("legal", "free"):
+        raise OptionError("regime", expected="legal or free", got=repr(regime), remedy="choose one")
     steps = steps_of(finetune)
     if banked and (regime == "free" or samples is not None):
         remedy = "leave it out: such a network is calibrated over the whole family of sensors at once"
@@ -123,15 +124,6 @@ def steps_of(finetune: int | str) -> int | None:
     return int(finetune)
 
 
-def _require_regime(regime: str) -> None:
-    if regime not in ("legal", "free"):
-        raise OptionError("regime", expected="legal or free", got=repr(regime), remedy="choose one")
-
-
-def _conditioned(network: NetworkLike) -> Conditioned | None:
-    return conditioned(Path(network)) if isinstance(network, str | os.PathLike) else None
-
-
 def _simulated(sensor: Sensor, images: Path | None, patches: int, patch_px: int, seed: int) -> "Calibration":
     from beers_deploy.quant.calibration import Calibration  # SciPy, which samples of one's own do without
 
@@ -145,20 +137,17 @@ def _free(origin: Network, calibration: Source) -> Network:
 
 
 def _legal(origin: Network, calibration: Source, target: TargetProfile, steps: int | None) -> Network:
-    shifts = _shifts_of(target)
-    tuning = None if steps == 0 else _tuning(calibration, steps)
+    shifts, tuning = _shifts_of(target), None
+    if steps != 0:
+        optional("torch", "finetune")
+        from beers_deploy.quant.passes.tune import Tuning
+
+        tuning = Tuning(calibration.for_tuning.pairs, steps)
     with begun("calibrating") as step:
         about = {**calibration.about, "target": target.name}
         result = quantise_model(origin.model, calibration.drawn, about, shifts, tuning, log=step)
-    layers = _layers(origin.model, result.core, result.host, calibration.drawn)
+    layers = integer_rows(origin.model, result.core, result.host, calibration.drawn.degraded)
     return Network(result.host, f"{origin.name}-int8", layers=layers, quantised=result)
-
-
-def _tuning(calibration: Source, steps: int | None) -> "Tuning":
-    optional("torch", "finetune")
-    from beers_deploy.quant.passes.tune import Tuning
-
-    return Tuning(calibration.for_tuning.pairs, steps)
 
 
 def _banked(
@@ -167,14 +156,8 @@ def _banked(
     """A network behind a bank, told a sensor; each integer layer on its patches."""
     family = family_model(network, calibration.images, calibration.seed, _shifts_of(target), steps)
     host = told_int8(family, sensor, {"target": target.name})
-    layers = _layers(network.model(sensor, int8=False), read_core(host), host, calibration.drawn)
+    layers = integer_rows(network.model(sensor, int8=False), read_core(host), host, calibration.drawn.degraded)
     return Network(host, f"{network.name}-int8", layers=layers)
-
-
-def _layers(model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, patches: "Patches") -> tuple[Row, ...]:
-    """Each integer layer, and what rounding ties up or to even makes of the result."""
-    layers, rounding = integer_rows(model, core, host, patches.degraded)
-    return (*layers, rounding)
 
 
 def _shifts_of(target: TargetProfile) -> Shifts:
@@ -186,13 +169,7 @@ def _shifts_of(target: TargetProfile) -> Shifts:
 
 
 def losses_of(network: Network, samples: object = None, **drawn: Any) -> str:
-    """What INT8 costs on patches or samples that calibration did not see, in one sentence.
-
-    Args:
-        network: what `quantize` made in the regime "legal".
-        samples: as given there.
-        drawn: sensor, images, patches, patch_px and seed as given there.
-    """
+    """What INT8 costs on what calibration did not see, in one sentence; all as in `sensitivity_report`."""
     assert network.origin is not None and network.quantised is not None  # noqa: S101, PT018
     model, result = network.origin.model, network.quantised
     held_out = (samples_of(model, samples) or _simulated(**drawn)).unseen
@@ -251,7 +228,7 @@ def family_model(
     return host_model(family.core, {**said, FAMILY: family.to_words(), WEIGHTS: sha256(network.weights)})
 
 
-def _training(scenes: "list[Scene]", seed: int, steps: int | None, log: Log) -> Callable[[IntCore], IntCore]:
+def _training(scenes: "list[Scene]", seed: int, steps: int | None, log: Log) -> "Callable[[IntCore], IntCore]":
     optional("torch", "finetune")
     from beers_deploy.quant.banked.train import STEPS, family_batches, train_body
 

@@ -30,9 +30,8 @@ from beers_deploy.profiles.figures import Check
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, TargetProfile
 from beers_deploy.profiles.toml import read_json, unreadable
-from beers_deploy.quant.gate import GateResult, Limits, judge, judge_saturation, limits_of, verdict_row
+from beers_deploy.quant.gate import METRICS, GateResult, Limits, judge, judge_saturation, limits_of, verdict_row
 from beers_deploy.quant.gate import compare as differences
-from beers_deploy.quant.metrics import METRICS
 from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px, metadata, require_quantised
 from beers_deploy.quant.samples import CALIBRATED_ON, OwnSamples, samples_of, without
 from beers_deploy.quant.session import open_any_size
@@ -91,8 +90,11 @@ class Verdict(Table):
 
     def to_markdown(self) -> str:
         """The checks as a table of Markdown, such as a job's summary shows."""
-        lines = [f"| {check.name} | {check.found} | {check.allowed} | {_mark(check)} |" for check in self.checks]
-        return "\n".join(["| check | found | allowed | |", "|---|---|---|---|", *lines]) + "\n"
+        lines = ["| check | found | allowed | |", "|---|---|---|---|"]
+        for check in self.checks:
+            mark = "passed" if check.passed else "**failed**"
+            lines.append(f"| {check.name} | {check.found} | {check.allowed} | {mark} |")
+        return "\n".join(lines) + "\n"
 
     def __repr__(self) -> str:
         return f"Verdict({self})"
@@ -101,10 +103,6 @@ class Verdict(Table):
         mae, drop_db = self.comparison.result.mae, self.comparison.result.drop_db
         drop = "" if math.isnan(drop_db) else f", PSNR drop {drop_db:.2f} dB"
         return f"gate {sentence(self.checks, f'MAE {mae:.3g} of full scale{drop}')}"
-
-
-def _mark(check: Check) -> str:
-    return "passed" if check.passed else "**failed**"
 
 
 class GateFailedError(AssertionError):
@@ -160,17 +158,9 @@ def compare(
     arguments: dict[str, object] = {"float": theirs.name, "int8": ours.name, "sensor": known.name, "images": images}
     arguments |= {"patches": patches, "seed": seed, "samples": samples if isinstance(samples, str | Path) else None}
     own = [Path(samples)] if isinstance(samples, str | Path) and Path(samples).is_file() else []
-    rows, inputs = (verdict_row(result, shares),), (theirs.input, ours.input, *map(input_of, own))
-    return Comparison(
-        "compare",
-        arguments,
-        inputs,
-        rows,
-        notes=notes,
-        result=result,
-        shares=shares,
-        float_sha256=theirs.sha256,
-    )
+    inputs = theirs.input, ours.input, *map(input_of, own)
+    table = "compare", arguments, inputs, (verdict_row(result, shares),)
+    return Comparison(*table, notes=notes, result=result, shares=shares, float_sha256=theirs.sha256)
 
 
 def gate(
@@ -218,16 +208,11 @@ def gate(
     """
     allowed, target, known = limits_of(limits), TargetProfile.load(board), Sensor.load(sensor)
     ours, theirs = _pair(int8, against, known)
-    config = limits if isinstance(limits, str | os.PathLike) else None
-    data = samples if isinstance(samples, str | os.PathLike) else None
-    arguments: dict[str, object] = {
-        "max_mae": allowed.mae,
-        "limits": config,
-        "baseline": baseline,
-        "target": target.name,
-    }
-    arguments |= {"sensor": sensor if isinstance(sensor, str) else known.name, "images": images, "patches": patches}
-    arguments |= {"seed": seed, "samples": data} | ({"metric": metric} if metric else {})
+    config, data = (each if isinstance(each, str | os.PathLike) else None for each in (limits, samples))
+    told = sensor if isinstance(sensor, str) else known.name
+    arguments: dict[str, object] = {"max_mae": allowed.mae, "limits": config, "baseline": baseline}
+    arguments |= {"target": target.name, "sensor": told, "images": images, "patches": patches, "seed": seed}
+    arguments |= {"samples": data} | ({"metric": metric} if metric else {})
     before = None if baseline is None else baseline_mae(Path(baseline), arguments)
     if before is None and allowed.mae_growth is not None:
         remedy = "give what an earlier 'gate --json' wrote, or leave that limit out"
@@ -288,12 +273,7 @@ def _require_references(own: OwnSamples | None, wanted: str) -> None:
 
 
 def baseline_mae(path: Path, arguments: Mapping[str, Any]) -> float:
-    """The MAE in a document that an earlier `gate --json` wrote, of the same patches.
-
-    Args:
-        path: the document.
-        arguments: of this run of the gate.
-    """
+    """The MAE in a document that an earlier `gate --json` wrote, of the same patches as with these arguments."""
     try:
         document: Any = read_json(path)
         before = {name: _plain(name, dict(document["arguments"]).get(name)) for name in PATCHES}
@@ -334,25 +314,16 @@ def _plain(name: str, value: object) -> str:
 
 
 def file_checks(float_model: onnx.ModelProto, int8: Network, target: TargetProfile) -> list[Check]:
-    """What the INT8 file itself shows: the target's rules, then what `quant.structure` looks at."""
-    return [*_legality(int8, target), *structure_checks(float_model, int8.model)]
-
-
-def _legality(int8: Network, target: TargetProfile) -> list[Check]:
-    """The rules of the DPU or NPU; a target without one has none."""
+    """What the INT8 file itself shows: the rules of the target's DPU or NPU, then what `quant.structure` looks at."""
+    checks = structure_checks(float_model, int8.model)
     if not (target.configurations or target.npu):
-        return []
+        return checks
     read = network_of(int8.model, fixed_tile_px(int8.model) or TILE_PX, int8.name)
-    return [legality(place(read, ruled(target)), npu=bool(target.npu))]
+    return [legality(place(read, ruled(target)), npu=bool(target.npu)), *checks]
 
 
 def sentence(checks: Sequence[Check], passed: str) -> str:
-    """The line that ends a command: every check that failed, with its value and its limit, and no other.
-
-    Args:
-        checks: all that were made.
-        passed: what to say beside their number where none failed.
-    """
+    """The line that ends a command: all checks that failed, with value and limit; or their number and `passed`."""
     failed = [str(check) for check in checks if not check.passed]
     if not failed:
         return f"passed, all {len(checks)} checks: {passed}"

@@ -89,7 +89,8 @@ def draw_views(
     A scene at a scale is drawn as often as it holds patches, as training sees it.
     """
     places = _places(scenes, recipe)
-    room = np.array([_room_px(*place) for place in places])
+    sides = [[size // ratio - 2 * MARGIN_PX for size in scene.radiance.shape] for scene, ratio in places]
+    room = np.prod(sides, axis=1)  # target pixels within the margin
     drawn = generator.choice(len(places), VIEW_CANDIDATES * count, p=room / room.sum())
     grounds = [_ground(places[k], recipe, generator) for k in drawn]
     seen_by = recipe.family or recipe.degraded
@@ -134,12 +135,6 @@ def _places(scenes: Sequence[Scene], recipe: PatchRecipe) -> list[tuple[Scene, i
     return fitting
 
 
-def _room_px(scene: Scene, oversampling: int) -> int:
-    """Target pixels of a scene within the margin."""
-    height, width = (size // oversampling - 2 * MARGIN_PX for size in scene.radiance.shape)
-    return int(height * width)
-
-
 def _ground(place: tuple[Scene, int], recipe: PatchRecipe, generator: np.random.Generator) -> Ground:
     scene, oversampling = place
     side_px = recipe.patch_px + 2 * MARGIN_PX
@@ -147,8 +142,8 @@ def _ground(place: tuple[Scene, int], recipe: PatchRecipe, generator: np.random.
     return Ground(scene, top, left, side_px, oversampling, float(generator.uniform(*recipe.exposures)))
 
 
-DEGRADED = "degraded"
-"""The role whose noise a patch carries: the same in a pair and alone."""
+ROLES = "degraded", "reference"
+"""Of the sensors of a pair, each with noise of its own: a degraded patch is the same in a pair and alone."""
 
 
 def draw_patches(
@@ -180,27 +175,25 @@ def draw_patches(
 
     def pair(number: int) -> Pair:
         view = views[number]
-        seen, meant = _simulate(
-            view.ground, {DEGRADED: view.degraded, "reference": view.reference}, Draw(seed, number)
-        )
+        seen, meant = _simulate(view.ground, (view.degraded, view.reference), Draw(seed, number))
         return seen, meant
 
     def alone(number: int) -> np.ndarray:
-        return _simulate(views[number].ground, {DEGRADED: views[number].degraded}, Draw(seed, number))[0]
+        return _simulate(views[number].ground, (views[number].degraded,), Draw(seed, number))[0]
 
     return Patches(views, Remade(pair, count), Remade(alone, count))
 
 
-def _simulate(ground: Ground, sensors: dict[str, Instrument], draw: Draw) -> list[np.ndarray]:
-    """What each sensor, by its role, makes of the same ground: patches (1, 1, P, P)."""
+def _simulate(ground: Ground, sensors: Sequence[Instrument], draw: Draw) -> list[np.ndarray]:
+    """What the degraded sensor, and the reference if given, make of the same ground: patches (1, 1, P, P)."""
     radiance = ground.radiance
     spectrum, width = scene_spectrum(radiance), radiance.shape[-1]
     images = [
         acquire(spectrum, width, sensor, ground.oversampling, draw, role) / sensor.max_dn
-        for role, sensor in sensors.items()
+        for role, sensor in zip(ROLES, sensors, strict=False)
     ]
     transfer_function.cache_clear()  # no two patches share one, and each is megabytes
-    mirrors, quarters = sensors[DEGRADED].symmetry
+    mirrors, quarters = sensors[0].symmetry
     turned = turn(np.stack(images)[:, None], draw.generator("turn"), quarters, mirrors)
     return [np.ascontiguousarray(image[None]) for image in turned]
 

@@ -6,7 +6,6 @@ written with the host file's integer kernels. What stays is the residual stream 
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -34,7 +33,7 @@ from beers_deploy.quant.onnx_file import fixed_tile_px, image_info, make_model, 
 from beers_deploy.quant.passes.equalise import Costs, channel_ranges, equalise, search
 from beers_deploy.quant.passes.fit_weights import Moments, fit, input_moments
 from beers_deploy.quant.passes.stream import half_lsb_pair, streams, two_gains
-from beers_deploy.quant.quantise import STREAM_STEP, Targets, crop_costs, search_targets
+from beers_deploy.quant.quantise import STREAM_STEP, crop_costs, search_targets
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import values_of
 
@@ -200,13 +199,14 @@ def quantise_free(
         known = {name: scales.get(name, Scale(STREAM_STEP)) for name in (PLANES, *tensors(fine))}
         return free_model(fine, known, ends, *more)
 
-    def costs_of(targets: Targets, tried: Graph) -> Costs:
+    targets = search_targets(graph, ends, patches.degraded)
+
+    def trial(tried: Graph) -> Costs:
         return crop_costs(written(tried), targets)
 
     for stream in streams(graph):
         log("equalising the channels of the residual stream")
         ranges = channel_ranges(graph, stream, patches.degraded, ends)
-        trial = partial(costs_of, search_targets(graph, ends, patches.degraded))
         graph = equalise(graph, stream, search(graph, stream, ranges, trial))
     about = {**metadata(model), "precision": "int8 free", "calibration_sha256": patches.digest, **about}
     log("rounding of the weights")

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,16 +10,84 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import onnxruntime as ort
 
-from beers_deploy.model.metrics.fidelity import psnr_db
+from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Check, Figure, Row, measured, unavailable
 from beers_deploy.profiles.toml import read_toml_text, unreadable
-from beers_deploy.quant.metrics import METRICS, Measured
 from beers_deploy.quant.session import result_of
 from beers_deploy.quant.untrusted import times
 
 if TYPE_CHECKING:
     from beers_deploy.quant.samples import Pair
+
+
+Parts = tuple[np.ndarray, np.ndarray]
+"""Numerators and denominators of one sample, for each class or for one: both are added up over the samples."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """What a user measures results by.
+
+    Attributes:
+        unit: of the figure.
+        larger_is_better: whether it is.
+        of_classes: whether references are numbers of classes, for every result or for every pixel.
+        parts: of a result and its reference.
+    """
+
+    unit: str
+    larger_is_better: bool
+    of_classes: bool
+    parts: Callable[[np.ndarray, np.ndarray], Parts]
+
+
+def _alone(value: float) -> Parts:
+    return np.array([value]), np.ones(1)
+
+
+def _similarity(result: np.ndarray, reference: np.ndarray) -> Parts:
+    return _alone(float(np.mean([ssim(*pair, 1.0) for pair in zip(result[0], reference[0], strict=True)])))
+
+
+def _hits(result: np.ndarray, reference: np.ndarray) -> Parts:
+    right = result.argmax(1).ravel() == reference.ravel()
+    return np.array([right.sum()]), np.array([right.size])
+
+
+def _overlap(result: np.ndarray, reference: np.ndarray) -> Parts:
+    """Of every class, the pixels that both say and those that one of them says."""
+    said, meant = (np.arange(result.shape[1])[:, None] == each.ravel() for each in (result.argmax(1), reference))
+    return (said & meant).sum(1), (said | meant).sum(1)
+
+
+METRICS: Mapping[str, Metric] = {
+    "psnr": Metric("dB", True, False, lambda result, reference: _alone(psnr_db(result, reference, 1.0))),
+    "ssim": Metric("ratio", True, False, _similarity),
+    "mae": Metric("of full scale", False, False, lambda result, reference: _alone(np.abs(result - reference).mean())),
+    "top1": Metric("ratio", True, True, _hits),
+    "iou": Metric("ratio", True, True, _overlap),
+}
+"""By name. iou is the mean over the classes of intersection over union."""
+
+
+def parts_of(name: str, result: np.ndarray, reference: np.ndarray) -> Parts:
+    """What one result (1, C, ...) adds to a metric, by its name."""
+    metric = METRICS[name]
+    wanted = (len(result), *result.shape[2:]) if metric.of_classes else result.shape
+    if reference.size != math.prod(wanted) or (metric.of_classes and result.shape[1] < 2):
+        kind = "numbers of classes" if metric.of_classes else "references"
+        expected, got = f"{kind} of {times(wanted)}", f"{times(reference.shape)} for results of {times(result.shape)}"
+        raise OptionError("metric", expected=expected, got=got, remedy="give these, or another metric")
+    return metric.parts(result, reference)
+
+
+def value_of(parts: Sequence[Parts]) -> float:
+    """The metric over all samples of one network; NaN of none."""
+    if not parts:
+        return math.nan
+    above, below = (np.sum(each, 0) for each in zip(*parts, strict=True))
+    return float((above[below > 0] / below[below > 0]).mean())
 
 
 @dataclass(frozen=True)
@@ -91,7 +159,7 @@ def compare(
         ModelError: results of different shapes.
         OptionError: references that the metric does not take.
     """
-    differences, errors, agreeing, measures = [], [], [], [Measured(), Measured()]
+    differences, errors, agreeing, measured_by = [], [], [], list[list[Parts]]()
     for degraded, reference in pairs:
         results = [result_of(s, degraded) for s in (float_session, int8_session)]
         if results[0].shape != results[1].shape:
@@ -105,9 +173,8 @@ def compare(
         in_float, in_int8 = (_as_in_a_file(result, is_image) for result in results)
         differences.append((in_int8 - in_float).ravel())
         errors.append([_psnr_db(image, reference) for image in (degraded, in_float, in_int8)])
-        for measure, result in zip(measures, (in_float, in_int8), strict=True):
-            if metric is not None:
-                measure.add(metric, result, reference)
+        if metric is not None:
+            measured_by.append([parts_of(metric, result, reference) for result in (in_float, in_int8)])
     difference = np.concatenate(differences).astype(np.float64)
     degraded_db, float_db, int8_db = np.mean(errors, axis=0)
     return GateResult(
@@ -123,8 +190,8 @@ def compare(
         same_class=float(np.mean(agreeing)),
         simulated=simulated,
         metric=metric or "",
-        metric_float=measures[0].value,
-        metric_int8=measures[1].value,
+        metric_float=value_of([parts for parts, _ in measured_by]),
+        metric_int8=value_of([parts for _, parts in measured_by]),
         worst_drop_db=float(np.max([in_float - in_int8 for _, in_float, in_int8 in errors])),
     )
 
@@ -185,23 +252,19 @@ BREAKABLE = {
 """What limits may be: images in [0, 1] differ by no more, no layer saturates more, and no network is so far off."""
 
 
-def limits_of(given: "Limits | Mapping[str, float] | str | os.PathLike[str] | None") -> Limits:
-    """Limits by their names, of a TOML file such as `mae = 0.0007`, or the defaults for None.
+def limits_of(
+    given: "Limits | Mapping[str, float] | str | os.PathLike[str] | None", max_mae: float | None = None
+) -> Limits:
+    """Limits by their names, of a TOML file such as `mae = 0.0007`, or the defaults for None; `max_mae` overrides.
 
     Raises:
         OptionError: no limits, unknown ones, or some that no network breaks.
     """
-    if given is None:
-        return Limits()
-    if isinstance(given, Limits):
-        return _breakable("limits", given)
-    return _named("limits", given) if isinstance(given, Mapping) else _parse(Path(given))
-
-
-def read_limits(path: Path | None, mae: float | None) -> Limits:
-    """As `limits_of`; `mae` overrides."""
-    limits = limits_of(path)
-    return limits if mae is None else _breakable("max_mae", replace(limits, mae=mae))
+    if isinstance(given, str | os.PathLike):
+        limits = _parse(Path(given))
+    else:
+        limits = _named("limits", given) if isinstance(given, Mapping) else _breakable("limits", given or Limits())
+    return limits if max_mae is None else _breakable("max_mae", replace(limits, mae=max_mae))
 
 
 def _breakable(where: str, limits: Limits) -> Limits:
@@ -218,10 +281,8 @@ def _parse(path: Path) -> Limits:
     try:
         raw = read_toml_text(path)
     except (OSError, ValueError) as error:
-        got = unreadable(path) or str(error)
-        raise OptionError(
-            str(path), expected="a TOML file of limits", got=got, remedy="write mae = 0.0007"
-        ) from error
+        got, expected = unreadable(path) or str(error), "a TOML file of limits"
+        raise OptionError(str(path), expected=expected, got=got, remedy="write mae = 0.0007") from error
     return _named(str(path), raw)
 
 

@@ -1,4 +1,4 @@
-"""Static INT8 in one call: float ONNX and calibration patches in, the two encodings of the integer core out."""
+"""Static INT8 in one call: float ONNX and calibration patches in, the integer core and its file for the host out."""
 
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -19,7 +19,7 @@ from beers_deploy.quant.core import (
     squared_errors,
     unclipped_frac_bits,
 )
-from beers_deploy.quant.encodings import board_model, host_model
+from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.ends import GAIN, ONE_CHANNEL, Ends, ends_of
 from beers_deploy.quant.graph import (
     CORRECTION,
@@ -59,7 +59,6 @@ from beers_deploy.quant.passes.stream import (
     exceeds_six,
     half_lsb_pair,
     lone_tensors,
-    share_stream_scale,
     streams,
     takes_gains,
     two_gains,
@@ -91,10 +90,9 @@ LOWERED = "full_range_relu"
 
 @dataclass(frozen=True)
 class Quantised:
-    """One network in whole numbers, for the host and for the board; `graph` is the float one that was rounded."""
+    """One network in whole numbers, also as the host's file; `graph` is the float one that was rounded."""
 
     host: onnx.ModelProto
-    board: onnx.ModelProto
     core: IntCore
     relus: int
     graph: Graph
@@ -117,14 +115,14 @@ class Plan:
     shifts: Shifts
     pairs: bool = True
 
-    @property
-    def takes_windows(self) -> bool:
-        """Whether the result comes in windows: where nothing is added to it, and a convolution writes it."""
-        room = self.ends.outputs <= MAX_CHANNELS // 2
-        return self.ends.gains == 1 and not self.ends.adds_image and takes_gains(self.graph) and room
-
     def with_windows(self, frac_bits: int, images: Iterable[np.ndarray]) -> "Plan":
-        """The result in windows over all that it is in float, finer by GAIN than its own scale of so many bits."""
+        """The result in windows over all that it is in float, finer by GAIN than its own scale of so many bits.
+
+        Itself where something is added to the result, or no convolution writes it, or one of too many channels.
+        """
+        alone = self.ends.gains == 1 and not self.ends.adds_image
+        if not (alone and takes_gains(self.graph) and self.ends.outputs <= MAX_CHANNELS // 2):
+            return self
         low, high = np.array(np.inf), np.array(-np.inf)
         for (result,) in values_of(self.graph, [CORRECTION], images, self.ends):
             low, high = np.minimum(low, result[0].min((1, 2))), np.maximum(high, result[0].max((1, 2)))
@@ -151,21 +149,14 @@ class Plan:
 
     def core(self, final: Graph, frac_bits: Mapping[str, int]) -> IntCore:
         """The integer core of a graph, paired and ended, whose tensors have these least-squares scales."""
-        chosen = share_stream_scale(streams(final), frac_bits) if self.streams else dict(frac_bits)
-        chosen |= dict.fromkeys(self.chain.tensors, STREAM_FRAC_BITS)
+        shared = [name for stream in streams(final) for name in stream] if self.streams else []
+        chosen = {**frac_bits, **dict.fromkeys([*shared, *self.chain.tensors], STREAM_FRAC_BITS)}
         if self.ends.offsets:
             chosen[CORRECTION] += FINER
         elif self.ends.gains == 2:
             chosen[CORRECTION] += 1
         assert set(tensors(final)) <= set(chosen)  # noqa: S101
         return build_core(final, chosen, self.shifts, self.ends)
-
-
-def _plan(model: onnx.ModelProto, shifts: Shifts, pairs: bool) -> Plan:
-    network = read_network(model)
-    graph = read_planes(network.graph)
-    ends, found = ends_of(network, 2 if network.adds_image and takes_gains(graph) else 1), streams(graph)
-    return Plan(graph, ends, found, _chain(graph, ends, found), network.tail, shifts, pairs)
 
 
 def _chain(graph: Graph, ends: Ends, streams: list[Stream]) -> Chain:
@@ -201,22 +192,22 @@ def quantise_model(
     Raises:
         ModelError: an operation that the DPU does not compute, or weights of no sensible size.
     """
-    plan = _plan(model, shifts, pairs)
+    network = read_network(model)
+    graph = read_planes(network.graph)
+    ends, found = ends_of(network, 2 if network.adds_image and takes_gains(graph) else 1), streams(graph)
+    plan = Plan(graph, ends, found, _chain(graph, ends, found), network.tail, shifts, pairs)
     core, final, last_sum = rounded(plan, patches.degraded, log)
-    core = replace(core, ends=replace(core.ends, tail=plan.tail))
+    core = replace(core, ends=replace(core.ends, tail=network.tail))
     if tuning:
         from beers_deploy.quant.passes.tune import tune  # torch, which no other step takes
 
         # Patches that hold few roofs would train the last sum's room away.
-        core, steps = tune(core, plan.graph, tuning, still=last_sum, log=log)
+        core, steps = tune(core, graph, tuning, still=last_sum, log=log)
     about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
     about["passes"] = f"{PASSES}, {LOWERED}" if any(getattr(op, "offset", 0.0) for op in final) else PASSES
     if tuning:
         about["finetune"] = f"{steps} steps on {len(tuning.pairs)} patches"
-    tile_px = fixed_tile_px(model)
-    return Quantised(
-        host_model(core, about, tile_px), board_model(core, about, tile_px), core, relu_count(plan.graph), final
-    )
+    return Quantised(host_model(core, about, fixed_tile_px(model)), core, relu_count(graph), final)
 
 
 def choose_frac_bits(graph: Graph, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL) -> dict[str, int]:
@@ -255,9 +246,7 @@ def rounded(plan: Plan, images: Remade[np.ndarray], log: Log = no_log) -> tuple[
     """A plan's graph in whole numbers, the float graph that was rounded, and the tensors of its last sum."""
     log("scale of each tensor")
     frac_bits = choose_frac_bits(plan.graph, images, plan.ends)
-    plan = plan.without_large_sums(frac_bits)
-    if plan.takes_windows:
-        plan = plan.with_windows(frac_bits[CORRECTION], images)
+    plan = plan.without_large_sums(frac_bits).with_windows(frac_bits[CORRECTION], images)
     graph = _balanced(plan, frac_bits, images, log)
     paired, last_sum = plan.paired(graph), frozenset[str]()
     if paired is not graph:
@@ -304,8 +293,7 @@ def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray],
 def _levelled(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], log: Log, copies: Copies) -> Graph:
     """The graph, its chain levelled; what the image itself passes through clips nothing that calibration sees."""
     log(f"equalising the channels of {len(plan.chain.tensors)} tensors")
-    places = dict(zip(plan.chain.tensors, plan.chain.parts, strict=True))
-    ranges = ranges_apart(chain_ranges(graph, plan.chain, images, plan.ends), places, copies)
+    ranges = ranges_apart(chain_ranges(graph, plan.chain, images, plan.ends), plan.chain.parts, copies)
     graph = plan.chain.scaled(graph, level(graph, plan.chain, ranges, np.ones(len(ranges)), trial))
     if not plan.ends.offsets:
         return graph

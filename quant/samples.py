@@ -86,22 +86,19 @@ FULL_SCALE_8 = 255
 REMEDY = "see docs/reference/any-network.md for how samples are given"
 
 
-Named = tuple[str, np.ndarray, np.ndarray]
-"""A sample's name for messages, its image (C, H, W), and its reference, empty where there is none."""
-
-
-def read_samples(given: Path | Sequence[Named], channels: int, fixed_px: int | None, multiple_px: int = 1) -> Patches:
+def read_samples(given: Path | Sequence[Pair], channels: int, fixed_px: int | None, multiple_px: int = 1) -> Patches:
     """The samples of a file, a folder or arrays, cut to what the network takes: each (1, C, h, w) float32 in [0, 1].
 
     Args:
-        given: the file or folder, or the samples.
+        given: the file or folder, or the samples (C, H, W) with their references.
         channels: that the network reads.
         fixed_px: side of the image that the network is fixed to; None cuts large samples to patches.
         multiple_px: what sides must be multiples of; the rest is cut off.
     """
+    named = _samples(given) if isinstance(given, Path) else ((f"{IN_MEMORY}[{k}]", *p) for k, p in enumerate(given))
     pairs = [
         pair
-        for name, image, reference in (_samples(given) if isinstance(given, Path) else given)
+        for name, image, reference in named
         for pair in _cut(_sound(name, image, channels), reference, name, fixed_px, multiple_px)
     ]
     if not pairs:
@@ -113,7 +110,7 @@ def read_samples(given: Path | Sequence[Named], channels: int, fixed_px: int | N
 IN_MEMORY = "samples"
 
 
-def samples_in(given: object) -> list[Named]:
+def samples_in(given: object) -> list[Pair]:
     """The samples in an array, in a pair of arrays (images, references), or in what gives such one after the other.
 
     Args:
@@ -124,24 +121,22 @@ def samples_in(given: object) -> list[Named]:
         pair: Any = given
         largest = np.float32(pair.sensor.max_dn)
         images = [np.asarray(image, np.float32)[None] / largest for image in (pair.degraded, pair.reference)]
-        return [("pair", images[0], images[1])]
+        return [(images[0], images[1])]
     if hasattr(given, "ndim"):
-        return [(f"{IN_MEMORY}[{k}]", image, NO_REFERENCE) for k, image in enumerate(_batch(given))]
+        return [(image, NO_REFERENCE) for image in _batch(given)]
     if isinstance(given, tuple) and len(given) == 2 and all(hasattr(each, "ndim") for each in given):
         seen, meant = _batch(given[0]), _plain(given[1])  # a reference may be a class, or a class for each pixel
         meant = meant[None] if np.ndim(given[0]) == 3 else meant
         if len(seen) != len(meant):
             got = f"{len(seen)} images and {len(meant)} references"
             raise ImageError(IN_MEMORY, expected="a reference for each image", got=got, remedy=REMEDY)
-        return [(f"{IN_MEMORY}[{k}]", *pair) for k, pair in enumerate(zip(seen, meant, strict=True))]
+        return list(zip(seen, meant, strict=True))
     if not isinstance(given, Iterable) or isinstance(given, str | bytes | Mapping):
         got = type(given).__name__
         raise ImageError(IN_MEMORY, expected="arrays (N, C, H, W), or a path", got=got, remedy=REMEDY)
     items = (tuple(item) if isinstance(item, list) and len(item) == 2 else item for item in given)
     items = (item[0] if isinstance(item, list | tuple) and len(item) == 1 else item for item in items)
-    return [
-        (f"{IN_MEMORY}[{k}]", *sample[1:]) for k, sample in enumerate(s for item in items for s in samples_in(item))
-    ]
+    return [sample for item in items for sample in samples_in(item)]
 
 
 def _batch(array: Any) -> np.ndarray:
@@ -187,12 +182,16 @@ def split_samples(samples: Patches) -> tuple[Patches, Patches]:
     return _patches([pair for k, pair in enumerate(pairs) if (k + 1) % HELD_OUT_EVERY]), _patches(held_out)
 
 
-def _samples(path: Path) -> Iterator[Named]:
-    """(name, image (C, H, W), reference)."""
+def _samples(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Name, image (C, H, W) and reference of each."""
     if path.is_dir():
         for file in sorted(path.iterdir()):
             if file.suffix.lower() == ".npy":
-                yield file.name, _one(file, _stored(file)[0]), NO_REFERENCE
+                image, _ = _stored(file)
+                if image.ndim != 3:
+                    got = times(image.shape)
+                    raise ImageError(str(file), expected="one image (C, H, W)", got=got, remedy=REMEDY)
+                yield file.name, image, NO_REFERENCE
             elif file.suffix.lower() in IMAGE_SUFFIXES:
                 yield file.name, _bands_first(file, read_pixels(file)), NO_REFERENCE
         return
@@ -202,12 +201,6 @@ def _samples(path: Path) -> Iterator[Named]:
         raise ImageError(str(path), expected="a batch of (N, C, H, W)", got=got, remedy=REMEDY)
     for number, image in enumerate(images):
         yield f"{path.name}[{number}]", image, references[number] if references.size else references
-
-
-def _one(file: Path, array: np.ndarray) -> np.ndarray:
-    if array.ndim != 3:
-        raise ImageError(str(file), expected="one image (C, H, W)", got=times(array.shape), remedy=REMEDY)
-    return array
 
 
 def _stored(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -283,7 +276,7 @@ def _cut(
 class OwnSamples:
     """Where a run's samples come from, in the place of `quant.calibration.Calibration`."""
 
-    given: Path | Sequence[Named]
+    given: Path | Sequence[Pair]
     channels: int
     fixed_px: int | None
     multiple_px: int
@@ -314,23 +307,16 @@ class OwnSamples:
         return split_samples(self.all)[1]
 
     @property
-    def patches(self) -> int:
-        """How many it is calibrated on."""
-        return len(self.drawn.pairs)
-
-    @property
     def about(self) -> dict[str, str]:
         """What the file says of it."""
-        digests = " ".join(digest_of(image) for image in self.drawn.degraded)
-        return {
-            "calibration_data": self.given.name if isinstance(self.given, Path) else IN_MEMORY,
-            CALIBRATED_ON: digests,
-        }
+        name = self.given.name if isinstance(self.given, Path) else IN_MEMORY
+        return {"calibration_data": name, CALIBRATED_ON: " ".join(map(digest_of, self.drawn.degraded))}
 
 
 def samples_of(model: onnx.ModelProto, given: object) -> OwnSamples | None:
     """A user's samples for a network, None where none are given and it takes simulated ones."""
-    channels, fixed_px, multiple_px = _channels(model), fixed_tile_px(model), _multiple_px(model)
+    channels = int(model.graph.input[0].type.tensor_type.shape.dim[1].dim_value) or 1
+    fixed_px, multiple_px = fixed_tile_px(model), _multiple_px(model)
     if given is not None:
         found = Path(given) if isinstance(given, str | os.PathLike) else samples_in(given)
         return OwnSamples(found, channels, fixed_px, multiple_px or 1)
@@ -342,10 +328,6 @@ def samples_of(model: onnx.ModelProto, given: object) -> OwnSamples | None:
         remedy = "give a .npy or .npz file of (N, C, H, W) in [0, 1], or a folder of images"
         raise OptionError("samples", expected=expected, got="none", remedy=remedy)
     return None
-
-
-def _channels(model: onnx.ModelProto) -> int:
-    return int(model.graph.input[0].type.tensor_type.shape.dim[1].dim_value) or 1
 
 
 def _multiple_px(model: onnx.ModelProto) -> int | None:

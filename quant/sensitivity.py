@@ -99,7 +99,12 @@ def layer_errors(graph: Graph, core: IntCore, crops: Iterable[np.ndarray]) -> tu
         core: the same operations in whole numbers.
         crops: each passes through the network once for every layer.
     """
-    twins = tuple(_twin(op, whole) for op, whole in zip(graph, core.ops, strict=True) if isinstance(whole, IntConv))
+    # The same convolutions, by their side, with the values that their int8 weights and biases stand for.
+    twins = tuple(
+        replace(dequantised(op, whole), name=op.name + IN_INT8, output=op.output + IN_INT8)
+        for op, whole in zip(graph, core.ops, strict=True)
+        if isinstance(op, Conv) and isinstance(whole, IntConv)
+    )
     names, width = tensors((*graph, *twins)), core.ends.planes * core.ends.channels
     halo_px = None if halo_of(graph) is None else 0
     exact, int8 = open_session(graph_to_onnx((*graph, *twins), names, width)), open_session(host_model(core, {}))
@@ -126,12 +131,6 @@ def layer_errors(graph: Graph, core: IntCore, crops: Iterable[np.ndarray]) -> tu
             layer.network.add(found, restored, offset)
         together.add(result_of(int8, crop), restored, offset)
     return layers, together
-
-
-def _twin(op: Op, whole: IntConv) -> Conv:
-    """The same convolution, by its side, with the values that its int8 weights and bias stand for."""
-    assert isinstance(op, Conv)  # noqa: S101 - the core was built from the graph
-    return replace(dequantised(op, whole), name=op.name + IN_INT8, output=op.output + IN_INT8)
 
 
 def _rest(graph: Graph, given: str, width: int) -> onnx.ModelProto:
@@ -264,27 +263,26 @@ def losses(result: Quantised, gate: GateResult, patches: Patches) -> str:
         said, much = f"INT8 tells {100 * gate.same_class:.2f} % of the classes as float", gate.same_class < SAME_CLASS
     else:
         said, much = f"INT8 differs from float by {gate.mae:.2g} of full scale on average", False
-    return f"{said} ({gate.source}){': ' + _costliest(result, patches) if much else ''}"
-
-
-def _costliest(result: Quantised, patches: Patches) -> str:
-    layers, _ = layer_errors(result.graph, result.core, few_crops(patches.degraded, result.host))
-    whole = sum(layer.network.squared for layer in layers)
-    layers.sort(key=lambda layer: layer.network.squared, reverse=True)
-    named = ", ".join(f"{layer.name} ({100 * layer.network.squared / whole:.0f} %)" for layer in layers[:MOST])
+    if not much:
+        return f"{said} ({gate.source})"
+    named = ", ".join(f"{name} ({share:.0f} %)" for name, share in _costliest(layer_error_rows(result, patches)))
     add = "" if result.core.ends.adds_image else ", or a network that ends with a global add, of which INT8 errs less"
-    return f"most of it in {named}; try --finetune auto{add}"
+    return f"{said} ({gate.source}): most of it in {named}; try --finetune auto{add}"
 
 
 MOST = 3
 """Layers that are named."""
 
 
+def _costliest(layers: list[Row]) -> list[tuple[str, float]]:
+    """The layers that make most of the squared error, with their shares in per cent; the last row is of all."""
+    shares = {row.name: row.figures["share of squared error"].value or 0 for row in layers[:-1]}
+    return sorted(shares.items(), key=lambda share: share[1], reverse=True)[:MOST]
+
+
 def headline(gate: GateResult, layers: list[Row]) -> str:
     """How much INT8 loses, of what kind the errors are, and which layers make most of them."""
-    shares = {row.name: row.figures["share of squared error"].value or 0 for row in layers[:-1]}
-    most = sorted(shares, key=lambda name: shares[name], reverse=True)[:MOST]
-    named = ", ".join(f"{name} {shares[name]:.0f} %" for name in most)
+    named = ", ".join(f"{name} {share:.0f} %" for name, share in _costliest(layers))
     drop = "" if math.isnan(gate.drop_db) else f" and costs {gate.drop_db:.2f} dB"
     return (
         f"INT8 differs from float by {gate.mae:.2g} of full scale on average{drop} "

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from beers_deploy.commands.shared import RULED, board_for, refuse, save_core, say
-from beers_deploy.model.shipped import SENSOR, SHIPPED, VARIANT
+from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_weights
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
@@ -57,10 +57,12 @@ def export(
     from beers_deploy.export import about, float_for, to_onnx
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.io.tensors import is_conditioned, read_plain
-    from beers_deploy.network import warn_outside, weights_file, weights_named
+    from beers_deploy.network import warn_outside, weights_file
     from beers_deploy.quant.onnx_file import require_onnx_name, save_onnx
 
-    path = weights_file(network) if network.suffix or network.exists() else weights_named(network)
+    if not (network.suffix or network.exists()):
+        shipped_weights(network.name.removesuffix(INT8))  # refuses other names
+    path = weights_file(network)
     read = [path, apply, *(Path(given) for given in (sensor, target) if given)]
     require_writable(out, board_file, delta, inputs=read)
     if board_file is None:

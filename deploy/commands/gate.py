@@ -57,7 +57,7 @@ def gate(
     """
     from beers_deploy.model.io.files import require_writable, write_text
     from beers_deploy.network import Network, pair_of
-    from beers_deploy.quant.gate import read_limits
+    from beers_deploy.quant.gate import limits_of
     from beers_deploy.results import print_rows
     from beers_deploy.verdict import gate as judged
 
@@ -71,7 +71,7 @@ def gate(
         beside = recorded(record)
     require_writable(json, junit, *beside, inputs=read, folders=(record,))
     against, int8 = pair_of(float_model, int8_model)
-    allowed = read_limits(limits, max_mae)
+    allowed = limits_of(limits, max_mae)
     verdict = judged(
         int8,
         against,

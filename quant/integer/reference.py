@@ -252,8 +252,8 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
 
 def integer_rows(
     model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, images: Iterable[np.ndarray]
-) -> tuple[list[Row], Row]:
-    """Each integer operation on a crop of a few images (1, C, H, W), and what the DPU's tie rounding changes."""
+) -> tuple[Row, ...]:
+    """Each integer operation on a crop of a few images (1, C, H, W); last what the DPU's tie rounding changes."""
     seen = few_crops(images, model)
     found = [agreement(core, host, crop) for crop in seen]
     source = f"the integer reference on {len(found)} calibration patches"
@@ -264,7 +264,7 @@ def integer_rows(
         for crop, one in zip(seen, found, strict=True)
     ]
     in_float = [core.ends.clipped(result_of(session, crop)) for crop in seen]
-    return layers, _rounding_row(in_float, both, source)
+    return (*layers, _rounding_row(in_float, both, source))
 
 
 def _layer_row(layers: list[LayerAgreement], source: str) -> Row:

@@ -59,12 +59,7 @@ class TrainableCore(torch.nn.Module):
     """
 
     def __init__(self, core: IntCore, still: Collection[str] = ()) -> None:
-        """Parameters that begin at the core's whole numbers.
-
-        Args:
-            core: in whole numbers.
-            still: the tensors whose convolutions stay as they are.
-        """
+        """Parameters that begin at the core's whole numbers; convolutions that write what is `still` stay so."""
         super().__init__()
         self._core, self._convs = core, [_one_copy(op, core.ends) for op in core.convolutions]
         self.weights = torch.nn.ParameterList(torch.tensor(op.weight).float() for op in self._convs)

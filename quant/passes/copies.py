@@ -13,7 +13,7 @@ import numpy as np
 
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import Conv, Graph
-from beers_deploy.quant.passes.equalise import channel_sizes
+from beers_deploy.quant.passes.equalise import largest_sizes
 
 APART = 0.87
 """The range of a copy is divided by it, so that levelling gives it another scale than its channel has."""
@@ -34,7 +34,7 @@ def with_copies(
         ends: what the host does to the images.
     """
     found, last = dict[str, np.ndarray](), runs(graph, names)
-    sizes = _largest(graph, [run[-1] for run in last], images, ends)
+    sizes = largest_sizes(graph, [run[-1] for run in last], images, ends) if last else ()
     for run, size in zip(last, sizes, strict=True):
         sources, copies = _pairs(graph, run[-1], size)
         if len(copies):
@@ -54,14 +54,6 @@ def runs(graph: Graph, names: Collection[str]) -> list[list[str]]:
             run.append(readers[run[-1]][0].output)
         if all(op.groups == 1 for op in readers[run[-1]]):
             found.append(run)
-    return found
-
-
-def _largest(graph: Graph, names: list[str], images: Iterable[np.ndarray], ends: Ends) -> list[np.ndarray]:
-    """(C,) the largest size of each channel of the named tensors."""
-    found = [np.zeros(1) for _ in names]
-    for sizes in channel_sizes(graph, names, images, ends, quantile=1.0) if names else ():
-        found = [np.maximum(most, size) for most, size in zip(found, sizes, strict=True)]
     return found
 
 

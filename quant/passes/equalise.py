@@ -56,13 +56,11 @@ def equalise(graph: Graph, stream: Stream, factors: np.ndarray) -> Graph:
 
     A channel behind ReLU6 is scaled until it can fill int8: the end of int8 is its clip then, and ReLU does.
     """
-    clipped = [
-        op for op in graph if isinstance(op, Conv) and op.output in stream and op.activation is Activation.relu6
-    ]
     factors = np.array(factors, np.float64)
-    for op in clipped:
-        own = stream[op.output]
-        factors[own] = np.maximum(factors[own], FULL / op.ceilings)
+    for op in graph:
+        if isinstance(op, Conv) and op.output in stream and op.activation is Activation.relu6:
+            own = stream[op.output]
+            factors[own] = np.maximum(factors[own], FULL / op.ceilings)
     return rescaled(graph, stream, factors)
 
 
@@ -87,15 +85,13 @@ def channel_ranges(
     graph: Graph, stream: Stream, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL
 ) -> np.ndarray:
     """(C,) range of each stream channel over images (1, C', H, W), the widest of all the stream's tensors."""
-    names, total, count = sorted(stream), np.zeros(1), 0
-    for sizes in channel_sizes(graph, names, images, ends):
-        wide = np.zeros(
-            (len(names), max(stream[name].stop or len(size) for name, size in zip(names, sizes, strict=True)))
-        )
-        for row, name, size in zip(wide, names, sizes, strict=True):
-            row[stream[name]] = size
-        total, count = total + wide, count + 1
-    return above_dead(np.asarray(total / max(count, 1)).max(axis=0))
+    names = sorted(stream)
+    tiles = channel_sizes(graph, names, images, ends)
+    means = {name: np.mean(sizes, axis=0) for name, sizes in zip(names, zip(*tiles, strict=True), strict=True)}
+    ranges = np.zeros(max(stream[name].stop or len(mean) for name, mean in means.items()))
+    for name, mean in means.items():
+        ranges[stream[name]] = np.maximum(ranges[stream[name]], mean)
+    return above_dead(ranges)
 
 
 def channel_sizes(
@@ -103,7 +99,15 @@ def channel_sizes(
 ) -> Iterator[list[np.ndarray]]:
     """A quantile of each channel's sizes, (C,) of each of the named tensors, for every tile of the images."""
     for results in values_of(graph, names, images, ends):
-        yield [np.quantile(np.abs(r[0]).reshape(r.shape[1], -1), quantile, axis=1) for r in results]
+        sizes = [np.abs(r[0]).reshape(r.shape[1], -1) for r in results]
+        yield [np.quantile(each, quantile, axis=1).astype(np.float64) for each in sizes]
+
+
+def largest_sizes(
+    graph: Graph, names: list[str], images: Iterable[np.ndarray], ends: Ends, quantile: float = 1.0
+) -> list[np.ndarray]:
+    """As `channel_sizes`, of the tile where each channel is largest."""
+    return [np.max(sizes, axis=0) for sizes in zip(*channel_sizes(graph, names, images, ends, quantile), strict=True)]
 
 
 def with_room(graph: Graph, step: float, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL) -> Graph:
@@ -119,10 +123,8 @@ def with_room(graph: Graph, step: float, images: Iterable[np.ndarray], ends: End
         ends: what the host does to the images.
     """
     add = graph[-2]
-    last, largest = dict.fromkeys((*add.inputs, add.output), slice(None)), np.zeros(1)
-    for sizes in channel_sizes(graph, sorted(last), images, ends, quantile=1.0):
-        largest = np.maximum(largest, np.max(sizes, axis=0))
-    limit = INT8_MAX * step
+    last, limit = dict.fromkeys((*add.inputs, add.output), slice(None)), INT8_MAX * step
+    largest = np.max(largest_sizes(graph, list(last), images, ends), axis=0)
     return equalise(graph, last, limit / np.maximum(ROOM * largest, limit))
 
 
@@ -139,14 +141,16 @@ def first_guess(ranges: np.ndarray, levelling: float, headroom: float) -> np.nda
 
 def search(graph: Graph, stream: Stream, ranges: np.ndarray, trial: Trial) -> np.ndarray:
     """The factors of least error: the best first guess, then channel by channel."""
-    best = None
-    for levelling, headroom in product(LEVELLING, HEADROOM):
-        guess = first_guess(ranges, levelling, headroom)
-        best = race(trial(equalise(graph, stream, guess)), guess, best)
-    assert best is not None  # noqa: S101
-    if len(ranges) > MOST_CHANNELS:
-        return best.factors
-    return stepped(lambda factors: trial(equalise(graph, stream, factors)), range(len(ranges)), best).factors
+
+    def costs_of(factors: np.ndarray) -> Costs:
+        return trial(equalise(graph, stream, factors))
+
+    first, *others = (first_guess(ranges, *shape) for shape in product(LEVELLING, HEADROOM))
+    best = Best(first, costs_of(first)(None))
+    for guess in others:
+        best = race(costs_of(guess), guess, best)
+    channels = range(len(ranges)) if len(ranges) <= MOST_CHANNELS else ()
+    return stepped(costs_of, channels, best).factors
 
 
 def stepped(costs_of: Callable[[np.ndarray], Costs], channels: Iterable[int], best: "Best") -> "Best":
@@ -171,10 +175,8 @@ class Best:
     costs: np.ndarray
 
 
-def race(costs_of: Costs, factors: np.ndarray, best: Best | None) -> Best:
+def race(costs_of: Costs, factors: np.ndarray, best: Best) -> Best:
     """The better of two, the costliest crops first: six of seven trials fail, and most of them show it on two."""
-    if best is None:
-        return Best(factors, costs_of(None))
     order = np.argsort(-best.costs, kind="stable")
     costs, seen = np.zeros(len(order)), 0
     while seen < len(order):

@@ -12,6 +12,8 @@ those before it are off by in the mean.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -70,11 +72,6 @@ class Moments:
         return np.asarray(self.total / self.count)
 
     @property
-    def exact_mean(self) -> np.ndarray:
-        """(G, n) mean window in float."""
-        return np.asarray((self.total + self.lost) / self.count)
-
-    @property
     def covariance(self) -> np.ndarray:
         """(G, n, n) covariance, a share of its mean variance added to the diagonal so that no direction is free."""
         covariance = self.products / self.count - self.mean[:, :, None] * self.mean[:, None]
@@ -115,17 +112,11 @@ def _windows(values: np.ndarray, op: Conv) -> np.ndarray:
     return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).reshape(-1, op.groups, op.weight[0].size)
 
 
-@dataclass(frozen=True)
-class Crop:
-    """What one crop's tensors (1, C, H, W) are in float and in INT8, as far as the network is computed."""
+class Crop(NamedTuple):
+    """What one crop's tensors (1, C, H, W) are in float and in INT8, as far as they are computed and still read."""
 
     exact: dict[str, np.ndarray]
     whole: dict[str, np.ndarray]
-
-    def forget(self, names: Iterable[str]) -> None:
-        """Drop tensors that no operation reads any more."""
-        for name in names:
-            del self.exact[name], self.whole[name]
 
 
 SWEEPS = 20
@@ -152,8 +143,8 @@ def fit_weights(graph: Graph, core: IntCore, images: Remade[np.ndarray], shifts:
                 ends = ends.moved(nearest.float_bias + raised - shifted - whole.float_bias)
         ops.append(whole)
         _compute(op, whole, core.frac_bits[op.output], seen)
-        for crop in seen:
-            crop.forget(name for name in dict.fromkeys(op.inputs) if last_read[name] == op.name)
+        for crop, name in product(seen, {name for name in op.inputs if last_read[name] == op.name}):
+            del crop.exact[name], crop.whole[name]
     return replace(core, ops=tuple(ops), ends=ends)
 
 
@@ -180,7 +171,7 @@ def _compute(op: Op, whole: IntConv | Op, frac_bits: int, seen: list[Crop]) -> N
     in_int8 = dequantised(op, whole) if isinstance(op, Conv) and isinstance(whole, IntConv) else op
     sessions = [open_session(operation_to_onnx(each)) for each in (op, in_int8)]
     for crop in seen:
-        for session, known in zip(sessions, (crop.exact, crop.whole), strict=True):
+        for session, known in zip(sessions, crop, strict=True):
             (known[op.output],) = session.run(None, {name: known[name] for name in dict.fromkeys(op.inputs)})
         crop.whole[op.output] = rounded_to(crop.whole[op.output], frac_bits)
 
@@ -211,7 +202,8 @@ def fit(weight: np.ndarray, scales: np.ndarray, moments: Moments) -> tuple[np.nd
     exact = weight.reshape(groups, -1, size).astype(np.float64)
     units = np.broadcast_to(scales, len(weight)).reshape(groups, -1, 1).astype(np.float64)
     fitted = np.stack([descend(*each) for each in zip(exact / units, moments.covariance, strict=True)])
-    raised = (fitted * units) @ moments.mean[:, :, None] - exact @ moments.exact_mean[:, :, None]
+    exact_mean = (moments.total + moments.lost) / moments.count
+    raised = (fitted * units) @ moments.mean[:, :, None] - exact @ exact_mean[:, :, None]
     return fitted.astype(np.int8).reshape(weight.shape), np.asarray(raised).ravel()
 
 

@@ -13,11 +13,11 @@ from the last, for what is rounded late reaches the result.
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import product
 
 import numpy as np
 
-from beers_deploy.quant.ends import ONE_CHANNEL, Ends
+from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import Conv, Graph
 from beers_deploy.quant.passes.equalise import (
     MOST_CHANNELS,
@@ -26,9 +26,9 @@ from beers_deploy.quant.passes.equalise import (
     Costs,
     Trial,
     above_dead,
-    channel_sizes,
     equalise,
     first_guess,
+    largest_sizes,
     stepped,
 )
 from beers_deploy.quant.passes.stream import STREAM_FRAC_BITS, only
@@ -44,22 +44,15 @@ EVERY, CLEARLY = 8, 1.1
 """A guess is tried on one of so many crops first, and dropped where it costs so much more there."""
 
 
-@dataclass(frozen=True)
-class Channels:
-    """What is known of channels (C,): the range of their values, and the largest of the weights that write each."""
+def _guess(ranges: np.ndarray, weights: np.ndarray, levelling: float, headroom: float) -> np.ndarray:
+    """Factors (C,) that level the ranges, but let no weak channel's weights outgrow those of the stronger half.
 
-    ranges: np.ndarray
-    weights: np.ndarray
-
-    def guess(self, levelling: float, headroom: float) -> np.ndarray:
-        """Factors (C,) that level the ranges, but let no weak channel's weights outgrow those of the stronger half.
-
-        A channel that is hardly ever on would else be blown up until its weights ruled the scale of all.
-        """
-        factors = first_guess(self.ranges, levelling, headroom)
-        strong = self.ranges >= np.median(self.ranges)
-        limit = (self.weights * factors)[strong].max()
-        return np.asarray(np.minimum(factors, limit / np.maximum(self.weights, 1e-12)))
+    A channel that is hardly ever on would else be blown up until its weights, `weights` the largest of those that
+    write each, ruled the scale of all.
+    """
+    factors = first_guess(ranges, levelling, headroom)
+    limit = (weights * factors)[ranges >= np.median(ranges)].max()
+    return np.asarray(np.minimum(factors, limit / np.maximum(weights, 1e-12)))
 
 
 @dataclass(frozen=True)
@@ -75,24 +68,14 @@ class Chain:
     by_channel: bool = True
 
     @property
-    def parts(self) -> list[slice]:
+    def parts(self) -> dict[str, slice]:
         """Where each tensor's channels stand."""
         ends = np.cumsum([0, *self.widths]).tolist()
-        return [slice(first, end) for first, end in pairwise(ends)]
-
-    @property
-    def stepped(self) -> bool:
-        """Whether each channel is tried: where that is wanted, and there are few enough."""
-        return self.by_channel and sum(self.widths) <= MOST_CHANNELS
-
-    @property
-    def one_by_one(self) -> bool:
-        """Whether each tensor is tried, once all were together."""
-        return self.by_channel or len(self.tensors) <= FEW_TENSORS
+        return dict(zip(self.tensors, map(slice, ends, ends[1:]), strict=True))
 
     def scaled(self, graph: Graph, factors: np.ndarray) -> Graph:
         """The same network with each channel scaled by its factor."""
-        for name, part in zip(self.tensors, self.parts, strict=True):
+        for name, part in self.parts.items():
             graph = equalise(graph, only(name), factors[part])
         return graph
 
@@ -103,38 +86,34 @@ class Chain:
 
 
 def chain_ranges(
-    graph: Graph, chain: Chain, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL, quantile: float = QUANTILE
+    graph: Graph, chain: Chain, images: Iterable[np.ndarray], ends: Ends, quantile: float = QUANTILE
 ) -> np.ndarray:
     """The range of every channel over images (1, C, H, W), that of the tile where it is widest."""
-    widest = [np.zeros(width) for width in chain.widths]
-    for sizes in channel_sizes(graph, list(chain.tensors), images, ends, quantile):
-        widest = [np.maximum(most, size) for most, size in zip(widest, sizes, strict=True)]
-    return np.concatenate([above_dead(ranges) for ranges in widest])
+    return np.concatenate(list(map(above_dead, largest_sizes(graph, list(chain.tensors), images, ends, quantile))))
 
 
 def level(graph: Graph, chain: Chain, ranges: np.ndarray, start: np.ndarray, trial: Trial) -> np.ndarray:
     """The factors of least error that were found, never more than that of `start`."""
     written = {op.output: np.abs(op.weight).max((1, 2, 3)) for op in graph if isinstance(op, Conv)}
-    known = [Channels(ranges[part], written[name]) for name, part in zip(chain.tensors, chain.parts, strict=True)]
+    placed = [(part, ranges[part], written[name]) for name, part in chain.parts.items()]
 
     def costs_of(factors: np.ndarray) -> Costs:
         return trial(chain.scaled(graph, factors))
 
-    def guessed(best: Best, own: list[tuple[Channels, slice]]) -> Best:
+    def guessed(best: Best, own: list[tuple[slice, np.ndarray, np.ndarray]]) -> Best:
         """The best of the first guesses for these tensors, the others as they are."""
         for shape in product(LEVELLING, HEADROOM):
             tried = best.factors.copy()
-            for channels, part in own:
-                tried[part] = channels.guess(*shape)
+            for part, sizes, weights in own:
+                tried[part] = _guess(sizes, weights, *shape)
             best = _better(tried, costs_of, best)
         return best
 
-    placed = list(zip(known, chain.parts, strict=True))
     best = guessed(Best(start, costs_of(start)(None)), placed)
-    for channels, part in reversed(placed) if chain.one_by_one else ():
-        best = guessed(best, [(channels, part)])
-        if chain.stepped:
-            best = stepped(costs_of, range(part.start, part.stop), best)
+    for tensor in reversed(placed) if chain.by_channel or len(placed) <= FEW_TENSORS else ():
+        best = guessed(best, [tensor])
+        if chain.by_channel and len(ranges) <= MOST_CHANNELS:
+            best = stepped(costs_of, range(tensor[0].start, tensor[0].stop), best)
     return best.factors
 
 

@@ -6,7 +6,7 @@ strongest edges. Windows for a result that nothing is added to: fine ones side b
 coarse one for what lies outside.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import accumulate, repeat
 
@@ -101,21 +101,15 @@ def lone_tensors(graph: Graph) -> list[str]:
 
 
 def _passes_factors(graph: Graph, stream: Stream) -> bool:
+    """Whether factors pass; through ReLU6 where `equalise` may make int8's end its clip, so not behind an add."""
     touching = [op for op in graph if stream.keys() & {*op.inputs, op.output}]
     known = all(isinstance(op, (Conv, Add, *PASSING)) for op in touching)
-    writers = [op for op in touching if op.output in stream and isinstance(op, Conv | Add)]
-    homogeneous = all(_passes(op.activation, isinstance(op, Conv)) for op in writers)
+    homogeneous = all(
+        op.activation.homogeneous or (isinstance(op, Conv) and op.activation is Activation.relu6)
+        for op in touching
+        if op.output in stream and isinstance(op, Conv | Add)
+    )
     return known and homogeneous and not stream.keys() & {PLANES, CORRECTION}
-
-
-def _passes(activation: Activation, of_conv: bool) -> bool:
-    """Whether factors pass; ReLU6 where `equalise` may make int8's end its clip, so not behind an add."""
-    return activation.homogeneous or (of_conv and activation is Activation.relu6)
-
-
-def share_stream_scale(streams: Iterable[Stream], frac_bits: Mapping[str, int]) -> dict[str, int]:
-    """The scales with one for all streams."""
-    return {**frac_bits, **{name: STREAM_FRAC_BITS for stream in streams for name in stream}}
 
 
 OFFSETS = np.array([-0.25, 0.25])
@@ -125,9 +119,7 @@ OFFSETS = np.array([-0.25, 0.25])
 def half_lsb_pair(graph: Graph, step: float) -> Graph:
     """The graph with two copies of what its last convolution reads, where that is the sum of two convolutions.
 
-    Args:
-        graph: that ends with an add and a convolution; any other is returned as it is.
-        step: the value of one unit of the tensors that the add reads and writes.
+    `step` is the value of one unit of the tensors that the add reads and writes.
     """
     *before, add, tail = graph if len(graph) > 1 else (None, None)
     if not (isinstance(add, Add) and isinstance(tail, Conv)):
@@ -161,22 +153,21 @@ def two_gains(graph: Graph) -> Graph:
 
     Any other last operation stays as it is, and so does one with an activation that factors do not pass.
     """
-    last = graph[-1]
-    if not takes_gains(graph):
-        return graph
-    assert isinstance(last, Conv)  # noqa: S101
-    weight = np.concatenate([last.weight, last.weight / GAIN])
-    bias = np.concatenate([last.bias, last.bias / GAIN])
-    return (*graph[:-1], replace(last, weight=weight.astype(np.float32), bias=bias.astype(np.float32)))
+    return _in_copies(graph, [(1, 0.0), (GAIN, 0.0)]) if takes_gains(graph) else graph
 
 
 def windowed(graph: Graph, offsets: np.ndarray) -> Graph:
     """The graph whose last convolution writes its channels coarse by GAIN, then less each of the offsets (W, C)."""
-    last = graph[-1]
+    return _in_copies(graph, [(GAIN, 0.0), *((1, offset) for offset in offsets)])
+
+
+def _in_copies(graph: Graph, copies: Sequence[tuple[int, np.ndarray | float]]) -> Graph:
+    """The graph whose last convolution writes its channels once for each gain and offset: coarser, and less that."""
+    *before, last = graph
     assert isinstance(last, Conv)  # noqa: S101 - takes_gains has seen to it
-    weight = np.concatenate([last.weight / GAIN, *[last.weight] * len(offsets)])
-    bias = np.concatenate([last.bias / GAIN, *(last.bias - offset for offset in offsets)])
-    return (*graph[:-1], replace(last, weight=weight.astype(np.float32), bias=bias.astype(np.float32)))
+    weight = np.concatenate([last.weight / gain for gain, _ in copies])
+    bias = np.concatenate([last.bias / gain - offset for gain, offset in copies])
+    return (*before, replace(last, weight=weight.astype(np.float32), bias=bias.astype(np.float32)))
 
 
 MAX_WINDOWS = 8
@@ -194,5 +185,4 @@ def window_offsets(low: np.ndarray, high: np.ndarray, unit: float) -> np.ndarray
 
 def takes_gains(graph: Graph) -> bool:
     """Whether the last operation is a convolution that can write its channels twice."""
-    last = graph[-1]
-    return isinstance(last, Conv) and last.activation is Activation.none and last.groups == 1
+    return isinstance(graph[-1], Conv) and _plain(graph[-1])

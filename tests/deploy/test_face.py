@@ -120,12 +120,6 @@ def test_the_gate_leaves_calibrations_samples_out(int8: bd.Network, samples: np.
         bd.gate(int8, samples=samples, limits={"mae": 1e-9}).raise_if_failed()
 
 
-def test_the_gate_refuses_samples_that_were_all_calibrated_on(tiny: bd.Network, samples: np.ndarray) -> None:
-    few = bd.quantize(tiny, samples[:3], progress=False)
-    with pytest.raises(ValueError, match="samples: expected samples that calibration did not see"):
-        bd.gate(few, samples=samples[:3])
-
-
 @pytest.mark.parametrize("kind", ["array", "tuple", "list", "batches", "file"])
 def test_samples_of_any_kind_are_the_same(
     kind: str, tiny: bd.Network, int8: bd.Network, samples: np.ndarray, tmp_path: Path
@@ -238,51 +232,46 @@ def test_the_traditional_pipeline_restores_arrays_as_files(raw: np.ndarray, tmp_
     np.testing.assert_array_equal(array, tifffile.imread(run.path))
 
 
-REFUSED: dict[str, tuple[Callable[[np.ndarray], object], type[Exception], str]] = {
-    "bands last": (lambda raw: bd.restore(np.stack([raw] * 3, -1)), ValueError, "moveaxis"),
-    "no array": (lambda _: bd.restore(3), ValueError, "got int"),
-    "a path alone": (lambda _: bd.restore("raw.tif"), ValueError, "out: expected a path"),
-    "an array with out": (lambda raw: bd.restore(raw, out="a.tif"), ValueError, "expected none beside an array"),
-    "no such sensor": (lambda raw: bd.restore(raw, sensor="none"), ValueError, "expected one of"),
-    "no such network": (lambda raw: bd.restore(raw, "none"), ValueError, "a shipped network"),
-    "no network": (lambda _: bd.Network.load(3), ValueError, r"torch.nn.Module"),  # type: ignore[arg-type]
-    "no method": (lambda raw: bd.restore(raw, method="x"), ValueError, "method: exp"),  # type: ignore[arg-type]
-    "8 bits": (lambda raw: bd.restore(raw.astype(np.uint8)), ValueError, "full_scale"),
-    "shares": (lambda raw: bd.restore(raw / 4095), ValueError, "full_scale"),
-    "other channels": (
-        lambda raw: bd.quantize(Tiny(), raw[None, None, :32, :32].repeat(3, 1)),
-        ValueError,
-        "1 channel",
-    ),
-    "not 0..1": (lambda raw: bd.quantize(Tiny(), raw[None, None]), ValueError, "values in"),
-    "INT8 again": (lambda _: bd.quantize(f"{SMALL}-int8"), ValueError, "got an INT8 one"),
-    "no float network": (lambda _: bd.gate(f"{SMALL}-int8"), ValueError, "against: expected the float network"),
-    "no limit": (lambda _: bd.gate(f"{SMALL}-int8", SMALL, limits={"maee": 1}), ValueError, "named mae"),
-    "no DPU": (lambda _: bd.check(f"{SMALL}-int8", "host-cpu"), ValueError, "a target with a DPU"),
-    "no board": (lambda _: bd.predict(SMALL, "none"), ValueError, "expected one of"),
+REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
+    "bands last": (lambda raw: bd.restore(np.stack([raw] * 3, -1)), "moveaxis"),
+    "no array": (lambda _: bd.restore(3), "got int"),
+    "a path alone": (lambda _: bd.restore("raw.tif"), "out: expected a path"),
+    "an array with out": (lambda raw: bd.restore(raw, out="a.tif"), "expected none beside an array"),
+    "no such sensor": (lambda raw: bd.restore(raw, sensor="none"), "expected one of"),
+    "no such network": (lambda raw: bd.restore(raw, "none"), "a shipped network"),
+    "no network": (lambda _: bd.Network.load(3), r"torch.nn.Module"),  # type: ignore[arg-type]
+    "no method": (lambda _: bd.restore("raw.tif", out="a.tif", method="x"), "method: exp"),  # type: ignore[arg-type]
+    "8 bits": (lambda raw: bd.restore(raw.astype(np.uint8)), "full_scale"),
+    "shares": (lambda raw: bd.restore(raw / 4095), "full_scale"),
+    "other channels": (lambda raw: bd.quantize(Tiny(), raw[None, None, :32, :32].repeat(3, 1)), "1 channel"),
+    "not 0..1": (lambda raw: bd.quantize(Tiny(), raw[None, None]), "values in"),
+    "INT8 again": (lambda _: bd.quantize(f"{SMALL}-int8"), "got an INT8 one"),
+    "no float network": (lambda _: bd.gate(f"{SMALL}-int8"), "against: expected the float network"),
+    "no limit": (lambda _: bd.gate(f"{SMALL}-int8", SMALL, limits={"maee": 1}), "named mae"),
+    "no DPU": (lambda _: bd.check(f"{SMALL}-int8", "host-cpu"), "a target with a DPU"),
+    "no board": (lambda _: bd.predict(SMALL, "none"), "expected one of"),
     "no pairs": (
         lambda raw: bd.quantize(Tiny(), (raw[None, None], raw[None, None].repeat(2, 0))),
-        ValueError,
         "a reference for each",
     ),
-    "no sample": (lambda _: bd.quantize(Tiny(), 3), ValueError, "or a path"),
-    "no batch": (lambda raw: bd.quantize(Tiny(), [raw]), ValueError, "a batch of"),
-    "empty": (lambda _: bd.quantize(Tiny(), []), ValueError, "at least one sample"),
-    "no raw image": (lambda _: bd.characterize([]), ValueError, "one or several"),
-    "no module's size": (lambda _: bd.Network.load(Tiny(), example=(1, 9, 8, 8)), ValueError, "that torch exports"),
-    "no samples": (lambda raw: bd.quantize(Tiny(), {"image": raw}), ValueError, "or a path"),
-    "no swath": (lambda _: bd.predict(SMALL, size=(0, 0)), ValueError, "size: expected"),
-    "no size": (lambda _: bd.simulate(size=0), ValueError, "size: expected"),
-    "other sizes": (lambda raw: bd.simulate(size=48).psnr(raw), ValueError, "one of shape"),
-    "no figure": (lambda _: bd.sensors().plot("x"), ValueError, "figure: expected one of"),
-    "no number": (lambda _: bd.Sensor.load("blind").replace(mtf=1), ValueError, "mtf_nyquist"),
+    "no sample": (lambda _: bd.quantize(Tiny(), 3), "or a path"),
+    "no batch": (lambda raw: bd.quantize(Tiny(), [raw]), "a batch of"),
+    "empty": (lambda _: bd.quantize(Tiny(), []), "at least one sample"),
+    "no raw image": (lambda _: bd.characterize([]), "one or several"),
+    "no module's size": (lambda _: bd.Network.load(Tiny(), example=(1, 9, 8, 8)), "that torch exports"),
+    "no samples": (lambda raw: bd.quantize(Tiny(), {"image": raw}), "or a path"),
+    "no swath": (lambda _: bd.predict(SMALL, size=(0, 0)), "size: expected"),
+    "no size": (lambda _: bd.simulate(size=0), "size: expected"),
+    "other sizes": (lambda raw: bd.simulate(size=48).psnr(raw), "one of shape"),
+    "no figure": (lambda _: bd.sensors().plot("x"), "figure: expected one of"),
+    "no number": (lambda _: bd.Sensor.load("blind").replace(mtf=1), "mtf_nyquist"),
 }
 
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_bad_input_is_one_sentence_and_the_class_that_one_expects(case: str, raw: np.ndarray) -> None:
-    call, kind, words = REFUSED[case]
-    with pytest.raises(kind, match=words) as caught:
+    call, words = REFUSED[case]
+    with pytest.raises(ValueError, match=words) as caught:
         call(raw)
     assert isinstance(caught.value, bd.BeersError)
     assert "--" not in str(caught.value)

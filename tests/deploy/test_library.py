@@ -201,13 +201,11 @@ def test_a_dask_array_of_unknown_size_is_refused(da: Any, model: Path) -> None:
 
 
 def test_options_and_models_are_refused_before_anything_is_computed(da: Any, model: Path, tmp_path: Path) -> None:
+    wrong: dict[str, Any] = {"runtime: expected onnxruntime or openvino": "tensorrt", "tile": 10, "halo": -1}
     for image in (noise(40, 40), da.from_array(noise(40, 40), chunks=20)):
-        with pytest.raises(OptionError, match="runtime: expected onnxruntime or openvino"):
-            restore(image, model, runtime="tensorrt")
-        with pytest.raises(OptionError, match="tile"):
-            restore(image, model, tile=10)
-        with pytest.raises(OptionError, match="halo"):
-            restore(image, model, halo=-1)
+        for said, value in wrong.items():
+            with pytest.raises(OptionError, match=said):
+                restore(image, model, **{said.split(":")[0]: value})
         with pytest.raises(ModelError, match="no such file"):
             restore(image, tmp_path / "none.onnx")
 

@@ -23,7 +23,7 @@ from beers_deploy.network import (
     told_int8,
     weights_file,
 )
-from beers_deploy.profiles.errors import ModelError, ProfileError
+from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import numbers_of
 from beers_deploy.profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
 from beers_deploy.quant.banked import calibrate
@@ -92,7 +92,9 @@ def test_the_shipped_int8_files_are_of_these_weights(name: str) -> None:
 def test_a_name_that_is_none_is_told_the_names_that_there_are() -> None:
     for name in ("convbeers-z", "convbeers-z-int8"):
         with pytest.raises(ModelError, match=r"shipped network \(convbeers, convbeers-half, .*convbeers-xs"):
-            network_file(Path(name), load_sensor(SENSOR))
+            network_file(Path(name), KNOWN)
+    with pytest.raises(ModelError, match="no such file"):
+        network_file(Path("none.safetensors"), KNOWN)
 
 
 def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
@@ -110,13 +112,6 @@ def test_what_lies_outside_is_said_each_time(conditioned: Path, tmp_path: Path) 
         float_file(conditioned, sensor, said.append)
     assert len(said) == 4
     assert all(re.match("warning: mtf_(across|along) 0.004 is outside 0.015 to 0.15", sentence) for sentence in said)
-
-
-def test_what_cannot_be_had_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(ProfileError, match="hubble"):
-        load_sensor("hubble")
-    with pytest.raises(ModelError, match="no such file"):
-        network_file(tmp_path / "none.safetensors", KNOWN)
 
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-xs-int8"])
@@ -138,17 +133,8 @@ def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_i
 
 def test_a_network_that_is_made_already_takes_no_sensor(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.full((20, 30), 900, np.uint16))
-    mine = shipped_pair("convbeers-xs")[0]
-    words = [
-        "restore",
-        str(tmp_path / "in.tif"),
-        str(tmp_path / "out.tif"),
-        "--network",
-        str(mine),
-        "--sensor",
-        SENSOR,
-    ]
-    assert "leave --sensor out" in refused(*words)
+    words = ["--network", shipped_pair("convbeers-xs")[0], "--sensor", SENSOR]
+    assert "leave --sensor out" in refused("restore", tmp_path / "in.tif", tmp_path / "out.tif", *words)
     assert not (tmp_path / "out.tif").exists()
 
 
@@ -177,12 +163,9 @@ def test_a_name_is_the_shipped_network(name: str, tmp_path: Path, monkeypatch: p
     assert int8_file(Path(name), KNOWN) == float_file(Path(name), KNOWN) == weights_file(Path(name)) == Path(name)
 
 
-@pytest.mark.parametrize("given", ["none", "none.onnx", "folder/convbeers-s"])
-def test_anything_else_stays_a_path(given: str) -> None:
-    assert int8_file(Path(given), KNOWN) == float_file(Path(given), KNOWN) == weights_file(Path(given)) == Path(given)
-
-
-def test_nothing_given_is_the_default() -> None:
+def test_anything_else_stays_a_path_and_nothing_is_the_default() -> None:
+    for path in map(Path, ("none", "none.onnx", "folder/convbeers-s")):
+        assert int8_file(path, KNOWN) == float_file(path, KNOWN) == weights_file(path) == path
     assert network_file(None, KNOWN) == int8_file(None, KNOWN) == int8_file(Path(VARIANT), KNOWN)
 
 
@@ -215,12 +198,9 @@ def test_the_gate_takes_the_names() -> None:
         assert tuple(map(str, names)) == ("convbeers-xs", "convbeers-xs-int8")
 
 
-def test_export_takes_the_name(tmp_path: Path) -> None:
+def test_export_writes_a_shipped_networks_integers_for_the_host_and_the_board(tmp_path: Path) -> None:
     done("export", "--network", "convbeers-xs", "--out", tmp_path / "net.onnx")
     assert metadata(load_onnx(tmp_path / "net.onnx"))["variant"] == "convbeers-xs"
-
-
-def test_export_writes_a_shipped_networks_integers_for_the_host_and_the_board(tmp_path: Path) -> None:
     host, board = str(tmp_path / "int8.onnx"), str(tmp_path / "core.onnx")
     words = ["export", "--network", "convbeers-half-xs-int8", "--sensor", "blind", "--tile", "64", "--out", host]
     done(*words, "--board-file", board)

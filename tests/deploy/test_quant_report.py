@@ -44,11 +44,7 @@ def test_the_free_regime_writes_a_file_of_its_own_kind(tmp_path: Path) -> None:
     done(*free, "--out", out, "--json", tmp_path / "q.json")
     assert metadata(load_onnx(out))["precision"] == "int8 free"
     valid(tmp_path / "q.json")
-    for option in (
-        ["--finetune", "1"],
-        ["--board-file", str(tmp_path / "b.onnx")],
-        ["--report", str(tmp_path / "r")],
-    ):
+    for option in (["--finetune", "1"], ["--board-file", tmp_path / "b.onnx"], ["--report", tmp_path / "r"]):
         assert "--regime legal" in refused(*free, "--out", tmp_path / "no.onnx", *option)
     assert not (tmp_path / "no.onnx").exists()
 
@@ -64,12 +60,9 @@ def test_steps_of_fine_tuning_are_whole_or_auto(given: str) -> None:
 def test_a_network_fixed_to_one_tile_is_quantised_reported_and_gated(tmp_path: Path) -> None:
     paths = tmp_path / "f.onnx", tmp_path / "i.onnx"
     save_onnx(to_onnx(plain(Variant(1, 4)), {}, tile_px=80), paths[0])
-    options = ["--out", str(paths[1]), "--patches", "2", "--patch", "64", "--report", str(tmp_path / "r")]
-    for arguments in (
-        ["quantize", str(paths[0]), *options],
-        ["gate", *map(str, paths), "--patches", "3", "--max-mae", "0.5"],
-    ):
-        done(*arguments)
+    options = ["--out", paths[1], "--patches", "2", "--patch", "64", "--report", tmp_path / "r"]
+    done("quantize", paths[0], *options)
+    done("gate", *paths, "--patches", "3", "--max-mae", "0.5")
     assert fixed_tile_px(load_onnx(paths[1])) == 80
 
 
@@ -154,12 +147,11 @@ def test_what_the_profile_gave_is_no_measurement() -> None:
     sensor = replace(profile.nominal(), mtf_nyquist=0.05)
     scene = procedural_scene(700, 700, np.random.default_rng(0))
     patches = draw_patches([scene], profile, reference_for(profile), 1, 0)
-    row = worst_row(0, replace(patches, views=[replace(patches.views[0], degraded=sensor)]), spread(np.zeros(9)))
-    assert row.text["MTF at Nyquist, drawn from the profile"] == "5 %"
-    assert not any("MTF" in key for key in row.figures)
-    along = replace(sensor, mtf_nyquist_along=0.03)
-    row = worst_row(0, replace(patches, views=[replace(patches.views[0], degraded=along)]), spread(np.zeros(9)))
-    assert row.text["MTF at Nyquist, drawn from the profile"] == "5 % across the track, 3 % along it"
+    for along, said in ((None, "5 %"), (0.03, "5 % across the track, 3 % along it")):
+        views = [replace(patches.views[0], degraded=replace(sensor, mtf_nyquist_along=along))]
+        row = worst_row(0, replace(patches, views=views), spread(np.zeros(9)))
+        assert row.text["MTF at Nyquist, drawn from the profile"] == said
+        assert not any("MTF" in key for key in row.figures)
 
 
 def test_the_ratio_is_put_into_words() -> None:

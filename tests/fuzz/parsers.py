@@ -28,7 +28,7 @@ from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.figures import Check, Row, measured, predicted, unavailable
 from beers_deploy.profiles.response import read_response
 from beers_deploy.profiles.scene_call import load_scene_call
-from beers_deploy.quant.gate import read_limits
+from beers_deploy.quant.gate import limits_of
 from beers_deploy.restoration.output import Checkpoint, part_folder
 from beers_deploy.results import Table, by_row, cell
 from beers_deploy.studies.tradeoff.measure import Measurements
@@ -223,7 +223,7 @@ PARSERS: tuple[Parser, ...] = (
     Parser("recipe of pairs", ".json", recipe_seeds, read_recipe, of_json),
     Parser("scene TOML", ".toml", lambda _: _files("scenes"), lambda p: load_scene_call(str(p))),
     Parser("target TOML", ".toml", lambda _: _files("targets"), board_of, share=0.3),
-    Parser("gate limits TOML", ".toml", lambda _: LIMITS, lambda p: read_limits(p, None)),
+    Parser("gate limits TOML", ".toml", lambda _: LIMITS, limits_of),
     Parser("results JSON", ".json", document_seeds, read_results, of_json),
     Parser("gate baseline JSON", ".json", document_seeds, lambda p: baseline_mae(p, GATED), of_json),
     Parser("board's runs JSON", ".json", runs_seeds, lambda p: read_own_runs(p, load_dpu("vck190")), of_json, 0.3),

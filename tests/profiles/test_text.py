@@ -12,7 +12,7 @@ from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.errors import BeersError, OptionError, ProfileError
 from beers_deploy.profiles.scene_call import load_scene_call
 from beers_deploy.profiles.toml import JSON_BYTES, QUOTED, TOML_BYTES, parse_json, read_json, read_toml_text
-from beers_deploy.quant.gate import read_limits
+from beers_deploy.quant.gate import limits_of
 
 BAD_TOML = {
     "nested arrays": "a = " + "[" * 20_000,
@@ -53,7 +53,7 @@ def test_the_line_that_is_no_toml_is_quoted_wherever_a_user_s_toml_is_read(
 ) -> None:
     path = tmp_path / "mine.toml"
     path.write_bytes(text.encode())
-    for load in (load_sensor, load_target, load_scene_call, lambda name: read_limits(Path(name), None)):
+    for load in (load_sensor, load_target, load_scene_call, limits_of):
         with pytest.raises(BeersError) as caught:
             load(str(path))
         assert shown in str(caught.value)

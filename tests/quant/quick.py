@@ -13,9 +13,11 @@ from onnxruntime.quantization import CalibrationDataReader
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles import load_sensor
 from beers_deploy.quant.calibration import draw_patches
-from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Conv, Graph, Op, same
+from beers_deploy.quant.ends import ONE_CHANNEL, Ends
+from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Conv, Graph, Op, graph_to_onnx, same
 from beers_deploy.quant.quantise import Quantised, quantise_model
 from beers_deploy.quant.samples import Patches, Remade
+from beers_deploy.quant.session import open_session, planes_of
 
 
 def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:
@@ -48,6 +50,12 @@ def with_relu6(size: float) -> Graph:
         graph.append(Conv(name, source, name, weight, bias, activation, same(weight), groups))
         source = name
     return tuple(graph)
+
+
+def in_float(graph: Graph, seen: np.ndarray, ends: Ends = ONE_CHANNEL, name: str = CORRECTION) -> np.ndarray:
+    """What a plane-reading float graph makes of an image, or another of its tensors."""
+    session = open_session(graph_to_onnx(graph, [name], ends.planes * ends.channels))
+    return np.asarray(session.run(None, {PLANES: planes_of(seen, ends)})[0])
 
 
 def copied(model: onnx.ModelProto) -> onnx.ModelProto:

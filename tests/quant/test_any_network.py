@@ -18,7 +18,7 @@ from beers_deploy.dpu.reading import network_of
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN
-from beers_deploy.quant.encodings import as_on_board, encoding_faults, read_core
+from beers_deploy.quant.encodings import as_on_board, board_model, encoding_faults, read_core
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.graph import correction_graph
 from beers_deploy.quant.integer.reference import agreement, run_core
@@ -138,7 +138,7 @@ def test_a_description_of_something_else_is_one_sentence(change: Callable[[dict[
 @pytest.mark.parametrize("name", NETWORKS)
 def test_the_core_is_legal_on_the_dpu(name: str) -> None:
     dpu = load_dpu("vck190", None)
-    for file in (quantised(name).host, quantised(name).board):
+    for file in (quantised(name).host, board_model(quantised(name).core, {})):
         assert legality(place(network_of(file, NETWORKS[name].side_px or 64), dpu)).passed
 
 

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from beers_deploy.quant.ends import Ends
-from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Add, Conv, Graph, graph_to_onnx, same
+from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Add, Conv, Graph, same
 from beers_deploy.quant.passes.copies import APART, ranges_apart, runs, with_copies
 from beers_deploy.quant.passes.stream import lone_tensors
-from beers_deploy.quant.session import open_session, planes_of
-from tests.quant.quick import image
+from tests.quant.quick import image, in_float
 
 SEEN = [image(24, 31, seed) for seed in range(3)]
 
@@ -31,8 +30,7 @@ def network(dead: int, seed: int = 0) -> Graph:
 
 
 def results(graph: Graph, name: str = CORRECTION) -> np.ndarray:
-    session = open_session(graph_to_onnx(graph, [name]))
-    return np.concatenate([session.run(None, {PLANES: planes_of(each, Ends())})[0] for each in SEEN])
+    return np.concatenate([in_float(graph, each, name=name) for each in SEEN])
 
 
 @pytest.mark.parametrize("dead", [1, 3, 5])

@@ -9,30 +9,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import numpy_helper
 
-from beers_deploy.quant.free import BINS, Scale, best_scale, free_model, quantise_free, round_weight, tensor_scales
+from beers_deploy.quant.free import BINS, best_scale, quantise_free, round_weight
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
-    PLANES_FRAC_BITS,
-    Activation,
-    Conv,
-    Graph,
     correction_graph,
-    graph_to_onnx,
     read_planes,
     relu_count,
     same,
-    tensors,
 )
 from beers_deploy.quant.integer.arithmetic import convolve
-from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.quant.passes.equalise import channel_ranges, equalise, first_guess
-from beers_deploy.quant.passes.stream import OFFSETS, half_lsb_pair, streams, two_gains
+from beers_deploy.quant.onnx_file import metadata, with_outputs
+from beers_deploy.quant.passes.stream import OFFSETS, half_lsb_pair
 from beers_deploy.quant.quantise import Quantised
 from beers_deploy.quant.samples import Patches
-from beers_deploy.quant.session import open_session, planes_of, run
-from tests.quant.quick import changed, copied, image, one_guess
+from beers_deploy.quant.session import open_session, run, tensors_of
+from tests.quant.quick import changed, image, in_float, one_guess
 from tests.quant.tiling.small_networks import half_resolution
 
 SIZES = [(37, 53), (16, 91), (5, 3)]
@@ -70,27 +63,27 @@ def whole_numbers(model: onnx.ModelProto, planes: np.ndarray, around: str = "zer
     return found[CORRECTION]
 
 
-def with_outputs(model: onnx.ModelProto, names: list[str]) -> onnx.ModelProto:
-    opened = copied(model)
-    kind = onnx.TensorProto.UINT8
-    opened.graph.output.extend(onnx.helper.make_tensor_value_info(n, kind, ["N", "C", "H", "W"]) for n in names)
-    return opened
+def stored(model: onnx.ModelProto, seen: np.ndarray) -> list[np.ndarray]:
+    """The planes and the correction, uint8."""
+    names = [PLANES, CORRECTION]
+    opened = with_outputs(model, dict.fromkeys(names, onnx.TensorProto.UINT8))
+    return tensors_of(open_session(opened), names, seen)
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_it_computes_what_whole_numbers_say_zeros_around_the_image(
+def test_it_computes_what_whole_numbers_say_zeros_around_the_image_optimised_or_not(
     free: onnx.ModelProto, size: tuple[int, int]
 ) -> None:
-    session = open_session(with_outputs(free, [PLANES, CORRECTION]))
-    planes, correction = session.run([PLANES, CORRECTION], {"image": image(*size)})
+    planes, correction = stored(free, image(*size))
     expected = whole_numbers(free, planes)
     assert (expected == correction).mean() > 0.98  # float32 beside float64: a rare half rounds the other way
     np.testing.assert_allclose(expected, correction, atol=2)
+    plain = open_session(free, optimise=False)
+    np.testing.assert_array_equal(run(open_session(free), image(*size)), run(plain, image(*size)))
 
 
 def test_padding_with_anything_but_zero_would_be_noticed(free: onnx.ModelProto) -> None:
-    session = open_session(with_outputs(free, [PLANES, CORRECTION]))
-    planes, correction = session.run([PLANES, CORRECTION], {"image": image(37, 53)})
+    planes, correction = stored(free, image(37, 53))
     same = whole_numbers(free, planes, around="zero bytes") == correction
     assert same[..., 7:-7, 7:-7].mean() > 0.98
     assert same[..., 0, :].mean() < 0.5
@@ -104,12 +97,6 @@ def test_every_convolution_stays_an_integer_kernel(free: onnx.ModelProto, tmp_pa
     kinds = Counter(node.op_type for node in onnx.load(tmp_path / "optimised.onnx").graph.node)
     assert kinds["QLinearConv"] == 8  # seven, the head also as a half-LSB pair
     assert not [kind for kind in kinds if kind.endswith("Conv") and kind != "QLinearConv"]
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_optimised_equals_unoptimised(free: onnx.ModelProto, size: tuple[int, int]) -> None:
-    plain = open_session(free, optimise=False)
-    np.testing.assert_array_equal(run(open_session(free), image(*size)), run(plain, image(*size)))
 
 
 def test_the_relus_are_kept(float_onnx: onnx.ModelProto, free: onnx.ModelProto) -> None:
@@ -177,16 +164,12 @@ def test_a_channel_of_zeros_stays_zero_and_a_tiny_one_keeps_its_bias_in_reach() 
     assert not whole.any()
 
 
-def in_float(graph: Graph) -> np.ndarray:
-    planes = planes_of(image(23, 31))
-    return np.asarray(open_session(graph_to_onnx(graph, [CORRECTION])).run(None, {PLANES: planes})[0])
-
-
 def test_the_half_lsb_pair_leave_the_float_network_as_it_was(float_onnx: onnx.ModelProto) -> None:
     graph = read_planes(correction_graph(float_onnx))
     twice = half_lsb_pair(graph, 2.0**-8)
     assert len(twice) == len(graph) + 1  # the head is also read by the first block, as it was
-    np.testing.assert_allclose(in_float(twice), in_float(graph), atol=2e-6)
+    found, wanted = (in_float(each, image(23, 31)) for each in (twice, graph))
+    np.testing.assert_allclose(found, wanted, atol=2e-6)
 
 
 def test_the_half_lsb_pair_need_an_add_of_two_convolutions_before_the_tail(float_onnx: onnx.ModelProto) -> None:
@@ -201,23 +184,17 @@ def test_two_copies_hold_half_an_lsb(value: float) -> None:
     assert abs(copies.mean() - value) <= 0.25 + 1e-9
 
 
-def test_the_half_lsb_pair_lose_less(float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches) -> None:
-    step, graph = 2.0**-8, read_planes(correction_graph(float_onnx))
-    (stream,) = streams(graph)
-    graph = equalise(graph, stream, first_guess(channel_ranges(graph, stream, patches.degraded), 0.5, 0.8))
-    levels = {op.output: 255 for op in graph if isinstance(op, Conv) and op.activation is Activation.relu} | {
-        CORRECTION: 127
-    }
-    units = tensor_scales(graph, levels, patches.degraded)
-    scales = {name: Scale(unit, 0 if levels[name] == 255 else 128) for name, unit in units.items()}
-    scales[PLANES] = Scale(2.0**-PLANES_FRAC_BITS)
+def test_the_half_lsb_pair_lose_less(
+    float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def mae() -> float:
+        with one_guess():
+            made = quantise_free(float_onnx, patches, {})
+        return compare(open_session(float_onnx), open_session(made), unseen.pairs).mae
 
-    def mae(offset: float) -> float:
-        fine = two_gains(half_lsb_pair(graph, offset))
-        model = free_model(fine, {name: scales.get(name, Scale(step)) for name in (PLANES, *tensors(fine))})
-        return compare(open_session(float_onnx), open_session(model), unseen.pairs).mae
-
-    assert mae(step) < 0.95 * mae(0.0)
+    apart = mae()
+    monkeypatch.setattr("beers_deploy.quant.free.half_lsb_pair", lambda graph, _: half_lsb_pair(graph, 0.0))
+    assert apart < 0.95 * mae()
 
 
 def test_at_half_resolution_the_pixels_of_a_place_find_their_way_back(patches: Patches, unseen: Patches) -> None:
@@ -226,7 +203,7 @@ def test_at_half_resolution_the_pixels_of_a_place_find_their_way_back(patches: P
     with one_guess():
         made = quantise_free(model, patches, {})
     assert {"SpaceToDepth", "DepthToSpace"} < {node.op_type for node in made.graph.node}
-    in_float, in_int8 = open_session(model), open_session(made)
-    found = compare(in_float, in_int8, unseen.pairs).mae
-    corrections = [float(np.abs(run(in_float, degraded) - degraded).mean()) for degraded, _ in unseen.pairs]
+    session, in_int8 = open_session(model), open_session(made)
+    found = compare(session, in_int8, unseen.pairs).mae
+    corrections = [float(np.abs(run(session, degraded) - degraded).mean()) for degraded, _ in unseen.pairs]
     assert found < 0.05 * np.mean(corrections)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activation, Add, split
 from beers_deploy.quant.integer.reference import correction, run_core
 from beers_deploy.quant.quantise import Quantised
@@ -15,7 +16,7 @@ from tests.quant.quick import image
 
 def by_runtime(quantised: Quantised, planes: np.ndarray) -> np.ndarray:
     feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
-    return np.asarray(open_session(quantised.board).run(None, feed)[0])
+    return np.asarray(open_session(board_model(quantised.core, {})).run(None, feed)[0])
 
 
 @pytest.mark.parametrize("shape", [(37, 53), (1, 1), (1, 40), (64, 33)])

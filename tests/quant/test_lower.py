@@ -21,7 +21,6 @@ from beers_deploy.quant.graph import (
     Conv,
     Graph,
     Window,
-    graph_to_onnx,
     same,
 )
 from beers_deploy.quant.integer.reference import agreement, correction, run_core
@@ -32,7 +31,7 @@ from beers_deploy.quant.samples import Remade
 from beers_deploy.quant.sensitivity import layer_errors
 from beers_deploy.quant.session import open_session, planes_of
 from beers_deploy.quant.structure import count_relus, saturated_shares
-from tests.quant.quick import image, with_relu6
+from tests.quant.quick import image, in_float, with_relu6
 
 STRIDED, VALID = Window(strides=(2, 3)), Window()
 BITS = {PLANES: PLANES_FRAC_BITS, "a": 5, "b": 5, "c": 5, "d": 5, CORRECTION: 5}
@@ -61,8 +60,7 @@ def core_of(graph: Graph) -> IntCore:
 
 
 def result(graph: Graph) -> np.ndarray:
-    session = open_session(graph_to_onnx(graph, [CORRECTION]))
-    return np.asarray(session.run(None, {PLANES: planes_of(image(), Ends())})[0])
+    return in_float(graph, image())
 
 
 def test_behind_relu_and_read_without_padding() -> None:
@@ -141,16 +139,11 @@ def test_the_layer_errs_half_as_much() -> None:
 
 def test_fitted_biases_give_back_what_was_taken() -> None:
     seen, ends = crops(8), Ends(planes=3, adds_image=False)
-    wanted = np.mean([result_of_float(network(), each, ends) for each in seen])
+    wanted = np.mean([in_float(network(), each, ends) for each in seen])
     graph = both_lowered(network())
     core = fit_weights(graph, build_core(graph, BITS, ends=ends), seen)
     found = np.mean([correction(core, core.ends.split(each)) for each in seen])
     assert abs(found - wanted) < core.scale(CORRECTION)
-
-
-def result_of_float(graph: Graph, seen: np.ndarray, ends: Ends) -> np.ndarray:
-    session = open_session(graph_to_onnx(graph, [CORRECTION]))
-    return np.asarray(session.run(None, {PLANES: planes_of(seen, ends)})[0])
 
 
 @pytest.mark.parametrize(("costs", "kept"), [((3, 4, 4, 2), "bc"), ((3, 2, 4, 5), "b"), ((3, 4, 4, 3), "")])

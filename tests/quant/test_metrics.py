@@ -10,16 +10,13 @@ from hypothesis.extra.numpy import arrays
 import beers_deploy as bd
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.quant.metrics import METRICS, Measured
+from beers_deploy.quant.gate import METRICS, parts_of, value_of
 from examples.networks import build, to_onnx
 from tests.quant.quick import one_guess
 
 
 def measured(name: str, results: list[np.ndarray], references: list[np.ndarray]) -> float:
-    found = Measured()
-    for result, reference in zip(results, references, strict=True):
-        found.add(name, result, reference)
-    return found.value
+    return value_of([parts_of(name, *pair) for pair in zip(results, references, strict=True)])
 
 
 @given(
@@ -46,7 +43,7 @@ def test_images_are_measured_as_everywhere_else() -> None:
 @pytest.mark.parametrize(("name", "shape"), [("psnr", (1, 2, 23, 30)), ("top1", (1, 2, 23, 31)), ("iou", (1,))])
 def test_references_of_another_kind_are_refused(name: str, shape: tuple[int, ...]) -> None:
     with pytest.raises(OptionError, match=r"metric: expected (references|numbers of classes) of 1 x "):
-        Measured().add(name, np.zeros((1, 2, 23, 31)), np.zeros(shape))
+        parts_of(name, np.zeros((1, 2, 23, 31)), np.zeros(shape))
 
 
 def test_a_gate_speaks_of_classes() -> None:

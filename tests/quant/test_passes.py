@@ -12,7 +12,6 @@ from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
-    PLANES_FRAC_BITS,
     Activation,
     Add,
     Concat,
@@ -22,7 +21,6 @@ from beers_deploy.quant.graph import (
     Resize,
     Window,
     graph_to_onnx,
-    split,
 )
 from beers_deploy.quant.passes.equalise import (
     FIRST_CROPS,
@@ -46,7 +44,7 @@ from beers_deploy.quant.passes.stream import (
 from beers_deploy.quant.quantise import Quantised, quantise_model
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session
-from tests.quant.quick import quickly
+from tests.quant.quick import image, in_float, quickly
 
 
 def stream_of(graph: Graph) -> Stream:
@@ -54,23 +52,16 @@ def stream_of(graph: Graph) -> Stream:
     return stream
 
 
-def correction(graph: Graph, seed: int = 0) -> np.ndarray:
-    dn = np.random.default_rng(seed).integers(0, 4096, (1, 1, 23, 31)).astype(np.float32) / np.float32(4095)
-    planes = split(dn).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)
-    return np.asarray(open_session(graph_to_onnx(graph, [CORRECTION])).run(None, {PLANES: planes})[0])
+def correction(graph: Graph) -> np.ndarray:
+    return in_float(graph, image(23, 31))
 
 
 def test_equalising_leaves_the_float_network_as_it_was(graph: Graph) -> None:
     factors = np.random.default_rng(1).uniform(0.2, 5, 8)
-    np.testing.assert_allclose(correction(equalise(graph, stream_of(graph), factors)), correction(graph), atol=2e-6)
-    first = equalise(graph, stream_of(graph), factors)[0]
-    assert isinstance(first, Conv)
-    assert not np.allclose(first.weight, graph[0].weight)  # type: ignore[attr-defined]
-
-
-def test_scaling_the_writers_alone_would_change_it(graph: Graph) -> None:
-    wrong = (equalise(graph, stream_of(graph), np.full(8, 2.0))[0], *graph[1:])
-    assert np.abs(correction(wrong) - correction(graph)).max() > 1e-3
+    scaled = equalise(graph, stream_of(graph), factors)
+    np.testing.assert_allclose(correction(scaled), correction(graph), atol=2e-6)
+    first_alone = (scaled[0], *graph[1:])
+    assert np.abs(correction(first_alone) - correction(graph)).max() > 1e-3
 
 
 def test_ranges_are_levelled_to_the_stream_s_own(graph: Graph, patches: Patches) -> None:
@@ -109,9 +100,9 @@ def test_a_stream_goes_through_pools_enlargements_and_concats() -> None:
     graph, fine, coarse = skipping(), slice(2, 5), slice(0, 2)
     wanted = {"head": fine, "inner": fine, "sum": fine, "pooled": fine, "deep": coarse, "up": coarse}
     assert stream_of(graph) == wanted | {"both": slice(0, 5)}
-    image = {PLANES: np.random.default_rng(1).normal(0, 3, (1, 3, 6, 10)).astype(np.float32)}
+    planes = {PLANES: np.random.default_rng(1).normal(0, 3, (1, 3, 6, 10)).astype(np.float32)}
     found = [
-        open_session(graph_to_onnx(each, [CORRECTION])).run(None, image)[0]
+        open_session(graph_to_onnx(each, [CORRECTION])).run(None, planes)[0]
         for each in (graph, equalise(graph, stream_of(graph), np.random.default_rng(2).lognormal(-1, 1, 5)))
     ]
     np.testing.assert_allclose(found[1], found[0], atol=1e-4)
@@ -191,9 +182,14 @@ def searched(graph: Graph, weights: np.ndarray) -> tuple[list[float], float, lis
     return ends[:-1], ends[-1], runs
 
 
-def test_the_search_never_ends_above_its_best_guess(graph: Graph) -> None:
-    guesses, found, _ = searched(graph, np.arange(1.0, CROPS + 1))
+def test_the_search_ends_below_its_best_guess_and_runs_a_trial_that_fails_at_first_on_no_other_crops(
+    graph: Graph,
+) -> None:
+    guesses, found, runs = searched(graph, np.arange(1.0, CROPS + 1))
     assert found < min(guesses)
+    assert set(runs) == {FIRST_CROPS, CROPS}  # every crop says the same here: it fails at once or not at all
+    assert runs[0] == CROPS
+    assert runs.count(FIRST_CROPS) > len(runs) / 3
 
 
 def test_a_wide_stream_is_not_searched_channel_by_channel(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -201,13 +197,6 @@ def test_a_wide_stream_is_not_searched_channel_by_channel(graph: Graph, monkeypa
     guesses, found, runs = searched(graph, np.arange(1.0, CROPS + 1))
     assert found == min(guesses)
     assert len(runs) == len(guesses)
-
-
-def test_a_trial_that_fails_on_its_first_crops_is_run_on_no_others(graph: Graph) -> None:
-    _, _, runs = searched(graph, np.arange(1.0, CROPS + 1))
-    assert set(runs) == {FIRST_CROPS, CROPS}  # every crop says the same here: it fails at once or not at all
-    assert runs[0] == CROPS
-    assert runs.count(FIRST_CROPS) > len(runs) / 3
 
 
 def test_a_trial_that_the_costliest_crops_favour_still_has_to_win_on_all(graph: Graph) -> None:

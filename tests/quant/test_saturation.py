@@ -48,6 +48,7 @@ def test_shares_are_those_of_the_values(zero_point: np.ndarray | None, relu: boo
     shares = saturated_shares(qdq(scale, zero_point, relu), [signed[:1], signed[1:]])
     assert shares == {"whole": pytest.approx(lost(signed / np.float32(scale)).mean(), abs=1e-3)}
     assert shares["whole"] > 0.1
+    assert saturated_shares(qdq(1 / 120, zero_point, relu), [IMAGE]) == {"whole": 0.0}
 
 
 def test_a_relu_between_two_roundings_reads_the_first() -> None:
@@ -65,10 +66,6 @@ def test_a_relu_between_two_roundings_reads_the_first() -> None:
     shares = saturated_shares(model, [signed])
     lost = float((signed * 400 >= 126.5).mean())
     assert shares == {"whole": pytest.approx(lost, abs=1e-3), "again": pytest.approx(lost, abs=1e-3)}
-
-
-def test_a_scale_that_fits_saturates_nothing() -> None:
-    assert saturated_shares(qdq(1 / 120, np.array(0, np.int8)), [IMAGE]) == {"whole": 0.0}
 
 
 def test_the_shipped_file_saturates_as_the_integer_reference_says() -> None:

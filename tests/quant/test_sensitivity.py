@@ -13,7 +13,7 @@ from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import Add
 from beers_deploy.quant.quantise import Quantised
 from beers_deploy.quant.samples import Patches
-from beers_deploy.quant.sensitivity import LayerError, Loss, layer_errors, losses, spread_of
+from beers_deploy.quant.sensitivity import Loss, layer_errors, losses, spread_of
 from beers_deploy.quant.session import few_crops, open_session, run
 from tests.quant.quick import quickly
 
@@ -23,34 +23,18 @@ def crops(patches: Patches) -> list[np.ndarray]:
     return [image[..., :61, :53] for image in list(patches.degraded)[:3]]
 
 
-@pytest.fixture(scope="module")
-def attributed(quantised: Quantised, crops: list[np.ndarray]) -> tuple[list[LayerError], Loss]:
-    return layer_errors(quantised.graph, quantised.core, crops)
-
-
-def test_together_they_lose_what_the_int8_file_loses(
-    float_onnx: onnx.ModelProto,
-    quantised: Quantised,
-    crops: list[np.ndarray],
-    attributed: tuple[list[LayerError], Loss],
+def test_layers_lose_together_what_the_int8_file_loses_and_adds_hardly_anything(
+    float_onnx: onnx.ModelProto, quantised: Quantised, crops: list[np.ndarray]
 ) -> None:
+    """Their squared errors nearly add up; adds of a shared residual scale lose what saturates."""
+    layers, together = layer_errors(quantised.graph, quantised.core, crops)
     sessions = open_session(float_onnx), open_session(quantised.host)
     differences = [np.subtract(*(np.clip(run(s, crop), 0, 1) for s in sessions)) for crop in crops]
-    assert attributed[1].mae == pytest.approx(float(np.mean(np.abs(differences))), rel=1e-3)
-
-
-def test_squared_errors_of_layers_nearly_add_up(attributed: tuple[list[LayerError], Loss]) -> None:
-    layers, together = attributed
-    assert sum(layer.network.squared for layer in layers) == pytest.approx(together.squared, rel=0.4)
-
-
-def test_adds_of_a_shared_residual_scale_lose_nothing_but_what_saturates(
-    quantised: Quantised, attributed: tuple[list[LayerError], Loss]
-) -> None:
-    adds = {op.name for op in quantised.core.ops if isinstance(op, Add)}
-    layers = {layer.name: layer for layer in attributed[0]}
-    rounded = sum(layer.network.squared for layer in attributed[0] if layer.name not in adds)
-    assert sum(layers[name].network.squared for name in adds) < 0.1 * rounded
+    assert together.mae == pytest.approx(float(np.mean(np.abs(differences))), rel=1e-3)
+    lost = {layer.name: layer.network.squared for layer in layers}
+    assert sum(lost.values()) == pytest.approx(together.squared, rel=0.4)
+    adds = sum(lost.pop(op.name) for op in quantised.core.ops if isinstance(op, Add))
+    assert adds < 0.1 * sum(lost.values())
 
 
 @pytest.fixture(scope="module")

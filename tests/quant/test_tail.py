@@ -95,7 +95,7 @@ def test_the_file_is_read_back_with_its_tail() -> None:
 
 def test_a_network_of_one_size_is_looked_at_whole() -> None:
     made = quantised()
-    layers, _ = integer_rows(detector(), made.core, made.host, images())
+    *layers, _ = integer_rows(detector(), made.core, made.host, images())
     assert {row.figures["as onnxruntime"].value for row in layers} == {100.0}
 
 

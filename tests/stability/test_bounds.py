@@ -11,7 +11,7 @@ from beers_deploy.model.shipped import SHIPPED
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.core import IntConv
-from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.encodings import board_model, read_core
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import CORRECTION, split
 from beers_deploy.quant.integer.reference import INT32_BITS, correction, run_core
@@ -57,7 +57,7 @@ def test_a_core_is_read_back_from_its_file(quantised: Quantised) -> None:
 
 
 def test_another_spelling_has_no_core(quantised: Quantised, float_onnx: onnx.ModelProto) -> None:
-    for model in (float_onnx, quantised.board):
+    for model in (float_onnx, board_model(quantised.core, {})):
         with pytest.raises(ModelError, match="a file that describes its integers"):
             read_core(model)
 

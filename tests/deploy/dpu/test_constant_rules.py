@@ -20,6 +20,7 @@ from beers_deploy.export import to_onnx
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.variants import Variant
 from beers_deploy.network import shipped_pair
+from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.quantise import Quantised, quantise_model
 from tests.deploy.dpu.graphs import IntegerSketch
 from tests.model.networks import plain
@@ -93,7 +94,7 @@ def test_the_shipped_files_keep_every_rule(name: str) -> None:
 def test_what_quantize_writes_of_random_networks_keeps_every_rule(spread: float) -> None:
     """In both encodings, biases small and large beside the products."""
     made = quantised(spread)
-    assert rules(made.host) == rules(made.board) == set()
+    assert rules(made.host) == rules(board_model(made.core, {})) == set()
 
 
 def test_a_bias_with_one_more_on_a_value_is_refused() -> None:

@@ -13,7 +13,6 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.encodings import PLACE_PX, board_model
 from beers_deploy.quant.onnx_file import save_onnx
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
-from tests.quant.quick import copied
 from tests.quant.tiling.small_networks import quantised_half_resolution
 
 
@@ -120,10 +119,11 @@ def test_nodes_that_cannot_be_never_end_in_a_traceback(tmp_path: Path, draw: Cal
         place(read_network(path, 32), load_dpu("vck190"))
 
 
-@pytest.mark.parametrize("encoding", ["host", "board"])
-def test_the_core_of_a_network_at_half_resolution_has_maps_of_half_the_tile(encoding: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("on_board", [False, True])
+def test_the_core_of_a_network_at_half_resolution_has_maps_of_half_the_tile(on_board: bool, tmp_path: Path) -> None:
     """In the host's file the core is only described, and the board's begins behind the rearranging."""
-    model = getattr(quantised_half_resolution(), encoding)
+    made = quantised_half_resolution()
+    model = board_model(made.core, {}) if on_board else made.host
     save_onnx(model, tmp_path / "half.onnx")
     convolutions = [op for op in read_network(tmp_path / "half.onnx", 64).operations if op.kind == "conv"]
     assert {op.out_shape[1:] for op in convolutions if op.out_shape} == {(32, 32)}
@@ -144,7 +144,7 @@ def test_a_core_at_half_resolution_that_is_fixed_to_a_tile_is_fixed_to_half_of_i
 
 @pytest.mark.parametrize("said", ["0", "-2", "half", "1000000"])
 def test_places_that_cannot_be_are_refused(said: str, tmp_path: Path) -> None:
-    model = copied(quantised_half_resolution().board)
+    model = board_model(quantised_half_resolution().core, {})
     next(each for each in model.metadata_props if each.key == PLACE_PX).value = said
     save_onnx(model, tmp_path / "half.onnx")
     with pytest.raises(ModelError, match="contradict"):
