@@ -29,7 +29,7 @@ from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Plan, Span, plan_for
 from beers_deploy.restoration.radiometry import full_scale_of
 from beers_deploy.restoration.run import restore_file, scale_of
-from beers_deploy.restoration.runtime import Packed, open_packed, open_runtime, pack, tiles_at_once
+from beers_deploy.restoration.runtime import Packed, open_runtime, tiles_at_once
 from beers_deploy.restoration.sensor_check import told_sensor
 from beers_deploy.restoration.source import (
     ArraySource,
@@ -356,7 +356,7 @@ class Task:
         """For this process, at the full scale that was asked for or that the window's pixels tell."""
         extent = self.raster.extent(window)._replace(whole=True)  # a tile alone is no proof of radiances
         full_scale = settled_scale(NAME, self.raster.dtype, [extent], self.full_scale)
-        return Restorer(self.raster, open_packed(self.network), full_scale, self.tiling, NAME)
+        return Restorer(self.raster, self.network, full_scale, self.tiling, NAME)
 
 
 def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
@@ -366,7 +366,7 @@ def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
     network = load_onnx(options.model)
     plan = plan_for(network, raster.shape, options)
     settled_scale(NAME, raster.dtype, (), options.full_scale)  # what the type alone decides comes at once
-    packed = pack(network, options.runtime, options.threads or 1)
+    packed = Packed(network.SerializeToString(), options.runtime, options.threads or 1)
     task = delayed(Task(raster, packed, options.full_scale, plan.tiling))
     tile = delayed(restore_tile)
 

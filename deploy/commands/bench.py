@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import arguments, refuse, save, say
+from beers_deploy.commands.shared import Json, arguments, refuse, save, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.errors import OptionError, missing_extra
@@ -99,7 +99,7 @@ def bench(
     ] = None,
     layers: Annotated[bool, typer.Option("--layers", help="Show where the time goes, layer by layer.")] = False,
     threads: Annotated[int, typer.Option(min=0, help="Threads of the host's runtime; 0 takes every core.")] = 0,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    json: Json = None,
 ) -> None:
     """Compare a network on the DPU with the traditional pipeline and with the paper's figures."""
     from beers_deploy.bench.board import bench_board
@@ -174,9 +174,7 @@ def _refuse_unused(context: typer.Context, here: bool) -> None:
 
 
 def _single(tiles: list[int]) -> int:
-
     if len(tiles) > 1:
-        raise OptionError(
-            "--tile", expected="one size with --target host", got=str(tiles), remedy="run it once a size"
-        )
+        expected, remedy = "one size with --target host", "run it once a size"
+        raise OptionError("--tile", expected=expected, got=str(tiles), remedy=remedy)
     return tiles[0]

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import arguments, save, say
+from beers_deploy.commands.shared import Json, arguments, save, say
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -20,7 +20,7 @@ def diff(
         list[str] | None,
         typer.Option(metavar="CHANGE", help="NAME>CHANGE or NAME<CHANGE, in the figure's unit or in %; repeatable."),
     ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    json: Json = None,
 ) -> None:
     """Show which figures of two results documents differ; exit code 1 if one changed more than --fail-on allows.
 

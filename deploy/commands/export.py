@@ -104,17 +104,7 @@ def _export_int8(
     delta: Path | None,
     apply: Path | None,
 ) -> None:
-    """Write an INT8 file told a sensor, or the sensor of a delta.
-
-    Args:
-        path: of any sensor's file.
-        out: the host's.
-        sensor: that is told; the default one if None.
-        tile_px: side of an image that the files are fixed to; None leaves them as they are.
-        board: where the same integers go in the board's encoding, or None; and the board.
-        delta: what the sensor changes, or None.
-        apply: a delta that is told in place of a sensor, or None.
-    """
+    """Write an INT8 file told a sensor, or that of a delta; `board` is where its integers go, if anywhere."""
     from beers_deploy.export import require_tile
     from beers_deploy.model.io.files import whole_file
     from beers_deploy.network import Network, told_by_delta, told_int8

@@ -5,7 +5,7 @@ from typing import Annotated, cast
 
 import typer
 
-from beers_deploy.commands.shared import BOARDS, refuse, save, say
+from beers_deploy.commands.shared import BOARDS, Json, refuse, save, say
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.target import DEFAULT_TARGET
 
@@ -26,7 +26,7 @@ def golden(
         int | None, typer.Option(min=1, max=4096, help="Tile side in pixels; the network's own, else 64.")
     ] = None,
     target: Annotated[str, typer.Option(help=f"Whose way to round ties is taken: {BOARDS}.")] = DEFAULT_TARGET,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    json: Json = None,
 ) -> None:
     """Write the inputs and the exact int8 tensors of every layer, or compare with them what a board wrote.
 

@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import arguments, refuse, save, say
+from beers_deploy.commands.shared import Json, Restoring, Tile, TrustIndex, arguments, refuse, save, say
 from beers_deploy.profiles import load_sensor
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import TILE_PX
@@ -32,9 +32,7 @@ def restore(
     context: typer.Context,
     image: Annotated[Path, typer.Argument(metavar="IN", help="Image: TIFF or what GDAL reads, of any size, or PNG.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="TIFF to write, of the type of IN.")],
-    network: Annotated[
-        Path | None, typer.Option(help="ONNX network, or a shipped one's name; convbeers-s-int8 if none.")
-    ] = None,
+    network: Restoring = None,
     method: Annotated[Method, typer.Option(help="A network, or the traditional chain of --sensor.")] = Method.network,
     sensor: Annotated[
         str | None,
@@ -43,7 +41,7 @@ def restore(
             "B0=a.toml,B1=b.toml for each band; blind if none."
         ),
     ] = None,
-    tile: Annotated[int, typer.Option(min=16, help="Longest side of a tile in pixels.")] = TILE_PX,
+    tile: Tile = TILE_PX,
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
     full_scale: Annotated[
         float | None,
@@ -67,9 +65,7 @@ def restore(
         bool, typer.Option("--cog", help="Write OUT as a Cloud-Optimised GeoTIFF: tiles, overviews, what was done.")
     ] = False,
     stac: Annotated[Path | None, typer.Option(help="Write a STAC item of OUT here; with --cog.")] = None,
-    trust_index: Annotated[
-        bool, typer.Option("--trust-index", help="Let a VRT or DIMAP name tiles outside its folder and at URLs.")
-    ] = False,
+    trust_index: TrustIndex = False,
     again: Annotated[bool, typer.Option("--again", help="Restore an image that 'restore' has written.")] = False,
     any_result: Annotated[
         bool, typer.Option("--any-result", help="Write OUT even if it is clipped, constant or far from IN's mean.")
@@ -78,7 +74,7 @@ def restore(
         bool, typer.Option("--strict", help="Refuse IN whose pixels contradict --sensor, instead of saying so.")
     ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped or killed.")] = False,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    json: Json = None,
 ) -> None:
     """Restore an image tile by tile; with the exact halo the result is the whole image's, bit for bit.
 
@@ -94,7 +90,7 @@ def restore(
     from beers_deploy.model.shipped import INT8
     from beers_deploy.network import conditioned, network_file
     from beers_deploy.restoration.bands import parse_sensors
-    from beers_deploy.restoration.cog import require_stac, write_item
+    from beers_deploy.restoration.cog import write_item
     from beers_deploy.restoration.run import restore_file
     from beers_deploy.results import Table, print_rows
 
@@ -120,7 +116,7 @@ def restore(
     if stac is not None:
         if not cog:
             raise OptionError("--stac", expected="--cog beside it", got="none", remedy="add it, or leave --stac out")
-        require_stac()
+        optional("pystac", "--stac")
     if sensor is not None and conditioned(network) is None:
         expected, remedy = "a shipped network, or weights of 'train --conditioned'", "leave --sensor out"
         raise OptionError("--sensor", expected=expected, got=f"{network}, made for one already", remedy=remedy)

@@ -19,7 +19,7 @@ import onnx
 
 from beers_deploy.model.io.files import write_text
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.restoration.gdal_source import ENVIRONMENT, LEAST_CACHE_BYTES, OFFLINE, require_package
+from beers_deploy.restoration.gdal_source import ENVIRONMENT, LEAST_CACHE_BYTES, OFFLINE
 from beers_deploy.restoration.options import Compression
 from beers_deploy.restoration.output import padded_px
 from beers_deploy.restoration.radiometry import FullScale
@@ -30,11 +30,6 @@ BLOCK_PX = 512
 
 LONGITUDE_LATITUDE = "EPSG:4326"
 WHEN = "datetime is the time of the restoration: the image states no time of acquisition that is known here"
-
-
-def require_cog() -> None:
-    """Find out before the run that rasterio is missing."""
-    require_package("rasterio", "cog", "GDAL to write it")
 
 
 def what_was_done(networks: Sequence[onnx.ModelProto], digests: str, scale: FullScale) -> dict[str, str]:
@@ -82,12 +77,6 @@ def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[s
             import_module("rasterio.shutil").copy(plain, cog, driver="COG", **options)
     except Exception as error:  # rasterio has a class of its own for each of GDAL's
         raise OSError(" ".join(str(error.__cause__ or error).split())) from error
-
-
-def require_stac() -> None:
-    """Find out before the run that a package is missing."""
-    for package in ("rasterio", "pystac"):
-        require_package(package, "stac", "a package that writes it")
 
 
 def write_item(image: Path, path: Path) -> None:

@@ -29,7 +29,7 @@ from beers_deploy.profiles.toml import read_json
 from beers_deploy.restoration.engine import RestoredRow
 from beers_deploy.restoration.options import Compression
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.source import BIG_TIFF_SUFFIXES, RESTORED, RGB_BANDS, Source, Tag
+from beers_deploy.restoration.source import BIG_TIFF_SUFFIXES, RESTORED, RGB_BANDS, Source, Tag, strips
 
 
 def part_folder(out: Path) -> Path:
@@ -251,11 +251,11 @@ def write_output(
         checkpoint.remove()
 
 
-def _squares_of(strips: Iterator[np.ndarray], dtype: np.dtype[Any], compression: Compression) -> dict[str, Any]:
+def _squares_of(rows: Iterator[np.ndarray], dtype: np.dtype[Any], compression: Compression) -> dict[str, Any]:
     """What tifffile is told of a page's pixels, given as rows of squares."""
     by_zlib = compression is Compression.zlib and dtype.kind != "b"  # whose bits tifffile packs
     return {
-        "data": _packed(strips) if by_zlib else _tiles(strips),
+        "data": _packed(rows) if by_zlib else (square for strip in rows for square in _squares(strip)),
         "dtype": dtype,
         "tile": (TILE_PX, TILE_PX),
         "compression": compression.codec,
@@ -266,10 +266,10 @@ def _squares_of(strips: Iterator[np.ndarray], dtype: np.dtype[Any], compression:
     }
 
 
-def _packed(strips: Iterator[np.ndarray]) -> Iterator[bytes]:
-    """The squares of `_tiles` as zlib's streams, those of a strip packed side by side."""
+def _packed(rows: Iterator[np.ndarray]) -> Iterator[bytes]:
+    """Squares as zlib's streams, those of a strip packed side by side."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for strip in strips:
+        for strip in rows:
             yield from pool.map(_pack, _squares(strip))
 
 
@@ -283,12 +283,6 @@ def _pack(square: np.ndarray) -> bytes:
     return isal_zlib.compress(square.tobytes(), FAST_LEVEL)
 
 
-def _tiles(strips: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
-    """Squares in the order of the file, zeros beyond the image."""
-    for strip in strips:
-        yield from _squares(strip)
-
-
 def _squares(strip: np.ndarray) -> list[np.ndarray]:
     return np.hsplit(strip, strip.shape[1] // TILE_PX)
 
@@ -296,7 +290,7 @@ def _squares(strip: np.ndarray) -> list[np.ndarray]:
 def _strips(checkpoint: Checkpoint, source: Source) -> Iterator[np.ndarray]:
     """Rows of squares, (TILE_PX, whole squares) of every band, and of the image's alpha."""
     for band in range(checkpoint.shape[0]):
-        for top, bottom in _heights(checkpoint):
+        for top, bottom in strips(checkpoint.shape[1], TILE_PX):
             yield _whole_squares(checkpoint.read(band, top, bottom))
     if source.raster.has_alpha:
         yield from _veil(checkpoint, source)
@@ -307,16 +301,10 @@ def _veil(checkpoint: Checkpoint, source: Source) -> Iterator[np.ndarray]:
     scale, read = checkpoint.shape[2] // source.raster.width_px, source.veil
     if read is None:
         raise ValueError("no veil")
-    for top, bottom in _heights(checkpoint):
+    for top, bottom in strips(checkpoint.shape[1], TILE_PX):
         plane = read(top // scale, -(-bottom // scale))
         plane = plane.repeat(scale, axis=0)[top % scale :][: bottom - top].repeat(scale, axis=1)
         yield _whole_squares(plane != 0 if source.raster.veil == "mask" else plane.astype(checkpoint.dtype))
-
-
-def _heights(checkpoint: Checkpoint) -> Iterator[tuple[int, int]]:
-    """First row and the one behind the last of each strip."""
-    for top in range(0, checkpoint.shape[1], TILE_PX):
-        yield top, min(top + TILE_PX, checkpoint.shape[1])
 
 
 def _whole_squares(rows: np.ndarray) -> np.ndarray:
@@ -344,13 +332,13 @@ NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, ENOTSUP
 
 
 @contextmanager
-def only_run(out: Path, folder: Path | None = None) -> Iterator[None]:
+def only_run(out: Path) -> Iterator[None]:
     """Hold the folder where a run keeps what it needs for `out`; in the end it is gone, unless rows were left in it.
 
     Folders above it that were made for it are gone then, too, unless something was written there. It locks nothing on
     a disk that has no locks, as some of networks.
     """
-    folder = folder or part_folder(out)
+    folder = part_folder(out)
     new = [parent for parent in folder.parents if not parent.exists()]
     lock = _take(out, folder)
     try:

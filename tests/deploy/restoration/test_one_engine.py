@@ -13,8 +13,8 @@ from beers_deploy.library import restore
 from beers_deploy.network import shipped_pair
 from beers_deploy.profiles import load_sensor
 from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.restoration import function
-from beers_deploy.restoration.engine import restore_dn, restore_floats
+from beers_deploy.restoration import engine
+from beers_deploy.restoration.engine import network_method, restore_dn, restore_floats
 from beers_deploy.restoration.options import Options, Runtime
 from beers_deploy.restoration.plan import plan_for
 from beers_deploy.restoration.run import restore_file
@@ -36,7 +36,7 @@ SMALL_HALOS_PX = {"float": 2, "int8": 8}
 @pytest.fixture(params=TILES_PX)
 def precision(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Of the network; evaluate and the trade-off's scores take tiles so small that the image has many."""
-    monkeypatch.setattr(function, "TILE_PX", TILES_PX[request.param])
+    monkeypatch.setattr(engine, "TILE_PX", TILES_PX[request.param])
     return str(request.param)
 
 
@@ -117,7 +117,7 @@ def test_a_sensor_of_other_bits_has_its_own_full_scale(bits: int, model: Path, t
     dn = np.random.default_rng(3).integers(0, max_dn + 1, ODD).astype(np.uint16)
     network = load_onnx(model)
     expected = by_command(dn, tmp_path, Options(model, 23, full_scale=max_dn))
-    evaluated = function.network_method(network, max_dn)(dn.astype(np.float32))
+    evaluated = network_method(network, max_dn)(dn.astype(np.float32))
     np.testing.assert_array_equal(evaluated, expected)
     infer, _ = open_runtime(Runtime.onnxruntime, network, threads=0)
     plan = plan_for(network, (1, *ODD), Options(model, 23))

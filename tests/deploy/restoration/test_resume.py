@@ -117,7 +117,7 @@ def test_a_full_disk_is_one_sentence_and_loses_no_finished_row(
         sync(handle)
 
     if calls == 1000:
-        monkeypatch.setattr("beers_deploy.restoration.output._tiles", full)
+        monkeypatch.setattr("beers_deploy.restoration.output._squares", full)
     else:
         monkeypatch.setattr(os, "fsync", full)
     out.write_bytes(b"old")
