@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from beers_deploy.bench.tables import Swath
 
-EXAMPLE = "bench --target vck190-model --size 13600x9016 --dpu C32B3"
 
 PAPER_SIZE = "13600x9016"  # as in deploy.bench.tables, which is imported late
 BOARD_ONLY = (

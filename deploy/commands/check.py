@@ -9,8 +9,6 @@ from beers_deploy.commands.shared import RULED, Json, save, say
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.target import DEFAULT_TARGET, load_target
 
-EXAMPLE = "check network.onnx --target zcu102 --dpu B4096"
-
 
 def check(
     model: Annotated[

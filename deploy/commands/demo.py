@@ -9,8 +9,6 @@ from beers_deploy.commands.shared import Json, Seed, arguments, save, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
 
-EXAMPLE = "demo --out demo"
-
 
 def demo(
     image: Annotated[Path | None, typer.Option(help="Raw 12-bit image, or an 8-bit photograph as scene.")] = None,

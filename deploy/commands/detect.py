@@ -9,7 +9,6 @@ import typer
 from beers_deploy.commands.shared import Classes, Detector, Json, Reference, Seed, arguments, refuse, save, say
 from beers_deploy.profiles.figures import by_table
 
-EXAMPLE = "detect --images DIOR/ --split test --detector yolo11n.onnx --sensor dior-medium --out detection/"
 SENSORS = "dior-medium,dior-high"
 REPORT = "report.html"
 METHODS = "traditional,convbeers-s,convbeers-s-int8"

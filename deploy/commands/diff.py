@@ -10,8 +10,6 @@ from beers_deploy.commands.shared import Json, arguments, save, say
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-EXAMPLE = "diff before.json after.json --fail-on 'MAE>2%' --fail-on 'PSNR<-0.05'"
-
 
 def diff(
     before: Annotated[Path, typer.Argument(metavar="A.json", help="What a command wrote with --json.")],

@@ -9,8 +9,6 @@ from beers_deploy.commands.shared import Json, Lpips, Reference, Seed, save, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
 
-EXAMPLE = "evaluate --images aerial/ --methods degraded,traditional,convbeers-s,convbeers-s-int8 --out report/"
-
 
 def evaluate(
     images: Annotated[

@@ -12,8 +12,6 @@ from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 
-EXAMPLE = "export --network convbeers-s --out float.onnx"
-
 
 def export(
     context: typer.Context,

@@ -11,8 +11,6 @@ from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.target import DEFAULT_TARGET
 
-EXAMPLE = "gate float.onnx int8.onnx --max-mae 0.0007"
-
 
 def gate(
     float_model: FloatModel = None,

@@ -9,8 +9,6 @@ from beers_deploy.commands.shared import BOARDS, Json, refuse, save, say
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.target import DEFAULT_TARGET
 
-EXAMPLE = "golden int8.onnx --tile 64 --out golden"
-
 
 def golden(
     context: typer.Context,

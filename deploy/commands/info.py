@@ -12,8 +12,6 @@ from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX
 from beers_deploy.restoration.options import Options
 
-EXAMPLE = "info raw.jp2"
-
 
 def info(
     image: Annotated[Path, typer.Argument(metavar="FILE", help="Image, or the index of its tiles.")],

@@ -19,9 +19,6 @@ from beers_deploy.profiles.toml import profile_path, read_toml
 
 Row = tuple[str, ...]
 
-EXAMPLE = "profiles pleiades-degraded"
-CHARACTERISE_EXAMPLE = "characterise raw1.tif raw2.tif --bits 12 --out my-sensor.toml"
-
 
 def profiles(
     name: Annotated[

@@ -12,8 +12,6 @@ from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET
 
-EXAMPLE = "quantize float.onnx --target zcu104 --sensor pleiades-degraded --out int8.onnx"
-
 
 class Regime(StrEnum):
     """Under the rules of the target's DPU, or without them."""

@@ -16,7 +16,6 @@ from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.restoration.options import Compression, Options, Runtime
 
-EXAMPLE = "restore raw.tif restored.tif"
 NETWORK_ONLY = ("network", "tile", "halo", "resume", "runtime", "threads", "scheduler", "cog", "stac", "any_result")
 """Options of which the traditional chain takes none."""
 
@@ -99,12 +98,20 @@ def restore(
     profiles = (Path(each) for each in sensors.values()) if sensor else ()
     require_writable(out, json, stac, inputs=(image, network, *profiles))
     how = Options(
+        tile_px=tile,
+        halo=halo,
         full_scale=full_scale,
+        runtime=runtime,
+        threads=threads,
         compression=compression,
         memory_bytes=budget_bytes,
+        resume=resume,
+        scheduler=scheduler,
         trust_index=trust_index,
         strict=strict,
+        cog=cog,
         again=again,
+        any_result=any_result,
     )
     if method is Method.traditional:
         expected, remedy = "none with --method traditional", "leave it out"
@@ -131,21 +138,8 @@ def restore(
     if len(bits) > 1 and full_scale is None:
         remedy = "give --full-scale, or restore such bands apart"
         raise OptionError("--sensor", expected="sensors of equal bits", got=f"{sorted(bits)}", remedy=remedy)
-    options = replace(
-        how,
-        model=path,
-        tile_px=tile,
-        halo=halo,
-        runtime=runtime,
-        threads=threads,
-        resume=resume,
-        scheduler=scheduler,
-        sensors=known if sensor else {},
-        cog=cog,
-        any_result=any_result,
-        bands={} if "" in paths else paths,
-    )
-    row = restore_file(image, out, options, say, (json, stac))
+    how = replace(how, model=path, sensors=known if sensor else {}, bands={} if "" in paths else paths)
+    row = restore_file(image, out, how, say, (json, stac))
     if stac is not None:
         write_item(out, stac)
     print_rows(f"wrote {out}", [row])

@@ -16,7 +16,6 @@ from beers_deploy.profiles.sensor_file import reference_beside
 if TYPE_CHECKING:
     from beers_deploy.model.dataset import DatasetRecipe
 
-EXAMPLE = "simulate aerial.png --sensor pleiades-degraded --out pairs"
 
 MIN_RATIO = 2
 """Below it the blur's kernel has negative lobes of its own (0.7 % of its peak at 7 %)."""

@@ -16,8 +16,6 @@ from beers_deploy.profiles.target import DEFAULT_TARGET
 if TYPE_CHECKING:
     from beers_deploy.studies.stress.battery import StageResult
 
-EXAMPLE = "stress float.onnx int8.onnx --out stability.md"
-
 
 HARD_CASES_ONLY = ("cases", "stages")
 BIT_FLIPS_ONLY = ("draws", "images", "target")

@@ -11,7 +11,6 @@ from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor, reference_beside
 from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
 
-EXAMPLE = "tradeoff --images aerial/ --out study/ --budget 'latency<=20s'"
 PAPER_SIZE = "13600x9016"
 BOARDS = ", ".join(board_names())
 

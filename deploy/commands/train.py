@@ -9,7 +9,6 @@ import typer
 from beers_deploy.commands.shared import Lpips, Reference, Seed, refuse, say
 from beers_deploy.profiles.errors import OptionError
 
-EXAMPLE = "train --variant convbeers-s --images aerial/ --out runs/s --steps 20000"
 RANGE = "pleiades-variable"
 """The sensors of a network that is for no single one."""
 

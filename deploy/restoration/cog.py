@@ -8,7 +8,7 @@ done to the image goes into its metadata, beside what the image said of itself. 
 import json
 import os
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import import_module
 from importlib.metadata import version
@@ -94,10 +94,11 @@ def write_item(image: Path, path: Path) -> None:
         corners = _corners(file) if file.crs and not file.transform.is_identity else []
         done = {key.lower(): text for key, text in file.tags().items() if key.startswith("RESTORED_")}
         bands = [{"name": name or f"{k}"} for k, name in enumerate(file.descriptions, 1)]
+    sides = list(zip(*corners, strict=True))
     item = pystac.Item(
         id=image.stem,
         geometry={"type": "Polygon", "coordinates": [[*corners, corners[0]]]} if corners else None,
-        bbox=_box(corners) if corners else None,
+        bbox=[*map(min, sides), *map(max, sides)] or None,
         datetime=datetime.now(UTC),
         properties={"description": f"restored by beers-deploy; {WHEN}", **done},
     )
@@ -113,9 +114,3 @@ def _corners(file: Any) -> list[tuple[float, float]]:
     x, y = zip(*(file.transform @ place for place in places), strict=True)
     longitudes, latitudes = import_module("rasterio.warp").transform(file.crs, LONGITUDE_LATITUDE, x, y)
     return list(zip(longitudes, latitudes, strict=True))
-
-
-def _box(corners: Iterable[tuple[float, float]]) -> list[float]:
-    """West, south, east, north."""
-    longitudes, latitudes = zip(*corners, strict=True)
-    return [min(longitudes), min(latitudes), max(longitudes), max(latitudes)]

@@ -197,7 +197,7 @@ def require_tiff_name(path: Path) -> None:
 def require_codec(compression: Compression) -> None:
     """Find out before the run that a compression needs a package which is not installed."""
     try:
-        tifffile.imwrite(io.BytesIO(), np.zeros((16, 16), np.uint16), compression=compression.codec)
+        tifffile.imwrite(io.BytesIO(), np.zeros((16, 16), np.uint16), compression=compression.value)
     except (ValueError, KeyError, ImportError) as error:
         got, remedy = " ".join(str(error).split()), "pip install 'beers-deploy[codecs]' or use zlib"
         raise MissingExtraError("compression", expected="an installed codec", got=got, remedy=remedy) from error
@@ -258,7 +258,7 @@ def _squares_of(rows: Iterator[np.ndarray], dtype: np.dtype[Any], compression: C
         "data": _packed(rows) if by_zlib else (square for strip in rows for square in _squares(strip)),
         "dtype": dtype,
         "tile": (TILE_PX, TILE_PX),
-        "compression": compression.codec,
+        "compression": compression.value,
         "predictor": HORIZONTAL if by_zlib and dtype.kind == "u" else None,
         "maxworkers": os.cpu_count(),  # its own choice is half of them
         "metadata": None,

@@ -23,7 +23,7 @@ from beers_deploy.host_state import peak_memory
 from beers_deploy.model.io.files import require_writable
 from beers_deploy.model.io.images import require_image_file
 from beers_deploy.model.processor import require_cores
-from beers_deploy.model.progress import Log, held_back, steps
+from beers_deploy.model.progress import Log, held_back, no_log, steps
 from beers_deploy.profiles.errors import BeersError, MachineError, optional
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.quant.onnx_file import load_onnx
@@ -46,7 +46,9 @@ MANY = 0.05
 """Share of an image above its full scale that no scene has, but a wrong full scale."""
 
 
-def restore_file(image: Path, out: Path, options: Options, log: Log, beside: Sequence[Path | None] = ()) -> Row:
+def restore_file(
+    image: Path, out: Path, options: Options, log: Log = no_log, beside: Sequence[Path | None] = ()
+) -> Row:
     """Restore `image` into the TIFF `out`, and return the run's figures.
 
     Args:

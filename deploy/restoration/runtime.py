@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import version
 from threading import Lock, get_ident
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import onnx
@@ -15,7 +15,7 @@ from onnx import helper, numpy_helper
 
 from beers_deploy.cluster import Cluster
 from beers_deploy.model.processor import asked, require_cores
-from beers_deploy.profiles.errors import MachineError, ModelError, optional
+from beers_deploy.profiles.errors import ModelError, optional
 from beers_deploy.quant.kernels import is_integer, made_exact
 from beers_deploy.quant.onnx_file import parse_onnx
 from beers_deploy.quant.session import open_session, tensors_of
@@ -26,21 +26,14 @@ Infer = Callable[[np.ndarray], np.ndarray]
 
 LOWEST = "openvino.lowest_uint8"
 
-Precision = Literal["f32", "bf16"]
 
-
-def open_openvino(
-    model: onnx.ModelProto, threads: int, precision: Precision = "f32", at_once: int = 1
-) -> tuple[Callable[[np.ndarray], np.ndarray], str]:
-    """A callable (1, C, h, w) float32 -> (1, C', h', w') for `at_once` callers, and the runtime's version."""
+def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tuple[Infer, str]:
+    """As `open_runtime`."""
     openvino = optional("openvino", "runtime")
     openvino.Type.f32.to_dtype()  # fills a table: two threads that are its first callers lock each other up (2026.4)
     core = openvino.Core()
-    if precision == "bf16" and "BF16" not in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
-        remedy = "run it on a processor that has them"
-        raise MachineError("bfloat16", expected="a processor with bfloat16 units", got="none", remedy=remedy)
     # Said aloud: where the processor has bfloat16 units, OpenVINO would round to it unasked.
-    options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": str(at_once), "ENABLE_CPU_PINNING": False}
+    options = {"INFERENCE_PRECISION_HINT": "f32", "NUM_STREAMS": str(at_once), "ENABLE_CPU_PINNING": False}
     options |= {"INFERENCE_NUM_THREADS": str(threads)} if threads else {}
     exact = model if not is_integer(model) or _adds_exactly(core) else made_exact(model)[0]
     content = saturating_adds(exact).SerializeToString()
@@ -126,7 +119,7 @@ def open_runtime(runtime: Runtime, model: onnx.ModelProto, threads: int, at_once
     """
     require_cores("threads", threads)
     if runtime is Runtime.openvino:
-        return open_openvino(model, threads, at_once=at_once)
+        return open_openvino(model, threads, at_once)
     session = open_session(model, session_threads(threads, at_once))
     return lambda image: tensors_of(session, None, image)[0], f"onnxruntime {ort.__version__}"
 

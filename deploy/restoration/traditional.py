@@ -14,20 +14,19 @@ import torch
 from torch import Tensor
 
 from beers_deploy.host_state import peak_memory
-from beers_deploy.model.progress import Log, steps
+from beers_deploy.model.progress import Log, no_log, steps
 from beers_deploy.model.traditional.pipeline import Chain, restore_strips
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Row, measured
-from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.engine import RestoredRow, as_stored, checked_strip
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.output import Checkpoint, write_output
 from beers_deploy.restoration.plan import Span, check_memory
-from beers_deploy.restoration.radiometry import FullScale, full_scale_of
+from beers_deploy.restoration.radiometry import full_scale_of
 from beers_deploy.restoration.run import begun
-from beers_deploy.restoration.sensor_check import SensorCheck, told_sensor
-from beers_deploy.restoration.source import Raster, Source, fingerprint, strips
+from beers_deploy.restoration.sensor_check import told_sensor
+from beers_deploy.restoration.source import Source, fingerprint, strips
 
 STRIP_PX = 128
 """Rows read at a time."""
@@ -38,7 +37,7 @@ Measured at 400 and 1200 columns: 75 MB and 30 kB."""
 
 
 def restore_file_traditionally(
-    image: Path, out: Path, options: Options, log: Log, beside: Sequence[Path | None] = ()
+    image: Path, out: Path, options: Options, log: Log = no_log, beside: Sequence[Path | None] = ()
 ) -> Row:
     """As `deploy.restoration.run.restore_file`, of a mono image, by the traditional chain of its one sensor."""
     started, sensor = time.perf_counter(), options.sensors[""]
@@ -61,7 +60,16 @@ def restore_file_traditionally(
         except BaseException:  # a strip is no place to go on from: the chain looks hundreds of rows back
             checkpoint.remove()
             raise
-    return _row(image.name, raster, time.perf_counter() - started, sensor, scale, check)
+    time_s = time.perf_counter() - started
+    how = f"from opening the image to the finished file, {torch.get_num_threads()} threads"
+    figures = {
+        "time": measured(time_s, "s", how),
+        "throughput": measured(raster.height_px * raster.width_px / time_s / 1e6, "Mpx/s", how),
+        "peak memory": peak_memory(),
+        **check.figures,
+    }
+    text = {"method": "traditional", "sensor": sensor.name, **scale.text, **check.text}
+    return Row("restore", image.name, figures, text)
 
 
 def _fill(checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: float, name: str) -> None:
@@ -89,15 +97,3 @@ def _read(source: Source, to_dn: float, full_scale: float, name: str) -> Iterato
         if strip.missing is not None:
             dn[strip.missing[0]] = np.nan
         yield torch.from_numpy(dn)
-
-
-def _row(name: str, raster: Raster, time_s: float, sensor: Sensor, scale: FullScale, check: SensorCheck) -> Row:
-    source = f"from opening the image to the finished file, {torch.get_num_threads()} threads"
-    figures = {
-        "time": measured(time_s, "s", source),
-        "throughput": measured(raster.height_px * raster.width_px / time_s / 1e6, "Mpx/s", source),
-        "peak memory": peak_memory(),
-        **check.figures,
-    }
-    text = {"method": "traditional", "sensor": sensor.name, **scale.text, **check.text}
-    return Row("restore", name, figures, text)

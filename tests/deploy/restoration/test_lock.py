@@ -36,7 +36,7 @@ def begun(image: Path, out: Path) -> subprocess.Popen[str]:
 
 
 def restore(image: Path, out: Path, resume: bool = False) -> None:
-    restore_file(image, out, Options(shipped_pair(sensor=BLIND)[1], TILE_PX, resume=resume), lambda _: None)
+    restore_file(image, out, Options(shipped_pair(sensor=BLIND)[1], TILE_PX, resume=resume))
 
 
 @pytest.mark.slow
