@@ -167,7 +167,7 @@ def _refuse_unused(context: typer.Context, here: bool) -> None:
     expected, remedy = f"{wanted} beside it", f"leave it out, or take {wanted}"
     refuse(context, BOARD_ONLY if here else HOST_ONLY, expected=expected, got="the other target", remedy=remedy)
     if context.params["image"] is None:
-        refuse(context, ["full_scale"], expected="--image beside it", got="none", remedy="leave it out")
+        refuse(context, ["full_scale"], expected="--image beside it")
     else:
         refuse(context, ["size"], expected="none with --image", got="both", remedy="give one of the two")
 

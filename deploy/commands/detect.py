@@ -55,9 +55,9 @@ def detect(
     from beers_deploy.studies.detection.tables import MAIN, PAPER_TABLE, detection_rows, headline, paper_rows
 
     if images is None:
-        refuse(context, ["labels", "split"], expected="--images beside it", got="none", remedy="leave it out")
+        refuse(context, ["labels", "split"], expected="--images beside it")
     else:
-        refuse(context, ["drawn"], expected="synthetic scenes", got="--images beside it", remedy="leave it out")
+        refuse(context, ["drawn"], expected="synthetic scenes", got="--images beside it")
     names = list(dict.fromkeys(["degraded", *(name.strip() for name in methods.split(","))]))
     sensors = list(dict.fromkeys(name.strip() for name in sensor.split(",")))
     trees = [tree.rglob("*") for tree in (images, labels) if tree is not None and tree.is_dir()]

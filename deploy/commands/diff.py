@@ -53,13 +53,12 @@ def diff(
 
 def differing(before: "Mapping[str, object]", after: "Mapping[str, object]") -> list[str]:
     """What besides the code differs between two runs, a sentence each."""
-    notes = []
-    if before["command"] != after["command"]:
-        notes.append(f"note: another command: {before['command']}, {after['command']}")
-    if before["arguments"] != after["arguments"]:
-        notes.append("note: other arguments")
-    if before["inputs"] != after["inputs"]:
-        notes.append("note: other input files")
+    words = {
+        "command": f"another command: {before['command']}, {after['command']}",
+        "arguments": "other arguments",
+        "inputs": "other input files",
+    }
+    notes = [f"note: {said}" for key, said in words.items() if before[key] != after[key]]
     hosts: list[Mapping[str, object]] = [before["host"], after["host"]]  # type: ignore[list-item]
     if any(hosts[0][key] != hosts[1][key] for key in ("machine", "cpus", "memory_gb")):
         notes.append("note: another machine: measured times do not compare")

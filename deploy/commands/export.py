@@ -62,7 +62,7 @@ def export(
     read = [path, apply, *(Path(given) for given in (sensor, target) if given)]
     require_writable(out, board_file, delta, inputs=read)
     if board_file is None:
-        refuse(context, ["target"], expected="--board-file beside it", got="none", remedy="leave it out")
+        refuse(context, ["target"], expected="--board-file beside it")
     if path.suffix != ".onnx":
         remedy = "give one that 'quantize' made of weights of 'train --conditioned', or leave it out"
         asked = ["board_file", "delta", "apply"]

@@ -39,14 +39,14 @@ def golden(
     inputs = given, compare, Path(target)
     require_writable(json, out / "golden.json" if out else None, inputs=inputs, folders=(out,))
     if compare is None:
-        refuse(context, ("json",), expected="--compare beside it", got="none", remedy="leave it out, or compare")
+        refuse(context, ("json",), expected="--compare beside it", remedy="leave it out, or compare")
     if (out is None) == (compare is None):
         expected, remedy = "one of --out and --compare", "give the folder to write, or the folder to compare with"
         raise OptionError("out", expected=expected, got="both" if out else "none", remedy=remedy)
     if compare is None:
         say(f"wrote {write_golden(in_int8(given), cast('Path', out), tile=tile, board=target)}")
         return
-    refuse(context, ("tile", "target"), expected="none with --compare", got="one", remedy="leave it out")
+    refuse(context, ("tile", "target"), expected="none with --compare", got="one")
     found = compare_golden(compare, given)
     print_rows(f"{given.name} against {compare.name}", list(found.rows))
     save(found, json)

@@ -87,7 +87,7 @@ def quantize(
         raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
     page, figures = _report_files(report, model)
     if board_file is None:
-        refuse(context, ["tile"], expected="--board-file beside it", got="none", remedy="leave it out")
+        refuse(context, ["tile"], expected="--board-file beside it")
     read = (model, images, samples, *map(Path, (target, sensor)))
     require_writable(out, board_file, json, page, figures, inputs=read)
     require_onnx_name(out, board_file)

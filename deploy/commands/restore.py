@@ -114,8 +114,7 @@ def restore(
         any_result=any_result,
     )
     if method is Method.traditional:
-        expected, remedy = "none with --method traditional", "leave it out"
-        refuse(context, NETWORK_ONLY, expected=expected, got="one", remedy=remedy)
+        refuse(context, NETWORK_ONLY, expected="none with --method traditional", got="one")
         row = _by_the_chain(image, out, sensor, how, json)
         print_rows(f"wrote {out}", [row])
         save(Table("restore", arguments(), (image,), (row,)), json)

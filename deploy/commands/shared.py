@@ -51,7 +51,9 @@ Classes = Annotated[
 ]
 
 
-def refuse(context: typer.Context, names: Iterable[str], *, expected: str, got: str, remedy: str) -> None:
+def refuse(
+    context: typer.Context, names: Iterable[str], *, expected: str, got: str = "none", remedy: str = "leave it out"
+) -> None:
     """Refuse the first of these parameters to which the command line gives a value; 0 asks for nothing.
 
     Args:

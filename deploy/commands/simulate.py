@@ -76,7 +76,7 @@ def simulate(
 
     if out is None:
         expected, remedy = "--out beside it", "leave it out, or give a folder"
-        refuse(context, ["workers", "scheduler", "resume"], expected=expected, got="none", remedy=remedy)
+        refuse(context, ["workers", "scheduler", "resume"], expected=expected, remedy=remedy)
     if scheduler is not None:
         refuse(context, ["workers"], expected="none beside --scheduler", got="some", remedy="leave one of them out")
     require_cores("--workers", workers)

@@ -78,7 +78,7 @@ def tradeoff(
     if labelled is None:
         named = [name for name, asked in limits.items() if any(each.key == MAP50 for each in asked)]
         remedy = "give labelled pictures, or leave it out"
-        refuse(context, ["detector", "classes", *named], expected="--labelled beside it", got="none", remedy=remedy)
+        refuse(context, ["detector", "classes", *named], expected="--labelled beside it", remedy=remedy)
     names = [name for each in network or [ALL] for name in (shipped_names() if each == ALL else [each])]
     aim, boards = reference or REFERENCE, parse_targets(target)
     tree = labelled.rglob("*") if labelled else ()

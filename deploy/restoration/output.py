@@ -27,9 +27,10 @@ from beers_deploy.model.io.tiff import MASK
 from beers_deploy.profiles.errors import ImageError, MachineError, MissingExtraError, OptionError, sizes
 from beers_deploy.profiles.toml import read_json
 from beers_deploy.restoration.engine import RestoredRow
+from beers_deploy.restoration.georeference import enlarged_tags
 from beers_deploy.restoration.options import Compression
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.source import BIG_TIFF_SUFFIXES, RESTORED, RGB_BANDS, Source, Tag, strips
+from beers_deploy.restoration.source import BIG_TIFF_SUFFIXES, RESTORED, RGB_BANDS, Source, strips
 
 
 def part_folder(out: Path) -> Path:
@@ -211,7 +212,6 @@ ToCog = Callable[[Path, Path], None]
 def write_output(
     checkpoint: Checkpoint,
     source: Source,
-    tags: tuple[Tag, ...],
     compression: Compression,
     to_cog: ToCog | None = None,
 ) -> None:
@@ -220,7 +220,6 @@ def write_output(
     Args:
         checkpoint: with every row.
         source: the image, whose alpha or mask is written beside its bands as it is.
-        tags: of the image.
         compression: of the TIFF; none where it is on its way to be cloud-optimised.
         to_cog: writes the TIFF again, cloud-optimised; None leaves it as it is.
     """
@@ -235,7 +234,7 @@ def write_output(
                 planarconfig="separate" if planes > 1 else None,
                 extrasamples=(source.raster.veil,) if source.raster.has_alpha else None,
                 software=RESTORED,
-                extratags=tags,
+                extratags=enlarged_tags(source.raster.tags, checkpoint.shape[2] // source.raster.width_px),
                 **_squares_of(_strips(checkpoint, source), checkpoint.dtype, compression),
             )
             if source.raster.veil == "mask":

@@ -31,7 +31,7 @@ from beers_deploy.quant.reading.external import network_sha256
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.cog import disk_bytes, what_was_done, write_cog
 from beers_deploy.restoration.engine import RestoredRow, Restorer, restore_rows
-from beers_deploy.restoration.georeference import enlarged_tags, unread_places
+from beers_deploy.restoration.georeference import unread_places
 from beers_deploy.restoration.options import Compression, Options
 from beers_deploy.restoration.output import Checkpoint, only_run, require_codec, require_tiff_name, write_output
 from beers_deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
@@ -85,13 +85,9 @@ def restore_file(
         done_rows = checkpoint.rows // plan.scale
         _finish_rows(checkpoint, source, plan, restorer, at_once, options, log)
         with held_back():  # a stop now would save nothing
-            tags = enlarged_tags(raster.tags, plan.scale)
-            if options.cog:
-                about = what_was_done(networks, digests, scale)
-                to_cog = partial(write_cog, compression=options.compression, about=about)
-                write_output(checkpoint, source, tags, Compression.none, to_cog)
-            else:
-                write_output(checkpoint, source, tags, options.compression)
+            about = what_was_done(networks, digests, scale)
+            to_cog = partial(write_cog, compression=options.compression, about=about) if options.cog else None
+            write_output(checkpoint, source, Compression.none if to_cog else options.compression, to_cog)
     time_s, tally = time.perf_counter() - started, checkpoint.tally
     if tally.clipped:
         share = tally.clipped / prod(raster.shape)
@@ -220,29 +216,26 @@ def plan_figures(plan: Plan) -> dict[str, Figure]:
 
 
 def seam_figures(source: Source, plan: Plan, restorer: Restorer) -> dict[str, Figure]:
-    """The error of seams, where the halo leaves any."""
+    """The error of seams, where the halo leaves any: of a tile in the middle, in digital numbers.
+
+    The same kept pixels are restored twice: from the tile's own window, and from one with the whole radius around.
+    """
+    keys = "seam error max", "seam error mean"
     if plan.halo_px >= plan.radius_px or len(plan.rows) == len(plan.columns) == 1:
         return {}
     if plan.tiling.fixed_px is not None:
         reason = "the network is fixed to one tile size: no wider window to compare with"
-        return {key: unavailable("DN", reason) for key in ("seam error max", "seam error mean")}
-    largest, mean = seam_error_dn(source, plan, restorer)
-    how = f"the tile in the middle with a halo of {plan.halo_px} px against {plan.radius_px} px"
-    return {"seam error max": measured(largest, "DN", how), "seam error mean": measured(mean, "DN", how)}
-
-
-def seam_error_dn(source: Source, plan: Plan, restorer: Restorer) -> tuple[float, float]:
-    """Largest and mean difference of a tile in the middle from the exact result, in digital numbers.
-
-    The same kept pixels are restored twice: from the tile's own window, and from one with the whole radius around.
-    """
+        return dict.fromkeys(keys, unavailable("DN", reason))
     rows, columns = plan.rows[len(plan.rows) // 2], plan.columns[len(plan.columns) // 2]
     ends_px = plan.rows[-1].stop, plan.columns[-1].stop
     wide = [_widened(span, plan.radius_px, end_px) for span, end_px in zip((rows, columns), ends_px, strict=True)]
     strip = restorer.read(source, min(rows.start, wide[0].start), max(rows.stop, wide[0].stop))
     cheap, exact = (restorer.tile(strip, 0, *spans).pixels.astype(np.float64) for spans in ((rows, columns), wide))
     error = np.abs(np.nan_to_num(cheap) - np.nan_to_num(exact))
-    return float(error.max()), float(error.mean())
+    how = f"the tile in the middle with a halo of {plan.halo_px} px against {plan.radius_px} px"
+    return {
+        key: measured(float(each), "DN", how) for key, each in zip(keys, (error.max(), error.mean()), strict=True)
+    }
 
 
 def _widened(span: Span, radius_px: int, size_px: int) -> Span:

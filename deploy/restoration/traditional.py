@@ -56,7 +56,7 @@ def restore_file_traditionally(
         checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, resume=False)
         try:
             _fill(checkpoint, source, chain, scale.value, str(image))
-            write_output(checkpoint, source, raster.tags, options.compression)
+            write_output(checkpoint, source, options.compression)
         except BaseException:  # a strip is no place to go on from: the chain looks hundreds of rows back
             checkpoint.remove()
             raise
