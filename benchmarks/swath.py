@@ -84,7 +84,7 @@ def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -
             infer(window)
 
     def engine() -> None:
-        restore_file(image, folder / "out.tif", options, lambda _: None)
+        restore_file(image, folder / "out.tif", options)
 
     (bare_s, bare_cpu_s), (engine_s, engine_cpu_s) = fastest([bare, engine], repeats)
     print(

@@ -54,7 +54,7 @@ def ways(task: Task, monai_python: str | None) -> Iterator[dict[str, Run]]:
     """The engine first, then its peers, ready to run."""
 
     def engine() -> None:
-        restore_file(task.image, task.out("engine"), task.options, lambda _: None)
+        restore_file(task.image, task.out("engine"), task.options)
 
     runs: dict[str, Run] = {
         "engine": engine,

@@ -224,33 +224,39 @@ def _installation() -> Iterator[str]:
             yield f"{package}: not installed"
 
 
-def example(text: str) -> str:
-    """The example that ends a command's help."""
-    return f"Example:  [bold]beers-deploy {text}[/bold]"
-
-
 RESTORE, INT8, BOARDS, STUDY, TRAIN = "Restore", "Quantise and judge", "Boards", "Study", "Sensors and training"
 """Panels of the help."""
 
 COMMANDS: dict[str, tuple[Callable[..., None], str, str]] = {
-    "restore": (restore.restore, restore.EXAMPLE, RESTORE),
-    "info": (info.info, info.EXAMPLE, RESTORE),
-    "demo": (demo.demo, demo.EXAMPLE, RESTORE),
-    "export": (export.export, export.EXAMPLE, INT8),
-    "quantize": (quantize.quantize, quantize.EXAMPLE, INT8),
-    "gate": (gate.gate, gate.EXAMPLE, INT8),
-    "diff": (diff.diff, diff.EXAMPLE, INT8),
-    "check": (check.check, check.EXAMPLE, BOARDS),
-    "golden": (golden.golden, golden.EXAMPLE, BOARDS),
-    "bench": (bench.bench, bench.EXAMPLE, BOARDS),
-    "evaluate": (evaluate.evaluate, evaluate.EXAMPLE, STUDY),
-    "tradeoff": (tradeoff.tradeoff, tradeoff.EXAMPLE, STUDY),
-    "stress": (stress.stress, stress.EXAMPLE, STUDY),
-    "detect": (detect.detect, detect.EXAMPLE, STUDY),
-    "profiles": (profiles.profiles, profiles.EXAMPLE, TRAIN),
-    "characterise": (profiles.characterise, profiles.CHARACTERISE_EXAMPLE, TRAIN),
-    "simulate": (simulate.simulate, simulate.EXAMPLE, TRAIN),
-    "train": (train.train, train.EXAMPLE, TRAIN),
+    "restore": (restore.restore, "raw.tif restored.tif", RESTORE),
+    "info": (info.info, "raw.jp2", RESTORE),
+    "demo": (demo.demo, "--out demo", RESTORE),
+    "export": (export.export, "--network convbeers-s --out float.onnx", INT8),
+    "quantize": (quantize.quantize, "float.onnx --target zcu104 --sensor pleiades-degraded --out int8.onnx", INT8),
+    "gate": (gate.gate, "float.onnx int8.onnx --max-mae 0.0007", INT8),
+    "diff": (diff.diff, "before.json after.json --fail-on 'MAE>2%' --fail-on 'PSNR<-0.05'", INT8),
+    "check": (check.check, "network.onnx --target zcu102 --dpu B4096", BOARDS),
+    "golden": (golden.golden, "int8.onnx --tile 64 --out golden", BOARDS),
+    "bench": (bench.bench, "--target vck190-model --size 13600x9016 --dpu C32B3", BOARDS),
+    "evaluate": (
+        evaluate.evaluate,
+        "--images aerial/ --methods degraded,traditional,convbeers-s,convbeers-s-int8 --out report/",
+        STUDY,
+    ),
+    "tradeoff": (tradeoff.tradeoff, "--images aerial/ --out study/ --budget 'latency<=20s'", STUDY),
+    "stress": (stress.stress, "float.onnx int8.onnx --out stability.md", STUDY),
+    "detect": (
+        detect.detect,
+        "--images DIOR/ --split test --detector yolo11n.onnx --sensor dior-medium --out detection/",
+        STUDY,
+    ),
+    "profiles": (profiles.profiles, "pleiades-degraded", TRAIN),
+    "characterise": (profiles.characterise, "raw1.tif raw2.tif --bits 12 --out my-sensor.toml", TRAIN),
+    "simulate": (simulate.simulate, "aerial.png --sensor pleiades-degraded --out pairs", TRAIN),
+    "train": (train.train, "--variant convbeers-s --images aerial/ --out runs/s --steps 20000", TRAIN),
 }
-for name, (function, text, panel) in COMMANDS.items():
-    app.command(name, epilog=example(text), rich_help_panel=panel)(command(function))
+"""Of each verb its function, the words of an example, and its panel."""
+
+for name, (function, words, panel) in COMMANDS.items():
+    epilog = f"Example:  [bold]beers-deploy {name} {words}[/bold]"
+    app.command(name, epilog=epilog, rich_help_panel=panel)(command(function))

@@ -5,11 +5,10 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Executor, Future
 from contextlib import contextmanager
-from importlib import import_module
 from importlib.metadata import version
 from typing import Any, TypeVar
 
-from beers_deploy.profiles.errors import MachineError, MissingExtraError
+from beers_deploy.profiles.errors import MachineError, optional
 
 ANSWER_S, JOIN_S = 10, 30
 """How long a scheduler may take to answer, and a first worker to be there."""
@@ -67,7 +66,7 @@ def open_cluster(scheduler: str | None) -> Iterator[Cluster | None]:
     if scheduler is None:
         yield None
         return
-    distributed = _import_distributed()
+    distributed = optional("distributed", "scheduler")
     with _quiet(), _connect(distributed, scheduler) as client:
         _require_same_versions(client)
         try:
@@ -81,14 +80,6 @@ def open_cluster(scheduler: str | None) -> Iterator[Cluster | None]:
 def _lost(got: str, remedy: str) -> MachineError:
     remedy = f"{remedy}, and go on with `resume`"
     return MachineError("workers", expected="some that live to the end", got=got, remedy=remedy)
-
-
-def _import_distributed() -> Any:
-    try:
-        return import_module("distributed")
-    except ImportError as error:
-        got, remedy = "no package distributed", "pip install 'beers-deploy[dask]'"
-        raise MissingExtraError("scheduler", expected="Dask installed", got=got, remedy=remedy) from error
 
 
 def _connect(distributed: Any, address: str) -> Any:

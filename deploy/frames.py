@@ -20,6 +20,11 @@ def figures_of(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(key for row in rows for key in row.figures))
 
 
+def words_of(rows: Sequence[Row]) -> list[str]:
+    """The names of the plain words beside figures."""
+    return list(dict.fromkeys(word for row in rows for word in row.text))
+
+
 def _index(rows: Sequence[Row]) -> Any:
     pandas = optional("pandas", "to_pandas")
     if len({row.table for row in rows}) > 1:
@@ -33,12 +38,11 @@ def wide_frame(rows: Sequence[Row]) -> "pd.DataFrame":
     columns: dict[str, list[object]] = {}
     for key in figures_of(rows):
         columns[key] = [row.figures[key].value if key in row.figures else None for row in rows]
-    frame = pandas.DataFrame(columns, index=_index(rows), dtype=float)
-    for word in dict.fromkeys(word for row in rows for word in row.text if word not in columns):
+    frame: pd.DataFrame = pandas.DataFrame(columns, index=_index(rows), dtype=float)
+    for word in (each for each in words_of(rows) if each not in columns):
         frame[word] = [row.text.get(word, "") for row in rows]
     frame.attrs["units"] = {key: figure.unit for row in rows for key, figure in row.figures.items()}
-    found: pd.DataFrame = frame
-    return found
+    return frame
 
 
 def tidy_frame(rows: Sequence[Row]) -> "pd.DataFrame":
@@ -87,7 +91,7 @@ def bars(rows: Sequence[Row], figure: str | None, ax: "Axes | None") -> "Axes":
 
 def html_table(title: str, rows: Sequence[Row]) -> str:
     """One line a row; the mode behind a figure, its source (or why there is none) as its tooltip."""
-    keys, words = figures_of(rows), list(dict.fromkeys(word for row in rows for word in row.text))
+    keys, words = figures_of(rows), words_of(rows)
     units = {key: figure.unit for row in rows for key, figure in row.figures.items()}
     head = "".join(_cell("th", f"{key} ({units[key]})" if units[key] else key) for key in keys)
     head = _cell("th", title) + head + "".join(_cell("th", word) for word in words)

@@ -5,11 +5,10 @@ predicted only from tiles that were timed; time on the board is the cost model's
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 import onnx
@@ -21,20 +20,20 @@ from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.restoration.georeference import KEYS, PIXEL_SCALE, POLYNOMIALS, TIE_POINTS, TRANSFORMATION
+from beers_deploy.restoration.georeference import KEYS, PIXEL_SCALE, POLYNOMIALS, TIE_POINTS, TRANSFORMATION, geo_keys
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.plan import Plan, plan_for
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
+from beers_deploy.restoration.run import plan_figures
 from beers_deploy.restoration.runtime import open_runtime, tiles_at_once
 from beers_deploy.restoration.sensor_check import SensorCheck, told_sensor
 from beers_deploy.restoration.source import Raster, open_source
 
 HEADER = "the file's own header"
-ARITHMETIC = "arithmetic on the plan of tiles"
 PROJECTED, GEOGRAPHIC = 3072, 2048
 """Keys of GeoTIFF that hold an EPSG code (OGC 19-008r4, annex D)."""
 RUNS = 3
-UNPLACED = "none"
+UNTIMED = "no tile was timed here: --measure times some"
 
 
 def info_row(image: Path, options: Options, target: TargetProfile, measure: bool = False, log: Log = no_log) -> Row:
@@ -59,9 +58,8 @@ def info_row(image: Path, options: Options, target: TargetProfile, measure: bool
         "width": measured(raster.width_px, "px", HEADER),
         "height": measured(raster.height_px, "px", HEADER),
         "bands": measured(raster.bands, "1", HEADER),
-        "tiles": predicted(plan.tiles, "1", (plan.tiles, plan.tiles), ARITHMETIC),
-        "work factor": predicted(plan.work_factor, "1", (plan.work_factor, plan.work_factor), ARITHMETIC),
-        "time here": time_here(network, plan, options) if measure else _not_measured(),
+        **plan_figures(plan),
+        "time here": time_here(network, plan, options) if measure else unavailable("s", UNTIMED),
         f"time on {target.name}": time_on_board(options.model, plan, target),
         **check.figures,
     }
@@ -92,22 +90,18 @@ def place_words(raster: Raster) -> Mapping[str, str]:
     """Where the image lies, as its tags say it."""
     tags = {tag[0]: tag[3] for tag in raster.tags}
     placed = PIXEL_SCALE in tags or TRANSFORMATION in tags
-    words = {"georeference": f"{_code(tags.get(KEYS, ()))}" if placed or KEYS in tags else UNPLACED}
+    words = {"georeference": f"{_code(tags.get(KEYS, ()))}" if placed or KEYS in tags else "none"}
     if PIXEL_SCALE in tags and TIE_POINTS in tags:
         (right, down), (x, y) = tags[PIXEL_SCALE][:2], tags[TIE_POINTS][3:5]
         words["georeference"] += f", first corner ({x:.9g}, {y:.9g}), pixels of {right:.9g} x {down:.9g}"
     return words | {"rational polynomials": "yes" if POLYNOMIALS in tags else "none"}
 
 
-def _code(keys: Any) -> str:
-    """The coordinate system among GeoTIFF's keys: a head of four numbers, then four for each."""
-    values = {keys[k]: keys[k + 3] for k in range(4, len(keys) - 3, 4)}
+def _code(keys: Sequence[int]) -> str:
+    """The coordinate system among GeoTIFF's keys."""
+    values = geo_keys(keys)
     code = values.get(PROJECTED, values.get(GEOGRAPHIC))
     return f"EPSG:{code}" if code not in (None, 32767) else "a coordinate system without a code"
-
-
-def _not_measured() -> Figure:
-    return unavailable("s", "no tile was timed here: --measure times some")
 
 
 def time_here(network: onnx.ModelProto, plan: Plan, options: Options) -> Figure:

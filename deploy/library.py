@@ -29,7 +29,7 @@ from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Plan, Span, plan_for
 from beers_deploy.restoration.radiometry import full_scale_of
 from beers_deploy.restoration.run import restore_file, scale_of
-from beers_deploy.restoration.runtime import Packed, open_packed, open_runtime, pack, tiles_at_once
+from beers_deploy.restoration.runtime import Packed, open_runtime, tiles_at_once
 from beers_deploy.restoration.sensor_check import told_sensor
 from beers_deploy.restoration.source import (
     ArraySource,
@@ -343,7 +343,7 @@ def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
     network = load_onnx(options.model)
     plan = plan_for(network, raster.shape, options)
     settled_scale(NAME, raster.dtype, (), options.full_scale)  # what the type alone decides comes at once
-    packed = pack(network, options.runtime, options.threads or 1)
+    packed = Packed(network.SerializeToString(), options.runtime, options.threads or 1)
     task = delayed(Task(raster, packed, options.full_scale, plan.tiling))
     tile = delayed(restore_tile)
 

@@ -15,7 +15,7 @@ from rich.measure import Measurement
 from rich.text import Text
 
 from beers_deploy import __version__
-from beers_deploy.frames import bars, html_table, tidy_frame, wide_frame
+from beers_deploy.frames import bars, figures_of, html_table, tidy_frame, wide_frame, words_of
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.processor import decided, processor_name
 from beers_deploy.profiles.errors import printable, visible
@@ -71,6 +71,7 @@ class Table:
     def to_dict(self) -> dict[str, object]:
         """The whole as the schema of results documents wants it."""
         inputs = [each if isinstance(each, Input) else input_of(each) for each in self.inputs]
+        checks = [check.to_json() for check in self.checks]
         return {
             "schema": SCHEMA_NAME,
             "schema_version": SCHEMA_VERSION,
@@ -79,7 +80,7 @@ class Table:
             "arguments": {key: _plain(value) for key, value in self.arguments.items()},
             "inputs": [each._asdict() for each in inputs],
             "host": host(),
-            **_verdict(self.checks),
+            **({"verdict": "passed" if self else "failed", "checks": checks} if checks else {}),
             "rows": [
                 {
                     "table": row.table,
@@ -158,14 +159,6 @@ def host() -> dict[str, object]:
     }
 
 
-def _verdict(checks: tuple[Check, ...]) -> dict[str, object]:
-    """Nothing of a command that judges nothing."""
-    if not checks:
-        return {}
-    passed = all(check.passed for check in checks)
-    return {"verdict": "passed" if passed else "failed", "checks": [check.to_json() for check in checks]}
-
-
 def _plain(value: object) -> object:
     return value if isinstance(value, str | int | float | bool | type(None)) else str(value)
 
@@ -184,7 +177,7 @@ def print_rows(title: str, rows: Iterable[Row], console: Console | None = None) 
     """
     rows = list(rows)
     console = console or default_console()
-    keys = list(dict.fromkeys(key for row in rows for key in row.figures))
+    keys = figures_of(rows)
     table = by_figure(rows, keys) if len(keys) > len(rows) else by_row(rows, keys)
     # Measured on a wide console: on its own a table's least width never exceeds the console's.
     if Measurement.get(console, console.options.update(width=PIPE_WIDTH), table).minimum > console.width:
@@ -249,11 +242,6 @@ def one_by_one(rows: list[Row]) -> rich_table.Table:
         for number, line in enumerate([*figures, *words] or [()]):
             table.add_row(plain("" if number else row.name), *line)
     return table
-
-
-def words_of(rows: list[Row]) -> list[str]:
-    """The names of the plain words beside figures."""
-    return list(dict.fromkeys(word for row in rows for word in row.text))
 
 
 def unit_of(key: str, rows: list[Row]) -> str:

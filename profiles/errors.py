@@ -105,7 +105,17 @@ class OutsideRangeWarning(UserWarning):
     """A sensor that lies outside the range that a network was trained for; the command line prints it as a line."""
 
 
-EXTRAS = {"cyclonedx": "record", "matplotlib": "study", "pandas": "notebook", "skimage": "study", "torch": "torch"}
+EXTRAS = {
+    "cyclonedx": "record",
+    "distributed": "dask",
+    "matplotlib": "study",
+    "openvino": "openvino",
+    "pandas": "notebook",
+    "pystac": "gdal",
+    "rasterio": "gdal",
+    "skimage": "study",
+    "torch": "torch",
+}
 """The extra of beers-deploy that installs a package."""
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import arguments, refuse, save, say
+from beers_deploy.commands.shared import Json, arguments, refuse, save, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.errors import OptionError, missing_extra
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from beers_deploy.bench.tables import Swath
 
-EXAMPLE = "bench --target vck190-model --size 13600x9016 --dpu C32B3"
 
 PAPER_SIZE = "13600x9016"  # as in deploy.bench.tables, which is imported late
 BOARD_ONLY = (
@@ -99,7 +98,7 @@ def bench(
     ] = None,
     layers: Annotated[bool, typer.Option("--layers", help="Show where the time goes, layer by layer.")] = False,
     threads: Annotated[int, typer.Option(min=0, help="Threads of the host's runtime; 0 takes every core.")] = 0,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    json: Json = None,
 ) -> None:
     """Compare a network on the DPU with the traditional pipeline and with the paper's figures."""
     from beers_deploy.bench.board import bench_board
@@ -168,15 +167,13 @@ def _refuse_unused(context: typer.Context, here: bool) -> None:
     expected, remedy = f"{wanted} beside it", f"leave it out, or take {wanted}"
     refuse(context, BOARD_ONLY if here else HOST_ONLY, expected=expected, got="the other target", remedy=remedy)
     if context.params["image"] is None:
-        refuse(context, ["full_scale"], expected="--image beside it", got="none", remedy="leave it out")
+        refuse(context, ["full_scale"], expected="--image beside it")
     else:
         refuse(context, ["size"], expected="none with --image", got="both", remedy="give one of the two")
 
 
 def _single(tiles: list[int]) -> int:
-
     if len(tiles) > 1:
-        raise OptionError(
-            "--tile", expected="one size with --target host", got=str(tiles), remedy="run it once a size"
-        )
+        expected, remedy = "one size with --target host", "run it once a size"
+        raise OptionError("--tile", expected=expected, got=str(tiles), remedy=remedy)
     return tiles[0]

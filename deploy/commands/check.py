@@ -5,11 +5,9 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import RULED, save, say
+from beers_deploy.commands.shared import RULED, Json, save, say
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.target import DEFAULT_TARGET, load_target
-
-EXAMPLE = "check network.onnx --target zcu102 --dpu B4096"
 
 
 def check(
@@ -30,7 +28,7 @@ def check(
     picture: Annotated[
         Path | None, typer.Option(help="Draw the graph here, coloured by device: a .svg or .html file.")
     ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    json: Json = None,
 ) -> None:
     """Place every node of a network on the host, the DPU or the CPU; exit code 1 if the DPU cannot run its part.
 

@@ -5,12 +5,9 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import arguments, save, say
-from beers_deploy.model.processor import SEEDS
+from beers_deploy.commands.shared import Json, Seed, arguments, save, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
-
-EXAMPLE = "demo --out demo"
 
 
 def demo(
@@ -23,8 +20,8 @@ def demo(
         str, typer.Option(help="Of the raw image, or to simulate: a profile's name or your .toml file, 12 bits.")
     ] = SENSOR,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for report and files.")] = Path("demo"),
-    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    seed: Seed = 0,
+    json: Json = None,
 ) -> None:
     """Simulate, quantise, gate, check, restore and predict, on a drawn scene or your image; ends with report.html."""
     from beers_deploy.model.io.files import require_writable

@@ -6,11 +6,9 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import arguments, refuse, save, say
-from beers_deploy.model.processor import SEEDS
+from beers_deploy.commands.shared import Classes, Detector, Json, Reference, Seed, arguments, refuse, save, say
 from beers_deploy.profiles.figures import by_table
 
-EXAMPLE = "detect --images DIOR/ --split test --detector yolo11n.onnx --sensor dior-medium --out detection/"
 SENSORS = "dior-medium,dior-high"
 REPORT = "report.html"
 METHODS = "traditional,convbeers-s,convbeers-s-int8"
@@ -26,28 +24,21 @@ def detect(
         Path | None, typer.Option(help="Folder of their labels (VOC, YOLO) or COCO's .json; beside them if none.")
     ] = None,
     split: Annotated[str | None, typer.Option(help="Pictures that a list of the folder names, such as test.")] = None,
-    detector: Annotated[
-        Path | None, typer.Option(help="ONNX as Ultralytics exports it; the embedded one if none.")
-    ] = None,
+    detector: Detector = None,
     sensor: Annotated[
         str, typer.Option(help="Profiles of the degraded images, names or .toml files with commas.")
     ] = SENSORS,
-    reference: Annotated[
-        str | None,
-        typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."),
-    ] = None,
+    reference: Reference = None,
     methods: Annotated[str, typer.Option(help="Names, with commas; degraded is always a row.")] = METHODS,
     side: Annotated[
         int | None,
         typer.Option(min=32, max=4096, help="Side of the detector's input, where its file leaves it open."),
     ] = None,
-    classes: Annotated[
-        str | None, typer.Option(help="Labelled classes under the detector's names: car=vehicle,minibus=vehicle.")
-    ] = None,
+    classes: Classes = None,
     drawn: Annotated[int, typer.Option(min=2, max=10_000, help="Synthetic scenes, without --images.")] = DRAWN,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for report.html.")] = Path("detection"),
-    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    seed: Seed = 0,
+    json: Json = None,
 ) -> None:
     """Show a detector the same scenes as the reference sees them, degraded and restored, and score what it finds.
 
@@ -64,9 +55,9 @@ def detect(
     from beers_deploy.studies.detection.tables import MAIN, PAPER_TABLE, detection_rows, headline, paper_rows
 
     if images is None:
-        refuse(context, ["labels", "split"], expected="--images beside it", got="none", remedy="leave it out")
+        refuse(context, ["labels", "split"], expected="--images beside it")
     else:
-        refuse(context, ["drawn"], expected="synthetic scenes", got="--images beside it", remedy="leave it out")
+        refuse(context, ["drawn"], expected="synthetic scenes", got="--images beside it")
     names = list(dict.fromkeys(["degraded", *(name.strip() for name in methods.split(","))]))
     sensors = list(dict.fromkeys(name.strip() for name in sensor.split(",")))
     trees = [tree.rglob("*") for tree in (images, labels) if tree is not None and tree.is_dir()]

@@ -5,12 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import arguments, save, say
+from beers_deploy.commands.shared import Json, arguments, save, say
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-EXAMPLE = "diff before.json after.json --fail-on 'MAE>2%' --fail-on 'PSNR<-0.05'"
 
 
 def diff(
@@ -20,7 +18,7 @@ def diff(
         list[str] | None,
         typer.Option(metavar="CHANGE", help="NAME>CHANGE or NAME<CHANGE, in the figure's unit or in %; repeatable."),
     ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    json: Json = None,
 ) -> None:
     """Show which figures of two results documents differ; exit code 1 if one changed more than --fail-on allows.
 
@@ -55,13 +53,12 @@ def diff(
 
 def differing(before: "Mapping[str, object]", after: "Mapping[str, object]") -> list[str]:
     """What besides the code differs between two runs, a sentence each."""
-    notes = []
-    if before["command"] != after["command"]:
-        notes.append(f"note: another command: {before['command']}, {after['command']}")
-    if before["arguments"] != after["arguments"]:
-        notes.append("note: other arguments")
-    if before["inputs"] != after["inputs"]:
-        notes.append("note: other input files")
+    words = {
+        "command": f"another command: {before['command']}, {after['command']}",
+        "arguments": "other arguments",
+        "inputs": "other input files",
+    }
+    notes = [f"note: {said}" for key, said in words.items() if before[key] != after[key]]
     hosts: list[Mapping[str, object]] = [before["host"], after["host"]]  # type: ignore[list-item]
     if any(hosts[0][key] != hosts[1][key] for key in ("machine", "cpus", "memory_gb")):
         notes.append("note: another machine: measured times do not compare")

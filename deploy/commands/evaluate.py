@@ -5,12 +5,9 @@ from typing import Annotated, Any
 
 import typer
 
-from beers_deploy.commands.shared import save, say
-from beers_deploy.model.processor import SEEDS
+from beers_deploy.commands.shared import Json, Lpips, Reference, Seed, save, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
-
-EXAMPLE = "evaluate --images aerial/ --methods degraded,traditional,convbeers-s,convbeers-s-int8 --out report/"
 
 
 def evaluate(
@@ -24,16 +21,11 @@ def evaluate(
         str | None,
         typer.Option(help=f"Profile of the degraded images; of pairs the recipe's, else {SENSOR} if none."),
     ] = None,
-    reference: Annotated[
-        str | None,
-        typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."),
-    ] = None,
+    reference: Reference = None,
     methods: Annotated[
         str, typer.Option(help="Names, separated by commas.")
     ] = "degraded,traditional,deconvolve-first,convbeers-s,convbeers-s-int8",
-    lpips: Annotated[
-        Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.")
-    ] = None,
+    lpips: Lpips = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for report.html and pictures.")] = None,
     sweep: Annotated[
         bool, typer.Option("--sweep", help="Also under 16 sensors known as they are, and 7 known wrongly.")
@@ -41,8 +33,8 @@ def evaluate(
     strict: Annotated[
         bool, typer.Option("--strict", help="Refuse pairs whose pixels contradict the sensor, instead of saying so.")
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    seed: Seed = 0,
+    json: Json = None,
 ) -> None:
     """Compare restorations with the reference, on average and by site; the degraded input is always a row.
 

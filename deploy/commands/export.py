@@ -12,8 +12,6 @@ from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 
-EXAMPLE = "export --network convbeers-s --out float.onnx"
-
 
 def export(
     context: typer.Context,
@@ -66,7 +64,7 @@ def export(
     read = [path, apply, *(Path(given) for given in (sensor, target) if given)]
     require_writable(out, board_file, delta, inputs=read)
     if board_file is None:
-        refuse(context, ["target"], expected="--board-file beside it", got="none", remedy="leave it out")
+        refuse(context, ["target"], expected="--board-file beside it")
     if path.suffix != ".onnx":
         remedy = "give one that 'quantize' made of weights of 'train --conditioned', or leave it out"
         asked = ["board_file", "delta", "apply"]
@@ -106,17 +104,7 @@ def _export_int8(
     delta: Path | None,
     apply: Path | None,
 ) -> None:
-    """Write an INT8 file told a sensor, or the sensor of a delta.
-
-    Args:
-        path: of any sensor's file.
-        out: the host's.
-        sensor: that is told; the default one if None.
-        tile_px: side of an image that the files are fixed to; None leaves them as they are.
-        board: where the same integers go in the board's encoding, or None; and the board.
-        delta: what the sensor changes, or None.
-        apply: a delta that is told in place of a sensor, or None.
-    """
+    """Write an INT8 file told a sensor, or that of a delta; `board` is where its integers go, if anywhere."""
     from beers_deploy.export import require_tile
     from beers_deploy.model.io.files import whole_file
     from beers_deploy.network import Network, told_by_delta, told_int8

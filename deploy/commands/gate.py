@@ -6,23 +6,15 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import RULED, STDOUT, arguments, save, say
-from beers_deploy.model.processor import SEEDS
+from beers_deploy.commands.shared import RULED, STDOUT, FloatModel, Int8Model, Json, Seed, arguments, save, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.target import DEFAULT_TARGET
 
-EXAMPLE = "gate float.onnx int8.onnx --max-mae 0.0007"
-
 
 def gate(
-    float_model: Annotated[
-        Path | None,
-        typer.Argument(metavar="[FLOAT]", help="Float ONNX or weights; or a shipped name, convbeers-s if none."),
-    ] = None,
-    int8_model: Annotated[
-        Path | None, typer.Argument(metavar="[INT8]", help="Its INT8 ONNX; that of a shipped name if none.")
-    ] = None,
+    float_model: FloatModel = None,
+    int8_model: Int8Model = None,
     max_mae: Annotated[
         float | None, typer.Option(min=0, help="Largest mean absolute difference, of full scale; 0.0007 if none.")
     ] = None,
@@ -43,12 +35,12 @@ def gate(
     metric: Annotated[
         str | None, typer.Option(help="Hold results against references too: psnr, ssim, mae, top1 or iou.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
+    seed: Seed = 0,
     junit: Annotated[Path | None, typer.Option(help="Write the verdict here as JUnit XML.")] = None,
     record: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for a record of evidence: JSON, a page and an ML-BOM.")
     ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    json: Json = None,
 ) -> None:
     """Compare a float and an INT8 network on simulated pairs neither was calibrated on.
 

@@ -5,11 +5,9 @@ from typing import Annotated, cast
 
 import typer
 
-from beers_deploy.commands.shared import BOARDS, refuse, save, say
+from beers_deploy.commands.shared import BOARDS, Json, refuse, save, say
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.target import DEFAULT_TARGET
-
-EXAMPLE = "golden int8.onnx --tile 64 --out golden"
 
 
 def golden(
@@ -26,7 +24,7 @@ def golden(
         int | None, typer.Option(min=1, max=4096, help="Tile side in pixels; the network's own, else 64.")
     ] = None,
     target: Annotated[str, typer.Option(help=f"Whose way to round ties is taken: {BOARDS}.")] = DEFAULT_TARGET,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    json: Json = None,
 ) -> None:
     """Write the inputs and the exact int8 tensors of every layer, or compare with them what a board wrote.
 
@@ -41,14 +39,14 @@ def golden(
     inputs = given, compare, Path(target)
     require_writable(json, out / "golden.json" if out else None, inputs=inputs, folders=(out,))
     if compare is None:
-        refuse(context, ("json",), expected="--compare beside it", got="none", remedy="leave it out, or compare")
+        refuse(context, ("json",), expected="--compare beside it", remedy="leave it out, or compare")
     if (out is None) == (compare is None):
         expected, remedy = "one of --out and --compare", "give the folder to write, or the folder to compare with"
         raise OptionError("out", expected=expected, got="both" if out else "none", remedy=remedy)
     if compare is None:
         say(f"wrote {write_golden(in_int8(given), cast('Path', out), tile=tile, board=target)}")
         return
-    refuse(context, ("tile", "target"), expected="none with --compare", got="one", remedy="leave it out")
+    refuse(context, ("tile", "target"), expected="none with --compare", got="one")
     found = compare_golden(compare, given)
     print_rows(f"{given.name} against {compare.name}", list(found.rows))
     save(found, json)

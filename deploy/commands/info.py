@@ -6,38 +6,32 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import arguments, save, say
+from beers_deploy.commands.shared import Json, Restoring, Tile, TrustIndex, arguments, save, say
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX
 from beers_deploy.restoration.options import Options
 
-EXAMPLE = "info raw.jp2"
-
 
 def info(
     image: Annotated[Path, typer.Argument(metavar="FILE", help="Image, or the index of its tiles.")],
-    network: Annotated[
-        Path | None, typer.Option(help="ONNX network, or a shipped one's name; convbeers-s-int8 if none.")
-    ] = None,
+    network: Restoring = None,
     sensor: Annotated[
         str | None, typer.Option(help="The sensor of FILE, a profile's name or your .toml file; blind if none.")
     ] = None,
     full_scale: Annotated[
         float | None, typer.Option(help="Pixel value that is full scale; else what FILE or --sensor states.")
     ] = None,
-    tile: Annotated[int, typer.Option(min=16, help="Longest side of a tile in pixels.")] = TILE_PX,
+    tile: Tile = TILE_PX,
     target: Annotated[
         str, typer.Option(help="The modelled board whose time is predicted, or your .toml file.")
     ] = DEFAULT_TARGET,
-    trust_index: Annotated[
-        bool, typer.Option("--trust-index", help="Let a VRT or DIMAP name tiles outside its folder and at URLs.")
-    ] = False,
+    trust_index: TrustIndex = False,
     strict: Annotated[
         bool, typer.Option("--strict", help="Refuse FILE whose pixels contradict --sensor, instead of saying so.")
     ] = False,
     measure: Annotated[bool, typer.Option("--measure", help="Time some tiles here, and predict the whole.")] = False,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    json: Json = None,
 ) -> None:
     """Say what an image is, how it would be cut and how long that would take.
 

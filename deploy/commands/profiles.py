@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import arguments, save, say
+from beers_deploy.commands.shared import Json, arguments, save, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles import Sensor, load_sensor, load_target, sensor_names, target_names
 from beers_deploy.profiles.constant import Constant, Words
@@ -18,9 +18,6 @@ from beers_deploy.profiles.sensor import TABLES, constant_keys
 from beers_deploy.profiles.toml import profile_path, read_toml
 
 Row = tuple[str, ...]
-
-EXAMPLE = "profiles pleiades-degraded"
-CHARACTERISE_EXAMPLE = "characterise raw1.tif raw2.tif --bits 12 --out my-sensor.toml"
 
 
 def profiles(
@@ -129,7 +126,7 @@ def characterise(
         float | None, typer.Option(help="DN per W/m2/sr/um; full scale is taken for 400 W/m2/sr/um if none.")
     ] = None,
     gsd: Annotated[float | None, typer.Option(help="Ground sampling distance in m; no pixel depends on it.")] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    json: Json = None,
 ) -> None:
     """Measure MTF and noise on raw images and write them as a sensor profile, for every --sensor.
 

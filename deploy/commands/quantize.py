@@ -6,14 +6,11 @@ from typing import Annotated, Any
 
 import typer
 
-from beers_deploy.commands.shared import RULED, arguments, board_for, refuse, save, save_core, say
-from beers_deploy.model.processor import SEEDS
+from beers_deploy.commands.shared import RULED, Json, Seed, arguments, board_for, refuse, save, save_core, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET
-
-EXAMPLE = "quantize float.onnx --target zcu104 --sensor pleiades-degraded --out int8.onnx"
 
 
 class Regime(StrEnum):
@@ -66,8 +63,8 @@ def quantize(
             help="Steps that train the INT8 numbers on --images or --samples; 'auto': minutes, while it helps."
         ),
     ] = "0",
-    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    seed: Seed = 0,
+    json: Json = None,
 ) -> None:
     """Quantise to int8 with power-of-two scales: the correction on the DPU, the 12-bit add on the host.
 
@@ -75,7 +72,6 @@ def quantize(
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.network import conditioned
     from beers_deploy.profiles.figures import by_table
     from beers_deploy.quant.encodings import read_core
     from beers_deploy.quant.onnx_file import require_onnx_name
@@ -86,13 +82,12 @@ def quantize(
     from beers_deploy.verdict import compare
 
     free = regime is Regime.free
-    _require_legal(free and bool(board_file or report or steps_of(finetune) != 0))
-    if report and conditioned(model):
-        expected, remedy = "a network that is calibrated by itself", "leave it out"
-        raise OptionError("--report", expected=expected, got="one behind a bank", remedy=remedy)
+    if free and (board_file or report or steps_of(finetune) != 0):
+        expected, remedy = "no --board-file, --report or --finetune", "leave it out, or take --regime legal"
+        raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
+    page, figures = _report_files(report, model)
     if board_file is None:
-        refuse(context, ["tile"], expected="--board-file beside it", got="none", remedy="leave it out")
-    page, figures = _report_files(report)
+        refuse(context, ["tile"], expected="--board-file beside it")
     read = (model, images, samples, *map(Path, (target, sensor)))
     require_writable(out, board_file, json, page, figures, inputs=read)
     require_onnx_name(out, board_file)
@@ -124,17 +119,14 @@ def quantize(
         save(document, path)
 
 
-def _require_legal(asked: bool) -> None:
-    """Refuse what was asked of the regime "free" and belongs to the other."""
-    if asked:
-        remedy = "leave it out, or take --regime legal"
-        expected = "no --board-file, --report or --finetune"
-        raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
-
-
-def _report_files(folder: Path | None) -> tuple[Path, Path] | tuple[None, None]:
+def _report_files(folder: Path | None, model: Path) -> tuple[Path, Path] | tuple[None, None]:
     """The page and the figures of --report, which matplotlib draws."""
+    from beers_deploy.network import conditioned
+
     if folder is None:
         return None, None
+    if conditioned(model):
+        expected, remedy = "a network that is calibrated by itself", "leave it out"
+        raise OptionError("--report", expected=expected, got="one behind a bank", remedy=remedy)
     optional("matplotlib", "--report")
     return folder / "report.html", folder / "report.json"

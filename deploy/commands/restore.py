@@ -8,15 +8,14 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import arguments, refuse, save, say
+from beers_deploy.commands.shared import Json, Restoring, Tile, TrustIndex, arguments, refuse, save, say
 from beers_deploy.profiles import load_sensor
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.restoration.options import Compression, Options, Runtime
 
-EXAMPLE = "restore raw.tif restored.tif"
 NETWORK_ONLY = ("network", "tile", "halo", "resume", "runtime", "threads", "scheduler", "cog", "stac", "any_result")
 """Options of which the traditional chain takes none."""
 
@@ -32,9 +31,7 @@ def restore(
     context: typer.Context,
     image: Annotated[Path, typer.Argument(metavar="IN", help="Image: TIFF or what GDAL reads, of any size, or PNG.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="TIFF to write, of the type of IN.")],
-    network: Annotated[
-        Path | None, typer.Option(help="ONNX network, or a shipped one's name; convbeers-s-int8 if none.")
-    ] = None,
+    network: Restoring = None,
     method: Annotated[Method, typer.Option(help="A network, or the traditional chain of --sensor.")] = Method.network,
     sensor: Annotated[
         str | None,
@@ -43,7 +40,7 @@ def restore(
             "B0=a.toml,B1=b.toml for each band; blind if none."
         ),
     ] = None,
-    tile: Annotated[int, typer.Option(min=16, help="Longest side of a tile in pixels.")] = TILE_PX,
+    tile: Tile = TILE_PX,
     halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
     full_scale: Annotated[
         float | None,
@@ -67,9 +64,7 @@ def restore(
         bool, typer.Option("--cog", help="Write OUT as a Cloud-Optimised GeoTIFF: tiles, overviews, what was done.")
     ] = False,
     stac: Annotated[Path | None, typer.Option(help="Write a STAC item of OUT here; with --cog.")] = None,
-    trust_index: Annotated[
-        bool, typer.Option("--trust-index", help="Let a VRT or DIMAP name tiles outside its folder and at URLs.")
-    ] = False,
+    trust_index: TrustIndex = False,
     again: Annotated[bool, typer.Option("--again", help="Restore an image that 'restore' has written.")] = False,
     any_result: Annotated[
         bool, typer.Option("--any-result", help="Write OUT even if it is clipped, constant or far from IN's mean.")
@@ -78,7 +73,7 @@ def restore(
         bool, typer.Option("--strict", help="Refuse IN whose pixels contradict --sensor, instead of saying so.")
     ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped or killed.")] = False,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    json: Json = None,
 ) -> None:
     """Restore an image tile by tile; with the exact halo the result is the whole image's, bit for bit.
 
@@ -94,7 +89,7 @@ def restore(
     from beers_deploy.model.shipped import INT8
     from beers_deploy.network import conditioned, network_file
     from beers_deploy.restoration.bands import parse_sensors
-    from beers_deploy.restoration.cog import require_stac, write_item
+    from beers_deploy.restoration.cog import write_item
     from beers_deploy.restoration.run import restore_file
     from beers_deploy.results import Table, print_rows
 
@@ -103,16 +98,23 @@ def restore(
     profiles = (Path(each) for each in sensors.values()) if sensor else ()
     require_writable(out, json, stac, inputs=(image, network, *profiles))
     how = Options(
+        tile_px=tile,
+        halo=halo,
         full_scale=full_scale,
+        runtime=runtime,
+        threads=threads,
         compression=compression,
         memory_bytes=budget_bytes,
+        resume=resume,
+        scheduler=scheduler,
         trust_index=trust_index,
         strict=strict,
+        cog=cog,
         again=again,
+        any_result=any_result,
     )
     if method is Method.traditional:
-        expected, remedy = "none with --method traditional", "leave it out"
-        refuse(context, NETWORK_ONLY, expected=expected, got="one", remedy=remedy)
+        refuse(context, NETWORK_ONLY, expected="none with --method traditional", got="one")
         row = _by_the_chain(image, out, sensor, how, json)
         print_rows(f"wrote {out}", [row])
         save(Table("restore", arguments(), (image,), (row,)), json)
@@ -120,7 +122,7 @@ def restore(
     if stac is not None:
         if not cog:
             raise OptionError("--stac", expected="--cog beside it", got="none", remedy="add it, or leave --stac out")
-        require_stac()
+        optional("pystac", "--stac")
     if sensor is not None and conditioned(network) is None:
         expected, remedy = "a shipped network, or weights of 'train --conditioned'", "leave --sensor out"
         raise OptionError("--sensor", expected=expected, got=f"{network}, made for one already", remedy=remedy)
@@ -135,21 +137,8 @@ def restore(
     if len(bits) > 1 and full_scale is None:
         remedy = "give --full-scale, or restore such bands apart"
         raise OptionError("--sensor", expected="sensors of equal bits", got=f"{sorted(bits)}", remedy=remedy)
-    options = replace(
-        how,
-        model=path,
-        tile_px=tile,
-        halo=halo,
-        runtime=runtime,
-        threads=threads,
-        resume=resume,
-        scheduler=scheduler,
-        sensors=known if sensor else {},
-        cog=cog,
-        any_result=any_result,
-        bands={} if "" in paths else paths,
-    )
-    row = restore_file(image, out, options, say, (json, stac))
+    how = replace(how, model=path, sensors=known if sensor else {}, bands={} if "" in paths else paths)
+    row = restore_file(image, out, how, say, (json, stac))
     if stac is not None:
         write_item(out, stac)
     print_rows(f"wrote {out}", [row])

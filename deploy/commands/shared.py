@@ -1,4 +1,4 @@
-"""What all commands share: how they print besides tables, and how they refuse options that would do nothing."""
+"""What commands share: options that several take, lines they print, how they refuse what does nothing."""
 
 import json
 import sys
@@ -7,10 +7,11 @@ from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, Annotated, TextIO
 
 import typer
 
+from beers_deploy.model.processor import SEEDS
 from beers_deploy.profiles.errors import OptionError, visible
 from beers_deploy.profiles.target import TargetProfile, board_names, load_target, npu_names
 
@@ -22,8 +23,37 @@ OR_YOURS = "or your .toml file"
 BOARDS, RULED = (", ".join([*names, OR_YOURS]) for names in (board_names(), board_names() + npu_names()))
 """What --target takes, for its help: where something is predicted, and where rules alone are asked for."""
 
+Json = Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")]
+Seed = Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")]
+Tile = Annotated[int, typer.Option(min=16, help="Longest side of a tile in pixels.")]
+Restoring = Annotated[
+    Path | None, typer.Option(help="ONNX network, or a shipped one's name; convbeers-s-int8 if none.")
+]
+TrustIndex = Annotated[
+    bool, typer.Option("--trust-index", help="Let a VRT or DIMAP name tiles outside its folder and at URLs.")
+]
+FloatModel = Annotated[
+    Path | None,
+    typer.Argument(metavar="[FLOAT]", help="Float ONNX or weights; or a shipped name, convbeers-s if none."),
+]
+Int8Model = Annotated[
+    Path | None, typer.Argument(metavar="[INT8]", help="Its INT8 ONNX; that of a shipped name if none.")
+]
+Reference = Annotated[
+    str | None, typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none.")
+]
+Lpips = Annotated[
+    Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.")
+]
+Detector = Annotated[Path | None, typer.Option(help="ONNX as Ultralytics exports it; the embedded one if none.")]
+Classes = Annotated[
+    str | None, typer.Option(help="Labelled classes under the detector's names: car=vehicle,minibus=vehicle.")
+]
 
-def refuse(context: typer.Context, names: Iterable[str], *, expected: str, got: str, remedy: str) -> None:
+
+def refuse(
+    context: typer.Context, names: Iterable[str], *, expected: str, got: str = "none", remedy: str = "leave it out"
+) -> None:
     """Refuse the first of these parameters to which the command line gives a value; 0 asks for nothing.
 
     Args:

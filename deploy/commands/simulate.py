@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import refuse, say
-from beers_deploy.model.processor import SEEDS
+from beers_deploy.commands.shared import Reference, Seed, refuse, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError
@@ -17,7 +16,6 @@ from beers_deploy.profiles.sensor_file import reference_beside
 if TYPE_CHECKING:
     from beers_deploy.model.dataset import DatasetRecipe
 
-EXAMPLE = "simulate aerial.png --sensor pleiades-degraded --out pairs"
 
 MIN_RATIO = 2
 """Below it the blur's kernel has negative lobes of its own (0.7 % of its peak at 7 %)."""
@@ -39,10 +37,7 @@ def simulate(
     ] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder of the dataset.")] = None,
     sensor: Annotated[str | None, typer.Option(help=f"Profile of the degraded images; {SENSOR} if none.")] = None,
-    reference: Annotated[
-        str | None,
-        typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."),
-    ] = None,
+    reference: Reference = None,
     preset: Annotated[str | None, typer.Option(help=f"A dataset of the paper: {', '.join(PRESETS)}.")] = None,
     patch: Annotated[
         int | None, typer.Option(min=8, max=8192, help="Patch side in pixels; whole scenes if none.")
@@ -63,7 +58,7 @@ def simulate(
     scheduler: Annotated[
         str | None, typer.Option(help="Dask scheduler whose workers simulate, such as tcp://host:8786.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
+    seed: Seed = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an unfinished dataset.")] = False,
 ) -> None:
     """Write degraded/NAME.tif and reference/NAME.tif for each scene or patch; the same bytes for the same seed.
@@ -81,7 +76,7 @@ def simulate(
 
     if out is None:
         expected, remedy = "--out beside it", "leave it out, or give a folder"
-        refuse(context, ["workers", "scheduler", "resume"], expected=expected, got="none", remedy=remedy)
+        refuse(context, ["workers", "scheduler", "resume"], expected=expected, remedy=remedy)
     if scheduler is not None:
         refuse(context, ["workers"], expected="none beside --scheduler", got="some", remedy="leave one of them out")
     require_cores("--workers", workers)

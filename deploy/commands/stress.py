@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import BOARDS, arguments, refuse, save, say
-from beers_deploy.model.processor import SEEDS
+from beers_deploy.commands.shared import BOARDS, FloatModel, Int8Model, Json, Seed, arguments, refuse, save, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.profiles.sensor_file import load_sensor
@@ -17,8 +16,6 @@ from beers_deploy.profiles.target import DEFAULT_TARGET
 if TYPE_CHECKING:
     from beers_deploy.studies.stress.battery import StageResult
 
-EXAMPLE = "stress float.onnx int8.onnx --out stability.md"
-
 
 HARD_CASES_ONLY = ("cases", "stages")
 BIT_FLIPS_ONLY = ("draws", "images", "target")
@@ -26,19 +23,14 @@ BIT_FLIPS_ONLY = ("draws", "images", "target")
 
 def stress(
     context: typer.Context,
-    float_model: Annotated[
-        Path | None,
-        typer.Argument(metavar="[FLOAT]", help="Float ONNX or weights; or a shipped name, convbeers-s if none."),
-    ] = None,
-    int8_model: Annotated[
-        Path | None, typer.Argument(metavar="[INT8]", help="Its INT8 ONNX; that of a shipped name if none.")
-    ] = None,
+    float_model: FloatModel = None,
+    int8_model: Int8Model = None,
     cases: Annotated[str | None, typer.Option(help="Only these cases, with commas: 'night,snow'.")] = None,
     stages: Annotated[str | None, typer.Option(help="Only these stages, with commas: 'float32,INT8'.")] = None,
     side: Annotated[
         int, typer.Option(min=16, max=4096, help="Side in pixels, where a case has none of its own.")
     ] = 96,
-    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
+    seed: Seed = 0,
     bit_flips: Annotated[
         bool,
         typer.Option("--bit-flips", help="Inject bit flips into the INT8 network instead of running hard cases."),
@@ -59,7 +51,7 @@ def stress(
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Tables as Markdown; with --bit-flips the curves beside it.")
     ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    json: Json = None,
 ) -> None:
     """Run hard cases through a network in float32, in INT8, in whole numbers alone and in tiles.
 

@@ -6,13 +6,11 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import refuse, save, say
-from beers_deploy.model.processor import SEEDS
+from beers_deploy.commands.shared import Classes, Detector, Json, Lpips, Reference, Seed, refuse, save, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor, reference_beside
 from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
 
-EXAMPLE = "tradeoff --images aerial/ --out study/ --budget 'latency<=20s'"
 PAPER_SIZE = "13600x9016"
 BOARDS = ", ".join(board_names())
 
@@ -24,10 +22,7 @@ def tradeoff(
         Path | None, typer.Option(help="Folder of held-out scenes to simulate from; drawn ones if none.")
     ] = None,
     sensor: Annotated[str, typer.Option(help="Profile of the degraded images.")] = SENSOR,
-    reference: Annotated[
-        str | None,
-        typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."),
-    ] = None,
+    reference: Reference = None,
     network: Annotated[
         list[str] | None,
         typer.Option(
@@ -41,9 +36,7 @@ def tradeoff(
     need: Annotated[
         str | None, typer.Option(help="What you must reach: 'psnr>=44'. Without a budget the least latency wins.")
     ] = None,
-    lpips: Annotated[
-        Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.")
-    ] = None,
+    lpips: Lpips = None,
     calibration: Annotated[
         Path | None, typer.Option(help="Folder of scenes to quantise your networks on; drawn ones if none.")
     ] = None,
@@ -53,12 +46,8 @@ def tradeoff(
             help="Folder of labelled pictures, as detect reads them: what a detector finds is a figure too."
         ),
     ] = None,
-    detector: Annotated[
-        Path | None, typer.Option(help="ONNX as Ultralytics exports it; the embedded one if none.")
-    ] = None,
-    classes: Annotated[
-        str | None, typer.Option(help="Labelled classes under the detector's names: car=vehicle,minibus=vehicle.")
-    ] = None,
+    detector: Detector = None,
+    classes: Classes = None,
     target: Annotated[
         str,
         typer.Option(
@@ -67,8 +56,8 @@ def tradeoff(
         ),
     ] = DEFAULT_TARGET,
     size: Annotated[str, typer.Option(help="Width x height of the swath in pixels.")] = PAPER_SIZE,
-    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
-    json: Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")] = None,
+    seed: Seed = 0,
+    json: Json = None,
 ) -> None:
     """Measure networks and traditional chains on the same images, predict their runs on a board, recommend a point.
 
@@ -89,7 +78,7 @@ def tradeoff(
     if labelled is None:
         named = [name for name, asked in limits.items() if any(each.key == MAP50 for each in asked)]
         remedy = "give labelled pictures, or leave it out"
-        refuse(context, ["detector", "classes", *named], expected="--labelled beside it", got="none", remedy=remedy)
+        refuse(context, ["detector", "classes", *named], expected="--labelled beside it", remedy=remedy)
     names = [name for each in network or [ALL] for name in (shipped_names() if each == ALL else [each])]
     aim, boards = reference or REFERENCE, parse_targets(target)
     tree = labelled.rglob("*") if labelled else ()

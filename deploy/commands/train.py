@@ -6,11 +6,9 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import refuse, say
-from beers_deploy.model.processor import SEEDS
+from beers_deploy.commands.shared import Lpips, Reference, Seed, refuse, say
 from beers_deploy.profiles.errors import OptionError
 
-EXAMPLE = "train --variant convbeers-s --images aerial/ --out runs/s --steps 20000"
 RANGE = "pleiades-variable"
 """The sensors of a network that is for no single one."""
 
@@ -38,10 +36,7 @@ def train(
         bool,
         typer.Option("--conditioned", help="Draw sensors of a wide range with that gain, and condition on each."),
     ] = False,
-    reference: Annotated[
-        str | None,
-        typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."),
-    ] = None,
+    reference: Reference = None,
     drawn: Annotated[int, typer.Option(min=0, max=1000, help="Drawn scenes to add to the images.")] = 0,
     steps: Annotated[int, typer.Option(min=1, help="Gradient steps.")] = 20_000,
     batch: Annotated[int, typer.Option(min=1, max=4096, help="Patches a step and worker.")] = 8,
@@ -53,14 +48,12 @@ def train(
     psnr_weight: Annotated[
         float, typer.Option(min=0, help="Weight of the patches' mean PSNR in the loss; 0.01 without L1.")
     ] = 0.0,
-    lpips: Annotated[
-        Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.")
-    ] = None,
+    lpips: Lpips = None,
     start: Annotated[
         Path | None, typer.Option(help="Weights to go on from; those of a smaller network grow.")
     ] = None,
     validate_every: Annotated[int, typer.Option(min=0, help="Steps between validations; 0 for none.")] = 1000,
-    seed: Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")] = 0,
+    seed: Seed = 0,
     device: Annotated[str, typer.Option(help="cpu, or cuda.")] = "cpu",
     precision: Annotated[
         Precision, typer.Option(help="Of the body's convolutions; bfloat16 is faster where there are units for it.")

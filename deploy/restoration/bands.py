@@ -5,7 +5,6 @@ given.
 """
 
 import re
-import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -14,7 +13,7 @@ import onnx
 
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.tiling.walk import tiling_of
-from beers_deploy.restoration.index_files import NoDoctype
+from beers_deploy.restoration.index_files import parse_xml
 from beers_deploy.restoration.source import Raster
 
 Each = TypeVar("Each")
@@ -39,8 +38,8 @@ def band_names(raster: Raster) -> tuple[str, ...]:
     """The names of an image's bands, as GDAL keeps them in a TIFF; empty where any has none."""
     text = next((str(tag[3]) for tag in raster.tags if tag[0] == METADATA_TAG), "")
     try:
-        root = ET.fromstring(text, ET.XMLParser(target=NoDoctype()))  # noqa: S314 - no document type, no entities
-    except (ET.ParseError, ValueError, RecursionError):
+        root = parse_xml(text)
+    except (ValueError, LookupError, RecursionError):
         return ()
     found = {item.get("sample"): item.text or "" for item in root.iter("Item") if item.get("role") == "description"}
     names = tuple(found.get(str(band), "") for band in range(raster.bands))

@@ -8,7 +8,7 @@ done to the image goes into its metadata, beside what the image said of itself. 
 import json
 import os
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import import_module
 from importlib.metadata import version
@@ -19,7 +19,7 @@ import onnx
 
 from beers_deploy.model.io.files import write_text
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.restoration.gdal_source import ENVIRONMENT, LEAST_CACHE_BYTES, OFFLINE, require_package
+from beers_deploy.restoration.gdal_source import ENVIRONMENT, LEAST_CACHE_BYTES, OFFLINE
 from beers_deploy.restoration.options import Compression
 from beers_deploy.restoration.output import padded_px
 from beers_deploy.restoration.radiometry import FullScale
@@ -30,11 +30,6 @@ BLOCK_PX = 512
 
 LONGITUDE_LATITUDE = "EPSG:4326"
 WHEN = "datetime is the time of the restoration: the image states no time of acquisition that is known here"
-
-
-def require_cog() -> None:
-    """Find out before the run that rasterio is missing."""
-    require_package("rasterio", "cog", "GDAL to write it")
 
 
 def what_was_done(networks: Sequence[onnx.ModelProto], digests: str, scale: FullScale) -> dict[str, str]:
@@ -84,12 +79,6 @@ def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[s
         raise OSError(" ".join(str(error.__cause__ or error).split())) from error
 
 
-def require_stac() -> None:
-    """Find out before the run that a package is missing."""
-    for package in ("rasterio", "pystac"):
-        require_package(package, "stac", "a package that writes it")
-
-
 def write_item(image: Path, path: Path) -> None:
     """Write the item of a Cloud-Optimised GeoTIFF that this tool has written, as JSON.
 
@@ -105,10 +94,11 @@ def write_item(image: Path, path: Path) -> None:
         corners = _corners(file) if file.crs and not file.transform.is_identity else []
         done = {key.lower(): text for key, text in file.tags().items() if key.startswith("RESTORED_")}
         bands = [{"name": name or f"{k}"} for k, name in enumerate(file.descriptions, 1)]
+    sides = list(zip(*corners, strict=True))
     item = pystac.Item(
         id=image.stem,
         geometry={"type": "Polygon", "coordinates": [[*corners, corners[0]]]} if corners else None,
-        bbox=_box(corners) if corners else None,
+        bbox=[*map(min, sides), *map(max, sides)] or None,
         datetime=datetime.now(UTC),
         properties={"description": f"restored by beers-deploy; {WHEN}", **done},
     )
@@ -124,9 +114,3 @@ def _corners(file: Any) -> list[tuple[float, float]]:
     x, y = zip(*(file.transform @ place for place in places), strict=True)
     longitudes, latitudes = import_module("rasterio.warp").transform(file.crs, LONGITUDE_LATITUDE, x, y)
     return list(zip(longitudes, latitudes, strict=True))
-
-
-def _box(corners: Iterable[tuple[float, float]]) -> list[float]:
-    """West, south, east, north."""
-    longitudes, latitudes = zip(*corners, strict=True)
-    return [min(longitudes), min(latitudes), max(longitudes), max(latitudes)]

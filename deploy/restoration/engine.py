@@ -12,22 +12,26 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import onnx
 
 from beers_deploy.model.io.images import remedy_outside
 from beers_deploy.profiles.errors import ImageError, ModelError
 from beers_deploy.profiles.sensor import MAX_DN
-from beers_deploy.quant.tiling.walk import Tiling
+from beers_deploy.profiles.target import TILE_PX
+from beers_deploy.quant.tiling.walk import Tiling, tiling_of
 from beers_deploy.quant.untrusted import times
+from beers_deploy.restoration.options import Runtime
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.plan import Plan, Span
+from beers_deploy.restoration.plan import Plan, Span, make_plan
 from beers_deploy.restoration.radiometry import require_room
-from beers_deploy.restoration.runtime import Infer
+from beers_deploy.restoration.runtime import Infer, open_runtime
 from beers_deploy.restoration.source import ArraySource, Raster, Source
 
 NAME = "image"
 """What messages call an image that came without a file."""
 
-
+Restore = Callable[[np.ndarray], np.ndarray]
+"""Degraded digital numbers (H, W) float32 to restored ones."""
 Window = tuple[slice, slice, slice]
 """Bands, rows and columns of an array."""
 
@@ -343,3 +347,18 @@ def restore_floats(dn: np.ndarray, infer: Infer, plan: Plan, max_dn: float = MAX
 def restore_dn(dn: np.ndarray, infer: Infer, plan: Plan, max_dn: float = MAX_DN) -> np.ndarray:
     """Restore (H, W) digital numbers of 0 to `max_dn` to whole ones, float32: what `restore` writes of integers."""
     return np.asarray(np.rint(restore_floats(dn, infer, plan, max_dn)))
+
+
+def network_method(model: onnx.ModelProto, max_dn: int) -> Restore:
+    """A network as a method: digital numbers of 0 to `max_dn` become whole ones, as `restore` writes them.
+
+    Tiles are the default ones, or those the network is fixed to.
+    """
+    infer, _ = open_runtime(Runtime.onnxruntime, model, threads=0)
+    tiling = tiling_of(model)
+
+    def restore(dn: np.ndarray) -> np.ndarray:
+        plan = make_plan((1, *dn.shape), tiling.fixed_px or TILE_PX, tiling.halo_px, tiling)
+        return restore_dn(dn, infer, plan, max_dn)
+
+    return restore

@@ -10,7 +10,6 @@ import os
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ import numpy as np
 import tifffile
 
 from beers_deploy.model.io.tiff import require_small_offset
-from beers_deploy.profiles.errors import BeersError, ImageError, MissingExtraError
+from beers_deploy.profiles.errors import BeersError, ImageError, optional
 from beers_deploy.restoration.index_files import dimap_bits, index_files, is_index
 from beers_deploy.restoration.source import (
     GDAL_DRIVERS,
@@ -48,15 +47,6 @@ OFFLINE = {"CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "{none}"}
 logging.getLogger("rasterio").addHandler(logging.NullHandler())  # who asks for its remarks still has them
 
 
-def require_package(name: str, where: str, expected: str, instead: str = "") -> Any:
-    """An optional package of the extra gdal."""
-    try:
-        return import_module(name)
-    except ImportError as error:
-        got, remedy = f"no package {name}", f"pip install 'beers-deploy[gdal]'{instead}"
-        raise MissingExtraError(where, expected=expected, got=got, remedy=remedy) from error
-
-
 @contextmanager
 def open_gdal(path: Path, trusted: bool = False) -> Iterator[Source]:
     """Open an image of a suffix in `GDAL_DRIVERS` for reading by rows.
@@ -65,7 +55,7 @@ def open_gdal(path: Path, trusted: bool = False) -> Iterator[Source]:
         path: of the file or the index.
         trusted: as in `index_files`.
     """
-    rasterio = require_package("rasterio", str(path), "GDAL to read it", ", or convert it to TIFF")
+    rasterio = optional("rasterio", str(path))
     files = path, *index_files(path, trusted)
     tiles = [file for file in files[1:] if not is_index(file)]
     environment = ENVIRONMENT if trusted else ENVIRONMENT | OFFLINE
@@ -81,7 +71,7 @@ def open_gdal(path: Path, trusted: bool = False) -> Iterator[Source]:
         if "alpha" in flags:
             yield VeiledSource(source, "unassalpha")
         elif "per_dataset" in flags:
-            yield VeiledSource(source, "mask", GdalMask(source))
+            yield VeiledSource(source, "mask", source.read_mask)
         else:
             yield source
 
@@ -137,21 +127,6 @@ class GdalSource:
         """GDAL's cache: the blocks around the rows, so that none is decoded for two strips."""
         row_bytes = self.raster.bands * self.raster.width_px * self.raster.dtype.itemsize
         return int(max(LEAST_CACHE_BYTES, (rows_px + 2 * self._block_px) * row_bytes))
-
-
-@dataclass(frozen=True)
-class GdalMask:
-    """The mask of an image, as rows."""
-
-    source: GdalSource
-
-    def read(self, start: int, stop: int) -> np.ndarray:
-        """Rows `start` to `stop` (excluded), (1, rows, width) uint8."""
-        return self.source.read_mask(start, stop)
-
-    def held_bytes(self, rows_px: int) -> int:  # noqa: ARG002
-        """Nothing beside GDAL's cache, which the image counts."""
-        return 0
 
 
 def _raster(path: Path, dataset: Any) -> Raster:

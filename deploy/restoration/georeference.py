@@ -5,7 +5,6 @@ polynomials, and GeoTIFF's where the raster is of points) move by the half pixel
 """
 
 import math
-import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 
 from beers_deploy.model.io.tiff import number_of, require_small_offset
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.restoration.index_files import NoDoctype
+from beers_deploy.restoration.index_files import read_xml
 from beers_deploy.restoration.source import NODATA_TAG, Raster, Tag, usable_nodata
 
 PIXEL_SCALE, TIE_POINTS, TRANSFORMATION, KEYS, POLYNOMIALS = 33550, 33922, 34264, 34735, 50844
@@ -28,14 +27,13 @@ def enlarged_tags(tags: tuple[Tag, ...], scale: int) -> tuple[Tag, ...]:
     if scale == 1:
         return tags
     values = {tag[0]: tag[3] for tag in tags}
-    points = _is_of_points(values.get(KEYS, ()))
+    points = geo_keys(values.get(KEYS, ())).get(RASTER_TYPE) == POINTS
     return tuple((tag[0], tag[1], tag[2], _enlarged(tag[0], tag[3], scale, points), tag[4]) for tag in tags)
 
 
-def _is_of_points(keys: Any) -> bool:
-    """The keys are a head of four numbers, and four for each: code, place of the value, count, value."""
-    found = [tuple(keys[k : k + 4]) for k in range(4, len(keys), 4)]
-    return any(key[0] == RASTER_TYPE and key[-1] == POINTS for key in found)
+def geo_keys(keys: Sequence[int]) -> dict[int, int]:
+    """GeoTIFF's keys: a head of four numbers, and four for each: code, place of the value, count, value."""
+    return {keys[k]: keys[k + 3] for k in range(4, len(keys) - 3, 4)}
 
 
 def _enlarged(code: int, value: Any, scale: int, points: bool) -> Any:
@@ -82,7 +80,8 @@ def of_sidecar(path: Path, raster: Raster) -> Raster:
     beside = path.with_name(f"{path.name}.aux.xml")
     if not beside.is_file():
         return raster
-    name, bands = str(beside), list(_metadata(beside).iter("PAMRasterBand"))
+    root = read_xml(beside, AUX_BYTES, "metadata as GDAL writes it", "write it again, or remove it")
+    name, bands = str(beside), list(root.iter("PAMRasterBand"))
     for band in bands:
         offset, scale = (number_of(band.findtext(key, ""), usual) for key, usual in (("Offset", 0), ("Scale", 1)))
         require_small_offset(name, offset, scale)
@@ -94,16 +93,6 @@ def of_sidecar(path: Path, raster: Raster) -> Raster:
     if nodata is None:
         return raster
     return replace(raster, nodata=nodata, tags=(*raster.tags, (NODATA_TAG, 2, 0, f"{nodata:.17g}", True)))
-
-
-def _metadata(path: Path) -> ET.Element:
-    try:
-        if path.stat().st_size > AUX_BYTES:
-            raise ValueError(f"more than {AUX_BYTES >> 20} MiB")
-        return ET.fromstring(path.read_bytes(), ET.XMLParser(target=NoDoctype()))  # noqa: S314 - no document type
-    except (ET.ParseError, ValueError, RecursionError) as error:
-        got, remedy = " ".join(str(error).split())[:120], "write it again, or remove it"
-        raise ImageError(str(path), expected="metadata as GDAL writes it", got=got, remedy=remedy) from error
 
 
 def unread_places(path: Path, raster: Raster) -> list[str]:

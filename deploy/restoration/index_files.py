@@ -31,12 +31,38 @@ DIMAP_PATHS = {PIXELS, "component_path"}
 """GDAL compares names of elements without regard to case."""
 
 
-class NoDoctype(ET.TreeBuilder):
+class _NoDoctype(ET.TreeBuilder):
     """A tree of untrusted XML: entities are declared in a document type; with none, nothing can be expanded."""
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:  # noqa: ARG002
         """Refuse it."""
         raise ValueError("a document type, which may declare entities")
+
+
+def parse_xml(content: str | bytes) -> ET.Element:
+    """The root of untrusted XML; a ValueError, LookupError or RecursionError where it is none.
+
+    With entities a file of a hundred bytes could grow to gigabytes: a document type is refused.
+    """
+    try:
+        return ET.fromstring(content, ET.XMLParser(target=_NoDoctype()))  # noqa: S314 - without one no entities
+    except ET.ParseError as error:
+        raise ValueError(str(error)) from error
+
+
+def read_xml(path: Path, limit_bytes: int, expected: str, remedy: str) -> ET.Element:
+    """The root of a file of untrusted XML, of at most `limit_bytes`.
+
+    Args:
+        path: of the file.
+        limit_bytes: more is refused.
+        expected: for the message where it is none.
+        remedy: for the message, too.
+    """
+    try:
+        return parse_xml(read_whole(path, limit_bytes))
+    except (ValueError, LookupError, OSError, RecursionError) as error:  # lookup: of an encoding
+        raise _refused(path, expected, getattr(error, "strerror", None) or str(error), remedy) from error
 
 
 def is_index(path: Path) -> bool:
@@ -89,14 +115,10 @@ def _require_pixels(index: Path, text: str, file: Path) -> None:
 
 
 def _parsed(path: Path) -> ET.Element:
-    try:
-        parser = ET.XMLParser(target=NoDoctype())  # noqa: S314 - without a document type there are no entities
-        root = ET.fromstring(read_whole(path, INDEX_BYTES), parser)  # noqa: S314
-        if path.suffix.lower() == ".vrt" and root.tag != VRT:
-            raise ValueError(f"a document that is no {VRT}")
-    except (ET.ParseError, ValueError, LookupError, OSError, RecursionError) as error:  # lookup: of an encoding
-        got = getattr(error, "strerror", None) or str(error)
-        raise _refused(path, "a VRT or a DIMAP, plain XML", got, "write it again") from error
+    expected, remedy = "a VRT or a DIMAP, plain XML", "write it again"
+    root = read_xml(path, INDEX_BYTES, expected, remedy)
+    if path.suffix.lower() == ".vrt" and root.tag != VRT:
+        raise _refused(path, expected, f"a document that is no {VRT}", remedy)
     return root
 
 

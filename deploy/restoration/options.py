@@ -18,17 +18,12 @@ class Runtime(StrEnum):
 
 
 class Compression(StrEnum):
-    """The compressions of the output, all lossless."""
+    """The compressions of the output, all lossless, by tifffile's names."""
 
     none = "none"
     zlib = "zlib"
     zstd = "zstd"
     lzw = "lzw"
-
-    @property
-    def codec(self) -> str | None:
-        """The name by which tifffile knows it; None without compression."""
-        return None if self is Compression.none else self.value
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,10 @@ from beers_deploy.model.io.tiff import MASK
 from beers_deploy.profiles.errors import ImageError, MachineError, MissingExtraError, OptionError, sizes
 from beers_deploy.profiles.toml import read_json
 from beers_deploy.restoration.engine import RestoredRow
+from beers_deploy.restoration.georeference import enlarged_tags
 from beers_deploy.restoration.options import Compression
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.source import BIG_TIFF_SUFFIXES, RESTORED, RGB_BANDS, Source, Tag
+from beers_deploy.restoration.source import BIG_TIFF_SUFFIXES, RESTORED, RGB_BANDS, Source, strips
 
 
 def part_folder(out: Path) -> Path:
@@ -197,7 +198,7 @@ def require_tiff_name(path: Path) -> None:
 def require_codec(compression: Compression) -> None:
     """Find out before the run that a compression needs a package which is not installed."""
     try:
-        tifffile.imwrite(io.BytesIO(), np.zeros((16, 16), np.uint16), compression=compression.codec)
+        tifffile.imwrite(io.BytesIO(), np.zeros((16, 16), np.uint16), compression=compression.value)
     except (ValueError, KeyError, ImportError) as error:
         got, remedy = " ".join(str(error).split()), "pip install 'beers-deploy[codecs]' or use zlib"
         raise MissingExtraError("compression", expected="an installed codec", got=got, remedy=remedy) from error
@@ -211,7 +212,6 @@ ToCog = Callable[[Path, Path], None]
 def write_output(
     checkpoint: Checkpoint,
     source: Source,
-    tags: tuple[Tag, ...],
     compression: Compression,
     to_cog: ToCog | None = None,
 ) -> None:
@@ -220,7 +220,6 @@ def write_output(
     Args:
         checkpoint: with every row.
         source: the image, whose alpha or mask is written beside its bands as it is.
-        tags: of the image.
         compression: of the TIFF; none where it is on its way to be cloud-optimised.
         to_cog: writes the TIFF again, cloud-optimised; None leaves it as it is.
     """
@@ -235,7 +234,7 @@ def write_output(
                 planarconfig="separate" if planes > 1 else None,
                 extrasamples=(source.raster.veil,) if source.raster.has_alpha else None,
                 software=RESTORED,
-                extratags=tags,
+                extratags=enlarged_tags(source.raster.tags, checkpoint.shape[2] // source.raster.width_px),
                 **_squares_of(_strips(checkpoint, source), checkpoint.dtype, compression),
             )
             if source.raster.veil == "mask":
@@ -251,14 +250,14 @@ def write_output(
         checkpoint.remove()
 
 
-def _squares_of(strips: Iterator[np.ndarray], dtype: np.dtype[Any], compression: Compression) -> dict[str, Any]:
+def _squares_of(rows: Iterator[np.ndarray], dtype: np.dtype[Any], compression: Compression) -> dict[str, Any]:
     """What tifffile is told of a page's pixels, given as rows of squares."""
     by_zlib = compression is Compression.zlib and dtype.kind != "b"  # whose bits tifffile packs
     return {
-        "data": _packed(strips) if by_zlib else _tiles(strips),
+        "data": _packed(rows) if by_zlib else (square for strip in rows for square in _squares(strip)),
         "dtype": dtype,
         "tile": (TILE_PX, TILE_PX),
-        "compression": compression.codec,
+        "compression": compression.value,
         "predictor": HORIZONTAL if by_zlib and dtype.kind == "u" else None,
         "maxworkers": os.cpu_count(),  # its own choice is half of them
         "metadata": None,
@@ -266,10 +265,10 @@ def _squares_of(strips: Iterator[np.ndarray], dtype: np.dtype[Any], compression:
     }
 
 
-def _packed(strips: Iterator[np.ndarray]) -> Iterator[bytes]:
-    """The squares of `_tiles` as zlib's streams, those of a strip packed side by side."""
+def _packed(rows: Iterator[np.ndarray]) -> Iterator[bytes]:
+    """Squares as zlib's streams, those of a strip packed side by side."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for strip in strips:
+        for strip in rows:
             yield from pool.map(_pack, _squares(strip))
 
 
@@ -283,12 +282,6 @@ def _pack(square: np.ndarray) -> bytes:
     return isal_zlib.compress(square.tobytes(), FAST_LEVEL)
 
 
-def _tiles(strips: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
-    """Squares in the order of the file, zeros beyond the image."""
-    for strip in strips:
-        yield from _squares(strip)
-
-
 def _squares(strip: np.ndarray) -> list[np.ndarray]:
     return np.hsplit(strip, strip.shape[1] // TILE_PX)
 
@@ -296,7 +289,7 @@ def _squares(strip: np.ndarray) -> list[np.ndarray]:
 def _strips(checkpoint: Checkpoint, source: Source) -> Iterator[np.ndarray]:
     """Rows of squares, (TILE_PX, whole squares) of every band, and of the image's alpha."""
     for band in range(checkpoint.shape[0]):
-        for top, bottom in _heights(checkpoint):
+        for top, bottom in strips(checkpoint.shape[1], TILE_PX):
             yield _whole_squares(checkpoint.read(band, top, bottom))
     if source.raster.has_alpha:
         yield from _veil(checkpoint, source)
@@ -307,16 +300,10 @@ def _veil(checkpoint: Checkpoint, source: Source) -> Iterator[np.ndarray]:
     scale, read = checkpoint.shape[2] // source.raster.width_px, source.veil
     if read is None:
         raise ValueError("no veil")
-    for top, bottom in _heights(checkpoint):
+    for top, bottom in strips(checkpoint.shape[1], TILE_PX):
         plane = read(top // scale, -(-bottom // scale))
         plane = plane.repeat(scale, axis=0)[top % scale :][: bottom - top].repeat(scale, axis=1)
         yield _whole_squares(plane != 0 if source.raster.veil == "mask" else plane.astype(checkpoint.dtype))
-
-
-def _heights(checkpoint: Checkpoint) -> Iterator[tuple[int, int]]:
-    """First row and the one behind the last of each strip."""
-    for top in range(0, checkpoint.shape[1], TILE_PX):
-        yield top, min(top + TILE_PX, checkpoint.shape[1])
 
 
 def _whole_squares(rows: np.ndarray) -> np.ndarray:
@@ -344,13 +331,13 @@ NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, ENOTSUP
 
 
 @contextmanager
-def only_run(out: Path, folder: Path | None = None) -> Iterator[None]:
+def only_run(out: Path) -> Iterator[None]:
     """Hold the folder where a run keeps what it needs for `out`; in the end it is gone, unless rows were left in it.
 
     Folders above it that were made for it are gone then, too, unless something was written there. It locks nothing on
     a disk that has no locks, as some of networks.
     """
-    folder = folder or part_folder(out)
+    folder = part_folder(out)
     new = [parent for parent in folder.parents if not parent.exists()]
     lock = _take(out, folder)
     try:

@@ -164,18 +164,12 @@ class Plan:
 
 def plan_for(network: onnx.ModelProto, shape: tuple[int, int, int], options: Options) -> Plan:
     """How an image of `shape` (bands, H, W) is cut for a network, as a user's options ask."""
-    tiling = tiling_of(network, str(options.model))
-    if tiling.fixed_px is not None:
-        require_fixed_tile(tiling.fixed_px, options.tile_px, shape[1:])
-    return make_plan(shape, options.tile_px, parse_halo(options.halo, tiling.halo_px), tiling)
-
-
-def require_fixed_tile(fixed_px: int, tile_px: int, size: tuple[int, int]) -> None:
-    """A network fixed to one tile size takes only windows of that size, in an image of `size` (H, W)."""
-    if fixed_px != tile_px or min(size) < fixed_px:
-        expected = f"{fixed_px}, the size the model is fixed to, and an image at least as large"
-        got, remedy = f"tile {tile_px}, image {size[1]} x {size[0]}", "take a network of free sizes"
+    tiling, (_, height_px, width_px) = tiling_of(network, str(options.model)), shape
+    if tiling.fixed_px is not None and (tiling.fixed_px != options.tile_px or min(shape[1:]) < tiling.fixed_px):
+        expected = f"{tiling.fixed_px}, the size the model is fixed to, and an image at least as large"
+        got, remedy = f"tile {options.tile_px}, image {width_px} x {height_px}", "take a network of free sizes"
         raise OptionError("tile", expected=expected, got=got, remedy=remedy)
+    return make_plan(shape, options.tile_px, parse_halo(options.halo, tiling.halo_px), tiling)
 
 
 def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling) -> Plan:
@@ -220,13 +214,9 @@ def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
     read = plan.strip_rows_px * row_px * (raster.dtype.itemsize + raster.may_miss)
     flags = plan.strip_rows_px * row_px * raster.may_miss
     held = 0 if begun else read + source.held_bytes(plan.strip_rows_px)
-    return 2 * read + flags + 3 * restored_bytes(source, plan) + held
-
-
-def restored_bytes(source: Source, plan: Plan) -> int:
-    """Memory of one row of tiles as it is stored."""
     bands, _, width_px = plan.out_shape
-    return plan.tile_shape[0] * plan.scale * bands * width_px * source.raster.out_dtype.itemsize
+    restored = plan.tile_shape[0] * plan.scale * bands * width_px * raster.out_dtype.itemsize
+    return 2 * read + flags + 3 * restored + held
 
 
 def check_memory(rows: int, budget_bytes: int | None, bulky: bool) -> int:

@@ -23,20 +23,20 @@ from beers_deploy.host_state import peak_memory
 from beers_deploy.model.io.files import require_writable
 from beers_deploy.model.io.images import require_image_file
 from beers_deploy.model.processor import require_cores
-from beers_deploy.model.progress import Log, held_back, steps
-from beers_deploy.profiles.errors import BeersError, MachineError
+from beers_deploy.model.progress import Log, held_back, no_log, steps
+from beers_deploy.profiles.errors import BeersError, MachineError, optional
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.reading.external import network_sha256
 from beers_deploy.restoration.bands import in_order, require_alike
-from beers_deploy.restoration.cog import disk_bytes, require_cog, what_was_done, write_cog
+from beers_deploy.restoration.cog import disk_bytes, what_was_done, write_cog
 from beers_deploy.restoration.engine import RestoredRow, Restorer, restore_rows
-from beers_deploy.restoration.georeference import enlarged_tags, unread_places
+from beers_deploy.restoration.georeference import unread_places
 from beers_deploy.restoration.options import Compression, Options
 from beers_deploy.restoration.output import Checkpoint, only_run, require_codec, require_tiff_name, write_output
 from beers_deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
-from beers_deploy.restoration.runtime import Infer, infer_on, open_runtime, pack, tiles_at_once
+from beers_deploy.restoration.runtime import Infer, Packed, infer_on, open_runtime, tiles_at_once
 from beers_deploy.restoration.sensor_check import told_sensor
 from beers_deploy.restoration.source import Source, fingerprint, open_source, require_raw
 
@@ -44,10 +44,11 @@ RUNS_UNTIL_STEADY = 2
 """Of each tile in work at a time: then a runtime takes no more memory."""
 MANY = 0.05
 """Share of an image above its full scale that no scene has, but a wrong full scale."""
-ARITHMETIC = "arithmetic on the plan of tiles"
 
 
-def restore_file(image: Path, out: Path, options: Options, log: Log, beside: Sequence[Path | None] = ()) -> Row:
+def restore_file(
+    image: Path, out: Path, options: Options, log: Log = no_log, beside: Sequence[Path | None] = ()
+) -> Row:
     """Restore `image` into the TIFF `out`, and return the run's figures.
 
     Args:
@@ -56,27 +57,13 @@ def restore_file(image: Path, out: Path, options: Options, log: Log, beside: Seq
             factor where it has one, and in its place on Earth.
         options: what the user chose.
         log: is told the plan, the memory, and how to go on after a stop.
-        beside: other files that the caller will write: they must be none that the image is read from.
+        beside: other files that the caller will write.
     """
-    require_image_file(image)
-    require_writable(out, inputs=(image, options.model))
+    started = time.perf_counter()
     if options.scheduler is None:
         require_cores("threads", options.threads)
-    require_tiff_name(out)
-    if options.cog:
-        require_cog()
-    else:
-        require_codec(options.compression)
-    with only_run(out):
-        return _restore(image, out, options, log, beside)
-
-
-def _restore(image: Path, out: Path, options: Options, log: Log, beside: Sequence[Path | None]) -> Row:
-    started = time.perf_counter()
-    with open_source(image, options.trust_index) as source, open_cluster(options.scheduler) as cluster:
-        require_writable(out, *beside, inputs=source.files)
+    with begun(image, out, options, beside) as source, open_cluster(options.scheduler) as cluster:
         raster = source.raster
-        require_raw(str(image), raster.restored, options.again)
         paths = in_order(options.bands, raster) if options.bands else [options.model]
         networks = [load_onnx(path) for path in paths]
         require_alike(networks, paths)
@@ -98,13 +85,9 @@ def _restore(image: Path, out: Path, options: Options, log: Log, beside: Sequenc
         done_rows = checkpoint.rows // plan.scale
         _finish_rows(checkpoint, source, plan, restorer, at_once, options, log)
         with held_back():  # a stop now would save nothing
-            tags = enlarged_tags(raster.tags, plan.scale)
-            if options.cog:
-                about = what_was_done(networks, digests, scale)
-                to_cog = partial(write_cog, compression=options.compression, about=about)
-                write_output(checkpoint, source, tags, Compression.none, to_cog)
-            else:
-                write_output(checkpoint, source, tags, options.compression)
+            about = what_was_done(networks, digests, scale)
+            to_cog = partial(write_cog, compression=options.compression, about=about) if options.cog else None
+            write_output(checkpoint, source, Compression.none if to_cog else options.compression, to_cog)
     time_s, tally = time.perf_counter() - started, checkpoint.tally
     if tally.clipped:
         share = tally.clipped / prod(raster.shape)
@@ -112,6 +95,29 @@ def _restore(image: Path, out: Path, options: Options, log: Log, beside: Sequenc
         log(f"{tally.clipped} pixels above full scale, {scale.words}, were clipped to it{doubt}")
     figures |= {**check.figures, **tally.figures}
     return run_row(image.name, plan, done_rows, time_s, runtime, options, figures, {**scale.text, **check.text})
+
+
+@contextmanager
+def begun(image: Path, out: Path, options: Options, beside: Sequence[Path | None]) -> Iterator[Source]:
+    """The open image of the only run on an output, once what is known before is found to be as it must.
+
+    Args:
+        image: as of `restore_file`.
+        out: as of `restore_file`.
+        options: what the user chose.
+        beside: other files that will be written: like `out` they must be none that is read.
+    """
+    require_image_file(image)
+    require_writable(out, inputs=[path for path in (image, options.model) if path.is_file()])
+    require_tiff_name(out)
+    if options.cog:
+        optional("rasterio", "cog")
+    else:
+        require_codec(options.compression)
+    with only_run(out), open_source(image, options.trust_index) as source:
+        require_writable(out, *beside, inputs=source.files)
+        require_raw(str(image), source.raster.restored, options.again)
+        yield source
 
 
 def _opened(
@@ -127,7 +133,7 @@ def _opened(
     infers, runtime = tuple(infer for infer, _ in opened), opened[0][1]
     if cluster:
         at_once = max(min(2 * cluster.slots, 2 * plan.row_tiles), 1)
-        packed = (pack(network, options.runtime, options.threads or 1) for network in networks)
+        packed = (Packed(each.SerializeToString(), options.runtime, options.threads or 1) for each in networks)
         infers = tuple(infer_on(cluster, each) for each in packed)
     return infers, at_once, runtime
 
@@ -168,9 +174,8 @@ def _finish_rows(
             if interrupt.asked:
                 raise KeyboardInterrupt
 
-        if rows:
-            with closing(restore_rows(source, plan, restorer, rows, tick, at_once)) as finished:
-                _write_behind(finished, checkpoint)
+        with closing(restore_rows(source, plan, restorer, rows, tick, at_once)) as finished:
+            _write_behind(finished, checkpoint)
         checkpoint.require_known(restorer.name)
         if not options.any_result:
             checkpoint.tally.require(restorer.name)
@@ -204,33 +209,33 @@ def _write_behind(restored: Iterable[RestoredRow], checkpoint: Checkpoint) -> No
             writing.result()
 
 
-# The figures of a run.
+def plan_figures(plan: Plan) -> dict[str, Figure]:
+    """How an image is cut: known, but not measured."""
+    numbers, source = {"tiles": plan.tiles, "work factor": plan.work_factor}, "arithmetic on the plan of tiles"
+    return {key: predicted(number, "1", (number, number), source) for key, number in numbers.items()}
 
 
 def seam_figures(source: Source, plan: Plan, restorer: Restorer) -> dict[str, Figure]:
-    """The error of seams, where the halo leaves any."""
+    """The error of seams, where the halo leaves any: of a tile in the middle, in digital numbers.
+
+    The same kept pixels are restored twice: from the tile's own window, and from one with the whole radius around.
+    """
+    keys = "seam error max", "seam error mean"
     if plan.halo_px >= plan.radius_px or len(plan.rows) == len(plan.columns) == 1:
         return {}
     if plan.tiling.fixed_px is not None:
         reason = "the network is fixed to one tile size: no wider window to compare with"
-        return {key: unavailable("DN", reason) for key in ("seam error max", "seam error mean")}
-    largest, mean = seam_error_dn(source, plan, restorer)
-    how = f"the tile in the middle with a halo of {plan.halo_px} px against {plan.radius_px} px"
-    return {"seam error max": measured(largest, "DN", how), "seam error mean": measured(mean, "DN", how)}
-
-
-def seam_error_dn(source: Source, plan: Plan, restorer: Restorer) -> tuple[float, float]:
-    """Largest and mean difference of a tile in the middle from the exact result, in digital numbers.
-
-    The same kept pixels are restored twice: from the tile's own window, and from one with the whole radius around.
-    """
+        return dict.fromkeys(keys, unavailable("DN", reason))
     rows, columns = plan.rows[len(plan.rows) // 2], plan.columns[len(plan.columns) // 2]
     ends_px = plan.rows[-1].stop, plan.columns[-1].stop
     wide = [_widened(span, plan.radius_px, end_px) for span, end_px in zip((rows, columns), ends_px, strict=True)]
     strip = restorer.read(source, min(rows.start, wide[0].start), max(rows.stop, wide[0].stop))
     cheap, exact = (restorer.tile(strip, 0, *spans).pixels.astype(np.float64) for spans in ((rows, columns), wide))
     error = np.abs(np.nan_to_num(cheap) - np.nan_to_num(exact))
-    return float(error.max()), float(error.mean())
+    how = f"the tile in the middle with a halo of {plan.halo_px} px against {plan.radius_px} px"
+    return {
+        key: measured(float(each), "DN", how) for key, each in zip(keys, (error.max(), error.mean()), strict=True)
+    }
 
 
 def _widened(span: Span, radius_px: int, size_px: int) -> Span:
@@ -259,8 +264,7 @@ def run_row(
     figures = {
         "time": measured(time_s, "s", source),
         "throughput": measured(useful_px / time_s / 1e6, "Mpx/s", f"the image's own pixels, {source}"),
-        "tiles": predicted(plan.tiles, "1", (plan.tiles, plan.tiles), ARITHMETIC),
-        "work factor": predicted(plan.work_factor, "1", (plan.work_factor, plan.work_factor), ARITHMETIC),
+        **plan_figures(plan),
         "peak memory": peak_memory(),
         **more,
     }

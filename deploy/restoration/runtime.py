@@ -4,10 +4,9 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import import_module
 from importlib.metadata import version
 from threading import Lock, get_ident
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import onnx
@@ -16,7 +15,7 @@ from onnx import helper, numpy_helper
 
 from beers_deploy.cluster import Cluster
 from beers_deploy.model.processor import asked, require_cores
-from beers_deploy.profiles.errors import MachineError, MissingExtraError, ModelError
+from beers_deploy.profiles.errors import ModelError, optional
 from beers_deploy.quant.kernels import is_integer, made_exact
 from beers_deploy.quant.onnx_file import parse_onnx
 from beers_deploy.quant.session import open_session, tensors_of
@@ -27,19 +26,14 @@ Infer = Callable[[np.ndarray], np.ndarray]
 
 LOWEST = "openvino.lowest_uint8"
 
-Precision = Literal["f32", "bf16"]
 
-
-def open_openvino(
-    model: onnx.ModelProto, threads: int, precision: Precision = "f32", at_once: int = 1
-) -> tuple[Callable[[np.ndarray], np.ndarray], str]:
-    """A callable (1, C, h, w) float32 -> (1, C', h', w') for `at_once` callers, and the runtime's version."""
-    core = _core()
-    if precision == "bf16" and "BF16" not in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
-        remedy = "run it on a processor that has them"
-        raise MachineError("bfloat16", expected="a processor with bfloat16 units", got="none", remedy=remedy)
+def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tuple[Infer, str]:
+    """As `open_runtime`."""
+    openvino = optional("openvino", "runtime")
+    openvino.Type.f32.to_dtype()  # fills a table: two threads that are its first callers lock each other up (2026.4)
+    core = openvino.Core()
     # Said aloud: where the processor has bfloat16 units, OpenVINO would round to it unasked.
-    options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": str(at_once), "ENABLE_CPU_PINNING": False}
+    options = {"INFERENCE_PRECISION_HINT": "f32", "NUM_STREAMS": str(at_once), "ENABLE_CPU_PINNING": False}
     options |= {"INFERENCE_NUM_THREADS": str(threads)} if threads else {}
     exact = model if not is_integer(model) or _adds_exactly(core) else made_exact(model)[0]
     content = saturating_adds(exact).SerializeToString()
@@ -73,16 +67,6 @@ def _adds_exactly(core: Any) -> bool:
         return np.asarray(core.compile_model(core.read_model(model), "CPU").create_infer_request().infer([image])[0])
 
     return asked("openvino", convolve)
-
-
-def _core() -> Any:  # openvino.Core, an optional package
-    try:
-        openvino = import_module("openvino")
-    except ImportError as error:
-        got, remedy = "no package openvino", "pip install 'beers-deploy[openvino]'"
-        raise MissingExtraError("runtime", expected="OpenVINO installed", got=got, remedy=remedy) from error
-    openvino.Type.f32.to_dtype()  # fills a table: two threads that are its first callers lock each other up (2026.4)
-    return openvino.Core()
 
 
 def saturating_adds(model: onnx.ModelProto) -> onnx.ModelProto:
@@ -135,7 +119,7 @@ def open_runtime(runtime: Runtime, model: onnx.ModelProto, threads: int, at_once
     """
     require_cores("threads", threads)
     if runtime is Runtime.openvino:
-        return open_openvino(model, threads, at_once=at_once)
+        return open_openvino(model, threads, at_once)
     session = open_session(model, session_threads(threads, at_once))
     return lambda image: tensors_of(session, None, image)[0], f"onnxruntime {ort.__version__}"
 
@@ -147,26 +131,21 @@ def session_threads(threads: int, at_once: int) -> int:
 
 @dataclass(frozen=True)
 class Packed:
-    """A network on its way to another process: an ONNX file's bytes, and how it is to be run."""
+    """A network as another process runs it, which opens it once: an ONNX file's bytes, and how it is to be run."""
 
     content: bytes
     runtime: Runtime
     threads: int
 
-
-def pack(model: onnx.ModelProto, runtime: Runtime, threads: int) -> Packed:
-    """A network with how it is to be run, as bytes that another process can open."""
-    return Packed(model.SerializeToString(), runtime, threads)
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        """As an `Infer`."""
+        with _opening:  # or each thread would open its own
+            infer = _opened(self)
+        return infer(image)
 
 
 NETWORKS_KEPT = 8
 _opening = Lock()
-
-
-def open_packed(packed: Packed) -> Infer:
-    """A network that arrived from another process, opened once in this one."""
-    with _opening:  # or each thread would open its own
-        return _opened(packed)
 
 
 @lru_cache(maxsize=NETWORKS_KEPT)
@@ -177,8 +156,4 @@ def _opened(packed: Packed) -> Infer:
 def infer_on(cluster: Cluster, packed: Packed) -> Infer:
     """A network that is run by the workers of a cluster: each call sends a tile and waits for its result."""
     shared = cluster.share(packed)
-    return lambda image: cluster.result(cluster.pool.submit(_infer, shared, image))
-
-
-def _infer(packed: Packed, image: np.ndarray) -> np.ndarray:
-    return open_packed(packed)(image)
+    return lambda image: cluster.result(cluster.pool.submit(Packed.__call__, shared, image))

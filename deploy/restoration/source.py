@@ -128,6 +128,12 @@ def is_restored(software: str, said: object) -> bool:
     return software.startswith(RESTORED) or RESTORED_BY in str(said)
 
 
+def strips(height_px: int, step_px: int) -> Iterator[tuple[int, int]]:
+    """First row and the one behind the last of each strip of an image."""
+    for top in range(0, height_px, step_px):
+        yield top, min(top + step_px, height_px)
+
+
 def require_raw(name: str, restored: bool, again: bool) -> None:
     """Refuse to restore twice what is `restored`: the second time sharpens what is sharp."""
     if restored and not again:
@@ -223,29 +229,27 @@ class Source(Protocol):
         """Memory that reading so many rows at a time takes, besides the rows themselves."""
 
 
-class Rows(Protocol):
-    """What gives rows (bands, rows, width) of a mask."""
-
-    def read(self, start: int, stop: int) -> np.ndarray:
-        """Rows `start` to `stop` (excluded)."""
-
-    def held_bytes(self, rows_px: int) -> int:
-        """Memory that reading so many rows at a time takes."""
-
-
 class VeiledSource:
     """An image whose pixels are missing where a plane beside its bands is 0."""
 
-    def __init__(self, source: Source, kind: Veil, mask: "Rows | None" = None, files: tuple[Path, ...] = ()) -> None:
-        """Of a source whose last band is its alpha, or of one with the page of a mask.
+    def __init__(
+        self,
+        source: Source,
+        kind: Veil,
+        mask: Plane | None = None,
+        held_bytes: Callable[[int], int] = lambda _: 0,
+        files: tuple[Path, ...] = (),
+    ) -> None:
+        """Of a source whose last band is its alpha, or of one with a mask.
 
         Args:
             source: the image.
             kind: of the veil.
-            mask: rows of its mask.
+            mask: gives rows of its mask, (1, rows, width).
+            held_bytes: memory that the mask takes beside the image, by rows at a time.
             files: that the mask lies in, where they are others.
         """
-        self._source, self._mask, self.files = source, mask, (*source.files, *files)
+        self._source, self._mask, self._mask_bytes, self.files = source, mask, held_bytes, (*source.files, *files)
         bands = source.raster.bands - (mask is None)
         self.raster = replace(source.raster, bands=bands, veil=kind)
         self.veil: Plane | None = self._rows_of_veil
@@ -259,10 +263,10 @@ class VeiledSource:
 
     def held_bytes(self, rows_px: int) -> int:
         """As the image's own, and the mask's."""
-        return self._source.held_bytes(rows_px) + (self._mask.held_bytes(rows_px) if self._mask else 0)
+        return self._source.held_bytes(rows_px) + self._mask_bytes(rows_px)
 
     def _rows_of_veil(self, start: int, stop: int) -> np.ndarray:
-        rows = self._source.read(start, stop)[-1:] if self._mask is None else self._mask.read(start, stop)
+        rows = self._source.read(start, stop)[-1:] if self._mask is None else self._mask(start, stop)
         return np.asarray(rows[0])
 
 
@@ -295,46 +299,34 @@ def open_source(path: Path, trusted: bool = False) -> Iterator[Source]:
 
             source = stack.enter_context(open_gdal(path, trusted))
         elif suffix in TIFF_SUFFIXES | BIG_TIFF_SUFFIXES:
-            source = stack.enter_context(open_pages(path))
+            source = _of_pages(path, stack)
         else:
             source = whole_source(path)
         from beers_deploy.restoration.georeference import of_sidecar  # it reads what this file defines
 
         source.raster = of_sidecar(path, source.raster)
         beside = path.with_name(f"{path.name}.msk")
-        yield stack.enter_context(_masked(source, beside)) if beside.is_file() else source
+        yield _masked(source, beside, stack) if beside.is_file() else source
 
 
-@contextmanager
-def open_pages(path: Path) -> Iterator[Source]:
+def _of_pages(path: Path, stack: ExitStack) -> Source:
     """A TIFF's bands, in one page or in a page each, and its mask or alpha."""
     with damage_in_a_sentence(path):
-        file = open_tiff(path)
-    with file:
-        with damage_in_a_sentence(path):
-            pages, mask = image_pages(path, file)
-            for page in [*pages, *([mask] if mask else [])]:
-                check_page(path, page)
-            source: Source = TiffSource(path, pages)
-            alpha = source.raster.veil
-            if alpha:
-                source = VeiledSource(source, alpha)
-            if mask:
-                source = _with_mask(source, PageRows(path, mask), ())
-        yield source
+        pages, mask = image_pages(path, stack.enter_context(open_tiff(path)))
+        for page in [*pages, *([mask] if mask else [])]:
+            check_page(path, page)
+        source: Source = TiffSource(path, pages)
+        if source.raster.veil:
+            source = VeiledSource(source, source.raster.veil)
+        return _with_mask(source, PageRows(path, mask), ()) if mask else source
 
 
-@contextmanager
-def _masked(source: Source, path: Path) -> Iterator[Source]:
+def _masked(source: Source, path: Path, stack: ExitStack) -> Source:
     """An image with the mask of a file beside it, as GDAL writes one (IMAGE.msk)."""
     with damage_in_a_sentence(path):
-        file = open_tiff(path)
-    with file:
-        with damage_in_a_sentence(path):
-            page = file.pages.first
-            check_page(path, page)
-            source = _with_mask(source, PageRows(path, page), (path,))
-        yield source
+        page = stack.enter_context(open_tiff(path)).pages.first
+        check_page(path, page)
+        return _with_mask(source, PageRows(path, page), (path,))
 
 
 def _with_mask(source: Source, mask: "PageRows", files: tuple[Path, ...]) -> Source:
@@ -342,7 +334,7 @@ def _with_mask(source: Source, mask: "PageRows", files: tuple[Path, ...]) -> Sou
     if mask.shape != (1, raster.height_px, raster.width_px) or raster.veil:
         got = "alpha or another mask beside it" if raster.veil else f"one of {times(mask.shape)}"
         raise ImageError(name, expected=f"one mask of {times(raster.shape[1:])}", got=got, remedy="keep one of them")
-    return VeiledSource(source, "mask", mask, files)
+    return VeiledSource(source, "mask", mask.read, mask.held_bytes, files)
 
 
 def whole_source(path: Path) -> Source:

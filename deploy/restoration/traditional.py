@@ -14,21 +14,19 @@ import torch
 from torch import Tensor
 
 from beers_deploy.host_state import peak_memory
-from beers_deploy.model.io.files import require_writable
-from beers_deploy.model.io.images import require_image_file
-from beers_deploy.model.progress import Log, steps
+from beers_deploy.model.progress import Log, no_log, steps
 from beers_deploy.model.traditional.pipeline import Chain, restore_strips
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Row, measured
-from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.engine import RestoredRow, as_stored, checked_strip
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.output import Checkpoint, only_run, require_codec, require_tiff_name, write_output
+from beers_deploy.restoration.output import Checkpoint, write_output
 from beers_deploy.restoration.plan import Span, check_memory
-from beers_deploy.restoration.radiometry import FullScale, full_scale_of
-from beers_deploy.restoration.sensor_check import SensorCheck, told_sensor
-from beers_deploy.restoration.source import Raster, Source, fingerprint, open_source, require_raw
+from beers_deploy.restoration.radiometry import full_scale_of
+from beers_deploy.restoration.run import begun
+from beers_deploy.restoration.sensor_check import told_sensor
+from beers_deploy.restoration.source import Source, fingerprint, strips
 
 STRIP_PX = 128
 """Rows read at a time."""
@@ -38,47 +36,40 @@ FIXED_BYTES, BYTES_PER_COLUMN = 100_000_000, 40_000
 Measured at 400 and 1200 columns: 75 MB and 30 kB."""
 
 
-def chain_of(sensor: Sensor) -> Chain:
-    """The chain from a sensor to its reference, in the middle of every range."""
-    return Chain(sensor.nominal(), sensor.reference.nominal())
-
-
 def restore_file_traditionally(
-    image: Path, out: Path, options: Options, log: Log, beside: Sequence[Path | None] = ()
+    image: Path, out: Path, options: Options, log: Log = no_log, beside: Sequence[Path | None] = ()
 ) -> Row:
     """As `deploy.restoration.run.restore_file`, of a mono image, by the traditional chain of its one sensor."""
-    require_image_file(image)
-    require_writable(out, inputs=(image,))
-    require_tiff_name(out)
-    require_codec(options.compression)
-    with only_run(out):
-        return _restore(image, out, options, log, beside)
-
-
-def _restore(image: Path, out: Path, options: Options, log: Log, beside: Sequence[Path | None]) -> Row:
     started, sensor = time.perf_counter(), options.sensors[""]
-    chain = chain_of(sensor)
-    with open_source(image, options.trust_index) as source:
-        require_writable(out, *beside, inputs=source.files)
+    chain = Chain(sensor.nominal(), sensor.reference.nominal())
+    with begun(image, out, options, beside) as source:
         raster = source.raster
-        require_raw(str(image), raster.restored, options.again)
         if raster.bands > 1:
             remedy = "extract the band that the profile describes"
             raise ImageError(str(image), expected="one band", got=f"{raster.bands} bands", remedy=remedy)
         needed = FIXED_BYTES + BYTES_PER_COLUMN * raster.width_px + source.held_bytes(STRIP_PX)
         check_memory(needed, options.memory_bytes, bulky=False)
-        extents = (raster.extent(source.read(*rows)) for rows in _strips(raster.height_px))
+        extents = (raster.extent(source.read(*rows)) for rows in strips(raster.height_px, STRIP_PX))
         scale = full_scale_of(str(image), raster, extents, options.full_scale, options.sensor_bits)
         check = told_sensor(source, options.sensors, scale.value, str(image), options.strict, log)
         job = {"image": list(fingerprint(source.files)), "method": "traditional"}
         checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, resume=False)
         try:
             _fill(checkpoint, source, chain, scale.value, str(image))
-            write_output(checkpoint, source, raster.tags, options.compression)
+            write_output(checkpoint, source, options.compression)
         except BaseException:  # a strip is no place to go on from: the chain looks hundreds of rows back
             checkpoint.remove()
             raise
-    return _row(image.name, raster, time.perf_counter() - started, sensor, scale, check)
+    time_s = time.perf_counter() - started
+    how = f"from opening the image to the finished file, {torch.get_num_threads()} threads"
+    figures = {
+        "time": measured(time_s, "s", how),
+        "throughput": measured(raster.height_px * raster.width_px / time_s / 1e6, "Mpx/s", how),
+        "peak memory": peak_memory(),
+        **check.figures,
+    }
+    text = {"method": "traditional", "sensor": sensor.name, **scale.text, **check.text}
+    return Row("restore", image.name, figures, text)
 
 
 def _fill(checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: float, name: str) -> None:
@@ -100,27 +91,9 @@ def _fill(checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: floa
 
 def _read(source: Source, to_dn: float, full_scale: float, name: str) -> Iterator[Tensor]:
     """Strips (rows, width) float32 of digital numbers, NaN where they are missing."""
-    for start, stop in _strips(source.raster.height_px):
+    for start, stop in strips(source.raster.height_px, STRIP_PX):
         strip = checked_strip(source.raster, start, source.read(start, stop), full_scale, name)
         dn = strip.pixels[0].astype(np.float32) * np.float32(to_dn)
         if strip.missing is not None:
             dn[strip.missing[0]] = np.nan
         yield torch.from_numpy(dn)
-
-
-def _strips(height_px: int) -> Iterator[tuple[int, int]]:
-    """First row and the one behind the last of each strip."""
-    for start in range(0, height_px, STRIP_PX):
-        yield start, min(start + STRIP_PX, height_px)
-
-
-def _row(name: str, raster: Raster, time_s: float, sensor: Sensor, scale: FullScale, check: SensorCheck) -> Row:
-    source = f"from opening the image to the finished file, {torch.get_num_threads()} threads"
-    figures = {
-        "time": measured(time_s, "s", source),
-        "throughput": measured(raster.height_px * raster.width_px / time_s / 1e6, "Mpx/s", source),
-        "peak memory": peak_memory(),
-        **check.figures,
-    }
-    text = {"method": "traditional", "sensor": sensor.name, **scale.text, **check.text}
-    return Row("restore", name, figures, text)

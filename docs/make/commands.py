@@ -47,7 +47,7 @@ def reference() -> str:
 
 def _section(name: str, lines: Mapping[str, str], once: Collection[str]) -> Iterator[str]:
     command = get_command(app).commands[name]  # type: ignore[attr-defined]
-    yield f"## {name}\n\n{command.help}\n\n    beers-deploy {COMMANDS[name][1]}\n"
+    yield f"## {name}\n\n{command.help}\n\n    beers-deploy {name} {COMMANDS[name][1]}\n"
     yield from (line for line in lines.values() if line not in once)
     also = [f"`{label}`" for label, line in lines.items() if line in once]
     yield f"\nAlso {', '.join(also)}.\n" if also else ""

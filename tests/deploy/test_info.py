@@ -51,7 +51,7 @@ def test_its_plan_is_that_of_the_restoration(model: Path, tmp_path: Path) -> Non
     tifffile.imwrite(tmp_path / "in.tif", np.ones((90, 70), np.uint16))
     options = Options(model, tile_px=23)
     told = about(tmp_path / "in.tif", options)
-    done = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options, lambda _: None)
+    done = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options)
     for key in ("tiles", "work factor"):
         assert told.figures[key].value == done.figures[key].value
     for key in ("halo", "full scale", "full scale from"):

@@ -36,7 +36,7 @@ def of_file(folder: Path, pixels: np.ndarray, options: Options, nodata: float | 
     planes: dict[str, Any] = {"photometric": "rgb", "planarconfig": "separate"} if pixels.shape[0] == 3 else {}
     stored = pixels if pixels.ndim == 2 or planes else pixels[0]
     tifffile.imwrite(folder / "in.tif", stored, extratags=tags, **(planes if pixels.ndim == 3 else {}))
-    restore_file(folder / "in.tif", folder / "out.tif", options, lambda _: None)
+    restore_file(folder / "in.tif", folder / "out.tif", options)
     return tifffile.imread(folder / "out.tif").reshape(pixels.shape)
 
 

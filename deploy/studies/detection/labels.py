@@ -22,7 +22,7 @@ from beers_deploy.model.io.files import IMAGE_SUFFIXES
 from beers_deploy.model.io.images import image_size_px, list_images
 from beers_deploy.profiles.errors import MissingExtraError, OptionError
 from beers_deploy.profiles.toml import read_json, read_whole
-from beers_deploy.restoration.index_files import NoDoctype
+from beers_deploy.restoration.index_files import parse_xml
 from beers_deploy.studies.detection.boxes import Boxes, areas
 from beers_deploy.studies.detection.detector import class_names, letters
 
@@ -187,9 +187,8 @@ def _read_voc_tree(folder: Path, split: str | None) -> list[_File]:
 def _read_voc(image: Path, labels: Path) -> _File:
     text = _read_bytes(labels)
     try:
-        # NoDoctype refuses a document type: with entities a file of a hundred bytes can grow to gigabytes.
-        root = ET.fromstring(text, ET.XMLParser(target=NoDoctype()))  # noqa: S314
-    except (ET.ParseError, ValueError, LookupError, RecursionError) as error:  # lookup: of an encoding
+        root = parse_xml(text)
+    except (ValueError, LookupError, RecursionError) as error:  # lookup: of an encoding
         raise _faulty(labels, "plain XML", " ".join(str(error).split())[:100]) from error
     if root.tag != "annotation":
         raise _faulty(labels, "Pascal VOC, an 'annotation'", f"<{root.tag}>"[:80], "give labels of VOC")

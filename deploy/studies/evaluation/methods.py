@@ -25,7 +25,7 @@ from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.profiles.sensor_file import BLIND as NOT_KNOWN
 from beers_deploy.profiles.sensor_file import BLIND_PROFILE, load_sensor
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.restoration.function import Restore, network_method
+from beers_deploy.restoration.engine import Restore, network_method
 
 Specialise = Callable[[Instrument], Restore]
 """A sensor to the restoration of images that it acquired."""

@@ -23,7 +23,7 @@ from beers_deploy.pairs import Pair
 from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.report.page import Picture, Report, Section, write_report
-from beers_deploy.restoration.function import Restore, network_method
+from beers_deploy.restoration.engine import Restore, network_method
 from beers_deploy.restoration.sensor_check import WINDOW_PX, held_against
 from beers_deploy.results import Table
 from beers_deploy.studies.evaluation import scores

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from beers_deploy.frames import words_of
 from beers_deploy.model.progress import steps
 from beers_deploy.profiles.errors import BeersError, OptionError
 from beers_deploy.profiles.figures import Figure, Row, by_table, measured, predicted
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.integer.reference import INT32_BITS
-from beers_deploy.results import common_mode, missing, unit_of, words_of
+from beers_deploy.results import common_mode, missing, unit_of
 from beers_deploy.studies.stress.cases import CASES, SIDE_PX, Case
 from beers_deploy.studies.stress.checks import Limitation, Measure, limitation_of, torch_threads
 from beers_deploy.studies.stress.networks import STAGES, Subject

@@ -33,8 +33,7 @@ from beers_deploy.quant.calibration import Calibration
 from beers_deploy.quant.onnx_file import metadata, save_onnx
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.reading.external import network_sha256
-from beers_deploy.restoration.engine import restore_dn
-from beers_deploy.restoration.function import Restore
+from beers_deploy.restoration.engine import Restore, restore_dn
 from beers_deploy.restoration.options import Runtime
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.runtime import open_runtime

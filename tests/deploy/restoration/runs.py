@@ -5,16 +5,28 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 
+from beers_deploy.profiles.figures import Row
 from beers_deploy.restoration.engine import Restorer, Tile
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.run import restore_file
 
 
 def noise(*shape: int, seed: int = 1) -> np.ndarray:
     """Digital numbers of 12 bits, uint16, none of them 0."""
     return np.random.default_rng(seed).integers(1, 4096, shape).astype(np.uint16)
+
+
+def restored(folder: Path, pixels: np.ndarray, options: Options, **written: Any) -> tuple[np.ndarray, Row]:
+    """Write pixels, restore them, and read the result again."""
+    tifffile.imwrite(folder / "in.tif", pixels, **written)
+    row = restore_file(folder / "in.tif", folder / "out.tif", options)
+    return tifffile.imread(folder / "out.tif"), row
 
 
 def begin(image: Path, out: Path, *options: object) -> subprocess.Popen[str]:

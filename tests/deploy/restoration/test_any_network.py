@@ -20,7 +20,7 @@ from beers_deploy.restoration.georeference import enlarged_tags
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.run import restore_file
-from tests.deploy.restoration.runs import stopped_after
+from tests.deploy.restoration.runs import restored, stopped_after
 from tests.quant.tiling.small_networks import (
     espcn,
     ffdnet,
@@ -79,9 +79,7 @@ def whole(path: Path, pixels: np.ndarray) -> np.ndarray:
 def by_file(pixels: np.ndarray, folder: Path, options: Options, **written: Any) -> np.ndarray:
     """As `restore` writes it."""
     planar: dict[str, Any] = {"planarconfig": "separate"} if pixels.ndim == 3 else {}
-    tifffile.imwrite(folder / "in.tif", pixels, photometric="minisblack", **planar, **written)
-    restore_file(folder / "in.tif", folder / "out.tif", options, lambda _: None)
-    return tifffile.imread(folder / "out.tif")
+    return restored(folder, pixels, options, photometric="minisblack", **planar, **written)[0]
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -108,8 +106,8 @@ def test_one_lattice_less_of_halo_shows_seams(path: Path, tmp_path: Path) -> Non
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (47, 2)])
 def test_tiny_images_are_extended_too(size: tuple[int, int], path: Path, tmp_path: Path) -> None:
     pixels = noise(path, size)
-    restored = by_file(pixels, tmp_path, Options(path, 83, threads=1))
-    np.testing.assert_array_equal(restored.squeeze(), whole(path, pixels))
+    found = by_file(pixels, tmp_path, Options(path, 83, threads=1))
+    np.testing.assert_array_equal(found.squeeze(), whole(path, pixels))
 
 
 def test_missing_pixels_stay_and_spoil_no_others(path: Path, tmp_path: Path) -> None:
@@ -143,8 +141,8 @@ def test_a_run_that_was_stopped_is_resumed_to_the_same_bytes(path: Path, tmp_pat
     by_file(noise(path), tmp_path, options)
     expected = (tmp_path / "out.tif").read_bytes()
     with stopped_after(4, MachineError("machine", expected="power", got="none", remedy="wait")):
-        restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options, lambda _: None)
-    row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", replace(options, resume=True), lambda _: None)
+        restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options)
+    row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", replace(options, resume=True))
     assert (tmp_path / "out.tif").read_bytes() == expected
     assert row.figures["tiles"].value
 
@@ -236,7 +234,7 @@ def test_a_larger_file_has_its_tags(tmp_path: Path) -> None:
 def test_a_one_band_network_still_takes_bands_one_by_one(tmp_path: Path) -> None:
     path = saved(espcn(), tmp_path)
     bands = np.random.default_rng(1).integers(0, 4096, (3, 41, 35)).astype(np.uint16)
-    restored = by_file(bands, tmp_path, Options(path, 23))
-    assert restored.shape == (3, 82, 70)
-    for band, result in zip(bands, restored, strict=True):
+    found = by_file(bands, tmp_path, Options(path, 23))
+    assert found.shape == (3, 82, 70)
+    for band, result in zip(bands, found, strict=True):
         np.testing.assert_array_equal(result, whole(path, band))

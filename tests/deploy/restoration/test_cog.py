@@ -27,8 +27,8 @@ cogeo: Any = pytest.importorskip("rio_cogeo")
 def both(folder: Path, pixels: np.ndarray, options: Options) -> tuple[Path, Path]:
     """The plain output and the cloud-optimised one of an image."""
     image = images.write_tiff(folder / "in.tif", pixels)
-    restore_file(image, folder / "plain.tif", options, lambda _: None)
-    restore_file(image, folder / "cog.tif", replace(options, cog=True), lambda _: None)
+    restore_file(image, folder / "plain.tif", options)
+    restore_file(image, folder / "cog.tif", replace(options, cog=True))
     assert sorted(path.name for path in folder.iterdir()) == ["cog.tif", "in.tif", "plain.tif"]
     return folder / "plain.tif", folder / "cog.tif"
 
@@ -40,7 +40,7 @@ def test_it_is_valid_and_holds_the_same(compression: Compression, model: Path, t
         pixels = pixels.astype(np.float32)
     options = Options(model, compression=Compression.zlib)
     plain, cog = both(tmp_path, pixels, options)
-    restore_file(tmp_path / "in.tif", cog, replace(options, compression=compression, cog=True), lambda _: None)
+    restore_file(tmp_path / "in.tif", cog, replace(options, compression=compression, cog=True))
     valid, errors, warnings = cogeo.cog_validate(cog, strict=True)
     assert (valid, errors, warnings) == (True, [], [])
     with rasterio.open(plain) as before, rasterio.open(cog) as after:
@@ -73,7 +73,7 @@ def test_missing_pixels_are_kept(model: Path, tmp_path: Path) -> None:
     pixels = np.maximum(images.digital_numbers(), 1)
     pixels[:, 30:60, 20:90] = 0
     image = images.write_tiff(tmp_path / "in.tif", pixels, nodata=0)
-    restore_file(image, tmp_path / "out.tif", Options(model, tile_px=64, cog=True), lambda _: None)
+    restore_file(image, tmp_path / "out.tif", Options(model, tile_px=64, cog=True))
     with rasterio.open(tmp_path / "out.tif") as file:
         assert file.nodata == 0
         np.testing.assert_array_equal(file.read() == 0, pixels == 0)
@@ -84,7 +84,7 @@ def test_a_run_stopped_while_it_is_written_goes_on(
 ) -> None:
     options = Options(model, tile_px=64, cog=True)
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    restore_file(image, tmp_path / "expected.tif", options, lambda _: None)
+    restore_file(image, tmp_path / "expected.tif", options)
     (tmp_path / "out.tif").write_bytes(b"the old one")
 
     def full(*_: object, **__: object) -> None:
@@ -95,11 +95,11 @@ def test_a_run_stopped_while_it_is_written_goes_on(
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "copy", full)
         with pytest.raises(MachineError, match=r"no space left.*`resume` from row 150 of 150"):
-            restore_file(image, tmp_path / "out.tif", options, lambda _: None)
+            restore_file(image, tmp_path / "out.tif", options)
     assert (tmp_path / "out.tif").read_bytes() == b"the old one"
     calls: list[str] = []
     monkeypatch.setattr("beers_deploy.restoration.engine.restore_window", lambda *_: calls.append("tile"))
-    restore_file(image, tmp_path / "out.tif", replace(options, resume=True), lambda _: None)
+    restore_file(image, tmp_path / "out.tif", replace(options, resume=True))
     assert calls == []
     assert (tmp_path / "out.tif").read_bytes() == (tmp_path / "expected.tif").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["expected.tif", "in.tif", "out.tif"]
@@ -110,7 +110,7 @@ def test_a_run_stopped_while_it_is_written_goes_on(
 @example(height=600, width=1)
 def test_it_is_valid_at_any_size(height: int, width: int, model: Path, tmp_path: Path) -> None:
     images.write_tiff(tmp_path / "in.tif", np.full((1, height, width), 700, np.uint16))
-    restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=256, cog=True), lambda _: None)
+    restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=256, cog=True))
     assert cogeo.cog_validate(tmp_path / "out.tif")[0]
 
 
@@ -118,7 +118,7 @@ def test_without_rasterio_it_is_one_sentence(model: Path, tmp_path: Path, monkey
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
     monkeypatch.setitem(sys.modules, "rasterio", None)
     with pytest.raises(MachineError, match=r"cog.*pip install 'beers-deploy\[gdal\]'"):
-        restore_file(image, tmp_path / "out.tif", Options(model, cog=True), lambda _: None)
+        restore_file(image, tmp_path / "out.tif", Options(model, cog=True))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
 
 
@@ -134,7 +134,7 @@ def test_the_disk_is_asked_for_all_that_stands_on_it_at_a_time(
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=free))
     free = needed - 1
     with pytest.raises(MachineError, match="of disk"):
-        restore_file(image, out, options, lambda _: None)
+        restore_file(image, out, options)
     assert [path.name for path in tmp_path.iterdir()] == ["in.tif"]
     free, taken, replace_file = needed, list[int](), Path.replace
 
@@ -144,5 +144,5 @@ def test_the_disk_is_asked_for_all_that_stands_on_it_at_a_time(
         return replace_file(self, target)
 
     monkeypatch.setattr(Path, "replace", counted)
-    restore_file(image, out, options, lambda _: None)
+    restore_file(image, out, options)
     assert 0.4 * needed < taken[0] < needed + 64_000

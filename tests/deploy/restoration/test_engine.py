@@ -54,35 +54,26 @@ def test_as_many_tiles_are_in_work_as_were_asked_for() -> None:
     assert np.array_equal(running(patient, 2), running(brighter, 1))
 
 
-def test_after_an_error_no_further_tile_is_begun() -> None:
-    calls, going = [], threading.Event()
-
-    def broken(image: np.ndarray) -> np.ndarray:
-        calls.append(1)
-        if len(calls) > 2:  # a tile takes longer than the news of an error
-            going.wait(0.2)
-        return np.full_like(image, np.nan)
-
-    with pytest.raises(ImageError, match="finite pixels"):
-        running(broken, 2)
-    assert len(calls) < 10, "the first two rows of tiles have twenty"
-
-
-def test_after_a_stop_no_further_tile_is_begun() -> None:
+@pytest.mark.parametrize(
+    ("factor", "error", "words"), [(np.nan, ImageError, "finite pixels"), (1, KeyboardInterrupt, "a stop")]
+)
+def test_after_an_error_or_a_stop_no_further_tile_is_begun(
+    factor: float, error: type[BaseException], words: str
+) -> None:
     calls, going = [], threading.Event()
 
     def slow(image: np.ndarray) -> np.ndarray:
         calls.append(1)
-        if len(calls) > 2:
+        if len(calls) > 2:  # a tile takes longer than the news of an error
             going.wait(0.2)
-        return brighter(image)
+        return brighter(image) * np.float32(factor)
 
     def stop() -> None:
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt("a stop")
 
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(error, match=words):
         running(slow, 2, stop)
-    assert len(calls) < 10
+    assert len(calls) < 10, "the first two rows of tiles have twenty"
 
 
 @given(threads=st.integers(0, 256), tiles=st.integers(0, 1000))

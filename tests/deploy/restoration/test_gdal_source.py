@@ -38,7 +38,7 @@ def test_the_restored_pixels_are_the_same_from_every_format(model: Path, tmp_pat
     for name, write in images.FORMATS.items():
         folder = tmp_path / name
         folder.mkdir()
-        restore_file(write(folder / name, pixels), folder / "out.tif", options, lambda _: None)
+        restore_file(write(folder / name, pixels), folder / "out.tif", options)
         results.append(tifffile.imread(folder / "out.tif"))
     for result in results[1:]:
         np.testing.assert_array_equal(result, results[0])
@@ -47,7 +47,7 @@ def test_the_restored_pixels_are_the_same_from_every_format(model: Path, tmp_pat
 @pytest.mark.parametrize("name", PLACED)
 def test_the_place_on_earth_is_kept(name: str, model: Path, tmp_path: Path) -> None:
     image = images.FORMATS[name](tmp_path / name, images.digital_numbers())
-    restore_file(image, tmp_path / "out.tif", Options(model), lambda _: None)
+    restore_file(image, tmp_path / "out.tif", Options(model))
     with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
         np.testing.assert_allclose(after.transform, images.profile()["transform"], rtol=0, atol=1e-9)
         assert after.crs == before.crs == rasterio.CRS.from_epsg(32631)
@@ -58,7 +58,7 @@ def test_polynomials_bits_and_gains_of_a_dimap_are_kept(cog: bool, model: Path, 
     image = images.write_dimap(tmp_path / "DIM.XML", images.digital_numbers(10), bits=10)
     with open_source(image) as source:
         assert source.raster.bits == 10
-    restore_file(image, tmp_path / "out.tif", Options(model, cog=cog), lambda _: None)
+    restore_file(image, tmp_path / "out.tif", Options(model, cog=cog))
     with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
         kept, stated = after.rpcs.to_dict(), before.rpcs.to_dict()
         for key in stated.keys() - {"err_bias", "err_rand"}:
@@ -70,7 +70,7 @@ def test_polynomials_bits_and_gains_of_a_dimap_are_kept(cog: bool, model: Path, 
 def test_names_and_gains_of_bands_are_kept(model: Path, tmp_path: Path) -> None:
     more = "<Description>B0</Description><Offset>-0.5</Offset><Scale>0.25</Scale>"
     image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers(), more)
-    restore_file(image, tmp_path / "out.tif", Options(model), lambda _: None)
+    restore_file(image, tmp_path / "out.tif", Options(model))
     with rasterio.open(tmp_path / "out.tif") as after:
         assert after.descriptions == ("B0", "B0")
         assert (after.scales, after.offsets) == ((0.25, 0.25), (-0.5, -0.5))
@@ -85,7 +85,7 @@ def test_ground_control_points_are_kept(model: Path, tmp_path: Path) -> None:
     text = image.read_text()
     place = text[text.index("<SRS>") : text.index("</GeoTransform>") + len("</GeoTransform>")]
     image.write_text(text.replace(place, f'<GCPList Projection="EPSG:4326">{points}</GCPList>'))
-    restore_file(image, tmp_path / "out.tif", Options(model), lambda _: None)
+    restore_file(image, tmp_path / "out.tif", Options(model))
     with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
         assert before.gcps[1] == after.gcps[1] == rasterio.CRS.from_epsg(4326)
         found = [[(p.col, p.row, p.x, p.y) for p in file.gcps[0]] for file in (before, after)]
@@ -96,21 +96,18 @@ def test_ground_control_points_are_kept(model: Path, tmp_path: Path) -> None:
 def test_missing_pixels_stay_missing(model: Path, tmp_path: Path) -> None:
     pixels = np.maximum(images.digital_numbers(), 1)
     pixels[:, 20:70, 30:90] = 0
-    results = []
-    for name, write in (("a.tif", images.write_tiff), ("a.img", images.FORMATS["a.img"])):
-        image = write(tmp_path / name, pixels)
-        with rasterio.open(image, "r+") as file:
-            file.nodata = 0
-        if name == "a.img":
-            assert not list(tmp_path.glob("*.aux.xml"))  # it is in the file
-        restore_file(image, tmp_path / f"{name}.tif", Options(model, tile_px=64), lambda _: None)
-        results.append(tifffile.imread(tmp_path / f"{name}.tif"))
-    np.testing.assert_array_equal(results[0] == 0, pixels == 0)
-    np.testing.assert_array_equal(results[1], results[0])
-    more = "<NoDataValue>0</NoDataValue>"
-    image = images.write_vrt(tmp_path / "a.vrt", pixels, more)
-    restore_file(image, tmp_path / "vrt.tif", Options(model, tile_px=64), lambda _: None)
-    np.testing.assert_array_equal(tifffile.imread(tmp_path / "vrt.tif"), results[0])
+    written = [
+        images.write_tiff(tmp_path / "a.tif", pixels, nodata=0),
+        images.write(tmp_path / "a.img", pixels, "HFA", nodata=0),
+        images.write_vrt(tmp_path / "a.vrt", pixels, "<NoDataValue>0</NoDataValue>"),
+    ]
+    assert not list(tmp_path.glob("*.img.aux.xml"))  # it is in the file
+    for image in written:
+        restore_file(image, tmp_path / f"{image.name}.tif", Options(model, tile_px=64))
+    first, *others = (tifffile.imread(tmp_path / f"{image.name}.tif") for image in written)
+    np.testing.assert_array_equal(first == 0, pixels == 0)
+    for other in others:
+        np.testing.assert_array_equal(other, first)
 
 
 def test_the_cache_is_counted_with_the_blocks_of_a_mosaic_s_tiles(tmp_path: Path) -> None:
@@ -134,7 +131,7 @@ def not_restored(image: Path, out: Path, model: Path, error: type[BeersError], *
     """One sentence, and nothing written."""
     before = sorted(out.parent.iterdir())
     with pytest.raises(error) as caught:
-        restore_file(image, out, Options(model, tile_px=64), lambda _: None)
+        restore_file(image, out, Options(model, tile_px=64))
     for word in words:
         assert word in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -170,7 +167,7 @@ def test_a_tile_is_no_output(model: Path, tmp_path: Path) -> None:
     tile, out = tmp_path / "IMG_R2C1.TIF", tmp_path / "out.tif"
     before = tile.read_bytes()
     with pytest.raises(BeersError, match="an input of this run"):
-        restore_file(image, tile, Options(model), lambda _: None)
+        restore_file(image, tile, Options(model))
     for words in (["restore", str(image), str(out), "--json", str(tile)], ["info", str(image), "--json", str(tile)]):
         assert "an input of this run" in refused(*words)
     assert tile.read_bytes() == before
@@ -209,7 +206,7 @@ def test_a_cog_keeps_mask_and_alpha(model: Path, tmp_path: Path) -> None:
     )
     tifffile.imwrite(tmp_path / "mask.tif.msk", np.where(hidden, 0, 255).astype(np.uint8))
     for name in ("mask", "alpha"):
-        restore_file(tmp_path / f"{name}.tif", tmp_path / "out.tif", Options(model, cog=True), lambda _: None)
+        restore_file(tmp_path / f"{name}.tif", tmp_path / "out.tif", Options(model, cog=True))
         with warnings.catch_warnings(action="ignore"), rasterio.open(tmp_path / "out.tif") as file:
             np.testing.assert_array_equal(file.dataset_mask() == 0, hidden)
             np.testing.assert_array_equal(file.read(1)[hidden], pixels[hidden])

@@ -36,7 +36,7 @@ def begun(image: Path, out: Path) -> subprocess.Popen[str]:
 
 
 def restore(image: Path, out: Path, resume: bool = False) -> None:
-    restore_file(image, out, Options(shipped_pair(sensor=BLIND)[1], TILE_PX, resume=resume), lambda _: None)
+    restore_file(image, out, Options(shipped_pair(sensor=BLIND)[1], TILE_PX, resume=resume))
 
 
 @pytest.mark.slow
@@ -75,7 +75,7 @@ def test_a_disk_without_locks_locks_nothing_and_is_left_clean(
 
     monkeypatch.setattr(fcntl, "flock", refuse)
     folder = tmp_path / ".out.part"
-    with only_run(tmp_path / "out", folder), only_run(tmp_path / "out", folder):
+    with only_run(tmp_path / "out"), only_run(tmp_path / "out"):
         pass
     assert not folder.exists()
 
@@ -87,30 +87,30 @@ def test_a_folder_that_never_comes_is_one_sentence(tmp_path: Path, monkeypatch: 
         raise FileNotFoundError(errno.ENOENT, "no such drive", str(self))
 
     monkeypatch.setattr(Path, "mkdir", missing)
-    with pytest.raises(MachineError, match="no such drive"), only_run(tmp_path / "out", tmp_path / ".out.part"):
+    with pytest.raises(MachineError, match="no such drive"), only_run(tmp_path / "out"):
         pass
 
 
 def test_rows_outlive_the_lock(tmp_path: Path) -> None:
     folder = tmp_path / ".out.part"
-    with only_run(tmp_path / "out", folder):
+    with only_run(tmp_path / "out"):
         (folder / "rows.raw").touch()
     assert [p.name for p in folder.iterdir()] == ["rows.raw"]
-    with only_run(tmp_path / "out", folder):
+    with only_run(tmp_path / "out"):
         (folder / "rows.raw").unlink()
     assert not folder.exists()
 
 
 def test_new_folders_above_go_with_it_unless_something_was_written_there(tmp_path: Path) -> None:
     out = tmp_path / "new" / "below" / "out"
-    with pytest.raises(ZeroDivisionError), only_run(out, out.with_name(".out.part")):
+    with pytest.raises(ZeroDivisionError), only_run(out):
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "new").mkdir()  # empty, but not ours
-    with only_run(out, out.with_name(".out.part")):
+    with only_run(out):
         pass
     assert [path.name for path in tmp_path.rglob("*")] == ["new"]
-    with only_run(out, out.with_name(".out.part")):
+    with only_run(out):
         out.touch()
     assert [path.name for path in tmp_path.rglob("*")] == ["new", "below", "out"]
 
@@ -129,10 +129,10 @@ def test_a_run_that_ends_just_then_takes_no_lock_along(tmp_path: Path, monkeypat
         taken(handle, operation)
 
     monkeypatch.setattr(fcntl, "flock", ending)
-    with only_run(tmp_path / "out", folder):
+    with only_run(tmp_path / "out"):
         monkeypatch.undo()
         assert (folder / output.NAME).is_file()
-        with pytest.raises(MachineError, match="no other run"), only_run(tmp_path / "out", folder):
+        with pytest.raises(MachineError, match="no other run"), only_run(tmp_path / "out"):
             pass
 
 
@@ -142,7 +142,7 @@ def test_many_that_try_are_never_two_at_once(tmp_path: Path) -> None:
     def trying() -> None:
         for _ in range(100):
             try:
-                with only_run(tmp_path / "out", tmp_path / ".out.part"):
+                with only_run(tmp_path / "out"):
                     inside[0] += 1
                     most[0] = max(most[0], inside[0])
                     time.sleep(0)

@@ -6,23 +6,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tifffile
 
 from beers_deploy import library
 from beers_deploy.library import restore
 from beers_deploy.network import shipped_pair
 from beers_deploy.profiles import load_sensor
 from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.restoration import function
-from beers_deploy.restoration.engine import restore_dn, restore_floats
+from beers_deploy.restoration import engine
+from beers_deploy.restoration.engine import network_method, restore_dn, restore_floats
 from beers_deploy.restoration.options import Options, Runtime
 from beers_deploy.restoration.plan import plan_for
-from beers_deploy.restoration.run import restore_file
 from beers_deploy.restoration.runtime import open_runtime
 from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.stress.networks import Network
 from beers_deploy.studies.tradeoff.measure import restore_in_tiles
 from beers_deploy.studies.tradeoff.points import FLOAT, INT8, Point, Variant
+from tests.deploy.restoration.runs import restored
 
 Restored = Callable[[np.ndarray], np.ndarray]
 
@@ -36,7 +35,7 @@ SMALL_HALOS_PX = {"float": 2, "int8": 8}
 @pytest.fixture(params=TILES_PX)
 def precision(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Of the network; evaluate and the trade-off's scores take tiles so small that the image has many."""
-    monkeypatch.setattr(function, "TILE_PX", TILES_PX[request.param])
+    monkeypatch.setattr(engine, "TILE_PX", TILES_PX[request.param])
     return str(request.param)
 
 
@@ -48,13 +47,6 @@ def path(precision: str, model: Path) -> Path:
 def image() -> np.ndarray:
     """Noise (H, W) uint16, black and full scale among it."""
     return np.random.default_rng(2).integers(0, 4096, ODD).astype(np.uint16)
-
-
-def by_command(pixels: np.ndarray, folder: Path, options: Options) -> np.ndarray:
-    """As `restore` writes it."""
-    tifffile.imwrite(folder / "in.tif", pixels)
-    restore_file(folder / "in.tif", folder / "out.tif", options, lambda _: None)
-    return tifffile.imread(folder / "out.tif")
 
 
 def by_engine(dn: np.ndarray, options: Options) -> np.ndarray:
@@ -85,7 +77,7 @@ def test_with_exact_seams_every_command_gives_the_pixels_of_restore(
     precision: str, path: Path, tmp_path: Path
 ) -> None:
     pixels, tile_px = image(), TILES_PX[precision]
-    expected = by_command(pixels, tmp_path, Options(path, tile_px))
+    expected = restored(tmp_path, pixels, Options(path, tile_px))[0]
     assert (expected != pixels).mean() > 0.5
     np.testing.assert_array_equal(restore(pixels, path, tile=tile_px), expected)
     for name, way in exact_ways(path, tile_px).items():
@@ -95,8 +87,8 @@ def test_with_exact_seams_every_command_gives_the_pixels_of_restore(
 def test_with_a_halo_below_the_radius_they_have_the_same_seams(precision: str, path: Path, tmp_path: Path) -> None:
     pixels, tile_px, halo_px = image(), TILES_PX[precision], SMALL_HALOS_PX[precision]
     options = Options(path, tile_px, str(halo_px))
-    expected = by_command(pixels, tmp_path, options)
-    assert (expected != by_command(pixels, tmp_path, Options(path, tile_px))).any()
+    expected = restored(tmp_path, pixels, options)[0]
+    assert (expected != restored(tmp_path, pixels, Options(path, tile_px))[0]).any()
     dn = pixels.astype(np.float32)
     np.testing.assert_array_equal(restore(pixels, path, tile=tile_px, halo=halo_px), expected)
     np.testing.assert_array_equal(by_tradeoff(path, precision, halo_px)(dn), expected)
@@ -105,7 +97,7 @@ def test_with_a_halo_below_the_radius_they_have_the_same_seams(precision: str, p
 
 def test_floats_are_those_of_restore_unrounded(precision: str, path: Path, tmp_path: Path) -> None:
     dn, tile_px = np.minimum(image() + np.float32(0.37), np.float32(4095)), TILES_PX[precision]
-    expected = by_command(dn, tmp_path, Options(path, tile_px))
+    expected = restored(tmp_path, dn, Options(path, tile_px))[0]
     assert (expected % 1 > 0).mean() > 0.5
     np.testing.assert_array_equal(restore(dn, path, tile=tile_px), expected)
     np.testing.assert_array_equal(Network(load_onnx(path)).restore(dn, tile_px=tile_px), expected)
@@ -116,8 +108,8 @@ def test_a_sensor_of_other_bits_has_its_own_full_scale(bits: int, model: Path, t
     max_dn = (1 << bits) - 1
     dn = np.random.default_rng(3).integers(0, max_dn + 1, ODD).astype(np.uint16)
     network = load_onnx(model)
-    expected = by_command(dn, tmp_path, Options(model, 23, full_scale=max_dn))
-    evaluated = function.network_method(network, max_dn)(dn.astype(np.float32))
+    expected = restored(tmp_path, dn, Options(model, 23, full_scale=max_dn))[0]
+    evaluated = network_method(network, max_dn)(dn.astype(np.float32))
     np.testing.assert_array_equal(evaluated, expected)
     infer, _ = open_runtime(Runtime.onnxruntime, network, threads=0)
     plan = plan_for(network, (1, *ODD), Options(model, 23))

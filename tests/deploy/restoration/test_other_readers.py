@@ -95,7 +95,7 @@ def qgis() -> Path:
 @pytest.mark.parametrize("name", ["a.tif", "a.jp2", "a.vrt", "DIM.XML"])
 def test_gdalinfo_finds_it_where_the_input_was(name: str, gdalinfo: str, model: Path, tmp_path: Path) -> None:
     image = images.FORMATS[name](tmp_path / name, images.digital_numbers())
-    restore_file(image, tmp_path / "out.tif", Options(model, cog=True), lambda _: None)
+    restore_file(image, tmp_path / "out.tif", Options(model, cog=True))
     before, after = (answer(gdalinfo, "-json", path) for path in (image, tmp_path / "out.tif"))
     assert after["geoTransform"] == pytest.approx(before["geoTransform"], rel=0, abs=1e-9)
     for corner, place in before["cornerCoordinates"].items():
@@ -125,7 +125,7 @@ def restore_with_a_hole(folder: Path, model: Path) -> np.ndarray:
     pixels = np.maximum(PIXELS, 1)
     pixels[:, 30:60, 20:90] = 0
     image = images.write_tiff(folder / "in.tif", pixels, nodata=0)
-    restore_file(image, folder / "out.tif", Options(model, cog=True), lambda _: None)
+    restore_file(image, folder / "out.tif", Options(model, cog=True))
     with images.rasterio.open(folder / "out.tif") as file:
         restored: np.ndarray = file.read()
     return restored
@@ -161,7 +161,7 @@ def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
     assert done
     assert not refused
     assert "expected a TIFF's name" in why
-    restore_file(image, tmp_path / "expected.tif", Options(shipped_pair(sensor=BLIND)[1]), lambda _: None)
+    restore_file(image, tmp_path / "expected.tif", Options(shipped_pair(sensor=BLIND)[1]))
     with images.rasterio.open(outs[0]) as ours, images.rasterio.open(tmp_path / "expected.tif") as theirs:
         np.testing.assert_array_equal(ours.read(), theirs.read())
         assert ours.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
@@ -170,7 +170,7 @@ def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
 def test_qgis_draws_the_footprint_of_a_stac_item(qgis: Path, model: Path, tmp_path: Path) -> None:
     pytest.importorskip("pystac")
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    restore_file(image, tmp_path / "out.tif", Options(model, cog=True), lambda _: None)
+    restore_file(image, tmp_path / "out.tif", Options(model, cog=True))
     write_item(tmp_path / "out.tif", tmp_path / "out.json")
     said = answer(qgis, "-c", IN_QGIS.replace("{}", FOOTPRINT), tmp_path / "out.json")
     assert (said["features"], said["crs"]) == (1, "EPSG:4326")

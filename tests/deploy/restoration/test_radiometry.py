@@ -17,6 +17,7 @@ from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
 from beers_deploy.restoration.run import restore_file
 from beers_deploy.restoration.source import Raster, open_source
+from tests.deploy.restoration.runs import restored
 
 SHAPE = 61, 47
 
@@ -93,11 +94,11 @@ def test_a_file_states_its_bits(bits: int, model: Path, tmp_path: Path) -> None:
     images = pytest.importorskip("tests.deploy.restoration.images", exc_type=ImportError)
     pixels = images.digital_numbers(bits)
     asked = Options(model, 64, full_scale=2**bits - 1)
-    restore_file(images.write_tiff(tmp_path / "a.tif", pixels), tmp_path / "out.tif", asked, lambda _: None)
+    restore_file(images.write_tiff(tmp_path / "a.tif", pixels), tmp_path / "out.tif", asked)
     expected = tifffile.imread(tmp_path / "out.tif")
     jp2 = images.write_jp2(tmp_path / "a.jp2", pixels, NBITS=bits)
     for image in (jp2, images.write_dimap(tmp_path / "DIM.XML", pixels, bits)):
-        row = restore_file(image, tmp_path / "out.tif", Options(model, 64), lambda _: None)
+        row = restore_file(image, tmp_path / "out.tif", Options(model, 64))
         assert row.text["full scale from"] == f"{bits} bits, as the file states"
         np.testing.assert_array_equal(tifffile.imread(tmp_path / "out.tif"), expected)
 
@@ -142,13 +143,10 @@ def test_missing_pixels_are_not_above(model: Path, tmp_path: Path) -> None:
     pixels[5:9, 3:40] = 65535
     pixels[30, 30] = 2000
     nodata = [(42113, "s", 0, "65535", True)]
-    tifffile.imwrite(tmp_path / "in.tif", pixels, extratags=nodata)
-    options = Options(model, 23, full_scale=1023)
-    row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options, lambda _: None)
+    found, row = restored(tmp_path, pixels, Options(model, 23, full_scale=1023), extratags=nodata)
     assert row.figures["clipped pixels"].value == 1
-    restored = tifffile.imread(tmp_path / "out.tif")
-    np.testing.assert_array_equal(restored == 65535, pixels == 65535)
-    assert restored[pixels != 65535].max() <= 1023
+    np.testing.assert_array_equal(found == 65535, pixels == 65535)
+    assert found[pixels != 65535].max() <= 1023
 
 
 def test_the_count_outlives_a_stop(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -160,7 +158,7 @@ def test_the_count_outlives_a_stop(model: Path, tmp_path: Path, monkeypatch: pyt
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, pixels, options)
     monkeypatch.undo()
-    row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", replace(options, resume=True), lambda _: None)
+    row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", replace(options, resume=True))
     assert row.figures["clipped pixels"].value == SHAPE[1]
 
 
@@ -174,7 +172,7 @@ def test_negative_and_infinite_values_stay_an_error(value: float, model: Path, t
 
 def test_8_bits_come_back_as_8_bits(model: Path, tmp_path: Path) -> None:
     eight = (noise(10) >> 2).astype(np.uint8)
-    restored, _, _ = run(tmp_path, eight, Options(model, 23, full_scale=255))
-    assert restored.dtype == np.uint8
-    wide, _, _ = run(tmp_path, eight.astype(np.uint16), Options(model, 23, full_scale=255))
-    np.testing.assert_array_equal(restored, wide)
+    kinds = [eight, eight.astype(np.uint16)]
+    narrow, wide = (restored(tmp_path, each, Options(model, 23, full_scale=255))[0] for each in kinds)
+    assert narrow.dtype == np.uint8
+    np.testing.assert_array_equal(narrow, wide)

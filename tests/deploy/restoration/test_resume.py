@@ -36,7 +36,7 @@ def image(tmp_path: Path) -> Path:
 @pytest.fixture
 def expected(image: Path, model: Path, tmp_path: Path) -> bytes:
     """The bytes of a run that nothing disturbs."""
-    restore_file(image, tmp_path / "expected.tif", Options(model, TILE_PX), lambda _: None)
+    restore_file(image, tmp_path / "expected.tif", Options(model, TILE_PX))
     return (tmp_path / "expected.tif").read_bytes()
 
 
@@ -76,7 +76,7 @@ def test_ctrl_c_says_how_to_go_on(image: Path, model: Path, expected: bytes, tmp
     assert "Traceback" not in said
     assert not (tmp_path / "out.tif").exists()
     options = Options(model, TILE_PX, threads=1, resume=True)
-    restore_file(image, tmp_path / "out.tif", options, lambda _: None)
+    restore_file(image, tmp_path / "out.tif", options)
     assert (tmp_path / "out.tif").read_bytes() == expected
 
 
@@ -85,9 +85,9 @@ def test_finished_rows_are_not_restored_again(
 ) -> None:
     out, options = tmp_path / "out.tif", Options(model, TILE_PX)
     with stopped_after(50):
-        restore_file(image, out, options, lambda _: None)
+        restore_file(image, out, options)
     with pytest.raises(OptionError, match="resume"):
-        restore_file(image, out, replace(options, halo="3", resume=True), lambda _: None)
+        restore_file(image, out, replace(options, halo="3", resume=True))
     seen: list[str] = []
     stop_after(50, monkeypatch, AssertionError("restored more than what was left"))
     restore_file(image, out, replace(options, resume=True), seen.append)
@@ -96,11 +96,11 @@ def test_finished_rows_are_not_restored_again(
 
 def test_another_image_of_the_same_name_is_not_mixed_in(image: Path, model: Path, tmp_path: Path) -> None:
     with stopped_after(50):
-        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX), lambda _: None)
+        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX))
     tifffile.imwrite(image, np.zeros((900, 260), np.uint16), tile=(16, 16))
     with pytest.raises(OptionError, match="the image"):
-        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX, resume=True), lambda _: None)
-    restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX), lambda _: None)
+        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX, resume=True))
+    restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX))
     assert tifffile.imread(tmp_path / "out.tif").max() < 4095
 
 
@@ -117,15 +117,15 @@ def test_a_full_disk_is_one_sentence_and_loses_no_finished_row(
         sync(handle)
 
     if calls == 1000:
-        monkeypatch.setattr("beers_deploy.restoration.output._tiles", full)
+        monkeypatch.setattr("beers_deploy.restoration.output._squares", full)
     else:
         monkeypatch.setattr(os, "fsync", full)
     out.write_bytes(b"old")
     with pytest.raises(MachineError, match=r"No space left.*resume"):
-        restore_file(image, out, replace(options, compression=Compression.none), lambda _: None)
+        restore_file(image, out, replace(options, compression=Compression.none))
     monkeypatch.undo()
     assert out.read_bytes() == b"old"
-    restore_file(image, out, replace(options, resume=True), lambda _: None)
+    restore_file(image, out, replace(options, resume=True))
     assert out.read_bytes() == expected
 
 
@@ -134,5 +134,5 @@ def test_a_swath_that_the_disk_cannot_hold_is_refused_first(
 ) -> None:
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
     with pytest.raises(MachineError, match="free"):
-        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX), lambda _: None)
+        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX))
     assert [p.name for p in tmp_path.iterdir()] == ["in.tif"]

@@ -1,6 +1,5 @@
 """Files restored by the swath engine: the whole image's result bit for bit, and what is kept beside the pixels."""
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,6 +20,7 @@ from beers_deploy.restoration.engine import fill_from_nearest, restore_window
 from beers_deploy.restoration.options import Compression, Options, Runtime
 from beers_deploy.restoration.runtime import Infer, open_runtime
 from tests.deploy.restoration.runs import noise
+from tests.deploy.restoration.runs import restored as restored_by_file
 
 RADIUS_PX = 5
 SHAPES = [(61, 83), (17, 130), (1, 40), (40, 1), (29, 29), (3, 5)]
@@ -28,10 +28,9 @@ SHAPES = [(61, 83), (17, 130), (1, 40), (40, 1), (29, 29), (3, 5)]
 
 def restore(folder: Path, pixels: np.ndarray, options: Options, **written: Any) -> tuple[np.ndarray, Row]:
     """Write, restore and read again."""
-    tifffile.imwrite(folder / "in.tif", pixels, **written)
-    row = swath.restore_file(folder / "in.tif", folder / "out.tif", options, lambda _: None)
+    found = restored_by_file(folder, pixels, options, **written)
     assert sorted(p.name for p in folder.iterdir()) == ["in.tif", "out.tif"]
-    return tifffile.imread(folder / "out.tif"), row
+    return found
 
 
 def whole_image(model: Path, pixels: np.ndarray) -> np.ndarray:
@@ -114,7 +113,7 @@ def test_nodata_settles_no_scale(model: Path, tmp_path: Path) -> None:
     shares[3:7] = -9999
     tifffile.imwrite(tmp_path / "in.tif", shares, extratags=[(42113, "s", 0, "-9999", True)])
     with pytest.raises(ImageError, match="full_scale"):
-        swath.restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=23), lambda _: None)
+        swath.restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=23))
 
 
 def test_georeference_and_rpcs_are_kept(model: Path, tmp_path: Path) -> None:
@@ -139,15 +138,13 @@ def test_georeference_and_rpcs_are_kept(model: Path, tmp_path: Path) -> None:
 def test_missing_pixels_stay_and_spoil_nothing(kind: str, model: Path, tmp_path: Path) -> None:
     known, missing = noise(70, 90).astype(np.float32), np.zeros((70, 90), bool)
     missing[20:60, 30:75] = missing[3, 5] = True
-    spoilt, tags = np.where(missing, np.nan, known).astype(np.float32), []
-    if kind == "tag":
-        spoilt, tags = (
-            np.where(missing, 7, np.where(known == 7, 8, known)).astype(np.uint16),
-            [(42113, "s", 0, "7", True)],
-        )
-    results = [
-        restore(tmp_path, spoilt, Options(model, tile_px=tile_px), extratags=tags)[0] for tile_px in (19, 31, 640)
-    ]
+    if kind == "nan":
+        spoilt, tags = np.where(missing, np.nan, known).astype(np.float32), []
+    else:
+        spoilt = np.where(missing, 7, np.where(known == 7, 8, known)).astype(np.uint16)
+        tags = [(42113, "s", 0, "7", True)]
+    options = [Options(model, tile_px=tile_px) for tile_px in (19, 31, 640)]
+    results = [restore(tmp_path, spoilt, each, extratags=tags)[0] for each in options]
     np.testing.assert_array_equal(results[0], results[2])
     np.testing.assert_array_equal(results[1], results[2])
     np.testing.assert_array_equal(results[0][missing], spoilt[missing])
@@ -171,55 +168,48 @@ def refused(folder: Path, pixels: np.ndarray, options: Options, error: type[Beer
     tifffile.imwrite(folder / "in.tif", pixels, tile=(16, 16))
     (folder / "out.tif").write_bytes(b"the old one")
     with pytest.raises(error) as caught:
-        swath.restore_file(folder / "in.tif", folder / "out.tif", options, lambda _: None)
+        swath.restore_file(folder / "in.tif", folder / "out.tif", options)
     for word in words:
         assert word in str(caught.value)
     assert (folder / "out.tif").read_bytes() == b"the old one"
     assert sorted(p.name for p in folder.iterdir()) == ["in.tif", "out.tif"]
 
 
-def test_values_beyond_full_scale_in_the_last_rows_leave_the_old_output(model: Path, tmp_path: Path) -> None:
-    pixels = noise(90, 40)
-    pixels[-1, -1] = 60000
-    refused(tmp_path, pixels, Options(model, tile_px=23), ImageError, "60000", "full_scale")
-    pixels = -noise(90, 40).astype(np.float32)
-    refused(tmp_path, pixels, Options(model, tile_px=23), ImageError, "-4", "add the offset")
-    refused(tmp_path, np.full((20, 20), np.inf, np.float32), Options(model), ImageError, "inf", "write NaN")
+@pytest.mark.parametrize(
+    ("pixels", "words"),
+    [
+        (np.pad(noise(89, 40), ((0, 1), (0, 0)), constant_values=60000), ("60000", "full_scale")),  # in the last row
+        (-noise(90, 40).astype(np.float32), ("-4", "add the offset")),
+        (np.full((20, 20), np.inf, np.float32), ("inf", "write NaN")),
+        (np.full((60, 40), np.nan, np.float32), ("NaN",)),
+    ],
+)
+def test_values_that_cannot_be_leave_the_old_output(
+    pixels: np.ndarray, words: tuple[str, ...], model: Path, tmp_path: Path
+) -> None:
+    refused(tmp_path, pixels, Options(model, tile_px=23), ImageError, *words)
 
 
-def test_an_image_all_missing_is_refused(model: Path, tmp_path: Path) -> None:
-    refused(tmp_path, np.full((60, 40), np.nan, np.float32), Options(model, tile_px=23), ImageError, "NaN")
-
-
-def test_options_that_cannot_be_are_refused(model: Path, tmp_path: Path) -> None:
-    sound = Options(model, tile_px=23)
-    for options, word in (
-        (replace(sound, tile_px=16, halo="8"), "tile"),
-        (replace(sound, halo="wide"), "halo"),
-        (replace(sound, full_scale=0.5), "full_scale"),
-    ):
-        refused(tmp_path, noise(40, 40), options, OptionError, word)
+@pytest.mark.parametrize(
+    ("word", "wrong"),
+    [("tile", {"tile_px": 16, "halo": "8"}), ("halo", {"halo": "wide"}), ("full_scale", {"full_scale": 0.5})],
+)
+def test_options_that_cannot_be_are_refused(word: str, wrong: dict[str, Any], model: Path, tmp_path: Path) -> None:
+    refused(tmp_path, noise(40, 40), Options(model, **{"tile_px": 23, **wrong}), OptionError, word)
 
 
 def test_a_budget_that_does_not_suffice_is_refused_before_the_run(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refused(
-        tmp_path,
-        noise(40, 40),
-        Options(model, memory_bytes=1000),
-        MachineError,
-        "memory",
-        "1.00 kB",
-        "give it more than",
-    )
+    words = "memory", "1.00 kB", "give it more than"
+    refused(tmp_path, noise(40, 40), Options(model, memory_bytes=1000), MachineError, *words)
     tifffile.imwrite(tmp_path / "in.tif", noise(1000, 3000), compression="zlib", rowsperstrip=1000)
     # What a process of many tests holds moves by more than the rows of the image.
     memory = SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=100_000_000))
     monkeypatch.setattr("beers_deploy.restoration.plan.psutil.Process", lambda: memory)
     options = Options(model, tile_px=64, memory_bytes=108_000_000)
     with pytest.raises(MachineError, match="TILED=YES"):
-        swath.restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options, lambda _: None)
+        swath.restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options)
 
 
 def test_memory_is_stated_before_anything_is_written(model: Path, tmp_path: Path) -> None:
@@ -252,9 +242,7 @@ def test_integers_are_packed_as_differences_and_gdal_reads_them(
     dtype: type, predictor: int, model: Path, tmp_path: Path
 ) -> None:
     rasterio = pytest.importorskip("rasterio")
-    pixels: np.ndarray = np.tile(noise(70, 90) // 20, (1, 4, 4)).astype(
-        dtype
-    )  # of several squares, none of them whole
+    pixels = np.tile(noise(70, 90) // 20, (1, 4, 4)).astype(dtype)  # of several squares, none of them whole
     restored, _ = restore(tmp_path, pixels, Options(model, full_scale=255))
     with rasterio.open(tmp_path / "out.tif") as file:
         np.testing.assert_array_equal(file.read(), restored.reshape(-1, *restored.shape[-2:]))

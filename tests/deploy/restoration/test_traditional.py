@@ -9,11 +9,11 @@ import tifffile
 import torch
 
 from beers_deploy.model.progress import no_log
-from beers_deploy.model.traditional.pipeline import restore_traditional
+from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError, MachineError
 from beers_deploy.restoration.options import Options
-from beers_deploy.restoration.traditional import chain_of, restore_file_traditionally
+from beers_deploy.restoration.traditional import restore_file_traditionally
 from tests.deploy.command_line import done, refused
 from tests.profiles.own_sensor import own_sensor
 
@@ -29,7 +29,9 @@ def noise(seed: int = 0) -> np.ndarray:
 
 
 def of_array(pixels: np.ndarray, asked: Options) -> np.ndarray:
-    return restore_traditional(torch.from_numpy(pixels.astype(np.float32)), chain_of(asked.sensors[""])).numpy()
+    sensor = asked.sensors[""]
+    chain = Chain(sensor.nominal(), sensor.reference.nominal())
+    return restore_traditional(torch.from_numpy(pixels.astype(np.float32)), chain).numpy()
 
 
 def of_file(folder: Path, pixels: np.ndarray, asked: Options, **written: object) -> np.ndarray:

@@ -27,7 +27,7 @@ HIDDEN[:9], HIDDEN[20:33, 40:], HIDDEN[50, 3] = True, True, True
 
 def restored(path: Path, model: Path, **options: Any) -> tuple[np.ndarray, np.ndarray | None]:
     """The pages of a restored file: its pixels, and its mask."""
-    restore_file(path, path.with_name("out.tif"), Options(model, tile_px=23, **options), lambda _: None)
+    restore_file(path, path.with_name("out.tif"), Options(model, tile_px=23, **options))
     with tifffile.TiffFile(path.with_name("out.tif")) as file:
         pages = [page.asarray() for page in file.pages]
         assert len(pages) == 1 or file.pages[1].asarray().dtype == bool
@@ -101,7 +101,7 @@ def test_alpha_goes_through_untouched(kind: str, planes: Any, bands: int, model:
     tifffile.imwrite(
         tmp_path / "in.tif", whole, photometric=photometric, planarconfig=planes, extrasamples=[kind], metadata=None
     )
-    restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=23), lambda _: None)
+    restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=23))
     with tifffile.TiffFile(tmp_path / "out.tif") as file:
         page = file.pages.first
         found, said = page.asarray(), (page.photometric, page.extrasamples)

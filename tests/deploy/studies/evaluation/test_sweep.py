@@ -15,7 +15,7 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles import Sensor, load_sensor
 from beers_deploy.profiles.figures import Row, by_table, unavailable
 from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.restoration.function import Restore
+from beers_deploy.restoration.engine import Restore
 from beers_deploy.studies.evaluation import scores as scores_module
 from beers_deploy.studies.evaluation import sweep as module
 from beers_deploy.studies.evaluation.methods import BLIND, Method
