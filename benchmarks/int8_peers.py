@@ -74,9 +74,7 @@ def ways(adaround_iterations: int) -> list[Way]:
         ("Quark XINT8 + AdaRound", QUARK, (), (str(adaround_iterations),)),
     ]
     ours = [Way(f"beers-deploy {regime}", False, OURS, (regime,)) for regime in ("legal", "free")]
-    return ours + [
-        Way(name, graph, script, before, after) for name, script, before, after in peers for graph in (False, True)
-    ]
+    return [*ours, *(Way(name, graph, *how) for name, *how in peers for graph in (False, True))]
 
 
 @dataclass(frozen=True)
@@ -178,15 +176,11 @@ def drawn(model: onnx.ModelProto, arguments: argparse.Namespace) -> tuple[list[P
         both = (samples_of(model, path) for path in (arguments.data, arguments.held_out_data or arguments.data))
         calibration, held_out = (list(samples.all.pairs) for samples in both if samples)
         return calibration, held_out
-    asked = (
-        (arguments.images, arguments.sensor, arguments.patches, arguments.seed),
-        (
-            *(arguments.held_out, arguments.held_out_sensor, arguments.held_out_patches),
-            arguments.seed + HELD_OUT_SEED,
-        ),
+    other = arguments.seed + HELD_OUT_SEED
+    return (
+        _simulated(arguments.images, arguments.sensor, arguments.patches, arguments.seed),
+        _simulated(arguments.held_out, arguments.held_out_sensor, arguments.held_out_patches, other),
     )
-    calibration, held_out = (_simulated(*each) for each in asked)
-    return calibration, held_out
 
 
 def _simulated(images: Path | None, sensor: str, count: int, seed: int) -> list[Pair]:
