@@ -1,6 +1,6 @@
 """What a step of fine-tuning costs against a plain float step of the same network on the same patches, in one run.
 
-    python benchmarks/finetune.py
+    python -m benchmarks.finetune
 
 Three networks with drawn weights, four patches of 128 x 128 a step. The float step is forward, loss, backward and
 Adam in torch, in whichever of its two memory layouts is faster. Both are interleaved, so that what else the machine
