@@ -5,11 +5,9 @@ from pathlib import Path
 
 import onnx
 import pytest
-import torch
 
 from beers_deploy.bench.tables import Swath
 from beers_deploy.export import to_onnx
-from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import Variant as Shape
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.constant import Constant
@@ -34,6 +32,7 @@ from beers_deploy.studies.tradeoff.points import (
 )
 from tests.deploy.dpu.graphs import integer_convbeers
 from tests.deploy.studies.tradeoff.made import DPU
+from tests.model.networks import plain
 
 WHOLE = Swath(13600, 9016)
 SENSOR = load_sensor("pleiades-degraded")
@@ -51,9 +50,7 @@ def refused(_: Path) -> Path:
 
 
 def float_file(path: Path) -> Path:
-    network = ConvBEERS(Shape(1, 2))
-    initialise(network, torch.Generator().manual_seed(0))
-    save_onnx(to_onnx(network.eval(), {}), path)
+    save_onnx(to_onnx(plain(Shape(1, 2)), {}), path)
     return path
 
 

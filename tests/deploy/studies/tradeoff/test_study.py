@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
-from beers_deploy.model.convbeers import ConvBEERS, initialise, save_network
+from beers_deploy.model.convbeers import save_network
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.variants import Variant as Shape
 from beers_deploy.profiles import load_sensor
@@ -30,6 +29,7 @@ from beers_deploy.studies.tradeoff.run import tradeoff
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 from tests.deploy.studies.tradeoff.small import small_studies
+from tests.model.networks import plain
 
 pytestmark = pytest.mark.slow
 
@@ -41,9 +41,7 @@ SENSOR = "pleiades-degraded"
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network, two scenes to judge on and one to calibrate on."""
     folder = tmp_path_factory.mktemp("tiny")
-    network = ConvBEERS(Shape(1, 2))
-    initialise(network, torch.Generator().manual_seed(3))
-    save_network(folder / "narrow.safetensors", network, {"degraded": SENSOR})
+    save_network(folder / "narrow.safetensors", plain(Shape(1, 2), seed=3), {"degraded": SENSOR})
     for number in range(SITES + 1):
         scene = procedural_scene(300, 340, np.random.default_rng(number)).radiance
         place = folder / ("images" if number < SITES else "calibration") / f"site{'abc'[number]}.png"
