@@ -28,7 +28,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -66,15 +66,15 @@ class Way:
 
 def ways(adaround_iterations: int) -> list[Way]:
     """All that are compared, the slowest last."""
-    peers: list[tuple[str, Path, tuple[str, ...], tuple[str, ...]]] = [
-        ("onnxruntime min-max", OURS, ("minmax",), ()),
-        ("onnxruntime percentile 99.99", OURS, ("percentile",), ()),
-        ("Quark VINT8", QUARK, (), ("vint8",)),
-        ("Quark XINT8", QUARK, (), ("0",)),
-        ("Quark XINT8 + AdaRound", QUARK, (), (str(adaround_iterations),)),
+    peers = [
+        Way("onnxruntime min-max", False, OURS, ("minmax",)),
+        Way("onnxruntime percentile 99.99", False, OURS, ("percentile",)),
+        Way("Quark VINT8", False, QUARK, (), ("vint8",)),
+        Way("Quark XINT8", False, QUARK, (), ("0",)),
+        Way("Quark XINT8 + AdaRound", False, QUARK, (), (str(adaround_iterations),)),
     ]
     ours = [Way(f"beers-deploy {regime}", False, OURS, (regime,)) for regime in ("legal", "free")]
-    return [*ours, *(Way(name, graph, *how) for name, *how in peers for graph in (False, True))]
+    return [*ours, *(replace(peer, rewritten=graph) for peer in peers for graph in (False, True))]
 
 
 @dataclass(frozen=True)
