@@ -84,15 +84,10 @@ def restored(networks: list[Path], out: Path) -> None:
     np.savez(out, **{path.stem: restore(image, path, tile=64, threads=1) for path in networks})
 
 
-def networks() -> list[Path]:
-    """The shipped pairs as ONNX files."""
-    return [file for name in NETWORKS for file in shipped_pair(name)]
-
-
 def compare(root: Path, processors: tuple[str, ...]) -> dict[str, dict[str, float]]:
     """The largest difference in DN from this processor's pixels, by emulated processor and network."""
     with tempfile.TemporaryDirectory() as folder:
-        files, here = networks(), Path(folder) / "here.npz"
+        files, here = [file for name in NETWORKS for file in shipped_pair(name)], Path(folder) / "here.npz"
         restored(files, here)
         expected, found = dict(np.load(here)), {}
         for processor in processors:

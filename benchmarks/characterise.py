@@ -67,9 +67,9 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             found = look(ways, sensor, chosen, number, Path(folder))
             if arguments.weights is not None and found is not None:
-                lost.append(
-                    psnr_lost(arguments.weights, chosen[0], sensor, as_read(found, Path(folder) / "found.toml"))
-                )
+                profile = Path(folder) / "found.toml"
+                profile.write_text(profile_toml(found), encoding="utf-8")
+                lost.append(psnr_lost(arguments.weights, chosen[0], sensor, load_sensor(str(profile)).nominal()))
     print("| figure | images | found | error, median | mean, signed | worst | in the 95 % interval |")
     print("|---|---|---|---|---|---|---|")
     for name, findings in ways.items():
@@ -96,12 +96,6 @@ def boxes_on_target(path: Path) -> tuple[str, str]:
     height, width = tifffile.imread(path).shape
     upright = f"{path}:{width // 2 - 10},{height // 2 - 50},28,34"
     return upright, f"{path}:{width // 2 + 16},{height // 2 - 10},34,28"
-
-
-def as_read(found: Characterised, path: Path) -> Instrument:
-    """The sensor of the profile, written and read."""
-    path.write_text(profile_toml(found), encoding="utf-8")
-    return load_sensor(str(path)).nominal()
 
 
 def psnr_lost(weights: Path, scene: Scene, sensor: Instrument, found: Instrument) -> float:

@@ -13,11 +13,8 @@ Names: BLOCKSxFEATURES as the paper's blocks, uFEATURES a U-Net of two levels, d
 """
 
 import argparse
-import io
-import math
 import re
 import time
-import warnings
 from collections.abc import Callable, Iterable
 from itertools import islice, product
 from pathlib import Path
@@ -26,14 +23,11 @@ import numpy as np
 import onnx
 import torch
 from safetensors.torch import load_file, save_file
+from shapes import on_a_swath
 from torch import Tensor, nn
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
-from beers_deploy.bench.tables import PAPER_SIZE, Swath, parse_size, swath_latency
 from beers_deploy.dpu.board import load_dpu
-from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.cost.latency import predict
-from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.convbeers import ResidualBlock
 from beers_deploy.model.io.images import list_images, site_of
 from beers_deploy.model.metrics.fidelity import psnr_db
@@ -42,11 +36,11 @@ from beers_deploy.model.progress import steps
 from beers_deploy.model.simulator.sampling import read_scene
 from beers_deploy.model.training.losses import LossWeights, RestorationLoss
 from beers_deploy.model.training.patches import PatchRecipe, PatchSource
+from beers_deploy.network import Network
 from beers_deploy.profiles import load_sensor
 from beers_deploy.quant.calibration import Calibration, draw_patches
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import Patches
-from beers_deploy.quant.session import open_any_size
 from beers_deploy.quant.tiling.walk import tiling_of
 
 FAMILIES = "4x64@2,8x48@2,2x32@2,u48@2,u64@2,d8x64@2,d8x96@2,k2x32@2,k3x48@2,u32,8x32"
@@ -64,22 +58,17 @@ LOSS = RestorationLoss(LossWeights(lpips=0.0, fft=0.0))
 
 
 class Restoring(nn.Module):
-    """Image plus correction, (N, 1, H, W) to the same: a head, a body between maps of equal size, a tail.
-
-    Where it is `narrow`, the body is computed in bfloat16.
-    """
+    """Image plus correction, (N, 1, H, W) to the same: a head, a body between maps of equal size, a tail."""
 
     def __init__(self, features: int, scale: int, body: nn.Module) -> None:
         super().__init__()
-        self.scale, self.body, self.narrow = scale, body, False
+        self.scale, self.body = scale, body
         self.head, self.tail = conv(scale**2, features), conv(features, scale**2)
 
     def forward(self, image: Tensor) -> Tensor:
         """Restore images."""
         shallow = self.head(pixel_unshuffle(image, self.scale) if self.scale > 1 else image)
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.narrow):
-            deep = self.body(shallow)
-        correction: Tensor = self.tail(shallow + (deep.float() if self.narrow else deep))
+        correction: Tensor = self.tail(shallow + self.body(shallow))
         return image + (pixel_shuffle(correction, self.scale) if self.scale > 1 else correction)
 
 
@@ -158,7 +147,7 @@ def trained(name: str, source: PatchSource, count: int, path: Path) -> Restoring
         return network.eval()
     optimiser = torch.optim.Adam(network.parameters(), RATE)
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, count)
-    network.narrow, begun = False, time.process_time()
+    begun = time.process_time()
     with steps(f"training {name}", count) as bar:
         for batch in islice(source.batches(), count):
             degraded, reference = map(torch.from_numpy, batch)
@@ -171,43 +160,23 @@ def trained(name: str, source: PatchSource, count: int, path: Path) -> Restoring
             bar.advance()
     print(f"{name}: trained in {time.process_time() - begun:.0f} s of processor time", flush=True)
     save_file(network.state_dict(), path)
-    network.narrow = False
     return network.eval()
 
 
-def exported(network: Restoring) -> onnx.ModelProto:
-    """As ONNX, `input` to `output`, batch, height and width free."""
-    axes = {0: "batch", 2: "height", 3: "width"}
-    names = {"input_names": ["input"], "output_names": ["output"], "dynamic_axes": {"input": axes, "output": axes}}
-    file = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        torch.onnx.export(network, (torch.zeros(1, 1, 64, 64),), file, dynamo=False, opset_version=17, **names)  # type: ignore[arg-type]
-    return onnx.load_model_from_string(file.getvalue())
-
-
-def psnrs_db(model: onnx.ModelProto, patches: Patches) -> np.ndarray:
-    """PSNR of each patch, dB over full scale."""
-    session, found = open_any_size(model), []
-    for degraded, reference in patches.pairs:
-        (restored,) = session.run(None, {session.get_inputs()[0].name: degraded})
-        found.append(psnr_db(restored[0, 0].clip(0, 1), reference[0, 0], 1.0))
-    return np.array(found)
+def psnr_cell(model: onnx.ModelProto, patches: Patches) -> str:
+    """Mean PSNR of the patches, dB over full scale."""
+    restore = Network.load(model)
+    levels = [psnr_db(restore(seen)[0, 0].clip(0, 1), meant[0, 0], 1.0) for seen, meant in patches.pairs]
+    return f"{np.mean(levels):.2f}"
 
 
 def swath_cell(model: onnx.ModelProto) -> str:
     """Predicted seconds of a swath, with interval, tile and configuration, where they are least."""
-    width_px, height_px = parse_size(PAPER_SIZE)
     found = []
     for configuration, tile_px in product(CONFIGURATIONS, TILES_PX):
-        dpu, radius_px = load_dpu("vck190", configuration), tiling_of(model).halo_px
-        if 2 * radius_px >= tile_px:
-            continue
-        prediction = predict(place(network_of(model, tile_px), dpu), dpu)
-        swath = Swath(width_px, height_px, tile_px, radius_px)
-        latency = swath_latency(prediction, math.ceil(swath.tiles / prediction.batch))
-        low, high = latency.interval or (math.nan, math.nan)
-        found.append((latency.value, f"{latency.value:.3g} [{low:.3g}, {high:.3g}] ({tile_px}, {configuration})"))
+        if 2 * tiling_of(model).halo_px < tile_px:
+            _, time_s, low_s, high_s = on_a_swath(model, load_dpu("vck190", configuration), tile_px)
+            found.append((time_s, f"{time_s:.3g} [{low_s:.3g}, {high_s:.3g}] ({tile_px}, {configuration})"))
     return min(found)[1]
 
 
@@ -233,9 +202,9 @@ def main() -> None:
     print("|", " | ".join(heads), "|\n" + "|---" * len(heads) + "|")
     for name in arguments.families.split(","):
         network = trained(name, source, arguments.steps, arguments.out / f"{name}.safetensors")
-        model = exported(network)
+        model = Network.load(network).model
         made = quantise_model(model, drawn, {}).host
-        scores = [f"{psnrs_db(each, judging).mean():.2f}" for each in (model, made)]
+        scores = [psnr_cell(each, judging) for each in (model, made)]
         weights = sum(parameter.numel() for parameter in network.parameters()) / 1e3
         cells = [name, f"{weights:.0f}", str(tiling_of(made).halo_px), *scores, swath_cell(made)]
         print("|", " | ".join(cells), "|", flush=True)

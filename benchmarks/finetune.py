@@ -1,6 +1,6 @@
 """What a step of fine-tuning costs against a plain float step of the same network on the same patches, in one run.
 
-    python benchmarks/finetune.py
+    python -m benchmarks.finetune
 
 Three networks with drawn weights, four patches of 128 x 128 a step. The float step is forward, loss, backward and
 Adam in torch, in whichever of its two memory layouts is faster. Both are interleaved, so that what else the machine
@@ -8,14 +8,11 @@ does falls on each of them.
 """
 
 import argparse
-import io
 import time
-import warnings
 from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-import onnx
 import torch
 from torch import Tensor, nn
 
@@ -60,16 +57,6 @@ def _conv(inputs: int, outputs: int) -> nn.Conv2d:
 NETWORKS: dict[str, Callable[[], nn.Module]] = {"depthwise": depthwise, "unet": UNet, "dncnn": dncnn}
 
 
-def exported(network: nn.Module) -> onnx.ModelProto:
-    """The network as ONNX for images of any size."""
-    file, axes = io.BytesIO(), {0: "batch", 2: "rows", 3: "columns"}
-    names = {"input_names": ["input"], "output_names": ["output"], "dynamic_axes": {"input": axes, "output": axes}}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        torch.onnx.export(network, (torch.zeros(1, 1, 64, 64),), file, dynamo=False, opset_version=17, **names)  # type: ignore[arg-type]
-    return onnx.load_model_from_string(file.getvalue())
-
-
 def float_step(network: nn.Module, layout: torch.memory_format) -> Callable[[], None]:
     """What anybody would write."""
     network, images = network.to(memory_format=layout), torch.rand(PATCHES, 1, SIDE_PX, SIDE_PX)  # type: ignore[call-overload]
@@ -101,7 +88,7 @@ def main() -> None:
     turns = parser.parse_args().turns
     print(f"{processor_name()}, {torch.get_num_threads()} threads, processor time of the fastest of {turns} steps")
     for name, make in NETWORKS.items():
-        core = read_core(quantize(exported(make()), patches=2, patch_px=64, progress=False).model)
+        core = read_core(quantize(make(), patches=2, patch_px=64, progress=False).model)
         layouts = torch.contiguous_format, torch.channels_last
         steps = [tuning_step(core), *(float_step(make(), layout) for layout in layouts)]
         taken = [[_seconds(step) for step in steps] for _ in range(turns)]

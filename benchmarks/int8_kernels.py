@@ -9,14 +9,15 @@ machine does falls on each of them; ratios are of the fastest turns. On another 
 """
 
 import argparse
-import time
 from collections import Counter
+from functools import partial
 from statistics import median
 
 import numpy as np
 import onnx
 import onnxruntime as ort
 
+from beers_deploy.bench.timing import interleaved, timed
 from beers_deploy.model.processor import decided, int8_adds_exactly, processor_name
 from beers_deploy.network import shipped_pair
 from beers_deploy.quant.kernels import filled, made_exact
@@ -62,12 +63,9 @@ def print_times(
         "ways": open_session(integer, threads, exact=True),
         "plain": open_session(integer, threads, exact=False),
     }
-    times_s: dict[str, list[float]] = {name: [] for name in sessions}
-    for _ in range(turns + 1):
-        for name, session in sessions.items():
-            begun = time.perf_counter()
-            run(session, image)
-            times_s[name].append(time.perf_counter() - begun)
+    calls = [partial(run, session, image) for session in sessions.values()]
+    found = interleaved(calls, lambda call: timed(call)[1], lambda taken: len(taken[0]) > turns)
+    times_s = dict(zip(sessions, found, strict=True))
     fastest_s = {name: min(times[1:]) for name, times in times_s.items()}  # the first turn sets up
     spread = max(median(times[1:]) / fastest_s[name] for name, times in times_s.items())
     shown = ", ".join(f"{name} {time_s:.3f} s" for name, time_s in fastest_s.items())

@@ -28,7 +28,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -66,17 +66,15 @@ class Way:
 
 def ways(adaround_iterations: int) -> list[Way]:
     """All that are compared, the slowest last."""
-    peers: list[tuple[str, Path, tuple[str, ...], tuple[str, ...]]] = [
-        ("onnxruntime min-max", OURS, ("minmax",), ()),
-        ("onnxruntime percentile 99.99", OURS, ("percentile",), ()),
-        ("Quark VINT8", QUARK, (), ("vint8",)),
-        ("Quark XINT8", QUARK, (), ("0",)),
-        ("Quark XINT8 + AdaRound", QUARK, (), (str(adaround_iterations),)),
+    peers = [
+        Way("onnxruntime min-max", False, OURS, ("minmax",)),
+        Way("onnxruntime percentile 99.99", False, OURS, ("percentile",)),
+        Way("Quark VINT8", False, QUARK, (), ("vint8",)),
+        Way("Quark XINT8", False, QUARK, (), ("0",)),
+        Way("Quark XINT8 + AdaRound", False, QUARK, (), (str(adaround_iterations),)),
     ]
     ours = [Way(f"beers-deploy {regime}", False, OURS, (regime,)) for regime in ("legal", "free")]
-    return ours + [
-        Way(name, graph, script, before, after) for name, script, before, after in peers for graph in (False, True)
-    ]
+    return [*ours, *(replace(peer, rewritten=graph) for peer in peers for graph in (False, True))]
 
 
 @dataclass(frozen=True)
@@ -178,15 +176,11 @@ def drawn(model: onnx.ModelProto, arguments: argparse.Namespace) -> tuple[list[P
         both = (samples_of(model, path) for path in (arguments.data, arguments.held_out_data or arguments.data))
         calibration, held_out = (list(samples.all.pairs) for samples in both if samples)
         return calibration, held_out
-    asked = (
-        (arguments.images, arguments.sensor, arguments.patches, arguments.seed),
-        (
-            *(arguments.held_out, arguments.held_out_sensor, arguments.held_out_patches),
-            arguments.seed + HELD_OUT_SEED,
-        ),
+    other = arguments.seed + HELD_OUT_SEED
+    return (
+        _simulated(arguments.images, arguments.sensor, arguments.patches, arguments.seed),
+        _simulated(arguments.held_out, arguments.held_out_sensor, arguments.held_out_patches, other),
     )
-    calibration, held_out = (_simulated(*each) for each in asked)
-    return calibration, held_out
 
 
 def _simulated(images: Path | None, sensor: str, count: int, seed: int) -> list[Pair]:

@@ -28,6 +28,7 @@ from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.restoration.sensor_check import SensorCheck, check_source
 from beers_deploy.restoration.source import ArraySource, Raster, open_source
+from beers_deploy.studies.evaluation.methods import profile_of
 
 BASE = load_sensor("pleiades-degraded")
 THIRD, SIDE_PX = 4 / 3, 2048
@@ -36,15 +37,16 @@ Image = np.ndarray
 
 def told(sensor: Instrument, mtf: float = 1.0, noise: float = 1.0, gain: float = 1.0, bits: int = 0) -> Sensor:
     """The profile of a sensor, its MTF, noise, gain or bits off by a factor, or so many bits."""
-    number = {
-        "mtf_nyquist": sensor.mtf_nyquist * mtf, "mtf_nyquist_along": sensor.mtf_axes[1] * mtf,
-        "alpha": sensor.alpha * noise**2, "beta": sensor.beta * noise**2,
-        "gain_dn_per_radiance": sensor.gain_dn_per_radiance * gain,
-    }  # fmt: skip
-    changed = BASE.replace(**{key: value for key, value in number.items() if key not in ("alpha", "beta")})
-    alpha, beta = (replace(changed.gsd_m, value=number[key]) for key in ("alpha", "beta"))
-    made = replace(changed, alpha=alpha, beta=beta, snr_0=None, snr_1=None)
-    return made.replace(bits=bits) if bits else made
+    changed = replace(
+        sensor,
+        mtf_nyquist=sensor.mtf_nyquist * mtf,
+        mtf_nyquist_along=sensor.mtf_axes[1] * mtf,
+        alpha=sensor.alpha * noise**2,
+        beta=sensor.beta * noise**2,
+        gain_dn_per_radiance=sensor.gain_dn_per_radiance * gain,
+        bits=bits or sensor.bits,
+    )
+    return profile_of(changed, BASE)
 
 
 def restored(image: Image, sensor: Instrument) -> Image:

@@ -18,7 +18,7 @@ import torch
 from beers_deploy.bench.tables import PAPER_SIZE, Swath, parse_size, swath_latency
 from beers_deploy.dpu.board import Dpu, load_dpu
 from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.cost.latency import predict
+from beers_deploy.dpu.cost.latency import Prediction, predict
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
@@ -70,16 +70,20 @@ def int8(variant: Variant) -> onnx.ModelProto:
         return quantise_model(to_onnx(network.eval(), {}), patches, {}).host
 
 
+def on_a_swath(model: onnx.ModelProto, dpu: Dpu, tile_px: int) -> tuple[Prediction, float, float, float]:
+    """The prediction of a tile; and seconds of the paper's swath in such tiles, with the ends of their interval."""
+    prediction = predict(place(network_of(model, tile_px), dpu), dpu)
+    swath = Swath(*parse_size(PAPER_SIZE), tile_px, tiling_of(model).halo_px)
+    latency = swath_latency(prediction, math.ceil(swath.tiles / prediction.batch))
+    return prediction, latency.value or math.nan, *(latency.interval or (math.nan, math.nan))
+
+
 def cells_of(model: onnx.ModelProto, dpu: Dpu, tile_px: int) -> tuple[str, str]:
     """Frames a second and seconds a swath, each as its interval and the middle."""
-    prediction = predict(place(network_of(model, tile_px), dpu), dpu)
-    width_px, height_px = parse_size(PAPER_SIZE)
-    swath = Swath(width_px, height_px, tile_px, tiling_of(model).halo_px)
-    latency = swath_latency(prediction, math.ceil(swath.tiles / prediction.batch))
-    low, high = latency.interval or (math.nan, math.nan)
+    prediction, time_s, low_s, high_s = on_a_swath(model, dpu, tile_px)
     slow, fast = prediction.fps_interval
     star = " *" if prediction.outside else ""
-    return f"{slow:.3g} to {fast:.3g} ({prediction.fps:.3g}){star}", f"{low:.3g} to {high:.3g} ({latency.value:.3g})"
+    return f"{slow:.3g} to {fast:.3g} ({prediction.fps:.3g}){star}", f"{low_s:.3g} to {high_s:.3g} ({time_s:.3g})"
 
 
 if __name__ == "__main__":

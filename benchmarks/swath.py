@@ -1,7 +1,7 @@
 """The swath engine beside the bare runtime on the same tiles in memory, and the memory of whole swaths.
 
     python benchmarks/swath.py [--size 3000x2000] [--runtimes onnxruntime,openvino] [--swaths 13600x9016,20000x20000]
-    python benchmarks/swath.py --peers [--monai-python monai/bin/python]
+    python benchmarks/swath.py --peers [--monai-python monai/bin/python]    (monai_child.py: how to make it)
 
 Random weights: speed and memory do not depend on them. Engine and bare runtime are interleaved; the ratios are
 of their fastest times, by the clock and by the processor (with --threads 1 the latter also holds on a busy machine).
@@ -17,8 +17,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -30,6 +33,7 @@ from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import VARIANTS, Variant
 from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.restoration.engine import restore_window
 from beers_deploy.restoration.options import Options, Runtime
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.run import restore_file
@@ -99,8 +103,6 @@ def beside_peers(
     folder: Path, options: Options, size: tuple[int, int], repeats: int, monai_python: str | None
 ) -> None:
     """Engine and peers from file to file; peers run on onnxruntime or OpenVINO here, MONAI on onnxruntime."""
-    from swath_peers import Task, difference_dn, ways
-
     image = folder / "image.tif"
     dn = write_noise(image, size)
     task = Task(image, options, options.threads or os.cpu_count() or 1)
@@ -114,6 +116,96 @@ def beside_peers(
             f"{cpu_s / times_s[0, 1]:.2f} by the processor; off by {largest:.0f} DN at most, {mean:.4f} on average",
             flush=True,
         )
+
+
+Run = Callable[[], float | None]
+"""One turn; returns what another process took of the processor, if one did."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One image through one network, into a file of each way's own."""
+
+    image: Path
+    options: Options
+    cores: int
+
+    @property
+    def halo_px(self) -> int:
+        """Of the engine, and of the peers."""
+        return tiling_of(onnx.load(self.options.model)).halo_px
+
+    def out(self, way: str) -> Path:
+        """Where a way writes."""
+        return self.image.with_name(f"{way.replace(',', '').replace(' ', '-')}.tif")
+
+
+@contextmanager
+def ways(task: Task, monai_python: str | None) -> Iterator[dict[str, Run]]:
+    """The engine first, then its peers, ready to run."""
+
+    def engine() -> None:
+        restore_file(task.image, task.out("engine"), task.options)
+
+    runs: dict[str, Run] = {
+        "engine": engine,
+        "dask, a chunk at a time": overlapped(task, "dask, a chunk at a time", 1),
+        "dask, a chunk a core": overlapped(task, "dask, a chunk a core", task.cores),
+    }
+    if monai_python is None:
+        yield runs
+        return
+    with child(task, monai_python) as turn:
+        yield {**runs, "MONAI": turn}
+
+
+def overlapped(task: Task, way: str, chunks_at_once: int) -> Run:
+    """dask.array.map_overlap over chunks that are a tile with their overlap, the cores shared among those at work."""
+    core_px, halo_px = TILE_PX - 2 * task.halo_px, task.halo_px
+    out, threads = task.out(way), max(task.cores // chunks_at_once, 1)
+
+    def run() -> None:
+        import dask.array as da
+
+        infer, _ = open_runtime(task.options.runtime, onnx.load(task.options.model), threads)
+
+        def restored(block: np.ndarray) -> np.ndarray:
+            return np.asarray(np.rint(restore_window(block, infer)), np.uint16)
+
+        image = da.from_array(tifffile.imread(task.image), chunks=core_px)  # type: ignore[no-untyped-call]
+        lazy = image.map_overlap(restored, depth=halo_px, boundary="none", meta=np.empty((0, 0), np.uint16))
+        pixels = lazy.compute(scheduler="threads", num_workers=chunks_at_once)
+        # As the engine writes, but for its strategy of zlib, which tifffile has no option for.
+        packed: dict[str, Any] = {"compression": "zlib", "compressionargs": {"level": 1}, "predictor": 2}
+        tifffile.imwrite(out, pixels, tile=(256, 256), maxworkers=os.cpu_count(), **packed)
+
+    return run
+
+
+@contextmanager
+def child(task: Task, python: str) -> Iterator[Run]:
+    """MONAI in its process, loaded and waiting; each call is one turn, and returns its seconds of the processor."""
+    given = task.options.model, task.image, task.out("MONAI"), TILE_PX, 2 * task.halo_px / TILE_PX, task.cores
+    command = [python, str(Path(__file__).with_name("monai_child.py")), *map(str, given)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:  # noqa: S603
+
+        def turn() -> float:
+            assert process.stdin is not None  # noqa: S101 - asked for above
+            assert process.stdout is not None  # noqa: S101
+            process.stdin.write("go\n")
+            process.stdin.flush()
+            said = process.stdout.readline()
+            if not said:
+                raise RuntimeError(f"MONAI ended with {process.wait()}; its message stands above")
+            return float(json.loads(said)["cpu_seconds"])
+
+        yield turn
+
+
+def difference_dn(ours: Path, theirs: Path) -> tuple[float, float]:
+    """Largest and mean difference of two files, in digital numbers."""
+    error = np.abs(tifffile.imread(ours).astype(np.float64) - tifffile.imread(theirs))
+    return float(error.max()), float(error.mean())
 
 
 def write_noise(path: Path, size: tuple[int, int]) -> np.ndarray:

@@ -362,7 +362,7 @@ def restore_tile(task: Task, window: np.ndarray, top: int, left: int, row: Span,
     """The kept pixels (bands, h, w) of one tile, from a window (bands, ., .) whose first pixel is at (top, left)."""
     extent = task.raster.extent(window)._replace(whole=True)  # a tile alone is no proof of radiances
     full_scale = settled_scale(NAME, task.raster.dtype, [extent], task.full_scale)
-    restorer = Restorer(task.raster, open_packed(task.network), full_scale, task.tiling, NAME)
+    restorer = Restorer(task.raster, task.network, full_scale, task.tiling, NAME)
     here = Span(*(side - left for side in (column.start, column.stop, column.keep_start, column.keep_stop)))
     return restorer.tile(checked_strip(task.raster, top, window, full_scale, NAME), 0, row, here).pixels
 

@@ -73,14 +73,6 @@ class Builder:
         weights = channels * window.kernel[0] * window.kernel[1]
         return self._append("Conv", "depthwise", (x,), (channels, *_slide(x.shape, window, 0)), window, weights)
 
-    def scale(self, x: Tensor) -> Tensor:
-        """A batch norm that no convolution before it can take in: a 1 x 1 depthwise convolution."""
-        return self.depthwise(x, 1)
-
-    def full(self, x: Tensor, channels: int) -> Tensor:
-        """A fully connected layer: a convolution as large as its input."""
-        return self.conv(x, channels, x.shape[1:], valid=1)
-
     def transposed(self, x: Tensor, channels: int, kernel: int, stride: int) -> Tensor:
         """A transposed convolution that enlarges by its stride."""
         cut = max(kernel - stride, 0)
@@ -89,13 +81,16 @@ class Builder:
         shape = (channels, x.shape[1] * stride, x.shape[2] * stride)
         return self._append("ConvTranspose", "transposed", (x,), shape, window, channels * x.channels * kernel**2)
 
-    def pool(self, x: Tensor, kernel: Size, stride: Size, *, valid: int = 0, ceil: int = 0) -> Tensor:
-        """The largest value of a window; `ceil` counts windows that only begin inside an image without padding."""
-        return self._pool("MaxPool", x, kernel, stride, valid, ceil)
-
-    def mean(self, x: Tensor, kernel: Size, stride: Size, *, valid: int = 0, ceil: int = 0) -> Tensor:
-        """The mean of a window, `ceil` as in `pool`."""
-        return self._pool("AveragePool", x, kernel, stride, valid, ceil)
+    def pool(
+        self, x: Tensor, kernel: Size, stride: Size, *, valid: int = 0, ceil: int = 0, op_type: str = "MaxPool"
+    ) -> Tensor:
+        """The largest value of a window, or its mean; `ceil` counts windows that only begin inside a bare image."""
+        window, seen = _window(kernel, stride, valid or ceil, 1), x.shape
+        if ceil:  # as much padding behind the image as may be lost to a stride
+            behind = window.stride[0] - 1, window.stride[1] - 1
+            window = replace(window, pads=(0, 0, *behind))
+            seen = (x.channels, x.shape[1] + behind[0], x.shape[2] + behind[1])
+        return self._append(op_type, "pool", (x,), (x.channels, *_slide(seen, window, valid or ceil)), window)
 
     def global_mean(self, x: Tensor) -> Tensor:
         """The mean of each channel."""
@@ -128,13 +123,12 @@ class Builder:
             raise ValueError(f"channels {first} to {first + count - 1} of {x.channels}")
         return self._append("Slice", "other", (x,), (count, *x.shape[1:]))
 
-    def resize(self, x: Tensor, to: int | Tensor = 2) -> Tensor:
-        """Larger by a whole factor, or as large as another result: nearest neighbour."""
-        return self._resize(x, to, "nearest")
-
-    def bilinear(self, x: Tensor, to: int | Tensor = 2) -> Tensor:
-        """Larger by a whole factor, or as large as another result: bilinear, its corners in place."""
-        return self._resize(x, to, "linear", coordinate_transformation_mode="asymmetric")
+    def resize(self, x: Tensor, to: int | Tensor = 2, *, linear: bool = False) -> Tensor:
+        """Larger by a whole factor, or as large as another result: nearest neighbour, or bilinear."""
+        height, width = to.shape[1:] if isinstance(to, Tensor) else (x.shape[1] * to, x.shape[2] * to)
+        corners = {"mode": "linear", "coordinate_transformation_mode": "asymmetric"}
+        attributes = corners if linear else {"mode": "nearest"}
+        return self._append("Resize", "resize", (x,), (x.channels, height, width), attributes=attributes)
 
     def shuffle(self, x: Tensor, block: int = 2) -> Tensor:
         """Channels become blocks of pixels (pixel shuffle)."""
@@ -167,19 +161,6 @@ class Builder:
         names = tuple(self._read_bytes)
         net = Network(tuple(self._operations), {self.image.name: self.image.shape}, names, quantised=False)
         return Written(net, self._read_bytes)
-
-    def _pool(self, op_type: str, x: Tensor, kernel: Size, stride: Size, valid: int, ceil: int) -> Tensor:
-        window, seen = _window(kernel, stride, valid or ceil, 1), x.shape
-        if ceil:  # as much padding behind the image as may be lost to a stride
-            behind = window.stride[0] - 1, window.stride[1] - 1
-            window = replace(window, pads=(0, 0, *behind))
-            seen = (x.channels, x.shape[1] + behind[0], x.shape[2] + behind[1])
-        return self._append(op_type, "pool", (x,), (x.channels, *_slide(seen, window, valid or ceil)), window)
-
-    def _resize(self, x: Tensor, to: int | Tensor, mode: str, **given: object) -> Tensor:
-        height, width = to.shape[1:] if isinstance(to, Tensor) else (x.shape[1] * to, x.shape[2] * to)
-        shape = (x.channels, height, width)
-        return self._append("Resize", "resize", (x,), shape, attributes={"mode": mode, **given})
 
     def _append(
         self,

@@ -1,16 +1,20 @@
 """Time of the traditional pipeline on each board's own processor: `python -m benchmarks.cost_model.chain_time`.
 
 Prints `chain_s_per_mpx` for the [cpu] of every board. CPU time of one core here is split by kind of work
-(`chain_work` counts it, `chain_rates` measures how fast this processor does each). A kind is slower there by the
+(`chain_work` counts it, `measured_rates` tells how fast this processor does each). A kind is slower there by the
 ratio of what bounds it: products of matrices, bytes moved or plain instructions, as measured here and as published
 for the board's cores. Where either of two may bound it, the interval holds both. What the kinds do not explain may be
-of any kind.
+of any kind. Short kernels of the library calls and shapes of `model.traditional`, timed in CPU time and interleaved,
+tell how fast this processor is; resources are measured as published benchmarks measure them.
 """
 
+import lzma
 import math
+import os
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -18,13 +22,205 @@ import torch
 from beers_deploy.bench.tables import Swath
 from beers_deploy.bench.traditional import CROP_PX, CROPS, drawn_acquisition
 from beers_deploy.model.shipped import SENSOR
+from beers_deploy.model.traditional.nl_bayes import overlap_add, patch_matrix
 from beers_deploy.model.traditional.pipeline import Chain, quality_named, restore_traditional
 from beers_deploy.model.traditional.rows import one_thread_per_operation
 from beers_deploy.profiles import TargetProfile, load_sensor, load_target
 from beers_deploy.profiles.sensor_file import REFERENCE
 from beers_deploy.profiles.target import board_names
-from benchmarks.cost_model.chain_rates import Rates, measured_rates
-from benchmarks.cost_model.chain_work import chain_work
+from benchmarks.cost_model.chain_work import FLOAT_BYTES, Work, chain_work
+
+ROUNDS = 25
+CLOCK = time.perf_counter if os.name == "nt" else time.thread_time
+"""Others' turns on the core do not count, but where the system counts in ticks of 16 ms."""
+
+SEVEN_ZIP_DECODER = 1.09
+"""How much faster 7-zip's decoder in C was than Python's, 1.04 to 1.12 on six texts (Zen 4, measured)."""
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Of one core of this processor.
+
+    Attributes:
+        kinds: amount a second of each kind of `chain_work`.
+        resources: what kinds are scaled by, a second: floating-point operations of large float32 "products", bytes
+            moved in order in "memory", and "integers" by 7-zip's rating of LZMA decoding: branches, dependent loads.
+    """
+
+    kinds: Mapping[str, float]
+    resources: Mapping[str, float]
+
+    def times_s(self, work: Work) -> dict[str, float]:
+        """Time of each kind of some work, on one core."""
+        return {kind: amount / self.kinds[kind] for kind, amount in work.items()}
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A call, and the amount of work that it does."""
+
+    call: Callable[[], object]
+    amount: float
+
+
+def measured_rates() -> Rates:
+    """Rates of this processor; takes about a second."""
+    generator = torch.Generator().manual_seed(0)
+    with one_thread_per_operation():
+        rates = _rates({name: make(generator) for name, make in KERNELS.items()})
+    resources = {name: rates.pop(name) for name in ("products", "integers")}
+    return Rates(rates, {**resources, "memory": rates["passes"]})
+
+
+def _rates(kernels: Mapping[str, Kernel]) -> dict[str, float]:
+    """Amount a second of each, from the median of ROUNDS turns.
+
+    Each is called once a turn: it finds the caches full of the others' arrays, as it does in the chain.
+    """
+    taken_s: dict[str, list[float]] = {name: [] for name in kernels}
+    for _ in range(ROUNDS + 1):
+        for name, kernel in kernels.items():
+            start_s = CLOCK()
+            kernel.call()
+            taken_s[name].append(CLOCK() - start_s)
+    return {name: kernel.amount / statistics.median(taken_s[name][1:]) for name, kernel in kernels.items()}
+
+
+REFERENCES, COVERED_PX, WINDOW_PX, MEMBERS, SIDE_PX = 24, 74, 23, 45, 5
+"""Of a tile of the first pass at standard quality; its groups are REFERENCES^2."""
+GROUPS, PIXELS = REFERENCES**2, SIDE_PX**2
+TRANSFORM_PX, PRODUCT_PX, CALLS = 512, 512, 400
+
+
+def _box_sums(generator: torch.Generator) -> Kernel:
+    rows = torch.rand(REFERENCES, COVERED_PX, generator=generator)
+    squares = torch.rand(WINDOW_PX, COVERED_PX, WINDOW_PX * COVERED_PX, generator=generator)
+    sums = REFERENCES * WINDOW_PX * COVERED_PX * (COVERED_PX + REFERENCES)
+
+    def call() -> None:
+        for of_a_row in squares:
+            _ = (rows @ of_a_row).reshape(-1, COVERED_PX) @ rows.T
+
+    return Kernel(call, 2 * WINDOW_PX * sums)
+
+
+def _group_products(generator: torch.Generator) -> Kernel:
+    patches = torch.rand(GROUPS, MEMBERS, PIXELS, generator=generator)
+    matrix = torch.rand(GROUPS, PIXELS, PIXELS, generator=generator)
+
+    def call() -> None:
+        _ = patches.mT @ patches
+        torch.baddbmm(patches, patches, matrix, alpha=-1)
+
+    return Kernel(call, 2 * 2 * GROUPS * MEMBERS * PIXELS**2)
+
+
+def _factorisations(generator: torch.Generator) -> Kernel:
+    patches = torch.rand(GROUPS, MEMBERS, PIXELS, generator=generator)
+    matrices = patches.mT @ patches + torch.eye(PIXELS)
+    return Kernel(lambda: torch.cholesky_inverse(torch.linalg.cholesky_ex(matrices)[0]), GROUPS * PIXELS**3)
+
+
+def _selection(generator: torch.Generator) -> Kernel:
+    distances = torch.rand(GROUPS, WINDOW_PX**2, generator=generator).numpy()
+    ends = [MEMBERS - 1, MEMBERS - 1]  # as the chain asks: numpy has a faster way for one place alone
+    return Kernel(lambda: np.argpartition(distances, ends, axis=1), distances.size)
+
+
+def _transforms(generator: torch.Generator) -> Kernel:
+    image = torch.rand(TRANSFORM_PX, TRANSFORM_PX, generator=generator)
+    operations = 2.5 * image.numel() * np.log2(image.numel())
+    return Kernel(lambda: torch.fft.irfft2(torch.fft.rfft2(image), s=image.shape), 2 * operations)
+
+
+def _passes(generator: torch.Generator) -> Kernel:
+    guide = torch.rand(COVERED_PX + WINDOW_PX - 1, COVERED_PX + WINDOW_PX - 1, generator=generator)
+
+    def call() -> None:
+        for top in range(WINDOW_PX):
+            rows = guide[top : top + COVERED_PX]
+            (rows.unfold(1, COVERED_PX, 1) - rows[:, None, :COVERED_PX]).square_()
+
+    return Kernel(call, 5 * FLOAT_BYTES * WINDOW_PX**2 * COVERED_PX**2)
+
+
+def _strided(generator: torch.Generator) -> Kernel:
+    image = torch.rand(COVERED_PX + WINDOW_PX, COVERED_PX + WINDOW_PX, generator=generator)
+    patches = patch_matrix(image, SIDE_PX)
+
+    def call() -> None:
+        overlap_add(patch_matrix(image, SIDE_PX), image.shape, SIDE_PX)
+
+    return Kernel(call, 5 * FLOAT_BYTES * patches.numel())
+
+
+def _gathers(generator: torch.Generator) -> Kernel:
+    side = COVERED_PX + WINDOW_PX - SIDE_PX
+    patches = torch.rand(side**2, PIXELS, generator=generator)
+    steps = torch.randint(WINDOW_PX, (2, GROUPS, MEMBERS), generator=generator)
+    places = torch.arange(REFERENCES) * (COVERED_PX // REFERENCES)
+    first = (places[:, None] * side + places).reshape(-1, 1)
+    numbers = (first + steps[0] * side + steps[1]).reshape(-1)
+    total = torch.zeros_like(patches)
+
+    def call() -> None:
+        total.index_add_(0, numbers, patches.index_select(0, numbers))
+
+    return Kernel(call, 5 * FLOAT_BYTES * numbers.numel() * PIXELS)
+
+
+def _calls(_: torch.Generator) -> Kernel:
+    few = torch.zeros(8)
+
+    def call() -> None:
+        for _ in range(CALLS):
+            few[1:].add_(1.0)
+
+    return Kernel(call, 2 * CALLS)
+
+
+def _large_product(generator: torch.Generator) -> Kernel:
+    factor = torch.rand(PRODUCT_PX, PRODUCT_PX, generator=generator)
+    return Kernel(lambda: factor @ factor, 2 * PRODUCT_PX**3)
+
+
+TEXT_BYTES, FARTHEST_BITS = 1 << 17, 17
+
+
+def _decoding(_: torch.Generator) -> Kernel:
+    """7-zip counts 200 instructions for each packed byte that it decodes, and 4 for each that comes out (16.02)."""
+    text = _compressible(np.random.default_rng(0))
+    packed = lzma.compress(text, format=lzma.FORMAT_ALONE)
+    return Kernel(lambda: lzma.decompress(packed), SEVEN_ZIP_DECODER * (200 * len(packed) + 4 * len(text)))
+
+
+def _compressible(generator: np.random.Generator) -> bytes:
+    """Fresh bytes and copies of earlier ones by turns, packed to a quarter; 7-zip's own test data to a third."""
+    text = bytearray(generator.bytes(1024))
+    while len(text) < TEXT_BYTES:
+        text += generator.bytes(int(generator.integers(0, 5)))
+        size = int(generator.integers(2, 30))
+        back = size + int(min(len(text) - size, 2 ** generator.uniform(0, FARTHEST_BITS)))
+        text += text[len(text) - back :][:size]
+    return bytes(text)
+
+
+KERNELS: Mapping[str, Callable[[torch.Generator], Kernel]] = {
+    "box sums": _box_sums,
+    "group products": _group_products,
+    "factorisations": _factorisations,
+    "selection": _selection,
+    "transforms": _transforms,
+    "passes": _passes,
+    "strided": _strided,
+    "gathers": _gathers,
+    "calls": _calls,
+    "products": _large_product,
+    "integers": _decoding,
+}
+"""One for each kind of work, and one for each resource that is none."""
+
 
 WIDTH_PX, HEIGHT_PX = 13600, 9016
 QUALITY = "standard"

@@ -69,13 +69,7 @@ class Tile:
 
 
 def chain_work(height: int, width: int, quality: Quality) -> Work:
-    """Work of `restore_traditional` on (H, W), all of it.
-
-    Raises:
-        ValueError: no pixels.
-    """
-    if min(height, width) < 1:
-        raise ValueError(f"an image of {width} x {height} pixels")
+    """Work of `restore_traditional` on (H, W), all of it."""
     passes = first_pass(WORKING_SIGMA), second_pass(WORKING_SIGMA, quality)
     found = compensation_work(height, width)
     for settings in passes:

@@ -47,6 +47,7 @@ import ast
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -59,13 +60,13 @@ STEPS: Mapping[str, Callable[..., Tensor]] = {
     "conv": Builder.conv,
     "dw": Builder.depthwise,
     "transposed": Builder.transposed,
-    "fc": Builder.full,
+    "fc": lambda builder, x, channels: builder.conv(x, channels, x.shape[1:], valid=1),
     "pool": Builder.pool,
-    "mean": Builder.mean,
+    "mean": partial(Builder.pool, op_type="AveragePool"),
     "global": Builder.global_mean,
-    "scale": Builder.scale,
+    "scale": lambda builder, x: builder.depthwise(x, 1),
     "resize": Builder.resize,
-    "bilinear": Builder.bilinear,
+    "bilinear": partial(Builder.resize, linear=True),
     "shuffle": Builder.shuffle,
     "unshuffle": Builder.unshuffle,
     "add": Builder.add,

@@ -29,8 +29,7 @@ from pathlib import Path
 from beers_deploy.dpu.board import Dpu, load_dpu
 from beers_deploy.dpu.cost.model import Array, Layers, host_work
 from beers_deploy.dpu.cost.work import count_work, largest_map_bytes
-from beers_deploy.dpu.graph import Network
-from benchmarks.cost_model.builder import Builder, Written
+from benchmarks.cost_model.builder import Written
 from benchmarks.cost_model.notation import read_library
 
 ZOO = Path(__file__).parent / "zoo"
@@ -124,16 +123,3 @@ def network_case(name: str, dpu: Dpu, fps: tuple[float, ...], fps_single: tuple[
     layers = Layers.of(count_work(net.operations, dpu), dpu)
     cores, largest = dpu.whole("cpu", "cores"), largest_map_bytes(net.operations)
     return Case(name, entry.family, dpu.name, layers, host, cores, fps, fps_single, largest)
-
-
-def convbeers(side: int = 640, blocks: int = 16, features: int = 64) -> Network:
-    """ConvBEERS as its paper describes it: head, residual blocks, body's end, tail, global add.
-
-    It is in no fit, only predicted.
-    """
-    b = Builder(side, side, 1)
-    stream = head = b.conv(b.image, features)
-    for _ in range(blocks):
-        stream = b.add(b.conv(b.conv(stream, features), features), stream)
-    deep = b.add(b.conv(stream, features), head)
-    return b.written(b.add(b.conv(deep, 1), b.image)).network

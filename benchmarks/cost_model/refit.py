@@ -19,7 +19,6 @@ from benchmarks.cost_model.notation import KINDS
 from benchmarks.cost_model.published import NETWORKS, SLOWER, boards, written
 from benchmarks.cost_model.validation import (
     Nested,
-    bias,
     by_network,
     coverage,
     nested,
@@ -84,18 +83,8 @@ def fitted_ranges(found: Nested) -> dict[str, tuple[float, float]]:
 
 def accuracy() -> Iterator[tuple[object, ...]]:
     """A row a board: errors of networks whose family was left out, and what the intervals held."""
-    yield (
-        "board",
-        "networks",
-        "families",
-        "rates",
-        "median",
-        "mean",
-        "largest",
-        "Spearman",
-        "rates inside",
-        "families",
-    )
+    errors = "median", "mean", "largest", "Spearman"
+    yield "board", "networks", "families", "rates", *errors, "rates inside", "families"
     for board in boards():
         found = nested(board)
         off = by_network((row.network for row in found.rows), (row.rates for row in found.rows))
@@ -112,10 +101,10 @@ def by_kind() -> Iterator[tuple[object, ...]]:
             rows = [row for row in nested(board).rows if NETWORKS[row.network].kind == kind]
             if not rows:
                 continue
-            off = by_network((row.network for row in rows), (row.rates for row in rows))
+            errors = [row.network for row in rows], [row.rates for row in rows]
+            off, bias = by_network(*errors), by_network(*errors, signed=True).mean()
             counts, (median, mean, largest) = (len(off), sum(len(row.rates) for row in rows)), _spread(off)
-            errors = median, mean, f"{100 * bias(rows):+.1f} %", largest
-            yield board, kind, *counts, *errors, *map(_percent, coverage(rows))
+            yield board, kind, *counts, median, mean, f"{100 * bias:+.1f} %", largest, *map(_percent, coverage(rows))
 
 
 def owners() -> Iterator[tuple[object, ...]]:

@@ -228,20 +228,13 @@ def outside_width(cases: Cases, share: float = 0.25) -> float:
     return family_quantile(tested.errors(fit(cases.only(~large))), tested.families)
 
 
-def by_network(names: Iterable[str], errors: Iterable[Array]) -> Array:
-    """Mean |predicted / published - 1| of each network, over its configurations and rates."""
+def by_network(names: Iterable[str], errors: Iterable[Array], *, signed: bool = False) -> Array:
+    """Mean |predicted / published - 1| of each network, or with its sign, over its configurations and rates."""
     found: dict[str, list[float]] = {}
     for name, each in zip(names, errors, strict=True):
-        found.setdefault(name, []).extend(np.abs(np.expm1(each)).tolist())
+        off = np.expm1(each)
+        found.setdefault(name, []).extend((off if signed else np.abs(off)).tolist())
     return np.array([np.mean(values) for values in found.values()])
-
-
-def bias(rows: Sequence[LeftOut]) -> float:
-    """Mean predicted / published - 1 over networks."""
-    found: dict[str, list[float]] = {}
-    for row in rows:
-        found.setdefault(row.network, []).extend(np.expm1(row.rates).tolist())
-    return float(np.mean([np.mean(values) for values in found.values()]))
 
 
 def coverage(rows: Sequence[LeftOut]) -> tuple[float, float]:

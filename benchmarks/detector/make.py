@@ -16,7 +16,6 @@ import torch
 
 from beers_deploy.model.progress import steps
 from beers_deploy.model.shipped import DETECTOR, DETECTOR_INT8
-from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import Patches, Remade
@@ -24,11 +23,10 @@ from beers_deploy.studies.detection.average_precision import find_hits, interval
 from beers_deploy.studies.detection.boxes import Boxes
 from beers_deploy.studies.detection.detector import open_detector
 from beers_deploy.studies.detection.scenes import CLASSES
-from benchmarks.detector.export import detector_to_onnx
-from benchmarks.detector.pictures import Picture, drawn_pictures
-from benchmarks.detector.training import DetectorRecipe, train_detector
+from benchmarks.detector.network import detector_to_onnx
+from benchmarks.detector.training import DetectorRecipe, Picture, drawn_picture, train_detector
 
-SIDE_PX, OVERSAMPLING = 256, 3
+SIDE_PX = 256
 SEEN = 64
 """Pictures of the training that INT8 is calibrated on."""
 RECIPE = DetectorRecipe(precision="bfloat16")
@@ -58,10 +56,10 @@ def main() -> None:
 
 def drawn(seed: int, count: int) -> list[Picture]:
     """Pictures of the reference sensor."""
-    sensor, made = load_sensor(REFERENCE).nominal(), list[Picture]()
+    made = list[Picture]()
     with steps("drawing", count) as bar:
-        for picture in drawn_pictures(sensor, OVERSAMPLING, SIDE_PX, seed, count):
-            made.append(picture)
+        for number in range(count):
+            made.append(drawn_picture(SIDE_PX, seed, number))
             bar.advance()
     return made
 

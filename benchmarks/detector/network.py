@@ -1,4 +1,4 @@
-"""A detector of 100 k parameters from convolutions, ReLU, one nearest enlargement and one concatenation.
+"""A detector of 100 k parameters from convolutions, ReLU, an enlargement and a concatenation, and its ONNX file.
 
     image -> 2 strided convolutions -> fine (stride 4) -> strided -> coarse (stride 8) -> enlarged, + fine -> head
 
@@ -7,8 +7,12 @@ how likely each class is: anchor-free, as CenterNet (Zhou et al., 2019, arXiv 19
 of the last map is legal on a DPU.
 """
 
+import io
 import math
+import warnings
+from collections.abc import Mapping, Sequence
 
+import onnx
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -78,3 +82,40 @@ def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
     """A 3 x 3 convolution, batch normalisation and ReLU."""
     conv = nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1, bias=False)
     return nn.Sequential(conv, nn.BatchNorm2d(outputs), nn.ReLU())
+
+
+def detector_to_onnx(
+    network: DetectorNetwork, names: Sequence[str], side_px: int, about: Mapping[str, str]
+) -> onnx.ModelProto:
+    """A detector as ONNX: `images` (1, 3, S, S) RGB in [0, 1] to `output0` (1, 4 + classes, S * S / 16).
+
+    Layout and metadata are those of Ultralytics' exporter (ultralytics/engine/exporter.py, read for its format; no
+    code is taken from it). A column of the output holds cx, cy, w, h in input pixels, then a score in [0, 1] for
+    each class. Batch normalisation is folded into the convolutions.
+
+    Args:
+        network: trained.
+        names: of the classes, in the network's order.
+        side_px: S, a multiple of 8.
+        about: further metadata.
+    """
+    buffer, image = io.BytesIO(), torch.zeros(1, 3, side_px, side_px)
+    with warnings.catch_warnings():
+        # The newer exporter wants onnxscript, a package more.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.onnx.export(
+            Decoding(network).eval(),
+            (image,),
+            buffer,  # type: ignore[arg-type]
+            input_names=["images"],
+            output_names=["output0"],
+            opset_version=17,
+            dynamo=False,
+        )
+    model: onnx.ModelProto = onnx.ModelProto.FromString(buffer.getvalue())
+    stated = {
+        "task": "detect", "stride": MULTIPLE_PX, "batch": 1, "imgsz": [side_px, side_px], "channels": 3,
+        "names": dict(enumerate(names)),
+    }  # fmt: skip
+    onnx.helper.set_model_props(model, {**{key: str(value) for key, value in stated.items()}, **about})
+    return model

@@ -35,9 +35,8 @@ from beers_deploy.studies.detection.study import (
 )
 from beers_deploy.studies.detection.tables import GAIN, PERCENT, POINTS, REGAINED
 from beers_deploy.studies.evaluation.methods import DEGRADED, Method, method_named
-from benchmarks.detector.export import detector_to_onnx
-from benchmarks.detector.pictures import Picture, picture_of
-from benchmarks.detector.training import DetectorRecipe, train_detector
+from benchmarks.detector.network import detector_to_onnx
+from benchmarks.detector.training import DetectorRecipe, Picture, picture_of, train_detector
 
 TABLE = "detector retrained for each row"
 SIDE_PX = 256

@@ -12,14 +12,12 @@ from beers_deploy.model.traditional.nl_bayes import QUALITIES
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.target import board_names
 from benchmarks.cost_model.builder import Builder
-from benchmarks.cost_model.chain_rates import Rates
-from benchmarks.cost_model.chain_time import BOUND_BY, HEIGHT_PX, WIDTH_PX, s_per_mpx
+from benchmarks.cost_model.chain_time import BOUND_BY, HEIGHT_PX, WIDTH_PX, Rates, s_per_mpx
 from benchmarks.cost_model.chain_work import UNITS, chain_work
 from benchmarks.cost_model.fit import Cases, fit, rounded
 from benchmarks.cost_model.published import (
     NETWORKS,
     boards,
-    convbeers,
     network_case,
     published_cases,
     published_rates,
@@ -70,7 +68,8 @@ def test_the_fit_and_the_prediction_are_one_formula(board: str, name: str) -> No
 def test_the_fitted_range_ends_with_the_largest_network() -> None:
     dpu = load_dpu("vck190")
     assert predict(place(written("rcan").network, dpu), dpu).outside == ()
-    assert predict(place(convbeers(1280), dpu), dpu).outside
+    b = Builder(1280, 1280, 1)
+    assert predict(place(b.written(b.conv(b.image, 64)).network, dpu), dpu).outside
 
 
 def test_the_papers_network_is_in_no_fit() -> None:

@@ -24,8 +24,7 @@ from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.quantise import Quantised
 from beers_deploy.quant.reading.folding import simplest
 from beers_deploy.quant.session import open_session, result_of
-from benchmarks.detector.export import detector_to_onnx
-from benchmarks.detector.network import DetectorNetwork, initialise
+from benchmarks.detector.network import DetectorNetwork, detector_to_onnx, initialise
 from tests.quant.quick import copied, patches_of, quickly
 
 SIDE_PX = 160

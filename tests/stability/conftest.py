@@ -9,10 +9,10 @@ import torch
 
 from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS
+from beers_deploy.model.traditional.rows import one_thread_per_operation
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.quant.quantise import Quantised
-from beers_deploy.studies.stress.checks import torch_threads
 from beers_deploy.studies.stress.networks import Subject, open_subject
 from tests.model.networks import plain
 from tests.quant.quick import drawn, quickly
@@ -21,7 +21,7 @@ from tests.quant.quick import drawn, quickly
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
     """On images this small a second thread only waits."""
-    with torch_threads(1):
+    with one_thread_per_operation():
         yield
 
 

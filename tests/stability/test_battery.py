@@ -1,5 +1,6 @@
 """The battery passes what is sound, and stops what is broken."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from beers_deploy.studies.stress.battery import StageResult, run_battery, worst
 from beers_deploy.studies.stress.cases import CASES, FULL_DN, Case
 from beers_deploy.studies.stress.checks import LIMITATIONS, Measure, differing, local_range, ringing
 from beers_deploy.studies.stress.networks import STAGES, Subject, open_subject
+from docs.make import stability as maker
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 from tests.quant.quick import changed
@@ -187,3 +189,13 @@ def test_the_command_writes_its_figures_and_fails_by_exit_code(pair: list[Path],
 def test_bad_input_is_one_sentence(arguments: list[str], words: str, pair: list[Path]) -> None:
     files = dict(zip(("FLOAT", "INT8"), map(str, pair), strict=True))
     assert words in refused("stress", *(files.get(text, text) for text in arguments))
+
+
+def test_the_page_of_stability_is_fresh() -> None:
+    """It has each case, each stage and each limitation, and nothing that failed."""
+    page = maker.TARGET.read_text(encoding="utf-8")
+    wanted = [maker.OPENING.strip(), *maker.stage_lines(), *maker.limitation_lines()]
+    assert [text for text in wanted if text.strip() not in page] == []
+    lines = re.findall(rf"^- {': .+?, '.join(STAGES)}: .+?\. (.+)\.$", page, re.MULTILINE)
+    assert sorted(name for line in lines for name in line.split("; ")) == sorted(case.name for case in CASES)
+    assert "FAILED" not in page

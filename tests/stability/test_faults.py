@@ -1,4 +1,4 @@
-"""Bit flips: as many as were asked for, in numbers that the memory can hold, wherever they fall."""
+"""Bit flips: as many as were asked for, wherever they fall; and guards, which keep what they promise."""
 
 from dataclasses import replace
 
@@ -8,33 +8,44 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.core import IntConv
-from beers_deploy.quant.graph import split
-from beers_deploy.quant.integer.reference import run_core
+from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, split
+from beers_deploy.quant.integer.reference import SOUND, Faults, merged_correction, run_core
 from beers_deploy.quant.quantise import Quantised
 from beers_deploy.studies.stress.faults import (
     SHIFT_BITS,
+    Guards,
     as_stored,
     bits_apart,
+    checksums,
     flip_bits,
+    flip_conv,
     flip_count,
     flip_shifts,
     flip_weights,
+    guarded,
+    learn_guards,
     map_channels,
+    scrubbed,
     shifts_of,
+    voted,
     weight_bits,
+    with_ops,
 )
+from tests.quant.quick import image
 
 KINDS = {"int8": (np.int8, 8), "maps": (np.int16, 8), "pixels": (np.uint16, 12), "shifts": (np.int16, 6)}
-
-
-def image(height: int = 21, width: int = 34) -> np.ndarray:
-    return np.random.default_rng(5).random((1, 1, height, width), dtype=np.float32)
 
 
 def flipped(a: np.ndarray, b: np.ndarray, bits: int) -> int:
     apart = (a.astype(np.int64) ^ b.astype(np.int64)) & ((1 << bits) - 1)
     return sum(int(value).bit_count() for value in apart.ravel())
+
+
+@pytest.fixture(scope="module")
+def core(quantised: Quantised) -> IntCore:
+    return as_stored(quantised.core)
 
 
 @given(st.sampled_from(sorted(KINDS)), st.integers(0, 2**32 - 1), st.data())
@@ -62,29 +73,25 @@ def test_the_rate_is_that_of_a_megabit() -> None:
 
 def test_the_stored_bias_is_int8_and_the_network_the_same(quantised: Quantised) -> None:
     stored = as_stored(quantised.core)
-    convs = [op for op in stored.ops if isinstance(op, IntConv)]
-    assert all(op.bias.dtype == np.int8 for op in convs)
-    assert weight_bits(stored) == 8 * sum(op.weight.size + op.bias.size for op in convs)
+    assert all(op.bias.dtype == np.int8 for op in stored.convolutions)
+    assert weight_bits(stored) == 8 * sum(op.weight.size + op.bias.size for op in stored.convolutions)
     planes = split(image())
     before, after = run_core(quantised.core, planes)[0], run_core(stored, planes)[0]
     for name in before:
         np.testing.assert_array_equal(before[name], after[name])
 
 
-def test_flips_fall_into_the_weights_of_all_layers(quantised: Quantised) -> None:
-    core = as_stored(quantised.core)
+def test_flips_fall_into_the_weights_of_all_layers(core: IntCore) -> None:
     injected = flip_weights(core, 200, np.random.default_rng(1))
     apart = {
         a.name: flipped(a.weight, b.weight, 8) + flipped(a.bias, b.bias, 8)
-        for a, b in zip(core.ops, injected.ops, strict=True)
-        if isinstance(a, IntConv) and isinstance(b, IntConv)
+        for a, b in zip(core.convolutions, injected.convolutions, strict=True)
     }
     assert sum(apart.values()) == 200
     assert sum(count > 0 for count in apart.values()) > len(apart) / 2
 
 
-def test_every_shift_is_what_the_core_uses(quantised: Quantised) -> None:
-    core = as_stored(quantised.core)
+def test_every_shift_is_what_the_core_uses(core: IntCore) -> None:
     shifts = shifts_of(core)
     assert len(shifts) == sum(2 if isinstance(op, IntConv) else 1 for op in core.ops)
     limit = 2 ** (SHIFT_BITS - 1)
@@ -95,7 +102,7 @@ def test_every_shift_is_what_the_core_uses(quantised: Quantised) -> None:
 
 
 def test_numbers_that_the_board_could_not_store_are_refused(quantised: Quantised) -> None:
-    op = next(op for op in quantised.core.ops if isinstance(op, IntConv))
+    op = quantised.core.convolutions[0]
     odd = replace(op, bias=np.full(len(op.bias), 100_001), bias_frac_bits=op.bias_frac_bits)
     far = replace(op, weight_frac_bits=op.weight_frac_bits + 40, bias_frac_bits=op.bias_frac_bits + 40)
     for wrong in (odd, far):
@@ -106,3 +113,89 @@ def test_numbers_that_the_board_could_not_store_are_refused(quantised: Quantised
 def test_maps_have_the_channels_that_run(quantised: Quantised) -> None:
     tensors, _ = run_core(quantised.core, split(image()))
     assert {name: tensor.shape[1] for name, tensor in tensors.items()} == map_channels(quantised.core)
+
+
+@pytest.fixture(scope="module")
+def guards(core: IntCore) -> Guards:
+    return learn_guards(core, [split(image(seed=seed)) for seed in range(3)])
+
+
+def test_calibration_patches_pass_untouched(core: IntCore, guards: Guards) -> None:
+    for seed in range(3):
+        bare, clamped = (
+            run_core(core, split(image(seed=seed)), faults=f)[0] for f in (SOUND, guarded(SOUND, guards))
+        )
+        np.testing.assert_array_equal(bare[CORRECTION], clamped[CORRECTION])
+        correction = merged_correction(core, bare)
+        np.testing.assert_array_equal(guards.limit(correction), correction)
+
+
+def test_bounds_are_the_next_ones_that_hold_what_was_seen(core: IntCore) -> None:
+    """A dark image leaves room below 96 units; a bright one fills int8, and such a ReLU gets no bound."""
+    dark = [split(0.1 * image(seed=seed)) for seed in range(2)]
+    guards = learn_guards(core, dark)
+    runs = [run_core(core, planes)[0] for planes in dark]
+    assert guards.relu6
+    for name, bound in guards.relu6.items():
+        peak = max(int(run[name].max()) for run in runs)
+        assert bound in (96, 48, 24, 12, 6, 3)
+        assert bound / 2 < max(peak, 2) <= max(bound, 2)
+    largest = max(MAX_DN * float(np.abs(merged_correction(core, run)).max()) for run in runs)
+    assert guards.limit_dn / 2 < largest <= guards.limit_dn
+
+
+def test_a_clamped_result_keeps_its_bound_whatever_the_weights(core: IntCore) -> None:
+    some = Guards({op.output: 24 for op in core.convolutions if op.activation is Activation.relu}, 64.0, {})
+    injected = flip_weights(core, 2000, np.random.default_rng(0))
+    bare, clamped = (run_core(injected, split(image(seed=9)), faults=f)[0] for f in (SOUND, guarded(SOUND, some)))
+    assert max(int(bare[name].max()) for name in some.relu6) > 24
+    assert max(int(clamped[name].max()) for name in some.relu6) == 24
+    limited = some.limit(merged_correction(core, clamped))
+    bound = np.float32(64 / MAX_DN)
+    assert np.abs(limited).max() <= bound < np.abs(merged_correction(core, bare)).max()
+
+
+def test_faults_enter_memory_after_the_clamp(core: IntCore) -> None:
+    name = next(op.output for op in core.convolutions if op.activation is Activation.relu)
+    faults = Faults({}, lambda found, tensor: np.full_like(tensor, 127) if found == name else tensor)
+    tensors, _ = run_core(core, split(image()), faults=guarded(faults, Guards({name: 3}, 1.0, {})))
+    assert (tensors[name] == 127).all()
+
+
+def test_every_single_flip_is_found_and_the_layer_scrubbed(core: IntCore, guards: Guards) -> None:
+    generator = np.random.default_rng(3)
+    for op in core.convolutions:
+        for _ in range(8):
+            injected = with_ops(core, {op.name: flip_conv(op, 1, generator)})
+            wrong = {name for name, sum_ in checksums(injected).items() if sum_ != guards.checksums[name]}
+            assert wrong == {op.name}
+            assert checksums(scrubbed(injected, core, guards.checksums)) == guards.checksums
+
+
+def test_two_copies_of_three_decide(core: IntCore) -> None:
+    meant = shifts_of(core)
+    one, other = (flip_shifts(meant, count, np.random.default_rng(count)) for count in (1, 4))
+    assert one != meant
+    assert voted((one, meant, meant)) == meant
+    assert voted((meant, one, meant)) == voted((meant, meant, other)) == meant
+    assert voted((one, one, meant)) == one  # the same bit twice is beyond triple modular redundancy
+
+
+def test_a_wrong_shift_is_used(core: IntCore) -> None:
+    meant = shifts_of(core)
+    planes = split(image(seed=2))
+    sound = run_core(core, planes)[0][CORRECTION]
+    np.testing.assert_array_equal(run_core(core, planes, faults=Faults(meant))[0][CORRECTION], sound)
+    for key in (key for key in meant if key[1] == "shift_cut"):
+        for wrong in (-32, 31):
+            assert not np.array_equal(run_core(core, planes, faults=Faults({key: wrong}))[0][CORRECTION], sound)
+
+
+def test_shifts_as_wrong_as_can_be_keep_every_sign() -> None:
+    """Nothing wraps around: bias moved left by 31, sums by 32."""
+    bias = np.array([57, 20, -3, 0], np.int8)
+    op = IntConv("c", PLANES, CORRECTION, np.zeros((4, 1, 1, 1), np.int8), 0, bias, 0)
+    core = IntCore((op,), {PLANES: 0, CORRECTION: 0})
+    faults = Faults({("c", "shift_bias"): 31, ("c", "shift_cut"): -32})
+    tensors, _ = run_core(core, np.zeros((1, 1, 1, 1), np.int8), faults=faults)
+    assert tensors[CORRECTION].ravel().tolist() == [127, 127, -128, 0]

@@ -16,7 +16,6 @@ import numpy as np
 import onnx
 from onnxruntime import InferenceSession
 
-from beers_deploy.model.processor import require_cores
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.onnx_file import constants, fixed_tile_px, load_onnx, metadata
 from beers_deploy.quant.session import open_session
@@ -82,7 +81,6 @@ def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> D
         threads: of onnxruntime; 0 takes a thread a core.
         size_px: side of the input; None takes the one that the file is fixed to or was trained for.
     """
-    require_cores("threads", threads)
     model = load_onnx(path)
     about = {key: _literal(value) for key, value in metadata(model).items()}
     names = class_names(about.get("names"))

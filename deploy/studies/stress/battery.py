@@ -9,13 +9,14 @@ import numpy as np
 
 from beers_deploy.frames import words_of
 from beers_deploy.model.progress import steps
+from beers_deploy.model.traditional.rows import one_thread_per_operation
 from beers_deploy.profiles.errors import BeersError, OptionError
 from beers_deploy.profiles.figures import Figure, Row, by_table, measured, predicted
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.integer.reference import INT32_BITS
 from beers_deploy.results import common_mode, missing, unit_of
 from beers_deploy.studies.stress.cases import CASES, SIDE_PX, Case
-from beers_deploy.studies.stress.checks import Limitation, Measure, limitation_of, torch_threads
+from beers_deploy.studies.stress.checks import Limitation, Measure, limitation_of
 from beers_deploy.studies.stress.networks import STAGES, Subject
 
 
@@ -71,7 +72,7 @@ def run_battery(
     """
     results, reasons = [], {stage: _cannot_be_looked_at(subject, stage) for stage in stages}
     # On images this small a second thread only waits.
-    with torch_threads(1), steps("stressing", len(cases) * len(stages)) as bar:
+    with one_thread_per_operation(), steps("stressing", len(cases) * len(stages)) as bar:
         for case in cases:
             # Seeded by its name: a case draws the same images whichever others are asked for.
             images = case.draw(side_px, np.random.default_rng([seed, zlib.crc32(case.name.encode())]))

@@ -1,11 +1,9 @@
 """What is measured on a hard case, and when it holds."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from skimage.morphology import dilation, erosion
 
 from beers_deploy.profiles.errors import BeersError
@@ -112,17 +110,6 @@ def fidelity(image: np.ndarray, result: np.ndarray, radius_px: int, flat: bool) 
         moved = abs(float(np.mean(inner, dtype=np.float64) - np.mean(image, dtype=np.float64)))
         measures += [Measure("mean moved", moved, FLAT_DN), border]
     return measures
-
-
-@contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Hold torch to so many threads for a while."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 NETWORKS = ("float32", "INT8")

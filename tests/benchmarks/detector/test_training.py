@@ -8,11 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beers_deploy.profiles.sensor_file import load_sensor
-from benchmarks.detector.export import detector_to_onnx
-from benchmarks.detector.network import Decoding, DetectorNetwork
-from benchmarks.detector.pictures import Picture, drawn_picture, picture_of
-from benchmarks.detector.training import DetectorRecipe, train_detector, turned
+from benchmarks.detector.network import Decoding, DetectorNetwork, detector_to_onnx
+from benchmarks.detector.training import DetectorRecipe, Picture, drawn_picture, picture_of, train_detector, turned
 
 SIDE_PX = 64
 NAMES = ("bright", "dark")
@@ -84,12 +81,11 @@ def test_the_file_says_what_the_network_says(
 
 
 def test_a_drawn_picture_shows_its_objects_where_its_boxes_say() -> None:
-    sensor = load_sensor("pleiades-reference").nominal()
-    picture = drawn_picture(sensor, 3, 96, seed=0, number=1)
+    picture = drawn_picture(96, seed=0, number=1)
     assert picture.image.shape == (3, 96, 96)
     assert picture.image.dtype == np.uint8
     assert picture.image.max() == 255
     assert len(picture.classes) == len(picture.corners) > 0
     assert picture.corners.max() <= 96
-    again = drawn_picture(sensor, 3, 96, seed=0, number=1)
+    again = drawn_picture(96, seed=0, number=1)
     np.testing.assert_array_equal(again.image, picture.image)

@@ -1,4 +1,3 @@
-import json
 import math
 import tomllib
 from dataclasses import replace
@@ -7,10 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from jsonschema import validate
-from typer.testing import CliRunner
 
-from beers_deploy.cli import app
 from beers_deploy.model.metrics.slanted_edge import slanted_edge
 from beers_deploy.model.simulator.acquire import acquire
 from beers_deploy.model.simulator.detector import Draw, to_uint16
@@ -19,8 +15,9 @@ from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import BeersError, OptionError
 from beers_deploy.profiles.sensor import Instrument, noise_from_snr
-from beers_deploy.results import SCHEMA_PATH
 from beers_deploy.studies.characterise import characterise, cut_box, profile_toml
+from tests.deploy.command_line import done, refused
+from tests.deploy.documents import valid
 
 RATIO, SIDE, GAIN, BOARD_PX = 4, 1280, 10.2375, 100
 SNRS = (50.0, 110.0)
@@ -53,16 +50,10 @@ def raw(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return paths
 
 
-def run(*words: object) -> tuple[int, str]:
-    done = CliRunner().invoke(app, ["characterise", *map(str, words)])
-    assert done.exception is None or isinstance(done.exception, SystemExit)
-    return done.exit_code, " ".join(done.output.split())
-
-
 def test_the_profile_is_that_of_the_sensor(raw: tuple[Path, Path], tmp_path: Path) -> None:
     out, figures = tmp_path / "mine.toml", tmp_path / "mine.json"
-    code, said = run(*raw, "--bits", 12, "--gain", GAIN, "--gsd", 0.7, "--out", out, "--json", figures)
-    assert code == 0, said
+    options = "--bits", 12, "--gain", GAIN, "--gsd", 0.7
+    done("characterise", *raw, *options, "--out", out, "--json", figures)
     profile = load_sensor(str(out))
     sensor = profile.nominal()
     assert sensor.mtf_axes == pytest.approx(SENSOR.mtf_axes, rel=0.1)
@@ -71,11 +62,9 @@ def test_the_profile_is_that_of_the_sensor(raw: tuple[Path, Path], tmp_path: Pat
     assert (sensor.bits, sensor.gain_dn_per_radiance, profile.gsd_m.low) == (12, GAIN, 0.7)
     assert {profile.mtf_nyquist.status, profile.snr_pair[0].status} == {"measured"}
     assert {profile.gain_dn_per_radiance.status, profile.bits.status, profile.gsd_m.status} == {"stated"}
-    assert run(*raw, "--bits", 12, "--gain", GAIN, "--gsd", 0.7, "--out", tmp_path / "again.toml")[0] == 0
+    done("characterise", *raw, *options, "--out", tmp_path / "again.toml")
     assert (tmp_path / "again.toml").read_bytes() == out.read_bytes()
-    document = json.loads(figures.read_text(encoding="utf-8"))
-    validate(document, json.loads(SCHEMA_PATH.read_text(encoding="utf-8")))
-    shown = document["rows"][0]["figures"]
+    shown = valid(figures)["rows"][0]["figures"]
     truths = (9.0, 5.0, *SNRS)
     assert {figure["mode"] for figure in shown.values()} == {"measured"}
     intervals = [figure["interval"] for figure in shown.values()]
@@ -118,8 +107,8 @@ def test_a_box_gives_one_axis_for_both(raw: tuple[Path, Path]) -> None:
 
 
 def test_images_without_an_edge_are_refused(raw: tuple[Path, Path], tmp_path: Path) -> None:
-    code, said = run(raw[1], "--bits", 12, "--out", tmp_path / "mine.toml")
-    assert (code, list(tmp_path.iterdir())) == (2, [])
+    said = refused("characterise", raw[1], "--bits", 12, "--out", tmp_path / "mine.toml")
+    assert list(tmp_path.iterdir()) == []
     assert "expected 3 straight edges" in said
     assert "--edge FILE:X,Y,WIDTH,HEIGHT" in said
 
@@ -143,9 +132,9 @@ def test_a_box_written_wrongly_is_refused(box: str, words: str) -> None:
     [("0,0,9999,20", "or more inside"), ("9,9,0,0", "or more inside"), ("2,2,30,40", "one straight edge")],
 )
 def test_a_box_that_holds_no_edge_is_refused(raw: tuple[Path, Path], tmp_path: Path, box: str, words: str) -> None:
-    code, said = run(*raw, "--bits", 12, "--edge", f"{raw[0]}:{box}", "--out", tmp_path / "mine.toml")
-    assert (code, list(tmp_path.iterdir())) == (2, [])
-    assert words in said
+    edge = "--edge", f"{raw[0]}:{box}"
+    assert words in refused("characterise", *raw, "--bits", 12, *edge, "--out", tmp_path / "mine.toml")
+    assert list(tmp_path.iterdir()) == []
 
 
 def tiff(folder: Path, pixels: np.ndarray) -> Path:
@@ -174,23 +163,23 @@ WRONG: dict[str, tuple[np.ndarray, tuple[str, ...], str]] = {
 def test_wrong_input_is_one_sentence(case: str, tmp_path: Path) -> None:
     pixels, options, words = WRONG[case]
     image = tiff(tmp_path, pixels)
-    code, said = run(image, *options, "--out", tmp_path / "mine.toml", "--json", tmp_path / "mine.json")
-    assert (code, [p.name for p in tmp_path.iterdir()]) == (2, ["raw.tif"])
+    written = "--out", tmp_path / "mine.toml", "--json", tmp_path / "mine.json"
+    said = refused("characterise", image, *options, *written)
+    assert [p.name for p in tmp_path.iterdir()] == ["raw.tif"]
     assert words in said
     assert said.startswith("beers-deploy: ")
 
 
 def test_one_image_twice_is_refused(raw: tuple[Path, Path], tmp_path: Path) -> None:
     """Its blocks would count twice, and the intervals would shrink for nothing."""
-    code, said = run(raw[0], raw[0], "--bits", 12, "--out", tmp_path / "mine.toml")
-    assert (code, "twice" in said) == (2, True)
+    assert "twice" in refused("characterise", raw[0], raw[0], "--bits", 12, "--out", tmp_path / "mine.toml")
 
 
 def test_images_of_two_gains_are_refused(raw: tuple[Path, Path], tmp_path: Path) -> None:
     half = tmp_path / "half.tif"
     tifffile.imwrite(half, tifffile.imread(raw[0]) // 2)
-    code, said = run(raw[0], half, "--bits", 12, "--out", tmp_path / "mine.toml")
-    assert (code, "differ in gain" in said) == (2, True)
+    said = refused("characterise", raw[0], half, "--bits", 12, "--out", tmp_path / "mine.toml")
+    assert "differ in gain" in said
     assert f"DN^2 in {half.name}" in said
 
 

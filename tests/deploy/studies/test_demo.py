@@ -1,21 +1,18 @@
-import json
 from pathlib import Path
 
-import jsonschema
 import numpy as np
 import onnx
 import pytest
 import tifffile
-from typer.testing import CliRunner
 
-from beers_deploy.cli import app
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.target import board_names
 from beers_deploy.profiles.toml import HERE
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.results import SCHEMA_PATH
 from beers_deploy.studies import demo
 from beers_deploy.studies.demo import load_sensors, read_input
+from tests.deploy.command_line import done
+from tests.deploy.documents import valid
 
 
 @pytest.mark.slow
@@ -28,14 +25,11 @@ def test_the_demo_takes_a_raw_image_through_the_whole_chain(tmp_path: Path, monk
     mine = tmp_path / "mine.toml"
     mine.write_text(text.replace("10.2375", "10.0"))
     out, figures = tmp_path / "out", tmp_path / "figures.json"
-    options = ["--image", str(raw), "--out", str(out), "--json", str(figures), "--sensor", str(mine)]
-    result = CliRunner().invoke(app, ["demo", *options])
-    assert result.exit_code == 0, result.output
+    done("demo", "--image", raw, "--out", out, "--json", figures, "--sensor", mine)
     made = {path.name for path in out.iterdir()}
     assert made == {"report.html", "float.onnx", "int8.onnx", "core.onnx", "restored.tif", "before-after.png"}
     assert tifffile.imread(out / "restored.tif").shape == (120, 150)
-    document = json.loads(figures.read_text())
-    jsonschema.validate(document, json.loads(SCHEMA_PATH.read_text()))
+    document = valid(figures)
     assert document["arguments"]["sensor"] == str(mine)
     assert metadata(onnx.load(out / "int8.onnx"))["sensor"] == "mine"
     modes = {figure["mode"] for row in document["rows"] for figure in row["figures"].values()}

@@ -1,30 +1,21 @@
 """`beers-deploy detect` from options to a page: on drawn scenes, on a labelled folder, and on what is refused."""
 
-import json
 from pathlib import Path
 
-import jsonschema
 import pytest
-from typer.testing import CliRunner, Result
 
-from beers_deploy.cli import app
-from beers_deploy.results import SCHEMA_PATH
 from beers_deploy.studies.detection.tables import PAPER_TABLE, paper_rows
+from tests.deploy.command_line import done, refused
+from tests.deploy.documents import valid
 from tests.deploy.studies.detection.folders import Object, dior, labelled
 
 pytestmark = pytest.mark.slow
 
 
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, ["detect", *map(str, arguments)])
-
-
 def document(path: Path) -> dict[str, dict[str, dict[str, float]]]:
     """Values by table, row and figure, of a document that the schema takes; 0 where there is none."""
-    found = json.loads(path.read_text())
-    jsonschema.validate(found, json.loads(SCHEMA_PATH.read_text()))
     tables: dict[str, dict[str, dict[str, float]]] = {}
-    for row in found["rows"]:
+    for row in valid(path)["rows"]:
         tables.setdefault(row["table"], {})[row["name"]] = {k: f["value"] or 0.0 for k, f in row["figures"].items()}
     return tables
 
@@ -35,10 +26,9 @@ MAP = ("--classes", "Motor-Car=vehicle,Storage tank=tank")
 
 def test_synthetic_scenes_and_the_same_as_pictures_score_alike(tmp_path: Path) -> None:
     """Reading, class names, labels and sites lead to what the scenes lead to, but for 8 bits and the clip."""
-    drawn = run(*SMALL, "--drawn", 2, "--out", tmp_path / "a", "--json", tmp_path / "a.json")
+    done("detect", *SMALL, "--drawn", 2, "--out", tmp_path / "a", "--json", tmp_path / "a.json")
     folder = labelled(tmp_path / "pictures", 2)
-    read = run(*SMALL, "--images", folder, *MAP, "--out", tmp_path / "b", "--json", tmp_path / "b.json")
-    assert (drawn.exit_code, read.exit_code) == (0, 0), drawn.output + read.output
+    done("detect", *SMALL, "--images", folder, *MAP, "--out", tmp_path / "b", "--json", tmp_path / "b.json")
     tables, others = (document(tmp_path / name) for name in ("a.json", "b.json"))
     one, other = (each["detection, dior-medium"] for each in (tables, others))
     assert one["reference"]["mAP50"] > 50
@@ -56,13 +46,12 @@ def test_dior_s_tree_is_read_and_nothing_in_it_is_written_over(tmp_path: Path) -
     boxes: list[Object] = [("vehicle", 4, 4, 20, 12), ("storagetank", 30, 10, 50, 30)]
     folder = dior(tmp_path / "dior", {"test": {"00001": boxes, "00002": boxes[:1]}, "val": {"00003": boxes}})
     command = [*SMALL, "--images", folder, "--classes", "storagetank=tank", "--out", tmp_path / "out"]
-    found = run(*command, "--json", tmp_path / "found.json")
-    assert found.exit_code == 0, found.output
-    inputs = [each["name"] for each in json.loads((tmp_path / "found.json").read_text())["inputs"]]
+    done("detect", *command, "--json", tmp_path / "found.json")
+    inputs = [each["name"] for each in valid(tmp_path / "found.json")["inputs"]]
     assert inputs == ["detector.onnx", "00001.jpg", "00002.jpg"]
     label = folder / "Annotations" / "Horizontal Bounding Boxes" / "00001.xml"
     before = label.read_text()
-    assert run(*command, "--json", label).exit_code == 2
+    refused("detect", *command, "--json", label)
     assert label.read_text() == before
 
 
@@ -84,9 +73,7 @@ def test_what_cannot_be_is_one_sentence(
     arguments: list[str], word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    found = run(*arguments, *([] if "--images" in arguments else ["--drawn", 2]))
-    lines = [line for line in found.stderr.splitlines() if line.startswith("beers-deploy: ")]
-    assert found.exit_code == 2, found.output
-    assert len(lines) == 1
-    assert word in lines[0]
+    said = refused("detect", *arguments, *([] if "--images" in arguments else ["--drawn", 2]))
+    assert said.count("beers-deploy: ") == 1
+    assert word in said.split("beers-deploy: ")[1]
     assert not (tmp_path / "detection" / "report.html").exists()

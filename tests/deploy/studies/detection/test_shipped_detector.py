@@ -11,7 +11,6 @@ from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.checker.table import legality
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.model.shipped import DETECTOR, DETECTOR_INT8
-from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
 from beers_deploy.profiles.target import board_names
 from beers_deploy.quant.encodings import encoding_faults
 from beers_deploy.quant.onnx_file import load_onnx, metadata
@@ -19,16 +18,14 @@ from beers_deploy.studies.detection.average_precision import find_hits, map50
 from beers_deploy.studies.detection.boxes import Boxes
 from beers_deploy.studies.detection.detector import open_detector
 from beers_deploy.studies.detection.scenes import CLASSES
-from benchmarks.detector.pictures import Picture, drawn_picture
-from benchmarks.detector.training import DetectorRecipe
+from benchmarks.detector.training import DetectorRecipe, Picture, drawn_picture
 
 HELD_OUT_SEED = 7
 
 
 @cache
 def pictures() -> list[Picture]:
-    sensor = load_sensor(REFERENCE).nominal()
-    return [drawn_picture(sensor, 3, 256, HELD_OUT_SEED, number) for number in range(6)]
+    return [drawn_picture(256, HELD_OUT_SEED, number) for number in range(6)]
 
 
 @cache

@@ -1,16 +1,12 @@
 """Pairs, methods, scores and targets of an evaluation."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from beers_deploy.cli import app
 from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.metrics.fidelity import fidelity_db
 from beers_deploy.model.metrics.refusal import Refusal
@@ -21,9 +17,9 @@ from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row, by_table, measured
-from beers_deploy.results import SCHEMA_PATH, missing
+from beers_deploy.results import missing
 from beers_deploy.studies.evaluation import scores as scores_module
-from beers_deploy.studies.evaluation.methods import Method, method_named
+from beers_deploy.studies.evaluation.methods import BLIND, KNOWN, Method, method_named, method_without_network
 from beers_deploy.studies.evaluation.pairs import (
     NamedPair,
     oversampling_note,
@@ -44,10 +40,15 @@ from beers_deploy.studies.evaluation.scores import (
     snr_name,
     target_figures,
 )
+from tests.deploy.command_line import done
+from tests.deploy.documents import valid
 
 DEGRADED, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
 SENSORS = DEGRADED.nominal(), REFERENCE.nominal()
 PLAIN = Instruments({"LPIPS-squeeze": "no weights"})
+
+
+OTHER = replace(SENSORS[0], mtf_nyquist=0.03, gain_dn_per_radiance=0.7 * SENSORS[0].gain_dn_per_radiance)
 
 
 def pair(name: str = "site_1.tif", seed: int = 0, noise_dn: float = 20) -> NamedPair:
@@ -160,6 +161,24 @@ def test_a_shipped_network_restores_as_it_knows_the_sensor() -> None:
     np.testing.assert_allclose(method.specialise(DEGRADED.nominal())(dn), method.restore(dn), rtol=0, atol=1)
     assert np.abs(method.specialise(blurred)(dn) - method.restore(dn)).max() > 5
     assert method_named("convbeers-xs@blind", DEGRADED, REFERENCE).specialise is None
+
+
+@pytest.mark.parametrize("name", ["traditional-fast", "deconvolve-first-fast", "wiener"])
+def test_a_chain_that_gets_to_know_a_sensor_is_the_one_made_for_it(name: str) -> None:
+    """Its gain included: the reference that is aimed at then has it too."""
+    dn = np.random.default_rng(0).integers(200, 1800, (40, 47)).astype(np.float32)
+    method = method_without_network(name, *SENSORS)
+    made = method_without_network(name, OTHER, SENSORS[1].in_units_of(OTHER))
+    found = method.knowing(OTHER).restore(dn)
+    assert np.array_equal(found, made.restore(dn))
+    assert not np.array_equal(found, method.restore(dn))
+
+
+def test_who_can_know_a_sensor_says_so_and_what_depends_on_none_stays_as_it_is() -> None:
+    for plain in (method_without_network("degraded", *SENSORS), Method("blind", np.sqrt, BLIND)):
+        assert plain.knowing(OTHER) is plain
+    method = Method("net", np.sqrt, BLIND, lambda _: np.abs)
+    assert (method.knowing(OTHER).sensor_known, method.sensor_known) == (KNOWN, BLIND)
 
 
 def test_clipped_pixels_do_not_count() -> None:
@@ -288,11 +307,9 @@ def test_tables_of_a_sweep_keep_their_words_on_the_page() -> None:
 def test_the_command_on_a_folder_of_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scores_module, "REPEATS", 1)
     folder = write_pairs(tmp_path / "pairs", [pair("a_1.tif", 1), pair("b_1.tif", 2)])
-    command = f"evaluate --pairs {folder} --methods traditional-fast --json {tmp_path}/e.json --out {tmp_path}/out"
-    result = CliRunner().invoke(app, command.split())
-    assert result.exit_code == 0, result.output
-    document = json.loads((tmp_path / "e.json").read_text())
-    jsonschema.validate(document, json.loads(SCHEMA_PATH.read_text()))
+    files = "--json", tmp_path / "e.json", "--out", tmp_path / "out"
+    done("evaluate", "--pairs", folder, "--methods", "traditional-fast", *files)
+    document = valid(tmp_path / "e.json")
     assert [each["name"] for each in document["inputs"]] == ["a_1.tif", "b_1.tif"] * 2
     names = [row["name"] for row in document["rows"] if row["table"] == "mean"]
     assert names == ["degraded", "traditional-fast", "paper: traditional", "paper: ConvBEERS"]

@@ -1,6 +1,5 @@
 """Conditions of a sweep: who is told which sensor, and what a chain loses when it is told the wrong one."""
 
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -8,9 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from typer.testing import CliRunner
 
-from beers_deploy.cli import app
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles import Sensor, load_sensor
 from beers_deploy.profiles.figures import Row, by_table, unavailable
@@ -28,6 +25,8 @@ from beers_deploy.studies.evaluation.sweep import (
     run_sweep,
     suppositions,
 )
+from tests.deploy.command_line import done
+from tests.deploy.documents import valid
 
 PROFILE, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
 NOMINAL = PROFILE.nominal()
@@ -147,12 +146,8 @@ def known() -> Found:
     return Found(psnr, dict.fromkeys(psnr, unavailable("%", "no edges here")), SITES, 0)
 
 
-def tables() -> dict[str, list[Row]]:
-    return by_table(known().rows)
-
-
 def test_the_interval_of_a_gain_is_that_of_differences_on_the_same_images() -> None:
-    nominal, blurred = (row.figures["net"] for row in tables()["sweep, gain over the chain"])
+    nominal, blurred = (row.figures["net"] for row in by_table(known().rows)["sweep, gain over the chain"])
     assert nominal.value == pytest.approx(0.75)
     assert nominal.interval == pytest.approx((0.75, 0.75))
     assert blurred.interval is not None
@@ -160,7 +155,7 @@ def test_the_interval_of_a_gain_is_that_of_differences_on_the_same_images() -> N
 
 
 def test_over_all_conditions_mean_and_least_gain_are_named() -> None:
-    (row,) = tables()["sweep, gain over the chain, all conditions"]
+    (row,) = by_table(known().rows)["sweep, gain over the chain, all conditions"]
     assert row.name == "net"
     assert row.figures["mean of 2 conditions"].value == pytest.approx((0.75 + 0.3) / 2)
     assert row.figures["least"].value == pytest.approx(0.3)
@@ -168,12 +163,14 @@ def test_over_all_conditions_mean_and_least_gain_are_named() -> None:
 
 
 def test_the_reference_without_noise_has_a_table_of_its_own() -> None:
-    noisy, clean = (tables()[f"sweep, PSNR{end}"][0].figures for end in ("", ", reference without noise"))
+    noisy, clean = (
+        by_table(known().rows)[f"sweep, PSNR{end}"][0].figures for end in ("", ", reference without noise")
+    )
     assert (clean["net"].value or 0) - (noisy["net"].value or 0) == pytest.approx(1)
 
 
 def test_what_a_wrongly_known_sensor_costs_is_on_the_same_images() -> None:
-    (row,) = tables()["sweep, lost by a sensor known wrongly"]
+    (row,) = by_table(known().rows)["sweep, lost by a sensor known wrongly"]
     assert row.name == "MTF 3%, supposed MTF 7%"
     assert row.figures["net"].value == pytest.approx(1.3)
     assert row.figures["net"].interval is not None
@@ -190,11 +187,7 @@ def test_the_command_sweeps_the_networks_alone(tmp_path: Path) -> None:
     scene = np.random.default_rng(0).integers(200, 1800, (500, 560)).astype(np.uint16)
     tifffile.imwrite(tmp_path / "scene.tif", scene)
     found = tmp_path / "found.json"
-    command = f"evaluate --images {tmp_path} --methods degraded,convbeers-xs --sweep --json {found}"
-    done = CliRunner().invoke(app, command.split())
-    assert done.exit_code == 0, done.output
-    rows = {
-        row["name"]: row["figures"] for row in json.loads(found.read_text())["rows"] if row["table"] == "sweep, PSNR"
-    }
+    done("evaluate", "--images", tmp_path, "--methods", "degraded,convbeers-xs", "--sweep", "--json", found)
+    rows = {row["name"]: row["figures"] for row in valid(found)["rows"] if row["table"] == "sweep, PSNR"}
     assert {"nominal", "MTF 3%", "dim"} <= set(rows)
     assert set(rows["nominal"]) >= {NOMINAL_KNOWN, TRUTH_KNOWN, "convbeers-xs"}

@@ -1,21 +1,23 @@
-"""Which operating points a study looks at."""
+"""Which operating points a study looks at; what is kept of measurements, and times on this machine."""
 
+import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import onnx
 import pytest
-import torch
 
 from beers_deploy.bench.tables import Swath
 from beers_deploy.export import to_onnx
-from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import Variant as Shape
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.target import TILE_PX, board_names
 from beers_deploy.quant.onnx_file import save_onnx
+from beers_deploy.studies.tradeoff.measure import ROUNDS, Measurements, host_figures, host_times, key_of
 from beers_deploy.studies.tradeoff.points import (
     FLOAT,
     HALOS_PX,
@@ -34,6 +36,7 @@ from beers_deploy.studies.tradeoff.points import (
 )
 from tests.deploy.dpu.graphs import integer_convbeers
 from tests.deploy.studies.tradeoff.made import DPU
+from tests.model.networks import plain
 
 WHOLE = Swath(13600, 9016)
 SENSOR = load_sensor("pleiades-degraded")
@@ -51,9 +54,7 @@ def refused(_: Path) -> Path:
 
 
 def float_file(path: Path) -> Path:
-    network = ConvBEERS(Shape(1, 2))
-    initialise(network, torch.Generator().manual_seed(0))
-    save_onnx(to_onnx(network.eval(), {}), path)
+    save_onnx(to_onnx(plain(Shape(1, 2)), {}), path)
     return path
 
 
@@ -159,3 +160,37 @@ def test_a_chain_on_a_boards_processor_takes_what_the_target_states_by_the_ratio
     assert latency.interval == pytest.approx((60, 240))
     bare = replace(DPU.target, tables={"cpu": {}})
     assert board_figures(Point(chain, bare), swath, slower=3.0)["board latency"].mode == "unavailable"
+
+
+def test_what_was_measured_is_kept_by_what_it_depends_on(tmp_path: Path) -> None:
+    path, calls = tmp_path / "measurements.json", list[int]()
+
+    def measure() -> list[int]:
+        calls.append(1)
+        return [len(calls)]
+
+    kept = Measurements.open(path)
+    assert kept.make(key_of(model="a"), measure) == [1]
+    assert Measurements.open(path).make(key_of(model="a"), measure) == [1]
+    assert Measurements.open(path).make(key_of(model="b"), measure) == [2]
+    assert len(json.loads(path.read_text())["measurements"]) == 2
+
+
+def test_methods_are_timed_in_turns_after_a_run_for_warm_up() -> None:
+    order = list[str]()
+
+    def restore(name: str, dn: np.ndarray) -> np.ndarray:
+        order.append(name)
+        return dn
+
+    names = ("one", "other")
+    found = host_times([partial(restore, name) for name in names], np.zeros((4, 4)))
+    assert [len(times) for times in found] == [ROUNDS, ROUNDS]
+    assert order == [*names] * (ROUNDS + 1)
+
+
+def test_host_figures_are_percentiles_for_a_megapixel() -> None:
+    figures = host_figures([0.1, 0.2, 0.3], 100_000)
+    assert figures["host p50"].value == 2.0
+    assert (figures["host p90"].value or 0.0) > 2.0
+    assert {figure.mode for figure in figures.values()} == {"measured"}

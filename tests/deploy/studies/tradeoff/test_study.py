@@ -8,21 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import pytest
-import torch
 from PIL import Image
-from typer.testing import CliRunner
 
-from beers_deploy.cli import app
-from beers_deploy.model.convbeers import ConvBEERS, initialise, save_network
+from beers_deploy.model.convbeers import save_network
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.variants import Variant as Shape
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.sensor_file import reference_for
 from beers_deploy.restoration.engine import Restore
-from beers_deploy.results import SCHEMA_PATH
 from beers_deploy.studies.evaluation.methods import Method, method_named
 from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes
 from beers_deploy.studies.evaluation.scores import Instruments
@@ -31,7 +26,10 @@ from beers_deploy.studies.tradeoff.measure import SEAM_ERROR, Benchmark, Labelle
 from beers_deploy.studies.tradeoff.page import Tradeoff
 from beers_deploy.studies.tradeoff.points import Point, Variant
 from beers_deploy.studies.tradeoff.run import tradeoff
+from tests.deploy.command_line import done, refused
+from tests.deploy.documents import valid
 from tests.deploy.studies.tradeoff.small import small_studies
+from tests.model.networks import plain
 
 pytestmark = pytest.mark.slow
 
@@ -43,9 +41,7 @@ SENSOR = "pleiades-degraded"
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network, two scenes to judge on and one to calibrate on."""
     folder = tmp_path_factory.mktemp("tiny")
-    network = ConvBEERS(Shape(1, 2))
-    initialise(network, torch.Generator().manual_seed(3))
-    save_network(folder / "narrow.safetensors", network, {"degraded": SENSOR})
+    save_network(folder / "narrow.safetensors", plain(Shape(1, 2), seed=3), {"degraded": SENSOR})
     for number in range(SITES + 1):
         scene = procedural_scene(300, 340, np.random.default_rng(number)).radiance
         place = folder / ("images" if number < SITES else "calibration") / f"site{'abc'[number]}.png"
@@ -222,23 +218,18 @@ def test_the_command_recommends_in_one_line_and_writes_its_files(
     folder: Path, study: tuple[Tradeoff, Path], budget: str, code: int
 ) -> None:
     out = study[1]
-    named = f"--network {folder}/narrow.safetensors --images {folder}/images --calibration {folder}/calibration"
-    command = f"tradeoff {named} --size 1500x1200 --out {out}"
-    result = CliRunner().invoke(app, [*command.split(), "--budget", budget])
-    assert result.exit_code == code, result.output
-    lines = [line for line in result.stdout.splitlines() if "recommend" in line]
+    given = "--network", folder / "narrow.safetensors", "--images", folder / "images", "--size", "1500x1200"
+    calibrated = "--calibration", folder / "calibration"
+    said = done("tradeoff", *given, *calibrated, "--out", out, "--budget", budget, code=code)
+    lines = [line for line in said.splitlines() if "recommend" in line]
     assert len(lines) == 1
     assert lines[0].startswith(f"{'nothing to recommend' if code else 'recommended'} for board latency <= ")
     names = {"tradeoff.html", "tradeoff.svg", "tradeoff.json", "measurements.json", "int8"}
     assert {path.name for path in out.iterdir()} == names
-    document = json.loads((out / "tradeoff.json").read_text())
-    jsonschema.validate(document, json.loads(SCHEMA_PATH.read_text()))
-    assert document["rows"][0]["text"]["line"] == lines[0]
+    assert valid(out / "tradeoff.json")["rows"][0]["text"]["line"] == lines[0]
     assert lines[0][1:40] in (out / "tradeoff.html").read_text().replace("&lt;", "<")
 
 
 @pytest.mark.parametrize("options", ["--detector d.onnx", "--classes car=vehicle", "--need map50>=40"])
 def test_what_only_labelled_pictures_have_is_refused_without_them(options: str, tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["tradeoff", "--out", str(tmp_path), *options.split()])
-    assert result.exit_code == 2
-    assert "--labelled beside it" in result.output
+    assert "--labelled beside it" in refused("tradeoff", "--out", tmp_path, *options.split())
