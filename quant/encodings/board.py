@@ -6,7 +6,7 @@ import onnx
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings.description import BORDER_PX, KEY, PLACE_PX, described_core
 from beers_deploy.quant.ends import Ends
-from beers_deploy.quant.graph import CORRECTION, PLANES, Conv
+from beers_deploy.quant.graph import CORRECTION, PLANES, Conv, Op
 from beers_deploy.quant.graph.writer import onnx_weight, write_float
 from beers_deploy.quant.onnx_file import GraphWriter, constants, fixed_tile_px, image_info, make_model, metadata
 from beers_deploy.quant.untrusted import contradictions
@@ -22,12 +22,8 @@ def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None
     writer = BoardWriter()
     writer.quantised("planes.dequantised", PLANES, core.frac_bits[PLANES])
     for op in core.ops:
-        feeds = ["planes.dequantised" if i == PLANES else i for i in op.inputs]
-        output = f"{op.output}.float"
-        if isinstance(op, IntConv):
-            write_conv(writer, op, feeds[0], output)
-        else:
-            write_float(writer, op, feeds, output)
+        feeds, output = ["planes.dequantised" if i == PLANES else i for i in op.inputs], f"{op.output}.float"
+        writer.operation(op, feeds, output)
         writer.quantised(op.output, output, core.frac_bits[op.output])
     return core_file(writer, core.ends, about, tile_px)
 
@@ -58,15 +54,6 @@ def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
         return board_model(core, {}, fixed_tile_px(model))
 
 
-def write_conv(w: "BoardWriter", op: IntConv, source: str, output: str) -> None:
-    """Write a convolution and its activation, weights and bias as int8 seen as float."""
-    weight = w.dequantised(f"{op.name}.weight", onnx_weight(op.weight, op.transposed), op.weight_frac_bits)
-    bias = w.dequantised(f"{op.name}.bias", op.bias, op.bias_frac_bits)
-    kind = (op.activation, op.window, op.groups, op.transposed)
-    as_float = Conv(op.name, op.input, op.output, op.weight, op.bias, *kind)
-    write_float(w, as_float, [source, weight, bias], output)
-
-
 class BoardWriter(GraphWriter):
     """Writes tensors as the board's flow reads them: quantised to int8, and seen as float again."""
 
@@ -80,7 +67,15 @@ class BoardWriter(GraphWriter):
         middle = self.node("QuantizeLinear", f"{source}.int8", [source, *self.scale(source, frac_bits)])
         self.node("DequantizeLinear", output, [middle, *self.scale(source, frac_bits)], f"{middle}.float")
 
-    def dequantised(self, name: str, value: np.ndarray, frac_bits: int) -> str:
-        """An int8 constant seen as float."""
+    def operation(self, op: IntConv | Op, feeds: list[str], output: str) -> None:
+        """Write an operation on tensors seen as float, a convolution's weights and bias as int8 seen so too."""
+        if isinstance(op, IntConv):
+            weight, kind = onnx_weight(op.weight, op.transposed), (op.activation, op.window, op.groups, op.transposed)
+            numbers = {"weight": (weight, op.weight_frac_bits), "bias": (op.bias, op.bias_frac_bits)}
+            feeds = [*feeds, *(self._dequantised(f"{op.name}.{role}", *each) for role, each in numbers.items())]
+            op = Conv(op.name, op.input, op.output, op.weight, op.bias, *kind)
+        write_float(self, op, feeds, output)
+
+    def _dequantised(self, name: str, value: np.ndarray, frac_bits: int) -> str:
         feeds = [self.constant(name, value), *self.scale(name, frac_bits)]
         return self.node("DequantizeLinear", f"{name}.float", feeds)

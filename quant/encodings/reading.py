@@ -33,17 +33,12 @@ def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
 
     None for files of others.
     """
-    with contradictions("INT8 model"):
-        return _encoding_faults(model)
-
-
-def _encoding_faults(model: onnx.ModelProto) -> list[str] | None:
-    ours = metadata(model).get("precision") == "int8 legal"
     try:
         core = read_core(model)
     except ModelError as error:
-        return [error.got] if ours else None
-    meant, faults = host_model(core, {}, fixed_tile_px(model)).graph, []
+        return [error.got] if metadata(model).get("precision") == "int8 legal" else None
+    with contradictions("INT8 model"):
+        meant, faults = host_model(core, {}, fixed_tile_px(model)).graph, list[str]()
     for kind, found, wanted in (
         ("constant", model.graph.initializer, meant.initializer),
         ("node", model.graph.node, meant.node),

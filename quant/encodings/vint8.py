@@ -22,9 +22,8 @@ from onnx import shape_inference
 from beers_deploy.model.io.files import write_text
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.quant.core import IntConv, IntCore
-from beers_deploy.quant.encodings.board import BoardWriter, core_file, write_conv
+from beers_deploy.quant.encodings.board import BoardWriter, core_file
 from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Add, Op, Pointwise
-from beers_deploy.quant.graph.writer import write_float
 
 CONFIG = "vitisai_config.json"
 """What AMD's compiler reads beside the network."""
@@ -41,11 +40,7 @@ def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> on
     parts = [(part, core.frac_bits[op.output]) for op in core.ops for part in _apart(op)]
     writer = _Writer({PLANES: core.frac_bits[PLANES], **{op.output: bits for op, bits in parts}})
     for op, _ in parts:
-        feeds, output = [writer.read(name) for name in op.inputs], writer.source(op.output)
-        if isinstance(op, IntConv):
-            write_conv(writer, op, feeds[0], output)
-        else:
-            write_float(writer, op, feeds, output)
+        writer.operation(op, [writer.read(name) for name in op.inputs], writer.source(op.output))
     writer.read(CORRECTION, CORRECTION)
     model = core_file(writer, core.ends, about, side_px)
     return shape_inference.infer_shapes(model, strict_mode=True)

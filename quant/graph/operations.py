@@ -118,19 +118,6 @@ def same(weight: np.ndarray) -> Window:
     return Window(pads=(rows, columns, rows, columns))
 
 
-def is_plain(op: Op) -> bool:
-    """Whether an operation is of the short list that ConvBEERS is made of.
-
-    A same-size convolution of stride 1, in float or whole numbers, with or without ReLU; or an add without one.
-    """
-    activation = getattr(op, "activation", None)
-    if not isinstance(op, HasWeight):
-        return isinstance(op, Add) and activation is Activation.none
-    dense = op.groups == 1 and not getattr(op, "transposed", False)
-    kept = activation in (Activation.none, Activation.relu)
-    return dense and kept and getattr(op, "window", None) == same(op.weight)
-
-
 @dataclass(frozen=True)
 class OneInput:
     """Operations that read one tensor, `input`."""
@@ -329,16 +316,6 @@ def read_planes(graph: Graph) -> Graph:
 
 def _reads_planes(op: Conv) -> Conv:
     unit = np.float32(2.0**PLANES_FRAC_BITS / MAX_DN)
-    weight = dense(op).weight
+    weight = op.weight if op.groups == 1 else op.weight * np.eye(op.groups, dtype=np.float32)[:, :, None, None]
     planes = [weight * (STEP * unit), weight * unit, np.zeros_like(weight)]
     return replace(op, input=PLANES, weight=np.concatenate(planes, axis=1).astype(np.float32), groups=1)
-
-
-def dense(op: Conv) -> Conv:
-    """A depthwise convolution as one of a single group; any other as it is."""
-    if op.groups == 1:
-        return op
-    weight = np.zeros((len(op.weight), op.groups, *op.weight.shape[2:]), np.float32)
-    channels = np.arange(op.groups)
-    weight[channels, channels] = op.weight[:, 0]
-    return replace(op, weight=weight, groups=1)

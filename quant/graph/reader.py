@@ -39,7 +39,7 @@ from beers_deploy.quant.graph.operations import (
     Resize,
     Shuffle,
     Window,
-    is_plain,
+    same,
 )
 from beers_deploy.quant.graph.tail import without_tail
 from beers_deploy.quant.untrusted import contradictions, times
@@ -50,7 +50,7 @@ def read_network(model: onnx.ModelProto) -> Network:
     with contradictions("float model"):
         body, tail = without_tail(model, {*READERS, *ACTIVATIONS})
         reader = _Reader(body)
-        network = replace(cut(reader.sized_graph(), reader.channels(), reader.flat, reader.softmax), tail=tail)
+        network = replace(cut(reader.graph(), reader.channels(), reader.flat, reader.softmax), tail=tail)
         check_network(network)
     return network
 
@@ -67,9 +67,16 @@ def plain_network(model: onnx.ModelProto) -> Network:
     if not (same_ends and blocks[0] == blocks[1] and len(blocks[0]) <= 1):
         raise refused_graph("an image of one channel, and a global add of it at the end", "another network")
     for op in network.graph:
-        if not (isinstance(op, Conv | Add) and is_plain(op)):
+        if not _is_plain(op):
             raise refused_graph("only same-size convolutions of stride 1, ReLU and adds", op.name)
     return network
+
+
+def _is_plain(op: Op) -> bool:
+    if isinstance(op, Conv):
+        alone = op.groups == 1 and not op.transposed and op.window == same(op.weight)
+        return alone and op.activation in (Activation.none, Activation.relu)
+    return isinstance(op, Add) and op.activation is Activation.none
 
 
 def correction_graph(model: onnx.ModelProto) -> Graph:
@@ -108,7 +115,7 @@ class _Reader:
         return sizes[1] or 1
 
     def graph(self) -> Graph:
-        """The operations, from the network's own input to its own output."""
+        """The operations from the network's own input to its own output; global pooling takes one size of image."""
         if len(self.source.outputs) != 1:
             got = f"{len(self.source.outputs)}: {', '.join(self.source.outputs)}"
             raise refused_graph("one output", got, "export it with one of them")
@@ -116,11 +123,7 @@ class _Reader:
             self._read(node)
         if not self.ops or self.ops[-1].output != self.result:
             raise refused_graph("an operation that writes the output", "none")
-        return named_apart(self.ops, {self.image: IMAGE, self.result: CORRECTION})
-
-    def sized_graph(self) -> Graph:
-        """As `graph`, the windows of global pooling known: a network that pools so has one size of image."""
-        graph = self.graph()
+        graph = named_apart(self.ops, {self.image: IMAGE, self.result: CORRECTION})
         pools = [op for op in graph if isinstance(op, AveragePool) and op.kernel is None]
         rows, columns = self.source.inputs[self.image][2:]
         if pools and not (rows and columns):
@@ -249,9 +252,6 @@ class _Reader:
         self._require(plain, node, "average pooling that counts padding")
         return AveragePool(node.name, node.inputs[0], node.outputs[0], kernel, window)
 
-    def _globalaveragepool(self, node: Node) -> Op:
-        return AveragePool(node.name, node.inputs[0], node.outputs[0], None)
-
     def _resize(self, node: Node) -> Op:
         found = Resizing.of(node, self.source)
         sound = found.factors[:2] == (1, 1) and found.factors[2] == found.factors[3]
@@ -313,7 +313,7 @@ READERS: dict[str, Callable[[_Reader, Node], Op | None]] = {
     "ConvTranspose": _Reader._convtranspose,
     "DepthToSpace": _Reader._shuffle,
     "Flatten": _Reader._flatten,
-    "GlobalAveragePool": _Reader._globalaveragepool,
+    "GlobalAveragePool": lambda _, node: AveragePool(node.name, node.inputs[0], node.outputs[0], None),
     "MaxPool": _Reader._maxpool,
     "Mul": _Reader._add_or_mul,
     "Resize": _Reader._resize,
