@@ -34,7 +34,7 @@ from onnx import TensorProto, numpy_helper, version_converter
 from onnx.shape_inference import InferenceError
 
 from beers_deploy.quant.reading.equivalents import rewrite
-from beers_deploy.quant.untrusted import contradictions, refused
+from beers_deploy.quant.untrusted import contradictions, opset_of, refused
 
 OPSET = 17
 IR_VERSION = 8
@@ -71,7 +71,7 @@ def _simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     _replace(folded.graph.input, inputs)  # one that is an input could be another when it runs
     folded.ir_version = IR_VERSION
     ends = list(inputs), list(folded.graph.output)
-    if _opset(model) < OPSET:  # an operator's own sizes become constants, which are then folded
+    if opset_of(model) < OPSET:  # an operator's own sizes become constants, which are then folded
         folded = _of_our_opset(folded)
     folded = _of_our_opset(_folded(folded, where))
     rewrite(folded)
@@ -84,7 +84,7 @@ def _simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 def _is_plain(model: onnx.ModelProto) -> bool:
     held = {tensor.name for tensor in model.graph.initializer}
     return (
-        _opset(model) == OPSET
+        opset_of(model) == OPSET
         and not any(tensor.data_type in HALVES for tensor in model.graph.initializer)
         and not any(value.name in held for value in model.graph.input)
         and all(
@@ -133,14 +133,9 @@ def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     return folded
 
 
-def _opset(model: onnx.ModelProto) -> int:
-    """The version of ONNX's own operators."""
-    return max((opset.version for opset in model.opset_import if opset.domain in ("", "ai.onnx")), default=1)
-
-
 def _of_our_opset(model: onnx.ModelProto) -> onnx.ModelProto:
     """With operators of our opset; as it is where the converter knows no way, or ours has no such operator."""
-    version = _opset(model)
+    version = opset_of(model)
     _replace(model.opset_import, [onnx.helper.make_opsetid("", version)])
     if version == OPSET:
         return model
