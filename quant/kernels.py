@@ -245,8 +245,7 @@ def filled(model: onnx.ModelProto) -> onnx.ModelProto:
     if any(each.domain in ("", "ai.onnx") and each.version < FIRST_OPSET for each in model.opset_import):
         return model
     wider = deepcopy(model)
-    arrays = {each.name: each for each in wider.graph.initializer}
-    work = _ChannelPadding(wider.graph, {name: numpy_helper.to_array(each) for name, each in arrays.items()})
+    work = _ChannelPadding(wider.graph, constants(model))
     nodes = [each for node in wider.graph.node for each in work.around(node)]
     del wider.graph.node[:]
     wider.graph.node.extend(nodes)
@@ -258,7 +257,7 @@ class _ChannelPadding:
 
     def __init__(self, graph: onnx.GraphProto, arrays: dict[str, np.ndarray]) -> None:
         self.graph, self.arrays = graph, arrays
-        self.wide_inputs: dict[str, str] = {}
+        self.wide_inputs = set[str]()
 
     def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
         """The node, and what widens its input and narrows its output."""
@@ -292,11 +291,10 @@ class _ChannelPadding:
         node.input[3] = self._constant(f"{name}.filled.weight", wide)
 
     def _padded(self, node: onnx.NodeProto, count: int) -> list[onnx.NodeProto]:
-        source = node.input[0]
-        known = source in self.wide_inputs
-        node.input[0] = self.wide_inputs.setdefault(source, f"{source}.padded")
-        if known:
+        source, node.input[0] = node.input[0], f"{node.input[0]}.padded"
+        if source in self.wide_inputs:
             return []
+        self.wide_inputs.add(source)
         pads = self._constant(f"{source}.padded.pads", np.array([0, 0, 0, 0, 0, count, 0, 0]))
         return [helper.make_node("Pad", [source, pads], [f"{source}.padded"], name=f"{source}.padded")]
 

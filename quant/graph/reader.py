@@ -42,6 +42,7 @@ from beers_deploy.quant.graph.operations import (
     same,
 )
 from beers_deploy.quant.graph.tail import without_tail
+from beers_deploy.quant.reading.equivalents import per_channel
 from beers_deploy.quant.untrusted import contradictions, times
 
 
@@ -221,14 +222,15 @@ class _Reader:
         if not found:
             return None
         (place, value), *others = found.items()
-        shape = (1,) * (4 - value.ndim) + value.shape  # as ONNX aligns it with (N, C, H, W)
-        own = value.ndim <= 4 and shape[0] == shape[2] == shape[3] == 1 and not others
-        self._require(own, node, "a constant of one number a channel", f"one of {times(value.shape)}")
+        flat = None if others else per_channel(value)
+        if flat is None:
+            got = f"one of {times(value.shape)} at {node}"
+            raise refused_graph("a constant of one number a channel", got)
         self._require(node.op_type != "Sub" or place == 1, node, "a constant that is taken off")
         source = node.inputs[1 - place]
         channels = channels_of(tuple(self.ops), {self.image: self.channels()})[source]
         self._require(value.size in (1, channels), node, f"{channels} numbers", f"{value.size}")
-        each = np.broadcast_to(value.astype(np.float32).ravel(), (channels,))
+        each = np.broadcast_to(flat.astype(np.float32), (channels,))
         one, none = np.ones(channels, np.float32), np.zeros(channels, np.float32)
         factor, offset = {"Add": (one, each), "Sub": (one, -each), "Mul": (each, none)}[node.op_type]
         return Conv(node.name, source, node.outputs[0], factor[:, None, None, None], offset, groups=channels)

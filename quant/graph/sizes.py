@@ -8,12 +8,11 @@ from onnx import TensorProto, helper, numpy_helper, shape_inference
 
 from beers_deploy.quant.graph.nodes import Kind, Node, Window
 from beers_deploy.quant.reading.folding import OPSET
+from beers_deploy.quant.untrusted import LIST_VALUES
 
 Shape = tuple[int, int, int]
 """Channels, height, width."""
 WINDOWED = ("conv", "grouped conv", "depthwise", "transposed", "pool")
-LIST_VALUES = 1024
-"""Most of a constant that says how large a result is; weights are longer, and say nothing."""
 
 
 def out_shape(

@@ -32,10 +32,6 @@ class Affine:
         """How many numbers it has."""
         return max(len(self.scale), len(self.shift))
 
-    def after(self, first: "Affine") -> "Affine":
-        """Both in one."""
-        return Affine(self.scale * first.scale, self.scale * first.shift + self.shift)
-
 
 def rewrite(model: onnx.ModelProto) -> None:
     """Rewrite a float network's nodes; its inputs and outputs keep their names."""
@@ -48,6 +44,8 @@ def rewrite(model: onnx.ModelProto) -> None:
         _in_front(graph, shapes)
         for shaped in (_cast, _mean, _depthwise):
             graph.pass_over(partial(shaped, shapes))
+        graph.pass_over(_behind)  # a normalisation that has become a convolution takes in what stands around it
+        _in_front(graph, shapes)
         graph.pass_over(Unflatten(shapes))
         graph.write()
 
@@ -77,39 +75,16 @@ def _difference(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
 
 
 def _behind(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
-    """What works on each channel by itself, folded into the convolution or normalisation that it follows."""
+    """What works on each channel by itself, folded into the convolution that it follows."""
     found = _affine(graph, node)
     before = graph.sole_writer(found[0]) if found else None
-    if found is None or before is None:
+    if found is None or before is None or not graph.is_linear(before):
         return None
-    affine = found[1]
-    if graph.is_linear(before):
-        if affine.channels not in (1, graph.width(before)):
-            return None
-        _scale_results(graph, before, affine)
-    else:
-        first = _affine(graph, before) if NORMALISATION in (before.op_type, node.op_type) else None
-        if first is None or min(affine.channels, first[1].channels) not in (1, affine.channels):
-            return None
-        _set_normalisation(graph, before, first[0], affine.after(first[1]))
-    _rename(graph, found[0], node.output[0])
+    if found[1].channels not in (1, graph.width(before)):
+        return None
+    _scale_results(graph, before, found[1])
+    graph.rename(found[0], node.output[0])
     return []
-
-
-def _rename(graph: Nodes, result: str, name: str) -> None:
-    """Let a result have the name of the one that it takes the place of."""
-    writer = graph.writers[name] = graph.writers[result]
-    writer.output[list(writer.output).index(result)] = name
-
-
-def _set_normalisation(graph: Nodes, node: NodeProto, source: str, affine: Affine) -> None:
-    """Make a node the normalisation of mean 0 and variance 1 that computes this."""
-    scale, shift = np.broadcast_arrays(affine.scale, affine.shift)
-    values = (scale, shift, np.zeros(scale.shape), np.ones(scale.shape))
-    names = ("scale", "shift", "mean", "variance")
-    inputs = [graph.keep(f"{node.output[0]}.{name}", value) for name, value in zip(names, values, strict=True)]
-    made = helper.make_node(NORMALISATION, [source, *inputs], node.output, name=node.name, epsilon=0.0)
-    node.CopyFrom(made)
 
 
 def _affine(graph: Nodes, node: NodeProto) -> tuple[str, Affine] | None:
@@ -119,7 +94,7 @@ def _affine(graph: Nodes, node: NodeProto) -> tuple[str, Affine] | None:
     if node.op_type not in ARITHMETIC:
         return None
     for place in (0, 1):
-        value = _per_channel(graph.value(node.input[1 - place]))
+        value = per_channel(graph.value(node.input[1 - place]))
         if value is not None and node.input[place] not in graph.constants:
             found = _arithmetic(node.op_type, value, place)
             return None if found is None else (node.input[place], found)
@@ -148,7 +123,7 @@ def _normalisation(graph: Nodes, node: NodeProto) -> tuple[str, Affine] | None:
     return node.input[0], Affine(scale, offset - mean * scale)
 
 
-def _per_channel(value: np.ndarray | None) -> np.ndarray | None:
+def per_channel(value: np.ndarray | None) -> np.ndarray | None:
     """(C,) or (1,) of a constant that is one number a channel of (N, C, H, W), None of any other."""
     if value is None or value.ndim > 4:
         return None
@@ -180,8 +155,7 @@ def _numbers(graph: Nodes, node: NodeProto) -> tuple[np.ndarray, np.ndarray]:
 
 def _set_numbers(graph: Nodes, node: NodeProto, weight: np.ndarray, bias: np.ndarray) -> None:
     name = node.name or node.output[0]
-    inputs = [node.input[0], graph.keep(f"{name}.weight", weight), graph.keep(f"{name}.bias", bias)]
-    node.input[:] = inputs
+    node.input[:] = [node.input[0], graph.keep(f"{name}.weight", weight), graph.keep(f"{name}.bias", bias)]
 
 
 def _hard_swish(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
@@ -203,7 +177,7 @@ def _cast(shapes: Shapes, graph: Nodes, node: NodeProto) -> list[NodeProto] | No
     before = graph.sole_writer(node.input[0]) if node.op_type == "Cast" and node.input[0] in shapes else None
     if before is None or attributes_of(node)["to"] != TensorProto.FLOAT:
         return None
-    _rename(graph, node.input[0], node.output[0])
+    graph.rename(node.input[0], node.output[0])
     return []
 
 
@@ -269,10 +243,7 @@ def _depthwise(shapes: Shapes, graph: Nodes, node: NodeProto) -> list[NodeProto]
         return None
     source, affine = found
     name = node.name or node.output[0]
-    numbers = (
-        graph.keep(f"{name}.weight", affine.scale.reshape(-1, 1, 1, 1)),
-        graph.keep(f"{name}.bias", affine.shift),
-    )
-    made = helper.make_node("Conv", [source, *numbers], node.output, name=name, kernel_shape=[1, 1])
+    made = helper.make_node("Conv", [source], node.output, name=name, kernel_shape=[1, 1])
     made.attribute.append(helper.make_attribute("group", affine.channels))
+    _set_numbers(graph, made, affine.scale.reshape(-1, 1, 1, 1), affine.shift)
     return [made]

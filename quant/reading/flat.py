@@ -42,18 +42,12 @@ class Unflatten:
             image = deepcopy(node)
             image.input[0] = source
             return self._flat(image, size)
-        if node.op_type == "Reshape" and graph.integers(node.input[1]) in ([1, *size], [0, *size], [-1, *size]):
-            return self._map_again(graph, node, source)
+        unseen = graph.reads[node.input[0]] == 1 and graph.reads[source] <= 1 and source in graph.writers
+        maps = [1, *size], [0, *size], [-1, *size]
+        if unseen and node.op_type == "Reshape" and graph.integers(node.input[1]) in maps:
+            graph.rename(source, node.output[0])  # nothing stands in the place of what makes a map of it again
+            return []
         return None
-
-    def _map_again(self, graph: Nodes, node: NodeProto, source: str) -> list[NodeProto] | None:
-        """Nothing in the place of what makes a map of it again, where no other node reads what was flat."""
-        writer = graph.writers.get(source)
-        if graph.reads[node.input[0]] != 1 or graph.reads[source] > 1 or writer is None:
-            return None
-        writer.output[list(writer.output).index(source)] = node.output[0]
-        graph.writers[node.output[0]] = writer
-        return []
 
     def _flattens(self, graph: Nodes, node: NodeProto) -> bool:
         """Whether a node makes (N, C H W) of a map whose size is known."""

@@ -34,6 +34,7 @@ from onnx import TensorProto, numpy_helper, version_converter
 from onnx.shape_inference import InferenceError
 
 from beers_deploy.quant.reading.equivalents import rewrite
+from beers_deploy.quant.reading.nodes import fresh
 from beers_deploy.quant.untrusted import contradictions, opset_of, refused
 
 OPSET = 17
@@ -174,14 +175,7 @@ def _tidy(folded: onnx.ModelProto, model: onnx.ModelProto) -> None:
     taken = {node.name for node in graph.node}
     for node in graph.node:
         if not node.name:
-            node.name = _fresh(node.output[0] or node.op_type, taken)
-
-
-def _fresh(name: str, taken: set[str]) -> str:
-    while name in taken:
-        name += "_"
-    taken.add(name)
-    return name
+            node.name = fresh(node.output[0] or node.op_type, taken)
 
 
 def _replace(field: object, values: object) -> None:
