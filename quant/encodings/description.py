@@ -1,7 +1,7 @@
 """What a host's file says of its core in its metadata: the operations and scales, without weights and biases.
 
 An operation such as a transposed convolution is several nodes there. Written again from the description and the
-file's own weights, all nodes must come out the same (`quant.encodings.reading.encoding_faults`).
+file's own weights, all nodes must come out the same (`quant.encodings.encoding_faults`).
 """
 
 import json

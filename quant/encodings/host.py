@@ -3,6 +3,9 @@
 Every operation rounds once, ties to even, and adds exactly. What onnxruntime has no integer operator for is written
 with those it has: transposed convolution and bilinear enlargement as convolutions and a pixel shuffle, average
 pooling as a depthwise convolution, activations by themselves as tables of 256, LeakyReLU on the convolution's sums.
+
+It describes its operations in its metadata, without weights and scales: those are its nodes' own. What is read back
+is written again, so that any node or constant which differs from what the numbers ask for is a fault.
 """
 
 from collections.abc import Callable
@@ -13,8 +16,9 @@ import numpy as np
 import onnx
 from onnx import TensorProto
 
+from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from beers_deploy.quant.encodings.description import KEY, describe, phases
+from beers_deploy.quant.encodings.description import KEY, describe, described_core, phases
 from beers_deploy.quant.ends import ZERO, HostWriter, write_back, write_front
 from beers_deploy.quant.graph import (
     CORRECTION,
@@ -35,7 +39,8 @@ from beers_deploy.quant.graph import (
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.graph.writer import window_attributes, write_float, write_shuffle
 from beers_deploy.quant.integer.arithmetic import activation_table, bilinear_weights, mean_factor, six_in_units
-from beers_deploy.quant.onnx_file import image_info, make_model
+from beers_deploy.quant.onnx_file import constants, fixed_tile_px, image_info, make_model, metadata
+from beers_deploy.quant.untrusted import contradictions
 
 MICROSOFT = "com.microsoft"
 
@@ -212,3 +217,37 @@ _WRITERS: dict[type, Callable[..., Any]] = {
     Resize: _resize,
     Pointwise: _pointwise,
 }
+
+
+def read_core(model: onnx.ModelProto) -> IntCore:
+    """The core of an INT8 file of the legal regime.
+
+    Raises:
+        ModelError: a file that describes none.
+    """
+    said = metadata(model).get(KEY)
+    if said is not None:
+        with contradictions("INT8 model"):
+            return described_core(said, constants(model))
+    expected, remedy = "a file that describes its integers", "make it with 'beers-deploy quantize --regime legal'"
+    raise ModelError("INT8 core", expected=expected, got="one that does not", remedy=remedy)
+
+
+def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
+    """Where a file of the legal regime is not what its integers ask for: the host's ends, ReLUs, a reader's scale.
+
+    None for files of others.
+    """
+    try:
+        core = read_core(model)
+    except ModelError as error:
+        return [error.got] if metadata(model).get("precision") == "int8 legal" else None
+    with contradictions("INT8 model"):
+        meant, faults = host_model(core, {}, fixed_tile_px(model)).graph, list[str]()
+    for kind, found, wanted in (
+        ("constant", model.graph.initializer, meant.initializer),
+        ("node", model.graph.node, meant.node),
+    ):
+        faults += [f"{kind} {a.name}" for a, b in zip(found, wanted, strict=False) if a != b]
+        faults += [f"{len(found)} {kind}s instead of {len(wanted)}"] if len(found) != len(wanted) else []
+    return faults
