@@ -1,6 +1,5 @@
 """What an INT8 network's integers can be over all images, by interval arithmetic on its own weights."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,11 +61,6 @@ def layer_bounds(core: IntCore) -> list[LayerBound]:
         ranges[op.output] = np.clip(low, INT8_MIN, INT8_MAX), np.clip(high, INT8_MIN, INT8_MAX)
         bounds.append(LayerBound(op.name, bits, int(low.min()), int(high.max())))
     return bounds
-
-
-def saturable(core: IntCore) -> Mapping[str, bool]:
-    """Which operations might saturate on some image."""
-    return {bound.name: bound.saturates for bound in layer_bounds(core)}
 
 
 def _planes(core: IntCore) -> Range:

@@ -206,10 +206,6 @@ class HostWriter(GraphWriter):
         """A float32 constant."""
         return self.constant(name, np.array(value, np.float32))
 
-    def unit(self, frac_bits: int) -> str:
-        """The constant 2^-frac_bits: one unit of a tensor."""
-        return self.constant(f"scale_2^{-frac_bits}", np.array(2.0**-frac_bits, np.float32))
-
     def zero_point(self) -> str:
         """The constant 128, around which uint8 stands for int8."""
         return self.constant("zero_point", np.array(ZERO, np.uint8))

@@ -64,11 +64,6 @@ REQUANTISING = {"QLinearConv": 7, "QLinearAdd": 7}
 """What may write a tensor behind which a ReLU is moved down, and where it holds its result's zero point."""
 
 
-def is_integer(model: onnx.ModelProto) -> bool:
-    """Whether a model holds 8-bit tensors: operators of integers, or float ones between such tensors (QDQ)."""
-    return any(node.op_type in (*OPERATORS, "DequantizeLinear") for node in model.graph.node)
-
-
 def made_exact(model: onnx.ModelProto) -> tuple[onnx.ModelProto, dict[str, Way]]:
     """The model with the same results on kernels that add exactly, and the way of each operator by its name."""
     work = _Rewriting(model)

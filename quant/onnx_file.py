@@ -150,6 +150,10 @@ class GraphWriter:
         self.weights.setdefault(name, numpy_helper.from_array(value, name))
         return name
 
+    def unit(self, frac_bits: int) -> str:
+        """The constant 2^-frac_bits: one unit of a tensor."""
+        return self.constant(f"scale_2^{-frac_bits}", np.array(2.0**-frac_bits, np.float32))
+
     def graph(
         self, name: str, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
     ) -> onnx.GraphProto:

@@ -33,7 +33,7 @@ def check_content(model: onnx.ModelProto, where: str) -> None:
         raise refused(where, "a network with an input and an output", "none", "export the network again")
     for value in (*graph.input, *graph.output, *graph.value_info):
         check_size(value.name, [d.dim_value for d in value.type.tensor_type.shape.dim], where)
-    for tensor in _tensors(graph):
+    for tensor in held_tensors(graph):
         _check_tensor(tensor, where)
 
 
@@ -69,7 +69,7 @@ def refused(where: str, expected: str, got: str, remedy: str) -> ModelError:
     return ModelError(where, expected=expected, got=got, remedy=remedy)
 
 
-def _tensors(graph: onnx.GraphProto) -> Iterator[TensorProto]:
+def held_tensors(graph: onnx.GraphProto) -> Iterator[TensorProto]:
     """Every constant, also of graphs within; protobuf itself ends their nesting at a hundred."""
     yield from graph.initializer
     for sparse in graph.sparse_initializer:
@@ -77,7 +77,7 @@ def _tensors(graph: onnx.GraphProto) -> Iterator[TensorProto]:
     for attribute in (a for node in graph.node for a in node.attribute):
         yield from (*([attribute.t] if attribute.HasField("t") else []), *attribute.tensors)
         for inner in (*([attribute.g] if attribute.HasField("g") else []), *attribute.graphs):
-            yield from _tensors(inner)
+            yield from held_tensors(inner)
 
 
 def _check_tensor(tensor: TensorProto, where: str) -> None:

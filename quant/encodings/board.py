@@ -59,8 +59,7 @@ class BoardWriter(GraphWriter):
 
     def scale(self, tensor: str, frac_bits: int) -> list[str]:  # noqa: ARG002 - tensors of one scale share it here
         """Scale and zero point of a tensor."""
-        name = self.constant(f"scale_2^{-frac_bits}", np.array(2.0**-frac_bits, np.float32))
-        return [name, self.constant("zero_point", np.array(0, np.int8))]
+        return [self.unit(frac_bits), self.constant("zero_point", np.array(0, np.int8))]
 
     def quantised(self, output: str, source: str, frac_bits: int) -> None:
         """Quantise and dequantise an activation."""

@@ -41,11 +41,6 @@ class Activation(StrEnum):
         return _FUNCTIONS[self](values)
 
     @property
-    def fused(self) -> bool:
-        """Whether it is computed on the accumulator, before anything is rounded."""
-        return self not in (Activation.hard_sigmoid, Activation.hard_swish)
-
-    @property
     def written(self) -> "Activation":
         """What a file has an operator for: none where rounding to int8 does it."""
         return Activation.none if self is Activation.saturated_relu else self

@@ -279,13 +279,14 @@ class _Reader:
 
     def _activation(self, node: Node) -> None:
         activation = self._which(node)
+        on_sums = activation not in (Activation.hard_sigmoid, Activation.hard_swish)  # before anything is rounded
         writer = next((k for k, op in enumerate(self.ops) if op.output == node.inputs[0]), None)
         before = self.ops[writer] if writer is not None else None
         fusible = isinstance(before, Conv) or (isinstance(before, Add) and activation is Activation.relu)
         free = getattr(before, "activation", None) is Activation.none and self.source.reads(node.inputs[0]) == 1
         # The host computes LeakyReLU on a convolution's own sums, which a transposed one has in phases.
         phased = isinstance(before, Conv) and before.transposed and activation is Activation.leaky_relu
-        if activation.fused and fusible and free and not phased and writer is not None:
+        if on_sums and fusible and free and not phased and writer is not None:
             assert isinstance(before, Conv | Add)  # noqa: S101
             self.ops[writer] = replace(before, output=node.outputs[0], activation=activation)
         else:

@@ -22,7 +22,6 @@ optimisation, which every installation has: it keeps to standard operators, and 
 come here: a runtime opens it.
 """
 
-from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -35,7 +34,7 @@ from onnx.shape_inference import InferenceError
 
 from beers_deploy.quant.reading.equivalents import rewrite
 from beers_deploy.quant.reading.nodes import fresh
-from beers_deploy.quant.untrusted import contradictions, opset_of, refused
+from beers_deploy.quant.untrusted import contradictions, held_tensors, opset_of, refused
 
 OPSET = 17
 IR_VERSION = 8
@@ -101,16 +100,11 @@ def _widen(model: onnx.ModelProto) -> None:
     for value in (*graph.input, *graph.output, *graph.value_info):
         if value.type.tensor_type.elem_type in HALVES:
             value.type.tensor_type.elem_type = TensorProto.FLOAT
-    for tensor in _constants(graph):
+    for tensor in held_tensors(graph):
         if tensor.data_type in HALVES:
             tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor).astype(np.float32), tensor.name))
     for attribute in (a for node in graph.node for a in node.attribute if a.name in ("to", "dtype")):
         attribute.i = TensorProto.FLOAT if attribute.i in HALVES else attribute.i
-
-
-def _constants(graph: onnx.GraphProto) -> Iterator[TensorProto]:
-    yield from graph.initializer
-    yield from (a.t for node in graph.node for a in node.attribute if a.HasField("t"))
 
 
 def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
