@@ -212,11 +212,7 @@ def _computed(node: NodeProto, values: Sequence[np.ndarray | None], opset: int) 
 
     Exporters leave a dozen nodes to state four sizes. They are computed by onnx's reference in Python, before a
     runtime has the file: so the sizes that follow are looked at like those that a file states.
-
-    Args:
-        node: an operator of ONNX's own.
-        values: its inputs, None for one that is not known; the caller has bounded what ConstantOfShape makes.
-        opset: the version of the operators.
+    The caller has bounded what ConstantOfShape makes.
     """
     short = all(value is not None and value.size <= LIST_VALUES for value in values)
     if node.op_type not in COMPUTED or not short:

@@ -110,7 +110,6 @@ def _without_shuffles(graph: Graph) -> tuple[Graph, tuple[Shuffle, ...]]:
 
 
 def _ended(graph: Graph, name: str) -> Graph:
-    """The graph that ends with the tensor of that name."""
     if name == IMAGE or not any(op.output == name for op in graph):
         raise refused_graph("a correction that the network computes", f"{name} of nobody")
     return tuple(renamed(op, {name: CORRECTION}) for op in graph)

@@ -182,7 +182,6 @@ class _Reader:
         return Conv(node.name, node.inputs[0], node.outputs[0], weight, bias, window=window, transposed=True)
 
     def _window(self, node: Node, kernel: Sequence[int] = ()) -> tuple[Pair, Window]:
-        """The kernel's sides, and how it moves."""
         window, auto = node.window(kernel), str(node.attributes.get("auto_pad", ""))
         if window is None:
             raise refused_graph("windows over rows and columns", f"another at {node}")

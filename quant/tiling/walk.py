@@ -88,7 +88,6 @@ def tiling_of(model: onnx.ModelProto, where: str = "tiled model") -> Tiling:
 
 
 def _channels(graph: OnnxGraph, model: onnx.ModelProto) -> tuple[int, int]:
-    """Channels of the only image in and the only one out."""
     if len(graph.inputs) != 1 or len(graph.outputs) != 1:
         raise refused("one image in and one out", f"{len(graph.inputs)} in and {len(graph.outputs)} out")
     (sizes,) = graph.inputs.values()
