@@ -14,6 +14,7 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles import load_sensor
 from beers_deploy.quant.calibration import draw_patches
 from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Conv, Graph, Op, same
+from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.quantise import Quantised, quantise_model
 from beers_deploy.quant.samples import Patches, Remade
 
@@ -48,6 +49,15 @@ def with_relu6(size: float) -> Graph:
         graph.append(Conv(name, source, name, weight, bias, activation, same(weight), groups))
         source = name
     return tuple(graph)
+
+
+def behind_conv(write: Callable[[GraphWriter], object]) -> onnx.ModelProto:
+    """A convolution of one pixel, and behind it what `write` writes from `x` to `restored`."""
+    writer = GraphWriter()
+    writer.node("Conv", "x", ["image", writer.constant("w", np.ones((2, 1, 1, 1), np.float32))], "first")
+    write(writer)
+    result = onnx.helper.make_tensor_value_info("restored", onnx.TensorProto.FLOAT, None)
+    return make_model(writer.graph("g", [image_info("image", 1, None)], [result]), {})
 
 
 def copied(model: onnx.ModelProto) -> onnx.ModelProto:

@@ -20,7 +20,6 @@ from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN
 from beers_deploy.quant.encodings import as_on_board, encoding_faults, read_core
 from beers_deploy.quant.encodings.description import KEY
-from beers_deploy.quant.graph import correction_graph
 from beers_deploy.quant.integer.reference import agreement, run_core
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.quantise import Quantised, quantise_model
@@ -182,8 +181,3 @@ def test_windows_make_a_result_finer_than_8_bits(weight: float, bias: float, mon
         errors.append(float(np.abs(result_of(open_session(made.host), seen[0]) - wanted).mean()))
         assert encoding_faults(made.host) == []
     assert errors[0] < 0.4 * errors[1]
-
-
-def test_what_stress_takes_is_the_plain_family() -> None:
-    with pytest.raises(ModelError, match="convolutions of stride 1"):
-        correction_graph(float_network("unet"))
