@@ -25,7 +25,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from beers_deploy.quant.onnx_file import constants
-from beers_deploy.quant.untrusted import refused
+from beers_deploy.quant.untrusted import opset_of, refused
 
 INT16_MAX, INT16_MIN = 32767, -32768
 MIDDLE, UINT8_MAX = 128, 255
@@ -237,7 +237,7 @@ FIRST_OPSET = 11
 
 def filled(model: onnx.ModelProto) -> onnx.ModelProto:
     """The model with the same results, its integer convolutions no narrower than suits onnxruntime."""
-    if any(each.domain in ("", "ai.onnx") and each.version < FIRST_OPSET for each in model.opset_import):
+    if opset_of(model) < FIRST_OPSET:
         return model
     wider = deepcopy(model)
     work = _ChannelPadding(wider.graph, constants(model))

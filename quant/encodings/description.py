@@ -6,7 +6,7 @@ file's own weights, all nodes must come out the same (`quant.encodings.encoding_
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -48,11 +48,9 @@ def describe(core: IntCore) -> str:
 
 
 def _plain(op: IntConv | Op) -> dict[str, Any]:
-    found = {field.name: getattr(op, field.name) for field in fields(op)}  # type: ignore[arg-type]
+    found = asdict(op)  # type: ignore[arg-type]
     if isinstance(op, IntConv):
-        found["weight"], found["bias"] = list(op.weight.shape), len(op.bias)
-    if "window" in found:
-        found["window"] = asdict(found["window"])
+        found |= {"weight": list(op.weight.shape), "bias": len(op.bias)}
     return found
 
 

@@ -156,31 +156,27 @@ class Conv(OneInput):
 
 
 @dataclass(frozen=True)
-class Add:
-    """An element-wise sum of two tensors."""
-
-    name: str
-    inputs: tuple[str, str]
-    output: str
-    activation: Activation = Activation.none
-
-
-@dataclass(frozen=True)
-class Mul:
-    """An element-wise product of two tensors of one size."""
-
-    name: str
-    inputs: tuple[str, str]
-    output: str
-
-
-@dataclass(frozen=True)
-class Concat:
-    """Tensors one behind the other along the channels; they share a scale."""
+class SeveralInputs:
+    """Operations that read several tensors."""
 
     name: str
     inputs: tuple[str, ...]
     output: str
+
+
+@dataclass(frozen=True)
+class Add(SeveralInputs):
+    """An element-wise sum of two tensors."""
+
+    activation: Activation = Activation.none
+
+
+class Mul(SeveralInputs):
+    """An element-wise product of two tensors of one size."""
+
+
+class Concat(SeveralInputs):
+    """Tensors one behind the other along the channels; they share a scale."""
 
 
 @dataclass(frozen=True)
