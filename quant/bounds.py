@@ -30,18 +30,11 @@ Range = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class LayerBound:
-    """What one operation can do, over all images.
-
-    Attributes:
-        name: of the operation.
-        bits: that its accumulator needs at most, without the sign.
-        low: of the result before it is clipped to int8.
-        high: likewise.
-    """
+    """What the operation of this name can do, over all images."""
 
     name: str
-    bits: float
-    low: int
+    bits: float  # that its accumulator needs at most, without the sign
+    low: int  # of the result before it is clipped to int8
     high: int
 
     @property

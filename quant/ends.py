@@ -41,16 +41,11 @@ FINE_MAX = 126
 class Ends:
     """The host's part of an INT8 network.
 
+    What does not stand here is as in `quant.graph.Network`; a sum with the image is clipped to [0, 1].
+
     Attributes:
         channels: of the core's image, behind `front`.
         planes: of int8 that each channel becomes.
-        front: pixel unshuffles of the image.
-        back: pixel shuffles of the correction.
-        adds_image: whether the image is added, and the sum clipped to [0, 1].
-        last: pixel shuffles of the sum.
-        flat: whether the result is (N, K).
-        softmax: whether it is made probabilities, along the channels.
-        tail: what else is done to the result, such as decoding boxes.
         banked: whether the core begins with the bank of a sensor (`quant.banked`): the image's borders are mirrored,
             the planes are the bank's, and the analytic restoration comes in copies behind the correction's gains.
         unit: the share of full scale that is 1 in the core's result.

@@ -36,8 +36,6 @@ class Rounded:
     """A tensor of 8 bits.
 
     Attributes:
-        name: in the graph.
-        scale: how it is to be read.
         low_is_relu: whether what is clipped at the lower end would have become zero anyway.
         counted: which channels count: of a result in gains or windows the coarse ones, which hold what others clip.
     """

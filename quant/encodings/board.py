@@ -38,11 +38,10 @@ def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None
         feeds, output = ["planes.dequantised" if i == PLANES else i for i in op.inputs], f"{op.output}.float"
         writer.operation(op, feeds, output)
         writer.quantised(op.output, output, core.frac_bits[op.output])
-    return core_file(writer, core.ends, about, tile_px)
+    return _core_file(writer, core.ends, about, tile_px)
 
 
-def core_file(writer: GraphWriter, ends: Ends, about: dict[str, str], tile_px: int | None) -> onnx.ModelProto:
-    """The model of what was written, from the planes that `ends` makes to the correction that it finishes."""
+def _core_file(writer: GraphWriter, ends: Ends, about: dict[str, str], tile_px: int | None) -> onnx.ModelProto:
     read_px = tile_px and (tile_px + 2 * ends.border_px) // ends.place_px
     size = image_info(PLANES, ends.planes * ends.channels, read_px)
     result = image_info(CORRECTION, ends.copies * ends.outputs, tile_px and tile_px // ends.correction_px)
@@ -115,7 +114,7 @@ def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> on
     for op, _ in parts:
         writer.operation(op, [writer.read(name) for name in op.inputs], writer.source(op.output))
     writer.read(CORRECTION, CORRECTION)
-    model = core_file(writer, core.ends, about, side_px)
+    model = _core_file(writer, core.ends, about, side_px)
     return shape_inference.infer_shapes(model, strict_mode=True)
 
 

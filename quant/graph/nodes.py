@@ -84,23 +84,14 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """An operator; an input that is left out has no name.
-
-    Attributes:
-        op_type: ONNX's name of it.
-        name: its own, or its first result's.
-        inputs: the tensors that it reads, in ONNX's order.
-        outputs: the tensors that it writes.
-        attributes: what it states, by name.
-        proto: as the file holds it.
-    """
+    """An operator, in ONNX's words; an input that is left out has no name."""
 
     op_type: str
-    name: str
+    name: str  # its own, or its first result's
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     attributes: Mapping[str, Any]
-    proto: onnx.NodeProto
+    proto: onnx.NodeProto  # as the file holds it
 
     @classmethod
     def of(cls, proto: onnx.NodeProto) -> "Node":
