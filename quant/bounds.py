@@ -1,6 +1,5 @@
 """What an INT8 network's integers can be over all images, by interval arithmetic on its own weights."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,18 +30,11 @@ Range = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class LayerBound:
-    """What one operation can do, over all images.
-
-    Attributes:
-        name: of the operation.
-        bits: that its accumulator needs at most, without the sign.
-        low: of the result before it is clipped to int8.
-        high: likewise.
-    """
+    """What the operation of this name can do, over all images."""
 
     name: str
-    bits: float
-    low: int
+    bits: float  # that its accumulator needs at most, without the sign
+    low: int  # of the result before it is clipped to int8
     high: int
 
     @property
@@ -62,11 +54,6 @@ def layer_bounds(core: IntCore) -> list[LayerBound]:
         ranges[op.output] = np.clip(low, INT8_MIN, INT8_MAX), np.clip(high, INT8_MIN, INT8_MAX)
         bounds.append(LayerBound(op.name, bits, int(low.min()), int(high.max())))
     return bounds
-
-
-def saturable(core: IntCore) -> Mapping[str, bool]:
-    """Which operations might saturate on some image."""
-    return {bound.name: bound.saturates for bound in layer_bounds(core)}
 
 
 def _planes(core: IntCore) -> Range:

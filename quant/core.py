@@ -227,8 +227,7 @@ def _activation(op: Conv, frac_bits: int) -> Activation:
 def quantise_bias(bias: np.ndarray, product: int, shifts: Shifts = SHIFTS) -> tuple[np.ndarray, int]:
     """An int8 bias (O,) and its scale, within reach of the accumulator's `product` fractional bits."""
     wanted = best_frac_bits(bias) if bias.any() else product
-    coarsest = min(wanted, unclipped_frac_bits(float(np.abs(bias).max(initial=0.0))) + 1)
-    frac_bits = product - clamp(product - max(wanted, coarsest), shifts.bias)
+    frac_bits = product - clamp(product - wanted, shifts.bias)
     return quantise(bias, frac_bits), frac_bits
 
 

@@ -41,16 +41,11 @@ FINE_MAX = 126
 class Ends:
     """The host's part of an INT8 network.
 
+    What does not stand here is as in `quant.graph.Network`; a sum with the image is clipped to [0, 1].
+
     Attributes:
         channels: of the core's image, behind `front`.
         planes: of int8 that each channel becomes.
-        front: pixel unshuffles of the image.
-        back: pixel shuffles of the correction.
-        adds_image: whether the image is added, and the sum clipped to [0, 1].
-        last: pixel shuffles of the sum.
-        flat: whether the result is (N, K).
-        softmax: whether it is made probabilities, along the channels.
-        tail: what else is done to the result, such as decoding boxes.
         banked: whether the core begins with the bank of a sensor (`quant.banked`): the image's borders are mirrored,
             the planes are the bank's, and the analytic restoration comes in copies behind the correction's gains.
         unit: the share of full scale that is 1 in the core's result.
@@ -205,10 +200,6 @@ class HostWriter(GraphWriter):
     def scalar(self, name: str, value: float) -> str:
         """A float32 constant."""
         return self.constant(name, np.array(value, np.float32))
-
-    def unit(self, frac_bits: int) -> str:
-        """The constant 2^-frac_bits: one unit of a tensor."""
-        return self.constant(f"scale_2^{-frac_bits}", np.array(2.0**-frac_bits, np.float32))
 
     def zero_point(self) -> str:
         """The constant 128, around which uint8 stands for int8."""

@@ -25,7 +25,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from beers_deploy.quant.onnx_file import constants
-from beers_deploy.quant.untrusted import refused
+from beers_deploy.quant.untrusted import opset_of, refused
 
 INT16_MAX, INT16_MIN = 32767, -32768
 MIDDLE, UINT8_MAX = 128, 255
@@ -62,11 +62,6 @@ FLOAT_OPERATORS = {"Conv": "QLinearConv", "MatMul": "QLinearMatMul", "Gemm": "QL
 
 REQUANTISING = {"QLinearConv": 7, "QLinearAdd": 7}
 """What may write a tensor behind which a ReLU is moved down, and where it holds its result's zero point."""
-
-
-def is_integer(model: onnx.ModelProto) -> bool:
-    """Whether a model holds 8-bit tensors: operators of integers, or float ones between such tensors (QDQ)."""
-    return any(node.op_type in (*OPERATORS, "DequantizeLinear") for node in model.graph.node)
 
 
 def made_exact(model: onnx.ModelProto) -> tuple[onnx.ModelProto, dict[str, Way]]:
@@ -242,11 +237,10 @@ FIRST_OPSET = 11
 
 def filled(model: onnx.ModelProto) -> onnx.ModelProto:
     """The model with the same results, its integer convolutions no narrower than suits onnxruntime."""
-    if any(each.domain in ("", "ai.onnx") and each.version < FIRST_OPSET for each in model.opset_import):
+    if opset_of(model) < FIRST_OPSET:
         return model
     wider = deepcopy(model)
-    arrays = {each.name: each for each in wider.graph.initializer}
-    work = _ChannelPadding(wider.graph, {name: numpy_helper.to_array(each) for name, each in arrays.items()})
+    work = _ChannelPadding(wider.graph, constants(model))
     nodes = [each for node in wider.graph.node for each in work.around(node)]
     del wider.graph.node[:]
     wider.graph.node.extend(nodes)
@@ -258,7 +252,7 @@ class _ChannelPadding:
 
     def __init__(self, graph: onnx.GraphProto, arrays: dict[str, np.ndarray]) -> None:
         self.graph, self.arrays = graph, arrays
-        self.wide_inputs: dict[str, str] = {}
+        self.wide_inputs = set[str]()
 
     def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
         """The node, and what widens its input and narrows its output."""
@@ -292,11 +286,10 @@ class _ChannelPadding:
         node.input[3] = self._constant(f"{name}.filled.weight", wide)
 
     def _padded(self, node: onnx.NodeProto, count: int) -> list[onnx.NodeProto]:
-        source = node.input[0]
-        known = source in self.wide_inputs
-        node.input[0] = self.wide_inputs.setdefault(source, f"{source}.padded")
-        if known:
+        source, node.input[0] = node.input[0], f"{node.input[0]}.padded"
+        if source in self.wide_inputs:
             return []
+        self.wide_inputs.add(source)
         pads = self._constant(f"{source}.padded.pads", np.array([0, 0, 0, 0, 0, count, 0, 0]))
         return [helper.make_node("Pad", [source, pads], [f"{source}.padded"], name=f"{source}.padded")]
 

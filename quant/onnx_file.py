@@ -19,7 +19,7 @@ from beers_deploy.profiles.errors import BeersError, ModelError, OptionError
 from beers_deploy.profiles.toml import read_whole, unreadable
 from beers_deploy.quant.reading.external import take_in
 from beers_deploy.quant.reading.folding import IR_VERSION, OPSET, simplest
-from beers_deploy.quant.untrusted import FILE_BYTES, check_content, check_runnable
+from beers_deploy.quant.untrusted import FILE_BYTES, check_content, check_runnable, opset_of
 
 REMEDY = "give an ONNX file, as 'beers-deploy export', 'beers-deploy quantize' or PyTorch writes it"
 
@@ -82,19 +82,13 @@ def parse_onnx(content: bytes, where: str, to_run: bool = True, path: Path | Non
     except (DecodeError, onnx.checker.ValidationError, ValueError) as error:
         got = " ".join(str(error).split())[:120] or "other bytes"
         raise ModelError(where, expected="an ONNX file", got=got, remedy=REMEDY) from error
-    _require_known_opset(model, where)
+    opset, known = opset_of(model), onnx.defs.onnx_opset_version()
+    if opset > known:
+        expected, remedy = f"an ONNX opset of at most {known}", "export it for an older one"
+        raise ModelError(where, expected=expected, got=f"{opset}", remedy=remedy)
     if to_run:
         check_runnable(model, where)
     return model
-
-
-def _require_known_opset(model: onnx.ModelProto, where: str) -> None:
-    """That the operators are of a version that is known here."""
-    known = onnx.defs.onnx_opset_version()
-    opset = max((each.version for each in model.opset_import if not each.domain), default=OPSET)
-    if opset > known:
-        remedy = "export it for an older one"
-        raise ModelError(where, expected=f"an ONNX opset of at most {known}", got=f"{opset}", remedy=remedy)
 
 
 def require_onnx_name(*paths: Path | None) -> None:
@@ -156,6 +150,10 @@ class GraphWriter:
         self.weights.setdefault(name, numpy_helper.from_array(value, name))
         return name
 
+    def unit(self, frac_bits: int) -> str:
+        """The constant 2^-frac_bits: one unit of a tensor."""
+        return self.constant(f"scale_2^{-frac_bits}", np.array(2.0**-frac_bits, np.float32))
+
     def graph(
         self, name: str, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
     ) -> onnx.GraphProto:
@@ -163,12 +161,10 @@ class GraphWriter:
         return onnx.helper.make_graph(self.nodes, name, inputs, outputs, list(self.weights.values()))
 
 
-def image_info(
-    name: str, channels: int, tile_px: int | None, kind: int = onnx.TensorProto.FLOAT
-) -> onnx.ValueInfoProto:
+def image_info(name: str, channels: int, tile_px: int | None) -> onnx.ValueInfoProto:
     """An (N, channels, H, W) tensor: a fixed tile of one image, or any number and size."""
     shape: list[str | int | None] = [1, channels, tile_px, tile_px] if tile_px else ["N", channels, "H", "W"]
-    return onnx.helper.make_tensor_value_info(name, kind, shape)
+    return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape)
 
 
 def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.ModelProto:

@@ -16,8 +16,8 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import PLANES, PLANES_FRAC_BITS, Add, Concat, Conv, Graph, Mul, Op, Pointwise, same
 from beers_deploy.quant.graph.writer import graph_to_onnx
-from beers_deploy.quant.kernels import filled, is_integer, made_exact
-from beers_deploy.quant.onnx_file import any_size, fixed_tile_px, load_onnx
+from beers_deploy.quant.kernels import filled, made_exact
+from beers_deploy.quant.onnx_file import any_size, fixed_tile_px, is_quantised, load_onnx
 from beers_deploy.quant.untrusted import contradictions, times
 
 
@@ -47,7 +47,7 @@ def open_session(
     name = "ONNX model" if isinstance(model, onnx.ModelProto) else str(model)
     with contradictions(name):
         known = filled(known) if optimise else known
-        if is_integer(known) and (not int8_adds_exactly() if exact is None else exact):
+        if is_quantised(known) and (not int8_adds_exactly() if exact is None else exact):
             known, _ = made_exact(known)
     try:
         return ort.InferenceSession(known.SerializeToString(), options, providers=["CPUExecutionProvider"])

@@ -14,8 +14,9 @@ import onnx
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Check
+from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import encoding_faults, read_core
-from beers_deploy.quant.ends import ZERO
+from beers_deploy.quant.ends import ZERO, Ends
 from beers_deploy.quant.graph import CORRECTION, Activation
 from beers_deploy.quant.graph.nodes import Node, OnnxGraph
 from beers_deploy.quant.graph.quantised import Scale, stated
@@ -35,8 +36,6 @@ class Rounded:
     """A tensor of 8 bits.
 
     Attributes:
-        name: in the graph.
-        scale: how it is to be read.
         low_is_relu: whether what is clipped at the lower end would have become zero anyway.
         counted: which channels count: of a result in gains or windows the coarse ones, which hold what others clip.
     """
@@ -81,21 +80,26 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
 def rounded_tensors(model: onnx.ModelProto) -> list[Rounded]:
     """What the graph's nodes round to 8 bits, in the graph's order."""
     with contradictions("INT8 model"):
-        return _rounded(OnnxGraph(model), _saturated_relus(model), _coarse(model))
+        return _rounded(OnnxGraph(model), _own_core(model))
 
 
-def _saturated_relus(model: onnx.ModelProto) -> set[str]:
-    """The tensors of a file of ours whose ReLU is int8's lower end."""
+def _own_core(model: onnx.ModelProto) -> IntCore | None:
     try:
-        convolutions = read_core(model).convolutions
+        return read_core(model)
     except ModelError:  # another's file
-        return set()
+        return None
+
+
+def _saturated_relus(core: IntCore | None) -> set[str]:
+    """The tensors whose ReLU is int8's lower end."""
+    convolutions = core.convolutions if core else ()
     return {op.output for op in convolutions if op.activation is Activation.saturated_relu}
 
 
-def _rounded(graph: OnnxGraph, relus: set[str], coarse: slice) -> list[Rounded]:
+def _rounded(graph: OnnxGraph, core: IntCore | None) -> list[Rounded]:
+    coarse = _coarse(core.ends) if core else slice(None)
     read_as = {node.outputs[0]: node.inputs[0] for node in graph.nodes if node.op_type == "DequantizeLinear"}
-    relus = relus | {name for node in graph.nodes if node.op_type in RELUS for name in node.inputs}
+    relus = _saturated_relus(core) | {name for node in graph.nodes if node.op_type in RELUS for name in node.inputs}
     relus |= {read_as[name] for name in relus & set(read_as)}
     found = []
     for node in graph.nodes:
@@ -106,12 +110,8 @@ def _rounded(graph: OnnxGraph, relus: set[str], coarse: slice) -> list[Rounded]:
     return found
 
 
-def _coarse(model: onnx.ModelProto) -> slice:
+def _coarse(ends: Ends) -> slice:
     """The correction's coarse channels, as `quant.ends` lays them out; all where there are no finer ones."""
-    try:
-        ends = read_core(model).ends
-    except ModelError:  # another's file
-        return slice(None)
     if ends.offsets:
         return slice(0, ends.outputs)
     return slice(ends.outputs, None) if ends.gains == 2 else slice(None)
@@ -141,12 +141,12 @@ class Relus:
 def count_relus(model: onnx.ModelProto) -> Relus:
     """The ReLUs of a file."""
     with contradictions("model"):
-        graph, saturated = OnnxGraph(model), _saturated_relus(model)
-        rounded = {tensor.name: tensor for tensor in _rounded(graph, saturated, slice(None))}
+        graph, core = OnnxGraph(model), _own_core(model)
+        rounded = {tensor.name: tensor for tensor in _rounded(graph, core)}
         convolved = {name for node in graph.nodes if "Conv" in node.op_type for name in node.outputs}
         explicit = sum(_is_relu(node, graph, rounded) for node in graph.nodes)
         folded = sum(_begins_at_zero(node, rounded, convolved) for node in graph.nodes)
-        return Relus(explicit, folded + len(saturated))
+        return Relus(explicit, folded + len(_saturated_relus(core)))
 
 
 def _is_relu(node: Node, graph: OnnxGraph, rounded: dict[str, Rounded]) -> bool:

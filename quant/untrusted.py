@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import onnx
-from onnx import AttributeProto, NodeProto, TensorProto, numpy_helper
+from onnx import AttributeProto, NodeProto, TensorProto, helper, numpy_helper
 
 from beers_deploy.profiles.errors import BeersError, ModelError
 
@@ -15,19 +15,14 @@ VALUES = 1 << 28
 """Of one tensor that a file sizes without holding it: 1 GiB of float32."""
 RANK = 16
 
-FIELDS: dict[int, tuple[int, str]] = {
-    TensorProto.FLOAT: (4, "float_data"),
-    TensorProto.DOUBLE: (8, "double_data"),
-    TensorProto.INT32: (4, "int32_data"),
-    TensorProto.INT64: (8, "int64_data"),
-    TensorProto.UINT32: (4, "uint64_data"),
-    TensorProto.UINT64: (8, "uint64_data"),
-}
-"""Bytes of a value, and where a tensor keeps values that are not raw bytes."""
 FLOATS = (TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.FLOAT16, TensorProto.BFLOAT16)
-FIELDS |= dict.fromkeys((TensorProto.BOOL, TensorProto.INT8, TensorProto.UINT8), (1, "int32_data"))
-SHORT = (TensorProto.FLOAT16, TensorProto.BFLOAT16, TensorProto.INT16, TensorProto.UINT16)
-FIELDS |= dict.fromkeys(SHORT, (2, "int32_data"))
+VALUE_BYTES: dict[int, int] = {
+    **dict.fromkeys((TensorProto.BOOL, TensorProto.INT8, TensorProto.UINT8), 1),
+    **dict.fromkeys((TensorProto.FLOAT16, TensorProto.BFLOAT16, TensorProto.INT16, TensorProto.UINT16), 2),
+    **dict.fromkeys((TensorProto.FLOAT, TensorProto.INT32, TensorProto.UINT32), 4),
+    **dict.fromkeys((TensorProto.DOUBLE, TensorProto.INT64, TensorProto.UINT64), 8),
+}
+"""Bytes of a value of each type of plain numbers."""
 
 
 def check_content(model: onnx.ModelProto, where: str) -> None:
@@ -38,7 +33,7 @@ def check_content(model: onnx.ModelProto, where: str) -> None:
         raise refused(where, "a network with an input and an output", "none", "export the network again")
     for value in (*graph.input, *graph.output, *graph.value_info):
         check_size(value.name, [d.dim_value for d in value.type.tensor_type.shape.dim], where)
-    for tensor in _tensors(graph):
+    for tensor in held_tensors(graph):
         _check_tensor(tensor, where)
 
 
@@ -74,7 +69,7 @@ def refused(where: str, expected: str, got: str, remedy: str) -> ModelError:
     return ModelError(where, expected=expected, got=got, remedy=remedy)
 
 
-def _tensors(graph: onnx.GraphProto) -> Iterator[TensorProto]:
+def held_tensors(graph: onnx.GraphProto) -> Iterator[TensorProto]:
     """Every constant, also of graphs within; protobuf itself ends their nesting at a hundred."""
     yield from graph.initializer
     for sparse in graph.sparse_initializer:
@@ -82,19 +77,20 @@ def _tensors(graph: onnx.GraphProto) -> Iterator[TensorProto]:
     for attribute in (a for node in graph.node for a in node.attribute):
         yield from (*([attribute.t] if attribute.HasField("t") else []), *attribute.tensors)
         for inner in (*([attribute.g] if attribute.HasField("g") else []), *attribute.graphs):
-            yield from _tensors(inner)
+            yield from held_tensors(inner)
 
 
 def _check_tensor(tensor: TensorProto, where: str) -> None:
     _check_place_and_type(tensor, where)
-    value_bytes, field = FIELDS[tensor.data_type]
     if len(tensor.dims) > RANK or min(tensor.dims, default=0) < 0:
         got = f"{tensor.name!r} of {times(tensor.dims)}"
         raise refused(where, f"at most {RANK} sizes from 0 on", got, "export it again")
     # A tensor that states more than it holds makes a runtime allocate first and read afterwards.
     stated = math.prod(tensor.dims)
     raw = tensor.HasField("raw_data")
-    present = len(tensor.raw_data) / value_bytes if raw else len(getattr(tensor, field))
+    kind = tensor.data_type
+    field = tensor.raw_data if raw else getattr(tensor, helper.tensor_dtype_to_field(kind))
+    present = len(field) / (VALUE_BYTES[kind] if raw else 1)
     if stated != present:
         got = f"{tensor.name!r} of {times(tensor.dims)} values that holds {present:g}"
         raise refused(where, "weights as many as it states", got, "copy or export it again")
@@ -117,7 +113,7 @@ def _check_place_and_type(tensor: TensorProto, where: str) -> None:
         place = next((entry.value for entry in tensor.external_data if entry.key == "location"), "no place")
         got = f"{tensor.name!r} kept in another file, {place!r}"
         raise refused(where, "one self-contained ONNX file", got, "save it as one file")
-    if tensor.data_type not in FIELDS:
+    if tensor.data_type not in VALUE_BYTES:
         known = TensorProto.DataType.values()
         kind = TensorProto.DataType.Name(tensor.data_type) if tensor.data_type in known else f"{tensor.data_type}"
         raise refused(where, "weights of plain numbers", f"{tensor.name!r} of type {kind}", "convert them")
@@ -166,7 +162,7 @@ class _Constants:
         self._arrays: dict[str, np.ndarray] = {}
         self._made = 0
         self._where = where
-        self._opset = max((o.version for o in model.opset_import if o.domain in STANDARD), default=1)
+        self._opset = opset_of(model)
 
     def follow(self, node: NodeProto) -> None:
         """Note a node that reads no image."""
@@ -216,11 +212,7 @@ def _computed(node: NodeProto, values: Sequence[np.ndarray | None], opset: int) 
 
     Exporters leave a dozen nodes to state four sizes. They are computed by onnx's reference in Python, before a
     runtime has the file: so the sizes that follow are looked at like those that a file states.
-
-    Args:
-        node: an operator of ONNX's own.
-        values: its inputs, None for one that is not known; the caller has bounded what ConstantOfShape makes.
-        opset: the version of the operators.
+    The caller has bounded what ConstantOfShape makes.
     """
     short = all(value is not None and value.size <= LIST_VALUES for value in values)
     if node.op_type not in COMPUTED or not short:
@@ -235,6 +227,11 @@ def _computed(node: NodeProto, values: Sequence[np.ndarray | None], opset: int) 
         return None
     array = np.asarray(result)
     return array if array.dtype.kind in "biuf" and array.size <= LIST_VALUES else None
+
+
+def opset_of(model: onnx.ModelProto) -> int:
+    """The version of ONNX's own operators."""
+    return max((opset.version for opset in model.opset_import if opset.domain in STANDARD), default=1)
 
 
 def named(node: NodeProto) -> str:
@@ -269,18 +266,10 @@ def _check_growth(node: NodeProto, constants: dict[str, TensorProto], of_image: 
                 continue
             if name not in constants:
                 raise refused(where, "sizes that the file states", f"a computed one in {named(node)}", "fold it")
+            # At most one more than any list of sizes has.
+            values = [float(value) for value in numpy_helper.to_array(constants[name]).ravel()[: 2 * RANK + 1]]
             if absolute:
-                check_size(named(node), _values(constants[name]), where)
-            else:
-                _check_factor(named(node), _values(constants[name]), where)
-
-
-def _check_factor(name: str, values: list[float], where: str) -> None:
-    if not max(map(abs, values), default=0) <= WINDOW_PX:
-        remedy = "export the network again"
-        raise refused(where, f"enlargements of at most {WINDOW_PX}", f"{name} by {times(values)}", remedy)
-
-
-def _values(tensor: TensorProto) -> list[float]:
-    """At most one more than any list of sizes has."""
-    return [float(value) for value in numpy_helper.to_array(tensor).ravel()[: 2 * RANK + 1]]
+                check_size(named(node), values, where)
+            elif not max(map(abs, values), default=0) <= WINDOW_PX:
+                got, remedy = f"{named(node)} by {times(values)}", "export the network again"
+                raise refused(where, f"enlargements of at most {WINDOW_PX}", got, remedy)

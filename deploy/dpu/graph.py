@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.graph.nodes import Kind, Window
+from beers_deploy.quant.graph.nodes import Kind, Shape, Window
 from beers_deploy.quant.graph.quantised import Scale
-from beers_deploy.quant.graph.sizes import Shape
 
 __all__ = ["CONVOLUTIONS", "Kind", "Network", "Operation", "Scale", "Shape", "Window"]
 

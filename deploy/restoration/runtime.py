@@ -16,8 +16,8 @@ from onnx import helper, numpy_helper
 from beers_deploy.cluster import Cluster
 from beers_deploy.model.processor import asked, require_cores
 from beers_deploy.profiles.errors import ModelError, optional
-from beers_deploy.quant.kernels import is_integer, made_exact
-from beers_deploy.quant.onnx_file import parse_onnx
+from beers_deploy.quant.kernels import made_exact
+from beers_deploy.quant.onnx_file import is_quantised, parse_onnx
 from beers_deploy.quant.session import open_session, tensors_of
 from beers_deploy.restoration.options import Runtime
 
@@ -35,7 +35,7 @@ def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tup
     # Said aloud: where the processor has bfloat16 units, OpenVINO would round to it unasked.
     options = {"INFERENCE_PRECISION_HINT": "f32", "NUM_STREAMS": str(at_once), "ENABLE_CPU_PINNING": False}
     options |= {"INFERENCE_NUM_THREADS": str(threads)} if threads else {}
-    exact = model if not is_integer(model) or _adds_exactly(core) else made_exact(model)[0]
+    exact = model if not is_quantised(model) or _adds_exactly(core) else made_exact(model)[0]
     content = saturating_adds(exact).SerializeToString()
 
     @lru_cache(maxsize=2)

@@ -12,12 +12,13 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from beers_deploy.model.bank import REFERENCE, UNIT_STEPS, bank_of_vector
+from beers_deploy.model.bank import UNIT_STEPS, bank_of_vector
 from beers_deploy.model.family import SensorFamily
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.patches import PatchRecipe, PatchSource
 from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.sensor_file import REFERENCE
 from beers_deploy.quant.banked.calibrate import LIKE, front_ends
 from beers_deploy.quant.banked.filters import BITS, COPIES, gain_of, whole_bank
 from beers_deploy.quant.core import IntConv, IntCore

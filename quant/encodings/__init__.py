@@ -5,11 +5,16 @@ itself as QDQ ONNX, with int8 bias and power-of-two scales; VINT8 is that in the
 Reading a host file back gives numbers to reason about.
 """
 
-from beers_deploy.quant.encodings.board import as_on_board, board_model
+from beers_deploy.quant.encodings.board import (
+    CONFIG,
+    as_on_board,
+    board_model,
+    required_tile,
+    save_config,
+    vint8_model,
+)
 from beers_deploy.quant.encodings.description import BORDER_PX, PLACE_PX
-from beers_deploy.quant.encodings.host import MICROSOFT, host_model
-from beers_deploy.quant.encodings.reading import encoding_faults, read_core
-from beers_deploy.quant.encodings.vint8 import CONFIG, required_tile, save_config, vint8_model
+from beers_deploy.quant.encodings.host import MICROSOFT, encoding_faults, host_model, read_core
 
 __all__ = [
     "BORDER_PX",

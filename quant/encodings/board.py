@@ -1,12 +1,25 @@
-"""The board's file: the integer core by itself as QDQ ONNX, with int8 bias and power-of-two scales."""
+"""The board's files: the integer core by itself as QDQ ONNX, with int8 bias and power-of-two scales; and VINT8.
+
+HardSigmoid, HardSwish and the mean of a window that is no power of two are ONNX's own in both, and the host's file
+has the DPU's approximations of them: there results may differ by a few steps.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import onnx
+from onnx import shape_inference
 
+from beers_deploy.model.io.files import write_text
+from beers_deploy.profiles.errors import OptionError
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings.description import BORDER_PX, KEY, PLACE_PX, described_core
 from beers_deploy.quant.ends import Ends
-from beers_deploy.quant.graph import CORRECTION, PLANES, Conv
+from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Add, Conv, Op, Pointwise
 from beers_deploy.quant.graph.writer import onnx_weight, write_float
 from beers_deploy.quant.onnx_file import GraphWriter, constants, fixed_tile_px, image_info, make_model, metadata
 from beers_deploy.quant.untrusted import contradictions
@@ -22,18 +35,13 @@ def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None
     writer = BoardWriter()
     writer.quantised("planes.dequantised", PLANES, core.frac_bits[PLANES])
     for op in core.ops:
-        feeds = ["planes.dequantised" if i == PLANES else i for i in op.inputs]
-        output = f"{op.output}.float"
-        if isinstance(op, IntConv):
-            write_conv(writer, op, feeds[0], output)
-        else:
-            write_float(writer, op, feeds, output)
+        feeds, output = ["planes.dequantised" if i == PLANES else i for i in op.inputs], f"{op.output}.float"
+        writer.operation(op, feeds, output)
         writer.quantised(op.output, output, core.frac_bits[op.output])
-    return core_file(writer, core.ends, about, tile_px)
+    return _core_file(writer, core.ends, about, tile_px)
 
 
-def core_file(writer: GraphWriter, ends: Ends, about: dict[str, str], tile_px: int | None) -> onnx.ModelProto:
-    """The model of what was written, from the planes that `ends` makes to the correction that it finishes."""
+def _core_file(writer: GraphWriter, ends: Ends, about: dict[str, str], tile_px: int | None) -> onnx.ModelProto:
     read_px = tile_px and (tile_px + 2 * ends.border_px) // ends.place_px
     size = image_info(PLANES, ends.planes * ends.channels, read_px)
     result = image_info(CORRECTION, ends.copies * ends.outputs, tile_px and tile_px // ends.correction_px)
@@ -58,29 +66,106 @@ def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
         return board_model(core, {}, fixed_tile_px(model))
 
 
-def write_conv(w: "BoardWriter", op: IntConv, source: str, output: str) -> None:
-    """Write a convolution and its activation, weights and bias as int8 seen as float."""
-    weight = w.dequantised(f"{op.name}.weight", onnx_weight(op.weight, op.transposed), op.weight_frac_bits)
-    bias = w.dequantised(f"{op.name}.bias", op.bias, op.bias_frac_bits)
-    kind = (op.activation, op.window, op.groups, op.transposed)
-    as_float = Conv(op.name, op.input, op.output, op.weight, op.bias, *kind)
-    write_float(w, as_float, [source, weight, bias], output)
-
-
 class BoardWriter(GraphWriter):
     """Writes tensors as the board's flow reads them: quantised to int8, and seen as float again."""
 
     def scale(self, tensor: str, frac_bits: int) -> list[str]:  # noqa: ARG002 - tensors of one scale share it here
         """Scale and zero point of a tensor."""
-        name = self.constant(f"scale_2^{-frac_bits}", np.array(2.0**-frac_bits, np.float32))
-        return [name, self.constant("zero_point", np.array(0, np.int8))]
+        return [self.unit(frac_bits), self.constant("zero_point", np.array(0, np.int8))]
 
     def quantised(self, output: str, source: str, frac_bits: int) -> None:
         """Quantise and dequantise an activation."""
         middle = self.node("QuantizeLinear", f"{source}.int8", [source, *self.scale(source, frac_bits)])
         self.node("DequantizeLinear", output, [middle, *self.scale(source, frac_bits)], f"{middle}.float")
 
-    def dequantised(self, name: str, value: np.ndarray, frac_bits: int) -> str:
-        """An int8 constant seen as float."""
+    def operation(self, op: IntConv | Op, feeds: list[str], output: str) -> None:
+        """Write an operation on tensors seen as float, a convolution's weights and bias as int8 seen so too."""
+        if isinstance(op, IntConv):
+            weight, kind = onnx_weight(op.weight, op.transposed), (op.activation, op.window, op.groups, op.transposed)
+            numbers = {"weight": (weight, op.weight_frac_bits), "bias": (op.bias, op.bias_frac_bits)}
+            feeds = [*feeds, *(self._dequantised(f"{op.name}.{role}", *each) for role, each in numbers.items())]
+            op = Conv(op.name, op.input, op.output, op.weight, op.bias, *kind)
+        write_float(self, op, feeds, output)
+
+    def _dequantised(self, name: str, value: np.ndarray, frac_bits: int) -> str:
         feeds = [self.constant(name, value), *self.scale(name, frac_bits)]
         return self.node("DequantizeLinear", f"{name}.float", feeds)
+
+
+CONFIG = "vitisai_config.json"
+"""What AMD's compiler reads beside the network."""
+CLAMPS = (Activation.relu, Activation.relu6)
+
+
+def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> onnx.ModelProto:
+    """VINT8, the file that AMD's current NPU flow compiles: the numbers of the board's file in another layout.
+
+    One image of one tile, every size stated; a pair of Q and DQ for each reader of a tensor; a scale and a zero point
+    of its own for each tensor; and a pair between an operation and a clamp behind it, which AMD's quantiser writes
+    there too. On the result's own grid it does not matter whether a value is clamped before it is rounded or after,
+    so no bit changes. LeakyReLU is no clamp: it stays behind the sums, as the core computes it.
+
+    Raises:
+        OptionError: no tile.
+    """
+    side_px = required_tile(tile_px)
+    parts = [(part, core.frac_bits[op.output]) for op in core.ops for part in _apart(op)]
+    writer = _PairWriter({PLANES: core.frac_bits[PLANES], **{op.output: bits for op, bits in parts}})
+    for op, _ in parts:
+        writer.operation(op, [writer.read(name) for name in op.inputs], writer.source(op.output))
+    writer.read(CORRECTION, CORRECTION)
+    model = _core_file(writer, core.ends, about, side_px)
+    return shape_inference.infer_shapes(model, strict_mode=True)
+
+
+def required_tile(tile_px: int | None) -> int:
+    """The tile's side, which an NPU's file must be fixed to."""
+    if tile_px is None:
+        expected, remedy = "a side in pixels: the compiler of an NPU takes stated sizes alone", "give it, such as 640"
+        raise OptionError("tile", expected=expected, got="none", remedy=remedy)
+    return tile_px
+
+
+def _apart(op: IntConv | Op) -> Iterator[IntConv | Op]:
+    """An operation, and by itself the clamp behind it."""
+    if not isinstance(op, IntConv | Add) or op.activation not in CLAMPS:
+        yield op
+        return
+    inner, kind = f"{op.output}.linear", op.activation
+    yield replace(op, output=inner, activation=Activation.none)
+    yield Pointwise(f"{op.name}.{kind.name}", inner, op.output, kind)
+
+
+class _PairWriter(BoardWriter):
+    """Writes each tensor once in float, and once more as int8 for each of its readers."""
+
+    def __init__(self, frac_bits: dict[str, int]) -> None:
+        super().__init__()
+        self._frac_bits = frac_bits
+        self._readers = Counter[str]()
+
+    def scale(self, tensor: str, frac_bits: int) -> list[str]:
+        """Scale and zero point of a tensor, which no other shares."""
+        scale = self.constant(f"{tensor}.scale", np.array(2.0**-frac_bits, np.float32))
+        return [scale, self.constant(f"{tensor}.zero_point", np.array(0, np.int8))]
+
+    def source(self, tensor: str) -> str:
+        """The name of a tensor in float, before it is rounded."""
+        return tensor if tensor == PLANES else f"{tensor}.float"
+
+    def read(self, tensor: str, name: str = "") -> str:
+        """One more reader of a tensor: a pair for it alone. Returns the name of what it reads."""
+        self._readers[tensor] += 1
+        reader, numbers = f"{tensor}.{self._readers[tensor]}", self.scale(tensor, self._frac_bits[tensor])
+        middle = self.node("QuantizeLinear", f"{reader}.int8", [self.source(tensor), *numbers])
+        return self.node("DequantizeLinear", name or reader, [middle, *numbers])
+
+
+def save_config(core: Path, device: str) -> Path:
+    """Write what AMD's compiler reads beside the file of a core: the device, and for the rest its own defaults."""
+    names, vaiml = ("init", "vaiml_partition"), {"device": device, "optimize_level": 2}
+    first, second = ({"name": name, "plugin": f"vaip-pass_{name}"} for name in names)
+    passes = [first, {**second, "vaiml_config": vaiml}]
+    said = {"passes": passes, "target": "VAIML", "targets": [{"name": "VAIML", "pass": [*names]}]}
+    write_text(core.with_name(CONFIG), json.dumps(said, indent=1) + "\n")
+    return core.with_name(CONFIG)

@@ -1,12 +1,12 @@
 """What a host's file says of its core in its metadata: the operations and scales, without weights and biases.
 
 An operation such as a transposed convolution is several nodes there. Written again from the description and the
-file's own weights, all nodes must come out the same (`quant.encodings.reading.encoding_faults`).
+file's own weights, all nodes must come out the same (`quant.encodings.encoding_faults`).
 """
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -48,11 +48,9 @@ def describe(core: IntCore) -> str:
 
 
 def _plain(op: IntConv | Op) -> dict[str, Any]:
-    found = {field.name: getattr(op, field.name) for field in fields(op)}  # type: ignore[arg-type]
+    found = asdict(op)  # type: ignore[arg-type]
     if isinstance(op, IntConv):
-        found["weight"], found["bias"] = list(op.weight.shape), len(op.bias)
-    if "window" in found:
-        found["window"] = asdict(found["window"])
+        found |= {"weight": list(op.weight.shape), "bias": len(op.bias)}
     return found
 
 

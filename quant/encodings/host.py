@@ -3,17 +3,22 @@
 Every operation rounds once, ties to even, and adds exactly. What onnxruntime has no integer operator for is written
 with those it has: transposed convolution and bilinear enlargement as convolutions and a pixel shuffle, average
 pooling as a depthwise convolution, activations by themselves as tables of 256, LeakyReLU on the convolution's sums.
+
+It describes its operations in its metadata, without weights and scales: those are its nodes' own. What is read back
+is written again, so that any node or constant which differs from what the numbers ask for is a fault.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import onnx
 from onnx import TensorProto
 
+from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from beers_deploy.quant.encodings.description import KEY, describe, phases
+from beers_deploy.quant.encodings.description import KEY, describe, described_core, phases
 from beers_deploy.quant.ends import ZERO, HostWriter, write_back, write_front
 from beers_deploy.quant.graph import (
     CORRECTION,
@@ -28,12 +33,14 @@ from beers_deploy.quant.graph import (
     Pointwise,
     Resize,
     Shuffle,
+    Window,
     channels_of,
 )
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
-from beers_deploy.quant.graph.writer import window_attributes, write_shuffle
+from beers_deploy.quant.graph.writer import window_attributes, write_float, write_shuffle
 from beers_deploy.quant.integer.arithmetic import activation_table, bilinear_weights, mean_factor, six_in_units
-from beers_deploy.quant.onnx_file import image_info, make_model
+from beers_deploy.quant.onnx_file import constants, fixed_tile_px, image_info, make_model, metadata
+from beers_deploy.quant.untrusted import contradictions
 
 MICROSOFT = "com.microsoft"
 
@@ -71,8 +78,7 @@ def _conv(w: HostWriter, core: IntCore, op: IntConv) -> None:
     elif op.activation is Activation.leaky_relu:
         _leaky(w, core, op)
     else:
-        attributes = {**window_attributes(op.window, op.groups), "kernel_shape": list(op.weight.shape[2:])}
-        _qlinear(w, core, op, op.weight, _bias(core, op), op.output, attributes)
+        _qlinear(w, core, op, _bias(core, op))
 
 
 def _bias(core: IntCore, op: IntConv) -> np.ndarray:
@@ -81,81 +87,66 @@ def _bias(core: IntCore, op: IntConv) -> np.ndarray:
     return op.bias.astype(np.int32) << shift
 
 
-def _qlinear(
-    w: HostWriter,
-    core: IntCore,
-    op: IntConv,
-    weight: np.ndarray,
-    bias: np.ndarray,
-    output: str,
-    attributes: dict[str, Any],
-) -> None:
+def _qlinear(w: HostWriter, core: IntCore, op: IntConv, bias: np.ndarray) -> None:
     feeds = [op.input, w.unit(core.frac_bits[op.input]), w.zero_point()]
-    feeds += [w.constant(f"{op.name}.weight", weight), w.unit(op.weight_frac_bits)]
-    # One a weight: where onnxruntime rewrites weights (see quant.session), it trips over a shared one.
-    feeds += [w.constant(f"{op.name}.weight_zero_point", np.array(0, np.int8))]
+    feeds += [w.constant(f"{op.name}.weight", op.weight), w.unit(op.weight_frac_bits), _weight_zero(w, op.name)]
     feeds += [w.unit(core.frac_bits[op.output]), w.zero_point(), w.constant(f"{op.name}.bias", bias)]
-    result = output if op.activation.written is Activation.none else f"{output}.linear"
-    w.node("QLinearConv", result, feeds, name=op.name, **attributes)
-    _clamp(w, core, op, result, output)
+    w.node("QLinearConv", _unclamped(op), feeds, name=op.name, **_attributes(op))
+    _clamp(w, core, op)
 
 
-def _clamp(w: HostWriter, core: IntCore, op: IntConv | Add, source: str, output: str) -> None:
+def _weight_zero(w: HostWriter, name: str) -> str:
+    """One a weight: where onnxruntime rewrites weights (see quant.session), it trips over a shared one."""
+    return w.constant(f"{name}.weight_zero_point", np.array(0, np.int8))
+
+
+def _attributes(op: IntConv) -> dict[str, Any]:
+    return {**window_attributes(op.window, op.groups), "kernel_shape": list(op.weight.shape[2:])}
+
+
+def _unclamped(op: IntConv | Add) -> str:
+    """The name of a result in front of its activation."""
+    return op.output if op.activation.written is Activation.none else f"{op.output}.linear"
+
+
+def _clamp(w: HostWriter, core: IntCore, op: IntConv | Add) -> None:
     """ReLU and ReLU6 of what is rounded already: they only clip."""
     if op.activation.written is Activation.none:
         return
-    relu = output if op.activation is Activation.relu else f"{output}.above_0"
-    w.node("Max", relu, [source, w.zero_point()], name=f"{op.name}.relu")
+    relu = op.output if op.activation is Activation.relu else f"{op.output}.above_0"
+    w.node("Max", relu, [_unclamped(op), w.zero_point()], name=f"{op.name}.relu")
     if op.activation is Activation.relu6:
-        six = ZERO + six_in_units(core.frac_bits[op.output])
-        w.node("Min", output, [relu, w.constant(f"{op.name}.six", np.array(six, np.uint8))], name=f"{op.name}.relu6")
+        six = w.constant(f"{op.name}.six", np.array(ZERO + six_in_units(core.frac_bits[op.output]), np.uint8))
+        w.node("Min", op.output, [relu, six], name=f"{op.name}.relu6")
 
 
 def _leaky(w: HostWriter, core: IntCore, op: IntConv) -> None:
     """max(256 x, 26 x) of the int32 sums, exact in float64, rounded once."""
     name, product = op.output, op.weight_frac_bits + core.frac_bits[op.input]
-    feeds = [op.input, w.constant(f"{op.name}.weight", op.weight), w.zero_point()]
-    feeds += [w.constant(f"{op.name}.weight_zero_point", np.array(0, np.int8))]
-    attributes = {**window_attributes(op.window, op.groups), "kernel_shape": list(op.weight.shape[2:])}
-    w.node("ConvInteger", f"{name}.products", feeds, name=op.name, **attributes)
+    feeds = [op.input, w.constant(f"{op.name}.weight", op.weight), w.zero_point(), _weight_zero(w, op.name)]
+    w.node("ConvInteger", f"{name}.products", feeds, name=op.name, **_attributes(op))
     bias = w.constant(f"{op.name}.bias", _bias(core, op)[:, None, None])
     w.node("Add", f"{name}.sums", [f"{name}.products", bias])
     w.node("Cast", f"{name}.wide", [f"{name}.sums"], to=TensorProto.DOUBLE)
-    scales = {"whole": 2.0 ** (core.frac_bits[op.output] - product)}
-    scales["leaking"] = LEAKY_SLOPE * scales["whole"]
-    for kind, factor in scales.items():
+    unit = 2.0 ** (core.frac_bits[op.output] - product)
+    for kind, factor in {"whole": unit, "leaking": LEAKY_SLOPE * unit}.items():
         by = w.constant(f"{op.name}.{kind}", np.array(factor, np.float64))
         w.node("Mul", f"{name}.{kind}", [f"{name}.wide", by])
     w.node("Max", f"{name}.linear", [f"{name}.whole", f"{name}.leaking"], name=f"{op.name}.leaky_relu")
-    _rounded(w, f"{name}.linear", name)
-
-
-def _rounded(w: HostWriter, source: str, output: str) -> None:
-    """A float64 tensor of units to uint8."""
-    w.node("Round", f"{output}.round", [source])
+    w.node("Round", f"{name}.round", [f"{name}.linear"])
     limits = [w.constant(f"int8_{end}", np.array(end, np.float64)) for end in (INT8_MIN, INT8_MAX)]
-    w.node("Clip", f"{output}.clip", [f"{output}.round", *limits])
-    w.node("Add", f"{output}.offset", [f"{output}.clip", w.constant("offset_64", np.array(ZERO, np.float64))])
-    w.node("Cast", output, [f"{output}.offset"], to=TensorProto.UINT8)
+    w.node("Clip", f"{name}.clip", [f"{name}.round", *limits])
+    w.node("Add", f"{name}.offset", [f"{name}.clip", w.constant("offset_64", np.array(ZERO, np.float64))])
+    w.node("Cast", name, [f"{name}.offset"], to=TensorProto.UINT8)
 
 
 def _transposed(w: HostWriter, core: IntCore, op: IntConv) -> None:
     """One convolution for each phase of the enlarged lattice, then a pixel shuffle, then the pads cut."""
     stride, top, left = op.window.strides[0], op.window.pads[0], op.window.pads[1]
     weight, reach = phases(op.weight, stride)
-    phased = IntConv(
-        op.name,
-        op.input,
-        f"{op.output}.phases",
-        weight,
-        op.weight_frac_bits,
-        op.bias,
-        op.bias_frac_bits,
-        op.activation,
-    )
-    both = IntCore((), {**core.frac_bits, phased.output: core.frac_bits[op.output]})
-    window = {"pads": [reach] * 4, "kernel_shape": list(weight.shape[2:])}
-    _qlinear(w, both, phased, weight, np.tile(_bias(core, op), stride**2), phased.output, window)
+    phased = replace(op, output=f"{op.output}.phases", weight=weight, window=Window(pads=(reach,) * 4))
+    both = replace(core, frac_bits={**core.frac_bits, phased.output: core.frac_bits[op.output]})
+    _qlinear(w, both, phased, np.tile(_bias(core, op), stride**2))
     shuffle = Shuffle(f"{op.name}.shuffle", phased.output, f"{op.output}.whole", stride, True, False)
     write_shuffle(w, shuffle, shuffle.input, shuffle.output)
     # Behind the last pixel the phases go on: as many rows and columns as the kernel does not reach are cut as well.
@@ -168,67 +159,46 @@ def _transposed(w: HostWriter, core: IntCore, op: IntConv) -> None:
 
 
 def _add(w: HostWriter, core: IntCore, op: Add | Mul) -> None:
-    activation = getattr(op, "activation", Activation.none)
-    result = op.output if activation is Activation.none else f"{op.output}.linear"
-    feeds = []
-    for name in (*op.inputs, op.output):
-        quantity = [] if name == op.output else [name]
-        feeds += [*quantity, w.unit(core.frac_bits[name]), w.zero_point()]
-    w.node("QLinearAdd" if isinstance(op, Add) else "QLinearMul", result, feeds, name=op.name, domain=MICROSOFT)
+    feeds = [feed for name in op.inputs for feed in (name, w.unit(core.frac_bits[name]), w.zero_point())]
+    feeds += [w.unit(core.frac_bits[op.output]), w.zero_point()]
+    result = _unclamped(op) if isinstance(op, Add) else op.output
+    w.node(f"QLinear{type(op).__name__}", result, feeds, name=op.name, domain=MICROSOFT)
     if isinstance(op, Add):
-        _clamp(w, core, op, result, op.output)
-
-
-def _max_pool(w: HostWriter, _: IntCore, op: MaxPool) -> None:
-    assert op.kernel is not None  # noqa: S101
-    w.node(
-        "MaxPool", op.output, [op.input], name=op.name, kernel_shape=list(op.kernel), **window_attributes(op.window)
-    )
+        _clamp(w, core, op)
 
 
 def _average_pool(w: HostWriter, core: IntCore, op: AveragePool) -> None:
     assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
     factor, shift = mean_factor(op.kernel)
-    channels = _channels(core, op.input)
-    weight = np.full((channels, 1, *op.kernel), factor, np.int8)
-    _by_weights(
-        w, core, op, weight, shift, op.output, {**window_attributes(op.window), "kernel_shape": list(op.kernel)}
-    )
+    _weighted(w, core, op, (op.input, op.output), np.full((1, 1, *op.kernel), factor), shift, op.window)
 
 
-def _by_weights(
+def _weighted(
     w: HostWriter,
     core: IntCore,
     op: AveragePool | Resize,
+    ends: tuple[str, str],
     weight: np.ndarray,
     shift: int,
-    output: str,
-    attributes: dict[str, Any],
-    source: str = "",
+    window: Window,
 ) -> None:
-    """A depthwise convolution whose result has its input's scale."""
-    unit = w.unit(core.frac_bits[op.input])
-    feeds = [source or op.input, unit, w.zero_point(), w.constant(f"{op.name}.weight", weight), w.unit(shift)]
-    feeds += [w.constant(f"{op.name}.weight_zero_point", np.array(0, np.int8)), unit, w.zero_point()]
-    w.node("QLinearConv", output, feeds, name=op.name, group=_channels(core, op.input), **attributes)
-
-
-def _channels(core: IntCore, name: str) -> int:
-    found = channels_of(core.ops, {PLANES: core.ends.planes * core.ends.channels})
-    return found[name]
+    """Weights (K, 1, kh, kw) for each channel: a depthwise convolution whose result has its input's scale."""
+    channels = channels_of(core.ops, {PLANES: core.ends.planes * core.ends.channels})[op.input]
+    unit, weight = w.unit(core.frac_bits[op.input]), np.tile(weight.astype(np.int8), (channels, 1, 1, 1))
+    feeds = [ends[0], unit, w.zero_point(), w.constant(f"{op.name}.weight", weight), w.unit(shift)]
+    feeds += [_weight_zero(w, op.name), unit, w.zero_point()]
+    attributes = {**window_attributes(window), "kernel_shape": list(weight.shape[2:])}
+    w.node("QLinearConv", ends[1], feeds, name=op.name, group=channels, **attributes)
 
 
 def _resize(w: HostWriter, core: IntCore, op: Resize) -> None:
     if not op.bilinear:
-        scales = w.constant(f"resize_by_{op.factor}", np.array([1, 1, op.factor, op.factor], np.float32))
-        how = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
-        w.node("Resize", op.output, [op.input, "", scales], name=op.name, **how)
+        write_float(w, op, op.inputs, op.output)
         return
     weight, shift = bilinear_weights(op.factor)
     wide, phased = f"{op.output}.edged", f"{op.output}.phases"
     w.node("Pad", wide, [op.input, w.constant("edge_pads", np.array([0, 0, 1, 1, 0, 0, 1, 1]))], mode="edge")
-    weight = np.tile(weight[:, None], (_channels(core, op.input), 1, 1, 1))
-    _by_weights(w, core, op, weight, shift, phased, {"pads": [0] * 4, "kernel_shape": [3, 3]}, wide)
+    _weighted(w, core, op, (wide, phased), weight[:, None], shift, Window())
     write_shuffle(w, Shuffle(f"{op.name}.shuffle", phased, op.output, op.factor), phased, op.output)
 
 
@@ -242,10 +212,42 @@ _WRITERS: dict[type, Callable[..., Any]] = {
     IntConv: _conv,
     Add: _add,
     Mul: _add,
-    Concat: lambda w, _, op: w.node("Concat", op.output, list(op.inputs), name=op.name, axis=1),
-    MaxPool: _max_pool,
+    **dict.fromkeys((Concat, MaxPool, Shuffle), lambda w, _, op: write_float(w, op, op.inputs, op.output)),
     AveragePool: _average_pool,
     Resize: _resize,
-    Shuffle: lambda w, _, op: write_shuffle(w, op, op.input, op.output),
     Pointwise: _pointwise,
 }
+
+
+def read_core(model: onnx.ModelProto) -> IntCore:
+    """The core of an INT8 file of the legal regime.
+
+    Raises:
+        ModelError: a file that describes none.
+    """
+    said = metadata(model).get(KEY)
+    if said is not None:
+        with contradictions("INT8 model"):
+            return described_core(said, constants(model))
+    expected, remedy = "a file that describes its integers", "make it with 'beers-deploy quantize --regime legal'"
+    raise ModelError("INT8 core", expected=expected, got="one that does not", remedy=remedy)
+
+
+def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
+    """Where a file of the legal regime is not what its integers ask for: the host's ends, ReLUs, a reader's scale.
+
+    None for files of others.
+    """
+    try:
+        core = read_core(model)
+    except ModelError as error:
+        return [error.got] if metadata(model).get("precision") == "int8 legal" else None
+    with contradictions("INT8 model"):
+        meant, faults = host_model(core, {}, fixed_tile_px(model)).graph, list[str]()
+    for kind, found, wanted in (
+        ("constant", model.graph.initializer, meant.initializer),
+        ("node", model.graph.node, meant.node),
+    ):
+        faults += [f"{kind} {a.name}" for a, b in zip(found, wanted, strict=False) if a != b]
+        faults += [f"{len(found)} {kind}s instead of {len(wanted)}"] if len(found) != len(wanted) else []
+    return faults

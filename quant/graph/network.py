@@ -73,12 +73,10 @@ def cut(graph: Graph, channels: int, flat: bool, softmax: bool) -> Network:
     Pixel shuffles there move values and cost the host next to nothing; DPUs have been seen to compute them wrongly.
     """
     graph, last = _without_shuffles(graph)
-    end = graph[-1] if graph else None
-    adds_image = isinstance(end, Add) and IMAGE in end.inputs and end.activation is Activation.none
-    if adds_image:
-        assert end is not None  # noqa: S101
-        graph = _ended(graph[:-1], end.inputs[1 - end.inputs.index(IMAGE)])
-        graph, back = _without_shuffles(graph)
+    end, adds_image = graph[-1] if graph else None, False
+    if isinstance(end, Add) and IMAGE in end.inputs and end.activation is Activation.none:
+        adds_image = True
+        graph, back = _without_shuffles(_ended(graph[:-1], end.inputs[1 - end.inputs.index(IMAGE)]))
     else:
         back, last = last, ()
     front: list[Shuffle] = []
@@ -112,7 +110,6 @@ def _without_shuffles(graph: Graph) -> tuple[Graph, tuple[Shuffle, ...]]:
 
 
 def _ended(graph: Graph, name: str) -> Graph:
-    """The graph that ends with the tensor of that name."""
     if name == IMAGE or not any(op.output == name for op in graph):
         raise refused_graph("a correction that the network computes", f"{name} of nobody")
     return tuple(renamed(op, {name: CORRECTION}) for op in graph)

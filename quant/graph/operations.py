@@ -41,11 +41,6 @@ class Activation(StrEnum):
         return _FUNCTIONS[self](values)
 
     @property
-    def fused(self) -> bool:
-        """Whether it is computed on the accumulator, before anything is rounded."""
-        return self not in (Activation.hard_sigmoid, Activation.hard_swish)
-
-    @property
     def written(self) -> "Activation":
         """What a file has an operator for: none where rounding to int8 does it."""
         return Activation.none if self is Activation.saturated_relu else self
@@ -118,19 +113,6 @@ def same(weight: np.ndarray) -> Window:
     return Window(pads=(rows, columns, rows, columns))
 
 
-def is_plain(op: Op) -> bool:
-    """Whether an operation is of the short list that ConvBEERS is made of.
-
-    A same-size convolution of stride 1, in float or whole numbers, with or without ReLU; or an add without one.
-    """
-    activation = getattr(op, "activation", None)
-    if not isinstance(op, HasWeight):
-        return isinstance(op, Add) and activation is Activation.none
-    dense = op.groups == 1 and not getattr(op, "transposed", False)
-    kept = activation in (Activation.none, Activation.relu)
-    return dense and kept and getattr(op, "window", None) == same(op.weight)
-
-
 @dataclass(frozen=True)
 class OneInput:
     """Operations that read one tensor, `input`."""
@@ -174,31 +156,27 @@ class Conv(OneInput):
 
 
 @dataclass(frozen=True)
-class Add:
-    """An element-wise sum of two tensors."""
-
-    name: str
-    inputs: tuple[str, str]
-    output: str
-    activation: Activation = Activation.none
-
-
-@dataclass(frozen=True)
-class Mul:
-    """An element-wise product of two tensors of one size."""
-
-    name: str
-    inputs: tuple[str, str]
-    output: str
-
-
-@dataclass(frozen=True)
-class Concat:
-    """Tensors one behind the other along the channels; they share a scale."""
+class SeveralInputs:
+    """Operations that read several tensors."""
 
     name: str
     inputs: tuple[str, ...]
     output: str
+
+
+@dataclass(frozen=True)
+class Add(SeveralInputs):
+    """An element-wise sum of two tensors."""
+
+    activation: Activation = Activation.none
+
+
+class Mul(SeveralInputs):
+    """An element-wise product of two tensors of one size."""
+
+
+class Concat(SeveralInputs):
+    """Tensors one behind the other along the channels; they share a scale."""
 
 
 @dataclass(frozen=True)
@@ -329,16 +307,6 @@ def read_planes(graph: Graph) -> Graph:
 
 def _reads_planes(op: Conv) -> Conv:
     unit = np.float32(2.0**PLANES_FRAC_BITS / MAX_DN)
-    weight = dense(op).weight
+    weight = op.weight if op.groups == 1 else op.weight * np.eye(op.groups, dtype=np.float32)[:, :, None, None]
     planes = [weight * (STEP * unit), weight * unit, np.zeros_like(weight)]
     return replace(op, input=PLANES, weight=np.concatenate(planes, axis=1).astype(np.float32), groups=1)
-
-
-def dense(op: Conv) -> Conv:
-    """A depthwise convolution as one of a single group; any other as it is."""
-    if op.groups == 1:
-        return op
-    weight = np.zeros((len(op.weight), op.groups, *op.weight.shape[2:]), np.float32)
-    channels = np.arange(op.groups)
-    weight[channels, channels] = op.weight[:, 0]
-    return replace(op, weight=weight, groups=1)

@@ -39,9 +39,10 @@ from beers_deploy.quant.graph.operations import (
     Resize,
     Shuffle,
     Window,
-    is_plain,
+    same,
 )
 from beers_deploy.quant.graph.tail import without_tail
+from beers_deploy.quant.reading.equivalents import per_channel
 from beers_deploy.quant.untrusted import contradictions, times
 
 
@@ -50,7 +51,7 @@ def read_network(model: onnx.ModelProto) -> Network:
     with contradictions("float model"):
         body, tail = without_tail(model, {*READERS, *ACTIVATIONS})
         reader = _Reader(body)
-        network = replace(cut(reader.sized_graph(), reader.channels(), reader.flat, reader.softmax), tail=tail)
+        network = replace(cut(reader.graph(), reader.channels(), reader.flat, reader.softmax), tail=tail)
         check_network(network)
     return network
 
@@ -67,9 +68,16 @@ def plain_network(model: onnx.ModelProto) -> Network:
     if not (same_ends and blocks[0] == blocks[1] and len(blocks[0]) <= 1):
         raise refused_graph("an image of one channel, and a global add of it at the end", "another network")
     for op in network.graph:
-        if not (isinstance(op, Conv | Add) and is_plain(op)):
+        if not _is_plain(op):
             raise refused_graph("only same-size convolutions of stride 1, ReLU and adds", op.name)
     return network
+
+
+def _is_plain(op: Op) -> bool:
+    if isinstance(op, Conv):
+        alone = op.groups == 1 and not op.transposed and op.window == same(op.weight)
+        return alone and op.activation in (Activation.none, Activation.relu)
+    return isinstance(op, Add) and op.activation is Activation.none
 
 
 def correction_graph(model: onnx.ModelProto) -> Graph:
@@ -108,7 +116,7 @@ class _Reader:
         return sizes[1] or 1
 
     def graph(self) -> Graph:
-        """The operations, from the network's own input to its own output."""
+        """The operations from the network's own input to its own output; global pooling takes one size of image."""
         if len(self.source.outputs) != 1:
             got = f"{len(self.source.outputs)}: {', '.join(self.source.outputs)}"
             raise refused_graph("one output", got, "export it with one of them")
@@ -116,11 +124,7 @@ class _Reader:
             self._read(node)
         if not self.ops or self.ops[-1].output != self.result:
             raise refused_graph("an operation that writes the output", "none")
-        return named_apart(self.ops, {self.image: IMAGE, self.result: CORRECTION})
-
-    def sized_graph(self) -> Graph:
-        """As `graph`, the windows of global pooling known: a network that pools so has one size of image."""
-        graph = self.graph()
+        graph = named_apart(self.ops, {self.image: IMAGE, self.result: CORRECTION})
         pools = [op for op in graph if isinstance(op, AveragePool) and op.kernel is None]
         rows, columns = self.source.inputs[self.image][2:]
         if pools and not (rows and columns):
@@ -178,7 +182,6 @@ class _Reader:
         return Conv(node.name, node.inputs[0], node.outputs[0], weight, bias, window=window, transposed=True)
 
     def _window(self, node: Node, kernel: Sequence[int] = ()) -> tuple[Pair, Window]:
-        """The kernel's sides, and how it moves."""
         window, auto = node.window(kernel), str(node.attributes.get("auto_pad", ""))
         if window is None:
             raise refused_graph("windows over rows and columns", f"another at {node}")
@@ -218,14 +221,15 @@ class _Reader:
         if not found:
             return None
         (place, value), *others = found.items()
-        shape = (1,) * (4 - value.ndim) + value.shape  # as ONNX aligns it with (N, C, H, W)
-        own = value.ndim <= 4 and shape[0] == shape[2] == shape[3] == 1 and not others
-        self._require(own, node, "a constant of one number a channel", f"one of {times(value.shape)}")
+        flat = None if others else per_channel(value)
+        if flat is None:
+            got = f"one of {times(value.shape)} at {node}"
+            raise refused_graph("a constant of one number a channel", got)
         self._require(node.op_type != "Sub" or place == 1, node, "a constant that is taken off")
         source = node.inputs[1 - place]
         channels = channels_of(tuple(self.ops), {self.image: self.channels()})[source]
         self._require(value.size in (1, channels), node, f"{channels} numbers", f"{value.size}")
-        each = np.broadcast_to(value.astype(np.float32).ravel(), (channels,))
+        each = np.broadcast_to(flat.astype(np.float32), (channels,))
         one, none = np.ones(channels, np.float32), np.zeros(channels, np.float32)
         factor, offset = {"Add": (one, each), "Sub": (one, -each), "Mul": (each, none)}[node.op_type]
         return Conv(node.name, source, node.outputs[0], factor[:, None, None, None], offset, groups=channels)
@@ -248,9 +252,6 @@ class _Reader:
         plain = zeros and not node.attributes.get("ceil_mode", 0)
         self._require(plain, node, "average pooling that counts padding")
         return AveragePool(node.name, node.inputs[0], node.outputs[0], kernel, window)
-
-    def _globalaveragepool(self, node: Node) -> Op:
-        return AveragePool(node.name, node.inputs[0], node.outputs[0], None)
 
     def _resize(self, node: Node) -> Op:
         found = Resizing.of(node, self.source)
@@ -277,13 +278,14 @@ class _Reader:
 
     def _activation(self, node: Node) -> None:
         activation = self._which(node)
+        on_sums = activation not in (Activation.hard_sigmoid, Activation.hard_swish)  # before anything is rounded
         writer = next((k for k, op in enumerate(self.ops) if op.output == node.inputs[0]), None)
         before = self.ops[writer] if writer is not None else None
         fusible = isinstance(before, Conv) or (isinstance(before, Add) and activation is Activation.relu)
         free = getattr(before, "activation", None) is Activation.none and self.source.reads(node.inputs[0]) == 1
         # The host computes LeakyReLU on a convolution's own sums, which a transposed one has in phases.
         phased = isinstance(before, Conv) and before.transposed and activation is Activation.leaky_relu
-        if activation.fused and fusible and free and not phased and writer is not None:
+        if on_sums and fusible and free and not phased and writer is not None:
             assert isinstance(before, Conv | Add)  # noqa: S101
             self.ops[writer] = replace(before, output=node.outputs[0], activation=activation)
         else:
@@ -313,7 +315,7 @@ READERS: dict[str, Callable[[_Reader, Node], Op | None]] = {
     "ConvTranspose": _Reader._convtranspose,
     "DepthToSpace": _Reader._shuffle,
     "Flatten": _Reader._flatten,
-    "GlobalAveragePool": _Reader._globalaveragepool,
+    "GlobalAveragePool": lambda _, node: AveragePool(node.name, node.inputs[0], node.outputs[0], None),
     "MaxPool": _Reader._maxpool,
     "Mul": _Reader._add_or_mul,
     "Resize": _Reader._resize,

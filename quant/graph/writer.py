@@ -86,11 +86,9 @@ def write_float(w: GraphWriter, op: Op, feeds: Sequence[str], output: str) -> No
 
 
 def _conv(w: GraphWriter, op: Conv, feeds: list[str], output: str) -> None:
+    kind = "ConvTranspose" if op.transposed else "Conv"
     window = {"kernel_shape": list(op.weight.shape[2:]), **window_attributes(op.window, op.groups)}
-    if op.transposed:
-        w.node("ConvTranspose", output, feeds, op.name, **window)
-    else:
-        w.node("Conv", output, feeds, op.name, **window)
+    w.node(kind, output, feeds, op.name, **window)
 
 
 def window_attributes(window: Window, groups: int = 1) -> dict[str, Any]:
@@ -121,11 +119,9 @@ def _pool(w: GraphWriter, op: MaxPool | AveragePool, feeds: list[str], output: s
     if op.kernel is None:
         w.node("GlobalAveragePool", output, feeds, op.name)
         return
-    kernel = {"kernel_shape": list(op.kernel), **window_attributes(op.window)}
-    if isinstance(op, MaxPool):
-        w.node("MaxPool", output, feeds, op.name, **kernel)
-    else:
-        w.node("AveragePool", output, feeds, op.name, count_include_pad=1, **kernel)
+    counted: dict[str, Any] = {} if isinstance(op, MaxPool) else {"count_include_pad": 1}
+    window = {"kernel_shape": list(op.kernel), **window_attributes(op.window)}
+    w.node(type(op).__name__, output, feeds, op.name, **counted, **window)
 
 
 def _resize(w: GraphWriter, op: Resize, feeds: list[str], output: str) -> None:
@@ -151,8 +147,7 @@ def write_shuffle(w: GraphWriter, op: Shuffle, source: str, output: str, channel
 
 _WRITERS: dict[type, Callable[..., None]] = {
     Conv: _conv,
-    Add: lambda w, op, feeds, output: w.node("Add", output, feeds, op.name),
-    Mul: lambda w, op, feeds, output: w.node("Mul", output, feeds, op.name),
+    **dict.fromkeys((Add, Mul), lambda w, op, feeds, output: w.node(type(op).__name__, output, feeds, op.name)),
     Concat: lambda w, op, feeds, output: w.node("Concat", output, feeds, op.name, axis=1),
     MaxPool: _pool,
     AveragePool: _pool,

@@ -4,14 +4,15 @@ Every rewriting is exact but for the rounding of float32, borders included. `qua
 what holds behind it.
 """
 
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
+from math import prod
 
 import numpy as np
 import onnx
 from onnx import NodeProto, TensorProto, helper
 
-from beers_deploy.quant.reading.flat import Unflatten
 from beers_deploy.quant.reading.nodes import Nodes, Shapes, attributes_of, shapes_of
 
 ARITHMETIC = {"Add", "Div", "Mul", "Sub"}
@@ -32,10 +33,6 @@ class Affine:
         """How many numbers it has."""
         return max(len(self.scale), len(self.shift))
 
-    def after(self, first: "Affine") -> "Affine":
-        """Both in one."""
-        return Affine(self.scale * first.scale, self.scale * first.shift + self.shift)
-
 
 def rewrite(model: onnx.ModelProto) -> None:
     """Rewrite a float network's nodes; its inputs and outputs keep their names."""
@@ -48,6 +45,8 @@ def rewrite(model: onnx.ModelProto) -> None:
         _in_front(graph, shapes)
         for shaped in (_cast, _mean, _depthwise):
             graph.pass_over(partial(shaped, shapes))
+        graph.pass_over(_behind)  # a normalisation that has become a convolution takes in what stands around it
+        _in_front(graph, shapes)
         graph.pass_over(Unflatten(shapes))
         graph.write()
 
@@ -77,39 +76,16 @@ def _difference(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
 
 
 def _behind(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
-    """What works on each channel by itself, folded into the convolution or normalisation that it follows."""
+    """What works on each channel by itself, folded into the convolution that it follows."""
     found = _affine(graph, node)
     before = graph.sole_writer(found[0]) if found else None
-    if found is None or before is None:
+    if found is None or before is None or not graph.is_linear(before):
         return None
-    affine = found[1]
-    if graph.is_linear(before):
-        if affine.channels not in (1, graph.width(before)):
-            return None
-        _scale_results(graph, before, affine)
-    else:
-        first = _affine(graph, before) if NORMALISATION in (before.op_type, node.op_type) else None
-        if first is None or min(affine.channels, first[1].channels) not in (1, affine.channels):
-            return None
-        _set_normalisation(graph, before, first[0], affine.after(first[1]))
-    _rename(graph, found[0], node.output[0])
+    if found[1].channels not in (1, graph.width(before)):
+        return None
+    _scale_results(graph, before, found[1])
+    graph.rename(found[0], node.output[0])
     return []
-
-
-def _rename(graph: Nodes, result: str, name: str) -> None:
-    """Let a result have the name of the one that it takes the place of."""
-    writer = graph.writers[name] = graph.writers[result]
-    writer.output[list(writer.output).index(result)] = name
-
-
-def _set_normalisation(graph: Nodes, node: NodeProto, source: str, affine: Affine) -> None:
-    """Make a node the normalisation of mean 0 and variance 1 that computes this."""
-    scale, shift = np.broadcast_arrays(affine.scale, affine.shift)
-    values = (scale, shift, np.zeros(scale.shape), np.ones(scale.shape))
-    names = ("scale", "shift", "mean", "variance")
-    inputs = [graph.keep(f"{node.output[0]}.{name}", value) for name, value in zip(names, values, strict=True)]
-    made = helper.make_node(NORMALISATION, [source, *inputs], node.output, name=node.name, epsilon=0.0)
-    node.CopyFrom(made)
 
 
 def _affine(graph: Nodes, node: NodeProto) -> tuple[str, Affine] | None:
@@ -119,7 +95,7 @@ def _affine(graph: Nodes, node: NodeProto) -> tuple[str, Affine] | None:
     if node.op_type not in ARITHMETIC:
         return None
     for place in (0, 1):
-        value = _per_channel(graph.value(node.input[1 - place]))
+        value = per_channel(graph.value(node.input[1 - place]))
         if value is not None and node.input[place] not in graph.constants:
             found = _arithmetic(node.op_type, value, place)
             return None if found is None else (node.input[place], found)
@@ -148,7 +124,7 @@ def _normalisation(graph: Nodes, node: NodeProto) -> tuple[str, Affine] | None:
     return node.input[0], Affine(scale, offset - mean * scale)
 
 
-def _per_channel(value: np.ndarray | None) -> np.ndarray | None:
+def per_channel(value: np.ndarray | None) -> np.ndarray | None:
     """(C,) or (1,) of a constant that is one number a channel of (N, C, H, W), None of any other."""
     if value is None or value.ndim > 4:
         return None
@@ -180,8 +156,7 @@ def _numbers(graph: Nodes, node: NodeProto) -> tuple[np.ndarray, np.ndarray]:
 
 def _set_numbers(graph: Nodes, node: NodeProto, weight: np.ndarray, bias: np.ndarray) -> None:
     name = node.name or node.output[0]
-    inputs = [node.input[0], graph.keep(f"{name}.weight", weight), graph.keep(f"{name}.bias", bias)]
-    node.input[:] = inputs
+    node.input[:] = [node.input[0], graph.keep(f"{name}.weight", weight), graph.keep(f"{name}.bias", bias)]
 
 
 def _hard_swish(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
@@ -203,12 +178,11 @@ def _cast(shapes: Shapes, graph: Nodes, node: NodeProto) -> list[NodeProto] | No
     before = graph.sole_writer(node.input[0]) if node.op_type == "Cast" and node.input[0] in shapes else None
     if before is None or attributes_of(node)["to"] != TensorProto.FLOAT:
         return None
-    _rename(graph, node.input[0], node.output[0])
+    graph.rename(node.input[0], node.output[0])
     return []
 
 
 def _mean(shapes: Shapes, _: Nodes, node: NodeProto) -> list[NodeProto] | None:
-    """A mean over height and width."""
     given = attributes_of(node)
     axes, image = {axis % 4 for axis in given.get("axes", [])}, len(shapes.get(node.input[0], ())) == 4
     if node.op_type != "ReduceMean" or not image or axes != {2, 3}:
@@ -269,10 +243,85 @@ def _depthwise(shapes: Shapes, graph: Nodes, node: NodeProto) -> list[NodeProto]
         return None
     source, affine = found
     name = node.name or node.output[0]
-    numbers = (
-        graph.keep(f"{name}.weight", affine.scale.reshape(-1, 1, 1, 1)),
-        graph.keep(f"{name}.bias", affine.shift),
-    )
-    made = helper.make_node("Conv", [source, *numbers], node.output, name=name, kernel_shape=[1, 1])
+    made = helper.make_node("Conv", [source], node.output, name=name, kernel_shape=[1, 1])
     made.attribute.append(helper.make_attribute("group", affine.channels))
+    _set_numbers(graph, made, affine.scale.reshape(-1, 1, 1, 1), affine.shift)
     return [made]
+
+
+POINTWISE = {"Clip", "Elu", "HardSigmoid", "HardSwish", "LeakyRelu", "Relu", "Sigmoid", "Tanh"}
+Map = tuple[int, int, int]
+"""Channels, height, width."""
+
+
+class Unflatten:
+    """A step of `Nodes.pass_over`, which remembers flat maps: fully connected layers as convolutions of whole maps.
+
+    The flattening is left behind them. A Softmax over what is flat becomes one along the channels of one pixel.
+    """
+
+    def __init__(self, shapes: Shapes) -> None:
+        self._shapes = shapes
+        self._maps: dict[str, tuple[str, Map]] = {}
+
+    def __call__(self, graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
+        """What stands for a node, None where it stays."""
+        if self._flattens(graph, node):
+            source = node.input[0]
+            channels, height, width = self._shapes[source][1:]
+            self._maps[node.output[0]] = source, (channels, height, width)
+        found = self._maps.get(node.input[0]) if node.input else None
+        if found is None or len(node.output) != 1:
+            return None
+        source, size = found
+        if node.op_type == "Gemm":
+            return self._connected(graph, node, source, size)
+        if node.op_type == "Softmax" and size[1:] == (1, 1) and attributes_of(node).get("axis", -1) in (1, -1):
+            return self._flat(helper.make_node("Softmax", [source], node.output, name=node.name, axis=1), size)
+        if node.op_type in POINTWISE:
+            image = deepcopy(node)
+            image.input[0] = source
+            return self._flat(image, size)
+        unseen = graph.reads[node.input[0]] == 1 and graph.reads[source] <= 1 and source in graph.writers
+        maps = [1, *size], [0, *size], [-1, *size]
+        if unseen and node.op_type == "Reshape" and graph.integers(node.input[1]) in maps:
+            graph.rename(source, node.output[0])  # nothing stands in the place of what makes a map of it again
+            return []
+        return None
+
+    def _flattens(self, graph: Nodes, node: NodeProto) -> bool:
+        """Whether a node makes (N, C H W) of a map whose size is known."""
+        sizes = self._shapes.get(node.input[0], ()) if node.input else ()
+        if len(sizes) != 4 or min(sizes[1:]) < 1:
+            return False
+        if node.op_type == "Flatten":
+            return attributes_of(node).get("axis", 1) in (1, -3)
+        asked = graph.integers(node.input[1]) if len(node.input) == 2 else None
+        if node.op_type == "Squeeze" and asked:
+            return {axis % 4 for axis in asked} == {2, 3}
+        if node.op_type != "Reshape" or asked is None or len(asked) != 2 or attributes_of(node).get("allowzero", 0):
+            return False
+        return asked[1] == prod(sizes[1:]) or (asked[1] == -1 and asked[0] in (0, sizes[0]))
+
+    def _connected(self, graph: Nodes, node: NodeProto, source: str, size: Map) -> list[NodeProto] | None:
+        given = attributes_of(node)
+        weight = graph.array(node.input[1])
+        bias = graph.array(node.input[2]) if len(node.input) > 2 and node.input[2] else np.zeros(1)
+        if weight is None or bias is None or weight.ndim != 2 or given.get("transA", 0):
+            return None
+        weight = (weight if given.get("transB", 0) else weight.T) * np.float32(given.get("alpha", 1.0))
+        if weight.shape[1] != prod(size) or bias.size not in (1, len(weight)):
+            return None
+        offset = np.broadcast_to(bias.reshape(-1) * given.get("beta", 1.0), len(weight))
+        name = node.name or node.output[0]
+        values = {"weight": weight.reshape(-1, *size), "bias": offset}
+        numbers = [graph.keep(f"{name}.{role}", value) for role, value in values.items()]
+        made = helper.make_node("Conv", [source, *numbers], node.output, name=name, kernel_shape=list(size[1:]))
+        return self._flat(made, (len(weight), 1, 1))
+
+    def _flat(self, image: NodeProto, size: Map) -> list[NodeProto]:
+        """A node that gives a map, and the map flat under the name of its result."""
+        name = image.output[0]
+        image.output[0] = f"{name}.map"
+        self._maps[name] = image.output[0], size
+        return [image, helper.make_node("Flatten", image.output, [name], name=f"{name}.flat")]

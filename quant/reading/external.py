@@ -15,7 +15,7 @@ from onnx import TensorProto
 from beers_deploy.model.io.files import sha256
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.toml import read_whole, unreadable
-from beers_deploy.quant.untrusted import FIELDS, FILE_BYTES, check_size, refused
+from beers_deploy.quant.untrusted import FILE_BYTES, VALUE_BYTES, check_size, refused
 
 
 def take_in(model: onnx.ModelProto, path: Path) -> None:
@@ -54,9 +54,9 @@ def _content(tensor: TensorProto, path: Path, limit_bytes: int) -> bytes:
     said = _said(tensor)
     where = str(path)
     check_size(tensor.name, tensor.dims, where)
-    if tensor.data_type not in FIELDS or min(tensor.dims, default=0) < 0:
+    if tensor.data_type not in VALUE_BYTES or min(tensor.dims, default=0) < 0:
         raise _refused(tensor, where, "a tensor of plain numbers")
-    size = math.prod(tensor.dims) * FIELDS[tensor.data_type][0]
+    size = math.prod(tensor.dims) * VALUE_BYTES[tensor.data_type]
     if size > limit_bytes:
         raise _refused(tensor, where, f"more than {FILE_BYTES} bytes in all")
     start, length = (_whole(said.get(key, default)) for key, default in (("offset", "0"), ("length", str(size))))

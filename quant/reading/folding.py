@@ -22,7 +22,6 @@ optimisation, which every installation has: it keeps to standard operators, and 
 come here: a runtime opens it.
 """
 
-from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -34,7 +33,8 @@ from onnx import TensorProto, numpy_helper, version_converter
 from onnx.shape_inference import InferenceError
 
 from beers_deploy.quant.reading.equivalents import rewrite
-from beers_deploy.quant.untrusted import contradictions, refused
+from beers_deploy.quant.reading.nodes import fresh
+from beers_deploy.quant.untrusted import contradictions, held_tensors, opset_of, refused
 
 OPSET = 17
 IR_VERSION = 8
@@ -71,7 +71,7 @@ def _simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     _replace(folded.graph.input, inputs)  # one that is an input could be another when it runs
     folded.ir_version = IR_VERSION
     ends = list(inputs), list(folded.graph.output)
-    if _opset(model) < OPSET:  # an operator's own sizes become constants, which are then folded
+    if opset_of(model) < OPSET:  # an operator's own sizes become constants, which are then folded
         folded = _of_our_opset(folded)
     folded = _of_our_opset(_folded(folded, where))
     rewrite(folded)
@@ -84,7 +84,7 @@ def _simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 def _is_plain(model: onnx.ModelProto) -> bool:
     held = {tensor.name for tensor in model.graph.initializer}
     return (
-        _opset(model) == OPSET
+        opset_of(model) == OPSET
         and not any(tensor.data_type in HALVES for tensor in model.graph.initializer)
         and not any(value.name in held for value in model.graph.input)
         and all(
@@ -100,16 +100,11 @@ def _widen(model: onnx.ModelProto) -> None:
     for value in (*graph.input, *graph.output, *graph.value_info):
         if value.type.tensor_type.elem_type in HALVES:
             value.type.tensor_type.elem_type = TensorProto.FLOAT
-    for tensor in _constants(graph):
+    for tensor in held_tensors(graph):
         if tensor.data_type in HALVES:
             tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor).astype(np.float32), tensor.name))
     for attribute in (a for node in graph.node for a in node.attribute if a.name in ("to", "dtype")):
         attribute.i = TensorProto.FLOAT if attribute.i in HALVES else attribute.i
-
-
-def _constants(graph: onnx.GraphProto) -> Iterator[TensorProto]:
-    yield from graph.initializer
-    yield from (a.t for node in graph.node for a in node.attribute if a.HasField("t"))
 
 
 def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
@@ -133,14 +128,9 @@ def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     return folded
 
 
-def _opset(model: onnx.ModelProto) -> int:
-    """The version of ONNX's own operators."""
-    return max((opset.version for opset in model.opset_import if opset.domain in ("", "ai.onnx")), default=1)
-
-
 def _of_our_opset(model: onnx.ModelProto) -> onnx.ModelProto:
     """With operators of our opset; as it is where the converter knows no way, or ours has no such operator."""
-    version = _opset(model)
+    version = opset_of(model)
     _replace(model.opset_import, [onnx.helper.make_opsetid("", version)])
     if version == OPSET:
         return model
@@ -179,14 +169,7 @@ def _tidy(folded: onnx.ModelProto, model: onnx.ModelProto) -> None:
     taken = {node.name for node in graph.node}
     for node in graph.node:
         if not node.name:
-            node.name = _fresh(node.output[0] or node.op_type, taken)
-
-
-def _fresh(name: str, taken: set[str]) -> str:
-    while name in taken:
-        name += "_"
-    taken.add(name)
-    return name
+            node.name = fresh(node.output[0] or node.op_type, taken)
 
 
 def _replace(field: object, values: object) -> None:

@@ -81,11 +81,14 @@ class Nodes:
 
     def keep(self, name: str, value: np.ndarray) -> str:
         """Note a constant as float32 under a name that is free, and return it."""
-        while name in self._taken:
-            name += "_"
-        self._taken.add(name)
+        name = fresh(name, self._taken)
         self.constants[name] = numpy_helper.from_array(value.astype(np.float32), name)
         return name
+
+    def rename(self, result: str, name: str) -> None:
+        """Let a result have the name of the one that it takes the place of."""
+        writer = self.writers[name] = self.writers[result]
+        writer.output[list(writer.output).index(result)] = name
 
     def sole_writer(self, name: str) -> NodeProto | None:
         """The node that writes a tensor which one node alone reads."""
@@ -103,6 +106,14 @@ class Nodes:
         """The channels that a convolution writes."""
         dims = self.constants[node.input[1]].dims
         return int(dims[0] if node.op_type == "Conv" else dims[1] * attributes_of(node).get("group", 1))
+
+
+def fresh(name: str, taken: set[str]) -> str:
+    """The name, or one like it, that is not taken; it is from now on."""
+    while name in taken:
+        name += "_"
+    taken.add(name)
+    return name
 
 
 Step = Callable[[Nodes, NodeProto], list[NodeProto] | None]

@@ -110,12 +110,10 @@ def _window(at: Along) -> Window:
 
 
 def _slide(at: Along) -> Step:
-    """Convolutions and pools."""
     return at.slid(_window(at), bool(at.given("ceil_mode", 0)))
 
 
 def _transpose(at: Along) -> Step:
-    """Transposed convolutions."""
     stated = at.given("auto_pad", "NOTSET") == "NOTSET" and at.given("output_shape", None) is None
     at.require(stated, "of a fixed or automatic size")
     return at.put_down(_window(at))

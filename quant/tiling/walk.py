@@ -24,10 +24,9 @@ from fractions import Fraction
 
 import onnx
 
-from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph.moves import MOVES, with_shuffles
 from beers_deploy.quant.graph.nodes import Node, OnnxGraph
-from beers_deploy.quant.onnx_file import fixed_tile_px
+from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px
 from beers_deploy.quant.tiling.steps import STEPS, Along, Step, refused
 from beers_deploy.quant.untrusted import contradictions
 
@@ -73,14 +72,7 @@ def tiling_of(model: onnx.ModelProto, where: str = "tiled model") -> Tiling:
     Raises:
         ModelError: a network that cannot be tiled; the sentence names the node.
     """
-    try:
-        return _tiling_of(model, where)
-    except ModelError as error:
-        raise ModelError(where, expected=error.expected, got=error.got, remedy=error.remedy) from error
-
-
-def _tiling_of(model: onnx.ModelProto, where: str) -> Tiling:
-    with contradictions(where):
+    with faults_named(where), contradictions(where):
         graph = with_shuffles(model)
         rows, columns = (_Walk(graph, axis) for axis in (0, 1))
         (channels_in, channels_out), fixed_px = _channels(graph, model), fixed_tile_px(model)
@@ -96,7 +88,6 @@ def _tiling_of(model: onnx.ModelProto, where: str) -> Tiling:
 
 
 def _channels(graph: OnnxGraph, model: onnx.ModelProto) -> tuple[int, int]:
-    """Channels of the only image in and the only one out."""
     if len(graph.inputs) != 1 or len(graph.outputs) != 1:
         raise refused("one image in and one out", f"{len(graph.inputs)} in and {len(graph.outputs)} out")
     (sizes,) = graph.inputs.values()

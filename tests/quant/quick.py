@@ -15,6 +15,7 @@ from beers_deploy.profiles import load_sensor
 from beers_deploy.quant.calibration import draw_patches
 from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Conv, Graph, Op, graph_to_onnx, same
+from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.quantise import Quantised, quantise_model
 from beers_deploy.quant.samples import Patches, Remade
 from beers_deploy.quant.session import open_session, planes_of
@@ -56,6 +57,15 @@ def in_float(graph: Graph, seen: np.ndarray, ends: Ends = ONE_CHANNEL, name: str
     """What a plane-reading float graph makes of an image, or another of its tensors."""
     session = open_session(graph_to_onnx(graph, [name], ends.planes * ends.channels))
     return np.asarray(session.run(None, {PLANES: planes_of(seen, ends)})[0])
+
+
+def behind_conv(write: Callable[[GraphWriter], object]) -> onnx.ModelProto:
+    """A convolution of one pixel, and behind it what `write` writes from `x` to `restored`."""
+    writer = GraphWriter()
+    writer.node("Conv", "x", ["image", writer.constant("w", np.ones((2, 1, 1, 1), np.float32))], "first")
+    write(writer)
+    result = onnx.helper.make_tensor_value_info("restored", onnx.TensorProto.FLOAT, None)
+    return make_model(writer.graph("g", [image_info("image", 1, None)], [result]), {})
 
 
 def copied(model: onnx.ModelProto) -> onnx.ModelProto:

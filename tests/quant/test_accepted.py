@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import onnx
@@ -11,7 +12,7 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.core import build_core, shift_faults
 from beers_deploy.quant.free import quantise_free
 from beers_deploy.quant.gate import compare
-from beers_deploy.quant.graph import PLANES, Add, Conv, Graph, Network, check_network, correction_graph, read_planes
+from beers_deploy.quant.graph import PLANES, Conv, Graph, Network, check_network, correction_graph, read_planes
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session
@@ -23,49 +24,27 @@ def graph(float_onnx: onnx.ModelProto) -> Graph:
     return correction_graph(float_onnx)
 
 
-def conv(graph: Graph, name: str) -> Conv:
+def with_conv(graph: Graph, name: str, **changes: Callable[[Any], Any]) -> Graph:
+    """The graph in which one convolution has other arrays, or another input."""
     found = next(op for op in graph if op.name == name)
     assert isinstance(found, Conv)
-    return found
+    other = replace(found, **{key: change(getattr(found, key)) for key, change in changes.items()})
+    return tuple(other if op is found else op for op in graph)
 
 
-def with_op(graph: Graph, changed: Conv | Add) -> Graph:
-    return tuple(changed if op.name == changed.name else op for op in graph)
-
-
-def three_channels(graph: Graph) -> Graph:
-    head = conv(graph, "head")
-    return with_op(graph, replace(head, weight=np.repeat(head.weight, 3, axis=1)))
-
-
-def wrong_end(graph: Graph) -> Graph:
-    return graph[:-1]
-
-
-def nan_weight(graph: Graph) -> Graph:
-    head = conv(graph, "head")
-    return with_op(graph, replace(head, bias=np.full_like(head.bias, np.nan)))
-
-
-def a_wide_branch(graph: Graph) -> Graph:
-    branch = conv(graph, "body.0.second")
-    weight, bias = np.concatenate([branch.weight] * 2), np.concatenate([branch.bias] * 2)
-    return with_op(graph, replace(branch, weight=weight, bias=bias))
-
-
-def nobody_wrote(graph: Graph) -> Graph:
-    return with_op(graph, replace(conv(graph, "body.0.second"), input="before the relu"))
+def twice(values: np.ndarray) -> np.ndarray:
+    return np.concatenate([values] * 2)
 
 
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
         (lambda _: (), "no operation"),
-        (three_channels, "3 channels for head"),
-        (wrong_end, "a last operation that writes the result"),
-        (nan_weight, "NaN or infinity in head"),
-        (a_wide_branch, "two tensors of one width"),
-        (nobody_wrote, "before the relu"),
+        (lambda g: with_conv(g, "head", weight=lambda w: np.repeat(w, 3, axis=1)), "3 channels for head"),
+        (lambda g: g[:-1], "a last operation that writes the result"),
+        (lambda g: with_conv(g, "head", bias=lambda b: b * np.nan), "NaN or infinity in head"),
+        (lambda g: with_conv(g, "body.0.second", weight=twice, bias=twice), "two tensors of one width"),
+        (lambda g: with_conv(g, "body.0.second", input=lambda _: "before the relu"), "before the relu"),
     ],
 )
 def test_what_cannot_be_quantised_is_refused(spoil: Callable[[Graph], Graph], said: str, graph: Graph) -> None:
@@ -99,9 +78,7 @@ def test_a_branch_of_tiny_values_stays_legal(share: float, float_onnx: onnx.Mode
 
 
 def test_sizes_beyond_all_shifts_are_refused(graph: Graph) -> None:
-    planes = read_planes(graph)
-    branch = conv(planes, "body.0.second")
-    huge = with_op(planes, replace(branch, weight=branch.weight * np.float32(1e30)))
+    huge = with_conv(read_planes(graph), "body.0.second", weight=lambda weight: weight * np.float32(1e30))
     frac_bits = {PLANES: 7, **{op.output: 8 for op in huge}}
     with pytest.raises(ModelError, match="shifts reach"):
         build_core(huge, frac_bits)

@@ -20,15 +20,15 @@ from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN
 from beers_deploy.quant.encodings import as_on_board, board_model, encoding_faults, read_core
 from beers_deploy.quant.encodings.description import KEY
-from beers_deploy.quant.graph import correction_graph
 from beers_deploy.quant.integer.reference import agreement, run_core
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.quantise import Quantised, quantise_model
 from beers_deploy.quant.reading.folding import simplest
-from beers_deploy.quant.session import open_any_size, open_session, result_of
+from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.tiling.walk import tiling_of
 from examples.networks import NETWORKS, build, to_onnx
 from tests.quant.quick import copied, patches_of, quickly
+from tests.quant.tiling.small_networks import check_tiles
 from tests.quant.trained import hold_to_reference, moved
 
 SIDE_PX = 48
@@ -145,20 +145,11 @@ def test_the_core_is_legal_on_the_dpu(name: str) -> None:
 TILED = [name for name in NETWORKS if name != "classifier"]
 
 
-@pytest.mark.parametrize("tile_px", [16, 24])
 @pytest.mark.parametrize("name", TILED)
-def test_tiles_of_int8_are_the_whole(name: str, tile_px: int) -> None:
+def test_tiles_of_int8_are_the_whole(name: str) -> None:
     model = quantised(name).host
-    tiling, seen = tiling_of(model), images(name, 1, 64)[0]
-    session = open_any_size(model)
-    whole, halo_px, scale = result_of(session, seen), tiling.halo_px, int(tiling.scale)
-    for top, left in ((0, 0), (24, 16), (64 - tile_px, 64 - tile_px)):
-        first = [max(place - halo_px, 0) for place in (top, left)]
-        tile = seen[..., first[0] : top + tile_px + halo_px, first[1] : left + tile_px + halo_px]
-        found = result_of(session, tile)
-        inner = [slice((p - f) * scale, (p - f + tile_px) * scale) for p, f in zip((top, left), first, strict=True)]
-        kept = [slice(p * scale, (p + tile_px) * scale) for p in (top, left)]
-        np.testing.assert_array_equal(found[..., inner[0], inner[1]], whole[..., kept[0], kept[1]])
+    lattice_px = tiling_of(model).lattice_px
+    check_tiles(model, images(name, 1, 64)[0], (16 // lattice_px, 24 // lattice_px))
 
 
 def one_convolution(weight: float, bias: float) -> onnx.ModelProto:
@@ -182,8 +173,3 @@ def test_windows_make_a_result_finer_than_8_bits(weight: float, bias: float, mon
         errors.append(float(np.abs(result_of(open_session(made.host), seen[0]) - wanted).mean()))
         assert encoding_faults(made.host) == []
     assert errors[0] < 0.4 * errors[1]
-
-
-def test_what_stress_takes_is_the_plain_family() -> None:
-    with pytest.raises(ModelError, match="convolutions of stride 1"):
-        correction_graph(float_network("unet"))

@@ -1,4 +1,3 @@
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -7,22 +6,45 @@ import pytest
 from onnx import helper
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.graph import CORRECTION, IMAGE, Add, Conv, Resize, correction_graph, read_network, relu_count
+from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.quant.graph import (
+    CORRECTION,
+    IMAGE,
+    QUARTER,
+    STEP,
+    Add,
+    Conv,
+    Resize,
+    correction_graph,
+    read_network,
+    relu_count,
+    split,
+)
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.session import open_session, result_of
-from tests.quant.quick import copied
+from tests.quant.quick import behind_conv, copied
 
 
-def test_the_global_add_is_left_to_the_host(float_onnx: onnx.ModelProto) -> None:
+def test_no_digital_number_is_lost_in_planes_nor_wrapped() -> None:
+    dn = np.arange(MAX_DN + 1, dtype=np.float32).reshape(1, 1, 64, 64)
+    planes = split(dn / np.float32(MAX_DN)).astype(np.int32)
+    np.testing.assert_array_equal(STEP * planes[:, :1] + planes[:, 1:2], dn.astype(np.int32))
+    assert np.abs(QUARTER * planes[:, 2:] - planes[:, 1:2]).max() <= QUARTER / 2
+    low, high = (split(np.full((1, 1, 1, 1), v, np.float32)).ravel().tolist() for v in (-3.0, 7.0))
+    assert low == [0, 0, 0]
+    assert STEP * high[0] + high[1] == MAX_DN
+
+
+def test_a_plain_network_keeps_its_weights_and_relus_and_leaves_the_global_add(float_onnx: onnx.ModelProto) -> None:
     graph = correction_graph(float_onnx)
     assert graph[0].inputs == (IMAGE,)
     assert graph[-1].output == CORRECTION
+    assert isinstance(graph[0], Conv)
     assert isinstance(graph[-1], Conv)
+    stored = next(t for t in float_onnx.graph.initializer if t.name == "head.weight")
+    np.testing.assert_array_equal(graph[0].weight, onnx.numpy_helper.to_array(stored))
     assert sum(isinstance(op, Add) for op in graph) == 3
-
-
-def test_every_relu_is_kept(float_onnx: onnx.ModelProto) -> None:
-    assert relu_count(correction_graph(float_onnx)) == sum(n.op_type == "Relu" for n in float_onnx.graph.node) == 2
+    assert relu_count(graph) == sum(n.op_type == "Relu" for n in float_onnx.graph.node) == 2
 
 
 @pytest.mark.parametrize("kind", ["Sigmoid", "Tanh"])
@@ -48,23 +70,6 @@ def test_a_strided_convolution_is_refused(float_onnx: onnx.ModelProto) -> None:
         correction_graph(model)
 
 
-def test_weights_are_read_as_stored(float_onnx: onnx.ModelProto) -> None:
-    first = correction_graph(float_onnx)[0]
-    assert isinstance(first, Conv)
-    stored = next(t for t in float_onnx.graph.initializer if t.name == "head.weight")
-    np.testing.assert_array_equal(first.weight, onnx.numpy_helper.to_array(stored))
-
-
-def of_one(write: Callable[[GraphWriter], object]) -> onnx.ModelProto:
-    """A convolution, and behind it what `write` writes from `x` to `restored`."""
-    writer = GraphWriter()
-    weight = writer.constant("w", np.ones((2, 1, 1, 1), np.float32))
-    writer.node("Conv", "x", ["image", weight], "first")
-    write(writer)
-    result = helper.make_tensor_value_info("restored", onnx.TensorProto.FLOAT, ["N", 2, "rows", "columns"])
-    return make_model(writer.graph("g", [image_info("image", 1, None)], [result]), {})
-
-
 @pytest.mark.parametrize("kind", ["Add", "Sub", "Mul"])
 @pytest.mark.parametrize("shape", [(1, 2, 1, 1), (2, 1, 1), ()])
 def test_one_number_a_channel_behind_an_activation_is_a_convolution(kind: str, shape: tuple[int, ...]) -> None:
@@ -73,7 +78,7 @@ def test_one_number_a_channel_behind_an_activation_is_a_convolution(kind: str, s
     def write(w: GraphWriter) -> None:
         w.node(kind, "restored", [w.node("LeakyRelu", "y", ["x"], alpha=26 / 256), w.constant("own", value)])
 
-    last = read_network(of_one(write)).graph[-1]
+    last = read_network(behind_conv(write)).graph[-1]
     assert isinstance(last, Conv)
     each = np.broadcast_to(value.ravel(), 2)
     factor, offset = {"Add": (1, each), "Sub": (1, -each), "Mul": (each, 0)}[kind]
@@ -91,7 +96,7 @@ def test_a_nearest_resize_is_taken_where_it_makes_blocks(where: str, rounding: s
             "Resize", "restored", ["x", "", w.constant("s", np.array([1, 1, factor, factor], np.float32))], "r", **how
         )
 
-    model, pixels = of_one(write), np.random.default_rng(0).random((1, 1, 5, 7), np.float32)
+    model, pixels = behind_conv(write), np.random.default_rng(0).random((1, 1, 5, 7), np.float32)
     found = result_of(open_session(model), pixels)[:, :1]
     # With aligned corners the places depend on the image's size: right for this one is not right for all.
     if where != "align_corners" and np.array_equal(found, pixels.repeat(factor, 2).repeat(factor, 3)):
@@ -117,11 +122,11 @@ def test_transposed_convolutions_that_the_dpu_lacks_are_refused(given: dict[str,
         w.node("ConvTranspose", "restored", ["x", w.constant("t", np.ones((2, 2, 2, 2), np.float32))], "up", **given)
 
     with pytest.raises(ModelError, match=f"{said}.* at ConvTranspose up"):
-        read_network(of_one(write))
+        read_network(behind_conv(write))
 
 
 def test_two_outputs_are_refused_by_name() -> None:
-    model = of_one(lambda w: w.node("Relu", "restored", ["x"]))
+    model = behind_conv(lambda w: w.node("Relu", "restored", ["x"]))
     model.graph.output.append(helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, ["N", 2, "H", "W"]))
     with pytest.raises(ModelError, match="one output, got 2: restored, x"):
         read_network(model)

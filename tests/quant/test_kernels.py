@@ -1,13 +1,15 @@
 """Integer operators are added exactly, in the ways that a processor takes whose fast kernels saturate.
 
 The ways are forced, so that they are proven on every processor; where the kernels do saturate, leaving them out
-fails (`test_left_alone_they_saturate_where_the_processor_does`).
+fails (`test_left_alone_they_saturate_where_the_processor_does`). Filled with channels of zeros, a network gives the
+same numbers.
 """
 
 from pathlib import Path
 
 import numpy as np
 import onnx
+import onnxruntime as ort
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,17 +21,19 @@ from beers_deploy.network import shipped_pair
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.integer.reference import merged_correction, run_core
-from beers_deploy.quant.kernels import INT16_MAX, INT16_MIN, Way, cannot_saturate, made_exact
+from beers_deploy.quant.kernels import FEWEST_OUTPUTS, INT16_MAX, INT16_MIN, Way, cannot_saturate, filled, made_exact
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session, run
 from tests.quant.quick import Calibration
 
 SHAPES = [(1, 1, 1), (3, 5, 3), (4, 6, 1), (16, 16, 3), (5, 33, 3), (32, 8, 2), (17, 32, 3)]
 """(outputs, inputs, kernel) of convolutions: odd ones straddle what a kernel takes at a time."""
+GROUPED = [(12, 3, 3, 2), (12, 1, 3, 6)]
+"""The same of one group, and how many there are."""
 
 
 def convolution(
-    weight: np.ndarray, kind: type[np.uint8 | np.int8], groups: int = 1, per_channel: bool = False
+    weight: np.ndarray, kind: type[np.uint8 | np.int8], groups: int = 1, per_channel: bool = False, middle: int = 3
 ) -> onnx.ModelProto:
     """QLinearConv of images (N, C, H, W) of 8 bits by int8 weights (O, C / groups, k, k), asymmetric, with a bias."""
     outputs, terms = len(weight), weight[0].size
@@ -39,7 +43,7 @@ def convolution(
         "middle": np.asarray(100 if kind is np.uint8 else -7, kind),
         "weight": weight,
         "weight_unit": 2.0 ** (np.arange(outputs) % 3).astype(np.float32) if per_channel else np.float32(1),
-        "weight_middle": np.zeros(outputs, np.int8) if per_channel else np.int8(3),
+        "weight_middle": np.zeros(outputs, np.int8) if per_channel else np.int8(middle),
         "result_unit": np.float32(1 / unit / 4),
         "bias": np.arange(outputs, dtype=np.int32) * 1001 - 7,
     }
@@ -73,39 +77,27 @@ def by_definition(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
 
 
 @given(
-    shape=st.sampled_from(SHAPES),
+    shape=st.sampled_from([*((*shape, 1) for shape in SHAPES), *GROUPED]),
     kind=st.sampled_from([np.uint8, np.int8]),
     per_channel=st.booleans(),
     large=st.booleans(),
     seed=st.integers(0, 2**32 - 1),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_any_convolution_is_added_exactly(
-    shape: tuple[int, int, int], kind: type[np.uint8 | np.int8], per_channel: bool, large: bool, seed: int
+    shape: tuple[int, int, int, int], kind: type[np.uint8 | np.int8], per_channel: bool, large: bool, seed: int
 ) -> None:
     generator = np.random.default_rng(seed)
-    outputs, inputs, kernel = shape
+    outputs, inputs, kernel, groups = shape
     weight = generator.integers(-128, 128, (outputs, inputs, kernel, kernel)).astype(np.int8)
     if large:  # as many as can be at the ends of what they hold
         weight = np.where(weight > 0, np.int8(127), np.int8(-128))
     limits = np.iinfo(kind)
-    image = generator.choice([limits.min, limits.max, 0], (2, inputs, 7, 9)).astype(kind)
-    model = convolution(weight, kind, per_channel=per_channel)
+    image = generator.choice([limits.min, limits.max, 0], (2, inputs * groups, 7, 9)).astype(kind)
+    model = convolution(weight, kind, groups, per_channel)
     for optimise in (False, True):
         session = open_session(model, 1, optimise, exact=True)
         assert np.array_equal(session.run(None, {"image": image})[0], by_definition(model, image))
-
-
-@pytest.mark.parametrize("groups", [2, 6])
-@pytest.mark.parametrize("kind", [np.uint8, np.int8])
-def test_grouped_and_depthwise_convolutions_are_added_exactly(groups: int, kind: type[np.uint8 | np.int8]) -> None:
-    generator = np.random.default_rng(groups)
-    weight = generator.choice([-128, 127], (12, 6 // groups, 3, 3)).astype(np.int8)
-    limits = np.iinfo(kind)
-    image = generator.choice([limits.min, limits.max], (1, 6, 9, 7)).astype(kind)
-    model = convolution(weight, kind, groups)
-    session = open_session(model, 1, exact=True)
-    assert np.array_equal(session.run(None, {"image": image})[0], by_definition(model, image))
 
 
 def test_left_alone_they_saturate_where_the_processor_does() -> None:
@@ -241,3 +233,42 @@ def test_files_of_other_makers_give_the_same_numbers_in_these_ways(
         assert np.array_equal(ways, run(open_session(theirs, 1, optimise=False, exact=True), image))
     if int8_adds_exactly():
         assert np.array_equal(ways, run(open_session(theirs, 1), image))
+
+
+def shapes_of_weights(model: onnx.ModelProto) -> list[tuple[int, ...]]:
+    shapes = {each.name: tuple(each.dims) for each in model.graph.initializer}
+    return [shapes[node.input[3]] for node in model.graph.node if node.op_type == "QLinearConv"]
+
+
+def as_written(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
+    """On a session of onnxruntime's own, which nobody rewrites a model for."""
+    session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    return np.asarray(session.run(None, {"image": image})[0])
+
+
+@pytest.mark.parametrize("path", [shipped_pair()[1], SMALL[0]], ids=lambda path: path.stem)
+def test_no_convolution_stays_narrow_and_the_numbers_are_the_same(path: Path) -> None:
+    model, generator = load_onnx(path), np.random.default_rng(0)
+    wider = filled(model)
+    onnx.checker.check_model(wider)
+    for old, new in zip(shapes_of_weights(model), shapes_of_weights(wider), strict=True):
+        assert new[0] == max(old[0], FEWEST_OUTPUTS)
+        assert new[1] % 4 == 0
+        assert new[1] - old[1] < 4
+    for shape in ((4, 4), (37, 53), (64, 41)):
+        image = generator.random((1, 1, *shape), dtype=np.float32)
+        assert np.array_equal(as_written(wider, image), as_written(model, image))
+
+
+@pytest.mark.parametrize(
+    ("middle", "opset", "shape"), [(0, 17, (FEWEST_OUTPUTS, 4, 1, 1)), (3, 17, (1, 2, 1, 1)), (0, 10, (1, 2, 1, 1))]
+)
+def test_one_output_is_filled_where_a_stored_zero_is_a_weight_of_zero(
+    middle: int, opset: int, shape: tuple[int, ...]
+) -> None:
+    """Its bias has one number, as a scale for the whole tensor might; older opsets cannot be filled."""
+    model = convolution(np.array([[[[1]], [[-2]]]], np.int8), np.uint8, middle=middle)
+    model.opset_import[0].version = opset
+    image = np.random.default_rng(0).integers(0, 256, (1, 2, 3, 5)).astype(np.uint8)
+    assert shapes_of_weights(filled(model)) == [shape]
+    assert np.array_equal(as_written(filled(model), image), as_written(model, image))

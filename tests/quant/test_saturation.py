@@ -82,7 +82,8 @@ def test_the_shipped_file_saturates_as_the_integer_reference_says() -> None:
     assert max(plain.values()) > 0.001
 
 
-def test_a_float_network_has_nothing_to_saturate() -> None:
+def test_a_scale_that_fits_saturates_nothing_and_a_float_network_has_nothing_to_saturate() -> None:
+    assert saturated_shares(qdq(1 / 120, np.array(0, np.int8)), [IMAGE]) == {"whole": 0.0}
     node = helper.make_node("Relu", ["image"], ["restored"])
     model = make_model(helper.make_graph([node], "float", [image_info("image", 1, None)], [RESTORED]), {})
     assert rounded_tensors(model) == []

@@ -20,12 +20,12 @@ from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.graph import CORRECTION, read_network
 from beers_deploy.quant.graph.tail import Tail
 from beers_deploy.quant.integer.reference import agreement, integer_rows
-from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
+from beers_deploy.quant.onnx_file import GraphWriter
 from beers_deploy.quant.quantise import Quantised
 from beers_deploy.quant.reading.folding import simplest
 from beers_deploy.quant.session import open_session, result_of
 from benchmarks.detector.network import DetectorNetwork, detector_to_onnx, initialise
-from tests.quant.quick import copied, patches_of, quickly
+from tests.quant.quick import behind_conv, copied, patches_of, quickly
 
 SIDE_PX = 160
 
@@ -126,15 +126,6 @@ def test_a_description_with_another_tail_is_one_sentence(text: str) -> None:
     entry.value = entry.value.replace(ends.tail.text, text)
     with pytest.raises(ModelError, match="contradict"):
         encoding_faults(spoilt)
-
-
-def behind_conv(write: Callable[[GraphWriter], object]) -> onnx.ModelProto:
-    writer = GraphWriter()
-    weight = writer.constant("w", np.ones((2, 1, 3, 3), np.float32))
-    writer.node("Conv", "x", ["image", weight], "conv", kernel_shape=[3, 3], pads=[1] * 4)
-    write(writer)
-    result = helper.make_tensor_value_info("restored", TensorProto.FLOAT, None)
-    return make_model(writer.graph("g", [image_info("image", 1, 32)], [result]), {})
 
 
 def sigmoid_then_conv(w: GraphWriter) -> None:

@@ -19,7 +19,7 @@ from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import float_file, int8_file, pair_of
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import BeersError, ModelError
-from beers_deploy.quant.bounds import saturable
+from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import CORRECTION, IMAGE, Activation, Add, Conv, Graph, correction_graph, image_channels
@@ -201,8 +201,9 @@ def reference(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Me
     (even, reports), (up, _) = run_core(core, planes, half_even=True), run_core(core, planes)
     by_rule, on_board = (core.ends.finished(crop, merged_correction(core, each))[0, 0] for each in (even, up))
     # A peak above its proof would mean that the proof is wrong, not the network.
-    over, can = max(report.peak_bits - report.proven_bits for report in reports), saturable(core)
-    unproven = [report.name for report in reports if report.saturated > 0 and not can[report.name]]
+    over = max(report.peak_bits - report.proven_bits for report in reports)
+    can = {bound.name for bound in layer_bounds(core) if bound.saturates}
+    unproven = [report.name for report in reports if report.saturated > 0 and report.name not in can]
     return [
         checks.not_finite(by_rule),
         checks.differing("runtime differs", by_rule, network.infer()(crop)[0, 0]),

@@ -64,7 +64,6 @@ def test_operators_of_other_opsets_become_ours(opset: int) -> None:
     short = simplest(model, "a.onnx")
     assert [(o.domain, o.version) for o in short.opset_import] == [("", OPSET)]
     assert folded(model) == {"Conv": 1, "Resize": 1, "Clip": 1}
-    assert kinds(short) == {"Conv": 1, "Resize": 1, "Clip": 1}
     assert all(n.op_type != "Clip" or len(n.input) == 3 for n in short.graph.node)
 
 

@@ -14,10 +14,11 @@ from onnx import TensorProto, helper, numpy_helper
 from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import Variant
-from beers_deploy.quant.onnx_file import image_info, make_model
+from beers_deploy.quant.onnx_file import any_size, image_info, make_model
 from beers_deploy.quant.quantise import Quantised
-from beers_deploy.quant.samples import Patches, Remade
-from tests.quant.quick import quickly
+from beers_deploy.quant.session import open_session, result_of
+from beers_deploy.quant.tiling.walk import tiling_of
+from tests.quant.quick import patches_of, quickly
 
 
 def constant(name: str, *shape: int) -> onnx.TensorProto:
@@ -294,11 +295,37 @@ def half_resolution() -> onnx.ModelProto:
 @cache
 def quantised_half_resolution() -> Quantised:
     """The same in legal INT8, for the host and for the board."""
-    seen = np.random.default_rng(5).random((2, 1, 1, 48, 48), dtype=np.float32)
-    patches = Patches([], Remade(lambda k: (seen[k], seen[k]), 2), Remade(lambda k: seen[k], 2))
-    return quickly(half_resolution(), patches)
+    return quickly(
+        half_resolution(), patches_of(list(np.random.default_rng(5).random((2, 1, 1, 48, 48), np.float32)))
+    )
 
 
 def int8_half_resolution() -> onnx.ModelProto:
     """The host's file of it."""
     return quantised_half_resolution().host
+
+
+def spans(size_px: int, kept_px: int, halo_px: int) -> list[tuple[int, int, int, int]]:
+    """Start and stop of each window and of what is kept of it, `kept_px` at a time."""
+    marks = range(0, size_px, kept_px)
+    return [(max(k - halo_px, 0), min(k + kept_px + halo_px, size_px), k, min(k + kept_px, size_px)) for k in marks]
+
+
+def check_tiles(model: onnx.ModelProto, image: np.ndarray, all_cells: tuple[int, ...], short_px: int = 0) -> None:
+    """Tiles of so many lattice cells give the whole image (1, C, H, W) bit for bit; the halo may be too short."""
+    tiling, session = tiling_of(model), open_session(any_size(model), 1)
+    more = [(0, -n % tiling.lattice_px) for n in image.shape[2:]]
+    image = np.pad(image, ((0, 0), (0, 0), *more), mode="edge")
+    expected = result_of(session, image)
+    assert expected.shape == (1, tiling.channels_out, *(int(n * tiling.scale) for n in image.shape[2:]))
+    for cells in all_cells:
+        kept_px, rows = cells * tiling.lattice_px, []
+        sides = [spans(size, kept_px, tiling.halo_px - short_px) for size in image.shape[2:]]
+        for top, bottom, low, high in sides[0]:
+            row = []
+            for left, right, west, east in sides[1]:
+                found = result_of(session, np.ascontiguousarray(image[:, :, top:bottom, left:right]))
+                ends = [int(n * tiling.scale) for n in (low - top, high - top, west - left, east - left)]
+                row.append(found[:, :, ends[0] : ends[1], ends[2] : ends[3]])
+            rows.append(np.concatenate(row, axis=3))
+        np.testing.assert_array_equal(np.concatenate(rows, axis=2), expected)
