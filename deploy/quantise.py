@@ -1,7 +1,7 @@
 """A float network quantised: what `quantize` makes of it, layer by layer in whole numbers, and where INT8 errs."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -13,7 +13,7 @@ from beers_deploy.model.bank import bank_of_vector
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.io.tensors import read_conditioned
-from beers_deploy.model.progress import Log, Progress, reporting
+from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.model.progress import progress as begun
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Conditioned, Network, NetworkLike, SensorLike, conditioned, told_int8
@@ -37,9 +37,7 @@ from beers_deploy.report.page import Report
 from beers_deploy.report.sensitivity_page import sensitivity_page
 
 if TYPE_CHECKING:
-    from beers_deploy.model.simulator.sampling import Scene
     from beers_deploy.quant.calibration import Calibration
-    from beers_deploy.quant.core import IntCore
 
 Source: TypeAlias = "Calibration | OwnSamples"
 """Where patches come from: simulated ones, or a user's own."""
@@ -97,9 +95,9 @@ def quantize(
     if regime not in ("legal", "free"):
         raise OptionError("regime", expected="legal or free", got=repr(regime), remedy="choose one")
     steps = steps_of(finetune)
-    if banked and (regime == "free" or samples is not None):
+    if banked and (regime == "free" or steps != 0 or samples is not None):
         remedy = "leave it out: such a network is calibrated over the whole family of sensors at once"
-        expected = "no other regime or samples"
+        expected = "no other regime, samples or fine-tuning"
         raise OptionError("a network behind a bank", expected=expected, got="one", remedy=remedy)
     origin = Network.load(network, sensor=known)
     require_quantised(origin.model, origin.label, wanted=False)
@@ -108,7 +106,7 @@ def quantize(
         own = samples_of(origin.model, samples)
         if banked:
             simulated = _simulated(known, scenes, patches, patch_px, seed)
-            return replace(_banked(banked, simulated, known, target, steps), origin=origin)
+            return replace(_banked(banked, simulated, known, target), origin=origin)
         calibration: Source = own or _simulated(known, scenes, patches, patch_px, seed)
         made = _free(origin, calibration) if regime == "free" else _legal(origin, calibration, target, steps)
     return replace(made, origin=origin)
@@ -150,11 +148,9 @@ def _legal(origin: Network, calibration: Source, target: TargetProfile, steps: i
     return Network(result.host, f"{origin.name}-int8", layers=layers, quantised=result)
 
 
-def _banked(
-    network: Conditioned, calibration: "Calibration", sensor: Sensor, target: TargetProfile, steps: int | None
-) -> Network:
+def _banked(network: Conditioned, calibration: "Calibration", sensor: Sensor, target: TargetProfile) -> Network:
     """A network behind a bank, told a sensor; each integer layer on its patches."""
-    family = family_model(network, calibration.images, calibration.seed, _shifts_of(target), steps)
+    family = family_model(network, calibration.images, calibration.seed, _shifts_of(target))
     host = told_int8(family, sensor, {"target": target.name})
     layers = integer_rows(network.model(sensor, int8=False), read_core(host), host, calibration.drawn.degraded)
     return Network(host, f"{network.name}-int8", layers=layers)
@@ -200,20 +196,15 @@ def sensitivity_report(
 
 
 def family_model(
-    network: Conditioned,
-    images: Path | None = None,
-    seed: int = 0,
-    shifts: Shifts = SHIFTS,
-    steps: int | None = 0,
+    network: Conditioned, images: Path | None = None, seed: int = 0, shifts: Shifts = SHIFTS
 ) -> onnx.ModelProto:
     """The INT8 file of a network behind a bank, for the middle of the family; any sensor can be told to it.
 
     Args:
         network: of weights that 'train --conditioned' wrote.
-        images: folder of scenes that the family sees while it is calibrated and trained; None draws some.
+        images: folder of scenes that the family sees while it is calibrated; None draws some.
         seed: of the patches.
         shifts: the windows of the target.
-        steps: of training the whole numbers on these scenes; None takes as many as the shipped files took.
     """
     from beers_deploy.model.simulator.procedural import load_scenes  # SciPy, which samples of one's own do without
     from beers_deploy.quant.banked.calibrate import family_images, quantise_family
@@ -221,15 +212,7 @@ def family_model(
     weights = read_conditioned(network.weights)
     scenes, scale = load_scenes(images, load_sensor(REFERENCE).nominal(), seed), weights.variant.scale
     with begun(f"calibrating {network.name} over the family of sensors") as log:
-        trained = None if steps == 0 else _training(scenes, seed, steps, log)
         seen, middle = family_images(scenes, scale, seed), bank_of_vector((0.0,) * len(RANGES))
-        family = quantise_family(weights, middle, seen, shifts, trained, log)
+        family = quantise_family(weights, middle, seen, shifts, log)
     said = {"variant": network.name, "reference": REFERENCE, "precision": "int8 legal", "calibration_seed": str(seed)}
     return host_model(family.core, {**said, FAMILY: family.to_words(), WEIGHTS: sha256(network.weights)})
-
-
-def _training(scenes: "list[Scene]", seed: int, steps: int | None, log: Log) -> "Callable[[IntCore], IntCore]":
-    optional("torch", "finetune")
-    from beers_deploy.quant.banked.train import STEPS, family_batches, train_body
-
-    return lambda body: train_body(body, family_batches(scenes, seed), steps or STEPS, log)

@@ -1,4 +1,4 @@
-"""Makes the shipped INT8 files anew, one for all sensors each, calibrated and trained on photographs. Minutes a file.
+"""Makes the shipped INT8 files anew, one for all sensors each, calibrated on photographs. Minutes a file.
 
 python docs/make/int8.py --images aerial/ [convbeers-s ...]
 """
@@ -19,12 +19,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", default=shipped_names())
     parser.add_argument("--images", type=Path, help="folder of scenes; drawn ones if none")
-    parser.add_argument("--steps", type=int, help="of training; 3000 if none, 0 for calibration alone")
     arguments = parser.parse_args()
     for name in arguments.names:
         shipped = WEIGHTS / f"{name}{INT8}.onnx"
         network = Conditioned(name, shipped_weights(name))
-        save_onnx(family_model(network, arguments.images, steps=arguments.steps), shipped)
+        save_onnx(family_model(network, arguments.images), shipped)
         print(shipped.name, flush=True)
 
 

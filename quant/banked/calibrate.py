@@ -4,7 +4,7 @@ The body reads the bank's results of many sensors' images, rounded as the core w
 values stand for what its head's bias will be told.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -144,12 +144,7 @@ def bank_results(image: np.ndarray, bank: Bank, vector: Sequence[float], scale: 
 
 
 def quantise_family(
-    weights: Weights,
-    bank: Bank,
-    images: Remade[np.ndarray],
-    shifts: Shifts = SHIFTS,
-    trained: Callable[[IntCore], IntCore] | None = None,
-    log: Log = no_log,
+    weights: Weights, bank: Bank, images: Remade[np.ndarray], shifts: Shifts = SHIFTS, log: Log = no_log
 ) -> Family:
     """A network behind a bank in whole numbers, for the middle of the family.
 
@@ -158,11 +153,9 @@ def quantise_family(
         bank: of the middle of the family.
         images: of `bank_results`, of sensors from all over the family.
         shifts: the windows of the target.
-        trained: makes a better body of the calibrated one; None leaves it.
         log: is told each step.
     """
     body, *_ = rounded(_plan(weights, shifts), images, log)
-    body = trained(body) if trained else body
     biases = {op.name: _biases(op) for op in body.convolutions}
     ops = tuple(map(_without_values, body.ops))
     family = Family(_assembled(replace(body, ops=ops), bank, weights.variant.scale, shifts), biases, shifts)

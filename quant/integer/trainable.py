@@ -103,8 +103,8 @@ class TrainableCore(torch.nn.Module):
         bias_unit = 2.0 ** (frac_bits - op.bias_frac_bits)
         if op.output == CORRECTION and ends.copies > 1:
             return _products(op, image, to_int8(weight) * unit, (bias if ends.offsets else to_int8(bias)) * bias_unit)
-        lifted = _products(op, image, to_int8(weight) * unit, to_int8(bias) * bias_unit + lift(op.activation) * unit)
-        return rounded(lifted, op.activation, frac_bits)
+        lifted = _products(op, image, to_int8(weight) * unit, to_int8(bias) * bias_unit + _lift(op.activation) * unit)
+        return _rounded(lifted, op.activation, frac_bits)
 
 
 def _whole(values: Tensor) -> np.ndarray:
@@ -126,7 +126,7 @@ def _products(op: IntConv, image: Tensor, weight: Tensor, bias: Tensor) -> Tenso
     return wide[:, :, around[2] : wide.shape[2] - around[3], around[0] : wide.shape[3] - around[1]]
 
 
-def lift(activation: Activation = Activation.none) -> float:
+def _lift(activation: Activation = Activation.none) -> float:
     """What sums are raised by, in their unit, so that ties to even become ties up and nothing else moves.
 
     LeakyReLU divides the unit by 128 and what is added by ten.
@@ -134,7 +134,7 @@ def lift(activation: Activation = Activation.none) -> float:
     return 2.0**-5 if activation is Activation.leaky_relu else 2.0**-2
 
 
-def rounded(lifted: Tensor, activation: Activation, frac_bits: int) -> Tensor:
+def _rounded(lifted: Tensor, activation: Activation, frac_bits: int) -> Tensor:
     """Lifted sums behind their activation, in int8."""
     if activation is Activation.leaky_relu:
         lifted = functional.leaky_relu(lifted, LEAKY_SLOPE)
@@ -148,8 +148,8 @@ def _add(op: Add, read: Sequence[Tensor], bits: Bits) -> Tensor:
     one, other = (_times(values, frac_bits - bits[name]) for name, values in zip(op.inputs, read, strict=True))
     sums = one + other
     if finest > frac_bits or op.activation is Activation.leaky_relu:
-        sums = sums + lift(op.activation) * 2.0 ** (frac_bits - finest)
-    return rounded(sums, op.activation, frac_bits)
+        sums = sums + _lift(op.activation) * 2.0 ** (frac_bits - finest)
+    return _rounded(sums, op.activation, frac_bits)
 
 
 def _times(values: Tensor, power: int) -> Tensor:
@@ -158,7 +158,7 @@ def _times(values: Tensor, power: int) -> Tensor:
 
 def _mul(op: Mul, read: Sequence[Tensor], bits: Bits) -> Tensor:
     unit = 2.0 ** (bits[op.output] - sum(bits[name] for name in op.inputs))
-    return to_int8(read[0] * read[1] * unit + lift() * unit)
+    return to_int8(read[0] * read[1] * unit + _lift() * unit)
 
 
 def _max_pool(op: MaxPool, read: Sequence[Tensor], _: Bits) -> Tensor:
@@ -170,7 +170,7 @@ def _average_pool(op: AveragePool, read: Sequence[Tensor], _: Bits) -> Tensor:
     assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
     factor, shift = mean_factor(op.kernel)
     sums = functional.avg_pool2d(_padded(read[0], op.window), op.kernel, op.window.strides, divisor_override=1)
-    return to_int8((sums * factor + lift()) * 2.0**-shift)
+    return to_int8((sums * factor + _lift()) * 2.0**-shift)
 
 
 def _padded(image: Tensor, window: Window, fill: float = 0.0) -> Tensor:
@@ -182,7 +182,7 @@ def _resize(op: Resize, read: Sequence[Tensor], _: Bits) -> Tensor:
     if not op.bilinear:
         return functional.interpolate(read[0], scale_factor=op.factor, mode="nearest")
     wide = functional.interpolate(read[0], scale_factor=op.factor, mode="bilinear", align_corners=False)
-    return to_int8(wide + lift() * 2.0 ** -bilinear_weights(op.factor)[1])
+    return to_int8(wide + _lift() * 2.0 ** -bilinear_weights(op.factor)[1])
 
 
 def _shuffle(op: Shuffle, read: Sequence[Tensor], _: Bits) -> Tensor:
