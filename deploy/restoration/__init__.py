@@ -12,7 +12,7 @@ An image passes, in this order:
     runtime      the network, on onnxruntime or OpenVINO, here or by the workers of a Dask scheduler
     engine       the one tile loop, for files and arrays: `restore_rows`, `restore_array`, `restore_dn`
     output       finished rows in a checkpoint, the lock, the TIFF
-    cog          the finished TIFF cloud-optimised, by GDAL; `stac` its item for a catalogue
+    cog          the finished TIFF cloud-optimised, by GDAL; its STAC item for a catalogue
     run          all of this for one file: `restore_file`
     traditional  a file by the traditional chain instead of a network: `restore_file_traditionally`
 
