@@ -75,7 +75,7 @@ def measure(given: argparse.Namespace) -> dict[str, object]:
     fps = throughput(stamps, given.batch)
     print(f"throughput: {fps:.3f} frame/s over {len(stamps) * given.batch} frames, {given.threads} threads")
     entry: dict[str, object] = {"model": given.model.name, "configuration": given.configuration}
-    entry.update(tile_px=given.tile, fps=round(fps, 4))
+    entry.update(tile_px=given.tile, fps=round(fps, 4), provider=given.provider)
     if power_w:
         entry["power_w"] = round(statistics.fmean(power_w), 3)
     return entry

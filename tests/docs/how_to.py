@@ -39,6 +39,7 @@ LEFT_OUT = {
 SHORTER = {
     r"--provider Vitis\S+ --option \S+": "--provider CPUExecutionProvider --tile 64",
     r"--frames 300": "--frames 4",
+    r"--out board\.json": "--out processor.json",  # bench takes a board's runs alone
     r"(beers-deploy gate)": r"\1 --patches 4",
     r"(characterise\.py .*convbeers-s)\.safetensors": r"\1.safetensors --sensors 1",
     r"raw1\.tif:412,300,28,34": "raw1.tif:114,82,28,34",

@@ -28,7 +28,7 @@ RUNS, TILE_PX, FAR = 1000, (16, 1 << 16), 10_000
 """Most runs; least and most of a tile's side; and how many times off a rate of this network may be predicted."""
 SCATTER = 3
 """Variance of networks over that of boards, of ln(predicted / published): 0.13^2 and 0.07^2."""
-KEYS = {"model", "configuration", "tile_px", "fps", "power_w"}
+KEYS = {"model", "configuration", "tile_px", "fps", "power_w", "provider"}
 
 
 @dataclass(frozen=True)
@@ -107,6 +107,9 @@ def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run
     if "model" not in entry or set(entry) - KEYS:
         expected = "model, configuration, tile_px, fps"
         raise OptionError(where, expected=expected, got=str(sorted(entry)), remedy=EXAMPLE)
+    if entry.get("provider") == "CPUExecutionProvider":
+        expected, got = "a run of the board", "one of onnxruntime's CPU provider"
+        raise OptionError(where, expected=expected, got=got, remedy="measure it with the board's provider")
     tile_px = _number(entry.get("tile_px", 640), "tile_px", TILE_PX, where)
     if tile_px != int(tile_px):
         raise OptionError(where, expected="tile_px in whole pixels", got=str(tile_px), remedy=EXAMPLE)
