@@ -202,7 +202,7 @@ def family_model(
 
     Args:
         network: of weights that 'train --conditioned' wrote.
-        images: folder of scenes that the family sees while it is calibrated; None draws some.
+        images: folder of photographs that the family sees as often as drawn scenes; None takes these alone.
         seed: of the patches.
         shifts: the windows of the target.
     """
@@ -210,7 +210,11 @@ def family_model(
     from beers_deploy.quant.banked.calibrate import family_images, quantise_family
 
     weights = read_conditioned(network.weights)
-    scenes, scale = load_scenes(images, load_sensor(REFERENCE).nominal(), seed), weights.variant.scale
+    aim, scale = load_sensor(REFERENCE).nominal(), weights.variant.scale
+    scenes = load_scenes(None, aim, seed)
+    if images is not None:  # drawn scenes have stronger edges, photographs finer ground
+        photographs = load_scenes(images, aim, seed)
+        scenes = photographs + scenes * max(len(photographs) // len(scenes), 1)
     with begun(f"calibrating {network.name} over the family of sensors") as log:
         seen, middle = family_images(scenes, scale, seed), bank_of_vector((0.0,) * len(RANGES))
         family = quantise_family(weights, middle, seen, shifts, log)
