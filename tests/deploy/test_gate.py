@@ -339,12 +339,8 @@ def test_samples_without_contrast_judge_nothing() -> None:
 SMALL = "convbeers-xs"
 
 
-@pytest.mark.parametrize(
-    ("factor", "unseen_layers"), [(2, {"body.0.second", "body.2.second", "body.3.second"}), (0, {"body.2.second"})]
-)
-def test_a_baseline_shows_a_wrong_bias_in_nearly_any_layer(
-    factor: int, unseen_layers: set[str], unseen: Patches
-) -> None:
+@pytest.mark.parametrize("factor", [2, 0])
+def test_a_baseline_shows_a_wrong_bias_in_nearly_any_layer(factor: int, unseen: Patches) -> None:
     """A bias off by one scale, or lost, may hide below a limit on the MAE, seldom in a twentieth of what it was.
 
     The two that are left out add nothing but where a copy is rounded.
@@ -360,7 +356,7 @@ def test_a_baseline_shows_a_wrong_bias_in_nearly_any_layer(
         model = changed(sound, name, lambda bias: bias * factor)
         checks = judge(compare(session, open_session(model), unseen.pairs), Limits(), before)
         hidden |= {name.removesuffix(".bias")} if all(check.passed for check in checks) else set()
-    assert hidden == unseen_layers
+    assert hidden == {"body.2.second", "body.3.second"}
 
 
 def as_nodes(model: onnx.ModelProto) -> onnx.ModelProto:
