@@ -17,7 +17,7 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 
-from beers_deploy.bench.timing import interleaved, timed
+from beers_deploy.bench.timing import interleaved
 from beers_deploy.model.processor import decided, int8_adds_exactly, processor_name
 from beers_deploy.network import shipped_pair
 from beers_deploy.quant.kernels import filled, made_exact
@@ -64,8 +64,8 @@ def print_times(
         "plain": open_session(integer, threads, exact=False),
     }
     calls = [partial(run, session, image) for session in sessions.values()]
-    found = interleaved(calls, lambda call: timed(call)[1], lambda taken: len(taken[0]) > turns)
-    times_s = dict(zip(sessions, found, strict=True))
+    found = interleaved(calls, turns + 1)
+    times_s = {name: [time_s for time_s, _ in taken] for name, taken in zip(sessions, found, strict=True)}
     fastest_s = {name: min(times[1:]) for name, times in times_s.items()}  # the first turn sets up
     spread = max(median(times[1:]) / fastest_s[name] for name, times in times_s.items())
     shown = ", ".join(f"{name} {time_s:.3f} s" for name, time_s in fastest_s.items())

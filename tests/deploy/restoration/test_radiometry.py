@@ -172,7 +172,7 @@ def test_negative_and_infinite_values_stay_an_error(value: float, model: Path, t
 
 def test_8_bits_come_back_as_8_bits(model: Path, tmp_path: Path) -> None:
     eight = (noise(10) >> 2).astype(np.uint8)
-    kinds = [eight, eight.astype(np.uint16)]
+    kinds: list[np.ndarray] = [eight, eight.astype(np.uint16)]
     narrow, wide = (restored(tmp_path, each, Options(model, 23, full_scale=255))[0] for each in kinds)
     assert narrow.dtype == np.uint8
     np.testing.assert_array_equal(narrow, wide)
