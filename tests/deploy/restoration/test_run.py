@@ -242,7 +242,7 @@ def test_integers_are_packed_as_differences_and_gdal_reads_them(
     dtype: type, predictor: int, model: Path, tmp_path: Path
 ) -> None:
     rasterio = pytest.importorskip("rasterio")
-    pixels: np.ndarray = np.tile(noise(70, 90) // 20, (1, 4, 4)).astype(dtype)  # of several squares, none of them whole
+    pixels: np.ndarray = np.tile(noise(70, 90) // 20, (1, 4, 4)).astype(dtype)  # no whole square
     restored, _ = restore(tmp_path, pixels, Options(model, full_scale=255))
     with rasterio.open(tmp_path / "out.tif") as file:
         np.testing.assert_array_equal(file.read(), restored.reshape(-1, *restored.shape[-2:]))
