@@ -1,4 +1,5 @@
 import sys
+import time
 from functools import partial
 from pathlib import Path
 
@@ -50,7 +51,12 @@ def test_calls_run_round_by_round_until_there_are_enough_and_they_took_long_enou
     rounds: int, least_s: float
 ) -> None:
     ran: list[str] = []
-    found = interleaved([partial(ran.append, name) for name in ("a", "b")], rounds, least_s)
+
+    def call(name: str) -> None:
+        ran.append(name)
+        time.sleep(0.002)
+
+    found = interleaved([partial(call, name) for name in ("a", "b")], rounds, least_s)
     count = len(found[0])
     assert ran == ["a", "b"] * count
     assert [len(taken) for taken in found] == [count, count]
