@@ -1,85 +1,216 @@
-"""The effects that a sensor or a scene may call for beside blur, noise and digitising: one dataclass a TOML table.
+"""The effects that a sensor or a scene may call for beside blur, noise and digitising: one class a TOML table.
 
-A profile calls for an effect by having its table. Every field's neutral value leaves the image as it is.
+A profile calls for an effect by having its table. A class has its parameters with their limits, what it does to an
+image, the most that it may change of it, and what that costs. At their neutral values they leave the image as it is.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, get_type_hints
 
 import numpy as np
 
 from beers_deploy.profiles.constant import Constant, check_keys, read_constant
 from beers_deploy.profiles.errors import ProfileError
 
+if TYPE_CHECKING:
+    from beers_deploy.profiles.sensor import Instrument
+
+PATTERN_LIMIT = 4.0
+"""Detectors further out are rejected at the factory: draws are clipped here, so that bounds can be proven."""
+
+Generator = Callable[[], np.random.Generator]
+"""Makes the generator of an effect, for those that draw."""
+
 
 @dataclass(frozen=True)
-class AntiAlias:
+class Effect:
+    """Parameters, each a number within the limits that its annotation states."""
+
+    cost: ClassVar[str] = "none: part of the MTF"
+
+    @classmethod
+    def limits(cls) -> dict[str, tuple[float, float]]:
+        """The least and the largest value of each parameter."""
+        hints = get_type_hints(cls, include_extras=True).items()
+        return {name: hint.__metadata__[0] for name, hint in hints if hasattr(hint, "__metadata__")}
+
+
+@dataclass(frozen=True)
+class PixelEffect(Effect, ABC):
+    """An effect on the sampled image, in radiance (W/m2/sr/um) or in digital numbers (DN)."""
+
+    acts_on: ClassVar[Literal["radiance", "DN"]]
+    cost: ClassVar[str] = "1 pass"
+    unseen: ClassVar[str] = ""
+    """Why a scene cannot show it where its bound is zero; without it, its parameters are neutral."""
+
+    @property
+    def growth(self) -> float:
+        """The largest factor by which it enlarges a change of the image that it is given."""
+        return 1.0
+
+    @abstractmethod
+    def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
+        """An image (..., H, W) with the effect."""
+
+    @abstractmethod
+    def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
+        """Largest change of any pixel, in DN, for a signal between `low` and `high` radiance."""
+
+
+@dataclass(frozen=True)
+class AntiAlias(Effect):
     """A Gaussian filter of standard deviation sigma_px target pixels, part of the MTF's budget; 0 is none."""
 
-    sigma_px: float
+    sigma_px: Annotated[float, (0.0, 5.0)]
 
 
 @dataclass(frozen=True)
-class Smear:
+class Smear(Effect):
     """Motion along the track during one exposure, in target pixels; 0 is none."""
 
-    length_px: float
+    length_px: Annotated[float, (0.0, 20.0)]
 
 
 @dataclass(frozen=True)
-class Haze:
-    """Haze, table `veil`: transmittance of the atmosphere (1 is clear), path radiance in W/m2/sr/um (0 is none)."""
+class Haze(PixelEffect):
+    """Haze, table `veil`: transmittance of the atmosphere (1 is clear), path radiance in W/m2/sr/um (0 is none).
 
-    transmittance: float
-    path_radiance: float
+    It is the same before and after the blur, whose gain at frequency 0 is 1.
+    """
+
+    transmittance: Annotated[float, (0.0, 1.0)]
+    path_radiance: Annotated[float, (0.0, 1e4)]
+    acts_on = "radiance"
+
+    def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
+        return image * self.transmittance + self.path_radiance
+
+    def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
+        changes = (abs((self.transmittance - 1) * v + self.path_radiance) for v in (low, high))
+        return sensor.gain_dn_per_radiance * max(changes)  # affine in L: the ends decide
 
 
 @dataclass(frozen=True)
-class Prnu:
+class FullWell(PixelEffect):
+    """Radiance in W/m2/sr/um at which a detector is full, and the share of the excess that runs along the column.
+
+    L' = min(L + share * (k * max(L - well, 0)), well). k spreads the excess up and down the column, falling by e
+    every `blooming_px` pixels, and sums to 1 at most (what leaves the image is lost). Below the well nothing changes;
+    share 0 is a plain clip.
+    """
+
+    radiance: Annotated[float, (1e-6, 1e6)]
+    blooming_share: Annotated[float, (0.0, 0.5)]
+    blooming_px: Annotated[float, (0.0, 64.0)]
+    acts_on = "radiance"
+    cost = "1 pass, 1 convolution if it blooms"
+    unseen = "the brightest signal stays below the well"
+
+    @property
+    def growth(self) -> float:
+        return 1 + self.blooming_share
+
+    def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
+        excess = np.maximum(image - self.radiance, 0)
+        if self.blooming_share > 0 and self.blooming_px > 0 and (excess > 0).any():
+            image = image + self.blooming_share * _spread(excess, self.blooming_px)
+        return np.asarray(np.minimum(image, self.radiance))
+
+    def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
+        return sensor.gain_dn_per_radiance * max(high - self.radiance, 0.0)  # what is cut off or spilt
+
+
+@dataclass(frozen=True)
+class Prnu(PixelEffect):
     """Relative spread of the detectors' responses, one detector a column; 0 is none."""
 
-    rms: float
+    rms: Annotated[float, (0.0, 0.2)]
+    acts_on = "radiance"
+    cost = "1 draw a column"
+
+    @property
+    def growth(self) -> float:
+        return 1 + PATTERN_LIMIT * self.rms
+
+    def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
+        return image * (1 + self.rms * _columns(image, generator()))
+
+    def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
+        return sensor.gain_dn_per_radiance * PATTERN_LIMIT * self.rms * max(abs(low), abs(high))
 
 
 @dataclass(frozen=True)
-class Dsnu:
+class Dsnu(PixelEffect):
     """Spread of the detectors' offsets in DN, one detector a column; 0 is none."""
 
-    rms_dn: float
+    rms_dn: Annotated[float, (0.0, 1e4)]
+    acts_on = "DN"
+    cost = "1 draw a column"
+
+    def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
+        return image + self.rms_dn * _columns(image, generator())
+
+    def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
+        return PATTERN_LIMIT * self.rms_dn
 
 
 @dataclass(frozen=True)
-class Striping:
-    """Difference in DN between even and odd columns, read out by two amplifiers; 0 is none."""
+class Striping(PixelEffect):
+    """Difference in DN between even and odd columns, read out by two amplifiers; 0 is none.
 
-    odd_even_dn: float
+    Half of it is added to even columns and taken from odd ones.
+    """
+
+    odd_even_dn: Annotated[float, (0.0, 1e4)]
+    acts_on = "DN"
+
+    def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
+        return image + self.odd_even_dn * (0.5 - (np.arange(image.shape[-1]) % 2).astype(image.dtype))
+
+    def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
+        return self.odd_even_dn / 2
 
 
 @dataclass(frozen=True)
-class FullWell:
-    """Radiance in W/m2/sr/um at which a detector is full, and the share of the excess that runs along the column."""
-
-    radiance: float
-    blooming_share: float
-    blooming_px: float
-
-
-@dataclass(frozen=True)
-class Offset:
+class Offset(PixelEffect):
     """Digital number of the dark; 0 is none."""
 
-    offset_dn: float
+    offset_dn: Annotated[float, (0.0, 65535.0)]
+    acts_on = "DN"
+
+    def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
+        return image + self.offset_dn
+
+    def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
+        return self.offset_dn
 
 
 @dataclass(frozen=True)
-class Defects:
+class Defects(PixelEffect):
     """Dead pixels (always 0) and hot ones (always full scale), per million; 0 is none."""
 
-    dead_per_million: float
-    hot_per_million: float
+    dead_per_million: Annotated[float, (0.0, 1e6)]
+    hot_per_million: Annotated[float, (0.0, 1e6)]
+    acts_on = "DN"
+    cost = "1 draw a pixel"
 
+    def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
+        draw = generator().random(image.shape, dtype=np.float32)
+        dead, hot = self.dead_per_million / 1e6, self.hot_per_million / 1e6
+        image = np.where(draw < dead, np.float32(0), image)
+        # One draw decides both, so a pixel is never dead and hot.
+        return np.where(draw >= 1 - hot, np.float32(sensor.max_dn), image) if hot > 0 else image
 
-Effect = AntiAlias | Smear | Haze | Prnu | Dsnu | Striping | FullWell | Offset | Defects
+    def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
+        if self.dead_per_million + self.hot_per_million == 0:
+            return 0.0
+        # A pixel becomes 0 or full scale, whatever it was before: beyond the converter's range too.
+        ends = [sensor.gain_dn_per_radiance * v for v in (low, high)]
+        return max(max(abs(dn), abs(sensor.max_dn - dn)) for dn in ends)
+
 
 TABLES: dict[str, type[Effect]] = {
     "antialias": AntiAlias,
@@ -92,35 +223,48 @@ TABLES: dict[str, type[Effect]] = {
     "offset": Offset,
     "defects": Defects,
 }
+"""By their tables; those of the image in the order in which they apply."""
 
-LIMITS: dict[str, tuple[float, float]] = {
-    "sigma_px": (0.0, 5.0),
-    "length_px": (0.0, 20.0),
-    "transmittance": (0.0, 1.0),
-    "path_radiance": (0.0, 1e4),
-    "rms": (0.0, 0.2),
-    "rms_dn": (0.0, 1e4),
-    "odd_even_dn": (0.0, 1e4),
-    "radiance": (1e-6, 1e6),
-    "blooming_share": (0.0, 0.5),
-    "blooming_px": (0.0, 64.0),
-    "offset_dn": (0.0, 65535.0),
-    "dead_per_million": (0.0, 1e6),
-    "hot_per_million": (0.0, 1e6),
-}
+
+def pixel_effects(effects: Mapping[str, Effect], acts_on: str) -> dict[str, PixelEffect]:
+    """The effects on radiance, or those on DN, in the order in which they apply."""
+    found = ((name, effects.get(name)) for name in TABLES)
+    return {name: effect for name, effect in found if isinstance(effect, PixelEffect) and effect.acts_on == acts_on}
+
+
+def _columns(image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """One clipped standard normal number a column, (W,) float32."""
+    draw = generator.standard_normal(image.shape[-1], dtype=np.float32)
+    return np.asarray(np.clip(draw, -PATTERN_LIMIT, PATTERN_LIMIT))
+
+
+def _spread(excess: np.ndarray, length_px: float) -> np.ndarray:
+    """Convolve each column of (..., H, W) with the two-sided exponential without its centre, normalised."""
+    radius = min(int(6 * length_px) + 1, excess.shape[-2] - 1)
+    if radius < 1:
+        return np.zeros_like(excess)
+    distance = np.abs(np.arange(-radius, radius + 1, dtype=np.float64))
+    with np.errstate(over="ignore"):  # of a length near 0 no neighbour is reached
+        kernel = np.exp(-distance / length_px) * (distance > 0)
+    if kernel.sum() == 0:  # so short that not even a neighbour is reached
+        return np.zeros_like(excess)
+    from scipy.ndimage import convolve1d  # a sixth of a second to load, for what few sensors have
+
+    return np.asarray(convolve1d(excess, kernel / kernel.sum(), axis=-2, mode="constant"))
+
 
 Table = Mapping[str, Constant]
 
 
 def read_effect(where: str, name: str, raw: object) -> Table:
     """Read one effect's table of a TOML file: every key of its dataclass and no other, each within its limits."""
-    keys = [field.name for field in fields(TABLES[name])]
+    limits = TABLES[name].limits()
     if not isinstance(raw, Mapping):
         raise ProfileError(where, expected=f"a table [{name}]", got=repr(raw), remedy="write it as one")
-    check_keys(where, raw, required=set(keys))
-    table = {key: read_constant(f"{where} {key}", raw[key]) for key in keys}
+    check_keys(where, raw, required=set(limits))
+    table = {key: read_constant(f"{where} {key}", raw[key]) for key in limits}
     for key, constant in table.items():
-        low, high = LIMITS[key]
+        low, high = limits[key]
         if not low <= constant.low <= constant.high <= high:
             raise ProfileError(
                 f"{where} {key}", expected=f"{low:g} to {high:g}", got=str(constant), remedy="correct the value"

@@ -17,19 +17,9 @@ from typing import Literal
 import numpy as np
 from scipy import fft
 
-from beers_deploy.model.simulator.detector import DN_EFFECTS, NOISE_LIMIT, PATTERN_LIMIT, RADIANCE_EFFECTS
+from beers_deploy.model.simulator.detector import NOISE_LIMIT
 from beers_deploy.model.simulator.mtf import Blur, smear_response, transfer_function
-from beers_deploy.profiles.effects import (
-    TABLES,
-    Defects,
-    Dsnu,
-    Effect,
-    FullWell,
-    Haze,
-    Offset,
-    Prnu,
-    Striping,
-)
+from beers_deploy.profiles.effects import TABLES, PixelEffect, pixel_effects
 from beers_deploy.profiles.sensor import Instrument, mtf_limit
 
 
@@ -83,30 +73,6 @@ def smear_moments(height: int, oversampling: int, length_px: float) -> tuple[flo
     return float(np.abs(kernel).sum()) / 2, float((np.abs(kernel) * distance).sum())
 
 
-def effect_bound_dn(effect: Effect, sensor: Instrument, low: float, high: float) -> float:
-    """Largest change of any pixel by an effect of the target grid, for a signal between low and high radiance."""
-    gain, brightest = sensor.gain_dn_per_radiance, max(abs(low), abs(high))
-    match effect:
-        case Haze():  # affine in L: the ends decide
-            return gain * max(abs((effect.transmittance - 1) * v + effect.path_radiance) for v in (low, high))
-        case FullWell():  # below the well nothing; above it, what is cut off or spilt
-            return gain * max(high - effect.radiance, 0.0)
-        case Prnu():
-            return gain * PATTERN_LIMIT * effect.rms * brightest
-        case Dsnu():
-            return PATTERN_LIMIT * effect.rms_dn
-        case Striping():
-            return effect.odd_even_dn / 2
-        case Offset():
-            return effect.offset_dn
-        case Defects():
-            # A pixel becomes 0 or full scale, whatever it was before: beyond the converter's range too.
-            rate, ends = effect.dead_per_million + effect.hot_per_million, [gain * v for v in (low, high)]
-            return max(max(abs(dn), abs(sensor.max_dn - dn)) for dn in ends) if rate else 0.0
-        case _:
-            return 0.0  # anti-alias and smear: the transfer function has bounds of its own
-
-
 def behind(name: str, change_dn: float, sensor: Instrument) -> float:
     """What a change of the signal by the effect `name` may become through those that come after it.
 
@@ -116,10 +82,8 @@ def behind(name: str, change_dn: float, sensor: Instrument) -> float:
     gain, change = sensor.gain_dn_per_radiance, change_dn
     for later in ORDER[ORDER.index(name) + 1 :]:
         effect = sensor.effects.get(later)
-        if isinstance(effect, FullWell):
-            change *= 1 + effect.blooming_share
-        if isinstance(effect, Prnu):
-            change *= 1 + PATTERN_LIMIT * effect.rms
+        if isinstance(effect, PixelEffect):
+            change *= effect.growth
         if later == "noise" and change > 0:
             variance = sensor.alpha * change / gain
             slope = variance / (2 * math.sqrt(sensor.beta)) if sensor.beta > 0 else math.inf
@@ -132,16 +96,27 @@ TOLERANCE_DN = 0.25
 
 Choice = Literal["applied", "not called for", "neutral", "cannot show"]
 
+PIXEL_EFFECTS = {name: kind for name, kind in TABLES.items() if issubclass(kind, PixelEffect)}
+
+
+def costs(acts_on: str) -> dict[str, str]:
+    """Of the effects on radiance, or on DN."""
+    return {name: kind.cost for name, kind in PIXEL_EFFECTS.items() if kind.acts_on == acts_on}
+
+
 COSTS = {
-    "mtf": "2 transforms of the scene", "antialias": "none: part of the MTF", "smear": "none: part of the MTF",
-    "sampling": "folding of the spectrum", "veil": "1 pass", "full_well": "1 pass, 1 convolution if it blooms",
-    "prnu": "1 draw a column", "noise": "1 draw a pixel", "dsnu": "1 draw a column", "striping": "1 pass",
-    "offset": "1 pass", "defects": "1 draw a pixel", "digitising": "1 pass",
-}  # fmt: skip
+    "mtf": "2 transforms of the scene",
+    **{name: kind.cost for name, kind in TABLES.items() if name not in PIXEL_EFFECTS},
+    "sampling": "folding of the spectrum",
+    **costs("radiance"),
+    "noise": "1 draw a pixel",
+    **costs("DN"),
+    "digitising": "1 pass",
+}
 ORDER = tuple(COSTS)
 """That of the light."""
 
-UNSEEN = {"mtf": "the scene is constant", "full_well": "the brightest signal stays below the well"}
+UNSEEN = {"mtf": "the scene is constant"} | {name: kind.unseen for name, kind in PIXEL_EFFECTS.items()}
 """Why an effect whose bound is zero cannot show, where that is the scene's doing."""
 
 
@@ -209,17 +184,15 @@ def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
         total *= 1 + 2 * size
     # The blurred pixel and the plain mean of its scene pixels lie in one range: they differ by its width at most.
     bounds["mtf"] = behind("mtf", gain * (1 + total) / 2 * span, sensor)
-    for name in RADIANCE_EFFECTS:
-        if name in sensor.effects:
-            direct = effect_bound_dn(sensor.effects[name], sensor, low, high)
-            bounds[name] = behind(name, direct, sensor)
-            low, high = low - direct / gain, high + direct / gain  # whether it is applied or not
+    for name, effect in pixel_effects(sensor.effects, "radiance").items():
+        direct = effect.bound_dn(sensor, low, high)
+        bounds[name] = behind(name, direct, sensor)
+        low, high = low - direct / gain, high + direct / gain  # whether it is applied or not
     bounds["noise"] = gain * NOISE_LIMIT * sensor.noise_sigma(max(high, 0.0))
     low, high = low - bounds["noise"] / gain, high + bounds["noise"] / gain
-    for name in DN_EFFECTS:
-        if name in sensor.effects:
-            bounds[name] = effect_bound_dn(sensor.effects[name], sensor, low, high)
-            low, high = low - bounds[name] / gain, high + bounds[name] / gain
+    for name, effect in pixel_effects(sensor.effects, "DN").items():
+        bounds[name] = effect.bound_dn(sensor, low, high)
+        low, high = low - bounds[name] / gain, high + bounds[name] / gain
     return bounds
 
 

@@ -8,11 +8,11 @@ from functools import partial
 import numpy as np
 
 from beers_deploy.model.simulator.acquire import without
-from beers_deploy.model.simulator.detector import DN_EFFECTS, RADIANCE_EFFECTS, Draw, add_noise, apply_effect
+from beers_deploy.model.simulator.detector import Draw, add_noise
 from beers_deploy.model.simulator.mtf import Blur, mtf, sensor_transfer
 from beers_deploy.model.simulator.sampling import crop_divisible, sample, scene_spectrum
 from beers_deploy.profiles import load_sensor
-from beers_deploy.profiles.effects import Effect, middle_effect
+from beers_deploy.profiles.effects import Effect, PixelEffect, middle_effect, pixel_effects
 from beers_deploy.profiles.response import MtfTable, PointSpread, Response, packed
 from beers_deploy.profiles.scene_call import typical_effects
 from beers_deploy.profiles.sensor import Instrument
@@ -35,14 +35,10 @@ def before_digitising(
         height, width = radiance.shape
         transfer = sensor_transfer(height, width, ratio, without(sensor, skip))
         signal = sample(scene_spectrum(radiance), transfer, width, ratio)
-    for name in RADIANCE_EFFECTS:
-        signal = _apply(signal, name, sensor, draw, skip)
+    signal = _apply(signal, "radiance", sensor, draw, skip)
     if "noise" not in skip:
         signal = add_noise(signal, sensor, draw.generator("noise-degraded"))
-    dn = signal * sensor.gain_dn_per_radiance
-    for name in DN_EFFECTS:
-        dn = _apply(dn, name, sensor, draw, skip)
-    return dn
+    return _apply(signal * sensor.gain_dn_per_radiance, "DN", sensor, draw, skip)
 
 
 def pixel_means(radiance: np.ndarray, ratio: int) -> np.ndarray:
@@ -51,15 +47,16 @@ def pixel_means(radiance: np.ndarray, ratio: int) -> np.ndarray:
     return np.asarray(crop_divisible(radiance, ratio).reshape(height, ratio, width, ratio).mean((1, 3)))
 
 
-def _apply(image: np.ndarray, name: str, sensor: Instrument, draw: Draw, skip: Collection[str]) -> np.ndarray:
-    if name in skip or name not in sensor.effects:
-        return image
-    return apply_effect(image, sensor.effects[name], sensor, partial(draw.generator, f"{name}-degraded"))
+def _apply(image: np.ndarray, acts_on: str, sensor: Instrument, draw: Draw, skip: Collection[str]) -> np.ndarray:
+    for name, effect in pixel_effects(sensor.effects, acts_on).items():
+        if name not in skip:
+            image = effect.apply(image, sensor, partial(draw.generator, f"{name}-degraded"))
+    return image
 
 
-def alone(effect: Effect, image: np.ndarray, seed: int = 0) -> np.ndarray:
+def alone(effect: PixelEffect, image: np.ndarray, seed: int = 0) -> np.ndarray:
     """One effect of the target grid on an image (..., H, W)."""
-    return apply_effect(image, effect, plain_sensor(), partial(Draw(seed).generator, "alone"))
+    return effect.apply(image, plain_sensor(), partial(Draw(seed).generator, "alone"))
 
 
 def with_response(sensor: Instrument, response: Response) -> Instrument:

@@ -11,7 +11,15 @@ from hypothesis import strategies as st
 
 from beers_deploy.model.simulator.acquire import prepare_scene, simulate_planned, without
 from beers_deploy.model.simulator.detector import Draw
-from beers_deploy.model.simulator.plan import TOLERANCE_DN, Plan, effect_bounds, make_plan, ringing_of, scene_stats
+from beers_deploy.model.simulator.plan import (
+    ORDER,
+    TOLERANCE_DN,
+    Plan,
+    effect_bounds,
+    make_plan,
+    ringing_of,
+    scene_stats,
+)
 from beers_deploy.model.simulator.sampling import crop_divisible
 from beers_deploy.profiles.effects import (
     AntiAlias,
@@ -208,7 +216,7 @@ def test_what_is_skipped_fits_the_tolerance_together() -> None:
 def test_a_plan_is_data() -> None:
     plan = make_plan(stages.plain_sensor(**stages.TYPICAL), scene_stats(SCENE, 2))
     assert json.loads(json.dumps(plan.to_json()))["tolerance_dn"] == TOLERANCE_DN
-    assert len(plan.decisions) == 13
+    assert [decision.effect for decision in plan.decisions] == [*ORDER]
 
 
 def test_a_flat_scene_is_simulated_without_a_transform() -> None:
