@@ -117,6 +117,9 @@ def restore(
     """
     if method not in (NETWORK, TRADITIONAL):
         raise OptionError("method", expected=f"{NETWORK} or {TRADITIONAL}", got=repr(method), remedy="choose one")
+    if method == TRADITIONAL and (network is not None or cog or resume):
+        name = "network" if network is not None else "cog" if cog else "resume"
+        raise OptionError(name, expected="none with method traditional", got="one", remedy="leave it out")
     known = Sensor.load(sensor)
     found = Network.load(f"{VARIANT}{INT8}" if network is None else network, sensor=known)
     told = {} if known.name == BLIND else {"": known}

@@ -188,11 +188,13 @@ def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
         direct = effect.bound_dn(sensor, low, high)
         bounds[name] = behind(name, direct, sensor)
         low, high = low - direct / gain, high + direct / gain  # whether it is applied or not
-    bounds["noise"] = gain * NOISE_LIMIT * sensor.noise_sigma(max(high, 0.0))
-    low, high = low - bounds["noise"] / gain, high + bounds["noise"] / gain
+    noise = gain * NOISE_LIMIT * sensor.noise_sigma(max(high, 0.0))
+    bounds["noise"] = behind("noise", noise, sensor)
+    low, high = low - noise / gain, high + noise / gain
     for name, effect in pixel_effects(sensor.effects, "DN").items():
-        bounds[name] = effect.bound_dn(sensor, low, high)
-        low, high = low - bounds[name] / gain, high + bounds[name] / gain
+        direct = effect.bound_dn(sensor, low, high)
+        bounds[name] = behind(name, direct, sensor)
+        low, high = low - direct / gain, high + direct / gain
     return bounds
 
 

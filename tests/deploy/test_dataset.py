@@ -14,6 +14,7 @@ from PIL import Image
 from beers_deploy.cluster import open_cluster
 from beers_deploy.model.dataset import CHUNK, DatasetRecipe, make_patches, plan_windows, write_dataset
 from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.effects import TABLES
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.scene_call import calling_for, load_scene_call, origins, scene_names, typical_effects
 from tests.deploy.command_line import done, refused
@@ -116,7 +117,7 @@ def test_a_drawn_scene_needs_no_file(scene: Path) -> None:
 
 
 def test_every_effect_has_a_typical_value_and_every_scene_loads() -> None:
-    assert len(typical_effects()) == 9
+    assert [*typical_effects()] == [*TABLES]
     assert scene_names() == ["desert-noon", "haze-over-sea", "night-port", "snow"]
     profile = load_sensor("pleiades-degraded")
     for name in scene_names():

@@ -240,6 +240,8 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
     "no such sensor": (lambda raw: bd.restore(raw, sensor="none"), "expected one of"),
     "no such network": (lambda raw: bd.restore(raw, "none"), "a shipped network"),
     "no network": (lambda _: bd.Network.load(3), r"torch.nn.Module"),  # type: ignore[arg-type]
+    "a network of no use": (lambda raw: bd.restore(raw, SMALL, method="traditional"), "network: expected none"),
+    "a COG of no use": (lambda _: bd.restore("raw.tif", out="a.tif", method="traditional", cog=True), "cog: exp"),
     "no method": (lambda _: bd.restore("raw.tif", out="a.tif", method="x"), "method: exp"),  # type: ignore[arg-type]
     "8 bits": (lambda raw: bd.restore(raw.astype(np.uint8)), "full_scale"),
     "shares": (lambda raw: bd.restore(raw / 4095), "full_scale"),
