@@ -182,7 +182,7 @@ class Network:
         """A file that holds it: its own, or one that goes with this process."""
         if self.path is not None:
             return self.path
-        path = _folder() / f"{_file_stem(self.name)}-{self.sha256[:12]}.onnx"
+        path = _place(self.name, self.sha256)
         return path if path.is_file() else self.save(path)
 
     def __eq__(self, other: object) -> bool:
@@ -347,16 +347,18 @@ def _folder() -> Path:
 def _written(network: Conditioned, sensor: Sensor, int8: bool, log: Log) -> Path:
     warn_outside(sensor, log)
     stem = network.name + (INT8 if int8 else "")
-    known = _file_stem(sensor.name)
     told = json.dumps({"weights": sha256(network.weights), "sensor": numbers_of(sensor)}, sort_keys=True, default=str)
-    path = _folder() / f"{stem}-{known}-{hashlib.sha256(told.encode()).hexdigest()[:12]}.onnx"
+    path = _place(stem, hashlib.sha256(told.encode()).hexdigest())
     if not path.is_file():
         save_onnx(network.model(sensor, int8), path)
     return path
 
 
-def _file_stem(name: str) -> str:
-    return re.sub(r"[^\w.-]+", "-", name)[:40]
+def _place(name: str, digest: str) -> Path:
+    """Of a file of this process, named for the tables that show it."""
+    folder, stem = _folder() / digest[:12], re.sub(r"[^\w.-]+", "-", name)[:40]
+    folder.mkdir(exist_ok=True)
+    return folder / f"{stem}.onnx"
 
 
 def told_int8(
