@@ -93,13 +93,18 @@ def bank_of_vector(vector: tuple[float, ...]) -> Bank:
     """As `network_bank`, of the sensor that a sensor vector (4,) tells of."""
     ends = zip(vector, RANGES.values(), strict=True)
     across, along, _, sigma = (low * (high / low) ** ((entry + 1) / 2) for entry, (low, high) in ends)
-    axes = replace(load_sensor(REFERENCE).nominal(), mtf_nyquist=across, mtf_nyquist_along=along, effects={})
+    axes = replace(_reference(), mtf_nyquist=across, mtf_nyquist_along=along, effects={})
     return _bank(axes, sigma)
+
+
+@lru_cache
+def _reference() -> Instrument:
+    return load_sensor(REFERENCE).nominal()
 
 
 def _bank(sensor: Instrument, sigma: float) -> Bank:
     fy, fx = np.fft.fftfreq(GRID)[:, None], np.fft.fftfreq(GRID)[None, :]
-    blur, target = (sensor_mtf(fx, fy, each) for each in (sensor, load_sensor(REFERENCE).nominal()))
+    blur, target = (sensor_mtf(fx, fy, each) for each in (sensor, _reference()))
     r_squared = (fx**2 + fy**2) / NYQUIST**2
     epsilons = [EPSILON_PER_SIGMA * sigma * STEP ** (k - 1) for k in range(FILTERS)]
     gains = [restoring_gain(blur, target, r_squared, epsilon) for epsilon in epsilons]

@@ -199,12 +199,13 @@ def quantise_free(
         known = {name: scales.get(name, Scale(STREAM_STEP)) for name in (PLANES, *tensors(fine))}
         return free_model(fine, known, ends, *more)
 
-    targets = search_targets(graph, ends, patches.degraded)
+    found = streams(graph)
+    targets = search_targets(graph, ends, patches.degraded) if found else []
 
     def trial(tried: Graph) -> Costs:
         return crop_costs(written(tried), targets)
 
-    for stream in streams(graph):
+    for stream in found:
         log("equalising the channels of the residual stream")
         ranges = channel_ranges(graph, stream, patches.degraded, ends)
         graph = equalise(graph, stream, search(graph, stream, ranges, trial))

@@ -35,7 +35,6 @@ from beers_deploy.quant.graph import (
     tensors,
     tied,
 )
-from beers_deploy.quant.graph.tail import Tail
 from beers_deploy.quant.onnx_file import fixed_tile_px, metadata
 from beers_deploy.quant.passes.copies import Copies, ranges_apart, with_copies
 from beers_deploy.quant.passes.equalise import (
@@ -111,7 +110,6 @@ class Plan:
     ends: Ends
     streams: list[Stream]
     chain: Chain
-    tail: Tail | None
     shifts: Shifts
     pairs: bool = True
 
@@ -195,7 +193,7 @@ def quantise_model(
     network = read_network(model)
     graph = read_planes(network.graph)
     ends, found = ends_of(network, 2 if network.adds_image and takes_gains(graph) else 1), streams(graph)
-    plan = Plan(graph, ends, found, _chain(graph, ends, found), network.tail, shifts, pairs)
+    plan = Plan(graph, ends, found, _chain(graph, ends, found), shifts, pairs)
     core, final, last_sum = rounded(plan, patches.degraded, log)
     core = replace(core, ends=replace(core.ends, tail=network.tail))
     if tuning:

@@ -85,8 +85,8 @@ class Backbone(nn.Module):
     def forward(self, image: Tensor) -> list[Tensor]:
         """Grey (N, 1, H, W), 0 to 1, as three equal channels, and its compared feature maps, each after a ReLU.
 
-        In the precision of the parameters, whatever the caller's autocast. The scaling layer of `lpips` is ImageNet's
-        figures after [-1, 1].
+        The image takes the precision of the parameters; the features do so without autocast. The scaling layer of
+        `lpips` is ImageNet's figures after [-1, 1].
         """
         colour = image.to(next(self.parameters()).dtype).expand(-1, 3, -1, -1)
         mean, std = (colour.new_tensor(x)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))

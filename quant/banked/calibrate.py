@@ -184,7 +184,7 @@ def _plan(weights: Weights, shifts: Shifts) -> Plan:
     inner = tuple(lone_tensors(graph))
     chain = Chain(inner, (weights.variant.features,) * len(inner), by_channel=False)
     # A pair in the last sum costs 10 to 18 % of the time, and bought 0.007 dB at most: what limits lies elsewhere.
-    return Plan(graph, ends, streams(graph), chain, None, shifts, pairs=False)
+    return Plan(graph, ends, streams(graph), chain, shifts, pairs=False)
 
 
 PATCHES, SNR = 80, (90.0, 165.0)

@@ -225,7 +225,7 @@ def _inferred(node: Node, known: list[Shape], constants: Mapping[str, np.ndarray
         if name in constants:
             value = constants[name]
             types[name] = helper.make_tensor_type_proto(helper.np_dtype_to_tensor_dtype(value.dtype), value.shape)
-            if value.size <= LIST_VALUES:
+            if value.size <= LIST_VALUES:  # weights are longer, and say nothing of sizes
                 data[name] = numpy_helper.from_array(value)
         elif (shape := next(shapes, None)) is not None:
             types[name] = helper.make_tensor_type_proto(TensorProto.FLOAT, [1, *shape])

@@ -191,6 +191,7 @@ def _mean(shapes: Shapes, _: Nodes, node: NodeProto) -> list[NodeProto] | None:
     pool = helper.make_node("GlobalAveragePool", node.input, [pooled], name=node.name)
     if pooled == node.output[0]:
         return [pool]
+    shapes[pooled] = (*shapes[node.input[0]][:2], 1, 1)
     return [pool, helper.make_node("Flatten", [pooled], node.output, name=f"{node.output[0]}.flat")]
 
 
@@ -238,9 +239,10 @@ def _scale_inputs(graph: Nodes, node: NodeProto, affine: Affine) -> None:
 
 def _depthwise(shapes: Shapes, graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
     """A normalisation of images that no convolution took in: a depthwise one of a single pixel."""
+    taken = _behind(graph, node)  # into one in front that has just become a convolution
     found = _affine(graph, node) if node.op_type == NORMALISATION else None
-    if found is None or len(shapes.get(node.input[0], ())) != 4:
-        return None
+    if taken is not None or found is None or len(shapes.get(node.input[0], ())) != 4:
+        return taken
     source, affine = found
     name = node.name or node.output[0]
     made = helper.make_node("Conv", [source], node.output, name=name, kernel_shape=[1, 1])

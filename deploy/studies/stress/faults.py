@@ -20,7 +20,7 @@ from beers_deploy.quant.integer.reference import SOUND, Faults, merged_correctio
 MEGABIT = 1e6
 INT8_BITS, PIXEL_BITS, SHIFT_BITS = 8, 12, 6
 Shifts = dict[tuple[str, str], int]
-"""By operation and field, as `quant.integer.Faults` takes them."""
+"""By operation and field, as `Faults` takes them."""
 
 
 def flip_count(bits: int, per_megabit: float, generator: np.random.Generator) -> int:

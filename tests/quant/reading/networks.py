@@ -141,6 +141,18 @@ CASES: dict[str, tuple[list[NodeProto], dict[str, int]]] = {
         [node("ReduceMean", "x", to="m", axes=[2, 3], keepdims=0), node("Unsqueeze", "m", "axes")],
         {"GlobalAveragePool": 1, "Flatten": 1, "Unsqueeze": 1},
     ),
+    "a mean, fully connected": (
+        [
+            node("ReduceMean", "x", to="m", axes=[2, 3], keepdims=0),
+            node("Gemm", "m", "square", "b", to="g", transB=1),
+            node("Unsqueeze", "g", "axes"),
+        ],
+        {"GlobalAveragePool": 1, "Conv": 1, "Flatten": 1, "Unsqueeze": 1},
+    ),
+    "normalised twice, with no convolution in front": (
+        [node("Relu", "x", to="r"), normal("r", "n"), normal("n", "m"), node("Relu", "m")],
+        {"Relu": 2, "Conv": 1},
+    ),
     "a mean over channels": ([node("ReduceMean", "x", axes=[1])], {"ReduceMean": 1}),
     "three summed": ([conv(), conv("c", "d"), node("Sum", "x", "c", "d")], {"Conv": 2, "Add": 2}),
     "what does nothing": (
