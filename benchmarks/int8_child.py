@@ -1,6 +1,6 @@
 """Quantise one network our way or onnxruntime's: `int8_peers.py` runs it in a process of its own, to see its memory.
 
-    python int8_child.py WAY FLOAT PATCHES OUT     WAY: legal, free, minmax or percentile
+    python int8_child.py WAY FLOAT PATCHES OUT     WAY: ours, minmax or percentile
 
 PATCHES is an .npy file (K, C, H, W) of what the network takes. Writes OUT, and prints seconds and peak resident
 memory as the last line, in JSON.
@@ -25,17 +25,16 @@ def main() -> None:
     """Quantise and say what it took."""
     way, network, stored, out = sys.argv[1], *map(Path, sys.argv[2:])
     started = time.perf_counter()
-    if way in ("legal", "free"):
-        ours(way, network, np.load(stored), out)
+    if way == "ours":
+        ours(network, np.load(stored), out)
     else:
         onnxruntimes(way, network, np.load(stored), out)
     seconds = time.perf_counter() - started
     print(json.dumps({"seconds": seconds, "peak_mb": peak_mb()}))
 
 
-def ours(way: str, network: Path, images: np.ndarray, out: Path) -> None:
+def ours(network: Path, images: np.ndarray, out: Path) -> None:
     """The host file of `quantize`, of these images (K, 1, H, W) in [0, 1]."""
-    from beers_deploy.quant.free import quantise_free
     from beers_deploy.quant.quantise import quantise_model
     from beers_deploy.quant.samples import Patches, Remade
 
@@ -45,10 +44,7 @@ def ours(way: str, network: Path, images: np.ndarray, out: Path) -> None:
     count = len(images)
     patches = Patches([], Remade(lambda k: (image(k), image(k)), count), Remade(image, count))
     model = onnx.load(network)
-    if way == "free":
-        onnx.save(quantise_free(model, patches, {}), out)
-    else:
-        onnx.save(quantise_model(model, patches, {}).host, out)
+    onnx.save(quantise_model(model, patches, {}).host, out)
 
 
 def onnxruntimes(way: str, network: Path, inputs: np.ndarray, out: Path) -> None:

@@ -73,8 +73,8 @@ def ways(adaround_iterations: int) -> list[Way]:
         Way("Quark XINT8", False, QUARK, (), ("0",)),
         Way("Quark XINT8 + AdaRound", False, QUARK, (), (str(adaround_iterations),)),
     ]
-    ours = [Way(f"beers-deploy {regime}", False, OURS, (regime,)) for regime in ("legal", "free")]
-    return [*ours, *(replace(peer, rewritten=graph) for peer in peers for graph in (False, True))]
+    ours = Way("beers-deploy", False, OURS, ("ours",))
+    return [ours, *(replace(peer, rewritten=graph) for peer in peers for graph in (False, True))]
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
         cells = [*scores(in_float, network.runner(out), held_out), f"{seconds:.0f}", f"{peak_mb:.0f}"]
         yield f"| {way.name} | {graph} | {' | '.join(cells)} |"
         made[f"{way.name}, {graph}"] = out
-    host, theirs = made.get("beers-deploy legal, rewritten"), made.get("Quark VINT8, rewritten")
+    host, theirs = made.get("beers-deploy, rewritten"), made.get("Quark VINT8, rewritten")
     if host and theirs:
         yield vint8_words(host, theirs, images.shape[2], arguments.quark_python)
 

@@ -238,7 +238,7 @@ def slug(name: str) -> str:
 
 def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
     """Line by line, as each network is judged."""
-    ours, quark = [Way("beers-deploy", False, OURS, ("legal",))], [Way("Quark XINT8", False, QUARK, (), ("0",))]
+    ours, quark = [Way("beers-deploy", False, OURS, ("ours",))], [Way("Quark XINT8", False, QUARK, (), ("0",))]
     if arguments.tuned:
         ours.append(TUNED)
         quark.append(Way("Quark XINT8, AdaRound", False, QUARK, (), (ADAROUND_STEPS,)))

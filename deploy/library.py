@@ -117,9 +117,11 @@ def restore(
     """
     if method not in (NETWORK, TRADITIONAL):
         raise OptionError("method", expected=f"{NETWORK} or {TRADITIONAL}", got=repr(method), remedy="choose one")
-    if method == TRADITIONAL and (network is not None or cog or resume):
-        name = "network" if network is not None else "cog" if cog else "resume"
-        raise OptionError(name, expected="none with method traditional", got="one", remedy="leave it out")
+    if method == TRADITIONAL:
+        changed = {"network": network is not None, "tile": tile != TILE_PX, "halo": halo != "exact"}
+        changed |= {"runtime": runtime != Runtime.onnxruntime, "threads": threads != 0}
+        for name in (name for name, given in (changed | {"resume": resume, "cog": cog}).items() if given):
+            raise OptionError(name, expected="none with method traditional", got="one", remedy="leave it out")
     known = Sensor.load(sensor)
     found = Network.load(f"{VARIANT}{INT8}" if network is None else network, sensor=known)
     told = {} if known.name == BLIND else {"": known}
@@ -130,8 +132,8 @@ def restore(
             path = Path(image if isinstance(image, str | os.PathLike) else image.name)
             return _restore_path(path, replace(job.options, resume=resume, cog=cog), job, out)
         if out is not None or resume or cog:
-            remedy = "give a path, or save the result yourself"
-            raise OptionError("out", expected="none beside an array", got=str(out), remedy=remedy)
+            name, remedy = "out" if out is not None else "cog" if cog else "resume", "save the result yourself"
+            raise OptionError(name, expected="none beside an array", got="one", remedy=remedy)
         return _restore_any(image, job)
 
 
@@ -171,7 +173,8 @@ def _restore_path(image: Path, options: Options, job: Job, out: str | os.PathLik
     else:
         row = restore_file(image, path, options, no_log)
     arguments = {"method": job.method, "sensor": job.sensor.name, "tile": options.tile_px, "halo": options.halo}
-    inputs, time_s = (options.model, image), row.figures["time"].value or 0.0
+    inputs = (image,) if job.method == TRADITIONAL else (options.model, image)
+    time_s = row.figures["time"].value or 0.0
     return Run("restore", arguments, inputs, (row,), path=path, time_s=time_s)
 
 

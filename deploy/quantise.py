@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import onnx
 
@@ -25,7 +25,6 @@ from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile, board_na
 from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
 from beers_deploy.quant.core import SHIFTS, Shifts, target_shifts
 from beers_deploy.quant.encodings import host_model, read_core
-from beers_deploy.quant.free import quantise_free
 from beers_deploy.quant.gate import compare, gate_row
 from beers_deploy.quant.integer.reference import integer_rows
 from beers_deploy.quant.onnx_file import faults_named, require_quantised
@@ -49,7 +48,6 @@ def quantize(
     *,
     board: BoardLike = DEFAULT_TARGET,
     sensor: SensorLike = SENSOR,
-    regime: Literal["legal", "free"] = "legal",
     images: str | os.PathLike[str] | None = None,
     patches: int = 64,
     patch_px: int = 128,
@@ -66,7 +64,6 @@ def quantize(
             references), or an iterable of these such as a DataLoader; None simulates patches.
         board: whose rules to obey.
         sensor: of the simulated patches.
-        regime: legal, under the board's rules, or free of them: float scales, a channel's own for weights.
         images: folder of scenes for the simulated patches; None for drawn ones.
         patches: how many are simulated.
         patch_px: their side.
@@ -92,12 +89,10 @@ def quantize(
     """
     target, known = TargetProfile.load(board), Sensor.load(sensor)
     banked = conditioned(Path(network)) if isinstance(network, str | os.PathLike) else None
-    if regime not in ("legal", "free"):
-        raise OptionError("regime", expected="legal or free", got=repr(regime), remedy="choose one")
     steps = steps_of(finetune)
-    if banked and (regime == "free" or steps != 0 or samples is not None):
+    if banked and (steps != 0 or samples is not None):
         remedy = "leave it out: such a network is calibrated over the whole family of sensors at once"
-        expected = "no other regime, samples or fine-tuning"
+        expected = "no samples or fine-tuning"
         raise OptionError("a network behind a bank", expected=expected, got="one", remedy=remedy)
     origin = Network.load(network, sensor=known)
     require_quantised(origin.model, origin.label, wanted=False)
@@ -108,7 +103,7 @@ def quantize(
             simulated = _simulated(known, scenes, patches, patch_px, seed)
             return replace(_banked(banked, simulated, known, target), origin=origin)
         calibration: Source = own or _simulated(known, scenes, patches, patch_px, seed)
-        made = _free(origin, calibration) if regime == "free" else _legal(origin, calibration, target, steps)
+        made = _by_itself(origin, calibration, target, steps)
     return replace(made, origin=origin)
 
 
@@ -128,13 +123,7 @@ def _simulated(sensor: Sensor, images: Path | None, patches: int, patch_px: int,
     return Calibration(sensor, images, patches, patch_px, seed)
 
 
-def _free(origin: Network, calibration: Source) -> Network:
-    with begun("calibrating") as step:
-        made = quantise_free(origin.model, calibration.drawn, calibration.about, step)
-    return Network(made, f"{origin.name}-int8")
-
-
-def _legal(origin: Network, calibration: Source, target: TargetProfile, steps: int | None) -> Network:
+def _by_itself(origin: Network, calibration: Source, target: TargetProfile, steps: int | None) -> Network:
     shifts, tuning = _shifts_of(target), None
     if steps != 0:
         optional("torch", "finetune")
@@ -159,7 +148,7 @@ def _banked(network: Conditioned, calibration: "Calibration", sensor: Sensor, ta
 def _shifts_of(target: TargetProfile) -> Shifts:
     if not (target.configurations or target.npu):
         expected = f"a target with a DPU or NPU: {', '.join(board_names() + npu_names())}"
-        remedy = "choose another, or the free regime"
+        remedy = "choose another"
         raise OptionError("target", expected=expected, got=repr(target.name), remedy=remedy)
     return target_shifts(target)
 
@@ -179,7 +168,7 @@ def sensitivity_report(
     """Where INT8 errs on patches or samples that calibration did not see: the rows, and a page.
 
     Args:
-        network: what `quantize` made in the regime "legal".
+        network: what `quantize` made.
         samples: as given there.
         more: rows that the page shows behind.
         drawn: sensor, images, patches, patch_px and seed as given there.
@@ -202,7 +191,7 @@ def family_model(
 
     Args:
         network: of weights that 'train --conditioned' wrote.
-        images: folder of photographs that the family sees as often as drawn scenes; None takes these alone.
+        images: folder of photographs, beside which about as many drawn scenes are seen; None takes these alone.
         seed: of the patches.
         shifts: the windows of the target.
     """

@@ -123,8 +123,10 @@ def optional(package: str, where: str) -> Any:
     """The module of an optional package, imported for `where`, the parameter or verb that needs it."""
     try:
         return import_module(package)
-    except ModuleNotFoundError as error:
-        raise missing_extra(error, where) from error
+    except ImportError as error:  # not there, or there and unable to load what it needs
+        name = package.split(".")[0]
+        got = "none" if error.name == name else f"one that does not load ({error})"
+        raise _without(name, where, got) from error
 
 
 def missing_extra(error: ModuleNotFoundError, where: str) -> Exception:
@@ -132,5 +134,9 @@ def missing_extra(error: ModuleNotFoundError, where: str) -> Exception:
     package = (error.name or "").split(".")[0]
     if package not in EXTRAS:
         return error
+    return _without(package, where, "none")
+
+
+def _without(package: str, where: str, got: str) -> MissingExtraError:
     remedy = f"pip install 'beers-deploy[{EXTRAS[package]}]'"
-    return MissingExtraError(where, expected=f"the package {package}", got="none", remedy=remedy)
+    return MissingExtraError(where, expected=f"the package {package}", got=got, remedy=remedy)

@@ -121,6 +121,7 @@ def bench(
             print_rows(f"{path.name} on this machine: {table}", part)
         say(NO_PROXY)
     elif board != ALL and (profile := load_target(board)).npu:
+        refuse(context, BOARD_ONLY, expected=f"none with {profile.name}, for which nothing is predicted", got="one")
         rows = quoted_rows(path.stem, profile)
         print_rows(f"{path.name} on {profile.name}: nothing is predicted; published are other networks", rows)
     else:

@@ -56,9 +56,11 @@ def differing(before: "Mapping[str, object]", after: "Mapping[str, object]") -> 
     words = {
         "command": f"another command: {before['command']}, {after['command']}",
         "arguments": "other arguments",
-        "inputs": "other input files",
     }
     notes = [f"note: {said}" for key, said in words.items() if before[key] != after[key]]
+    digests = [[each["sha256"] for each in found["inputs"]] for found in (before, after)]  # type: ignore[attr-defined]
+    if digests[0] != digests[1]:
+        notes.append("note: other input files")
     hosts: list[Mapping[str, object]] = [before["host"], after["host"]]  # type: ignore[list-item]
     if any(hosts[0][key] != hosts[1][key] for key in ("machine", "cpus", "memory_gb")):
         notes.append("note: another machine: measured times do not compare")

@@ -1,6 +1,5 @@
-"""`beers-deploy quantize`: float ONNX to static INT8 under the DPU's rules, or free of them."""
+"""`beers-deploy quantize`: float ONNX to static INT8 under the DPU's rules."""
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,14 +10,6 @@ from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET
-
-
-class Regime(StrEnum):
-    """Under the rules of the target's DPU, or without them."""
-
-    legal = "legal"
-    free = "free"
-
 
 TITLES = {
     "integer layers": "integer layers",
@@ -36,9 +27,6 @@ def quantize(
     out: Annotated[Path, typer.Option("-o", "--out", help="INT8 ONNX for stock onnxruntime.")],
     target: Annotated[str, typer.Option(help=f"Whose rules to obey: {RULED}.")] = DEFAULT_TARGET,
     sensor: Annotated[str, typer.Option(help="Profile that calibration patches are drawn from.")] = SENSOR,
-    regime: Annotated[
-        Regime, typer.Option(help="legal: the DPU's rules; free: float scales, a channel's own for weights.")
-    ] = Regime.legal,
     board_file: Annotated[
         Path | None, typer.Option(help="Also write the core in the board's encoding: QDQ ONNX, of an NPU VINT8.")
     ] = None,
@@ -75,16 +63,11 @@ def quantize(
     from beers_deploy.profiles.figures import by_table
     from beers_deploy.quant.encodings import read_core
     from beers_deploy.quant.onnx_file import require_onnx_name
-    from beers_deploy.quantise import losses_of, sensitivity_report, steps_of
+    from beers_deploy.quantise import losses_of, sensitivity_report
     from beers_deploy.quantise import quantize as quantised
     from beers_deploy.report.page import write_report
     from beers_deploy.results import Table, print_rows
-    from beers_deploy.verdict import compare
 
-    free = regime is Regime.free
-    if free and (board_file or report or steps_of(finetune) != 0):
-        expected, remedy = "no --board-file, --report or --finetune", "leave it out, or take --regime legal"
-        raise OptionError("--regime free", expected=expected, got="one", remedy=remedy)
     page, figures = _report_files(report, model)
     if board_file is None:
         refuse(context, ["tile"], expected="--board-file beside it")
@@ -94,18 +77,15 @@ def quantize(
     board = board_for(target, board_file, tile, read)
     known = Sensor.load(sensor)
     drawn: dict[str, Any] = {"sensor": known, "images": images, "patches": patches, "seed": seed}
-    made = quantised(model, samples, board=board, regime=regime.value, patch_px=patch, finetune=finetune, **drawn)
+    made = quantised(model, samples, board=board, patch_px=patch, finetune=finetune, **drawn)
     core = made.core(board, tile) if board_file else None
     made.save(out)
     kept = f", {made.quantised.relus} ReLUs kept" if made.quantised else f", told {known.name}"
-    count = f"{len(read_core(made.model).ops)} integer operations{kept}" if not free else "float scales"
-    say(f"wrote {out}: {count}")
+    say(f"wrote {out}: {len(read_core(made.model).ops)} integer operations{kept}")
     save_core(core, board_file, board)
     if made.quantised:
         say(losses_of(made, samples, patch_px=patch, **drawn))
     rows = list(made.layers)
-    if free:
-        rows += compare(made, samples=samples, sensor=known, images=images, seed=seed).rows
     for title, part in by_table(rows).items():
         print_rows(TITLES[title], part)
     if page is not None:

@@ -84,14 +84,14 @@ def restore(
     --method traditional restores one band, about a minute a megapixel on two cores, and is not resumable.
     JPEG 2000, NITF, HFA, VRT and DIMAP need the extra 'gdal'. Until OUT is finished its rows lie in .OUT.part.
     """
-    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.model.io.files import require_writable, sha256
     from beers_deploy.model.io.images import require_image_file
     from beers_deploy.model.shipped import INT8
     from beers_deploy.network import conditioned, network_file
     from beers_deploy.restoration.bands import parse_sensors
     from beers_deploy.restoration.cog import write_item
     from beers_deploy.restoration.run import restore_file
-    from beers_deploy.results import Table, print_rows
+    from beers_deploy.results import Input, Table, print_rows
 
     budget_bytes = None if memory is None else max(int(memory * 1e9), 1)
     sensors = parse_sensors(sensor or BLIND)
@@ -139,10 +139,11 @@ def restore(
         raise OptionError("--sensor", expected="sensors of equal bits", got=f"{sorted(bits)}", remedy=remedy)
     how = replace(how, model=path, sensors=known if sensor else {}, bands={} if "" in paths else paths)
     row = restore_file(image, out, how, say, (json, stac))
+    networks = [Input(f"{path.name}, {band}" if band else path.name, sha256(path)) for band, path in paths.items()]
     if stac is not None:
         write_item(out, stac)
     print_rows(f"wrote {out}", [row])
-    save(Table("restore", arguments(sensor=sensor or BLIND), (*paths.values(), image), (row,)), json)
+    save(Table("restore", arguments(sensor=sensor or BLIND), (*networks, image), (row,)), json)
 
 
 def _by_the_chain(image: Path, out: Path, sensor: str | None, how: Options, json: Path | None) -> Row:

@@ -207,6 +207,8 @@ DIGEST_BYTES = 1 << 16
 
 Plane = Callable[[int, int], np.ndarray]
 """Gives rows `start` to `stop` (excluded) of one plane, (rows, width)."""
+Rows = Callable[[int, int], np.ndarray]
+"""Gives them of several bands, (bands, rows, width)."""
 
 
 class Source(Protocol):
@@ -236,7 +238,7 @@ class VeiledSource:
         self,
         source: Source,
         kind: Veil,
-        mask: Plane | None = None,
+        mask: Rows | None = None,
         held_bytes: Callable[[int], int] = lambda _: 0,
         files: tuple[Path, ...] = (),
     ) -> None:

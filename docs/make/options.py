@@ -168,7 +168,6 @@ REFUSED = {
         Refused(("target",), without="--board-file"),
     ],
     "quantize": [
-        Refused(("board_file", "report", "finetune"), "--regime free"),
         Refused(("tile",), without="--board-file"),
     ],
     "golden": [Refused(("tile", "target"), "--compare COMPARE"), Refused(("json",), without="--compare")],

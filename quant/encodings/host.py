@@ -220,7 +220,7 @@ _WRITERS: dict[type, Callable[..., Any]] = {
 
 
 def read_core(model: onnx.ModelProto) -> IntCore:
-    """The core of an INT8 file of the legal regime.
+    """The core of an INT8 file of `quantize`.
 
     Raises:
         ModelError: a file that describes none.
@@ -229,12 +229,12 @@ def read_core(model: onnx.ModelProto) -> IntCore:
     if said is not None:
         with contradictions("INT8 model"):
             return described_core(said, constants(model))
-    expected, remedy = "a file that describes its integers", "make it with 'beers-deploy quantize --regime legal'"
+    expected, remedy = "a file that describes its integers", "make it with 'beers-deploy quantize'"
     raise ModelError("INT8 core", expected=expected, got="one that does not", remedy=remedy)
 
 
 def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
-    """Where a file of the legal regime is not what its integers ask for: the host's ends, ReLUs, a reader's scale.
+    """Where a file of `quantize` is not what its integers ask for: the host's ends, ReLUs, a reader's scale.
 
     None for files of others.
     """

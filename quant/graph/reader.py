@@ -57,7 +57,7 @@ def read_network(model: onnx.ModelProto) -> Network:
 
 
 def plain_network(model: onnx.ModelProto) -> Network:
-    """A network of ConvBEERS' kind: what proofs, the stress battery, bit flips and the free regime take.
+    """A network of ConvBEERS' kind: what proofs, the stress battery and bit flips take.
 
     It adds a correction to an image of one channel, and computes it by same-size convolutions of stride 1, ReLU and
     adds; at full resolution, or at a lower one, with the image's pixels rearranged into channels and back.

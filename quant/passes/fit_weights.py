@@ -10,7 +10,6 @@ Convolutions are rounded one after the other on what they read in INT8, so the b
 those before it are off by in the mean.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
@@ -30,11 +29,10 @@ from beers_deploy.quant.core import (
     quantise_bias,
     rounded_to,
 )
-from beers_deploy.quant.ends import ONE_CHANNEL, Ends
-from beers_deploy.quant.graph import CORRECTION, PLANES, Conv, Graph, Op, graph_to_onnx, tensors
+from beers_deploy.quant.graph import CORRECTION, PLANES, Conv, Graph, Op
 from beers_deploy.quant.graph.writer import operation_to_onnx
 from beers_deploy.quant.samples import Remade
-from beers_deploy.quant.session import crops, halo_of, open_session, planes_of, tensor_values
+from beers_deploy.quant.session import crops, halo_of, open_session, planes_of
 
 FLOOR = 1e-2
 """Added to every variance, as a share of their mean. Without it the weights of a channel that hardly changes run to
@@ -77,25 +75,6 @@ class Moments:
         covariance = self.products / self.count - self.mean[:, :, None] * self.mean[:, None]
         floor = FLOOR * np.trace(covariance, axis1=1, axis2=2).mean() / covariance.shape[-1]
         return np.asarray(covariance + floor * np.eye(covariance.shape[-1]))
-
-
-def input_moments(graph: Graph, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL) -> dict[str, Moments]:
-    """The moments of every convolution of a plane-reading graph, by its name, over images (1, C, H, W) in [0, 1].
-
-    The values are those of the float network.
-    """
-    convs = [op for op in graph if isinstance(op, Conv)]
-    found = {op.name: Moments.of_none(op.groups, op.weight[0].size) for op in convs}
-    names, halo_px = tensors(graph), halo_of(graph)
-    session = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels))
-    for image in images:
-        tiles = tensor_values(session, names, image, halo_px, ends)
-        for crop, values in zip(crops(image, halo_px), tiles, strict=True):
-            read = {PLANES: planes_of(crop, ends), **dict(zip(names, values, strict=True))}
-            for op in convs:
-                windows = _windows(read[op.input], op)
-                found[op.name].add(windows, windows)
-    return found
 
 
 def _windows(values: np.ndarray, op: Conv) -> np.ndarray:
@@ -185,25 +164,24 @@ def _fit(
     """
     if moments.count <= op.weight[0].size:
         return whole, raised
-    weight, shifted = fit(op.weight, np.array([2.0**-whole.weight_frac_bits]), moments)
+    weight, shifted = fit(op.weight, 2.0**-whole.weight_frac_bits, moments)
     bias, bias_frac_bits = quantise_bias(op.stored_bias - shifted, whole.weight_frac_bits + input_frac_bits, shifts)
     return replace(whole, weight=weight, bias=bias, bias_frac_bits=bias_frac_bits), shifted
 
 
-def fit(weight: np.ndarray, scales: np.ndarray, moments: Moments) -> tuple[np.ndarray, np.ndarray]:
+def fit(weight: np.ndarray, unit: float, moments: Moments) -> tuple[np.ndarray, np.ndarray]:
     """Whole weights (O, I, kh, kw) int8, and by how much they raise the mean result of each channel (O,).
 
     Args:
         weight: (O, I, kh, kw), what they stand for.
-        scales: (1,) or (O,), the value of 1.
+        unit: what 1 is worth.
         moments: of what the convolution reads.
     """
     groups, size = moments.mean.shape
     exact = weight.reshape(groups, -1, size).astype(np.float64)
-    units = np.broadcast_to(scales, len(weight)).reshape(groups, -1, 1).astype(np.float64)
-    fitted = np.stack([descend(*each) for each in zip(exact / units, moments.covariance, strict=True)])
+    fitted = np.stack([descend(*each) for each in zip(exact / unit, moments.covariance, strict=True)])
     exact_mean = (moments.total + moments.lost) / moments.count
-    raised = (fitted * units) @ moments.mean[:, :, None] - exact @ exact_mean[:, :, None]
+    raised = (fitted * unit) @ moments.mean[:, :, None] - exact @ exact_mean[:, :, None]
     return fitted.astype(np.int8).reshape(weight.shape), np.asarray(raised).ravel()
 
 

@@ -241,6 +241,8 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
     "no such network": (lambda raw: bd.restore(raw, "none"), "a shipped network"),
     "no network": (lambda _: bd.Network.load(3), r"torch.nn.Module"),  # type: ignore[arg-type]
     "a network of no use": (lambda raw: bd.restore(raw, SMALL, method="traditional"), "network: expected none"),
+    "a tile of no use": (lambda raw: bd.restore(raw, tile=64, method="traditional"), "tile: expected none"),
+    "a COG of an array": (lambda raw: bd.restore(raw, cog=True), "cog: expected none beside an array"),
     "a COG of no use": (lambda _: bd.restore("raw.tif", out="a.tif", method="traditional", cog=True), "cog: exp"),
     "no method": (lambda _: bd.restore("raw.tif", out="a.tif", method="x"), "method: exp"),  # type: ignore[arg-type]
     "8 bits": (lambda raw: bd.restore(raw.astype(np.uint8)), "full_scale"),

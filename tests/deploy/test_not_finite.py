@@ -104,7 +104,6 @@ def test_no_command_takes_such_weights(tmp_path: Path, command: str) -> None:
     "command",
     [
         "quantize {0} --out {1}/int8.onnx --images {2} --patches 1",
-        "quantize {0} --out {1}/int8.onnx --images {2} --patches 1 --regime free",
         "bench {0} --target host --tile 64 --json {1}/b.json",
         "restore {1}/raw.tif {1}/out.tif --network {0}",
     ],

@@ -19,11 +19,11 @@ from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.profiles.sensor_file import reference_for
 from beers_deploy.quant.calibration import draw_patches
-from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
+from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, save_onnx
 from beers_deploy.quant.sensitivity import Spread, kind_of_error, worst_row
 from beers_deploy.quantise import steps_of
 from beers_deploy.report.plots import FONT_PX, MOST_BARS, bins, histogram_url
-from tests.deploy.command_line import done, refused
+from tests.deploy.command_line import done
 from tests.deploy.documents import valid
 from tests.deploy.report.svg import style_of, text_width
 from tests.model.networks import plain
@@ -35,18 +35,6 @@ PHONE_PX = 358
 def float_file(path: Path) -> str:
     save_onnx(to_onnx(plain(Variant(1, 4)), {}), path)
     return str(path)
-
-
-@pytest.mark.slow
-def test_the_free_regime_writes_a_file_of_its_own_kind(tmp_path: Path) -> None:
-    free = ["quantize", float_file(tmp_path / "f.onnx"), "--regime", "free", "--patches", "2", "--patch", "64"]
-    out = tmp_path / "free.onnx"
-    done(*free, "--out", out, "--json", tmp_path / "q.json")
-    assert metadata(load_onnx(out))["precision"] == "int8 free"
-    valid(tmp_path / "q.json")
-    for option in (["--finetune", "1"], ["--board-file", tmp_path / "b.onnx"], ["--report", tmp_path / "r"]):
-        assert "--regime legal" in refused(*free, "--out", tmp_path / "no.onnx", *option)
-    assert not (tmp_path / "no.onnx").exists()
 
 
 @pytest.mark.parametrize("given", ["-1", "many", "2.5"])

@@ -1,6 +1,8 @@
 """Errors come back whole from worker processes, which hand them over pickled; what they say can be read."""
 
+import sys
 from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
 
 import pytest
 from hypothesis import example, given
@@ -10,9 +12,11 @@ from beers_deploy.profiles.errors import (
     BeersError,
     ImageError,
     MachineError,
+    MissingExtraError,
     ModelError,
     OptionError,
     ProfileError,
+    optional,
     sizes,
     visible,
 )
@@ -47,3 +51,14 @@ def test_visible_text_keeps_its_lines_and_nothing_that_is_obeyed(text: str) -> N
     assert all(c.isprintable() or c in "\n\t" for c in found)
     assert found.count("\n") == text.count("\n")
     assert visible(found) == found
+
+
+@pytest.mark.parametrize("lacks", ["import affine_of_nobody", "raise ImportError('libexpat.so.1: no such file')"])
+def test_a_package_that_cannot_load_is_one_sentence(
+    lacks: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "rasterio.py").write_text(lacks, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "rasterio", raising=False)
+    with pytest.raises(MissingExtraError, match=r"^cog: .*one that does not load.*beers-deploy\[gdal\]"):
+        optional("rasterio", "cog")

@@ -10,7 +10,6 @@ import pytest
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.core import build_core, shift_faults
-from beers_deploy.quant.free import quantise_free
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import PLANES, Conv, Graph, Network, check_network, correction_graph, read_planes
 from beers_deploy.quant.quantise import quantise_model
@@ -53,9 +52,8 @@ def test_what_cannot_be_quantised_is_refused(spoil: Callable[[Graph], Graph], sa
         check_network(Network(spoil(graph)))
 
 
-@pytest.mark.parametrize("regime", ["legal", "free"])
 def test_a_layer_that_never_fires_costs_nothing(
-    regime: str, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
+    float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
     """Weights that meet only zeros cannot be fitted to them; the bias behind them still counts."""
     dead = changed(float_onnx, "body.0.first.bias", lambda bias: bias - 50)
@@ -63,7 +61,7 @@ def test_a_layer_that_never_fires_costs_nothing(
 
     def mae(model: onnx.ModelProto) -> float:
         with one_guess():
-            made = quantise_free(model, patches, {}) if regime == "free" else quantise_model(model, patches, {}).host
+            made = quantise_model(model, patches, {}).host
         return compare(open_session(model), open_session(made), unseen.pairs).mae
 
     assert mae(dead) < 1.5 * mae(float_onnx)

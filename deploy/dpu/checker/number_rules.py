@@ -11,8 +11,8 @@ from beers_deploy.dpu.graph import Operation, Scale
 
 # ruff: noqa: ARG001 - every rule takes the operation and the DPU
 
-AGAIN = "'beers-deploy quantize --regime legal' does"
-MOVE = "move the output's scale until it fits: 'beers-deploy quantize --regime legal' does"
+AGAIN = "'beers-deploy quantize' does"
+MOVE = "move the output's scale until it fits: 'beers-deploy quantize' does"
 
 
 def on_integers(op: Operation, dpu: Dpu) -> Finding | None:

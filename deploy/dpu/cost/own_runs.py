@@ -26,6 +26,7 @@ from beers_deploy.profiles.toml import read_json, unreadable
 EXAMPLE = 'write [{"model": "core.onnx", "configuration": "C32B3", "tile_px": 640, "fps": 9.5}]'
 RUNS, TILE_PX, FAR = 1000, (16, 1 << 16), 10_000
 """Most runs; least and most of a tile's side; and how many times off a rate of this network may be predicted."""
+POWER_W = (0.01, 1000.0)
 SCATTER = 3
 """Variance of networks over that of boards, of ln(predicted / published): 0.13^2 and 0.07^2."""
 KEYS = {"model", "configuration", "tile_px", "fps", "power_w", "provider"}
@@ -95,8 +96,9 @@ def _read(path: Path) -> Sequence[Mapping[str, object]]:
     try:
         runs = read_json(path)
     except (OSError, ValueError) as error:
-        got = unreadable(path) or str(error)
-        raise OptionError(str(path), expected="a file of JSON", got=got, remedy=EXAMPLE) from error
+        missing = unreadable(path)
+        got, remedy = missing or str(error), "check the path" if missing else EXAMPLE
+        raise OptionError(str(path), expected="a file of JSON", got=got, remedy=remedy) from error
     if not isinstance(runs, list) or not 0 < len(runs) <= RUNS or not all(isinstance(run, dict) for run in runs):
         expected, got = f"a list of 1 to {RUNS} runs", type(runs).__name__
         raise OptionError(str(path), expected=expected, got=got, remedy=EXAMPLE)
@@ -105,7 +107,7 @@ def _read(path: Path) -> Sequence[Mapping[str, object]]:
 
 def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run:
     if "model" not in entry or set(entry) - KEYS:
-        expected = "model, configuration, tile_px, fps"
+        expected = ", ".join(sorted(KEYS))
         raise OptionError(where, expected=expected, got=str(sorted(entry)), remedy=EXAMPLE)
     if entry.get("provider") == "CPUExecutionProvider":
         expected, got = "a run of the board", "one of onnxruntime's CPU provider"
@@ -117,6 +119,8 @@ def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run
     model = path.parent / str(entry["model"])
     placement = place(read_network(model, int(tile_px)), dpu)
     prediction = predict(placement, dpu)
+    if "power_w" in entry:
+        _number(entry["power_w"], "power_w", POWER_W, where)
     fps = _number(entry.get("fps"), "fps", (prediction.fps / FAR, prediction.fps * FAR), where)
     return Run(f"{model.stem}, tiles of {tile_px:g}", placement, fps, prediction)
 

@@ -67,7 +67,7 @@ def _narrow(op: IntConv) -> IntConv:
 
 
 def _refuse(got: str) -> ModelError:
-    remedy = "make it with 'beers-deploy quantize --regime legal'"
+    remedy = "make it with 'beers-deploy quantize'"
     return ModelError("INT8 core", expected="bias and shifts as the board stores them", got=got, remedy=remedy)
 
 

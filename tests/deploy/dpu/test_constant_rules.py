@@ -82,7 +82,7 @@ def test_the_bias_of_an_integer_kernel_is_looked_at(tmp_path: Path, bias: list[i
     path = s.save(tmp_path / "b.onnx", s.node("DequantizeLinear", inner, *s.numbers))
     failed = place(read_network(path, 20), DPU).failed
     assert {b.rule for node in failed for b in node.broken} == broken
-    assert all("quantize --regime legal" in node.broken[0].finding.remedy for node in failed)
+    assert all("beers-deploy quantize" in node.broken[0].finding.remedy for node in failed)
 
 
 @pytest.mark.parametrize("name", shipped_names())

@@ -76,6 +76,7 @@ def test_a_part_without_runs_keeps_its_constants(folder: Path) -> None:
         '[{"model": "deep.onnx", "fps": 3, "speed": 8}]',
         '[{"model": "deep.onnx", "fps": 3, "provider": "CPUExecutionProvider"}]',
         '[{"model": "deep.onnx", "fps": 1e-300}]',
+        '[{"model": "deep.onnx", "fps": 3, "power_w": "x"}]',
         '[{"model": "deep.onnx", "fps": 1e999}]',
         '[{"model": "deep.onnx", "fps": 3, "tile_px": 1048576}]',
         f'[{{"model": "deep.onnx", "fps": 3, "tile_px": {10**300}}}]',
