@@ -14,14 +14,13 @@ from beers_deploy.cli import app
 from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, save_network
 from beers_deploy.model.variants import VARIANTS
-from beers_deploy.network import shipped_pair
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.session import open_session
 
 VARIANT = "convbeers-xs"
-INT8 = str(shipped_pair(VARIANT)[1])
+INT8 = f"{VARIANT}-int8"
 READERS = [
     "quantize {0} --out {1}/int8.onnx --board-file {1}/board.onnx --json {1}/q.json",
     f"gate {{0}} {INT8} --json {{1}}/g.json",
