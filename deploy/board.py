@@ -119,8 +119,8 @@ def boards() -> Table:
     """The shipped boards with a DPU: its configurations, and where its rules come from.
 
     Examples:
-        >>> bd.boards().to_pandas().index.to_list()[:2]
-        ['kv260', 'vck190']
+        >>> bd.boards().to_pandas().index.to_list()
+        ['kv260', 'vck190', 'vek280', 'zcu102', 'zcu104']
     """
     rows = []
     for name in board_names():

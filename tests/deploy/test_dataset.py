@@ -118,6 +118,7 @@ def test_a_drawn_scene_needs_no_file(scene: Path) -> None:
 
 def test_every_effect_has_a_typical_value_and_every_scene_loads() -> None:
     assert [*typical_effects()] == [*TABLES]
+    assert len(TABLES) == 9
     assert scene_names() == ["desert-noon", "haze-over-sea", "night-port", "snow"]
     profile = load_sensor("pleiades-degraded")
     for name in scene_names():

@@ -108,7 +108,7 @@ def test_the_citation_and_the_changelog_are_of_this_version() -> None:
     cited = dict(re.findall(r"^([\w-]+): (.+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE))
     assert (cited["cff-version"], cited["version"]) == ("1.2.0", __version__)
     changes = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
-    assert changes[changes[0] == "Unreleased"] == f"{__version__} - {cited['date-released']}"
+    assert changes[0] == f"{__version__} - {cited['date-released']}"
     assert cited["license"] == project["license"]
 
 

@@ -19,7 +19,7 @@ SHIPPED = ["dior-high", "dior-medium", "pleiades-degraded", "pleiades-reference"
 
 def test_the_promised_profiles_are_shipped() -> None:
     assert sensor_names() == SHIPPED
-    assert {"host-cpu", "kv260", "vck190", "vek280", "vek385", "zcu102", "zcu104"} <= {*target_names()}
+    assert target_names() == ["host-cpu", "kv260", "vck190", "vek280", "vek385", "zcu102", "zcu104"]
 
 
 @pytest.mark.parametrize("name", SHIPPED)

@@ -218,6 +218,7 @@ def test_a_plan_is_data() -> None:
     plan = make_plan(stages.plain_sensor(**stages.TYPICAL), scene_stats(SCENE, 2))
     assert json.loads(json.dumps(plan.to_json()))["tolerance_dn"] == TOLERANCE_DN
     assert [decision.effect for decision in plan.decisions] == [*ORDER]
+    assert len(plan.decisions) == 13
 
 
 def test_a_flat_scene_is_simulated_without_a_transform() -> None:
