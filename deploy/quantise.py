@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
 import onnx
 
 from beers_deploy.dpu.board import BoardLike
@@ -17,17 +18,17 @@ from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.model.progress import progress as begun
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Conditioned, Network, NetworkLike, SensorLike, conditioned, told_int8
-from beers_deploy.profiles.errors import OptionError, optional
+from beers_deploy.profiles.errors import ModelError, OptionError, optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile, board_names, npu_names
-from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
+from beers_deploy.quant.banked.family import FAMILY, WEIGHTS, required_family
 from beers_deploy.quant.core import SHIFTS, Shifts, target_shifts
 from beers_deploy.quant.encodings import host_model, read_core
 from beers_deploy.quant.gate import compare, gate_row
 from beers_deploy.quant.integer.reference import integer_rows
-from beers_deploy.quant.onnx_file import faults_named, require_quantised
+from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata, require_quantised
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import OwnSamples, samples_of
 from beers_deploy.quant.sensitivity import WORST, headline, layer_error_rows, losses, sizes_row, spread_of, worst_row
@@ -36,6 +37,7 @@ from beers_deploy.report.page import Report
 from beers_deploy.report.sensitivity_page import sensitivity_page
 
 if TYPE_CHECKING:
+    from beers_deploy.model.convbeers import Rounding
     from beers_deploy.quant.calibration import Calibration
 
 Source: TypeAlias = "Calibration | OwnSamples"
@@ -182,6 +184,23 @@ def sensitivity_report(
     layers = layer_error_rows(result, held_out)
     rows = [gate_row(found), *layers, *(worst_row(k, held_out, spread) for k in worst), sizes_row(spread)]
     return rows, sensitivity_page(headline(found, layers), [*rows, *more], spread, held_out, sessions, worst)
+
+
+def rounding_of(int8: Path, weights: Path) -> "Rounding":
+    """How the INT8 file of a network behind a bank rounds its maps; refused where it is of other weights."""
+    import torch
+
+    from beers_deploy.model.convbeers import Rounding
+    from beers_deploy.quant.banked.calibrate import map_steps
+    from beers_deploy.quant.banked.filters import gain_of
+
+    model = load_onnx(int8)
+    if metadata(model).get(WEIGHTS) != sha256(weights):
+        expected, remedy = f"the INT8 file of {weights}", "make it with 'beers-deploy quantize'"
+        raise ModelError(str(int8), expected=expected, got="another network's", remedy=remedy)
+    found = map_steps(required_family(model), read_conditioned(weights))
+    stream, *inner = (torch.from_numpy(np.float32(steps))[:, None, None] for steps in found)
+    return Rounding(stream, tuple(inner), gain_of)
 
 
 def family_model(

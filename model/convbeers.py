@@ -16,9 +16,11 @@ What a sensor changes are the filters that make u and w and the unit g, known in
 head, which is linear in the sensor vector.
 
 A larger network can begin where a smaller one stands (`grow`): wider, deeper or coarser, with the same outputs.
+Trained in the end with its maps rounded as its INT8 file rounds them (`Rounding`), a network loses less in INT8.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
@@ -43,9 +45,12 @@ class ResidualBlock(nn.Module):
         self.first = nn.Conv2d(features, features, kernel_size=3, padding=1)
         self.second = nn.Conv2d(features, features, kernel_size=3, padding=1)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Add the block's correction to x (N, F, H, W); the shape is kept."""
-        correction: Tensor = self.second(torch.relu(self.first(x)))
+    def forward(self, x: Tensor, step: Tensor | None = None, inner_step: Tensor | None = None) -> Tensor:
+        """Add the block's correction to x (N, F, H, W); the shape is kept. Given steps, the maps are rounded."""
+        inner = torch.relu(self.first(x))
+        if step is not None and inner_step is not None:
+            return in_steps(x + in_steps(self.second(in_steps(inner, inner_step)), step), step)
+        correction: Tensor = self.second(inner)
         return x + correction
 
 
@@ -60,11 +65,44 @@ class Layers(nn.Module):
         self.body_end = nn.Conv2d(variant.features, variant.features, kernel_size=3, padding=1)
         self.tail = nn.Conv2d(variant.features, variant.pixels, kernel_size=3, padding=1)
 
-    def corrected(self, shallow: Tensor, bfloat16: bool) -> Tensor:
-        """What the head gave, (N, F, H / S, W / S), to the correction (N, 1, H, W)."""
+    def corrected(self, shallow: Tensor, bfloat16: bool, steps: Sequence[Tensor] = ()) -> Tensor:
+        """What the head gave, (N, F, H / S, W / S), to the correction (N, 1, H, W); see `Rounding.steps`."""
         with torch.autocast(shallow.device.type, dtype=torch.bfloat16, enabled=bfloat16):
-            deep = self.body_end(self.body(shallow))
-        return pixel_shuffle(self.tail(shallow + deep.float()), self.variant.scale)
+            deep = self._rounded(shallow, *steps) if steps else shallow + self.body_end(self.body(shallow)).float()
+        return pixel_shuffle(self.tail(deep), self.variant.scale)
+
+    def _rounded(self, shallow: Tensor, step: Tensor, *inner: Tensor) -> Tensor:
+        """What the tail reads, with every map between head and tail rounded."""
+        first = stream = in_steps(shallow, step)
+        for block, inner_step in zip(self.body, inner, strict=True):
+            stream = block(stream, step, inner_step)
+        return in_steps(first + in_steps(self.body_end(stream), step), step)
+
+
+def in_steps(maps: Tensor, step: Tensor) -> Tensor:
+    """Maps (N, F, H, W) in float32, held to int8 and rounded to whole steps; gradients pass the rounding."""
+    held = maps.float().clamp(-128 * step, 127 * step)
+    return held + (torch.round(held / step) * step - held).detach()
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """How an INT8 file rounds the maps of a network behind a bank.
+
+    Attributes:
+        stream: what a 1 stands for in the maps between head and tail, (F, 1, 1), at a gain of 1.
+        inner: the same of the map within each block.
+        gain_of: how many times finer a sensor's steps are, of its bank.
+    """
+
+    stream: Tensor
+    inner: tuple[Tensor, ...]
+    gain_of: Callable[[Bank], float]
+
+    def steps(self, banks: Sequence[Bank], image: Tensor) -> list[Tensor]:
+        """Those of images (N, 1, H, W), each with its bank: (N, F, 1, 1) of the stream, then of each block."""
+        shares = 1 / image.new_tensor([self.gain_of(bank) for bank in banks])[:, None, None, None]
+        return [step.to(image) * shares for step in (self.stream, *self.inner)]
 
 
 class ConvBEERS(Layers):
@@ -87,7 +125,12 @@ class BankedConvBEERS(Layers):
         nn.init.zeros_(self.bias.weight)
 
     def forward(
-        self, image: Tensor, vectors: Tensor, banks: Sequence[Bank] | None = None, bfloat16: bool = False
+        self,
+        image: Tensor,
+        vectors: Tensor,
+        banks: Sequence[Bank] | None = None,
+        bfloat16: bool = False,
+        rounding: Rounding | None = None,
     ) -> Tensor:
         """Restore each image as its own sensor asks for.
 
@@ -96,6 +139,7 @@ class BankedConvBEERS(Layers):
             vectors: (N, 4).
             banks: of each sensor; None makes them of the vectors.
             bfloat16: for the blocks alone.
+            rounding: rounds the maps as INT8 does; None leaves them as they are.
         """
         banks = banks or [bank_of_vector(tuple(vector.tolist())) for vector in vectors]
         kernels = np.stack([[*bank.planes, bank.analytic / bank.unit] for bank in banks])
@@ -104,7 +148,7 @@ class BankedConvBEERS(Layers):
         shallow = (self.head(read) + self.bias(vectors)[:, :, None, None]).contiguous(
             memory_format=torch.channels_last
         )
-        correction = self.corrected(shallow, bfloat16)
+        correction = self.corrected(shallow, bfloat16, rounding.steps(banks, image) if rounding else ())
         unit = image.new_tensor([bank.unit for bank in banks])[:, None, None, None]
         restored: Tensor = image + unit * (filtered[:, FILTERS:] + correction)
         return restored

@@ -52,6 +52,9 @@ def train(
     start: Annotated[
         Path | None, typer.Option(help="Weights to go on from; those of a smaller network grow.")
     ] = None,
+    rounding: Annotated[
+        Path | None, typer.Option(help="INT8 file of the --start weights: trains with the maps rounded as there.")
+    ] = None,
     validate_every: Annotated[int, typer.Option(min=0, help="Steps between validations; 0 for none.")] = 1000,
     seed: Seed = 0,
     device: Annotated[str, typer.Option(help="cpu, or cuda.")] = "cpu",
@@ -65,11 +68,11 @@ def train(
     The loss is the paper's: 1.0 L1 + 0.5 LPIPS + 0.1 L1 of spectra; without weights for LPIPS that term is left out,
     which is said and kept in the recipe. A twentieth of the images, whole sites, is held out for validation. Several
     GPUs: start it with torchrun. --conditioned weights become the network of any sensor in range; --start then takes
-    such weights, and plain ones without.
+    such weights, and plain ones without. --rounding prepares such weights for INT8: quantised anew they lose less.
     """
     from beers_deploy.model.dataset import profiles_for, read_pairs_recipe
     from beers_deploy.model.family import SensorFamily
-    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.model.io.files import require_writable, sha256
     from beers_deploy.model.training.checkpoint import TrainingRecipe
     from beers_deploy.model.training.losses import LossWeights
     from beers_deploy.model.training.patches import PatchRecipe
@@ -77,6 +80,7 @@ def train(
     from beers_deploy.model.training.run import train as run_training
     from beers_deploy.model.training.trainer import joined
     from beers_deploy.network import weights_file
+    from beers_deploy.quantise import rounding_of
 
     if pairs is not None and (images is not None or drawn):
         expected, remedy = "neither --images nor --drawn beside it", "leave one out"
@@ -84,10 +88,14 @@ def train(
     if conditioned and pairs is not None:
         remedy = "leave one out: stored pairs do not say what sensor each had"
         raise OptionError("--conditioned", expected="no --pairs beside it", got="both", remedy=remedy)
+    if rounding is not None and not (conditioned and start):
+        expected, remedy = "--conditioned and --start beside it", "give both, or leave it out"
+        raise OptionError("--rounding", expected=expected, got="not both", remedy=remedy)
     _refuse_unused(context)
     stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
     start = weights_file(start) if start else None
-    read = (*stored, lpips, start, *(Path(name) for name in (sensor, reference) if name))
+    rounding = weights_file(rounding) if rounding else None
+    read = (*stored, lpips, start, rounding, *(Path(name) for name in (sensor, reference) if name))
     require_writable(*(out / name for name in (*FILES, f"{variant}.safetensors")), inputs=read)
     recipe = TrainingRecipe(
         steps=steps,
@@ -95,6 +103,7 @@ def train(
         learning_rate=learning_rate,
         loss=LossWeights(l1_weight, lpips_weight, fft_weight, psnr_weight),
         seed=seed,
+        rounding=sha256(rounding) if rounding else "",
     )
     made = read_pairs_recipe(pairs) if pairs else None
     degraded, wanted = profiles_for(sensor or (None if made else RANGE), reference, made, say)
@@ -113,6 +122,7 @@ def train(
         validate_every,
         device,
         precision.value,
+        rounding_of(rounding, start) if rounding and start else None,
     )
     with joined(device) as worker:
         run_training(run, resume, worker, say)

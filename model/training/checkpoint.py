@@ -31,6 +31,7 @@ class TrainingRecipe:
         ema_decay: of the running average of the weights, which is what is shipped.
         loss: weights of the loss's terms.
         seed: of the first weights and of the patches.
+        rounding: the digest of the INT8 file that maps are rounded as; "" rounds none.
     """
 
     steps: int
@@ -41,6 +42,7 @@ class TrainingRecipe:
     ema_decay: float = 0.999
     loss: LossWeights = PAPER
     seed: int = 0
+    rounding: str = ""
 
     def __post_init__(self) -> None:
         numbers = {"learning rate": self.learning_rate}

@@ -14,7 +14,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, grow, load_network, told, vector_tensor
+from beers_deploy.model.convbeers import (
+    BankedConvBEERS,
+    ConvBEERS,
+    Network,
+    Rounding,
+    grow,
+    load_network,
+    told,
+    vector_tensor,
+)
 from beers_deploy.model.family import SensorFamily
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.images import list_images, site_of
@@ -59,6 +68,7 @@ class Run:
     validate_steps: int = 1000
     device: str = "cpu"
     precision: Precision = "float32"
+    rounding: Rounding | None = None
 
     @property
     def checkpoint(self) -> Path:
@@ -159,7 +169,8 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
     generator = torch.Generator().manual_seed(run.recipe.seed)
     start = grow(_given(run, run.start), variant, generator) if run.start else None
     conditioned = run.patches.family is not None
-    trainer = Trainer(variant, run.recipe, loss, worker, run.device, start, run.precision, conditioned)
+    options = (run.device, start, run.precision, conditioned, run.rounding)
+    trainer = Trainer(variant, run.recipe, loss, worker, *options)
     if loss.perceptual is not None:
         loss.perceptual.to(trainer.device)
     if resume:
@@ -189,6 +200,14 @@ def _given(run: Run, path: Path) -> Network:
         kinds = {ConvBEERS: "a plain network's", BankedConvBEERS: "those that 'train --conditioned' wrote"}
         remedy = "give others, or give `conditioned`" if wanted is ConvBEERS else "give others"
         raise ModelError(str(path), expected=f"weights: {kinds[wanted]}", got=kinds[type(network)], remedy=remedy)
+    if run.rounding is not None and network.variant != variant_named(run.variant):
+        remedy = "train a network of that size first, and make its INT8 file"
+        raise OptionError(
+            "rounding",
+            expected=f"weights of {run.variant}",
+            got=f"{network.variant.blocks} blocks of {network.variant.features} features",
+            remedy=remedy,
+        )
     require_finite_output(network, str(path), "give another network")
     return network
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, arrays, initialise
+from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, Rounding, arrays, initialise
 from beers_deploy.model.io.tensors import write_tensors
 from beers_deploy.model.progress import held_back
 from beers_deploy.model.training.checkpoint import MOMENTS, Guards, TrainingRecipe, read_checkpoint
@@ -105,6 +105,7 @@ class Trainer:
         start: a network of the same kind and size to go on from; None draws new weights.
         precision: what the body is computed in; it is the machine's, and a resumed run may take another.
         conditioned: whether the network is given the sensor of each patch.
+        rounding: of a conditioned network's maps, as its INT8 file rounds them; None leaves them as they are.
     """
 
     def __init__(
@@ -117,6 +118,7 @@ class Trainer:
         start: Network | None = None,
         precision: Precision = "float32",
         conditioned: bool = False,
+        rounding: Rounding | None = None,
     ) -> None:
         self.recipe, self.worker = recipe, worker or Worker()
         self.loss, self.device = loss or RestorationLoss(recipe.loss), self.worker.device(device)
@@ -128,6 +130,7 @@ class Trainer:
             self.network.load_state_dict(start.state_dict())
         self.network.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.bfloat16 = precision == "bfloat16"
+        self.rounding = {"rounding": rounding} if rounding else {}
         # Gradients are averaged over the workers.
         self.forward: nn.Module = self.network if self.worker.count == 1 else DistributedDataParallel(self.network)
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
@@ -178,7 +181,7 @@ class Trainer:
             group["lr"] = self.recipe.rate_at(self.step)
         degraded = degraded.to(self.device, memory_format=torch.channels_last)
         known = (vector.to(self.device) for vector in vectors)
-        restored = self.forward(degraded, *known, bfloat16=self.bfloat16)
+        restored = self.forward(degraded, *known, bfloat16=self.bfloat16, **self.rounding)
         total, terms = self.loss(restored, reference.to(self.device))
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]

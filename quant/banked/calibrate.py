@@ -162,6 +162,29 @@ def quantise_family(
     return replace(family, core=family.for_sensor(bank, (0.0,) * SENSOR_VALUES))
 
 
+def map_steps(family: Family, weights: Weights) -> list[np.ndarray]:
+    """What a 1 of a family's maps is in those of its float network, at a gain of 1.
+
+    Levelling multiplied each channel by a factor: the one that whole weights have to the float ones.
+
+    Returns:
+        (F,) of the maps between head and tail, then of the one within each block.
+    """
+    whole = {op.name: op.weight * 2.0**-op.weight_frac_bits for op in family.core.convolutions}
+    given = {op.name: op.weight for op in body_graph(weights) if isinstance(op, Conv)}
+
+    def steps(name: str, read: np.ndarray | float, output: str) -> np.ndarray:
+        weight = given[name][:, : whole[name].shape[1]] * read
+        square = np.square(weight).sum((1, 2, 3))
+        factors = np.where(square > 0, (weight * whole[name]).sum((1, 2, 3)) / np.maximum(square, 1e-30), 1.0)
+        return np.asarray(2.0 ** -family.core.frac_bits[output] / factors)
+
+    stream = steps("head", 1.0, "head")
+    read = 2.0 ** family.core.frac_bits["head"] * stream[:, None, None]
+    inner = (steps(f"body.{k}.first", read, f"body.{k}.relu") for k in range(weights.variant.blocks))
+    return [stream, *inner]
+
+
 def _biases(op: IntConv) -> np.ndarray:
     """What a convolution adds, (O, 1); where it reads the planes of a sensor's values, which hold half, (O, 5)."""
     if op.input != PLANES:

@@ -82,6 +82,40 @@ def test_a_conditioned_run_goes_on_from_others_and_resumes_to_the_same(images: P
     assert recipe["held_out"] == ["coast_1.png"]
 
 
+def test_a_run_with_the_roundings_of_int8_differs_from_one_without_and_resumes_to_the_same(
+    images: Path, tmp_path: Path
+) -> None:
+    name = "convbeers-half-xs"
+    options = ["--variant", name, "--conditioned", "--start", name]
+    run(images, tmp_path / "plain", *options)
+    run(images, tmp_path / "a", *options, "--rounding", f"{name}-int8")
+    first, plain = (weights_of(tmp_path / each / f"{name}.safetensors") for each in ("a", "plain"))
+    assert not torch.equal(first["tail.weight"], plain["tail.weight"])
+    run(images, tmp_path / "a", *options, "--rounding", f"{name}-int8", "--resume")
+    assert all(
+        torch.equal(value, first[k]) for k, value in weights_of(tmp_path / "a" / f"{name}.safetensors").items()
+    )
+    said = refused("train", "--images", images, "--out", tmp_path / "a", *options, "--steps", 4, "--resume")
+    assert "another recipe" in said
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--start", "convbeers-xs"], "--conditioned and --start"),
+        (["--conditioned"], "--conditioned and --start"),
+        (["--conditioned", "--start", "convbeers-s"], "the INT8 file of"),
+        (["--conditioned", "--start", "convbeers-xs", "--variant", "convbeers-s"], "weights of convbeers-s"),
+    ],
+)
+def test_roundings_of_anything_but_the_start_are_refused(
+    options: list[str], said: str, images: Path, tmp_path: Path
+) -> None:
+    command = ["train", "--images", images, "--out", tmp_path / "r", "--steps", 1, "--rounding", "convbeers-xs-int8"]
+    assert said in refused(*command, *options)
+    assert not (tmp_path / "r").exists()
+
+
 def banked_weights(folder: Path) -> Path:
     """Of a small network behind a bank, that give something else for each sensor."""
     save_network(folder / "start.safetensors", behind_a_bank(VARIANTS["convbeers-xs"], 0.1), {})

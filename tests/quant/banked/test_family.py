@@ -11,11 +11,11 @@ from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.bank import bank_of_vector
-from beers_deploy.model.convbeers import BankedConvBEERS, initialise
+from beers_deploy.model.convbeers import BankedConvBEERS, Rounding, initialise
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.banked.calibrate import bank_results, quantise_family
+from beers_deploy.quant.banked.calibrate import bank_results, map_steps, quantise_family
 from beers_deploy.quant.banked.family import FAMILY, Family, delta_of_file, family_of, required_family, with_delta
 from beers_deploy.quant.banked.filters import channels, gain_of
 from beers_deploy.quant.bounds import layer_bounds
@@ -40,13 +40,16 @@ def network(scale: int) -> BankedConvBEERS:
     return made.eval()
 
 
+def weights_of(made: BankedConvBEERS) -> Weights:
+    return Weights({name: value.numpy() for name, value in made.state_dict().items()}, made.variant, {})
+
+
 @pytest.fixture(scope="module", params=[1, 2])
 def pair(request: pytest.FixtureRequest) -> tuple[BankedConvBEERS, Family]:
     made, scale = network(request.param), int(request.param)
-    weights = Weights({name: value.numpy() for name, value in made.state_dict().items()}, made.variant, {})
     images = [bank_results(textured(48, 48, k), bank_of_vector(each), each, scale) for k, each in enumerate(SENSORS)]
     middle = bank_of_vector((0.0, 0.0, 0.0, 0.0))
-    return made, quantise_family(weights, middle, Remade(images.__getitem__, len(images)))
+    return made, quantise_family(weights_of(made), middle, Remade(images.__getitem__, len(images)))
 
 
 def core_of(family: Family, vector: tuple[float, ...]) -> IntCore:
@@ -65,6 +68,33 @@ def test_int8_is_near_the_float_network_for_every_sensor(
     unit = bank_of_vector(vector).unit
     assert np.sqrt(np.square(found - wanted).mean()) < 0.05 * unit
     assert np.sqrt(np.square(image - wanted).mean()) > 0.1 * unit
+
+
+@pytest.mark.parametrize("vector", SENSORS)
+def test_a_float_network_rounded_as_its_file_errs_as_that_does(
+    pair: tuple[BankedConvBEERS, Family], vector: tuple[float, ...]
+) -> None:
+    made, family = pair
+    image, told = 0.3 + 0.3 * textured(46, 58, 9), torch.tensor([vector])
+    stream, *inner = (torch.from_numpy(each)[:, None, None] for each in map_steps(family, weights_of(made)))
+    with torch.inference_mode():
+        plain = made(torch.from_numpy(image), told)
+        rounded = made(torch.from_numpy(image), told, rounding=Rounding(stream, tuple(inner), gain_of))
+    file = run(open_session(host_model(core_of(family, vector), {})), image)
+    errors = file - plain.clamp(0, 1).numpy(), (rounded - plain).numpy()
+    ratio = np.linalg.norm(errors[1]) / np.linalg.norm(errors[0])
+    assert 0.4 < ratio < 1.1  # weights, the bank and the last sum are rounded in the file alone
+
+
+def test_the_steps_of_maps_turn_float_weights_into_the_files(pair: tuple[BankedConvBEERS, Family]) -> None:
+    made, family = pair
+    stream, *inner = map_steps(family, weights_of(made))
+    convolutions = {op.name: op for op in family.core.convolutions}
+    for k, read in enumerate(inner):  # what the steps were not found by
+        op, given = convolutions[f"body.{k}.second"], made.state_dict()[f"body.{k}.second.weight"].numpy()
+        bits = op.weight_frac_bits + family.core.frac_bits[op.input] - family.core.frac_bits[op.output]
+        wanted = (given * (read * 2.0**bits / stream[:, None])[:, :, None, None]).clip(-128, 127)
+        assert np.sqrt(np.square(op.weight - wanted).mean()) < 1  # of 127; without levelling tens
 
 
 def test_the_file_is_what_its_integers_ask_for_and_the_reference_gives_the_same(
