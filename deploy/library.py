@@ -83,7 +83,7 @@ def restore(
         full_scale: the pixel value that is 1.0 to the network. None is a DataArray's attribute of that name, or 4095
             (12 bits) for integers of more than 8 bits and for floats of digital numbers; without it 8-bit pixels, and
             floats that all lie in about 0..1, are refused. Floats of Dask are judged tile by tile when computed.
-        nodata: the value of missing pixels, besides NaN; a DataArray's own `_FillValue` if None.
+        nodata: the value of an array's missing pixels, besides NaN; a DataArray's own `_FillValue` if None.
         tile: longest side of a tile in pixels.
         halo: "exact", or pixels of context around a tile.
         runtime: "onnxruntime" or "openvino".
@@ -165,6 +165,9 @@ def _restore_path(image: Path, options: Options, job: Job, out: str | os.PathLik
     if out is None:
         remedy = "name the TIFF to write, or read the image into an array"
         raise OptionError("out", expected="a path beside an image file", got="none", remedy=remedy)
+    if job.nodata is not None:
+        remedy = "leave it out: the file says which value its missing pixels have"
+        raise OptionError("nodata", expected="none beside an image file", got=f"{job.nodata:g}", remedy=remedy)
     path = Path(out)
     if job.method == TRADITIONAL:
         from beers_deploy.restoration.traditional import restore_file_traditionally  # it takes torch

@@ -18,6 +18,7 @@ from beers_deploy.profiles.target import DEFAULT_TARGET, MODEL_SUFFIX, board_nam
 if TYPE_CHECKING:
     import numpy as np
 
+    from beers_deploy.bench.board import BoardBench, Tables
     from beers_deploy.bench.tables import Swath
 
 
@@ -139,7 +140,7 @@ def bench(
             within_s=within,
             host_task=task,
         )
-        for title, part in (*(found.layers if layers else []), *found.shown):
+        for title, part in (*(_required_layers(found) if layers else []), *found.shown):
             print_rows(title, part)
         for note in (*found.notes, PREDICTED, *([LAYERS] if found.layers and not layers else [])):
             say(note)
@@ -152,6 +153,13 @@ def bench(
                 say(f"The traditional pipeline is not measured here: {missing_extra(error, 'bench')}")
     inputs = tuple(file for file in (path, image, measured) if file)
     save(Table("bench", arguments(), inputs, tuple(rows)), json)
+
+
+def _required_layers(found: "BoardBench") -> "Tables":
+    if not found.layers:
+        expected = "one --target, --tile and --dpu, and no --within"
+        raise OptionError("--layers", expected=expected, got="a comparison", remedy="choose one")
+    return found.layers
 
 
 def _traditional_row(dn: "np.ndarray | None", swath: "Swath") -> "Row":

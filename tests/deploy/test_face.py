@@ -237,6 +237,7 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
     "no array": (lambda _: bd.restore(3), "got int"),
     "a path alone": (lambda _: bd.restore("raw.tif"), "out: expected a path"),
     "an array with out": (lambda raw: bd.restore(raw, out="a.tif"), "expected none beside an array"),
+    "a file's nodata": (lambda _: bd.restore("raw.tif", out="a.tif", nodata=0), "nodata: expected none"),
     "no such sensor": (lambda raw: bd.restore(raw, sensor="none"), "expected one of"),
     "no such network": (lambda raw: bd.restore(raw, "none"), "a shipped network"),
     "no network": (lambda _: bd.Network.load(3), r"torch.nn.Module"),  # type: ignore[arg-type]

@@ -90,6 +90,7 @@ def test_layers_are_shown_when_asked_for_and_written_always(tmp_path: Path) -> N
     assert ("--layers" in brief, "--layers" in full) == (True, False)
     assert full.index("LdFM") < full.index("throughput")
     assert {"bench", "layers"} <= {row["table"] for row in valid(out)["rows"]}
+    assert "--layers: expected one --target" in refused(*command, "--tile", "32,48", "--layers")
 
 
 def test_layer_rows_have_the_columns_of_vaitrace_and_sum_to_their_last(tmp_path: Path) -> None:
