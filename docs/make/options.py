@@ -37,7 +37,7 @@ PATHS = {
     "profiles": Paths({}, (), ("name",)),
     "characterise": Paths({"out": FILE, "json": FILE}, ("images",)),
     "simulate": Paths({"out": FOLDER}, ("scenes",), ("sensor", "reference", "scene")),
-    "train": Paths({"out": FOLDER}, ("images", "pairs", "lpips", "start"), ("sensor", "reference")),
+    "train": Paths({"out": FOLDER}, ("images", "pairs", "lpips", "start", "rounding"), ("sensor", "reference")),
     "export": Paths({"out": FILE, "board_file": FILE, "delta": FILE}, ("network", "apply"), ("sensor", "target")),
     "quantize": Paths(
         {"out": FILE, "board_file": FILE, "report": FOLDER, "json": FILE},
@@ -162,6 +162,7 @@ REFUSED = {
         Refused(("images", "drawn", "conditioned"), "--pairs PAIRS"),
         Refused(("validate_every",), without="--images"),
         Refused(("lpips",), "--lpips-weight 0"),
+        Refused(("rounding",), without="--conditioned"),
     ],
     "export": [
         Refused(("board_file", "delta", "apply"), without="--network"),

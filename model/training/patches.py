@@ -4,6 +4,8 @@ A scene's spectrum is computed once; each visit blurs, samples and folds it anew
 and exposure. Visiting whole scenes yields many patches for one transform.
 """
 
+import os
+from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -80,15 +82,16 @@ class PatchSource:
     def batches(self, first: int = 0) -> Iterator[tuple[np.ndarray, ...]]:
         """Batch number `first` and all that follow, of (N, 1, P, P): a resumed run goes on where it stopped.
 
-        The next shard is made while the present one is used.
+        The next shards are made while the present one is used, on half of the cores: a GPU waits for patches.
         """
         number, within = divmod(first, self.SHARD_BATCHES)
-        with ThreadPoolExecutor(1) as ahead:
-            waiting = ahead.submit(self._shard, number)
+        threads = max((os.cpu_count() or 1) // 2, 1)
+        with ThreadPoolExecutor(threads) as ahead:
+            waiting = deque(ahead.submit(self._shard, number + k) for k in range(threads))
             while True:
-                shard = waiting.result()
+                shard = waiting.popleft().result()
                 number += 1
-                waiting = ahead.submit(self._shard, number)
+                waiting.append(ahead.submit(self._shard, number + threads - 1))
                 for k in range(within, self.SHARD_BATCHES):
                     part = slice(k * self.batch, (k + 1) * self.batch)
                     yield tuple(array[part] for array in shard)

@@ -356,7 +356,7 @@ def test_a_baseline_shows_a_wrong_bias_in_nearly_any_layer(factor: int, unseen: 
         model = changed(sound, name, lambda bias: bias * factor)
         checks = judge(compare(session, open_session(model), unseen.pairs), Limits(), before)
         hidden |= {name.removesuffix(".bias")} if all(check.passed for check in checks) else set()
-    assert hidden == {"body.2.second", "body.3.second"}
+    assert hidden == {"body.2.second", "body.3.second"} | ({"body.3.first"} if factor else set())
 
 
 def as_nodes(model: onnx.ModelProto) -> onnx.ModelProto:

@@ -37,6 +37,7 @@ MORE = {"stress": ("--bit-flips",), "tradeoff": ("--network", "convbeers-xs")}
 """Without which a command does not write, or computes for seconds before it looks at its images."""
 BESIDE = {
     ("restore", "sensor"): ("--method", "traditional"),
+    ("train", "rounding"): ("--conditioned", "--start", "convbeers-xs"),
     ("detect", "labels"): ("--images", "pictures"),
     ("tradeoff", "detector"): ("--labelled", "pictures"),
 }

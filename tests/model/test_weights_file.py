@@ -125,8 +125,7 @@ def test_the_shipped_weights_load_and_say_how_they_were_made(name: str) -> None:
     recipe = shipped.recipe
     assert shipped.variant == VARIANTS[name]
     assert recipe["degraded"] == "drawn over the ranges"
-    noise_free = name in ("convbeers", "convbeers-s")  # see their cards
-    assert recipe["reference"] == ("noise-free" if noise_free else "pleiades-reference")
+    assert recipe["reference"] == "noise-free"
     images = recipe["images"]
     assert isinstance(images, list)
     assert len(images) >= 50
