@@ -88,14 +88,6 @@ class Verdict(Table):
         """The verdict as JUnit XML: a test case a check."""
         return junit_text(f"INT8 gate of {self.comparison.arguments['int8']}", self.checks)
 
-    def to_markdown(self) -> str:
-        """The checks as a table of Markdown, such as a job's summary shows."""
-        lines = ["| check | found | allowed | |", "|---|---|---|---|"]
-        for check in self.checks:
-            mark = "passed" if check.passed else "**failed**"
-            lines.append(f"| {check.name} | {check.found} | {check.allowed} | {mark} |")
-        return "\n".join(lines) + "\n"
-
     def __repr__(self) -> str:
         return f"Verdict({self})"
 

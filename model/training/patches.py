@@ -65,6 +65,8 @@ class PatchSource:
 
     SHARD_BATCHES = 16
     """Batches mixed together: enough scenes in one batch, little memory."""
+    MOST_THREADS = 8
+    """Shards are made ahead by so many: each is some tens of megabytes."""
 
     def __init__(
         self,
@@ -85,7 +87,7 @@ class PatchSource:
         The next shards are made while the present one is used, on half of the cores: a GPU waits for patches.
         """
         number, within = divmod(first, self.SHARD_BATCHES)
-        threads = max((os.cpu_count() or 1) // 2, 1)
+        threads = min(max((os.cpu_count() or 1) // 2, 1), self.MOST_THREADS)
         with ThreadPoolExecutor(threads) as ahead:
             waiting = deque(ahead.submit(self._shard, number + k) for k in range(threads))
             while True:
