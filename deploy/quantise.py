@@ -33,6 +33,7 @@ from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import OwnSamples, samples_of
 from beers_deploy.quant.sensitivity import WORST, headline, layer_error_rows, losses, sizes_row, spread_of, worst_row
 from beers_deploy.quant.session import open_any_size
+from beers_deploy.quant.untrusted import contradictions
 from beers_deploy.report.page import Report
 from beers_deploy.report.sensitivity_page import sensitivity_page
 
@@ -194,11 +195,12 @@ def rounding_of(int8: Path, weights: Path) -> "Rounding":
     from beers_deploy.quant.banked.calibrate import map_steps
     from beers_deploy.quant.banked.filters import gain_of
 
-    model = load_onnx(int8)
+    model, given = load_onnx(int8), read_conditioned(weights)
     if metadata(model).get(WEIGHTS) != sha256(weights):
         expected, remedy = f"the INT8 file of {weights}", "make it with 'beers-deploy quantize'"
         raise ModelError(str(int8), expected=expected, got="another network's", remedy=remedy)
-    found = map_steps(required_family(model), read_conditioned(weights))
+    with contradictions(str(int8)):
+        found = map_steps(required_family(model), given)
     stream, *inner = (torch.from_numpy(np.float32(steps))[:, None, None] for steps in found)
     return Rounding(stream, tuple(inner), gain_of)
 

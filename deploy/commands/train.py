@@ -97,6 +97,7 @@ def train(
     rounding = weights_file(rounding) if rounding else None
     read = (*stored, lpips, start, rounding, *(Path(name) for name in (sensor, reference) if name))
     require_writable(*(out / name for name in (*FILES, f"{variant}.safetensors")), inputs=read)
+    rounded = rounding_of(rounding, start) if rounding and start else None
     recipe = TrainingRecipe(
         steps=steps,
         batch=batch,
@@ -122,7 +123,7 @@ def train(
         validate_every,
         device,
         precision.value,
-        rounding_of(rounding, start) if rounding and start else None,
+        rounded,
     )
     with joined(device) as worker:
         run_training(run, resume, worker, say)

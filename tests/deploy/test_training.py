@@ -105,6 +105,8 @@ def test_a_run_with_the_roundings_of_int8_differs_from_one_without_and_resumes_t
         (["--start", "convbeers-xs"], "--conditioned and --start"),
         (["--conditioned"], "--conditioned and --start"),
         (["--conditioned", "--start", "convbeers-s"], "the INT8 file of"),
+        (["--conditioned", "--start", "none.safetensors"], "none.safetensors: expected"),
+        (["--conditioned", "--start", "convbeers-xs", "--rounding", "none.onnx"], "none.onnx: expected"),
         (["--conditioned", "--start", "convbeers-xs", "--variant", "convbeers-s"], "weights of convbeers-s"),
     ],
 )
