@@ -33,7 +33,7 @@ from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import VARIANTS, Variant
 from beers_deploy.quant.tiling.walk import tiling_of
-from beers_deploy.restoration.engine import restore_window
+from beers_deploy.restoration.exposures import restore_window
 from beers_deploy.restoration.options import Options, Runtime
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.run import restore_file

@@ -12,22 +12,23 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import onnx
 
-from beers_deploy.model.io.images import settled_scale
 from beers_deploy.model.progress import Progress, no_log, reporting
 from beers_deploy.model.shipped import INT8, VARIANT
-from beers_deploy.network import Network, NetworkLike, SensorLike
+from beers_deploy.network import Network, NetworkLike, SensorLike, brighter_files, conditioned, other_sensor
 from beers_deploy.profiles.errors import ImageError, OptionError, optional
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.quant.tiling.walk import Tiling
-from beers_deploy.restoration.engine import NAME, Restorer, as_stored, checked_strip, restore_array
+from beers_deploy.restoration.engine import NAME, Restorer, as_stored, checked_strip
+from beers_deploy.restoration.lazy import restore_lazily
 from beers_deploy.restoration.options import Options, Runtime
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.plan import Plan, Span, plan_for
+from beers_deploy.restoration.plan import plan_for
 from beers_deploy.restoration.radiometry import full_scale_of
+from beers_deploy.restoration.rows import restore_array
 from beers_deploy.restoration.run import restore_file, scale_of
 from beers_deploy.restoration.runtime import Packed, open_runtime, tiles_at_once
 from beers_deploy.restoration.sensor_check import told_sensor
@@ -40,6 +41,7 @@ from beers_deploy.restoration.source import (
     require_raw,
     usable_nodata,
 )
+from beers_deploy.restoration.steps import consistency_steps, exposed_networks
 from beers_deploy.results import Table
 
 NETWORK, TRADITIONAL = "network", "traditional"
@@ -64,6 +66,8 @@ def restore(
     again: bool = False,
     any_result: bool = False,
     strict: bool = False,
+    consistency: bool = True,
+    exposure: bool = True,
     progress: Progress = None,
 ) -> Any:
     """Restore an image of raw digital numbers: an array, or a file into another.
@@ -76,8 +80,8 @@ def restore(
             xarray.DataArray keeps coordinates and attributes, its bands in a dimension "band" wherever that stands.
             Or the path of an image file, restored into `out`.
         network: what `Network.load` takes; convbeers-s-int8 if None.
-        sensor: that a shipped network is told, or that the traditional pipeline knows: a `Sensor`, a name, a .toml
-            file, or "blind" where it is not known.
+        sensor: that acquired the image: a `Sensor`, a name, a .toml file, or "blind" where it is not known. A shipped
+            network is conditioned on it, and the consistency step and the traditional pipeline need it.
         method: "network", or "traditional" for the denoising and deconvolution that networks are compared with.
         quality: of the traditional pipeline on arrays: fast, standard or best.
         full_scale: the pixel value that is 1.0 to the network. None is a DataArray's attribute of that name, or 4095
@@ -94,6 +98,8 @@ def restore(
         again: take an image that says it was restored already.
         any_result: give a result even if it is clipped, constant or far from the image's mean.
         strict: refuse an image, none of Dask, that contradicts its sensor; else warn, or say "sensor told" of a file.
+        consistency: make the result agree with the raw image at low spatial frequencies, where the sensor is known.
+        exposure: restore dark parts at a higher exposure, by a shipped network.
         progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
 
     Returns:
@@ -125,8 +131,22 @@ def restore(
     known = Sensor.load(sensor)
     found = Network.load(f"{VARIANT}{INT8}" if network is None else network, sensor=known)
     told = {} if known.name == BLIND else {"": known}
-    options = Options(found.file, tile, str(halo), full_scale, _runtime(runtime), threads, sensors=told)
-    job = Job(method, quality, known, nodata, replace(options, again=again, any_result=any_result, strict=strict))
+    brighter = _brighter(network, found, known) if exposure and method == NETWORK else {}
+    options = Options(
+        found.file,
+        tile,
+        str(halo),
+        full_scale,
+        _runtime(runtime),
+        threads,
+        sensors=told,
+        again=again,
+        any_result=any_result,
+        strict=strict,
+        consistency=consistency,
+        brighter={"": brighter} if brighter else {},
+    )
+    job = Job(method, quality, known, nodata, options)
     with reporting(progress):
         if isinstance(image, str | os.PathLike) or hasattr(image, "crs"):  # the latter of rasterio
             path = Path(image if isinstance(image, str | os.PathLike) else image.name)
@@ -135,6 +155,17 @@ def restore(
             name, remedy = "out" if out is not None else "cog" if cog else "resume", "save the result yourself"
             raise OptionError(name, expected="none beside an array", got="one", remedy=remedy)
         return _restore_any(image, job)
+
+
+def _brighter(network: NetworkLike | None, found: Network, sensor: Sensor) -> dict[int, Path]:
+    """A conditioned network at higher exposures; of any other one none, and a warning if it is another sensor's."""
+    if network is None or isinstance(network, str | os.PathLike):
+        given = None if network is None else Path(network)
+        if conditioned(given) is not None:
+            return brighter_files(given, sensor)
+    if sensor.name != BLIND and (doubt := other_sensor(found.model, sensor)):
+        warnings.warn(doubt, stacklevel=3)
+    return {}
 
 
 @dataclass(frozen=True)
@@ -293,7 +324,13 @@ def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndar
     infer, _ = open_runtime(options.runtime, network, options.threads, at_once)
     full_scale = scale_of(source, plan, options, NAME).value
     told_sensor(source, options.sensors, full_scale, NAME, options.strict, warnings.warn)
-    restorer = Restorer(raster, infer, full_scale, plan.tiling, NAME)
+
+    def at_first_call(brighter: onnx.ModelProto) -> Packed:
+        return Packed(brighter.SerializeToString(), options.runtime, options.threads, at_once)
+
+    exposed = exposed_networks([infer], options, raster, plan.tiling, full_scale, at_first_call)
+    steps, _ = consistency_steps(options, raster, plan.tiling, full_scale)
+    restorer = Restorer(raster, exposed, full_scale, plan.tiling, NAME, consistency=steps)
     look = None if options.any_result else partial(Tally.require, name=NAME)
     return restore_array(source, plan, restorer, at_once, look)
 
@@ -333,50 +370,3 @@ def _runtime(name: str) -> Runtime:
     except ValueError as error:
         expected = " or ".join(Runtime)
         raise OptionError("runtime", expected=expected, got=repr(name), remedy="choose one") from error
-
-
-@dataclass(frozen=True)
-class Task:
-    """What all tiles of a lazy array share: facts of the image and a network, as they are sent to Dask's workers."""
-
-    raster: Raster
-    network: Packed
-    full_scale: float | None
-    tiling: Tiling
-
-
-def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
-    """A lazy (bands, H, W) array of Dask; errors in options and model come at once, in pixels when it is computed."""
-    da: Any = import_module("dask.array")
-    delayed: Any = import_module("dask").delayed
-    network = load_onnx(options.model)
-    plan = plan_for(network, raster.shape, options)
-    settled_scale(NAME, raster.dtype, (), options.full_scale)  # what the type alone decides comes at once
-    packed = Packed(network.SerializeToString(), options.runtime, options.threads or 1)
-    task = delayed(Task(raster, packed, options.full_scale, plan.tiling))
-    tile = delayed(restore_tile)
-
-    def block(group: int, row: Span, column: Span) -> Any:
-        rows, columns = (_around(span, raster, plan) for span in (row, column))
-        window = bands[group * count : (group + 1) * count, rows, columns]
-        sides = ((span.keep_stop - span.keep_start) * plan.scale for span in (row, column))
-        restored = tile(task, window, rows.start, columns.start, row, column)
-        return da.from_delayed(restored, (plan.tiling.channels_out, *sides), raster.out_dtype)
-
-    count, groups = plan.tiling.channels_in, range(plan.groups)
-    return da.block([[[block(g, row, column) for column in plan.columns] for row in plan.rows] for g in groups])
-
-
-def restore_tile(task: Task, window: np.ndarray, top: int, left: int, row: Span, column: Span) -> np.ndarray:
-    """The kept pixels (bands, h, w) of one tile, from a window (bands, ., .) whose first pixel is at (top, left)."""
-    extent = task.raster.extent(window)._replace(whole=True)  # a tile alone is no proof of radiances
-    full_scale = settled_scale(NAME, task.raster.dtype, [extent], task.full_scale)
-    restorer = Restorer(task.raster, task.network, full_scale, task.tiling, NAME)
-    here = Span(*(side - left for side in (column.start, column.stop, column.keep_start, column.keep_stop)))
-    return restorer.tile(checked_strip(task.raster, top, window, full_scale, NAME), 0, row, here).pixels
-
-
-def _around(span: Span, raster: Raster, plan: Plan) -> slice:
-    """What a tile reads along one side: its window, and what missing pixels may be filled from."""
-    margin_px = raster.fill_margin_px(plan.radius_px)
-    return slice(max(span.start - margin_px, 0), span.stop + margin_px)

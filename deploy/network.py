@@ -27,6 +27,7 @@ import onnxruntime as ort
 
 from beers_deploy.export import float_for, float_model, require_tile
 from beers_deploy.model.bank import network_bank
+from beers_deploy.model.exposure import brightened, factors_for
 from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.io.tensors import is_conditioned
@@ -35,7 +36,7 @@ from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_n
 from beers_deploy.profiles.errors import ModelError, OptionError, OutsideRangeWarning, optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor, numbers_of
-from beers_deploy.profiles.sensor_file import BLIND, load_sensor
+from beers_deploy.profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.profiles.toml import unreadable
 from beers_deploy.quant.banked.family import required_family, with_delta
@@ -296,6 +297,24 @@ def network_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
     return int8_file(given, sensor, log) if int8 else float_file(given, sensor, log)
 
 
+def brighter_files(given: Path | None, sensor: Sensor) -> dict[int, Path]:
+    """Write a conditioned network for the sensor at higher exposures; return the files by factor.
+
+    Args:
+        given: as of `network_file`.
+        sensor: likewise.
+
+    Returns:
+        Empty for any other network, and where the sensor's noise allows no factor above 1.
+    """
+    network = conditioned(given)
+    if network is None:
+        return {}
+    int8 = given is None or given.name.endswith(INT8)
+    factors = factors_for(sensor.nominal())
+    return {factor: _written(network, brightened(sensor, factor), int8, no_log) for factor in factors if factor > 1}
+
+
 def float_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
     """As `network_file`, a conditioned network always in float32."""
     found = conditioned(given)
@@ -318,6 +337,14 @@ def warn_outside(sensor: Sensor, log: Log) -> None:
     """Tell what of a sensor lies outside the range that was trained."""
     for sentence in sensor_vector(sensor.nominal()).outside:
         log(f"warning: {sentence}")
+
+
+def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
+    """Return a warning if a network was made for another sensor than the one named; else nothing."""
+    own = metadata(model).get("sensor", "")
+    if own in ("", BLIND, BLIND_PROFILE, sensor.name):
+        return ""
+    return f"look at the sensor: the network was made for {own}, not for {sensor.name}"
 
 
 def other_precision(model: onnx.ModelProto) -> onnx.ModelProto | None:

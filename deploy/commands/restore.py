@@ -1,5 +1,6 @@
 """`beers-deploy restore`: a raw image in, the restored one out, of any size."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from enum import StrEnum
 from functools import partial
@@ -12,11 +13,25 @@ from beers_deploy.commands.shared import Json, Restoring, Tile, TrustIndex, argu
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.restoration.options import Compression, Options, Runtime
 
-NETWORK_ONLY = ("network", "tile", "halo", "resume", "runtime", "threads", "scheduler", "cog", "stac", "any_result")
+NETWORK_ONLY = (
+    "network",
+    "tile",
+    "halo",
+    "resume",
+    "runtime",
+    "threads",
+    "scheduler",
+    "cog",
+    "stac",
+    "any_result",
+    "consistency",
+    "exposure",
+)
 """Options of which the traditional chain takes none."""
 
 
@@ -36,8 +51,8 @@ def restore(
     sensor: Annotated[
         str | None,
         typer.Option(
-            help="The sensor of IN, a profile's name or your .toml file, which a shipped network is told; "
-            "B0=a.toml,B1=b.toml for each band; blind if none."
+            help="The sensor of IN, a profile's name or your .toml file: shipped networks and the consistency step "
+            "use it; B0=a.toml,B1=b.toml for each band; blind if none."
         ),
     ] = None,
     tile: Tile = TILE_PX,
@@ -72,6 +87,17 @@ def restore(
     strict: Annotated[
         bool, typer.Option("--strict", help="Refuse IN whose pixels contradict --sensor, instead of saying so.")
     ] = False,
+    consistency: Annotated[
+        bool,
+        typer.Option(
+            "--consistency/--no-consistency",
+            help="Make OUT agree with IN at low spatial frequencies, where --sensor is given.",
+        ),
+    ] = True,
+    exposure: Annotated[
+        bool,
+        typer.Option("--exposure/--no-exposure", help="Restore dark parts at a higher exposure (shipped networks)."),
+    ] = True,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped or killed.")] = False,
     json: Json = None,
 ) -> None:
@@ -79,15 +105,16 @@ def restore(
 
     The image is read and written by rows, so memory does not grow with its height. OUT has the scale of IN. Bands are
     restored one by one. Georeference, RPCs, missing pixels (NaN, the nodata value, or a mask) and alpha are kept.
-    A shipped network is told --sensor, in float32 (NAME) and in INT8 (NAME-int8); IN's own noise and edges are then
-    held against it. Without --sensor the middle of its range is assumed.
+    A shipped network, in float32 (NAME) or INT8 (NAME-int8), is conditioned on --sensor, and without it on the middle
+    of its range. IN's own noise and edges are compared with --sensor. The consistency step keeps the mean and the
+    flux of points; exposure lets INT8 restore dark parts as well as bright ones.
     --method traditional restores one band, about a minute a megapixel on two cores, and is not resumable.
     JPEG 2000, NITF, HFA, VRT and DIMAP need the extra 'gdal'. Until OUT is finished its rows lie in .OUT.part.
     """
     from beers_deploy.model.io.files import require_writable, sha256
     from beers_deploy.model.io.images import require_image_file
     from beers_deploy.model.shipped import INT8
-    from beers_deploy.network import conditioned, network_file
+    from beers_deploy.network import brighter_files, conditioned, network_file
     from beers_deploy.restoration.bands import parse_sensors
     from beers_deploy.restoration.cog import write_item
     from beers_deploy.restoration.run import restore_file
@@ -112,6 +139,7 @@ def restore(
         cog=cog,
         again=again,
         any_result=any_result,
+        consistency=consistency,
     )
     if method is Method.traditional:
         refuse(context, NETWORK_ONLY, expected="none with --method traditional", got="one")
@@ -119,13 +147,7 @@ def restore(
         print_rows(f"wrote {out}", [row])
         save(Table("restore", arguments(), (image,), (row,)), json)
         return
-    if stac is not None:
-        if not cog:
-            raise OptionError("--stac", expected="--cog beside it", got="none", remedy="add it, or leave --stac out")
-        optional("pystac", "--stac")
-    if sensor is not None and conditioned(network) is None:
-        expected, remedy = "a shipped network, or weights of 'train --conditioned'", "leave --sensor out"
-        raise OptionError("--sensor", expected=expected, got=f"{network}, made for one already", remedy=remedy)
+    _require_item(stac, cog)
     known = {band: load_sensor(each) for band, each in sensors.items()}
     require_image_file(image)
     if found := conditioned(network):
@@ -133,17 +155,47 @@ def restore(
         name = network.name if network else f"{found.name}{INT8}"
         say(f"network: {name}, {told}")
     paths = {band: network_file(network, each, partial(say, err=True)) for band, each in known.items()}
+    brighter = {band: brighter_files(network, each) for band, each in known.items()} if exposure else {}
+    if sensor and not found:
+        _look_at_network(network, paths, known)
     path, bits = next(iter(paths.values())), {int(each.bits.low) for each in known.values()}
     if len(bits) > 1 and full_scale is None:
         remedy = "give --full-scale, or restore such bands apart"
         raise OptionError("--sensor", expected="sensors of equal bits", got=f"{sorted(bits)}", remedy=remedy)
-    how = replace(how, model=path, sensors=known if sensor else {}, bands={} if "" in paths else paths)
+    how = replace(
+        how,
+        model=path,
+        sensors=known if sensor else {},
+        bands={} if "" in paths else paths,
+        brighter={band: files for band, files in brighter.items() if files},
+    )
     row = restore_file(image, out, how, say, (json, stac))
     networks = [Input(f"{path.name}, {band}" if band else path.name, sha256(path)) for band, path in paths.items()]
     if stac is not None:
         write_item(out, stac)
     print_rows(f"wrote {out}", [row])
     save(Table("restore", arguments(sensor=sensor or BLIND), (*networks, image), (row,)), json)
+
+
+def _require_item(stac: Path | None, cog: bool) -> None:
+    """Refuse a STAC item of what is no Cloud-Optimised GeoTIFF, or without its package."""
+    if stac is None:
+        return
+    if not cog:
+        raise OptionError("--stac", expected="--cog beside it", got="none", remedy="add it, or leave --stac out")
+    optional("pystac", "--stac")
+
+
+def _look_at_network(network: Path | None, paths: Mapping[str, Path], known: Mapping[str, Sensor]) -> None:
+    """Refuse sensors by band for a network that is for one; say where it was made for another sensor."""
+    from beers_deploy.network import other_sensor
+    from beers_deploy.quant.onnx_file import load_onnx
+
+    if len(known) > 1:
+        expected, remedy = "a shipped network, or weights of 'train --conditioned'", "give one sensor for all bands"
+        raise OptionError("--sensor", expected=expected, got=f"{network} with a sensor for each band", remedy=remedy)
+    if doubt := other_sensor(load_onnx(paths[""]), known[""]):
+        say(doubt, err=True)
 
 
 def _by_the_chain(image: Path, out: Path, sensor: str | None, how: Options, json: Path | None) -> Row:

@@ -44,6 +44,8 @@ class Options:
         again: whether an image may be one that was restored already.
         any_result: whether a result is written that no restoration has.
         bands: networks of single bands by their names, each for its own sensor; empty where `model` is for all.
+        brighter: the network for sensors of so many times the gain, by band and factor; empty where none is.
+        consistency: whether the consistency step is taken where the sensor is known.
         cog: whether the output is a Cloud-Optimised GeoTIFF.
         sensors: that the user named, by band; under no name where one is for all, empty where none was named.
         strict: whether an image is refused that contradicts its sensor.
@@ -67,6 +69,8 @@ class Options:
     again: bool = False
     any_result: bool = False
     bands: Mapping[str, Path] = field(default_factory=dict)
+    brighter: Mapping[str, Mapping[int, Path]] = field(default_factory=dict)
+    consistency: bool = True
 
     @property
     def sensor_bits(self) -> int | None:

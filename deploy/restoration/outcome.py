@@ -36,6 +36,10 @@ class Tally:
         before_squared: of their squares.
         after: sum of the results.
         after_squared: of their squares.
+        tiles: tiles that the network was run on.
+        runs: of the network, one for each exposure that a tile asks for.
+        brightened: results that were restored at an exposure above 1.
+        change_squared: sum of the squares of what the consistency step changed.
     """
 
     known: int = 0
@@ -46,6 +50,10 @@ class Tally:
     before_squared: float = 0.0
     after: float = 0.0
     after_squared: float = 0.0
+    tiles: int = 0
+    runs: int = 0
+    brightened: int = 0
+    change_squared: float = 0.0
 
     @classmethod
     def of(
@@ -112,6 +120,23 @@ class Tally:
             "results at ends": measured(100 * self.share_at_ends, "%", ends),
             "mean moved": measured(100 * self.moved, "% of full scale", mean),
         }
+
+    @property
+    def exposure_figures(self) -> Mapping[str, Figure]:
+        """What several exposures of the network were used for, for the results of a run."""
+        runs, pixels = "exposures that tiles asked for, mean of the tiles", "restored at an exposure above 1"
+        share = 100 * self.brightened / max(self.known, 1)
+        return {
+            "network runs": measured(self.runs / max(self.tiles, 1), "run/tile", runs),
+            "brightened pixels": measured(share, "%", pixels),
+        }
+
+    @property
+    def consistency_figures(self) -> Mapping[str, Figure]:
+        """What the consistency step changed, for the results of a run."""
+        rms = math.sqrt(self.change_squared / max(self.known, 1))
+        source = "root mean square of what the step added to the known pixels"
+        return {"consistency step": measured(100 * rms, "% of full scale", source)}
 
     @property
     def doubts(self) -> list[str]:

@@ -26,10 +26,10 @@ from beers_deploy.model.io.files import TIFF_SUFFIXES
 from beers_deploy.model.io.tiff import MASK
 from beers_deploy.profiles.errors import ImageError, MachineError, MissingExtraError, OptionError, sizes
 from beers_deploy.profiles.toml import read_json
-from beers_deploy.restoration.engine import RestoredRow
 from beers_deploy.restoration.georeference import enlarged_tags
 from beers_deploy.restoration.options import Compression
 from beers_deploy.restoration.outcome import Tally
+from beers_deploy.restoration.rows import RestoredRow
 from beers_deploy.restoration.source import BIG_TIFF_SUFFIXES, RESTORED, RGB_BANDS, Source, strips
 
 

@@ -9,6 +9,7 @@ extended there by copies of its last row and column. Whether a run fits into mem
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
 import onnx
 import psutil
 
@@ -202,12 +203,16 @@ def _require_fit(bands: int, halo_px: int, tiling: Tiling) -> None:
         raise OptionError("halo", expected=expected, got=f"{halo_px} px", remedy=remedy)
 
 
+FLOAT_BYTES = np.dtype(np.float32).itemsize
+
+
 def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
     """Memory that rows of the image will take beyond what is held now.
 
-    Three strips as read and three as restored: two in work and one on its way, on either side; and what the source
-    holds. Once the run has `begun`, the first strip and the source's share are there already. Where pixels may be
-    missing, each has a flag, and one more while flags are made.
+    Three strips as read: two in work and one on its way. Three rows of tiles in float32, as the network gave them:
+    one waits for the row below it, and one more is begun. Two finished rows, and what the source holds. Once the run
+    has `begun`, the first strip and the source's share are there already. Where pixels may be missing, each has a
+    flag, and one more while flags are made.
     """
     raster = source.raster
     row_px = raster.bands * raster.width_px
@@ -215,8 +220,9 @@ def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
     flags = plan.strip_rows_px * row_px * raster.may_miss
     held = 0 if begun else read + source.held_bytes(plan.strip_rows_px)
     bands, _, width_px = plan.out_shape
-    restored = plan.tile_shape[0] * plan.scale * bands * width_px * raster.out_dtype.itemsize
-    return 2 * read + flags + 3 * restored + held
+    row_values = plan.tile_shape[0] * plan.scale * bands * width_px
+    restored = row_values * (3 * FLOAT_BYTES + 2 * raster.out_dtype.itemsize)
+    return 2 * read + flags + restored + held
 
 
 def check_memory(rows: int, budget_bytes: int | None, bulky: bool) -> int:

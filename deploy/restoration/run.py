@@ -26,19 +26,23 @@ from beers_deploy.model.processor import require_cores
 from beers_deploy.model.progress import Log, held_back, no_log, steps
 from beers_deploy.profiles.errors import BeersError, MachineError, optional
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
+from beers_deploy.profiles.sensor import numbers_of
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.reading.external import network_sha256
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.cog import disk_bytes, what_was_done, write_cog
-from beers_deploy.restoration.engine import RestoredRow, Restorer, restore_rows
+from beers_deploy.restoration.engine import Restorer
+from beers_deploy.restoration.exposures import ExposedNetwork
 from beers_deploy.restoration.georeference import unread_places
 from beers_deploy.restoration.options import Compression, Options
 from beers_deploy.restoration.output import Checkpoint, only_run, require_codec, require_tiff_name, write_output
 from beers_deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
+from beers_deploy.restoration.rows import RestoredRow, restore_rows, rows_to_run
 from beers_deploy.restoration.runtime import Infer, Packed, infer_on, open_runtime, tiles_at_once
 from beers_deploy.restoration.sensor_check import told_sensor
 from beers_deploy.restoration.source import Source, fingerprint, open_source, require_raw
+from beers_deploy.restoration.steps import OFF, consistency_steps, exposed_networks, factor_words
 
 RUNS_UNTIL_STEADY = 2
 """Of each tile in work at a time: then a runtime takes no more memory."""
@@ -74,12 +78,17 @@ def restore_file(
         check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
         scale = scale_of(source, plan, options, str(image))
         check = told_sensor(source, options.sensors, scale.value, str(image), options.strict, log)
-        opened, at_once, runtime = _opened(networks, plan, options, cluster)
-        restorer = Restorer(raster, opened[0], scale.value, plan.tiling, str(image), not scale.assumed, opened[1:])
+        exposed, at_once, runtime = _opened(networks, source, plan, options, cluster, scale.value)
+        steps_taken, words = consistency_steps(options, raster, plan.tiling, scale.value)
+        clips = not scale.assumed
+        restorer = Restorer(raster, exposed, scale.value, plan.tiling, str(image), clips, steps_taken)
         figures = seam_figures(source, plan, restorer)
         # Another version of the runtime might give other bits: rows of one are not finished by another.
+        brighter = [path for files in options.brighter.values() for path in files.values()]
         digests = ", ".join(network_sha256(path) for path in paths)
         job = _job(image, source, digests, plan, runtime, scale.value)
+        job["exposures"] = [network_sha256(path) for path in brighter]
+        job["consistency"] = str([numbers_of(sensor) for sensor in options.sensors.values()]) if steps_taken else OFF
         cog_bytes = disk_bytes(plan.out_shape, raster.out_dtype.itemsize) if options.cog else 0
         checkpoint = Checkpoint(out, plan.out_shape, raster.out_dtype, job, options.resume, cog_bytes)
         done_rows = checkpoint.rows // plan.scale
@@ -94,7 +103,13 @@ def restore_file(
         doubt = f": {share:.0%} of the image; is that its full scale?" if share > MANY else ""
         log(f"{tally.clipped} pixels above full scale, {scale.words}, were clipped to it{doubt}")
     figures |= {**check.figures, **tally.figures}
-    return run_row(image.name, plan, done_rows, time_s, runtime, options, figures, {**scale.text, **check.text})
+    text = {**scale.text, **check.text, "consistency": words}
+    if options.brighter:
+        figures |= tally.exposure_figures
+        text["exposures"] = factor_words(options.brighter)
+    if steps_taken:
+        figures |= tally.consistency_figures
+    return run_row(image.name, plan, done_rows, time_s, runtime, options, figures, text)
 
 
 @contextmanager
@@ -121,8 +136,13 @@ def begun(image: Path, out: Path, options: Options, beside: Sequence[Path | None
 
 
 def _opened(
-    networks: Sequence[onnx.ModelProto], plan: Plan, options: Options, cluster: Cluster | None
-) -> tuple[tuple[Infer, ...], int, str]:
+    networks: Sequence[onnx.ModelProto],
+    source: Source,
+    plan: Plan,
+    options: Options,
+    cluster: Cluster | None,
+    full_scale: float,
+) -> tuple[tuple[ExposedNetwork, ...], int, str]:
     """The networks ready to run, how many tiles are in work at a time, and the runtime's name and version.
 
     A cluster is given two tiles for each call that it runs at once, of the two rows of tiles that are in work.
@@ -130,12 +150,20 @@ def _opened(
     threads = 1 if cluster else options.threads
     at_once = tiles_at_once(threads, plan.tiles)
     opened = [open_runtime(options.runtime, network, threads, at_once) for network in networks]
-    infers, runtime = tuple(infer for infer, _ in opened), opened[0][1]
-    if cluster:
+    infers, runtime = [infer for infer, _ in opened], opened[0][1]
+
+    def at_first_call(network: onnx.ModelProto) -> Infer:
+        if cluster is None:
+            return Packed(network.SerializeToString(), options.runtime, threads, at_once)
+        return infer_on(cluster, Packed(network.SerializeToString(), options.runtime, options.threads or 1))
+
+    if cluster is not None:
+        infers = [at_first_call(network) for network in networks]
+    about = options, source.raster, plan.tiling, full_scale
+    exposed = exposed_networks(infers, *about, at_first_call)
+    if cluster is not None:
         at_once = max(min(2 * cluster.slots, 2 * plan.row_tiles), 1)
-        packed = (Packed(each.SerializeToString(), options.runtime, options.threads or 1) for each in networks)
-        infers = tuple(infer_on(cluster, each) for each in packed)
-    return infers, at_once, runtime
+    return exposed, at_once, runtime
 
 
 def scale_of(source: Source, plan: Plan, options: Options, name: str) -> FullScale:
@@ -161,7 +189,7 @@ def _finish_rows(
 ) -> None:
     """Restore the rows that a checkpoint lacks, and keep each in it while the next is made."""
     rows = [row for row in plan.rows if row.keep_start * plan.scale >= checkpoint.rows]
-    tiles = len(rows) * plan.row_tiles
+    tiles = len(rows_to_run(plan, restorer, rows)) * plan.row_tiles
     steady = min(RUNS_UNTIL_STEADY * at_once, tiles)
     with _kept_for_resuming(checkpoint, log), steps("restoring", tiles) as bar, held_back() as interrupt:
 

@@ -131,11 +131,19 @@ def session_threads(threads: int, at_once: int) -> int:
 
 @dataclass(frozen=True)
 class Packed:
-    """A network as another process runs it, which opens it once: an ONNX file's bytes, and how it is to be run."""
+    """A network that is opened once, at its first call, be it in another process.
+
+    Attributes:
+        content: bytes of its ONNX file.
+        runtime: what runs it.
+        threads: of the runtime, in all.
+        at_once: how many callers share the threads.
+    """
 
     content: bytes
     runtime: Runtime
     threads: int
+    at_once: int = 1
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """As an `Infer`."""
@@ -150,7 +158,7 @@ _opening = Lock()
 
 @lru_cache(maxsize=NETWORKS_KEPT)
 def _opened(packed: Packed) -> Infer:
-    return open_runtime(packed.runtime, parse_onnx(packed.content, "network"), packed.threads)[0]
+    return open_runtime(packed.runtime, parse_onnx(packed.content, "network"), packed.threads, packed.at_once)[0]
 
 
 def infer_on(cluster: Cluster, packed: Packed) -> Infer:

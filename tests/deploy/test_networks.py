@@ -131,10 +131,10 @@ def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_i
     assert np.abs(restored[0] - restored[1]).max() > 5
 
 
-def test_a_network_that_is_made_already_takes_no_sensor(tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "in.tif", np.full((20, 30), 900, np.uint16))
-    words = ["--network", shipped_pair("convbeers-xs")[0], "--sensor", SENSOR]
-    assert "leave --sensor out" in refused("restore", tmp_path / "in.tif", tmp_path / "out.tif", *words)
+def test_a_network_that_is_made_for_one_sensor_takes_no_sensor_for_each_band(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", np.full((2, 20, 30), 900, np.uint16))
+    words = ["--network", shipped_pair("convbeers-xs")[0], "--sensor", f"B0={SENSOR},B1={SENSOR}"]
+    assert "one sensor for all bands" in refused("restore", tmp_path / "in.tif", tmp_path / "out.tif", *words)
     assert not (tmp_path / "out.tif").exists()
 
 

@@ -13,7 +13,7 @@ from beers_deploy.cli import app
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.quant.tiling.walk import Tiling
-from beers_deploy.restoration.engine import restore_floats
+from beers_deploy.restoration.rows import restore_floats
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.studies.stress.battery import StageResult, run_battery, worst
 from beers_deploy.studies.stress.cases import CASES, FULL_DN, Case

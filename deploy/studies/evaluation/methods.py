@@ -4,7 +4,7 @@ They are the input itself, the traditional pipeline in both orders and three qua
 networks.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -13,19 +13,20 @@ import onnx
 import torch
 
 from beers_deploy.export import float_model
+from beers_deploy.model.exposure import brightened, factors_for
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.shipped import INT8, shipped_names
 from beers_deploy.model.traditional.nl_bayes import QUALITIES
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.pipeline import Chain, Order, restore_traditional
-from beers_deploy.network import conditioned, network_file, warn_outside
+from beers_deploy.network import Conditioned, conditioned, network_file, warn_outside
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.profiles.sensor_file import BLIND as NOT_KNOWN
 from beers_deploy.profiles.sensor_file import BLIND_PROFILE, load_sensor
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.restoration.engine import Restore, network_method
+from beers_deploy.restoration.method import BOTH, Around, Restore, network_method
 
 Specialise = Callable[[Instrument], Restore]
 """A sensor to the restoration of images that it acquired."""
@@ -90,7 +91,7 @@ EXPECTED = (
 )
 
 
-def method_named(name: str, degraded: Sensor, reference: Sensor, log: Log = no_log) -> Method:
+def method_named(name: str, degraded: Sensor, reference: Sensor, log: Log = no_log, around: Around = BOTH) -> Method:
     """The method of that name; the traditional ones know both sensors, a shipped network the degraded one.
 
     Args:
@@ -98,6 +99,7 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, log: Log = no_l
         degraded: the sensor of the images.
         reference: the one that is aimed at.
         log: is told what of the sensor lies outside the range that a network was trained for.
+        around: which steps around a network are taken.
     """
     if name in WITHOUT_NETWORK:
         return method_without_network(name, degraded.nominal(), reference.nominal())
@@ -106,24 +108,54 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, log: Log = no_l
     if not shipped and Path(network).suffix not in (".onnx", ".safetensors"):
         raise OptionError("methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
     sensor = load_sensor(other) if other else degraded
-    model = float_model(network_file(Path(network), sensor, log))
-    known = knowledge_of(model, degraded.name)
-    specialise = None if other else _network_specialise(network, degraded, log)
-    return Method(name, network_method(model, degraded.nominal().max_dn), known, specialise)
-
-
-def _network_specialise(name: str, like: Sensor, log: Log) -> Specialise | None:
-    """A conditioned network told any sensor in the grid of a profile; None of a network that is plain."""
-    found = conditioned(Path(name))
+    found = conditioned(Path(network))
     if found is None:
-        return None
+        model = float_model(network_file(Path(network), sensor, log))
+        restore = with_steps(model, {}, sensor, reference.nominal(), around)
+        return Method(name, restore, knowledge_of(model, degraded.name))
+    model = found.model(sensor, network.endswith(INT8))
+    warn_outside(sensor, log)
+    specialise = None if other else _network_specialise(network, found, degraded, reference.nominal(), around, log)
+    restore = _conditioned_restore(network, found, sensor, reference.nominal(), around)
+    return Method(name, restore, knowledge_of(model, degraded.name), specialise)
+
+
+def _network_specialise(
+    name: str, network: Conditioned, like: Sensor, reference: Instrument, around: Around, log: Log
+) -> Specialise:
+    """A conditioned network given any sensor in the grid of a profile."""
 
     def specialise(sensor: Instrument) -> Restore:
         known = profile_of(sensor, like)
         warn_outside(known, log)
-        return network_method(found.model(known, name.endswith(INT8)), sensor.max_dn)
+        return _conditioned_restore(name, network, known, reference, around)
 
     return specialise
+
+
+def _conditioned_restore(
+    name: str, network: Conditioned, sensor: Sensor, reference: Instrument, around: Around
+) -> Restore:
+    """A conditioned network for one sensor, with its exposures."""
+    int8 = name.endswith(INT8)
+    factors = factors_for(sensor.nominal()) if around.exposure else (1,)
+    models = {factor: network.model(brightened(sensor, factor) if factor > 1 else sensor, int8) for factor in factors}
+    brighter = {factor: model for factor, model in models.items() if factor > 1}
+    return with_steps(models[1], brighter, sensor, reference, around)
+
+
+def with_steps(
+    model: onnx.ModelProto,
+    brighter: Mapping[int, onnx.ModelProto],
+    sensor: Sensor,
+    reference: Instrument,
+    around: Around,
+) -> Restore:
+    """A network with the steps around it; the consistency step only where a sensor is known."""
+    instrument, aim = sensor.nominal(), None
+    if around.consistency and sensor.name not in (NOT_KNOWN, BLIND_PROFILE):
+        aim = reference.in_units_of(instrument)
+    return network_method(model, instrument.max_dn, brighter, instrument, aim)
 
 
 def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:

@@ -11,8 +11,10 @@ from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.quant.tiling.walk import Tiling
-from beers_deploy.restoration.engine import Restorer, restore_rows
+from beers_deploy.restoration.engine import Restorer
+from beers_deploy.restoration.exposures import ExposedNetwork
 from beers_deploy.restoration.plan import Plan, make_plan
+from beers_deploy.restoration.rows import restore_rows
 from beers_deploy.restoration.runtime import AT_ONCE, Infer, session_threads, tiles_at_once
 from beers_deploy.restoration.source import ArraySource, Raster
 
@@ -25,7 +27,7 @@ def running(infer: Infer, at_once: int, tick: Callable[[], None] = lambda: None)
     pixels = np.random.default_rng(0).integers(0, 4096, SHAPE).astype(np.uint16)
     raster = Raster(*SHAPE, pixels.dtype, None)
     plan: Plan = make_plan(raster.shape, TILE_PX, RADIUS_PX, Tiling(RADIUS_PX))
-    restorer = Restorer(raster, infer, 4095.0, Tiling(RADIUS_PX))
+    restorer = Restorer(raster, (ExposedNetwork({1: infer}),), 4095.0, Tiling(RADIUS_PX))
     result = np.empty(SHAPE, np.uint16)
     source = ArraySource(pixels, raster)
     for row, kept, tally in restore_rows(source, plan, restorer, plan.rows, tick, at_once):

@@ -1,5 +1,6 @@
 """One engine: one image is restored to the same pixels, whichever command or function restores it."""
 
+import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -12,11 +13,13 @@ from beers_deploy.library import restore
 from beers_deploy.network import shipped_pair
 from beers_deploy.profiles import load_sensor
 from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.restoration import engine
-from beers_deploy.restoration.engine import network_method, restore_dn, restore_floats
+from beers_deploy.restoration import method
+from beers_deploy.restoration.method import Around, network_method
 from beers_deploy.restoration.options import Options, Runtime
 from beers_deploy.restoration.plan import plan_for
+from beers_deploy.restoration.rows import restore_dn, restore_floats
 from beers_deploy.restoration.runtime import open_runtime
+from beers_deploy.restoration.steps import step_for
 from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.stress.networks import Network
 from beers_deploy.studies.tradeoff.measure import restore_in_tiles
@@ -35,7 +38,7 @@ SMALL_HALOS_PX = {"float": 2, "int8": 8}
 @pytest.fixture(params=TILES_PX)
 def precision(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Of the network; evaluate and the trade-off's scores take tiles so small that the image has many."""
-    monkeypatch.setattr(engine, "TILE_PX", TILES_PX[request.param])
+    monkeypatch.setattr(method, "TILE_PX", TILES_PX[request.param])
     return str(request.param)
 
 
@@ -53,20 +56,21 @@ def by_engine(dn: np.ndarray, options: Options) -> np.ndarray:
     """As an array in memory."""
     network = load_onnx(options.model)
     infer, _ = open_runtime(Runtime.onnxruntime, network, threads=0)
-    return restore_dn(dn, infer, plan_for(network, (1, *ODD), options))
+    steps = tuple(step_for(sensor, 4095) for sensor in options.sensors.values())
+    return restore_dn(dn, infer, plan_for(network, (1, *ODD), options), consistency=steps)
 
 
 def by_tradeoff(path: Path, precision: str, halo_px: int) -> Restored:
     """As a study scores an operating point whose halo is smaller than the network's radius."""
     variant = Variant(path.stem, FLOAT if precision == "float" else INT8, path)
-    return restore_in_tiles(Point(variant, tile_px=TILES_PX[precision], halo_px=halo_px), 4095)
+    return restore_in_tiles(Point(variant, tile_px=TILES_PX[precision], halo_px=halo_px), SENSOR, REFERENCE)
 
 
 def exact_ways(path: Path, tile_px: int) -> dict[str, Restored]:
     """Every way from digital numbers (H, W) float32 to whole restored ones whose seams are exact."""
     network = load_onnx(path)
     return {
-        "evaluate and tradeoff": method_named(str(path), SENSOR, REFERENCE).restore,
+        "evaluate and tradeoff": method_named(str(path), SENSOR, REFERENCE, around=Around(consistency=False)).restore,
         "the library and the demo": lambda dn: np.rint(library.restore(dn, path, tile=tile_px, full_scale=4095)),
         "stress": lambda dn: np.rint(Network(network).restore(dn, tile_px=tile_px)),
         "the array": partial(by_engine, options=Options(path, tile_px)),
@@ -86,11 +90,13 @@ def test_with_exact_seams_every_command_gives_the_pixels_of_restore(
 
 def test_with_a_halo_below_the_radius_they_have_the_same_seams(precision: str, path: Path, tmp_path: Path) -> None:
     pixels, tile_px, halo_px = image(), TILES_PX[precision], SMALL_HALOS_PX[precision]
-    options = Options(path, tile_px, str(halo_px))
+    options = Options(path, tile_px, str(halo_px), sensors={"": SENSOR})
     expected = restored(tmp_path, pixels, options)[0]
-    assert (expected != restored(tmp_path, pixels, Options(path, tile_px))[0]).any()
+    assert (expected != restored(tmp_path, pixels, Options(path, tile_px, sensors={"": SENSOR}))[0]).any()
     dn = pixels.astype(np.float32)
-    np.testing.assert_array_equal(restore(pixels, path, tile=tile_px, halo=halo_px), expected)
+    with warnings.catch_warnings(action="ignore"):  # noise contradicts the sensor
+        found = restore(pixels, path, tile=tile_px, halo=halo_px, sensor=SENSOR)
+    np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(by_tradeoff(path, precision, halo_px)(dn), expected)
     np.testing.assert_array_equal(by_engine(dn, options), expected)
 

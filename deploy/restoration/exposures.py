@@ -1,0 +1,135 @@
+"""A network at several exposures, as it restores the tiles of a band (see `model.exposure`)."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from beers_deploy.model.exposure import choose_factors
+from beers_deploy.profiles.errors import ImageError, ModelError
+from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.quant.tiling.walk import Tiling
+from beers_deploy.quant.untrusted import times
+from beers_deploy.restoration.plan import Plan
+from beers_deploy.restoration.runtime import Infer
+
+Kept = tuple[slice, slice]
+"""Rows and columns of a window that are kept of it."""
+
+
+class Exposed(NamedTuple):
+    """The kept pixels of a window, restored, and what was chosen for them.
+
+    Attributes:
+        pixels: (bands, h, w) float32 in 0..full_scale, not rounded.
+        runs: how often the network was run, once for each factor.
+        brightened: kept pixels that were restored at a factor above 1.
+    """
+
+    pixels: np.ndarray
+    runs: int
+    brightened: int
+
+
+@dataclass(frozen=True)
+class ExposedNetwork:
+    """A network for one exposure or several.
+
+    Attributes:
+        infers: the network ready to run, by factor: the one for a sensor of so many times the gain. 1 is among them.
+        radius_px: receptive radius, within which the brightest pixel decides.
+        offset: the pixel value of the dark.
+    """
+
+    infers: Mapping[int, Infer]
+    radius_px: int = 0
+    offset: float = 0.0
+
+    def restore(self, window: np.ndarray, full_scale: float, kept: Kept, tiling: Tiling) -> Exposed:
+        """Restore a window of pixel values (bands, h, w) without missing pixels.
+
+        Args:
+            window: what the network reads.
+            full_scale: the pixel value that is 1.0 to the network.
+            kept: the part of the window that is kept.
+            tiling: how the network meets an image.
+
+        Raises:
+            ModelError: a result of another shape than the network's file states.
+        """
+        scale = int(tiling.scale)
+        inside = (slice(None), *(slice(each.start * scale, each.stop * scale) for each in kept))
+        if len(self.infers) == 1:
+            restored = restore_window(window, self.infers[1], full_scale)
+            _require_shape(restored, (tiling.channels_out, *(side * scale for side in window.shape[1:])))
+            return Exposed(restored[inside], 1, 0)
+        image = np.asarray(window[0], np.float32)
+        chosen = choose_factors(image, self.infers, self.radius_px, full_scale, self.offset)[kept]
+        pixels = np.zeros((1, *chosen.shape), np.float32)
+        factors = np.unique(chosen).tolist()
+        for factor in factors:
+            restored = self._at(factor, image, full_scale)[inside]
+            pixels = np.where(chosen == factor, restored, pixels)
+        return Exposed(pixels, len(factors), int((chosen > 1).sum()))
+
+    def _at(self, factor: int, image: np.ndarray, full_scale: float) -> np.ndarray:
+        """The image restored at one factor, in its own pixel values: (1, h, w)."""
+        if factor == 1:
+            return restore_window(image[None], self.infers[1], full_scale)
+        offset = np.float32(self.offset)
+        # What exceeds full scale lies beyond the network's reach of every pixel that takes this factor.
+        brighter = np.clip((image - offset) * np.float32(factor) + offset, 0, np.float32(full_scale))
+        restored = restore_window(brighter[None], self.infers[factor], full_scale)
+        return np.asarray((restored - offset) / np.float32(factor) + offset)
+
+
+def tiles_by_factor(
+    image: np.ndarray, plan: Plan, factors: Sequence[int], full_scale: float, offset: float = 0.0
+) -> dict[int, int]:
+    """Count the tiles of an image (H, W) that ask for each factor; a tile may ask for several.
+
+    Args:
+        image: pixel values, none missing.
+        plan: how it is cut.
+        factors: in rising order, 1 first.
+        full_scale: the pixel value that is 1.0 to the network.
+        offset: the pixel value of the dark.
+    """
+    pixels = np.asarray(image, np.float32)
+    chosen = choose_factors(pixels, factors, plan.tiling.halo_px, full_scale, offset)
+    counts = dict.fromkeys(factors, 0)
+    for row, column in product(plan.rows, plan.columns):
+        kept = chosen[row.keep_start : row.keep_stop, column.keep_start : column.keep_stop]
+        for factor in np.unique(kept).tolist():
+            counts[factor] += 1
+    return counts
+
+
+def _require_shape(restored: np.ndarray, shape: tuple[int, ...]) -> None:
+    if restored.shape != shape:
+        expected = f"a result of {times(shape)}, as its file says"
+        remedy = "export it for images of any size, or check its sizes"
+        raise ModelError("ONNX model", expected=expected, got=times(restored.shape), remedy=remedy)
+
+
+def restore_window(dn: np.ndarray, infer: Infer, full_scale: float = MAX_DN) -> np.ndarray:
+    """Run a network on a window of pixel values: float32 in 0..full_scale, not rounded.
+
+    Args:
+        dn: (h, w) or (bands, h, w).
+        infer: the network.
+        full_scale: the pixel value that is 1.0 to it.
+
+    Returns:
+        Of as many axes; of other bands and sizes where the network makes others.
+    """
+    bands = dn[None] if dn.ndim == 2 else dn
+    image = np.ascontiguousarray(bands, dtype=np.float32)[None] / np.float32(full_scale)
+    with np.errstate(over="ignore"):  # what overflows is refused
+        restored = infer(image)[0] * np.float32(full_scale)
+    if not np.isfinite(restored).all():
+        raise ImageError("restored tile", expected="finite pixels", got="NaN", remedy="check the model with 'gate'")
+    restored = np.clip(restored, 0, np.float32(full_scale))
+    return np.asarray(restored[0] if dn.ndim == 2 else restored)

@@ -1,0 +1,67 @@
+"""A network as a method that restores images in memory, with the steps around it: what studies compare.
+
+The pixels are those that `restore` writes.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import onnx
+
+from beers_deploy.model.consistency import Consistency
+from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.target import TILE_PX
+from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.restoration.exposures import ExposedNetwork
+from beers_deploy.restoration.options import Runtime
+from beers_deploy.restoration.plan import make_plan
+from beers_deploy.restoration.rows import restore_dn
+from beers_deploy.restoration.runtime import Packed, open_runtime
+
+Restore = Callable[[np.ndarray], np.ndarray]
+"""Degraded digital numbers (H, W) float32 to restored ones."""
+
+
+@dataclass(frozen=True)
+class Around:
+    """Which steps around a network are taken where they can be: the consistency step, and exposure."""
+
+    consistency: bool = True
+    exposure: bool = True
+
+
+BOTH = Around()
+
+
+def network_method(
+    model: onnx.ModelProto,
+    max_dn: int,
+    brighter: Mapping[int, onnx.ModelProto] | None = None,
+    sensor: Instrument | None = None,
+    reference: Instrument | None = None,
+) -> Restore:
+    """Build a method: digital numbers of 0 to `max_dn` become whole ones, as `restore` writes them.
+
+    Tiles are the default ones, or those the network is fixed to.
+
+    Args:
+        model: the network.
+        max_dn: the largest digital number.
+        brighter: the same network for sensors of so many times the gain, by factor; none leaves exposure out.
+        sensor: that acquired the images; None leaves the consistency step out.
+        reference: that the restoration aims at; needed with `sensor`.
+    """
+    infer, _ = open_runtime(Runtime.onnxruntime, model, threads=0)
+    tiling = tiling_of(model)
+    others = {} if brighter is None else brighter
+    packed = {factor: Packed(each.SerializeToString(), Runtime.onnxruntime, 0) for factor, each in others.items()}
+    offset = sensor.offset_dn if sensor else 0.0
+    network = ExposedNetwork({1: infer, **packed}, tiling.halo_px, offset)
+    consistency = (Consistency.of(sensor, reference, max_dn),) if sensor and reference else ()
+
+    def restore(dn: np.ndarray) -> np.ndarray:
+        plan = make_plan((1, *dn.shape), tiling.fixed_px or TILE_PX, tiling.halo_px, tiling)
+        return restore_dn(dn, network, plan, max_dn, consistency)
+
+    return restore

@@ -1,0 +1,26 @@
+"""Missing pixels on the way into a network: filled from known ones that lie near."""
+
+import numpy as np
+
+
+def fill_from_nearest(pixels: np.ndarray, missing: np.ndarray, reach_px: int) -> np.ndarray:
+    """(h, w) pixels where each `missing` one is a copy of a known one at most `reach_px` rows and columns away.
+
+    The nearest known pixel of the row, then the nearest filled one of the column; 0 where there is none in reach. So
+    a filled pixel depends on nothing farther away, and a window gives just what the whole image gives.
+    """
+    filled, missing = _along_rows(pixels, missing, reach_px)
+    filled, missing = _along_rows(filled.T, missing.T, reach_px)
+    return np.asarray(np.where(missing, 0, filled).T)
+
+
+def _along_rows(pixels: np.ndarray, missing: np.ndarray, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Filled pixels, and where none was in reach; of two at the same distance the left one is taken."""
+    width = pixels.shape[1]
+    far = width + reach_px + 1  # out of reach from every pixel: no known one on that side
+    here = np.arange(width)
+    left = np.maximum.accumulate(np.where(missing, -far, here), axis=1)
+    right = np.minimum.accumulate(np.where(missing, 2 * far, here)[:, ::-1], axis=1)[:, ::-1]
+    nearest = np.where(here - left <= right - here, left, right)
+    out_of_reach = np.abs(nearest - here) > reach_px
+    return np.take_along_axis(pixels, np.where(out_of_reach, here, nearest), axis=1), out_of_reach

@@ -1,0 +1,98 @@
+"""The steps around a network that a run takes: its exposures, and the consistency step.
+
+Both depend on what is known of the sensor. Exposures need a network that is conditioned on its sensor; the
+consistency step needs a known sensor, and a network that gives one pixel of the same band for each pixel.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import onnx
+
+from beers_deploy.model.consistency import Consistency
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.quant.tiling.walk import Tiling
+from beers_deploy.restoration.bands import in_order
+from beers_deploy.restoration.exposures import ExposedNetwork
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.runtime import Infer
+from beers_deploy.restoration.source import Raster
+
+OFF = "off"
+NO_SENSOR = f"{OFF}: no sensor is named"
+OTHER_PIXELS = f"{OFF}: the network makes other pixels or bands"
+
+
+def exposed_networks(
+    infers: Sequence[Infer],
+    options: Options,
+    raster: Raster,
+    tiling: Tiling,
+    full_scale: float,
+    opened: Callable[[onnx.ModelProto], Infer],
+) -> tuple[ExposedNetwork, ...]:
+    """Build the network of each band at its exposures.
+
+    Args:
+        infers: the networks at factor 1, one for all bands or one for each.
+        options: what the user chose.
+        raster: of the image.
+        tiling: how the network meets it.
+        full_scale: the pixel value that is 1.0 to the network.
+        opened: makes a network ready to run.
+    """
+    if not options.brighter:
+        return tuple(ExposedNetwork({1: infer}) for infer in infers)
+    # A band whose sensor allows no factor above 1 has no files.
+    bands = options.sensors or options.brighter
+    brighter = in_order({band: options.brighter.get(band, {}) for band in bands}, raster)
+    sensors = in_order(options.sensors, raster) if options.sensors else [None] * len(brighter)
+    networks = []
+    for infer, files, sensor in zip(infers, brighter, sensors, strict=True):
+        others = {factor: opened(load_onnx(path)) for factor, path in files.items()}
+        offset = offset_of(sensor, full_scale) if sensor else 0.0
+        networks.append(ExposedNetwork({1: infer, **others}, tiling.halo_px, offset))
+    return tuple(networks)
+
+
+def offset_of(sensor: Sensor, full_scale: float) -> float:
+    """Return the pixel value of the dark."""
+    instrument = sensor.nominal()
+    return instrument.offset_dn * full_scale / instrument.max_dn
+
+
+def consistency_steps(
+    options: Options, raster: Raster, tiling: Tiling, full_scale: float
+) -> tuple[tuple[Consistency | None, ...], str]:
+    """Build the consistency step, one for all bands or one for each, and say in words whether it is taken.
+
+    "blind" is the name of no sensor: a band of that name has None.
+    """
+    if not options.consistency:
+        return (), OFF
+    blind = [band for band, sensor in options.sensors.items() if sensor.name == BLIND]
+    if len(blind) == len(options.sensors):
+        return (), NO_SENSOR
+    if not keeps_pixels(tiling):
+        return (), OTHER_PIXELS
+    sensors = in_order(options.sensors, raster)
+    steps = tuple(None if sensor.name == BLIND else step_for(sensor, full_scale) for sensor in sensors)
+    return steps, f"on; {', '.join(blind)} {NO_SENSOR}" if blind else "on"
+
+
+def keeps_pixels(tiling: Tiling) -> bool:
+    """Return True if a network gives one pixel of the same band for each pixel, as the consistency step needs."""
+    return tiling.scale == 1 and tiling.channels_in == tiling.channels_out
+
+
+def step_for(sensor: Sensor, full_scale: float) -> Consistency:
+    """Build the consistency step for the middle of a sensor's ranges and its reference."""
+    return Consistency.of(sensor.nominal(), sensor.reference.nominal(), full_scale)
+
+
+def factor_words(brighter: Mapping[str, Mapping[int, Path]]) -> str:
+    """Return the factors that may be used, in words."""
+    factors = sorted({1, *(factor for files in brighter.values() for factor in files)})
+    return ", ".join(f"x{factor}" for factor in factors)
