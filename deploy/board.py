@@ -3,25 +3,26 @@
 import json
 import os
 import shutil
+import warnings
 from pathlib import Path
 
 import numpy as np
 
 from beers_deploy.dpu.checker.table import check
 from beers_deploy.kit.golden import PICTURE, save_array, write_golden
+from beers_deploy.kit.host_facts import host_facts
 from beers_deploy.kit.record import recorded, write_record
+from beers_deploy.model.consistency import REACH_PX
+from beers_deploy.model.exposure import HEADROOM
 from beers_deploy.model.io.files import write_text
 from beers_deploy.model.shipped import INT8, shipped_names
-from beers_deploy.network import Network, NetworkLike
+from beers_deploy.network import Network, NetworkLike, SensorLike, brighter_files, other_sensor
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Figure, Mode, Row
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import sensor_names
+from beers_deploy.profiles.sensor_file import BLIND, sensor_names
 from beers_deploy.profiles.target import TILE_PX, TargetProfile, board_names
-from beers_deploy.quant.banked.filters import MIDDLE_DN, PART, STEP_DN
-from beers_deploy.quant.encodings import read_core, save_config
-from beers_deploy.quant.ends import FINE_MAX
-from beers_deploy.quant.graph import CORRECTION, QUARTER, STEP
+from beers_deploy.quant.encodings import save_config
 from beers_deploy.quant.session import open_session, tensors_of
 from beers_deploy.results import Table
 
@@ -37,7 +38,13 @@ class Board(TargetProfile):
     """
 
     def kit(
-        self, int8: NetworkLike, out: str | os.PathLike[str], *, tile: int = TILE_PX, record: bool = False
+        self,
+        int8: NetworkLike,
+        out: str | os.PathLike[str],
+        *,
+        tile: int = TILE_PX,
+        record: bool = False,
+        sensor: SensorLike | None = None,
     ) -> Path:
         """Write what a board's engineer needs of an INT8 network to a folder, and return it.
 
@@ -46,73 +53,66 @@ class Board(TargetProfile):
         and what onnxruntime makes of it on this processor. `host.py` is the host's part around it in plain NumPy,
         `golden` has what every layer must write, and README.md says what to do there.
 
+        With a sensor, `host.py` takes the same steps around the network as `restore`: the consistency step, and for
+        a shipped network the exposures, whose cores are `core-x4.onnx` and so on. The golden vectors are those of
+        `core.onnx`.
+
         Args:
             int8: the network, quantised under this board's rules.
             out: the folder.
             tile: side of a tile in pixels.
             record: whether a record of evidence is added: what the network is, and what `check` says of it.
+            sensor: that acquires the images: a `Sensor`, a name or a .toml file. A shipped network is conditioned on
+                it; None is the middle of the sensors that it knows, and leaves the steps around the network out.
 
         Raises:
             MissingExtraError: a record, and cyclonedx-python-lib is not installed.
             ModelError: a float network, or one that was not quantised under a DPU's rules here.
+            OptionError: a sensor that would change nothing.
+            ProfileError: no such sensor.
         """
-        network, folder = Network.load(int8), Path(out)
+        known = None if sensor is None else Sensor.load(sensor)
+        network, folder = Network.load(int8, sensor=BLIND if known is None else known), Path(out)
+        if known is not None and known.name != BLIND and (doubt := other_sensor(network.model, known)):
+            warnings.warn(doubt, stacklevel=2)
         if record:
             recorded(folder / "record")  # refused before anything is written
-        core = network.core(self, tile)
+        core, brighter = network.core(self, tile), _brighter(int8, known)
+        facts = host_facts(network, tile, known, brighter)
         core.save(folder / "core.onnx")
+        for factor, each in brighter.items():
+            each.core(self, tile).save(folder / f"core-x{factor}.onnx")
         if self.npu:
             save_config(folder / "core.onnx", *self.npu["device"].value)
-        session = open_session(core.model)
-        shape = [side if isinstance(side, int) else 1 for side in session.get_inputs()[0].shape]
-        kind = np.int8 if "int8" in session.get_inputs()[0].type else np.float32
-        planes = np.random.default_rng(0).integers(-64, 64, shape).astype(kind)
-        for name, values in (("input", planes), ("expected", tensors_of(session, None, planes)[0])):
-            save_array(folder / f"{name}.npy", values)
+        _write_example(core, folder)
         shutil.copyfile(MEASURE, folder / "measure.py")
-        if (said := host_constants(network, tile)) is not None:
-            write_text(folder / "host.json", json.dumps(said, indent=1) + "\n")
+        if facts is not None:
+            write_text(folder / "host.json", json.dumps(facts, indent=1) + "\n")
             shutil.copyfile(HOST, folder / "host.py")
         vectors = write_golden(network, folder / "golden", board=self)
         network.core(self, np.load(vectors / "noise" / PICTURE).shape[-1]).save(vectors / "core.onnx")
         if record:
             write_record(check(network, self, tile=tile), network, folder / "record")
-        words = {"network": network.name, "board": self.name, "tile": tile}
+        words = {"network": network.name, "board": self.name, "tile": tile, "reach": REACH_PX, "headroom": HEADROOM}
         write_text(folder / "README.md", README.read_text(encoding="utf-8").format(**words))
         return folder
 
 
-def host_constants(network: Network, tile_px: int) -> dict[str, object] | None:
-    """What host.py needs to know; None of a network whose result is no image, or whose pixels move otherwise."""
-    core = read_core(network.model)
-    ends = core.ends
-    outputs = {"back": (ends.back, ends.outputs), "last": (ends.last, ends.outputs)}
-    shuffles = {"front": (ends.front, ends.channels), **outputs}
-    # Of one band ONNX's order of the channels is that of torch, which host.py takes.
-    plain = all(each.columns_first or wide == each.block**2 for found, wide in shuffles.values() for each in found)
-    if not ends.is_image or ends.direct or not plain or any(len(found) > 1 for found, _ in shuffles.values()):
-        return None
-    tiling, scale = network.tiling, core.scale(CORRECTION)
-    step, part, middle = (STEP_DN, PART, MIDDLE_DN) if ends.banked else (STEP, QUARTER, 0)
-    return {
-        **{name: found[0].block if found else 1 for name, (found, _) in shuffles.items()},
-        "tile_px": tile_px,
-        "halo_px": tiling.halo_px,
-        "lattice_px": tiling.lattice_px,
-        "scale": int(tiling.scale),
-        "bands": tiling.channels_out,
-        "border_px": ends.border_px,
-        "step": step,
-        "part": part,
-        "middle": middle,
-        "coarse": 2 if ends.banked else 1,
-        "copies": ends.copies,
-        "offsets": ends.offsets,
-        "fine_max": (FINE_MAX + 0.5) * scale,
-        "analytic": ends.analytic_gain(scale),
-        "unit": ends.unit,
-        "adds_image": ends.adds_image,
-    }
+def _brighter(int8: NetworkLike, sensor: Sensor | None) -> dict[int, Network]:
+    """Return a shipped network for the sensor at higher exposures, by factor; none of any other network."""
+    if sensor is None or not isinstance(int8, str | os.PathLike):
+        return {}
+    return {factor: Network.load(path) for factor, path in brighter_files(Path(int8), sensor).items()}
+
+
+def _write_example(core: Network, folder: Path) -> None:
+    """Write one input of a core, and what onnxruntime makes of it on this processor."""
+    session = open_session(core.model)
+    shape = [side if isinstance(side, int) else 1 for side in session.get_inputs()[0].shape]
+    kind = np.int8 if "int8" in session.get_inputs()[0].type else np.float32
+    planes = np.random.default_rng(0).integers(-64, 64, shape).astype(kind)
+    for name, values in (("input", planes), ("expected", tensors_of(session, None, planes)[0])):
+        save_array(folder / f"{name}.npy", values)
 
 
 def boards() -> Table:

@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -10,7 +10,11 @@ from beers_deploy.commands.shared import RULED, board_for, refuse, save_core, sa
 from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_weights
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
+
+if TYPE_CHECKING:
+    import onnx
 
 
 def export(
@@ -37,7 +41,11 @@ def export(
         str | None, typer.Option(help=f"Whose encoding --board-file has, QDQ ONNX or an NPU's VINT8: {RULED}.")
     ] = None,
     delta: Annotated[
-        Path | None, typer.Option(help="Of an INT8 file: also write what the sensor changes in it, 1 to 3 kB.")
+        Path | None,
+        typer.Option(
+            help="Of an INT8 file: also write what the sensor changes in it, 1 to 3 kB; for the exposures of "
+            "'restore', -x4 and so on before the suffix."
+        ),
     ] = None,
     apply: Annotated[
         Path | None, typer.Option(help="Of an INT8 file: tell it the sensor of this delta, in place of --sensor.")
@@ -51,6 +59,8 @@ def export(
 
     An INT8 file of conditioned weights (--network FILE.onnx) is told another sensor without being calibrated anew.
     --delta writes what the sensor changes, and --apply makes the file of any sensor that sensor's, to the byte.
+    'restore' restores dark parts at higher exposures, by the network of a sensor of 2, 4 or 8 times the gain. So
+    --delta my.delta also writes my-x4.delta and my-x8.delta: one file for each factor that the sensor's noise allows.
     """
     from beers_deploy.export import about, float_for, to_onnx
     from beers_deploy.model.io.files import require_writable
@@ -62,7 +72,8 @@ def export(
         shipped_weights(network.name.removesuffix(INT8))  # refuses other names
     path = weights_file(network)
     read = [path, apply, *(Path(given) for given in (sensor, target) if given)]
-    require_writable(out, board_file, delta, inputs=read)
+    deltas = _delta_files(delta, sensor)
+    require_writable(out, board_file, *deltas.values(), inputs=read)
     if board_file is None:
         refuse(context, ["target"], expected="--board-file beside it")
     if path.suffix != ".onnx":
@@ -72,7 +83,7 @@ def export(
     require_onnx_name(out, board_file)
     board = board_for(target or DEFAULT_TARGET, board_file, tile, read)
     if path.suffix == ".onnx":
-        _export_int8(path, out, sensor, tile, (board_file, board), delta, apply)
+        _export_int8(path, out, sensor, tile, (board_file, board), deltas, apply)
         return
     known = load_sensor(sensor or SENSOR) if is_conditioned(path) else None
     if known is not None:
@@ -95,24 +106,43 @@ def export(
     say(f"wrote {out}: largest difference from torch {difference:.2g} of full scale (measured)")
 
 
+def _delta_files(delta: Path | None, sensor: str | None) -> dict[int, Path]:
+    """Return the files that --delta writes by factor: the one named at 1, and one for each higher exposure."""
+    from beers_deploy.model.exposure import factors_for
+
+    if delta is None:
+        return {}
+    factors = factors_for(load_sensor(sensor or SENSOR).nominal())
+    higher = {factor: delta.with_name(f"{delta.stem}-x{factor}{delta.suffix}") for factor in factors if factor > 1}
+    return {1: delta, **higher}
+
+
 def _export_int8(
     path: Path,
     out: Path,
     sensor: str | None,
     tile_px: int | None,
     board: tuple[Path | None, TargetProfile],
-    delta: Path | None,
+    deltas: dict[int, Path],
     apply: Path | None,
 ) -> None:
-    """Write an INT8 file told a sensor, or that of a delta; `board` is where its integers go, if anywhere."""
+    """Write an INT8 file conditioned on a sensor, or on that of a delta.
+
+    Args:
+        path: an INT8 file.
+        out: the file to write.
+        sensor: a profile's name or file; the default one if None.
+        tile_px: side of the tile that `out` is fixed to.
+        board: the file that its integers go to, if any, and the board whose encoding they have.
+        deltas: the deltas to write, by the factor of their exposure.
+        apply: a delta to read in place of the sensor.
+    """
     from beers_deploy.export import require_tile
-    from beers_deploy.model.io.files import whole_file
     from beers_deploy.network import Network, told_by_delta, told_int8
-    from beers_deploy.quant.banked.family import delta_of_file
     from beers_deploy.quant.encodings import host_model, read_core
     from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
 
-    if apply is not None and (sensor or delta):
+    if apply is not None and (sensor or deltas):
         remedy = "leave one out: the delta brings its sensor"
         raise OptionError("--apply", expected="no --sensor or --delta beside it", got="one", remedy=remedy)
     model = load_onnx(path)
@@ -127,8 +157,20 @@ def _export_int8(
     save_onnx(host_model(core, about, side_px), out)
     say(f"wrote {out}")
     save_core(for_board, board_file, profile)
-    if delta is not None:
-        packed = delta_of_file(made)
-        with whole_file(delta) as temporary:
-            temporary.write_bytes(packed)
-        say(f"wrote {delta}: {len(packed)} bytes")
+    for factor, delta in deltas.items():
+        _save_delta(made, load_sensor(sensor or SENSOR), factor, delta)
+
+
+def _save_delta(made: "onnx.ModelProto", sensor: Sensor, factor: int, delta: Path) -> None:
+    """Write the delta of an INT8 network that is conditioned on a sensor, at one of its exposures."""
+    from beers_deploy.model.exposure import brightened
+    from beers_deploy.model.io.files import whole_file
+    from beers_deploy.network import told_int8
+    from beers_deploy.quant.banked.family import delta_of_file
+
+    # The other exposures of a sensor are no user's choice: what of them lies outside the trained range is not told.
+    model = made if factor == 1 else told_int8(made, brightened(sensor, factor))
+    packed = delta_of_file(model)
+    with whole_file(delta) as temporary:
+        temporary.write_bytes(packed)
+    say(f"wrote {delta}: {len(packed)} bytes")

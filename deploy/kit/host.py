@@ -1,7 +1,13 @@
 #!/usr/bin/env python3
 """The host's part of a network on a board: python3 host.py image.npy restored.npy, float32 (C, H, W) in [0, 1].
 
-It needs NumPy, host.json and, for core.onnx, onnxruntime: on a board put its own runner into `run`.
+The script needs NumPy, host.json and, for the cores, onnxruntime. On a board, replace the runners in `cores`.
+
+1. Each tile goes to one core or several (`factors`, `exposed`): core.onnx restores the tile as it is. Where host.json
+   has exposures, core-x4.onnx restores the dark pixels of a tile that was multiplied by 4, and so on.
+2. Around a core (`restored`), the host splits the tile into int8 planes and adds the core's result to the tile.
+3. After the last tile, the consistency step (`consistent`) makes the restored image agree with the raw one at low
+   spatial frequencies, if host.json has its weights.
 """
 
 from __future__ import annotations
@@ -14,7 +20,11 @@ from typing import Any
 import numpy as np
 
 F, HERE = np.float32, Path(__file__).parent
+BLOCK, NEAR = 8, 8
+"""Pixels: the side of a block of the consistency step, and the radius of the near part of its blur."""
 S = json.loads((HERE / "host.json").read_text(encoding="utf-8"))
+UNITS = {1: S["unit"], **{int(factor): unit for factor, unit in S["exposures"].items()}}
+"""The unit of each core's result, by the factor that the core's tile is multiplied by."""
 
 
 def shuffled(x: np.ndarray, r: int, up: bool) -> np.ndarray:
@@ -25,7 +35,7 @@ def shuffled(x: np.ndarray, r: int, up: bool) -> np.ndarray:
     return x.reshape(c, h // r, r, w // r, r).transpose(0, 2, 4, 1, 3).reshape(1, c * r**2, h // r, w // r)
 
 
-def restored(image: np.ndarray, run: Any) -> np.ndarray:
+def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
     """A tile (1, C, h, w): planes in whole multiples of 1/128 to the core, its result merged, added and clipped."""
     wide = np.pad(image, ((0, 0), (0, 0), *[(S["border_px"],) * 2] * 2), "reflect")
     dn = np.clip(np.rint(shuffled(wide, S["front"], up=False) * F(4095)), 0, F(4095)) - F(S["middle"])
@@ -40,8 +50,118 @@ def restored(image: np.ndarray, run: Any) -> np.ndarray:
     elif others:  # fine, coarse, and the copies of the analytic restoration
         value = np.where(np.abs(value) <= F(S["fine_max"]), value, others[0] * F(8))
         value = value + np.sum(others[1:], 0) * F(S["analytic"]) if others[1:] else value
-    value = shuffled(value, S["back"], up=True) * F(S["unit"])
+    value = shuffled(value, S["back"], up=True) * F(unit)
     return shuffled(np.asarray(np.clip(image + value, 0, 1) if S["adds_image"] else value), S["last"], up=True)
+
+
+def exposed(factor: int, image: np.ndarray, run: Any) -> np.ndarray:
+    """Multiply the light of a tile by a factor, restore the tile by the core of that factor, and divide it again."""
+    if factor == 1:
+        return restored(image, run, UNITS[1])
+    dark = F(S["offset"])
+    brighter = np.clip((image - dark) * F(factor) + dark, 0, F(1))
+    return (restored(brighter, run, UNITS[factor]) - dark) / F(factor) + dark
+
+
+def factors(tile: np.ndarray) -> np.ndarray:
+    """Choose the factor of every pixel (h, w) of a tile (1, C, h, w).
+
+    A pixel gets the largest factor at which no pixel within the network's receptive radius exceeds `headroom`.
+    """
+    chosen = np.ones(tile.shape[2:], int)
+    if len(UNITS) == 1:
+        return chosen
+    dark, brightest = F(S["offset"]), brightest_around(tile[0, 0], S["halo_px"])
+    for factor in sorted(UNITS)[1:]:
+        chosen[(brightest - dark) * F(factor) + dark <= F(S["headroom"])] = factor
+    return chosen
+
+
+def brightest_around(pixels: np.ndarray, radius: int) -> np.ndarray:
+    """Compute the maximum of the square of `radius` pixels around each pixel (h, w)."""
+    size = 2 * radius + 1
+    for _ in range(2):  # down, then across
+        pixels, length = np.pad(pixels, [(radius, radius), (0, 0)], "edge"), 1
+        while length < size:  # the maximum of two windows that touch or overlap is that of a window twice as long
+            step = min(length, size - length)
+            pixels, length = np.maximum(pixels[:-step], pixels[step:]), length + step
+        pixels = pixels.T
+    return pixels
+
+
+def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return x + G (raw - H x) of one band (H, W), clipped to [0, 1].
+
+    H is the sensor's blur relative to the reference. G takes the means of blocks and interpolates between their
+    centres, which keeps low spatial frequencies only.
+    """
+    rows, columns, far, means, excess = (
+        np.array(S["consistency"][name], F) for name in ("rows", "columns", "far", "means", "excess")
+    )
+    # The near part of H x is a sum of separable filters, computed for the means of blocks alone.
+    near = extended(x, NEAR)
+    blurred = sum(summed(near, row, column) for row, column in zip(rows, columns))  # noqa: B905 - as above
+    blurred = blurred + around(block_means(extended(x, BLOCK * (len(far) // 2))), far)
+    own = block_means(extended(raw, 0))
+    # The converter clips noise at zero, which raises the means of dark blocks. This is no error of x.
+    clipped = np.interp(own, means, excess, right=0.0).astype(F)
+    residual = own - np.minimum(clipped, np.maximum(own, F(0))) - blurred
+    # Blocks that a saturated pixel reaches through the near part of H are left out.
+    ones = np.ones(BLOCK + 2 * NEAR, F)
+    reached = summed(extended((raw >= 1).astype(F), NEAR), ones, ones) > 0
+    if not reached.any():
+        return np.asarray(np.clip(x + interpolated(residual, x.shape), 0, F(1)))
+    usable = (~reached).astype(F)
+    change, share = interpolated(residual * usable, x.shape), interpolated(usable, x.shape)
+    change = np.divide(change, share, out=np.zeros_like(change), where=share > 0)
+    return np.asarray(np.clip(x + change, 0, F(1)))
+
+
+def extended(x: np.ndarray, margin: int) -> np.ndarray:
+    """Mirror an image (H, W) beyond its borders: to whole blocks, and `margin` pixels more on every side."""
+    for axis, size in enumerate(x.shape):
+        places = np.arange(-margin, -(-size // BLOCK) * BLOCK + margin) % (2 * size)
+        x = x.take(np.minimum(places, 2 * size - 1 - places), axis)
+    return x
+
+
+def summed(x: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Compute the weighted sum of a window of each block: rows weighted by `row`, columns by `column`."""
+    for weights in (row, column):
+        end = x.shape[0] - len(weights) + 1
+        x = sum(x[place : place + end : BLOCK] * weight for place, weight in enumerate(weights)).T
+    return x
+
+
+def block_means(x: np.ndarray) -> np.ndarray:
+    """Compute the mean of each block."""
+    mean = np.full(BLOCK, 1 / BLOCK, F)
+    return summed(x, mean, mean)
+
+
+def around(means: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """Compute the far part of H x: the sum of the block means around each block, weighted by `far`."""
+    height, width = (size - len(far) + 1 for size in means.shape)
+    total = np.zeros((height, width), F)
+    for y, weights in enumerate(far):
+        for x, weight in enumerate(weights):
+            total += weight * means[y : y + height, x : x + width]
+    return total
+
+
+def interpolated(blocks: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Interpolate bilinearly between the centres of blocks.
+
+    Blocks at the image's border are left out, because H brings light into them that the image does not show. Nearer
+    to the border the nearest block inside counts.
+    """
+    for size in shape:
+        place = np.arange(size) - BLOCK // 2
+        low, high = (1, len(blocks) - 2) if len(blocks) > 2 else (0, len(blocks) - 1)
+        left, right = (np.clip(place // BLOCK + k, low, high) for k in (0, 1))
+        share = (((2 * place + 1) % (2 * BLOCK)).astype(F) / F(2 * BLOCK))[:, None]
+        blocks = (blocks[left] * (F(1) - share) + blocks[right] * share).T
+    return blocks
 
 
 def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
@@ -50,23 +170,40 @@ def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
     return [(s, s and s + halo, starts[k + 1] + halo if s < size - tile else size) for k, s in enumerate(starts)]
 
 
-def main(source: str, target: str, run: Any) -> None:
-    """Restore an image of at least a tile, tile by tile."""
+def main(source: str, target: str, runs: dict[int, Any]) -> None:
+    """Restore an image of at least a tile, tile by tile. `runs` has the core of each factor: planes to result."""
     image, t, r = np.load(source).astype(F), S["tile_px"], S["scale"]
     wide = np.pad(image, [(0, 0)] + [(0, -n % S["lattice_px"]) for n in image.shape[1:]], "edge")
     down, across = (spans(n, t, S["halo_px"]) for n in wide.shape[1:])
     out = np.empty((S["bands"], *(n * r for n in wide.shape[1:])), F)
     for (y, top, bottom), (x, left, right) in ((a, b) for a in down for b in across):
-        tile = restored(wide[None, :, y : y + t, x : x + t], run)[0]
-        kept = slice((top - y) * r, (bottom - y) * r), slice((left - x) * r, (right - x) * r)
-        out[:, top * r : bottom * r, left * r : right * r] = tile[:, kept[0], kept[1]]
-    np.save(target, out[:, : image.shape[1] * r, : image.shape[2] * r])
+        tile = wide[None, :, y : y + t, x : x + t]
+        chosen = factors(tile)[top - y : bottom - y, left - x : right - x].repeat(r, 0).repeat(r, 1)
+        place = out[:, top * r : bottom * r, left * r : right * r]
+        for factor in np.unique(chosen).tolist():
+            found = exposed(factor, tile, runs[factor])[0]
+            kept = found[:, (top - y) * r : (bottom - y) * r, (left - x) * r : (right - x) * r]
+            np.copyto(place, kept, where=chosen == factor)
+    out = out[:, : image.shape[1] * r, : image.shape[2] * r]  # without what the lattice asked for
+    if S["consistency"]:
+        out = np.stack([consistent(raw, np.clip(x, 0, F(1))) for raw, x in zip(image, out)])  # noqa: B905 - as above
+    np.save(target, out)
 
 
-if __name__ == "__main__":
+def cores() -> dict[int, Any]:
+    """Open the core of each factor in onnxruntime: what a board's own runners replace."""
     import onnxruntime as ort
 
     plain = ort.SessionOptions()
     plain.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL  # fused kernels may saturate
-    session = ort.InferenceSession(str(HERE / "core.onnx"), plain, providers=["CPUExecutionProvider"])
-    main(sys.argv[1], sys.argv[2], lambda planes: session.run(None, {"planes": planes})[0])
+
+    def opened(factor: int) -> Any:
+        name = "core.onnx" if factor == 1 else f"core-x{factor}.onnx"
+        session = ort.InferenceSession(str(HERE / name), plain, providers=["CPUExecutionProvider"])
+        return lambda planes: session.run(None, {"planes": planes})[0]
+
+    return {factor: opened(factor) for factor in UNITS}
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2], cores())

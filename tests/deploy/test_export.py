@@ -13,6 +13,7 @@ from beers_deploy.model.convbeers import ConvBEERS, arrays, grow, load_network, 
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.shipped import shipped_names, shipped_weights
 from beers_deploy.model.variants import VARIANTS, Variant
+from beers_deploy.network import brighter_files
 from beers_deploy.parity import require_parity, torch_network
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError
@@ -131,3 +132,47 @@ def test_plain_weights_take_no_sensor_and_conditioned_ones_the_default(
     assert not out.exists()
     done("export", "--network", conditioned, "--out", out)
     assert metadata(onnx.load(out))["sensor"] == "pleiades-degraded"
+
+
+SMALL = "convbeers-xs-int8"
+
+
+@pytest.mark.parametrize(("sensor", "factors"), [("pleiades-degraded", [4, 8]), ("dior-medium", [2, 4])])
+def test_the_deltas_of_exposures_make_the_networks_that_restore_runs(
+    sensor: str, factors: list[int], tmp_path: Path
+) -> None:
+    """To the byte, applied to the INT8 file of another sensor."""
+    words = ["export", "--network", SMALL, "--out", tmp_path / "x.onnx"]
+    said = done(*words, "--sensor", sensor, "--delta", tmp_path / "my.delta")
+    expected = brighter_files(Path(SMALL), load_sensor(sensor))
+    assert sorted(expected) == factors
+    names = ["my.delta", *(f"my-x{factor}.delta" for factor in factors)]
+    assert sorted(path.name for path in tmp_path.glob("*.delta")) == sorted(names)
+    for name in names:
+        assert f"{name}: {(tmp_path / name).stat().st_size} bytes" in said.replace("\n", "")
+    for factor in factors:
+        delta, applied = tmp_path / f"my-x{factor}.delta", tmp_path / f"x{factor}.onnx"
+        assert delta.stat().st_size < 3000
+        done("export", "--network", SMALL, "--apply", delta, "--out", applied)
+        assert applied.read_bytes() == expected[factor].read_bytes()
+
+
+def test_where_no_higher_exposure_is_allowed_there_is_one_delta(tmp_path: Path) -> None:
+    done(
+        "export", "--network", SMALL, "--sensor", "dior-high", "--out", tmp_path / "x.onnx", "--delta", tmp_path / "d"
+    )
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["d", "x.onnx"]
+
+
+def test_the_files_of_exposures_are_refused_before_any_work(tmp_path: Path) -> None:
+    """Where one is an input, another output or cannot be written; and where the sensor does not exist."""
+    sensor = own_sensor(tmp_path).rename(tmp_path / "my-x4.toml")
+    before, out = sensor.read_bytes(), tmp_path / "my-x8.onnx"
+    words = ["export", "--network", SMALL, "--out", out, "--delta"]
+    assert "an input of this run" in refused(*words, tmp_path / "my.toml", "--sensor", sensor)
+    assert "another output takes" in refused(*words, tmp_path / "my.onnx")
+    (tmp_path / "my-x4.delta").mkdir()
+    assert "my-x4.delta" in refused(*words, tmp_path / "my.delta")
+    assert "expected one of" in refused(*words, tmp_path / "d", "--sensor", "hubble")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["my-x4.delta", "my-x4.toml"]
+    assert sensor.read_bytes() == before

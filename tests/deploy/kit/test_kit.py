@@ -1,9 +1,12 @@
 """What a board's engineer is handed: the host's part gives the host file's bytes, and the record says what it is."""
 
 import json
+import runpy
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -13,9 +16,15 @@ from cyclonedx.validation.json import JsonStrictValidator
 
 import beers_deploy as bd
 from beers_deploy.kit.golden import read_golden
+from beers_deploy.kit.host_facts import host_facts
 from beers_deploy.kit.record import NAMES
+from beers_deploy.model.consistency import REACH_PX, Consistency, Placed
+from beers_deploy.model.exposure import HEADROOM, choose_factors, factors_for
+from beers_deploy.network import brighter_files
+from beers_deploy.profiles.errors import OptionError, ProfileError
 from tests.deploy.command_line import done
 from tests.deploy.kit.test_golden import network
+from tests.profiles.own_sensor import edited, own_sensor
 
 BARE = """
 import sys
@@ -48,7 +57,113 @@ def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> 
     assert [side.dim_value for side in read][1:] == [
         *np.load(folder / "golden" / "noise" / "00-planes.npy").shape[1:]
     ]
-    assert len((folder / "host.py").read_text(encoding="utf-8").replace("\n\n", "\n").splitlines()) < 65
+    assert len((folder / "host.py").read_text(encoding="utf-8").replace("\n\n", "\n").splitlines()) < 200
+
+
+OFFSET_DN = 60
+NAME, TILE_PX, FACTORS = "convbeers-xs-int8", 96, {1, 4, 8}
+
+
+@pytest.fixture(scope="module")
+def image() -> np.ndarray:
+    """Draw an image (131, 203) of odd sides: dark ground, bright ground, and some saturated pixels."""
+    light = np.random.default_rng(1).random((131, 203), dtype=np.float32)
+    light *= np.linspace(0.02, 0.9, 203, dtype=np.float32)
+    light[:60] *= np.float32(0.2)
+    light[100:103, 150:153] = 1
+    return light
+
+
+@pytest.fixture(scope="module")
+def sensor(tmp_path_factory: pytest.TempPathFactory) -> bd.Sensor:
+    """A sensor whose dark is not 0."""
+    offset = f'[offset]\noffset_dn = {{ value = {OFFSET_DN}, status = "assumed", source = "a test" }}\n'
+    return bd.Sensor.load(own_sensor(tmp_path_factory.mktemp("sensor"), text=f"{edited()}\n{offset}"))
+
+
+@pytest.fixture(scope="module")
+def kit(sensor: bd.Sensor, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return bd.Board.load("vck190").kit(NAME, tmp_path_factory.mktemp("kit"), tile=TILE_PX, sensor=sensor)
+
+
+def by_host(folder: Path, image: np.ndarray) -> np.ndarray:
+    """Restore an image (H, W) by a kit's host.py, on a Python with NumPy and onnxruntime alone."""
+    np.save(folder / "image.npy", image[None])
+    subprocess.run([sys.executable, "-c", BARE, "-", "image.npy", "out.npy"], cwd=folder, check=True)
+    return np.asarray(np.load(folder / "out.npy")[0])
+
+
+def facts(folder: Path) -> dict[str, Any]:
+    return dict(json.loads((folder / "host.json").read_text(encoding="utf-8")))
+
+
+def test_the_host_part_restores_as_restore_does(kit: Path, sensor: bd.Sensor, image: np.ndarray) -> None:
+    """With both steps around the network; each of them changes the image."""
+    restored = partial(bd.restore, image, NAME, sensor=sensor, full_scale=1.0, any_result=True)
+    by_kit = by_host(kit, image)
+    np.testing.assert_allclose(by_kit, restored(), rtol=0, atol=1e-6)
+    for without in (restored(exposure=False), restored(consistency=False)):
+        assert np.abs(by_kit - without).max() > 0.001
+
+
+def test_each_exposure_has_a_core_and_a_unit(kit: Path, sensor: bd.Sensor) -> None:
+    said = facts(kit)
+    assert {1, *map(int, said["exposures"])} == FACTORS == {*factors_for(sensor.nominal())}
+    assert len({said["unit"], *said["exposures"].values()}) == len(FACTORS)
+    for factor, path in brighter_files(Path(NAME), sensor).items():
+        expected = bd.Network.load(path).core("vck190", TILE_PX).model
+        assert onnx.load(kit / f"core-x{factor}.onnx") == expected
+    golden = onnx.load(kit / "golden" / "int8.onnx")
+    assert golden == bd.Network.load(NAME, sensor=sensor).model
+    readme = " ".join((kit / "README.md").read_text(encoding="utf-8").split())
+    assert f"at most {HEADROOM} of full scale" in readme
+    assert f"up to {REACH_PX} pixels away" in readme
+
+
+def test_the_host_part_chooses_factors_and_takes_the_consistency_step_as_the_library_does(
+    kit: Path, sensor: bd.Sensor, image: np.ndarray
+) -> None:
+    """Bit for bit, with saturated pixels and without."""
+    host, radius_px = runpy.run_path(str(kit / "host.py")), facts(kit)["halo_px"]
+    chosen = choose_factors(image, sorted(FACTORS), radius_px, 1.0, OFFSET_DN / 4095)
+    assert {*np.unique(chosen)} == FACTORS
+    np.testing.assert_array_equal(host["factors"](image[None, None]), chosen)
+    restored = np.clip(image + np.random.default_rng(2).normal(0, 0.01, image.shape), 0, 1).astype(np.float32)
+    step = Consistency.of(sensor.nominal(), sensor.reference.nominal(), full_scale=1.0)
+    for raw in (image, np.minimum(image, np.float32(0.95))):
+        down, across = (Placed(side, 0, 0, side) for side in image.shape)
+        change: np.ndarray = step.correction(raw, restored, down, across, (0, 0))
+        expected = np.clip(restored + change, 0, 1)
+        np.testing.assert_array_equal(host["consistent"](raw, restored), expected)
+
+
+def test_a_network_in_memory_gets_the_consistency_step_alone(
+    tmp_path: Path, sensor: bd.Sensor, image: np.ndarray
+) -> None:
+    """A `Network` is not known at other exposures. Without a sensor, neither step is taken."""
+    in_memory = bd.Network.load("convbeers-half-xs-int8", sensor=sensor)
+    folder = bd.Board.load("vck190").kit(in_memory, tmp_path / "kit", tile=TILE_PX, sensor=sensor)
+    assert not facts(folder)["exposures"]
+    assert not [*folder.glob("core-*")]
+    expected = bd.restore(image, in_memory, sensor=sensor, full_scale=1.0, any_result=True)
+    np.testing.assert_allclose(by_host(folder, image), expected, rtol=0, atol=1e-6)
+
+
+def test_a_sensor_that_does_not_exist_or_changes_nothing_is_one_sentence(tmp_path: Path) -> None:
+    board, in_memory = bd.Board.load("vck190"), bd.Network.load(NAME)
+    with pytest.raises(ProfileError, match=r"profile 'hubble': expected one of .*got 'hubble'"):
+        board.kit(NAME, tmp_path / "kit", tile=TILE_PX, sensor="hubble")
+    with pytest.raises(OptionError, match=r"sensor: expected none where .* got blind"):
+        board.kit(in_memory, tmp_path / "kit", tile=TILE_PX, sensor="blind")
+    with pytest.raises(OptionError, match="got pleiades-degraded"):
+        host_facts(network("espcn"), TILE_PX, bd.Sensor.load("pleiades-degraded"))  # it enlarges the image
+    assert not (tmp_path / "kit").exists()
+
+
+def test_a_network_for_another_sensor_is_said(tmp_path: Path) -> None:
+    made = bd.Network.load(NAME, sensor="dior-medium")
+    with pytest.warns(UserWarning, match="made for dior-medium, not for pleiades-degraded"):
+        bd.Board.load("vck190").kit(made, tmp_path / "kit", tile=TILE_PX, sensor="pleiades-degraded")
 
 
 def test_a_record_says_what_a_network_is_and_what_was_checked(tmp_path: Path) -> None:
@@ -74,7 +189,8 @@ def test_of_a_users_network_nothing_is_made_up(tmp_path: Path) -> None:
 
 
 def test_for_an_npu_the_core_is_what_its_compiler_reads(tmp_path: Path) -> None:
-    folder = bd.Board.load("vek385").kit("convbeers-xs-int8", tmp_path / "kit", tile=48)
+    folder = bd.Board.load("vek385").kit("convbeers-xs-int8", tmp_path / "kit", tile=48, sensor="dior-medium")
     assert "ve2-xc2ve3858" in (folder / "vitisai_config.json").read_text(encoding="utf-8")
     assert read_golden(folder / "golden").half_even
     assert bd.check(folder / "core.onnx", "vek385")
+    assert bd.check(folder / "core-x4.onnx", "vek385")
