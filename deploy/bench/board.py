@@ -5,7 +5,7 @@ predicted by the frame.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -33,15 +33,20 @@ from beers_deploy.dpu.cost.latency import Prediction
 from beers_deploy.dpu.cost.model import TASKS, Task
 from beers_deploy.dpu.cost.own_runs import read_own_runs
 from beers_deploy.dpu.reading import own_tile_px
+from beers_deploy.model.exposure import factors_for
 from beers_deploy.model.io.images import read_acquisition
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, require_side
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.restoration.exposures import tiles_by_factor
 from beers_deploy.restoration.options import parse_halo
+from beers_deploy.restoration.plan import make_plan
+from beers_deploy.restoration.steps import keeps_pixels
 from beers_deploy.results import Table
 
 FACE = {"throughput": "fps", "latency": "swath"}
@@ -69,6 +74,7 @@ def predict(
     halo: int | str = "exact",
     host_task: Task | None = None,
     measured: str | os.PathLike[str] | None = None,
+    consistency: bool = True,
 ) -> Predicted:
     """Predict a network on boards by the cost model; nothing is measured.
 
@@ -83,6 +89,7 @@ def predict(
         halo: context around a tile in pixels; "exact" leaves no seams.
         host_task: what the host does with the results; None for what the file tells.
         measured: runs of the user's own board as JSON, by which the cost model is corrected.
+        consistency: whether the host takes the consistency step.
 
     Raises:
         ModelError: no network, or one that does not run on the DPU.
@@ -102,13 +109,15 @@ def predict(
     found = Network.load(network, sensor=SENSOR, to_run=False)
     boards, corrected = _boards(board, dpu, None if measured is None else Path(measured))
     width_px, height_px = parse_size("x".join(map(str, size)) if isinstance(size, tuple | list) else str(size))
-    predictions, notes = _predictions(found.file, found.model, boards, tile, host_task)
     try:
-        exact_px = found.tiling.halo_px
+        tiling = found.tiling
     except ModelError:
+        predictions, notes = _predictions(found.file, found.model, boards, tile, host_task)
         rows = list(map(frame_row, predictions))
     else:
-        swath = Swath(width_px, height_px, tile, parse_halo(str(halo), exact_px))
+        halo_px, takes_step = parse_halo(str(halo), tiling.halo_px), consistency and keeps_pixels(tiling)
+        swath = Swath(width_px, height_px, tile, halo_px, consistency=takes_step)
+        predictions, notes = _predictions(found.file, found.model, boards, tile, host_task, swath.step_px)
         rows = [swath_row(prediction, swath) for prediction in predictions]
     layers = layer_rows(predictions[0]) if len(boards) == 1 else []
     names = ", ".join(each.target.name for each in boards)
@@ -121,11 +130,16 @@ def predict(
 
 
 def _predictions(
-    file: Path, model: onnx.ModelProto, boards: Sequence[Dpu], tile_px: int, task: Task | None
+    file: Path,
+    model: onnx.ModelProto,
+    boards: Sequence[Dpu],
+    tile_px: int,
+    task: Task | None,
+    step_px: float = 0.0,
 ) -> tuple[list[Prediction], list[str]]:
     """A network on each board, of its own size where it is fixed to one; and what to say of its host."""
     size_px = None if own_tile_px(model) else tile_px
-    found = [predict_file(file, dpu, size_px, task) for dpu in boards]
+    found = [predict_file(file, dpu, size_px, task, step_px) for dpu in boards]
     return found, [*dict.fromkeys(words for each in found for words in host_words(each))]
 
 
@@ -171,6 +185,8 @@ def bench_board(
     measured: Path | None = None,
     within_s: float | None = None,
     host_task: Task | None = None,
+    sensor: Sensor | None = None,
+    consistency: bool = True,
 ) -> BoardBench:
     """Predict a network's swath on boards; nothing is measured.
 
@@ -188,6 +204,8 @@ def bench_board(
         measured: runs of the user's board, by which the cost model is corrected.
         within_s: what the swath may take; None does not ask.
         host_task: what the host does with the results; None for what the file tells.
+        sensor: that a shipped network is conditioned on: the exposures of `image` are counted; None counts none.
+        consistency: whether the host takes the consistency step.
     """
     network = load_onnx(model)
     boards, corrected = _boards(target, config, measured)
@@ -199,21 +217,40 @@ def bench_board(
         return _frames(model, network, boards, corrected, error, host_task)
     dn = read_acquisition(image, full_scale, None) if image else None
     width_px, height_px = (dn.shape[1], dn.shape[0]) if dn is not None else parse_size(size or PAPER_SIZE)
-    swath = Swath(width_px, height_px, tiles_px[0], parse_halo(halo, tiling.halo_px))
+    halo_px, takes_step = parse_halo(halo, tiling.halo_px), consistency and keeps_pixels(tiling)
+    swath = Swath(width_px, height_px, tiles_px[0], halo_px, consistency=takes_step)
+    counts = dict[int, int]()
+    if dn is not None and sensor is not None:
+        plan = make_plan((1, height_px, width_px), tiles_px[0], halo_px, tiling)
+        instrument = sensor.nominal()
+        counts = tiles_by_factor(dn, plan, factors_for(instrument), instrument.max_dn, instrument.offset_dn)
+        swath = replace(swath, runs=sum(counts.values()) / plan.tiles)
     targets = list({dpu.target.name: dpu.target for dpu in boards}.values())
     papers = published_rows() if any(each.name == PAPER_TARGET for each in targets) else []
     beside = [*(processor_row(swath, each) for each in targets), *papers]
     title = f"{width_px} x {height_px} pixels"
     if len(boards) == len(tiles_px) == 1 and within_s is None:
-        prediction = predict_file(model, boards[0], swath.tile_px, host_task)
+        prediction = predict_file(model, boards[0], swath.tile_px, host_task, swath.step_px)
         rows = [*predicted_rows(model.stem, prediction, swath), *beside]
         shown = [*corrected, (f"{title} in tiles of {swath.tile_px}", rows)]
-        notes, layers = host_words(prediction), [_layers(model, prediction)]
+        notes, layers = [*host_words(prediction), *exposure_words(counts)], [_layers(model, prediction)]
         return BoardBench(shown, notes, layers, swath, dn)
     swept = sweep_rows(model, swath, boards, tiles_px, host_task)
     whole = (f"{model.name}, {title} in whole tiles, halo {swath.halo_px} px", swept)
     shown = [*corrected, whole, (f"{title}, for comparison", beside)]
-    return BoardBench(shown, [] if within_s is None else [within_words(swept, boards, within_s)], [], swath, dn)
+    notes = exposure_words(counts)
+    if within_s is not None:
+        notes.append(within_words(swept, boards, within_s))
+    return BoardBench(shown, notes, [], swath, dn)
+
+
+def exposure_words(counts: Mapping[int, int]) -> list[str]:
+    """Say which share of an image's tiles asks for each exposure; nothing without counts."""
+    if len(counts) < 2:
+        return []
+    total = sum(counts.values())
+    shares = ", ".join(f"x{factor} {count / total:.0%}" for factor, count in counts.items())
+    return [f"runs of the network by exposure (measured on the image's pixels): {shares}; one tile may need several"]
 
 
 def _layers(model: Path, prediction: Prediction) -> tuple[str, list[Row]]:

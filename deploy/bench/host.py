@@ -17,10 +17,12 @@ import psutil
 from beers_deploy.bench.timing import interleaved
 from beers_deploy.dpu.reading import inputs_of
 from beers_deploy.host_state import cpu_load, resident_bytes
+from beers_deploy.model.consistency import Consistency, Placed
 from beers_deploy.model.processor import require_cores
 from beers_deploy.network import other_precision
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import is_quantised, load_onnx
 from beers_deploy.quant.session import open_session, require_finite
 
@@ -83,8 +85,12 @@ def _mean_power(run: Timed) -> Figure:
     return measured(energy_j / sum(run.times_s), "W", run.powers[0].source)
 
 
-def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0) -> list[Row]:
+def host_rows(
+    model: Path, target: TargetProfile, tile_px: int, threads: int = 0, sensor: Sensor | None = None
+) -> list[Row]:
     """A network's time for one tile through onnxruntime, float32 and INT8 interleaved, and how much faster INT8 is.
+
+    With a `sensor` the time of the consistency step is a row too.
 
     Each runs for the target's minimum time and count, one run for warm-up left out. Its pair in the other
     precision is the shipped network of the same variant; without one it runs alone.
@@ -100,7 +106,23 @@ def host_rows(model: Path, target: TargetProfile, tile_px: int, threads: int = 0
     time_networks(runs, tile_px, threads, min_time_s, min_runs)
     conditions = conditions_of(threads or psutil.cpu_count(logical=False) or 1)
     rows = [_row(run, tile_px, conditions) for run in runs]
+    if sensor is not None:
+        rows.append(step_row(sensor, tile_px, min_time_s, min_runs))
     return rows if other is None else [*rows, _ratio_row(runs)]
+
+
+def step_row(sensor: Sensor, tile_px: int, min_time_s: float, min_runs: int) -> Row:
+    """Time the consistency step on one thread here, on a tile of noise."""
+    instrument = sensor.nominal()
+    step = Consistency.of(instrument, sensor.reference.nominal())
+    raw = np.random.default_rng(0).uniform(0, instrument.max_dn / 2, (tile_px, tile_px)).astype(np.float32)
+    side = Placed(tile_px, 0, 0, tile_px)
+    call = partial(step.correction, raw, raw, side, side, (0, 0))
+    call()
+    times_ms = np.array([1e3 * time_s for time_s, _ in interleaved([call], min_runs, min_time_s)[0]])
+    source = f"{len(times_ms)} runs on one thread after one for warm-up"
+    figures = {f"p{p}": measured(float(np.percentile(times_ms, p)), "ms/tile", source) for p in (50, 90)}
+    return Row("host", f"consistency step, {tile_px} x {tile_px}", figures)
 
 
 def conditions_of(threads: int) -> dict[str, Figure]:

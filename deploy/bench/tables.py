@@ -8,6 +8,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 from beers_deploy.dpu.board import Dpu
@@ -45,12 +46,23 @@ PAPER_TARGET = "vck190"
 
 @dataclass(frozen=True)
 class Swath:
-    """The image that all rows are about, and the tiles it is cut into."""
+    """The image that all rows are about, and the tiles it is cut into.
+
+    Attributes:
+        width_px: of the image.
+        height_px: of the image.
+        tile_px: side of a tile.
+        halo_px: context around what is kept of a tile.
+        runs: how often the network runs on a tile, once for each exposure that its pixels ask for; a mean.
+        consistency: whether the host takes the consistency step.
+    """
 
     width_px: int
     height_px: int
     tile_px: int = TILE_PX
     halo_px: int = 0
+    runs: float = 1.0
+    consistency: bool = False
 
     @property
     def pixels(self) -> int:
@@ -71,20 +83,27 @@ class Swath:
         rows, columns = (plan_side(side, self.tile_px, self.halo_px) for side in (self.height_px, self.width_px))
         return len(rows) * len(columns)
 
+    @property
+    def step_px(self) -> float:
+        """Pixels of the image for which the host takes the consistency step, for each run of the network."""
+        return self.pixels / (self.tiles * self.runs) if self.consistency else 0.0
 
-def predict_file(model: Path, dpu: Dpu, tile_px: int | None = TILE_PX, task: Task | None = None) -> Prediction:
+
+def predict_file(
+    model: Path, dpu: Dpu, tile_px: int | None = TILE_PX, task: Task | None = None, step_px: float = 0.0
+) -> Prediction:
     """What the cost model says of an ONNX file, for tiles of that side or, with None, for the size it is fixed to.
 
-    The `task` of the host is what the file tells, if none is given.
+    The `task` of the host is what the file tells, if none is given; `step_px` as of `predict`.
     """
-    return predict(place(read_network(model, tile_px), dpu), dpu, task)
+    return predict(place(read_network(model, tile_px), dpu), dpu, task, step_px)
 
 
 def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]:
     """A network on the DPU, twice: as the paper counts, and with whole tiles."""
-    batches = math.ceil(swath.tiles / prediction.batch)
+    batches = math.ceil(swath.tiles * swath.runs / prediction.batch)
     counts = {
-        "as the paper counts": (swath.frames, swath.frames / prediction.batch),
+        "as the paper counts": (swath.frames, swath.frames * swath.runs / prediction.batch),
         f"whole tiles, halo {swath.halo_px} px": (float(swath.tiles), float(batches)),
     }
     besides = {
@@ -101,15 +120,26 @@ def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]
 
 def _swath_figures(prediction: Prediction, swath: Swath, frames: float, batches: float) -> dict[str, Figure]:
     power, latency = dpu_power(prediction.dpu), swath_latency(prediction, batches)
+    step = {"consistency step": step_time(prediction, swath)} if swath.consistency else {}
     return {
         "tiles": exact(frames, "tile", ARITHMETIC),
+        "network runs": exact(swath.runs, "run/tile", "exposures that the image's tiles ask for; 1 without an image"),
         "work factor": exact(frames * swath.tile_px**2 / swath.pixels, "px/px", ARITHMETIC),
         "latency": latency,
         "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
         "power": power,
         "energy": energy(latency, power),
         "efficiency": efficiency(swath.pixels, latency, power),
+        **step,
     }
+
+
+def step_time(prediction: Prediction, swath: Swath) -> Figure:
+    """Time of the consistency step for the swath on the host's cores, in s; it runs while the DPU works."""
+    runs = swath.tiles * swath.runs
+    low_s, high_s = (end_s * runs for end_s in prediction.step_s)
+    source = "counted work of the step at the rates of the board's processor, from the best published to plain code"
+    return predicted(between((low_s, high_s)), "s", (low_s, high_s), source)
 
 
 def host_time(prediction: Prediction, unit: str) -> Figure:
@@ -272,16 +302,16 @@ def sweep_rows(
     model: Path, swath: Swath, boards: Sequence[Dpu], tiles_px: Sequence[int], task: Task | None = None
 ) -> list[Row]:
     """A row a configuration and tile size, for whole tiles with the swath's halo."""
-    return [
-        swath_row(predict_file(model, dpu, tile_px, task), replace(swath, tile_px=tile_px))
-        for dpu in boards
-        for tile_px in tiles_px
-    ]
+    rows = []
+    for dpu, tile_px in product(boards, tiles_px):
+        cut = replace(swath, tile_px=tile_px)
+        rows.append(swath_row(predict_file(model, dpu, tile_px, task, cut.step_px), cut))
+    return rows
 
 
 def swath_row(prediction: Prediction, swath: Swath) -> Row:
     """A swath in whole tiles on one configuration."""
-    batches = math.ceil(swath.tiles / prediction.batch)
+    batches = math.ceil(swath.tiles * swath.runs / prediction.batch)
     kept = [not layer.work.map_bytes for layer in prediction.layers]
     figures = _swath_figures(prediction, swath, swath.tiles, batches) | {
         "maps through memory": exact(prediction.streamed_bytes / 1e6, "MB/tile"),

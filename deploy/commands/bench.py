@@ -33,6 +33,7 @@ BOARD_ONLY = (
     "measured",
     "no_traditional",
     "within",
+    "consistency",
     "layers",
 )
 HOST_ONLY = ("threads",)
@@ -97,6 +98,10 @@ def bench(
         float | None,
         typer.Option(min=0, help="Seconds that the swath may take: which is the smallest DPU that meets them?"),
     ] = None,
+    consistency: Annotated[
+        bool,
+        typer.Option("--consistency/--no-consistency", help="Count the consistency step on the board's processor."),
+    ] = True,
     layers: Annotated[bool, typer.Option("--layers", help="Show where the time goes, layer by layer.")] = False,
     threads: Annotated[int, typer.Option(min=0, help="Threads of the host's runtime; 0 takes every core.")] = 0,
     json: Json = None,
@@ -107,17 +112,18 @@ def bench(
     from beers_deploy.dpu.board import ALL
     from beers_deploy.dpu.cost.model import TASKS
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.network import int8_file
+    from beers_deploy.network import conditioned, int8_file
     from beers_deploy.results import Table, print_rows
 
     tiles, here, board = parse_tiles(tile), target in HOSTS, target.removesuffix(MODEL_SUFFIX)
     _refuse_unused(context, here)
     require_writable(json, inputs=(model, image, measured, Path(target), Path(sensor)))
-    path = int8_file(model, load_sensor(sensor), partial(say, err=True))
+    known = load_sensor(sensor)
+    path = int8_file(model, known, partial(say, err=True))
     if here:
         from beers_deploy.bench.host import host_rows
 
-        rows = host_rows(path, load_target("host-cpu"), _single(tiles), threads)
+        rows = host_rows(path, load_target("host-cpu"), _single(tiles), threads, known)
         for table, part in by_table(rows).items():
             print_rows(f"{path.name} on this machine: {table}", part)
         say(NO_PROXY)
@@ -139,6 +145,8 @@ def bench(
             measured=measured,
             within_s=within,
             host_task=task,
+            sensor=known if conditioned(model) is not None else None,
+            consistency=consistency,
         )
         for title, part in (*(_required_layers(found) if layers else []), *found.shown):
             print_rows(title, part)

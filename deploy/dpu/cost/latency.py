@@ -25,6 +25,7 @@ from beers_deploy.dpu.cost.model import (
     Structure,
     Task,
     between,
+    consistency_interval_s,
     frame_rate,
     own_speed,
     placed_work,
@@ -70,6 +71,7 @@ class Prediction:
         outside: what lies beyond the fitted networks; empty where nothing does.
         refused: names of nodes that the DPU refuses and the host runs.
         refused_s: what they take of `host_s`, least and most.
+        step_s: what the consistency step takes of `host_s`, least and most.
     """
 
     dpu: Dpu
@@ -83,6 +85,7 @@ class Prediction:
     note: str = ""
     refused: tuple[str, ...] = ()
     refused_s: Interval = (0.0, 0.0)
+    step_s: Interval = (0.0, 0.0)
 
     @property
     def batch(self) -> int:
@@ -135,9 +138,10 @@ class Prediction:
 
     @property
     def _host_ends_s(self) -> Interval:
-        """With the refused nodes at their least and at their most."""
-        rest_s = self.host_s - between(self.refused_s)
-        return rest_s + self.refused_s[0], rest_s + self.refused_s[1]
+        """With the refused nodes and the consistency step at their least and at their most."""
+        rest_s = self.host_s - between(self.refused_s) - between(self.step_s)
+        low_s, high_s = (sum(ends) for ends in zip(self.refused_s, self.step_s, strict=True))
+        return rest_s + low_s, rest_s + high_s
 
     def rate(self, batch_time_s: float, host_s: float) -> float:
         """Images a second if a batch took that long on the DPU, and an image that long on the host."""
@@ -154,13 +158,14 @@ class Prediction:
         return sum(layer.work.map_bytes for layer in self.layers)
 
 
-def predict(placement: Placement, dpu: Dpu, task: Task | None = None) -> Prediction:
+def predict(placement: Placement, dpu: Dpu, task: Task | None = None, step_px: float = 0.0) -> Prediction:
     """Predict a network whose convolutions the DPU runs; what it refuses at the ends of a float file the host does.
 
     Args:
         placement: where its nodes run.
         dpu: a board's.
         task: what the host does with the results; None for what the file tells.
+        step_px: pixels of an image for which the host takes the consistency step; 0 leaves it out.
     """
     if placement.cutting:
         names = ", ".join(node.op.name for node in placement.cutting[:3])
@@ -179,7 +184,9 @@ def predict(placement: Placement, dpu: Dpu, task: Task | None = None) -> Predict
     refused = [node.op for node in placement.failed]
     cores, refused_s = dpu.whole("cpu", "cores"), refused_interval_s(refused, dpu)
     task = task or task_of(placement)
-    host_s = float(placed_work(placement, task) @ constants.host_s_per_unit) / cores / host_speed + between(refused_s)
+    step_s = consistency_interval_s(step_px, dpu) if step_px else (0.0, 0.0)
+    host_s = float(placed_work(placement, task) @ constants.host_s_per_unit) / cores / host_speed
+    host_s += between(refused_s) + between(step_s)
     dpu_s = math.fsum(layer.time_s for layer in layers) / dpu.batch
     map_bytes = largest_map_bytes(placement.core)
     regime = regime_of(host_s > dpu_s, map_bytes)
@@ -197,6 +204,7 @@ def predict(placement: Placement, dpu: Dpu, task: Task | None = None) -> Predict
         note=placement.note,
         refused=tuple(op.name for op in refused),
         refused_s=refused_s,
+        step_s=step_s,
     )
 
 

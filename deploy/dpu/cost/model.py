@@ -20,6 +20,7 @@ from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.placement import Placement
 from beers_deploy.dpu.cost.work import Work
 from beers_deploy.dpu.graph import Operation
+from beers_deploy.model.consistency import PRODUCTS_PER_PX
 
 Array = NDArray[np.float64]
 Interval = tuple[float, float]
@@ -222,11 +223,27 @@ def between(interval: Interval) -> float:
 
 
 def _core_s(op: Operation, dpu: Dpu) -> Interval:
+    values = op.out_bytes + sum(math.prod(shape) for shape in op.in_shapes if shape is not None)
+    return _plain_work_s(op.operations, values + op.weight_bytes, op.out_bytes, dpu)
+
+
+def _plain_work_s(operations: float, moved_values: float, results: float, dpu: Dpu) -> Interval:
+    """Time of one core for float32 work, least and most: as a good library does it, and number by number."""
     keys = ("clock_ghz", "product_flops_per_cycle", "moved_bytes_per_s", "decoding_mips_per_ghz")
     clock, products, moved, decoding = (dpu.limit("cpu", key) for key in keys)
-    values = op.out_bytes + sum(math.prod(shape) for shape in op.in_shapes if shape is not None)
-    floats = FLOAT_BYTES * (values + op.weight_bytes)
-    least_s = max(op.operations / (1e9 * clock.high * products.high), floats / moved.high)
-    instructions = INSTRUCTIONS * op.out_bytes + PRODUCT_INSTRUCTIONS * op.operations
-    most_s = instructions / (1e6 * decoding.low * clock.low) + floats / moved.low
+    moved_bytes = FLOAT_BYTES * moved_values
+    least_s = max(operations / (1e9 * clock.high * products.high), moved_bytes / moved.high)
+    instructions = INSTRUCTIONS * results + PRODUCT_INSTRUCTIONS * operations
+    most_s = instructions / (1e6 * decoding.low * clock.low) + moved_bytes / moved.low
     return least_s, most_s
+
+
+def consistency_interval_s(pixels: float, dpu: Dpu) -> Interval:
+    """Time that the board's processor takes for the consistency step on so many pixels: all cores, in s.
+
+    None of it is fitted. The raw and the restored image are read and the result is written; the step's other numbers
+    stay in the caches.
+    """
+    low_s, high_s = _plain_work_s(2 * PRODUCTS_PER_PX * pixels, 3 * pixels, pixels, dpu)
+    cores = dpu.whole("cpu", "cores")
+    return low_s / cores, high_s / cores

@@ -20,6 +20,7 @@ from beers_deploy.bench.tables import Swath
 from beers_deploy.bench.timing import interleaved
 from beers_deploy.bench.traditional import drawn_acquisition
 from beers_deploy.export import float_model
+from beers_deploy.model.consistency import Consistency
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.io.images import list_images
 from beers_deploy.model.metrics.perceptual import find_backbone
@@ -33,23 +34,25 @@ from beers_deploy.quant.calibration import Calibration
 from beers_deploy.quant.onnx_file import metadata, save_onnx
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.reading.external import network_sha256
-from beers_deploy.restoration.engine import Restore, restore_dn
+from beers_deploy.restoration.exposures import ExposedNetwork, tiles_by_factor
+from beers_deploy.restoration.method import Restore
 from beers_deploy.restoration.options import Runtime
-from beers_deploy.restoration.plan import make_plan
-from beers_deploy.restoration.runtime import open_runtime
+from beers_deploy.restoration.plan import Plan, make_plan
+from beers_deploy.restoration.rows import restore_dn
+from beers_deploy.restoration.runtime import Packed, open_runtime
 from beers_deploy.studies.detection.average_precision import find_hits, interval, map50, site_weights
 from beers_deploy.studies.detection.detector import Detector, open_detector, parse_classes
 from beers_deploy.studies.detection.study import LabelledScene, SensorPair, acquired, labelled_scenes
 from beers_deploy.studies.evaluation.methods import Method
 from beers_deploy.studies.evaluation.pairs import NamedPair
-from beers_deploy.studies.evaluation.scores import NOISE_FREE, Instruments, perceptual_distances
+from beers_deploy.studies.evaluation.scores import DETAILS, Instruments, perceptual_distances
 from beers_deploy.studies.tradeoff.points import HALO_STEP_PX, Point, Variant, model_of, tiling_of_file
 
 Scores = Mapping[str, float | None]
 """Figures of one image by name; None where an instrument is not there."""
 
 LPIPS, SEAM_ERROR = "LPIPS-squeeze", "seam error"
-NOT_SHOWN = ("PSNR gain", NOISE_FREE, SEAM_ERROR)
+NOT_SHOWN = (*DETAILS, SEAM_ERROR)
 """Of the scores of an image, in the means of a point."""
 
 
@@ -134,7 +137,9 @@ class Benchmark:
     def depends(self, variant: Variant) -> str:
         """Digest of what a variant's pictures depend on."""
         if variant.file is not None:
-            return network_sha256(variant.file)
+            sensors = self.degraded, self.reference
+            files = [network_sha256(path) for path in (variant.file, *(path for _, path in variant.brighter))]
+            return key_of(files=files, sensors=sensors)
         return key_of(method=variant.method, sensors=[self.degraded, self.reference])
 
     def scores(self, point: Point, exact: Restore, kept: Measurements) -> list[dict[str, float | None]]:
@@ -143,8 +148,22 @@ class Benchmark:
         if point.halo_px is None:
             return list(kept.make(key_of(**about), lambda: self.score(exact)))
         about |= {"tile_px": point.tile_px, "halo_px": point.halo_px}
-        max_dn = self.degraded.nominal().max_dn
-        return list(kept.make(key_of(**about), lambda: self.score(restore_in_tiles(point, max_dn), exact)))
+        restore = restore_in_tiles(point, self.degraded, self.reference)
+        return list(kept.make(key_of(**about), lambda: self.score(restore, exact)))
+
+    def runs(self, point: Point) -> float:
+        """How often the network of a point runs on a tile of the images, once for each exposure; a mean."""
+        if not point.variant.brighter:
+            return 1.0
+        sensor = self.degraded.nominal()
+        factors = (1, *(factor for factor, _ in point.variant.brighter))
+        tiles, runs = 0, 0
+        for pair in self.pairs:
+            plan = tiles_of_point(point, pair.degraded.shape)
+            counts = tiles_by_factor(pair.degraded, plan, factors, sensor.max_dn, sensor.offset_dn)
+            tiles += plan.tiles
+            runs += sum(counts.values())
+        return runs / tiles
 
     def score(self, restore: Restore, exact: Restore | None = None) -> list[dict[str, float | None]]:
         """Scores of every pair; and how far, in DN, a restoration with seams is from the exact one given."""
@@ -168,17 +187,26 @@ class Benchmark:
         return found
 
 
-def restore_in_tiles(point: Point, max_dn: int) -> Restore:
-    """A network in a point's tiles; an image that is no larger than a tile is cut in two along each side."""
-    file, halo_px = point.variant.file or Path(), point.halo_px or 0
+def restore_in_tiles(point: Point, degraded: Sensor, reference: Sensor) -> Restore:
+    """A network in a point's tiles, with the steps around it that `restore` takes."""
+    file, sensor = point.variant.file or Path(), degraded.nominal()
     infer, _ = open_runtime(Runtime.onnxruntime, model_of(file), threads=0)
+    others = {factor: Packed(path.read_bytes(), Runtime.onnxruntime, 0) for factor, path in point.variant.brighter}
+    network = ExposedNetwork({1: infer, **others}, tiling_of_file(file).halo_px, sensor.offset_dn)
+    steps = (Consistency.of(sensor, reference.nominal().in_units_of(sensor), sensor.max_dn),)
 
     def restore(dn: np.ndarray) -> np.ndarray:
-        half_px = HALO_STEP_PX * -(-(min(dn.shape) // 2) // HALO_STEP_PX) + 2 * halo_px
-        plan = make_plan((1, *dn.shape), min(point.tile_px, half_px), halo_px, tiling_of_file(file))
-        return restore_dn(dn, infer, plan, max_dn)
+        return restore_dn(dn, network, tiles_of_point(point, dn.shape), sensor.max_dn, steps)
 
     return restore
+
+
+def tiles_of_point(point: Point, shape: tuple[int, ...]) -> Plan:
+    """The tiles of a point on an image (H, W); one that is no larger than a tile is cut in two along each side."""
+    tiling = tiling_of_file(point.variant.file or Path())
+    halo_px = tiling.halo_px if point.halo_px is None else point.halo_px
+    half_px = HALO_STEP_PX * -(-(min(shape) // 2) // HALO_STEP_PX) + 2 * halo_px
+    return make_plan((1, *shape), min(point.tile_px, half_px), halo_px, tiling)
 
 
 @dataclass(frozen=True)

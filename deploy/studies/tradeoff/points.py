@@ -21,10 +21,11 @@ from beers_deploy.dpu.cost.latency import dpu_power, predict
 from beers_deploy.dpu.graph import Network
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.export import float_model
+from beers_deploy.model.shipped import INT8 as SUFFIX
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.traditional.nl_bayes import QUALITIES
 from beers_deploy.model.traditional.peers import PEERS
-from beers_deploy.network import float_file, int8_file
+from beers_deploy.network import brighter_files, float_file, int8_file
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Figure, predicted, unavailable
@@ -50,11 +51,13 @@ class Variant:
         method: its name without the precision.
         precision: float32 or INT8.
         file: the network's file; None of a method without a network.
+        brighter: of a shipped network, its files for sensors of so many times the gain, by factor.
     """
 
     method: str
     precision: str = FLOAT
     file: Path | None = None
+    brighter: tuple[tuple[int, Path], ...] = ()
 
     @property
     def name(self) -> str:
@@ -137,9 +140,14 @@ def _variants(
     if is_quantised(model):
         yield Variant(method, INT8, given)
         return
+    if name in shipped_names():
+        yield Variant(method, FLOAT, given, tuple(brighter_files(path, sensor).items()))
+        made = int8_file(path, sensor)
+        yield Variant(method, INT8, made, tuple(brighter_files(Path(f"{name}{SUFFIX}"), sensor).items()))
+        return
     yield Variant(method, FLOAT, given)
     try:
-        made = int8_file(path, sensor) if name in shipped_names() else make_int8(given)
+        made = make_int8(given)
     except ModelError as error:
         log(f"{name} is compared in float32 alone: {error}")
         return
@@ -200,7 +208,7 @@ def fastest_tile_px(variant: Variant, dpu: Dpu, whole: Swath) -> int:
     """The tile with exact seams, no larger than the paper's, in which the swath is predicted to take least time."""
     radius = radius_px(variant)
     sides = range(TILE_STEP_PX * (2 * radius // TILE_STEP_PX + 1), TILE_PX + 1, TILE_STEP_PX)
-    swaths = [replace(whole, tile_px=side_px, halo_px=radius) for side_px in sides]
+    swaths = [replace(whole, tile_px=side_px, halo_px=radius, consistency=True) for side_px in sides]
     times = {swath.tile_px: dpu_latency(variant, dpu, swath).value or math.inf for swath in swaths}
     return min(times, key=lambda side_px: times[side_px], default=TILE_PX)
 
@@ -213,8 +221,8 @@ def dpu_latency(variant: Variant, dpu: Dpu, swath: Swath) -> Figure:
         dpu: that it runs on.
         swath: with its tiles and their halo.
     """
-    prediction = predict(place(_graph(variant.file or Path(), swath.tile_px), dpu), dpu)
-    return tables.swath_latency(prediction, math.ceil(swath.tiles / prediction.batch))
+    prediction = predict(place(_graph(variant.file or Path(), swath.tile_px), dpu), dpu, step_px=swath.step_px)
+    return tables.swath_latency(prediction, math.ceil(swath.tiles * swath.runs / prediction.batch))
 
 
 def radius_px(variant: Variant) -> int:
@@ -251,17 +259,18 @@ CHAIN = "traditional-standard"
 """The chain whose time on a board's processor a target states."""
 
 
-def board_figures(point: Point, whole: Swath, slower: float | None = None) -> dict[str, Figure]:
+def board_figures(point: Point, whole: Swath, slower: float | None = None, runs: float = 1.0) -> dict[str, Figure]:
     """The figures of a point's board; unavailable, with the reason, where it has none.
 
     Args:
         point: a network on a DPU, or a traditional chain on the board's processor.
         whole: the swath.
         slower: how many times as long a chain takes as CHAIN, measured on this machine.
+        runs: how often the network runs on a tile of the measured images, a mean.
     """
     if point.dpu is not None:
         halo_px = radius_px(point.variant) if point.halo_px is None else point.halo_px
-        swath = replace(whole, tile_px=point.tile_px, halo_px=halo_px)
+        swath = replace(whole, tile_px=point.tile_px, halo_px=halo_px, runs=runs, consistency=True)
         latency, power = dpu_latency(point.variant, point.dpu, swath), dpu_power(point.dpu)
     elif point.board is not None and slower is not None:
         row = tables.processor_row(whole, point.board)

@@ -15,11 +15,13 @@ from beers_deploy.model.io.images import list_images
 from beers_deploy.model.metrics.bootstrap import too_few
 from beers_deploy.model.metrics.perceptual import find_backbone
 from beers_deploy.model.progress import Log, Progress, no_log, reporting, steps
+from beers_deploy.model.shipped import INT8 as SUFFIX
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.errors import MachineError
 from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.figures import measured as measured_figure
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import REFERENCE
 from beers_deploy.profiles.target import DEFAULT_TARGET
@@ -29,7 +31,15 @@ from beers_deploy.studies.evaluation.pairs import pairs_of_scenes
 from beers_deploy.studies.tradeoff import advice
 from beers_deploy.studies.tradeoff.measure import Benchmark, Labelled, Measurements, make_int8, measure_host
 from beers_deploy.studies.tradeoff.page import Tradeoff
-from beers_deploy.studies.tradeoff.points import CHAIN, Point, Variant, board_figures, network_variants, points_of
+from beers_deploy.studies.tradeoff.points import (
+    CHAIN,
+    INT8,
+    Point,
+    Variant,
+    board_figures,
+    network_variants,
+    points_of,
+)
 
 
 def tradeoff(
@@ -163,7 +173,11 @@ def _measured(
     for point, measured in zip(there, found, strict=True):
         here_s = medians_s[point.variant]
         slower = here_s / medians_s.get(Variant(CHAIN), here_s)
-        measured.figures.update(host[point.variant] | board_figures(point, swath, slower))
+        runs = benchmark.runs(point) if point.dpu is not None else 1.0
+        figures = host[point.variant] | board_figures(point, swath, slower, runs)
+        if point.dpu is not None:
+            figures["network runs"] = measured_figure(runs, "run/tile", "exposures that tiles of the images ask for")
+        measured.figures.update(figures)
     return found
 
 
@@ -171,11 +185,18 @@ def _methods(variants: Sequence[Variant], benchmark: Benchmark, log: Log) -> dic
     found: dict[Variant, Method] = {}
     for variant in dict.fromkeys(variants):
         try:
-            name = str(variant.file or variant.method)
+            name = _method_name(variant)
             found[variant] = method_named(name, benchmark.degraded, benchmark.reference)
         except MachineError as error:
             log(f"{variant.name} is left out: {error}")
     return found
+
+
+def _method_name(variant: Variant) -> str:
+    """What `method_named` calls a variant: a shipped network by its name, which brings its exposures."""
+    if variant.brighter:
+        return variant.method + (SUFFIX if variant.precision == INT8 else "")
+    return str(variant.file or variant.method)
 
 
 def _text(point: Point, method: Method) -> dict[str, str]:

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from beers_deploy.restoration.engine import Restore
+from beers_deploy.restoration.method import Restore
 from beers_deploy.studies.tradeoff import measure, points
 
 

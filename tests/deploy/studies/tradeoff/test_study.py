@@ -17,7 +17,7 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.variants import Variant as Shape
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.sensor_file import reference_for
-from beers_deploy.restoration.engine import Restore
+from beers_deploy.restoration.method import Restore
 from beers_deploy.studies.evaluation.methods import Method, method_named
 from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes
 from beers_deploy.studies.evaluation.scores import Instruments
