@@ -14,16 +14,17 @@ import torch
 from torch import Tensor
 
 from beers_deploy.host_state import peak_memory
-from beers_deploy.model.progress import Log, no_log, steps
+from beers_deploy.model.progress import Log, Steps, no_log, steps
 from beers_deploy.model.traditional.pipeline import Chain, restore_strips
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Row, measured
-from beers_deploy.restoration.engine import RestoredRow, as_stored, checked_strip
+from beers_deploy.restoration.engine import as_stored, checked_strip
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.output import Checkpoint, write_output
 from beers_deploy.restoration.plan import Span, check_memory
 from beers_deploy.restoration.radiometry import full_scale_of
+from beers_deploy.restoration.rows import RestoredRow
 from beers_deploy.restoration.run import begun
 from beers_deploy.restoration.sensor_check import told_sensor
 from beers_deploy.restoration.source import Source, fingerprint, strips
@@ -55,7 +56,8 @@ def restore_file_traditionally(
         job = {"image": list(fingerprint(source.files)), "method": "traditional"}
         checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, resume=False)
         try:
-            _fill(checkpoint, source, chain, scale.value, str(image))
+            fitted = _fitted(source, chain, scale.value, str(image))
+            _fill(checkpoint, source, fitted, scale.value, str(image))
             write_output(checkpoint, source, options.compression)
         except BaseException:  # a strip is no place to go on from: the chain looks hundreds of rows back
             checkpoint.remove()
@@ -70,6 +72,20 @@ def restore_file_traditionally(
     }
     text = {"method": "traditional", "sensor": sensor.name, **scale.text, **check.text}
     return Row("restore", image.name, figures, text)
+
+
+def _fitted(source: Source, chain: Chain, full_scale: float, name: str) -> Chain:
+    """Derive the regularisation of the chain from a first pass over the image, which takes little of the time."""
+    to_dn = chain.degraded.max_dn / full_scale
+    with steps("measuring noise and contrast", source.raster.height_px) as bar:
+        return chain.fitted_to(_counted(_read(source, to_dn, full_scale, name), bar))
+
+
+def _counted(strips_read: Iterator[Tensor], bar: Steps) -> Iterator[Tensor]:
+    """Pass strips on as they come, and report the rows of each once the next one is asked for."""
+    for strip in strips_read:
+        yield strip
+        bar.advance(strip.shape[0])
 
 
 def _fill(checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: float, name: str) -> None:

@@ -19,15 +19,6 @@ from beers_deploy.model.traditional.rows import Rows, fill_with_local_means, map
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.response import NYQUIST
 
-EPSILON_PER_PERCENT = 3.3e-3
-"""Regularisation at Nyquist per per cent of noise at the brighter radiance that a profile states (100 W/m2/sr/um in
-the shipped ones): what denoising leaves grows about as sigma.
-
-A share of the light, not a radiance: scenes half as bright, seen with twice the gain, are restored alike. On a
-photograph 3e-3 was best of 1e-3, 3e-3 and 1e-2 at MTF 7 %, SNR 50 / 110, and 1e-2 at 3 %, 15 / 50; with this
-rule both lose less than 0.05 dB (measured).
-"""
-
 RADIUS_PX = 64
 """Half the filter's side. The gain's kink at DC gives it a slow tail: half a per cent of its weight lies beyond."""
 

@@ -1,7 +1,7 @@
 """The noise that NL-Bayes removes: white, or coloured by a filter that came before."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -43,6 +43,11 @@ def coloured_by(kernel: Tensor, sigma: float) -> Noise:
     autocorrelation = full[: 2 * LAG_PX + 1, : 2 * LAG_PX + 1]
     energy = autocorrelation[LAG_PX, LAG_PX]
     return Noise(sigma * float(energy.sqrt()), autocorrelation / energy)
+
+
+def with_rounding_noise(sensor: Instrument) -> Instrument:
+    """Return the sensor with the 1/12 DN^2 of its converter's rounding added to beta."""
+    return replace(sensor, beta=sensor.beta + 1 / (12 * sensor.gain_dn_per_radiance**2))
 
 
 def stabilise(radiance: Tensor, sensor: Instrument) -> Tensor:

@@ -16,8 +16,8 @@ from torch import Tensor
 from beers_deploy.model.simulator.detector import to_dn, to_radiance
 from beers_deploy.model.simulator.mtf import transfer_function
 from beers_deploy.model.traditional.compensate import filter_strips
-from beers_deploy.model.traditional.noise import bias_radiance, destabilise, stabilise
-from beers_deploy.model.traditional.pipeline import Chain, with_rounding_noise
+from beers_deploy.model.traditional.noise import bias_radiance, destabilise, stabilise, with_rounding_noise
+from beers_deploy.model.traditional.pipeline import Chain
 from beers_deploy.model.traditional.rows import mirrored
 
 PAD_PX = 64
@@ -58,7 +58,7 @@ def nl_means(dn: Tensor, chain: Chain) -> Tensor:
         stable.numpy(), NLM_PATCH_PX, NLM_DISTANCE_PX, h=NLM_STRENGTH, sigma=1.0, fast_mode=True
     )
     radiance = destabilise(torch.from_numpy(clean).float(), sensor) + bias_radiance(sensor)
-    sharp = torch.cat(list(filter_strips([radiance], len(radiance), chain.kernel())))
+    sharp = torch.cat(list(filter_strips([radiance], len(radiance), chain.fitted_to([dn]).kernel())))
     return to_dn(sharp, chain.reference)
 
 
