@@ -4,7 +4,7 @@
 
 One photograph of each site is acquired and restored with the sensor's profile, and its mean compared with the
 reference's. The crops, which were restored on the ground, are degraded as scenes and restored, and restored once more
-as they are. A border of 16 pixels is left out.
+as they are. Inner pixels count, as in `evaluate`.
 """
 
 import argparse
@@ -19,8 +19,9 @@ from beers_deploy.model.simulator.sampling import Scene, scene_of
 from beers_deploy.profiles import load_sensor
 from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.evaluation.pairs import NamedPair, oversamplings_of, simulate_pairs
+from beers_deploy.studies.evaluation.scores import bias_percent
 
-BORDER_PX, CROP_PX, SEED = 16, 700, 0
+CROP_PX, SEED = 700, 0
 DEGRADED, REFERENCE = load_sensor(SENSOR), load_sensor("pleiades-reference")
 
 
@@ -56,11 +57,9 @@ def acquired(scenes: list[Scene]) -> list[NamedPair]:
 
 
 def change(restored: np.ndarray, wanted: np.ndarray | None) -> float:
-    """Of the mean, in %, without the border."""
+    """Return the change of the mean of the inner pixels in %, clipped pixels among them."""
     assert wanted is not None  # noqa: S101 - pairs simulated here have it
-    inner = slice(BORDER_PX, -BORDER_PX), slice(BORDER_PX, -BORDER_PX)
-    means = [float(image[inner].mean(dtype=np.float64)) for image in (restored, wanted)]
-    return 100 * (means[0] / means[1] - 1)
+    return bias_percent(restored, wanted)
 
 
 if __name__ == "__main__":

@@ -30,6 +30,17 @@ def evaluate(
     sweep: Annotated[
         bool, typer.Option("--sweep", help="Also under 16 sensors known as they are, and 7 known wrongly.")
     ] = False,
+    brightness: Annotated[
+        str | None, typer.Option(help="Also with the scenes' radiance times these factors: 0.25,0.05.")
+    ] = None,
+    consistency: Annotated[
+        bool,
+        typer.Option("--consistency/--no-consistency", help="Networks that know the sensor take the step."),
+    ] = True,
+    exposure: Annotated[
+        bool,
+        typer.Option("--exposure/--no-exposure", help="Shipped networks restore dark parts at a higher exposure."),
+    ] = True,
     strict: Annotated[
         bool, typer.Option("--strict", help="Refuse pairs whose pixels contradict the sensor, instead of saying so.")
     ] = False,
@@ -38,17 +49,19 @@ def evaluate(
 ) -> None:
     """Compare restorations with the reference, on average and by site; the degraded input is always a row.
 
-    PSNR leaves out clipped pixels; of simulated pairs it is also taken against the reference without its noise. MTF
-    and SNR are measured on restored slanted edges and flat fields. Traditional methods and shipped networks know the
-    sensors' nominal figures; NAME@blind is told no sensor, NAME@SENSOR another one.
+    PSNR leaves out clipped pixels; of simulated pairs it is also taken against the reference without its noise. Inner
+    PSNR leaves out a border of 57 pixels. MTF and SNR are measured on restored slanted edges and flat fields; the
+    table of targets has the flux of points and the contrast of faint bars and zone plates. Traditional methods and
+    shipped networks know the sensors' nominal figures; NAME@blind is told no sensor, NAME@SENSOR another one.
     """
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.io.images import list_images
     from beers_deploy.results import print_rows
 
-    if pairs is not None and (images is not None or sweep):
-        expected = "no --images or --sweep beside it: pairs are as they are"
+    if pairs is not None and (images is not None or sweep or brightness):
+        expected = "no --images, --sweep or --brightness with it: pairs are as they are"
         raise OptionError("pairs", expected=expected, got="both", remedy="leave one out")
+    factors = parse_brightness(brightness)
     names = list(dict.fromkeys(name.strip() for name in methods.split(",")))
     folders = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
     read = (*folders, lpips, *(Path(name) for name in (sensor, reference, *names) if name))
@@ -57,7 +70,8 @@ def evaluate(
         list_images(images)  # an empty folder is refused before torch is loaded
     from beers_deploy.studies.evaluation.run import evaluate as compared
 
-    about: dict[str, Any] = {"sensor": sensor, "reference": reference, "lpips": lpips}
+    about: dict[str, Any] = {"sensor": sensor, "reference": reference, "lpips": lpips, "brightness": factors}
+    about |= {"consistency": consistency, "exposure": exposure}
     found = compared(names, pairs, images=images, sweep=sweep, strict=strict, seed=seed, log=say, **about)
     for title, rows in {found.title: found.mean, **found.more}.items():
         print_rows(title, rows)
@@ -66,3 +80,12 @@ def evaluate(
     if out is not None:
         say(f"wrote {found.report(out)}")
     save(found, json)
+
+
+def parse_brightness(text: str | None) -> tuple[float, ...]:
+    """Return the factors of radiance that a user wrote, separated by commas; 1 alone if none."""
+    try:
+        return tuple(float(each) for each in (text or "1").split(","))
+    except ValueError as error:
+        expected, remedy = "numbers separated by commas", "give factors such as 0.25,0.05"
+        raise OptionError("brightness", expected=expected, got=repr(text), remedy=remedy) from error

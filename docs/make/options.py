@@ -102,6 +102,7 @@ UNITS = {
 
 WORDS = {
     "add": "effect",
+    "brightness": "factors",
     "budget": "limits",
     "cases": "names",
     "classes": "pairs",
@@ -200,7 +201,7 @@ REFUSED = {
         Refused(("method",), without="--sensor"),
         Refused(("stac",), without="--cog"),
     ],
-    "evaluate": [Refused(("images", "sweep"), "--pairs PAIRS")],
+    "evaluate": [Refused(("images", "sweep", "brightness"), "--pairs PAIRS")],
     "detect": [
         Refused(("labels", "split"), without="--images"),
         Refused(("drawn",), "--images IMAGES"),

@@ -5,6 +5,7 @@
 
 A table lies between `<!-- NAME -->` and `<!-- end -->`, NAME being that of the document's table. The heading of the
 table on the page says which of the document's columns are shown; what the document does not hold stays as it is.
+Tables whose name begins with "mean", such as "mean, radiance x 0.25", and "targets" have a row for each method.
 """
 
 import re
@@ -18,7 +19,8 @@ from beers_deploy.profiles.toml import read_json
 
 PAGES = Path(__file__).parents[1] / "results"
 MARKED = re.compile(r"(<!-- (?P<name>[^>]+?) -->\n)(?P<table>.*?)(<!-- end -->\n)", re.DOTALL)
-DIGITS = {"dB": 2, "%": 1, "ratio": 4, "distance": 4}
+DIGITS = {"dB": 2, "%": 1, "ratio": 4, "distance": 4, "of the reference": 2}
+DIGITS_OF_BIAS = 2
 
 Figure = Mapping[str, Any]
 Row = Mapping[str, Any]
@@ -49,19 +51,22 @@ def filled(tables: Mapping[str, list[Row]], found: re.Match[str]) -> str:
     if name not in tables:
         return found[0]
     wanted = [cell.strip() for cell in found["table"].split("\n")[0].strip("| ").split("|")]
-    made = mean_table(tables[name], wanted) if name == "mean" else plain_table(tables[name], wanted)
+    by_method = name.startswith("mean") or name == "targets"
+    made = mean_table(tables[name], wanted) if by_method else plain_table(tables[name], wanted)
     return f"{found[1]}{made}{found[4]}"
 
 
 def mean_table(rows: Iterable[Row], wanted: list[str]) -> str:
-    """Methods down, what the page wants across; the paper's rows stand elsewhere."""
+    """Return a table with a row for each method and the columns that the page wants, without the paper's rows."""
     ours = [row for row in rows if not row["name"].startswith("paper")]
     titles = {key: f"{key} {unit(ours, key)}".replace(" ratio", "") for row in ours for key in row["figures"]}
     keys = [key for title in wanted for key in titles if titles[key] == title]
     head = ["method", "sensor", *(titles[key] for key in keys)]
-    return markdown(
-        head, [[r["name"], r["text"]["sensor"], *(shown(r["figures"].get(k)) for k in keys)] for r in ours]
-    )
+    lines = []
+    for row in ours:
+        figures = [shown(row["figures"].get(key), digits=DIGITS_OF_BIAS if "bias" in key else None) for key in keys]
+        lines.append([row["name"], row["text"]["sensor"], *figures])
+    return markdown(head, lines)
 
 
 def plain_table(rows: list[Row], wanted: list[str]) -> str:
@@ -77,11 +82,12 @@ def unit(rows: Iterable[Row], key: str) -> str:
     return next((str(row["figures"][key]["unit"]) for row in rows if key in row["figures"]), "")
 
 
-def shown(figure: Figure | None, interval: bool = True) -> str:
+def shown(figure: Figure | None, interval: bool = True, digits: int | None = None) -> str:
     """A figure as the page writes it, with its interval where there is one."""
     if figure is None or figure.get("value") is None:
         return str(figure["source"]) if figure and figure.get("unit") == "" else "-"
-    digits = 0 if figure["unit"] == "ratio" and figure["value"] > 2 else DIGITS.get(figure["unit"], 2)
+    if digits is None:
+        digits = 0 if figure["unit"] == "ratio" and figure["value"] > 2 else DIGITS.get(figure["unit"], 2)
     text, ends = f"{figure['value']:.{digits}f}", figure.get("interval")
     return f"{text} [{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]" if ends and interval else text
 

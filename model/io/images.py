@@ -19,8 +19,14 @@ from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, O
 from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.profiles.toml import read_whole, unreadable
 
-FRAME_NUMBERS = re.compile(r"(_[0-9a-f]*\d[0-9a-f]*)+$")
-"""What a name ends in that tells frames of one site apart: _0034, _5dded5bc_23."""
+CAMERA = r"[_-](?:dji|img|image|dsc[nf]?|fhd|mos|gopr|frame|p)[_-]?"
+"""How cameras and programs begin the names of their files, after the name of a place."""
+
+FRAME_NUMBERS = re.compile(
+    rf"(?:(?:_|{CAMERA})[0-9a-f]*\d[0-9a-f]*(?:-[0-9]+)*(?:_(?:pre|post)(?=_|$))?)+$", re.IGNORECASE
+)
+"""The end of a name that tells frames of one site apart: _0034, _5dded5bc_23, _DJI_0005, _P1010012, _386690-220241,
+_2016_pre_1. Nothing else can be known by a name: the site is what it begins with."""
 
 PACKED_BYTES = 1 << 30
 """Of a PNG or JPEG file."""
@@ -99,7 +105,12 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def site_of(name: str) -> str:
-    """The name of an image without what tells frames of one site apart."""
+    """Return the site of an image: its name without the end that tells frames of one site apart.
+
+    Examples:
+        >>> site_of("zebra_DJI_0005.jpg"), site_of("lake_2016_pre_1.tif")
+        ('zebra', 'lake')
+    """
     return FRAME_NUMBERS.sub("", Path(name).stem) or name
 
 

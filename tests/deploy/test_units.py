@@ -81,7 +81,7 @@ def test_radiance_gain_and_bits_scaled_together_change_nothing_but_rounding(
     (usual, pixels), (found, _) = evaluated(12, 1, offset_dn), evaluated(bits, dimmer, offset_dn)
     allowed = rounding_db(usual, bits, pixels)
     assert np.all(np.abs(found - usual) <= allowed), (found - usual, allowed)
-    assert allowed.max() < 0.16 < np.diff(np.sort(usual)).min() / 2  # so the ranking is settled
+    assert allowed.max() < 0.18 < np.diff(np.sort(usual)).min() / 2  # so the ranking is settled
     assert np.argsort(found).tolist() == np.argsort(usual).tolist()
 
 

@@ -3,15 +3,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from hypothesis import assume, given
+from hypothesis import strategies as st
 from PIL import Image
 
 from beers_deploy.model.io.files import whole_file
-from beers_deploy.model.io.images import image_size_px, list_images, read_pixels
+from beers_deploy.model.io.images import image_size_px, list_images, read_pixels, site_of
 from beers_deploy.model.simulator.sampling import read_scene
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
 
 SENSOR = load_sensor("pleiades-reference").nominal()
+CAMERAS = {"dji", "img", "image", "dsc", "dscn", "dscf", "fhd", "mos", "gopr", "frame"}
 
 
 def test_every_kind_of_file_reads_as_stored(tmp_path: Path) -> None:
@@ -130,3 +133,52 @@ def test_nothing_half_written_is_left(tmp_path: Path) -> None:
         breaks()
     assert [p.name for p in tmp_path.iterdir()] == ["out.txt"]
     assert (tmp_path / "out.txt").read_text() == "old"
+
+
+PLACE = st.from_regex(r"[a-z]{3,9}(_[a-z]{3,9}){0,2}", fullmatch=True)
+FRAME = st.one_of(
+    st.from_regex(r"_[0-9]{1,6}", fullmatch=True),
+    st.from_regex(r"_[0-9a-f]{7}[0-9](_[0-9]{1,2})?", fullmatch=True),
+    st.from_regex(r"_[0-9]{6}-[0-9]{6}", fullmatch=True),
+    st.from_regex(r"_(19|20)[0-9]{2}_(pre|post)_[0-9]", fullmatch=True),
+    st.from_regex(r"[_-](DJI_|IMG_|IMG|DSC_|DSC|DSCN|FHD|P|MOS|image_)[0-9]{2,7}", fullmatch=True),
+)
+
+
+@given(PLACE, FRAME, FRAME, st.sampled_from([".jpg", ".tif", ".PNG"]))
+def test_frames_do_not_change_the_site(place: str, frame: str, other: str, suffix: str) -> None:
+    assume(site_of(place) == place)
+    assume(place.split("_")[-1] not in CAMERAS)
+    assert site_of(place + frame + suffix) == place
+    assert site_of(place + frame + other + suffix) == place
+
+
+@given(PLACE, PLACE, FRAME)
+def test_places_stay_apart(place: str, other: str, frame: str) -> None:
+    assume(place != other)
+    assume(not {place.split("_")[-1], other.split("_")[-1]} & CAMERAS)
+    assert site_of(place + frame) != site_of(other + frame)
+
+
+@pytest.mark.parametrize(
+    ("name", "site"),
+    [
+        ("zebra_DJI_0005.jpg", "zebra"),
+        ("zebra_DJI_0013.jpg", "zebra"),
+        ("lake_P1010012.jpg", "lake"),
+        ("kitais_MunichStreet02-MOS74.png", "kitais_MunichStreet02"),
+        ("kitais_munich_street_a_157.png", "kitais_munich_street_a"),
+        ("kitais_munich_street_b_74.png", "kitais_munich_street_b"),
+        ("kahramanmaras_2016_pre_1.tif", "kahramanmaras"),
+        ("kahramanmaras_2023_post_2.tif", "kahramanmaras"),
+        ("niza_bogota_houses_101_0058.jpg", "niza_bogota_houses"),
+        ("banepa_nepal_town_386690-220241.jpg", "banepa_nepal_town"),
+        ("garfield_autumn_forest_park_163234_0000.jpg", "garfield_autumn_forest_park"),
+        ("trading_post_2.jpg", "trading_post"),
+        ("lake_2016_prefix.jpg", "lake_2016_prefix"),
+        ("DJI_0005.jpg", "DJI"),
+        ("0001-drawn-00012.tif", "0001-drawn-00012"),
+    ],
+)
+def test_a_site_is_what_its_names_begin_with(name: str, site: str) -> None:
+    assert site_of(name) == site

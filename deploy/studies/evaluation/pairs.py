@@ -1,8 +1,8 @@
 """Pairs of a degraded and a reference image: simulated from scenes, or read from a folder that `simulate` wrote."""
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.patches import pair_files
-from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.sensor import MAX_DN, Instrument, Sensor
 
 OVERSAMPLINGS = (4, 2)
@@ -44,20 +44,46 @@ class NamedPair:
 
 
 def pairs_of_scenes(
-    images: Path | None, degraded: Sensor, reference: Sensor, seed: int
+    images: Path | None, degraded: Sensor, reference: Sensor, seed: int, brightness: float = 1.0
 ) -> tuple[list[NamedPair], list[str]]:
-    """Pairs of the scenes of a folder, or of drawn ones, and what a reader must know of them.
+    """Simulate pairs of the scenes of a folder, or of drawn ones, and return them with notes for the reader.
 
     Args:
         images: the folder; drawn scenes if None.
         degraded: profile of the degraded images.
         reference: profile of the reference images.
         seed: of every random draw.
+        brightness: factor of the scenes' radiance.
     """
-    scenes = load_scenes(images, reference.nominal(), seed)
+    scenes = scenes_at(brightness, load_scenes(images, reference.nominal(), seed))
     pairs, small = simulate_pairs(scenes, degraded, reference, seed, oversamplings_of(degraded))
     left_out = f"Left out, too small: {', '.join(small)}." if small else ""
     return pairs, [note for note in (oversampling_note(pairs, degraded), left_out) if note]
+
+
+def scenes_at(brightness: float, scenes: Iterable[Scene]) -> list[Scene]:
+    """Return the scenes with their radiance multiplied by a factor."""
+    factor = np.float32(brightness)
+    return [replace(scene, radiance=scene.radiance * factor) for scene in scenes]
+
+
+def table_at(brightness: float, name: str) -> str:
+    """Return the name of a table of scenes whose radiance was multiplied by a factor."""
+    return name if brightness == 1 else f"{name}, radiance x {brightness:g}"
+
+
+def check_brightness(brightness: Iterable[float]) -> list[float]:
+    """Return 1 and the other factors of radiance, each once.
+
+    Raises:
+        OptionError: a factor is not above 0 and at most 1.
+    """
+    factors = list(dict.fromkeys((1.0, *brightness)))
+    for factor in factors:
+        if not 0 < factor <= 1:
+            expected, remedy = "factors of radiance above 0 and up to 1", "give factors such as 1,0.25,0.05"
+            raise OptionError("brightness", expected=expected, got=f"{factor:g}", remedy=remedy)
+    return factors
 
 
 def simulate_pairs(

@@ -20,15 +20,22 @@ from beers_deploy.model.metrics.bootstrap import too_few
 from beers_deploy.model.progress import Log, Progress, no_log, once, reporting
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.pairs import Pair
+from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.report.page import Picture, Report, Section, write_report
-from beers_deploy.restoration.engine import Restore, network_method
+from beers_deploy.restoration.method import Around, Restore
 from beers_deploy.restoration.sensor_check import WINDOW_PX, held_against
 from beers_deploy.results import Table
-from beers_deploy.studies.evaluation import scores
-from beers_deploy.studies.evaluation.methods import DEGRADED, Method, knowledge_of, method_named
-from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes, read_pairs
+from beers_deploy.studies.evaluation import scores, targets
+from beers_deploy.studies.evaluation.methods import DEGRADED, Method, knowledge_of, method_named, with_steps
+from beers_deploy.studies.evaluation.pairs import (
+    NamedPair,
+    check_brightness,
+    pairs_of_scenes,
+    read_pairs,
+    table_at,
+)
 from beers_deploy.studies.evaluation.sweep import run_sweep
 
 Methods = Mapping[str, NetworkLike | Restore] | Sequence[str]
@@ -62,8 +69,12 @@ class Evaluation(Table):
 
     @property
     def more(self) -> dict[str, list[Row]]:
-        """The tables by site and of other sensors; those of single images are for the document alone."""
-        return {name: rows for name, rows in by_table(self.rows).items() if name not in ("mean", "images")}
+        """The tables of other brightness, of targets, by site and of other sensors.
+
+        Those of single images are for the document alone.
+        """
+        tables = by_table(self.rows).items()
+        return {name: rows for name, rows in tables if name != "mean" and not name.startswith("images")}
 
     def report(self, folder: str | os.PathLike[str]) -> Path:
         """Write report.html and pictures into a folder; returns the page's path."""
@@ -81,7 +92,10 @@ def evaluate(
     reference: SensorLike | None = None,
     lpips: str | os.PathLike[str] | None = None,
     sweep: bool = False,
+    brightness: Sequence[float] = (1.0,),
     strict: bool = False,
+    consistency: bool = True,
+    exposure: bool = True,
     seed: int = 0,
     progress: Progress = None,
     log: Log = no_log,
@@ -97,13 +111,17 @@ def evaluate(
         reference: the sensor that is aimed at.
         lpips: weights of SqueezeNet 1.1, or a folder of backbones, for LPIPS.
         sweep: whether other blurs, noises and gains are looked at too.
+        brightness: factors of the scenes' radiance before they are acquired, above 0 and up to 1; tables of a factor
+            other than 1 have it in their name. 1 is always evaluated.
         strict: whether pairs are refused whose degraded images contradict the sensor, instead of a note.
+        consistency: whether networks take the consistency step where they know the sensor.
+        exposure: whether shipped networks restore dark parts at a higher exposure.
         seed: of every random draw.
         progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
         log: is told where a reference is taken in other units than it states.
 
     Raises:
-        OptionError: no such method.
+        OptionError: no such method; or a brightness out of range, or with pairs, which are as they are.
         ImageError: pairs that cannot be read, or differ in size.
         ProfileError: no such sensor.
 
@@ -118,13 +136,18 @@ def evaluate(
     made = None if pairs is None or isinstance(pairs, str | os.PathLike) else list(pairs)
     if made and sensor is None:
         sensor, reference = made[0].profiles
+    factors = check_brightness(brightness)
+    if pairs is not None and len(factors) > 1:
+        expected, remedy = "no brightness with pairs, which are as they are", "give images instead of pairs"
+        raise OptionError("brightness", expected=expected, got="both", remedy=remedy)
     recipe = read_pairs_recipe(folder) if folder else None
     sensors = profiles_for(sensor, reference, recipe, log)
     scenes, weights = (None if path is None else Path(path) for path in (images, lpips))
     told = once(log)
     with reporting(progress):
-        ways = [_method(name, each, sensors, told) for name, each in asked.items()]
-        instruments = scores.Instruments(scores.perceptual_distances(weights), sensors[0].nominal().max_dn)
+        around = Around(consistency, exposure)
+        ways = [_method(name, each, sensors, told, around) for name, each in asked.items()]
+        instruments = _instruments(weights, sensors[0])
         said, seen = list[str](), list[Row]()
         if made is not None:
             loaded = [_named(number, pair) for number, pair in enumerate(made)]
@@ -133,25 +156,60 @@ def evaluate(
             seen = [_seen(loaded, sensors[0], str(folder), strict, said.append)]
         else:
             loaded, said = pairs_of_scenes(scenes, *sensors, seed)
-        targets, rows = scores.acquire_targets(sensors[0].nominal(), seed), list[Row]()
-        for way in ways:
-            mean, *each = scores.score(way, loaded, instruments, seed)
-            rows += [replace(mean, figures={**mean.figures, **scores.target_figures(way, targets)}), *each]
-        swept = run_sweep(ways, scenes, *sensors, seed).rows if sweep else []
+        rows = _compared(ways, loaded, sensors, instruments, seed)
+        for factor in factors[1:]:
+            dimmed, _ = pairs_of_scenes(scenes, *sensors, seed, factor)
+            found = [row for way in ways for row in scores.score(way, dimmed, instruments, seed)]
+            rows += [replace(row, table=table_at(factor, row.table)) for row in found]
+        swept = list[Row]()
+        for factor in factors if sweep else ():
+            swept += run_sweep(ways, scenes, *sensors, seed, factor).rows
     few = too_few(len({pair.site for pair in loaded}))
+    notes = [note for note in (few, scores.inner_note(loaded), *said) if note]
     arguments: dict[str, object] = {"images": images, "pairs": folder, "sensor": sensors[0].name, "lpips": lpips}
     arguments |= {"reference": sensors[1].name, "methods": ",".join(asked), "sweep": sweep, "seed": seed}
-    tables = by_table([*rows, *scores.paper_rows()])
+    arguments |= {"consistency": consistency, "exposure": exposure}
+    arguments["brightness"] = ",".join(f"{factor:g}" for factor in factors)
     return Evaluation(
         "evaluate",
         arguments,
         tuple(_inputs(asked, weights, scenes, folder)),
-        (*tables["mean"], *scores.site_rows(tables["images"]), *tables["images"], *seen, *swept),
-        notes=tuple([few, *said] if few else said),
+        (*_in_order([*rows, *scores.paper_rows()]), *seen, *swept),
+        notes=tuple(notes),
         sensors=sensors,
         methods=ways,
         pairs=loaded,
     )
+
+
+def _instruments(lpips: Path | None, sensor: Sensor) -> scores.Instruments:
+    nominal = sensor.nominal()
+    return scores.Instruments(scores.perceptual_distances(lpips), nominal.max_dn, nominal.offset_dn)
+
+
+def _compared(
+    methods: Sequence[Method],
+    pairs: Sequence[NamedPair],
+    sensors: tuple[Sensor, Sensor],
+    instruments: scores.Instruments,
+    seed: int,
+) -> list[Row]:
+    """Return the rows of each method: mean, targets and images."""
+    acquired = targets.acquire_targets(sensors[0].nominal(), sensors[1].nominal(), seed)
+    rows = list[Row]()
+    for method in methods:
+        mean, *images = scores.score(method, pairs, instruments, seed)
+        figures = {**mean.figures, **targets.mean_figures(method, acquired)}
+        rows += [replace(mean, figures=figures), targets.target_row(method, acquired), *images]
+    return rows
+
+
+def _in_order(rows: Iterable[Row]) -> list[Row]:
+    """Return the rows by table: means, targets, sites, images; with the sites' means among them."""
+    tables = by_table(rows)
+    means = [row for name in tables if name.startswith("mean") for row in tables[name]]
+    images = [row for name in tables if name.startswith("images") for row in tables[name]]
+    return [*means, *tables[targets.TARGETS], *scores.site_rows(tables["images"]), *images]
 
 
 def _seen(pairs: Sequence[NamedPair], sensor: Sensor, name: str, strict: bool, log: Log) -> Row:
@@ -174,14 +232,16 @@ def _named(number: int, pair: Pair) -> NamedPair:
     return NamedPair(f"pair{number}", seen, meant, noise_free=pair.clean)
 
 
-def _method(name: str, given: NetworkLike | Restore, sensors: tuple[Sensor, Sensor], log: Log) -> Method:
+def _method(
+    name: str, given: NetworkLike | Restore, sensors: tuple[Sensor, Sensor], log: Log, around: Around
+) -> Method:
     if isinstance(given, str):
-        return replace(method_named(given, *sensors, log), name=name)
+        return replace(method_named(given, *sensors, log, around), name=name)
     if callable(given) and not isinstance(given, Network) and not hasattr(given, "state_dict"):
         return Method(name, given, "what the function knows")
     network = Network.load(cast("NetworkLike", given), sensor=sensors[0])
     known = knowledge_of(network.model, sensors[0].name)
-    return Method(name, network_method(network.model, sensors[0].nominal().max_dn), known)
+    return Method(name, with_steps(network.model, {}, sensors[0], sensors[1].nominal(), around), known)
 
 
 SITES, CROP_PX, ZOOM = 4, 96, 2
@@ -233,16 +293,43 @@ def evaluation_report(found: Evaluation, strips: Sequence[Picture]) -> Report:
     """The page: pictures, means, sites, and the sweep where there was one."""
     tables = [Section("Means over all pairs", found.mean, MEAN_CAPTION)]
     for name, rows in found.more.items():
-        caption = SWEEP_CAPTION if name.startswith("sweep") else SITES_CAPTION
-        tables.append(Section(f"{name[0].upper()}{name[1:]}", rows, caption))
+        tables.append(Section(f"{name[0].upper()}{name[1:]}", rows, caption_of(name)))
     return Report(found.title, headline(found.mean), tables, strips, (*NOTES, *found.notes))
+
+
+def caption_of(table: str) -> str:
+    """Return the sentence that explains a table to its reader."""
+    if table.startswith("mean"):
+        return DIMMED_CAPTION
+    if table == targets.TARGETS:
+        return TARGETS_CAPTION
+    return SWEEP_CAPTION if table.startswith("sweep") else SITES_CAPTION
 
 
 MEAN_CAPTION = (
     "Intervals: 95 % bootstrap over sites for image figures, none below five sites; 90 % for the MTF. What a "
-    "method knows of the sensor stands beside it: one that knows it has an advantage that it may not have in orbit."
+    "method knows of the sensor stands beside it: one that knows it has an advantage that it may not have in orbit. "
+    "Inner PSNR leaves out a border on every side. The bias of the mean is the mean of the restored inner pixels "
+    "over that of the reference (without noise, where there is one) minus 1; the largest bias is that of one image."
 )
-SITES_CAPTION = "Over full scale; from PSNR, pixels that clipped in the input or the reference are left out."
+DIMMED_CAPTION = (
+    "The radiance of the scenes was multiplied by this factor before the sensors acquired them. MTF, SNR and targets "
+    "do not depend on it."
+)
+TARGETS_CAPTION = (
+    "Faint things whose truth is known, restored and compared with what the reference sensor would acquire without "
+    "noise; 90 % intervals. Flux: the light that a point adds to the restored image in a square of "
+    f"{targets.APERTURE_PX} pixels a side, over what it adds to the reference; 100 % is right. 'Points of 12 on 20' "
+    "raise the mean radiance of one pixel by 12 W/m2/sr/um on a background of 20. Bars and zone plates, on a "
+    f"background of {targets.PATTERN_BACKGROUND:g} W/m2/sr/um: the contrast that is left, as a share of the "
+    "reference's; 1 is as the reference, 0 is nothing, below 0 is reversed. Their name has the contrast of the scene "
+    "(amplitude over background). Zone plates are measured from "
+    f"{targets.ZONE_BAND[0]} to {targets.ZONE_BAND[1]} cycles per pixel."
+)
+SITES_CAPTION = (
+    "PSNR is over full scale and leaves out pixels that clipped in the input or the reference. The bias of the mean "
+    "is that of inner pixels against the reference."
+)
 SWEEP_CAPTION = (
     "One image of each site. The chain and every network that can know a sensor know that of the row, unless it says "
     "that another one is supposed. Of gains and losses the interval is that of differences on the same images."

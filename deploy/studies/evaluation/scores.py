@@ -1,33 +1,26 @@
-"""Figures of one method: scores on pairs, by image and their mean, and MTF and SNR on targets whose truth is known.
+"""Figures of one method on pairs of images: scores of each image, their means, and means by site.
 
-Targets are slanted edges and flat fields, acquired by the degraded sensor as scenes are, restored by the method, and
-measured as if found in an image. The MTF is that of edges of a step of 160 W/m2/sr/um; a method that adapts to its
-input may treat fine texture otherwise. The noise in flat fields is what is left where nothing is to be seen.
+Scores of inner pixels leave out a border on every side. At the border of an image a method sees less than its
+receptive field, and the borders of small images make up much of them; a swath has hardly any border.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import count
 from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.special import stdtrit
 
 from beers_deploy.model.metrics.bootstrap import site_interval
 from beers_deploy.model.metrics.fidelity import fidelity_db, ssim
 from beers_deploy.model.metrics.perceptual import Dists, Lpips, find_backbone, not_found
-from beers_deploy.model.metrics.refusal import Refusal
-from beers_deploy.model.metrics.slanted_edge import edge_mtf, slanted_edge
 from beers_deploy.model.progress import steps
-from beers_deploy.model.simulator.acquire import acquire
-from beers_deploy.model.simulator.detector import Draw
-from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.profiles.figures import Figure, Row, measured, published, unavailable
-from beers_deploy.profiles.sensor import MAX_DN, Instrument
+from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.studies.evaluation.methods import Method
 from beers_deploy.studies.evaluation.pairs import NamedPair
+from beers_deploy.studies.evaluation.targets import snr_name
 
 Perceptual = Callable[[np.ndarray, np.ndarray], float]
 """Distance of two images (H, W) in [0, 1] of full scale."""
@@ -57,9 +50,59 @@ def _distance(metric: Lpips | Dists, image: np.ndarray, reference: np.ndarray) -
 
 DISTANCE = "distance"
 NOISE_FREE = "PSNR, reference without noise"
-UNITS = {"PSNR": "dB", "PSNR gain": "dB", NOISE_FREE: "dB", "SSIM": "ratio"}
+INNER, INNER_NOISE_FREE = "inner PSNR", f"inner {NOISE_FREE}"
+BIAS, LARGEST_BIAS = "bias of the mean", "largest bias of the mean"
+DETAILS: tuple[str, ...] = (NOISE_FREE, INNER, INNER_NOISE_FREE, "PSNR gain", BIAS)
+"""Scores that say more about PSNR, or about the level of an image."""
+UNITS = {"PSNR": "dB", "SSIM": "ratio", **dict.fromkeys(DETAILS, "dB"), BIAS: "%", LARGEST_BIAS: "%"}
 READ = "pairs read from files hold no reference without noise"
 IDENTICAL = "infinite: identical to the reference"
+BLACK = "the reference is black"
+
+INNER_BORDER_PX = 57
+"""Border that inner pixels leave out: the receptive radius of the largest shipped network (38 px), and the reach of
+the consistency step (19 px). It is the same for all methods, so that their rows compare."""
+
+
+def inner_border_px(height: int, width: int) -> int:
+    """Return the border that inner pixels leave out: at most a quarter of the shorter side."""
+    return min(INNER_BORDER_PX, min(height, width) // 4)
+
+
+def inner_note(pairs: Sequence[NamedPair]) -> str:
+    """Return a sentence if some images are too small for the whole border; else nothing."""
+    small = sum(inner_border_px(*pair.degraded.shape) < INNER_BORDER_PX for pair in pairs)
+    if not small:
+        return ""
+    return (
+        f"Inner pixels leave out {INNER_BORDER_PX} px on every side, and a quarter of the shorter side of small "
+        f"images ({small} of {len(pairs)})."
+    )
+
+
+def inner(image: np.ndarray) -> np.ndarray:
+    """Return the inner pixels of an image (H, W)."""
+    border_px = inner_border_px(*image.shape)
+    height, width = image.shape
+    return image[border_px : height - border_px, border_px : width - border_px]
+
+
+def bias_percent(
+    dn: np.ndarray, wanted: np.ndarray, unclipped: np.ndarray | None = None, offset_dn: float = 0.0
+) -> float:
+    """Return by how much the mean of the inner pixels differs from the wanted one, in %; NaN for a black image.
+
+    Args:
+        dn: the restored image (H, W), digital numbers.
+        wanted: the reference, likewise.
+        unclipped: True where pixels count, (H, W); None if all of them do.
+        offset_dn: the digital number of the dark.
+    """
+    images = [inner(image) for image in (dn, wanted)]
+    if unclipped is not None and inner(unclipped).any():
+        images = [image[inner(unclipped)] for image in images]
+    restored, level = (float(image.mean(dtype=np.float64)) - offset_dn for image in images)
+    return 100 * (restored / level - 1) if level > 0 else float("nan")
 
 
 @dataclass(frozen=True)
@@ -69,23 +112,34 @@ class Instruments:
     Attributes:
         perceptual: distances by name besides PSNR and SSIM, each or the reason why not.
         max_dn: the digital number that is full scale.
+        offset_dn: the digital number of the dark.
     """
 
     perceptual: Mapping[str, Perceptual | str]
     max_dn: int = MAX_DN
+    offset_dn: float = 0.0
 
     def score(self, dn: np.ndarray, pair: NamedPair) -> dict[str, float | None]:
-        """The figures of one restored image of a pair, (H, W) digital numbers."""
-        clean, unclipped = pair.noise_free, (pair.degraded, self.max_dn)
-        psnr, before = (fidelity_db(image, pair.reference, *unclipped) for image in (dn, pair.degraded))
+        """Return the figures of one restored image of a pair, (H, W) digital numbers."""
+        psnr, before = (self._psnr_db(image, pair.reference, pair) for image in (dn, pair.degraded))
+        clean = pair.noise_free
         scores: dict[str, float | None] = {"PSNR": psnr}
-        scores[NOISE_FREE] = None if clean is None else fidelity_db(dn, clean, *unclipped)
+        scores[NOISE_FREE] = None if clean is None else self._psnr_db(dn, clean, pair)
+        inside = replace(pair, degraded=inner(pair.degraded), reference=inner(pair.reference))
+        scores[INNER] = self._psnr_db(inner(dn), inside.reference, inside)
+        scores[INNER_NOISE_FREE] = None if clean is None else self._psnr_db(inner(dn), inner(clean), inside)
         scores["PSNR gain"] = psnr - before if psnr != before else 0.0
+        unclipped = (pair.reference < self.max_dn) & (pair.degraded < self.max_dn)
+        level = pair.reference if clean is None else clean
+        scores[BIAS] = bias_percent(dn, level, unclipped, self.offset_dn)
         scores["SSIM"] = ssim(dn, pair.reference, self.max_dn)
         for name, distance in self.perceptual.items():
             both = dn / self.max_dn, pair.reference / self.max_dn
             scores[name] = None if isinstance(distance, str) else distance(*both)
         return scores
+
+    def _psnr_db(self, dn: np.ndarray, wanted: np.ndarray, pair: NamedPair) -> float:
+        return fidelity_db(dn, wanted, pair.degraded, self.max_dn)
 
     def figure(
         self, key: str, value: float | None, source: str, interval: tuple[float, float] | None = None
@@ -93,8 +147,10 @@ class Instruments:
         """A score as a figure; unavailable with the reason where there is none."""
         unit = UNITS.get(key, DISTANCE)
         if value is None:
-            return unavailable(unit, READ if key == NOISE_FREE else str(self.perceptual[key]))
-        return measured(value, unit, source, interval) if np.isfinite(value) else unavailable(unit, IDENTICAL)
+            return unavailable(unit, READ if key in (NOISE_FREE, INNER_NOISE_FREE) else str(self.perceptual[key]))
+        if not np.isfinite(value):
+            return unavailable(unit, BLACK if key == BIAS else IDENTICAL)
+        return measured(value, unit, source, interval)
 
     def means(
         self, scores: Sequence[Mapping[str, float | None]], sites: Sequence[str], seed: int
@@ -111,6 +167,9 @@ class Instruments:
             interval, words = site_interval(values, places, np.random.default_rng(seed))
             source = f"mean of {len(values)} pairs from {len(set(places))} sites, {words}"
             figures[key] = self.figure(key, float(np.mean(values)), source, interval)
+            if key == BIAS:
+                largest, site = max(usable, key=lambda each: abs(each[0]))
+                figures[LARGEST_BIAS] = self.figure(LARGEST_BIAS, largest, f"one pair of site {site}")
         return figures
 
 
@@ -129,9 +188,10 @@ def score(method: Method, pairs: Sequence[NamedPair], instruments: Instruments, 
 
 
 def site_rows(rows: Sequence[Row]) -> list[Row]:
-    """PSNR, SSIM and what other scores there are, by site: a row a site, a column a method."""
+    """Return tables by site of every score but the gain: a row a site, a column a method."""
     images = [row for row in rows if row.table == "images"]
-    keys = [key for key in images[0].figures if key != "PSNR gain" and any(row.figures[key].value for row in images)]
+    there = [key for key in images[0].figures if any(row.figures[key].value is not None for row in images)]
+    keys = [key for key in there if key != "PSNR gain"]
     sites = dict.fromkeys(row.text["site"] for row in images)
     by_site = {site: [row for row in images if row.text["site"] == site] for site in sites}
     return [_site_row(key, site, here) for key in keys for site, here in by_site.items()]
@@ -147,85 +207,6 @@ def _site_row(key: str, site: str, images: Sequence[Row]) -> Row:
     return Row(f"{key} by site", site, figures, {"images": str(len(here))})
 
 
-ANGLES_DEG = (3.0, 5.0, 8.0, 11.0)
-REPEATS = 3
-OVERSAMPLING, SIDE_PX, EDGE_PX, FLAT_PX = 5, 240, 80, 128
-RADIANCES = (25.0, 100.0)
-"""Of the flat fields, W/m2/sr/um."""
-
-
-@dataclass(frozen=True)
-class Targets:
-    """Acquired targets, (H, W) digital numbers.
-
-    Attributes:
-        sensor: that acquired them.
-        edges: angle in degrees, and the edge; each with independent noise.
-        flats: radiance in W/m2/sr/um, and the field.
-    """
-
-    sensor: Instrument
-    edges: Sequence[tuple[float, np.ndarray]]
-    flats: Sequence[tuple[float, np.ndarray]]
-
-
-def acquire_targets(sensor: Instrument, seed: int) -> Targets:
-    """Edges at several angles with independent noise, and flat fields at 25 and 100 W/m2/sr/um."""
-    draws = (Draw(seed, number) for number in count())
-    scenes = [(angle, slanted_edge(SIDE_PX, OVERSAMPLING, angle)) for angle in ANGLES_DEG * REPEATS]
-    edges = [(angle, _acquire(scene, sensor, next(draws))) for angle, scene in scenes]
-    fields = [(radiance, np.full((FLAT_PX, FLAT_PX), radiance, np.float32)) for radiance in RADIANCES]
-    return Targets(sensor, edges, [(at, _acquire(field, sensor, next(draws), ratio=1)) for at, field in fields])
-
-
-def _acquire(scene: np.ndarray, sensor: Instrument, draw: Draw, ratio: int = OVERSAMPLING) -> np.ndarray:
-    return acquire(scene_spectrum(scene), scene.shape[1], sensor, ratio, draw, "degraded", margin_px=0)
-
-
-def snr_name(radiance: float) -> str:
-    """The name of the SNR in a flat field of a radiance in W/m2/sr/um."""
-    return f"SNR at {radiance:g} W/m2/sr/um"
-
-
-def target_figures(method: Method, targets: Targets) -> dict[str, Figure]:
-    """MTF at Nyquist in %, and SNR in flat fields, of what the method makes of the targets."""
-    figures = {"MTF at Nyquist": restored_mtf(method, targets)}
-    for radiance, flat in targets.flats:
-        figures[snr_name(radiance)] = flat_figure(_middle(method.restore(flat)) - targets.sensor.offset_dn)
-    return figures
-
-
-def restored_mtf(method: Method, targets: Targets) -> Figure:
-    """MTF at Nyquist in % of the edges that the method restored."""
-    max_dn = targets.sensor.max_dn
-    return mtf_figure([edge_mtf(_middle(method.restore(edge)), angle, max_dn) for angle, edge in targets.edges])
-
-
-def _middle(image: np.ndarray) -> np.ndarray:
-    top, left = ((side - EDGE_PX) // 2 for side in image.shape)
-    return image[top : top + EDGE_PX, left : left + EDGE_PX]
-
-
-def mtf_figure(found: Sequence[float | Refusal]) -> Figure:
-    """The mean over the edges with its 90 % interval; unavailable where most edges were refused."""
-    values = [100 * each for each in found if not isinstance(each, Refusal)]
-    refused = [each for each in found if isinstance(each, Refusal)]
-    if len(values) < max(len(refused), 2):
-        return unavailable("%", f"{len(refused)} of {len(found)} edges refused: {refused[0].reason}")
-    reach = float(stdtrit(len(values) - 1, 0.95)) * float(np.std(values, ddof=1)) / len(values) ** 0.5
-    mean = float(np.mean(values))
-    source = f"{len(values)} of {len(found)} simulated slanted edges, 90 % interval of the mean"
-    return measured(mean, "%", source, (mean - reach, mean + reach))
-
-
-def flat_figure(flat: np.ndarray) -> Figure:
-    """Mean over standard deviation of a flat field (h, w), about its mean: the linear SNR there."""
-    mean, deviation = float(flat.mean(dtype=np.float64)), float(flat.std(dtype=np.float64, ddof=1))
-    if deviation <= 1e-6 * mean:
-        return unavailable("ratio", "nothing is left of the noise in a flat field")
-    return measured(mean / deviation, "ratio", f"one flat field of {flat.shape[1]} x {flat.shape[0]}, L / sigma")
-
-
 SOURCE = "ConvBEERS paper, table on its simulated test set"
 NOTE = "another test set: does not compare"
 PAPER_UNITS = {
@@ -234,7 +215,8 @@ PAPER_UNITS = {
     "LPIPS, network not stated": DISTANCE,
     "DISTS": DISTANCE,
     "MTF at Nyquist": "%",
-    **{snr_name(radiance): "ratio" for radiance in RADIANCES},
+    snr_name(25): "ratio",
+    snr_name(100): "ratio",
 }
 PAPER = {
     "paper: traditional": (20.6, 0.843, 0.216, 0.220, None, 65.33, 138.51),

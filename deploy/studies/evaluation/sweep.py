@@ -17,8 +17,9 @@ from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.profiles.figures import Figure, Row, measured
 from beers_deploy.profiles.sensor import Instrument, Sensor, noise_from_snr
 from beers_deploy.studies.evaluation.methods import DEGRADED, TRADITIONAL, WITHOUT_NETWORK, Method, method_named
-from beers_deploy.studies.evaluation.pairs import NamedPair, oversamplings_of, simulate_pairs
-from beers_deploy.studies.evaluation.scores import NOISE_FREE, acquire_targets, restored_mtf
+from beers_deploy.studies.evaluation.pairs import NamedPair, oversamplings_of, scenes_at, simulate_pairs, table_at
+from beers_deploy.studies.evaluation.scores import NOISE_FREE
+from beers_deploy.studies.evaluation.targets import acquire_edges, restored_mtf
 
 NOMINAL = "nominal"
 """The condition that the others depart from."""
@@ -70,7 +71,12 @@ def _noisy(sensor: Instrument, profile: Sensor, snr_0: float, snr_1: float) -> I
 
 
 def run_sweep(
-    methods: Sequence[Method], images: Path | None, profile: Sensor, reference: Sensor, seed: int
+    methods: Sequence[Method],
+    images: Path | None,
+    profile: Sensor,
+    reference: Sensor,
+    seed: int,
+    brightness: float = 1.0,
 ) -> "Found":
     """Try the input, the chain and every network under every condition, on one scene of each site.
 
@@ -80,10 +86,12 @@ def run_sweep(
         profile: of the sensor that the conditions depart from.
         reference: profile of the sensor that is aimed at.
         seed: of every random draw.
+        brightness: factor of the scenes' radiance. The MTF is measured at 1 alone: edges do not depend on it.
     """
     psnr, mtf, pairs = dict[Key, np.ndarray](), dict[Key, Figure](), list[NamedPair]()
     nominal, aim, ratios = profile.nominal(), reference.nominal(), oversamplings_of(profile)
-    scenes = {site_of(scene.name): scene for scene in reversed(load_scenes(images, aim, seed))}
+    loaded = scenes_at(brightness, load_scenes(images, aim, seed))
+    scenes = {site_of(scene.name): scene for scene in reversed(loaded)}
     tried = [method_named(name, profile, reference) for name in (DEGRADED, TRADITIONAL)]
     tried += [method for method in methods if method.name not in WITHOUT_NETWORK]
     sensors = conditions(nominal, profile)
@@ -91,14 +99,14 @@ def run_sweep(
     with steps("sweep", sum(map(len, trials.values()))) as bar:
         for name, sensor in sensors.items():
             pairs, _ = simulate_pairs(list(scenes.values()), sensor, aim.in_units_of(sensor), seed, ratios)
-            targets = acquire_targets(sensor, seed)
+            edges = acquire_edges(sensor, seed) if brightness == 1 else []
             for supposed, other, method in trials[name]:
                 key, knowing = (name, supposed, method.name), method.knowing(other)
                 psnr[key] = _psnr_db(knowing, pairs, sensor.max_dn)
-                if supposed in (name, NOMINAL):
-                    mtf[key] = restored_mtf(knowing, targets)
+                if brightness == 1 and supposed in (name, NOMINAL):
+                    mtf[key] = restored_mtf(knowing, edges, sensor.max_dn)
                 bar.advance(1, f"{name}: {method.name}")
-    return Found(psnr, mtf, [pair.site for pair in pairs], seed)
+    return Found(psnr, mtf, [pair.site for pair in pairs], seed, brightness)
 
 
 def _trials(
@@ -140,12 +148,14 @@ class Found:
         mtf: after restoration, where the sensor is known as it is, and of the chain that supposes the nominal one.
         sites: of the images, (N,).
         seed: of the bootstrap.
+        brightness: factor of the scenes' radiance.
     """
 
     psnr: Mapping[Key, np.ndarray]
     mtf: Mapping[Key, Figure]
     sites: Sequence[str]
     seed: int
+    brightness: float = 1.0
 
     @property
     def conditions(self) -> list[str]:
@@ -159,15 +169,21 @@ class Found:
 
     @property
     def rows(self) -> list[Row]:
-        """Every table, a row a condition; and of the gains a row a network over all conditions."""
+        """Every table, a row a condition; and of the gains a row a network over all conditions.
+
+        The MTF does not depend on the scenes, so it is left out where their brightness is not their own.
+        """
         psnr, clean = ({key: self._mean(both[k]) for key, both in self.psnr.items()} for k in (0, 1))
-        tables = (("sweep, PSNR", psnr), (f"sweep, {NOISE_FREE}", clean), ("sweep, MTF at Nyquist", self.mtf))
+        tables = [("sweep, PSNR", psnr), (f"sweep, {NOISE_FREE}", clean)]
+        if self.brightness == 1:
+            tables.append(("sweep, MTF at Nyquist", dict(self.mtf)))
         conditions = [
             Row(table, truth, {shown: figures[key] for shown, key in self._columns(truth).items()})
             for table, figures in tables
             for truth in self.conditions
         ]
-        return [*conditions, *self._gains(), *self._wrong()]
+        rows = [*conditions, *self._gains(), *self._wrong()]
+        return [replace(row, table=table_at(self.brightness, row.table)) for row in rows]
 
     def _columns(self, truth: str) -> dict[str, Key]:
         """The input, the chain that knows the truth, the one that knows the nominal sensor, and each network."""

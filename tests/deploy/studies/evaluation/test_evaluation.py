@@ -9,38 +9,43 @@ import pytest
 
 from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.metrics.fidelity import fidelity_db
-from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.simulator.acquire import simulate_pair
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.network import Network
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row, by_table, measured
 from beers_deploy.results import missing
-from beers_deploy.studies.evaluation import scores as scores_module
+from beers_deploy.studies.evaluation import targets as targets_module
 from beers_deploy.studies.evaluation.methods import BLIND, KNOWN, Method, method_named, method_without_network
 from beers_deploy.studies.evaluation.pairs import (
     NamedPair,
     oversampling_note,
     oversamplings_of,
     read_pairs,
+    scenes_at,
     simulate_pairs,
 )
-from beers_deploy.studies.evaluation.run import Evaluation, chosen_pairs, evaluation_report, strip_of
+from beers_deploy.studies.evaluation.run import Evaluation, chosen_pairs, evaluate, evaluation_report, strip_of
 from beers_deploy.studies.evaluation.scores import (
+    BIAS,
+    INNER,
+    INNER_BORDER_PX,
+    INNER_NOISE_FREE,
+    LARGEST_BIAS,
     NOISE_FREE,
     READ,
     Instruments,
-    acquire_targets,
-    flat_figure,
-    mtf_figure,
+    bias_percent,
+    inner_border_px,
+    inner_note,
     score,
     site_rows,
-    snr_name,
-    target_figures,
 )
-from tests.deploy.command_line import done
+from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 
 DEGRADED, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
@@ -63,6 +68,18 @@ def write_pairs(folder: Path, pairs: list[NamedPair]) -> Path:
         for role in ("degraded", "reference"):
             write_tiff(folder / role / each.name, getattr(each, role).astype(np.uint16))
     return folder
+
+
+def few_targets(patch: pytest.MonkeyPatch) -> None:
+    less = {
+        "REPEATS": 1,
+        "POINTS_A_SIDE": 3,
+        "BAR_CONTRASTS": (0.1,),
+        "BAR_PERIODS_PX": (2.0,),
+        "ZONE_CONTRASTS": (0.3,),
+    }
+    for name, value in less.items():
+        patch.setattr(targets_module, name, value)
 
 
 IDENTITY = Method("degraded", lambda dn: dn, "blind")
@@ -201,7 +218,8 @@ def test_the_degraded_input_gains_nothing_and_missing_figures_have_a_reason() ->
     assert mean.figures["PSNR gain"].value == 0
     assert len(images) == 5
     assert mean.figures["LPIPS-squeeze"].reason == "no weights"
-    assert missing([mean, *images]) == [f"- {NOISE_FREE}: {READ}", "- LPIPS-squeeze: no weights"]
+    reasons = [f"- {NOISE_FREE}: {READ}", f"- {INNER_NOISE_FREE}: {READ}", "- LPIPS-squeeze: no weights"]
+    assert missing([mean, *images]) == reasons
     interval = mean.figures["PSNR"].interval
     assert interval is not None
     assert interval[0] <= (mean.figures["PSNR"].value or 0) <= interval[1]
@@ -234,6 +252,65 @@ def test_the_reference_without_noise_is_the_same_acquisition_otherwise() -> None
     assert abs(float(noise[sound].mean())) < 3 * float(np.sqrt(variance.mean() / noise.size))
 
 
+def test_errors_in_the_border_are_none_of_inner_pixels() -> None:
+    for height, width in ((37, 45), (300, 131)):
+        border_px = inner_border_px(height, width)
+        reference = np.random.default_rng(height).uniform(100, 3000, (height, width)).astype(np.float32)
+        inside = np.zeros((height, width), bool)
+        inside[border_px : height - border_px, border_px : width - border_px] = True
+        assert inside.sum(0).max() >= height / 2
+        restored = reference + np.where(inside, 2, 400).astype(np.float32)
+        scores = PLAIN.score(restored, NamedPair("a", reference, reference, noise_free=reference))
+        for key in (INNER, INNER_NOISE_FREE):
+            assert scores[key] == pytest.approx(20 * np.log10(4095 / 2), abs=1e-3)
+        assert (scores["PSNR"] or 0) < 30
+        assert scores[BIAS] == pytest.approx(200 / reference[inside].mean(), rel=1e-3)
+
+
+def test_the_border_covers_what_every_shipped_network_sees_and_is_less_of_small_images() -> None:
+    reach_of_the_consistency_step_px = 19
+    halos_px = [Network.load(name).tiling.halo_px for name in shipped_names()]
+    assert max(halos_px) + reach_of_the_consistency_step_px == INNER_BORDER_PX
+    assert inner_border_px(4 * INNER_BORDER_PX, 999) == INNER_BORDER_PX
+    assert inner_border_px(101, 60) == 15
+    large = NamedPair("large", *(np.ones((4 * INNER_BORDER_PX, 230), np.float32),) * 2)
+    assert not inner_note([large])
+    assert "(1 of 2)" in inner_note([large, pair()])
+
+
+@pytest.mark.parametrize("factor", [1.01, 0.97])
+def test_a_method_that_multiplies_has_that_bias(factor: float) -> None:
+    perfect = [
+        replace(pair(f"{name}_1.tif", seed), degraded=pair(seed=seed).reference) for seed, name in enumerate("ab")
+    ]
+    scaled = Method("scaled", lambda dn: dn * np.float32(factor), BLIND)
+    mean, *images = score(scaled, perfect, PLAIN, 0)
+    for row in (mean, *images):
+        assert row.figures[BIAS].value == pytest.approx(100 * (factor - 1), abs=1e-3)
+        assert row.figures[BIAS].unit == "%"
+
+
+def test_the_largest_bias_is_that_of_the_worst_image_with_its_sign() -> None:
+    perfect = [replace(pair(f"{name}.tif", 1), degraded=pair(seed=1).reference) for name in ("a_1", "b_1", "b_2")]
+    factors = iter((1.01, 0.96, 1.02))
+    mean, *_ = score(Method("drifts", lambda dn: dn * np.float32(next(factors)), BLIND), perfect, PLAIN, 0)
+    assert mean.figures[BIAS].value == pytest.approx(-1 / 3, abs=1e-3)
+    assert mean.figures[LARGEST_BIAS].value == pytest.approx(-4, abs=1e-3)
+    assert mean.figures[LARGEST_BIAS].source == "one pair of site b"
+
+
+def test_clipped_pixels_and_the_offset_are_no_bias_and_black_has_none() -> None:
+    level = np.full((40, 41), 500, np.float32)
+    restored, unclipped = level.copy(), np.ones(level.shape, bool)
+    restored[15:20, 15:20], unclipped[15:20, 15:20] = 4095, False
+    assert bias_percent(restored, level, unclipped) == 0
+    assert bias_percent(restored, level) > 1
+    assert bias_percent(level + 4, level, offset_dn=100) == pytest.approx(1)
+    black = np.zeros((40, 41), np.float32)
+    mean, _ = score(Method("lifts", lambda dn: dn + 1, BLIND), [NamedPair("a", black, black)], PLAIN, 0)
+    assert mean.figures[BIAS].reason == "the reference is black"
+
+
 def test_noise_of_the_reference_is_no_error_of_a_method_that_leaves_it_out() -> None:
     scene = procedural_scene(700, 760, np.random.default_rng(3))
     (one,), _ = simulate_pairs([scene], DEGRADED, REFERENCE, 7)
@@ -251,34 +328,14 @@ def test_sites_are_means_of_their_images() -> None:
     pairs = [pair("a_1.tif", 1, 10), pair("a_2.tif", 2, 40), pair("b_1.tif", 3, 20)]
     _, *images = score(IDENTITY, pairs, PLAIN, 0)
     rows = site_rows(images)
-    assert list(by_table(rows)) == ["PSNR by site", "SSIM by site"]
+    keys = "PSNR", INNER, BIAS, "SSIM"
+    assert list(by_table(rows)) == [f"{key} by site" for key in keys]
     first, second = rows[:2]
     levels = [row.figures["PSNR"].value or 0 for row in images]
     assert (first.name, second.name) == ("a", "b")
     assert first.figures["degraded"].value == pytest.approx(sum(levels[:2]) / 2)
     assert second.figures["degraded"].value == pytest.approx(levels[2])
     assert (first.text["images"], second.text["images"]) == ("2", "1")
-
-
-def test_targets_measure_the_sensor_and_what_a_chain_makes_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scores_module, "REPEATS", 1)
-    targets = acquire_targets(SENSORS[0], 0)
-    assert len(targets.edges) == 4
-    before = target_figures(IDENTITY, targets)
-    assert before["MTF at Nyquist"].value == pytest.approx(7, abs=0.7)
-    assert snr_name(25) == "SNR at 25 W/m2/sr/um"
-    assert before[snr_name(25)].value == pytest.approx(50, rel=0.05)
-    assert before[snr_name(100)].value == pytest.approx(110, rel=0.05)
-    after = target_figures(method_named("traditional-fast", DEGRADED, REFERENCE), targets)
-    assert (after["MTF at Nyquist"].value or 0) > 12
-    assert (after[snr_name(25)].value or 0) > 200
-
-
-def test_refused_edges_and_silent_fields_are_unavailable() -> None:
-    refused = mtf_figure([Refusal("a step of 3 in noise of 2")] * 3)
-    assert refused.value is None
-    assert refused.reason == "3 of 3 edges refused: a step of 3 in noise of 2"
-    assert flat_figure(np.full((9, 9), 100.0)).value is None
 
 
 def test_strips_hold_every_method_and_black_below_the_reference() -> None:
@@ -298,14 +355,17 @@ def test_one_pair_a_site_is_shown() -> None:
 
 def test_tables_of_a_sweep_keep_their_words_on_the_page() -> None:
     mean, *_ = score(IDENTITY, [pair()], PLAIN, 0)
-    swept = Row("sweep, MTF at Nyquist", "nominal", {"degraded": measured(7, "%", "edges")})
+    dim = replace(mean, table="mean, radiance x 0.05")
+    rest = [Row(name, "nominal", {"degraded": measured(7, "%", "a test")}) for name in ("targets", "sweep, PSNR")]
     about: dict[str, Any] = {"sensors": (DEGRADED, REFERENCE), "methods": [], "pairs": []}
-    report = evaluation_report(Evaluation("evaluate", {}, (), (mean, swept), **about), [])
-    assert [table.title for table in report.tables] == ["Means over all pairs", "Sweep, MTF at Nyquist"]
+    report = evaluation_report(Evaluation("evaluate", {}, (), (mean, dim, *rest), **about), [])
+    titles = ["Means over all pairs", "Mean, radiance x 0.05", "Targets", "Sweep, PSNR"]
+    assert [table.title for table in report.tables] == titles
+    assert len({table.caption for table in report.tables}) == len(titles)
 
 
 def test_the_command_on_a_folder_of_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scores_module, "REPEATS", 1)
+    few_targets(monkeypatch)
     folder = write_pairs(tmp_path / "pairs", [pair("a_1.tif", 1), pair("b_1.tif", 2)])
     files = "--json", tmp_path / "e.json", "--out", tmp_path / "out"
     done("evaluate", "--pairs", folder, "--methods", "traditional-fast", *files)
@@ -317,3 +377,69 @@ def test_the_command_on_a_folder_of_pairs(tmp_path: Path, monkeypatch: pytest.Mo
     assert {figure["mode"] for figures in printed for figure in figures.values()} == {"published", "unavailable"}
     assert (tmp_path / "out" / "report.html").read_text().count("data:image/png") == 2
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.png", "b.png", "report.html"]
+
+
+def test_brightness_scales_the_scenes_before_they_are_acquired() -> None:
+    """The signal is a quarter; the noise is less than that of the full light, and more than a quarter of it."""
+    scenes = [procedural_scene(400, 430, np.random.default_rng(3))]
+    (whole,), _ = simulate_pairs(scenes, DEGRADED, REFERENCE, 7)
+    (dim,), _ = simulate_pairs(scenes_at(0.25, scenes), DEGRADED, REFERENCE, 7)
+    assert whole.noise_free is not None
+    assert dim.noise_free is not None
+    unclipped = whole.reference < SENSORS[1].max_dn
+    np.testing.assert_allclose(4 * dim.noise_free[unclipped], whole.noise_free[unclipped], rtol=1e-3, atol=0.1)
+    noise, dim_noise = (float((each.reference - each.noise_free)[unclipped].std()) for each in (whole, dim))
+    assert noise / 4 < dim_noise < noise
+
+
+@pytest.mark.parametrize("brightness", [(0.0,), (1.5,), (-0.25,), (float("nan"),), (float("inf"),)])
+def test_a_brightness_out_of_range_is_refused(brightness: tuple[float, ...]) -> None:
+    with pytest.raises(OptionError, match="factors of radiance above 0 and up to 1"):
+        evaluate(["degraded"], brightness=brightness)
+
+
+def test_pairs_are_as_bright_as_they_are() -> None:
+    with pytest.raises(OptionError, match="no brightness with pairs"):
+        evaluate(["degraded"], [], brightness=(1.0, 0.25))
+
+
+@pytest.mark.parametrize("text", [",", "a quarter", "0.25,,0.05"])
+def test_a_brightness_that_is_no_number_is_one_sentence(text: str, tmp_path: Path) -> None:
+    write_tiff(tmp_path / "scene.tif", np.ones((400, 400), np.uint16))
+    said = refused("evaluate", "--images", tmp_path, "--brightness", text)
+    assert said.startswith("beers-deploy: --brightness: expected numbers separated by commas")
+
+
+def test_the_command_at_two_brightnesses_on_photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few_targets(monkeypatch)
+    scene = np.random.default_rng(0).integers(200, 3000, (270, 300)).astype(np.uint16)
+    write_tiff(tmp_path / "scenes" / "zebra_DJI_0005.tif", scene)
+    write_tiff(tmp_path / "scenes" / "zebra_DJI_0013.tif", scene[::-1])
+    dim = ", radiance x 0.05"
+    done(
+        "evaluate",
+        "--images",
+        tmp_path / "scenes",
+        "--methods",
+        "degraded",
+        "--brightness",
+        "0.05",
+        "--json",
+        tmp_path / "e.json",
+    )
+    document = valid(tmp_path / "e.json")
+    assert document["arguments"]["brightness"] == "1,0.05"
+    tables = by_name(document["rows"])
+    assert list(tables)[:3] == ["mean", f"mean{dim}", "targets"]
+    assert [row["name"] for row in tables["PSNR by site"]] == ["zebra"]
+    assert len(tables["images"]) == len(tables[f"images{dim}"]) == 2
+    means = [tables[name][0]["figures"] for name in ("mean", f"mean{dim}")]
+    assert means[1]["PSNR"]["value"] > means[0]["PSNR"]["value"] + 10  # over the same full scale
+    assert {"MTF at Nyquist", "SNR at 10 W/m2/sr/um"} <= set(means[0]) - set(means[1])
+
+
+def by_name(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    tables: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        tables.setdefault(row["table"], []).append(row)
+    return tables

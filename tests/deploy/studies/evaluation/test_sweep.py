@@ -12,9 +12,9 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles import Sensor, load_sensor
 from beers_deploy.profiles.figures import Row, by_table, unavailable
 from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.restoration.engine import Restore
-from beers_deploy.studies.evaluation import scores as scores_module
+from beers_deploy.restoration.method import Restore
 from beers_deploy.studies.evaluation import sweep as module
+from beers_deploy.studies.evaluation import targets as targets_module
 from beers_deploy.studies.evaluation.methods import BLIND, Method
 from beers_deploy.studies.evaluation.sweep import (
     NOMINAL_KNOWN,
@@ -69,9 +69,11 @@ def half(dn: np.ndarray) -> np.ndarray:
 def quick() -> Iterator[None]:
     """Three conditions, on targets that are small and seen once."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scores_module, "REPEATS", 1)
-        patch.setattr(scores_module, "ANGLES_DEG", (5.0, 8.0))
-        patch.setattr(scores_module, "SIDE_PX", 100)
+        patch.setattr(targets_module, "REPEATS", 1)
+        patch.setattr(targets_module, "ANGLES_DEG", (5.0, 8.0))
+        patch.setattr(targets_module, "SIDE_PX", 100)
+        patch.setattr(targets_module, "POINTS_A_SIDE", 3)
+        patch.setattr(targets_module, "BAR_CONTRASTS", (0.1,))
         patch.setattr(module, "conditions", few)
         yield
 
@@ -169,6 +171,14 @@ def test_the_reference_without_noise_has_a_table_of_its_own() -> None:
     assert (clean["net"].value or 0) - (noisy["net"].value or 0) == pytest.approx(1)
 
 
+def test_tables_of_another_brightness_have_it_in_their_names_and_no_mtf() -> None:
+    found = replace(known(), brightness=0.25)
+    tables = by_table(found.rows)
+    assert all(name.endswith(", radiance x 0.25") for name in tables)
+    assert len(tables) == len(by_table(known().rows)) - 1
+    assert not [name for name in tables if "MTF" in name]
+
+
 def test_what_a_wrongly_known_sensor_costs_is_on_the_same_images() -> None:
     (row,) = by_table(known().rows)["sweep, lost by a sensor known wrongly"]
     assert row.name == "MTF 3%, supposed MTF 7%"
@@ -183,11 +193,15 @@ def test_without_networks_there_are_no_gains() -> None:
     assert not [row for row in Found(chain, one.mtf, SITES, 0).rows if "gain" in row.table]
 
 
-def test_the_command_sweeps_the_networks_alone(tmp_path: Path) -> None:
+def test_the_command_sweeps_the_networks_alone_at_each_brightness(tmp_path: Path) -> None:
     scene = np.random.default_rng(0).integers(200, 1800, (500, 560)).astype(np.uint16)
     tifffile.imwrite(tmp_path / "scene.tif", scene)
-    found = tmp_path / "found.json"
-    done("evaluate", "--images", tmp_path, "--methods", "degraded,convbeers-xs", "--sweep", "--json", found)
-    rows = {row["name"]: row["figures"] for row in valid(found)["rows"] if row["table"] == "sweep, PSNR"}
-    assert {"nominal", "MTF 3%", "dim"} <= set(rows)
-    assert set(rows["nominal"]) >= {NOMINAL_KNOWN, TRUTH_KNOWN, "convbeers-xs"}
+    found, methods = tmp_path / "found.json", "degraded,convbeers-xs"
+    done("evaluate", "--images", tmp_path, "--methods", methods, "--sweep", "--brightness", 0.1, "--json", found)
+    whole, dim = (
+        {row["name"]: row["figures"] for row in valid(found)["rows"] if row["table"] == f"sweep, PSNR{end}"}
+        for end in ("", ", radiance x 0.1")
+    )
+    assert list(whole) == list(dim) == ["nominal", "MTF 3%", "dim"]
+    assert set(whole["nominal"]) >= {NOMINAL_KNOWN, TRUTH_KNOWN, "convbeers-xs"}
+    assert dim["nominal"]["degraded"]["value"] > whole["nominal"]["degraded"]["value"] + 5

@@ -1,0 +1,137 @@
+"""Targets whose truth is known: what they say of methods that do nothing, scale, blur, or sharpen."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.studies.evaluation import targets as module
+from beers_deploy.studies.evaluation.methods import BLIND, Method, method_named
+from beers_deploy.studies.evaluation.targets import (
+    OF_REFERENCE,
+    Targets,
+    acquire_targets,
+    flat_figure,
+    flux_name,
+    mean_figures,
+    mtf_figure,
+    snr_name,
+    target_row,
+)
+
+DEGRADED, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+SENSORS = DEGRADED.nominal(), REFERENCE.nominal()
+IDENTITY = Method("identity", lambda dn: dn, BLIND)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick() -> Iterator[None]:
+    """Fewer edges, points and patterns."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "REPEATS", 1)
+        patch.setattr(module, "POINTS_A_SIDE", 3)
+        patch.setattr(module, "BAR_CONTRASTS", (0.1,))
+        yield
+
+
+@pytest.fixture(scope="module")
+def seen() -> Targets:
+    """The targets as the degraded sensor sees them."""
+    return acquire_targets(*SENSORS, 0)
+
+
+@pytest.fixture(scope="module")
+def perfect(seen: Targets) -> Targets:
+    """The targets as the reference sensor sees them without noise; the background of points keeps its noise."""
+    points = [replace(each, seen=each.flat + each.wanted) for each in seen.points]
+    return replace(seen, points=points, patterns=[replace(each, seen=each.wanted) for each in seen.patterns])
+
+
+def values(row: Row, unit: str) -> list[float]:
+    """Return the values of the figures that have a unit."""
+    return [figure.value or 0.0 for figure in row.figures.values() if figure.unit == unit]
+
+
+def test_what_is_as_the_reference_has_all_flux_and_contrast(perfect: Targets) -> None:
+    row = target_row(IDENTITY, perfect)
+    assert (row.table, row.name, row.text["sensor"]) == ("targets", "identity", BLIND)
+    assert len(row.figures) == 6 + 3 + 2
+    assert values(row, "%") == pytest.approx([100] * 6, abs=0.01)
+    assert values(row, OF_REFERENCE) == pytest.approx([1] * 5, abs=1e-4)
+
+
+@pytest.mark.parametrize("factor", [1.01, 0.5])
+def test_a_factor_is_a_factor_of_flux_and_contrast(perfect: Targets, factor: float) -> None:
+    before = target_row(IDENTITY, perfect)
+    row = target_row(Method("scaled", lambda dn: dn * np.float32(factor), BLIND), perfect)
+    for key, figure in row.figures.items():
+        assert figure.value == pytest.approx(factor * (before.figures[key].value or 0), rel=1e-3)
+
+
+def test_a_blur_takes_contrast_and_leaves_the_flux(perfect: Targets) -> None:
+    blurred = target_row(Method("blur", lambda dn: gaussian_filter(dn, 1.0), BLIND), perfect)
+    assert values(blurred, "%") == pytest.approx([100] * 6, abs=3)
+    period_2, period_267, period_3, *plates = values(blurred, OF_REFERENCE)
+    assert period_2 < period_267 < period_3 < 0.15
+    assert period_3 == pytest.approx(np.exp(-2 * (np.pi / 3) ** 2), rel=0.05)
+    assert max(plates) < 0.1
+
+
+def test_a_level_that_is_off_is_no_flux_and_no_contrast(perfect: Targets) -> None:
+    before = target_row(IDENTITY, perfect)
+    row = target_row(Method("brighter", lambda dn: dn + np.float32(37), BLIND), perfect)
+    for key, figure in row.figures.items():
+        assert figure.value == pytest.approx(before.figures[key].value, abs=0.01)
+
+
+def test_what_is_erased_is_nothing_and_reversed_contrast_is_below_zero(perfect: Targets) -> None:
+    flat = Method("erases", lambda dn: np.full_like(dn, 300), BLIND)
+    assert values(target_row(flat, perfect), "%") == [0] * 6
+    assert values(target_row(flat, perfect), OF_REFERENCE) == pytest.approx([0] * 5, abs=1e-6)
+    reverse = Method("reverses", lambda dn: 2 * np.median(dn) - dn, BLIND)
+    assert max(values(target_row(reverse, perfect), OF_REFERENCE)) < -0.99
+
+
+def test_flux_and_contrast_of_the_raw_image_are_those_of_its_blur(seen: Targets) -> None:
+    row = target_row(IDENTITY, seen)
+    bright = row.figures[flux_name(120, 100)]
+    assert bright.value == pytest.approx(98, abs=2)
+    assert bright.interval is not None
+    assert bright.interval[0] < (bright.value or 0) < bright.interval[1]
+    assert row.figures["bars of 10%, period 2 px"].value == pytest.approx(7 / 25, abs=0.03)
+    assert all(0.2 < value < 0.5 for value in values(row, OF_REFERENCE))
+
+
+def test_points_and_their_flat_field_have_the_same_noise(seen: Targets) -> None:
+    for points in seen.points:
+        far = points.wanted < 0.2
+        difference = points.seen - points.flat
+        assert np.abs(difference[far]).max() <= 2
+        assert float(points.flat.std()) > 2 * float(difference[far].std())
+
+
+def test_targets_measure_the_sensor_and_what_a_chain_makes_of_it(seen: Targets) -> None:
+    assert len(seen.edges) == 4
+    before = mean_figures(IDENTITY, seen)
+    assert before["MTF at Nyquist"].value == pytest.approx(7, abs=0.7)
+    assert snr_name(25) == "SNR at 25 W/m2/sr/um"
+    sensor: Instrument = SENSORS[0]
+    for radiance in (10, 25, 100):
+        true_snr = radiance / sensor.noise_sigma(radiance)
+        assert before[snr_name(radiance)].value == pytest.approx(true_snr, rel=0.06)
+    after = mean_figures(method_named("traditional-fast", DEGRADED, REFERENCE), seen)
+    assert (after["MTF at Nyquist"].value or 0) > 12
+    assert (after[snr_name(25)].value or 0) > 200
+
+
+def test_refused_edges_and_silent_fields_are_unavailable() -> None:
+    refused = mtf_figure([Refusal("a step of 3 in noise of 2")] * 3)
+    assert refused.value is None
+    assert refused.reason == "3 of 3 edges refused: a step of 3 in noise of 2"
+    assert flat_figure(np.full((9, 9), 100.0)).value is None

@@ -1,0 +1,50 @@
+"""Tables of docs/results, filled from a document: those with a row for each method, and the others."""
+
+from typing import Any
+
+import pytest
+
+from docs.make.results import MARKED, filled
+
+
+def figure(value: float | None, unit: str, interval: list[float] | None = None) -> dict[str, Any]:
+    return {"value": value, "unit": unit, "mode": "measured", "interval": interval, "source": "a test"}
+
+
+def row(table: str, name: str, **figures: Any) -> dict[str, Any]:
+    named = {key.replace("_", " "): value for key, value in figures.items()}
+    return {"table": table, "name": name, "figures": named, "text": {"sensor": "known"}}
+
+
+def fill(table: str, heading: str, *rows: dict[str, Any]) -> str:
+    page = f"before\n<!-- {table} -->\n{heading}\n|---|\n| old |\n<!-- end -->\nafter\n"
+    return MARKED.sub(lambda found: filled({table: list(rows)}, found), page)
+
+
+@pytest.mark.parametrize("table", ["mean", "mean, radiance x 0.25"])
+def test_tables_of_means_have_a_row_for_each_method_without_the_papers(table: str) -> None:
+    means = {"PSNR": figure(47.123, "dB", [46.0, 48.5]), "bias_of_the_mean": figure(-0.0149, "%")}
+    page = fill(
+        table,
+        "| method | sensor | bias of the mean % | PSNR dB |",
+        row(table, "net", **means, SSIM=figure(0.9, "ratio")),
+        row(table, "paper: net", **means),
+    )
+    assert page.splitlines()[2:5] == [
+        "| method | sensor | bias of the mean % | PSNR dB |",
+        "|---|---|---|---|",
+        "| net | known | -0.01 | 47.12 [46.00, 48.50] |",
+    ]
+    assert "paper" not in page
+
+
+def test_targets_are_filled_likewise() -> None:
+    figures = {"zone plate of 8%": figure(0.5499, "of the reference", [0.5288, 0.5711]), "flux": figure(98, "%")}
+    heading = "| method | sensor | zone plate of 8% of the reference |"
+    page = fill("targets", heading, {**row("targets", "net"), "figures": figures})
+    assert page.splitlines()[2:5] == [heading, "|---|---|---|", "| net | known | 0.55 [0.53, 0.57] |"]
+
+
+def test_what_the_document_lacks_stays() -> None:
+    page = "<!-- targets -->\n| method |\n|---|\n| old |\n<!-- end -->\n"
+    assert MARKED.sub(lambda found: filled({"mean": []}, found), page) == page
