@@ -33,11 +33,11 @@ from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import VARIANTS, Variant
 from beers_deploy.quant.tiling.walk import tiling_of
-from beers_deploy.restoration.exposures import restore_window
 from beers_deploy.restoration.options import Options, Runtime
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.run import restore_file
 from beers_deploy.restoration.runtime import open_runtime
+from beers_deploy.restoration.tiles.exposures import restore_window
 
 TILE_PX = 640
 ENTRY = "from beers_deploy.cli import app; app()"

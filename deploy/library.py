@@ -22,13 +22,10 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.restoration.engine import NAME, Restorer, as_stored, checked_strip
-from beers_deploy.restoration.lazy import restore_lazily
 from beers_deploy.restoration.options import Options, Runtime
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import plan_for
 from beers_deploy.restoration.radiometry import full_scale_of
-from beers_deploy.restoration.rows import restore_array
 from beers_deploy.restoration.run import restore_file, scale_of
 from beers_deploy.restoration.runtime import Packed, open_runtime, tiles_at_once
 from beers_deploy.restoration.sensor_check import told_sensor
@@ -42,6 +39,9 @@ from beers_deploy.restoration.source import (
     usable_nodata,
 )
 from beers_deploy.restoration.steps import consistency_steps, exposed_networks
+from beers_deploy.restoration.tiles.engine import NAME, Restorer, as_stored, checked_strip
+from beers_deploy.restoration.tiles.lazy import restore_lazily
+from beers_deploy.restoration.tiles.rows import restore_array
 from beers_deploy.results import Table
 
 NETWORK, TRADITIONAL = "network", "traditional"

@@ -53,6 +53,10 @@ REACH_PX = BLOCK_PX * (FAR_BLOCKS + 2) - 1
 RAW_REACH_PX = 2 * BLOCK_PX - 1 + NEAR_PX
 """How far from a pixel lie the raw pixels that its correction depends on."""
 
+LEAST_SHARE = 0.25
+"""Where fewer of the weights around a pixel lie on usable blocks, the correction fades out instead of ending in a
+step."""
+
 GRID = 512
 """Frequencies along an axis from which H is transformed: wide enough for the far part not to wrap around."""
 
@@ -178,7 +182,7 @@ class Consistency:
             return _interpolated(residual, down, across)
         share = _interpolated(weights, down, across)
         change = _interpolated(residual * weights, down, across)
-        return np.asarray(np.divide(change, share, out=np.zeros_like(change), where=share > 0))
+        return change / np.maximum(share, np.float32(LEAST_SHARE))
 
     def _near(self, wide: Image) -> Image:
         """Block means of the near part of H x, from pixels with NEAR_PX more on every side."""

@@ -43,10 +43,10 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, require_side
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.tiling.walk import tiling_of
-from beers_deploy.restoration.exposures import tiles_by_factor
 from beers_deploy.restoration.options import parse_halo
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.steps import keeps_pixels
+from beers_deploy.restoration.tiles.exposures import tiles_by_factor
 from beers_deploy.results import Table
 
 FACE = {"throughput": "fps", "latency": "swath"}

@@ -112,8 +112,8 @@ def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     if not reached.any():
         return np.asarray(np.clip(x + interpolated(residual, x.shape), 0, F(1)))
     usable = (~reached).astype(F)
-    change, share = interpolated(residual * usable, x.shape), interpolated(usable, x.shape)
-    change = np.divide(change, share, out=np.zeros_like(change), where=share > 0)
+    # Where few of the blocks around are usable, the correction fades out.
+    change = interpolated(residual * usable, x.shape) / np.maximum(interpolated(usable, x.shape), F(0.25))
     return np.asarray(np.clip(x + change, 0, F(1)))
 
 

@@ -10,7 +10,9 @@ An image passes, in this order:
     plan         how it is cut into tiles, and the memory that takes
     radiometry   which pixel value is full scale, and who says so
     runtime      the network, on onnxruntime or OpenVINO, here or by the workers of a Dask scheduler
-    engine       the one tile loop, for files and arrays: `restore_rows`, `restore_array`, `restore_dn`
+    steps        the steps around the network: its exposures, and the consistency step
+    tiles        the one tile loop, for files, arrays and Dask
+    method       a network as a method that studies compare
     output       finished rows in a checkpoint, the lock, the TIFF
     cog          the finished TIFF cloud-optimised, by GDAL; its STAC item for a catalogue
     run          all of this for one file: `restore_file`

@@ -13,11 +13,11 @@ from beers_deploy.model.consistency import Consistency
 from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.quant.tiling.walk import tiling_of
-from beers_deploy.restoration.exposures import ExposedNetwork
 from beers_deploy.restoration.options import Runtime
 from beers_deploy.restoration.plan import make_plan
-from beers_deploy.restoration.rows import restore_dn
 from beers_deploy.restoration.runtime import Packed, open_runtime
+from beers_deploy.restoration.tiles.exposures import ExposedNetwork
+from beers_deploy.restoration.tiles.rows import restore_dn
 
 Restore = Callable[[np.ndarray], np.ndarray]
 """Degraded digital numbers (H, W) float32 to restored ones."""

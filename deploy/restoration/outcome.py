@@ -6,7 +6,7 @@ are told, those that no restoration has are refused.
 
 import math
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from operator import add
 
 import numpy as np
@@ -74,12 +74,18 @@ class Tally:
         before, after = stored, restored
         if seen is not None and known is not None:
             at_ends, before, after = at_ends & known, stored[seen], restored[known]
-        counts = after.size, int((before > 1).sum()), int(at_ends.sum())
+        counts = cls(after.size, int((before > 1).sum()), int(at_ends.sum()))
         if not alike:
-            return cls(*counts)
+            return counts
         before = np.minimum(before, 1)
-        sums = before.sum(), (before**2).sum(), after.sum(), (after**2).sum()
-        return cls(*counts, before.size, *map(float, sums))
+        return replace(
+            counts,
+            compared=before.size,
+            before=float(before.sum()),
+            before_squared=float((before**2).sum()),
+            after=float(after.sum()),
+            after_squared=float((after**2).sum()),
+        )
 
     def __add__(self, other: "Tally") -> "Tally":
         return Tally(*map(add, astuple(self), astuple(other)))

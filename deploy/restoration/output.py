@@ -29,8 +29,8 @@ from beers_deploy.profiles.toml import read_json
 from beers_deploy.restoration.georeference import enlarged_tags
 from beers_deploy.restoration.options import Compression
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.rows import RestoredRow
 from beers_deploy.restoration.source import BIG_TIFF_SUFFIXES, RESTORED, RGB_BANDS, Source, strips
+from beers_deploy.restoration.tiles.rows import RestoredRow
 
 
 def part_folder(out: Path) -> Path:

@@ -31,18 +31,18 @@ from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.reading.external import network_sha256
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.cog import disk_bytes, what_was_done, write_cog
-from beers_deploy.restoration.engine import Restorer
-from beers_deploy.restoration.exposures import ExposedNetwork
 from beers_deploy.restoration.georeference import unread_places
 from beers_deploy.restoration.options import Compression, Options
 from beers_deploy.restoration.output import Checkpoint, only_run, require_codec, require_tiff_name, write_output
 from beers_deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
-from beers_deploy.restoration.rows import RestoredRow, restore_rows, rows_to_run
 from beers_deploy.restoration.runtime import Infer, Packed, infer_on, open_runtime, tiles_at_once
 from beers_deploy.restoration.sensor_check import told_sensor
 from beers_deploy.restoration.source import Source, fingerprint, open_source, require_raw
 from beers_deploy.restoration.steps import OFF, consistency_steps, exposed_networks, factor_words
+from beers_deploy.restoration.tiles.engine import Restorer
+from beers_deploy.restoration.tiles.exposures import ExposedNetwork
+from beers_deploy.restoration.tiles.rows import RestoredRow, restore_rows, rows_to_run
 
 RUNS_UNTIL_STEADY = 2
 """Of each tile in work at a time: then a runtime takes no more memory."""

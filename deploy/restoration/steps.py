@@ -15,10 +15,10 @@ from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.tiling.walk import Tiling
 from beers_deploy.restoration.bands import in_order
-from beers_deploy.restoration.exposures import ExposedNetwork
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.runtime import Infer
 from beers_deploy.restoration.source import Raster
+from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 
 OFF = "off"
 NO_SENSOR = f"{OFF}: no sensor is named"

@@ -18,16 +18,16 @@ from beers_deploy.model.progress import Log, Steps, no_log, steps
 from beers_deploy.model.traditional.pipeline import Chain, restore_strips
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Row, measured
-from beers_deploy.restoration.engine import as_stored, checked_strip
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.output import Checkpoint, write_output
 from beers_deploy.restoration.plan import Span, check_memory
 from beers_deploy.restoration.radiometry import full_scale_of
-from beers_deploy.restoration.rows import RestoredRow
 from beers_deploy.restoration.run import begun
 from beers_deploy.restoration.sensor_check import told_sensor
 from beers_deploy.restoration.source import Source, fingerprint, strips
+from beers_deploy.restoration.tiles.engine import as_stored, checked_strip
+from beers_deploy.restoration.tiles.rows import RestoredRow
 
 STRIP_PX = 128
 """Rows read at a time."""

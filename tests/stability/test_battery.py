@@ -13,8 +13,8 @@ from beers_deploy.cli import app
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.quant.tiling.walk import Tiling
-from beers_deploy.restoration.rows import restore_floats
 from beers_deploy.restoration.plan import make_plan
+from beers_deploy.restoration.tiles.rows import restore_floats
 from beers_deploy.studies.stress.battery import StageResult, run_battery, worst
 from beers_deploy.studies.stress.cases import CASES, FULL_DN, Case
 from beers_deploy.studies.stress.checks import LIMITATIONS, Measure, differing, local_range, ringing

@@ -28,8 +28,8 @@ from beers_deploy.quant.onnx_file import any_size, load_onnx, require_quantised
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.walk import Tiling, tiling_of
 from beers_deploy.restoration.plan import make_plan
-from beers_deploy.restoration.rows import restore_floats
 from beers_deploy.restoration.runtime import Infer
+from beers_deploy.restoration.tiles.rows import restore_floats
 from beers_deploy.studies.stress import checks
 from beers_deploy.studies.stress.cases import FULL_DN, Case
 

@@ -34,12 +34,12 @@ from beers_deploy.quant.calibration import Calibration
 from beers_deploy.quant.onnx_file import metadata, save_onnx
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.reading.external import network_sha256
-from beers_deploy.restoration.exposures import ExposedNetwork, tiles_by_factor
 from beers_deploy.restoration.method import Restore
 from beers_deploy.restoration.options import Runtime
 from beers_deploy.restoration.plan import Plan, make_plan
-from beers_deploy.restoration.rows import restore_dn
 from beers_deploy.restoration.runtime import Packed, open_runtime
+from beers_deploy.restoration.tiles.exposures import ExposedNetwork, tiles_by_factor
+from beers_deploy.restoration.tiles.rows import restore_dn
 from beers_deploy.studies.detection.average_precision import find_hits, interval, map50, site_weights
 from beers_deploy.studies.detection.detector import Detector, open_detector, parse_classes
 from beers_deploy.studies.detection.study import LabelledScene, SensorPair, acquired, labelled_scenes

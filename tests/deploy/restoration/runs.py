@@ -12,9 +12,9 @@ import pytest
 import tifffile
 
 from beers_deploy.profiles.figures import Row
-from beers_deploy.restoration.engine import Restorer, Tile
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
+from beers_deploy.restoration.tiles.engine import Restorer, Tile
 
 
 def noise(*shape: int, seed: int = 1) -> np.ndarray:

@@ -98,7 +98,7 @@ def test_a_run_stopped_while_it_is_written_goes_on(
             restore_file(image, tmp_path / "out.tif", options)
     assert (tmp_path / "out.tif").read_bytes() == b"the old one"
     calls: list[str] = []
-    monkeypatch.setattr("beers_deploy.restoration.exposures.restore_window", lambda *_: calls.append("tile"))
+    monkeypatch.setattr("beers_deploy.restoration.tiles.exposures.restore_window", lambda *_: calls.append("tile"))
     restore_file(image, tmp_path / "out.tif", replace(options, resume=True))
     assert calls == []
     assert (tmp_path / "out.tif").read_bytes() == (tmp_path / "expected.tif").read_bytes()

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.quant.tiling.walk import Tiling
-from beers_deploy.restoration.engine import Restorer
-from beers_deploy.restoration.exposures import ExposedNetwork
 from beers_deploy.restoration.plan import Plan, make_plan
-from beers_deploy.restoration.rows import restore_rows
 from beers_deploy.restoration.runtime import AT_ONCE, Infer, session_threads, tiles_at_once
 from beers_deploy.restoration.source import ArraySource, Raster
+from beers_deploy.restoration.tiles.engine import Restorer
+from beers_deploy.restoration.tiles.exposures import ExposedNetwork
+from beers_deploy.restoration.tiles.rows import restore_rows
 
 SHAPE = (2, 75, 133)
 TILE_PX, RADIUS_PX = 32, 3

@@ -17,9 +17,9 @@ from beers_deploy.restoration import method
 from beers_deploy.restoration.method import Around, network_method
 from beers_deploy.restoration.options import Options, Runtime
 from beers_deploy.restoration.plan import plan_for
-from beers_deploy.restoration.rows import restore_dn, restore_floats
 from beers_deploy.restoration.runtime import open_runtime
 from beers_deploy.restoration.steps import step_for
+from beers_deploy.restoration.tiles.rows import restore_dn, restore_floats
 from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.stress.networks import Network
 from beers_deploy.studies.tradeoff.measure import restore_in_tiles

@@ -16,10 +16,10 @@ from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.restoration import run as swath
 from beers_deploy.restoration import runtime
-from beers_deploy.restoration.exposures import restore_window
-from beers_deploy.restoration.missing import fill_from_nearest
 from beers_deploy.restoration.options import Compression, Options, Runtime
 from beers_deploy.restoration.runtime import Infer, open_runtime
+from beers_deploy.restoration.tiles.exposures import restore_window
+from beers_deploy.restoration.tiles.missing import fill_from_nearest
 from tests.deploy.restoration.runs import noise
 from tests.deploy.restoration.runs import restored as restored_by_file
 
@@ -267,7 +267,7 @@ def test_a_tile_without_known_pixels_costs_no_inference(
         seen.append(window.shape)
         return restore_window(window, infer, full_scale)
 
-    monkeypatch.setattr("beers_deploy.restoration.exposures.restore_window", counting)
+    monkeypatch.setattr("beers_deploy.restoration.tiles.exposures.restore_window", counting)
     pixels = noise(30, 300).astype(np.float32)
     pixels[:, 100:] = np.nan
     _, row = restore(tmp_path, pixels, Options(model, tile_px=30))

@@ -19,12 +19,12 @@ from beers_deploy.model.consistency import Consistency
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.quant.untrusted import times
-from beers_deploy.restoration.engine import Restorer, Strip, Tile
-from beers_deploy.restoration.exposures import ExposedNetwork
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Plan, Span
 from beers_deploy.restoration.runtime import Infer
 from beers_deploy.restoration.source import ArraySource, Raster, Source
+from beers_deploy.restoration.tiles.engine import Restorer, Strip, Tile
+from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 
 Steps = tuple[Consistency | None, ...]
 """The consistency step, one for all bands or one for each; empty where it is left out, None for a band without it."""

@@ -2,7 +2,7 @@
 
 `Restorer.read` takes a strip of rows from a `Source`, `Restorer.tile` runs the network on one tile of it, at each
 exposure that its pixels ask for, and `Restorer.finish` makes the restored pixels agree with the raw ones and stores
-them. `deploy.restoration.rows` calls these for all tiles of an image.
+them. `deploy.restoration.tiles.rows` calls these for all tiles of an image.
 """
 
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ from beers_deploy.model.consistency import RAW_REACH_PX, REACH_PX, Consistency, 
 from beers_deploy.model.io.images import remedy_outside
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.quant.tiling.walk import Tiling
-from beers_deploy.restoration.exposures import ExposedNetwork
-from beers_deploy.restoration.missing import fill_from_nearest
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Span
 from beers_deploy.restoration.radiometry import require_room
 from beers_deploy.restoration.source import Raster, Source
+from beers_deploy.restoration.tiles.exposures import ExposedNetwork
+from beers_deploy.restoration.tiles.missing import fill_from_nearest
 
 NAME = "image"
 """What messages call an image that came without a file."""

@@ -1,0 +1,150 @@
+"""Exposure: which factors a sensor allows, and which pixels of an image take them."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from beers_deploy.model.exposure import (
+    FACTORS,
+    HEADROOM,
+    MOST_FACTORS,
+    NOISE_BEYOND,
+    brightened,
+    choose_factors,
+    factors_for,
+)
+from beers_deploy.model.family import RANGES, sensor_values
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.sensor import Instrument
+
+FULL_SCALE = 4095.0
+NOMINAL = load_sensor("pleiades-degraded").nominal()
+
+
+def noisier(times: float) -> Instrument:
+    """The nominal sensor with so many times the noise."""
+    return replace(NOMINAL, alpha=NOMINAL.alpha * times**2, beta=NOMINAL.beta * times**2)
+
+
+def excess_of(sensor: Instrument, factor: int) -> float:
+    """How far the noise lies above what training saw, at so many times the gain: 1 is at the end of the range."""
+    values = sensor_values(replace(sensor, gain_dn_per_radiance=sensor.gain_dn_per_radiance * factor))
+    return max(values[key] / RANGES[key][1] for key in ("sigma_dark", "sigma_bright"))
+
+
+@given(st.floats(0.05, 20))
+def test_factors_begin_with_1_rise_and_stay_within_training(times: float) -> None:
+    factors = factors_for(noisier(times))
+    assert factors[0] == 1
+    assert list(factors) == sorted(set(factors))
+    assert set(factors) <= {1, *FACTORS}
+    assert len(factors) <= 1 + MOST_FACTORS
+    sensor = noisier(times)
+    assert all(excess_of(sensor, factor) <= NOISE_BEYOND for factor in factors[1:])
+    if factors[-1] < max(FACTORS):
+        assert excess_of(sensor, 2 * factors[-1]) > NOISE_BEYOND
+
+
+@given(st.floats(0.05, 20), st.floats(1, 4))
+def test_a_noisier_sensor_has_no_higher_factor(times: float, more: float) -> None:
+    assert factors_for(noisier(times * more))[-1] <= factors_for(noisier(times))[-1]
+
+
+@pytest.mark.parametrize(
+    ("name", "factors"), [("pleiades-degraded", (1, 4, 8)), ("dior-medium", (1, 2, 4)), ("dior-high", (1,))]
+)
+def test_the_factors_of_shipped_sensors(name: str, factors: tuple[int, ...]) -> None:
+    assert factors_for(load_sensor(name).nominal()) == factors
+
+
+@pytest.mark.parametrize("factor", FACTORS)
+def test_a_brightened_sensor_has_more_gain_and_is_otherwise_the_same(factor: int) -> None:
+    sensor = load_sensor("pleiades-variable")
+    other = brightened(sensor, factor)
+    changed = {each.name for each in fields(sensor) if getattr(sensor, each.name) != getattr(other, each.name)}
+    assert changed == {"gain_dn_per_radiance"}
+    assert other.gain_dn_per_radiance.low == factor * sensor.gain_dn_per_radiance.low
+    assert other.nominal().mtf_axes == sensor.nominal().mtf_axes
+    assert other.noise(50.0) == sensor.noise(50.0)
+
+
+def image_of(seed: int, height: int, width: int) -> NDArray[np.float32]:
+    """Dark ground with some bright pixels, whole digital numbers."""
+    generator = np.random.default_rng(seed)
+    pixels = generator.integers(0, 300, (height, width)).astype(np.float32)
+    bright = generator.random((height, width)) < 0.02
+    pixels[bright] = generator.integers(0, 4096, bright.sum())
+    return pixels
+
+
+sides = st.integers(1, 60)
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 999), sides, sides, st.integers(0, 9), st.sampled_from([0.0, 120.0]))
+def test_a_pixel_takes_the_highest_factor_that_leaves_headroom(
+    seed: int, height: int, width: int, radius_px: int, offset: float
+) -> None:
+    """By a loop over pixels; so HEADROOM holds everywhere within the radius."""
+    image, factors = image_of(seed, height, width), (1, 4, 8)
+    chosen = choose_factors(image, factors, radius_px, FULL_SCALE, offset)
+    for row, column in np.random.default_rng(seed).integers(0, (height, width), (20, 2)):
+        around = image[max(row - radius_px, 0) : row + radius_px + 1, max(column - radius_px, 0) :]
+        brightest = float(around[:, : min(column, radius_px) + radius_px + 1].max())
+        fitting = [each for each in factors if (brightest - offset) * each + offset <= HEADROOM * FULL_SCALE]
+        assert chosen[row, column] == max(fitting, default=1)
+
+
+@settings(max_examples=60)
+@given(st.data(), st.integers(0, 999), sides, sides, st.integers(0, 9))
+def test_a_part_chooses_as_the_whole_image_does(
+    data: st.DataObject, seed: int, height: int, width: int, radius_px: int
+) -> None:
+    image, factors = image_of(seed, height, width), (1, 2, 4)
+    top, left = data.draw(st.integers(0, height - 1)), data.draw(st.integers(0, width - 1))
+    bottom, right = data.draw(st.integers(top + 1, height)), data.draw(st.integers(left + 1, width))
+    row, column = max(top - radius_px, 0), max(left - radius_px, 0)
+    part = image[row : bottom + radius_px, column : right + radius_px]
+    found = choose_factors(part, factors, radius_px, FULL_SCALE, 0.0)[top - row :, left - column :]
+    whole = choose_factors(image, factors, radius_px, FULL_SCALE, 0.0)[top:bottom, left:right]
+    np.testing.assert_array_equal(found[: bottom - top, : right - left], whole)
+
+
+def test_with_a_pixel_less_around_it_a_part_may_choose_otherwise() -> None:
+    image = np.full((1, 30), 10, np.float32)
+    image[0, 20] = 4000
+    whole = choose_factors(image, (1, 8), 5, FULL_SCALE, 0.0)
+    assert whole[0].tolist() == [8] * 15 + [1] * 11 + [8] * 4
+    assert (choose_factors(image[:, :20], (1, 8), 5, FULL_SCALE, 0.0) != whole[:, :20]).any()
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 999), sides, sides, st.integers(0, 9), st.floats(0, 500), st.floats(0, 300))
+def test_a_brighter_image_takes_no_higher_factor(
+    seed: int, height: int, width: int, radius_px: int, more: float, offset: float
+) -> None:
+    image = image_of(seed, height, width)
+    brighter = image + np.float32(more) * (np.arange(width) % 3 == 0).astype(np.float32)
+    before, after = (choose_factors(each, (1, 4, 8), radius_px, FULL_SCALE, offset) for each in (image, brighter))
+    assert (after <= before).all()
+
+
+def test_the_offset_is_no_light() -> None:
+    """A factor multiplies what lies above the offset: an image and its offset copy take the same factors."""
+    image = np.arange(0, 1200, dtype=np.float32)[None]
+    plain = choose_factors(image, (1, 4, 8), 0, FULL_SCALE, 0.0)
+    assert np.unique(plain).tolist() == [1, 4, 8]
+    shifted = choose_factors(image + 100, (1, 4, 8), 0, FULL_SCALE + 100 / HEADROOM, 100.0)
+    np.testing.assert_array_equal(shifted, plain)
+    counted_as_light = choose_factors(image + 100, (1, 4, 8), 0, FULL_SCALE + 100 / HEADROOM, 0.0)
+    assert (counted_as_light <= plain).all()
+    assert (counted_as_light < plain).any()
+
+
+def test_pixels_below_the_offset_take_the_highest_factor() -> None:
+    dark = np.zeros((3, 4), np.float32)
+    assert (choose_factors(dark, (1, 4, 8), 1, FULL_SCALE, 120.0) == 8).all()
