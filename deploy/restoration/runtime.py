@@ -152,7 +152,7 @@ class Packed:
         return infer(image)
 
 
-NETWORKS_KEPT = 8
+NETWORKS_KEPT = 32
 _opening = Lock()
 
 

@@ -153,7 +153,7 @@ def with_steps(
 ) -> Restore:
     """A network with the steps around it; the consistency step only where a sensor is known."""
     instrument, aim = sensor.nominal(), None
-    if around.consistency and sensor.name not in (NOT_KNOWN, BLIND_PROFILE):
+    if around.consistency and sensor.name != NOT_KNOWN:
         aim = reference.in_units_of(instrument)
     return network_method(model, instrument.max_dn, brighter, instrument, aim)
 
