@@ -90,7 +90,7 @@ def run_demo(
     images = {
         INPUT: degraded,
         TRADITIONAL: restore(degraded, method="traditional", sensor=sensors[0], full_scale=MAX_DN),
-        INT8: np.rint(restore(degraded, int8_file, full_scale=MAX_DN)),
+        INT8: np.rint(restore(degraded, f"{VARIANT}-int8", sensor=sensors[0], full_scale=MAX_DN)),
     }
     write_tiff(out / "restored.tif", images[INT8].astype(np.uint16))
     quality = list[Row]()
@@ -145,9 +145,10 @@ def bench_tables(model: Path, dn: np.ndarray, sensors: tuple[Sensor, Sensor]) ->
     """Speed for this image, for the swath of the paper beside its rows, and for that swath on every board."""
     dpu, halo_px = load_dpu(DEFAULT_TARGET), tiling_of(load_onnx(model)).halo_px
     chain = measure_chain(dn, *sensors)
-    prediction, rows = tables.predict_file(model, dpu), []
+    rows = []
     for width, height in ((dn.shape[1], dn.shape[0]), SWATH_PX):
-        swath = tables.Swath(width, height, TILE_PX, halo_px)
+        swath = tables.Swath(width, height, TILE_PX, halo_px, consistency=True)
+        prediction = tables.predict_file(model, dpu, step_px=swath.step_px)
         network = tables.predicted_rows(VARIANT, prediction, swath)
         rows.append([chain.row(swath), tables.processor_row(swath, dpu.target), *network])
     dpus = [load_dpu(name) for name in board_names()]

@@ -1,11 +1,12 @@
 """Puts the figures of an evaluation into the pages of docs/results: the tables between their markers.
 
     beers-deploy evaluate --images aerial-test/ --sweep ... --json evaluation.json
-    python docs/make/results.py evaluation.json
+    python docs/make/results.py evaluation.json 'without steps'=plain.json
 
 A table lies between `<!-- NAME -->` and `<!-- end -->`, NAME being that of the document's table. The heading of the
 table on the page says which of the document's columns are shown; what the document does not hold stays as it is.
-Tables whose name begins with "mean", such as "mean, radiance x 0.25", and "targets" have a row for each method.
+Tables whose name begins with "mean", such as "mean, radiance x 0.25", and "targets" have a row for each method. A
+document given as WORDS=FILE fills the tables whose name is WORDS, a colon and the document's name of it.
 """
 
 import re
@@ -29,8 +30,10 @@ Row = Mapping[str, Any]
 def main() -> None:
     """Fill each table that a document given holds, on whichever page it stands; the last document counts."""
     tables: dict[str, list[Row]] = {}
-    for path in map(Path, sys.argv[1:]):
-        tables |= tables_of(path)
+    for argument in sys.argv[1:]:
+        words, _, path = argument.rpartition("=")
+        prefix = f"{words}: " if words else ""
+        tables |= {f"{prefix}{name}": rows for name, rows in tables_of(Path(path)).items()}
     for page in sorted(PAGES.glob("*.md")):
         text = page.read_text(encoding="utf-8")
         page.write_text(MARKED.sub(partial(filled, tables), text), encoding="utf-8", newline="")
@@ -51,7 +54,8 @@ def filled(tables: Mapping[str, list[Row]], found: re.Match[str]) -> str:
     if name not in tables:
         return found[0]
     wanted = [cell.strip() for cell in found["table"].split("\n")[0].strip("| ").split("|")]
-    by_method = name.startswith("mean") or name == "targets"
+    kind = name.rpartition(": ")[2]
+    by_method = kind.startswith("mean") or kind == "targets"
     made = mean_table(tables[name], wanted) if by_method else plain_table(tables[name], wanted)
     return f"{found[1]}{made}{found[4]}"
 
