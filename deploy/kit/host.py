@@ -157,7 +157,8 @@ def interpolated(blocks: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """
     for size in shape:
         place = np.arange(size) - BLOCK // 2
-        low, high = (1, len(blocks) - 2) if len(blocks) > 2 else (0, len(blocks) - 1)
+        left_out = 2 if len(blocks) > 4 else 0
+        low, high = left_out, len(blocks) - 1 - left_out
         left, right = (np.clip(place // BLOCK + k, low, high) for k in (0, 1))
         share = (((2 * place + 1) % (2 * BLOCK)).astype(F) / F(2 * BLOCK))[:, None]
         blocks = (blocks[left] * (F(1) - share) + blocks[right] * share).T
