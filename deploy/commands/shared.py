@@ -56,6 +56,8 @@ def refuse(
 ) -> None:
     """Refuse the first of these parameters to which the command line gives a value; 0 asks for nothing.
 
+    A switch with a name for off, such as --no-exposure, is refused under either name.
+
     Args:
         context: of the command that runs.
         names: of its parameters, as Python spells them.
@@ -63,11 +65,12 @@ def refuse(
         got: what stands there.
         remedy: what the user can do.
     """
-    options = {parameter.name: parameter.opts[0] for parameter in context.command.params}
+    parameters = {parameter.name: parameter for parameter in context.command.params}
     for name in names:
-        source = context.get_parameter_source(name)
-        if source is not None and source.name == "COMMANDLINE" and context.params[name]:
-            raise OptionError(options[name], expected=expected, got=got, remedy=remedy)
+        source, parameter = context.get_parameter_source(name), parameters[name]
+        spellings = parameter.opts if context.params[name] else parameter.secondary_opts
+        if source is not None and source.name == "COMMANDLINE" and spellings:
+            raise OptionError(spellings[0], expected=expected, got=got, remedy=remedy)
 
 
 STDOUT = Path("-")

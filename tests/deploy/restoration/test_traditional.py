@@ -114,6 +114,9 @@ def test_the_command_needs_a_sensor_and_no_option_of_a_network(tmp_path: Path) -
         ([*named, "--tile", "64"], "--tile: expected none with --method traditional"),
         ([*named, "--resume"], "--resume: expected none"),
         ([*named, "--scheduler", "host:8786"], "--scheduler: expected none"),
+        ([*named, "--no-consistency"], "--no-consistency: expected none with --method traditional"),
+        ([*named, "--no-exposure"], "--no-exposure: expected none"),
+        ([*named, "--exposure"], "--exposure: expected none"),
     ):
         assert words in refused(*arguments)
         assert not out.exists()
