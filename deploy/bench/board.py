@@ -39,13 +39,13 @@ from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import MAX_DN, Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, require_side
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.restoration.options import parse_halo
 from beers_deploy.restoration.plan import make_plan
-from beers_deploy.restoration.steps import keeps_pixels
+from beers_deploy.restoration.steps import keeps_pixels, offset_of
 from beers_deploy.restoration.tiles.exposures import tiles_by_factor
 from beers_deploy.results import Table
 
@@ -222,8 +222,8 @@ def bench_board(
     counts = dict[int, int]()
     if dn is not None and sensor is not None:
         plan = make_plan((1, height_px, width_px), tiles_px[0], halo_px, tiling)
-        instrument = sensor.nominal()
-        counts = tiles_by_factor(dn, plan, factors_for(instrument), instrument.max_dn, instrument.offset_dn)
+        # `dn` is in 0..MAX_DN whatever the bits of the sensor.
+        counts = tiles_by_factor(dn, plan, factors_for(sensor.nominal()), MAX_DN, offset_of(sensor, MAX_DN))
         swath = replace(swath, runs=sum(counts.values()) / plan.tiles)
     targets = list({dpu.target.name: dpu.target for dpu in boards}.values())
     papers = published_rows() if any(each.name == PAPER_TARGET for each in targets) else []

@@ -1,12 +1,14 @@
 """Several boards in one table, what meets a time, and networks that are run on whole images."""
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
 import pytest
+import tifffile
 import torch
 
 from beers_deploy.bench.board import BoardBench, bench_board
@@ -14,6 +16,7 @@ from beers_deploy.bench.tables import Swath, frame_row, predict_file, sweep_rows
 from beers_deploy.commands.bench import HostTask
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.cost.model import TASKS
+from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.target import board_names
@@ -124,3 +127,22 @@ def test_a_stated_task_of_the_host_is_that_of_every_row(classifier: Path, networ
 
 def test_the_commands_names_of_tasks_are_the_models() -> None:
     assert [task.value for task in HostTask] == list(TASKS)
+
+
+@pytest.mark.parametrize("bits", [12, 14])
+def test_the_exposures_of_an_image_are_counted_whatever_the_bits_of_the_sensor(
+    network: Path, bits: int, tmp_path: Path
+) -> None:
+    sensor = load_sensor("pleiades-degraded")
+    gain = sensor.gain_dn_per_radiance.low * 2 ** (bits - 12)
+    sensor = sensor.replace(bits=bits, gain_dn_per_radiance=gain)
+    pixels = np.full((128, 256), 2000, np.uint16)  # too bright for x4, unless full scale is that of 14 bits
+    pixels[:, :128] = 200  # dark enough for x8, far from bright ground as well
+    tifffile.imwrite(tmp_path / "image.tif", pixels)
+    found = bench(network, size=None, image=tmp_path / "image.tif", full_scale=4095, sensor=sensor)
+    (words,) = (note for note in found.notes if "by exposure" in note)
+    shares = dict(re.findall(r"(x\d) (\d+)%", words))
+    assert shares.keys() == {"x1", "x4", "x8"}
+    assert int(shares["x1"]) > 0
+    assert int(shares["x8"]) > 0
+    assert int(shares["x4"]) == 0
