@@ -174,6 +174,8 @@ def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
 def main(source: str, target: str, runs: dict[int, Any]) -> None:
     """Restore an image of at least a tile, tile by tile. `runs` has the core of each factor: planes to result."""
     image, t, r = np.load(source).astype(F), S["tile_px"], S["scale"]
+    if image.ndim != 3 or min(image.shape[1:]) < t or not np.isfinite(image).all():
+        sys.exit(f"{source}: expected finite values (C, H, W) of at least {t} x {t} pixels, got shape {image.shape}")
     wide = np.pad(image, [(0, 0)] + [(0, -n % S["lattice_px"]) for n in image.shape[1:]], "edge")
     down, across = (spans(n, t, S["halo_px"]) for n in wide.shape[1:])
     out = np.empty((S["bands"], *(n * r for n in wide.shape[1:])), F)

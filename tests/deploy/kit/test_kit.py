@@ -60,6 +60,17 @@ def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> 
     assert len((folder / "host.py").read_text(encoding="utf-8").replace("\n\n", "\n").splitlines()) < 200
 
 
+@pytest.mark.parametrize("shape", [(1, 3, 203), (1, 203, 95), (96, 96)])
+def test_the_host_part_refuses_what_it_cannot_restore(shape: tuple[int, ...], tmp_path: Path) -> None:
+    folder = bd.Board.load("vck190").kit(network(NAME), tmp_path / "kit", tile=TILE_PX)
+    np.save(tmp_path / "image.npy", np.full(shape, 0.1, np.float32))
+    command = [sys.executable, "host.py", str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]
+    result = subprocess.run(command, cwd=folder, check=False, capture_output=True, text=True)
+    assert result.returncode == 1
+    assert result.stderr.splitlines()[-1].endswith(f"at least 96 x 96 pixels, got shape {shape}")
+    assert not (tmp_path / "out.npy").exists()
+
+
 OFFSET_DN = 60
 NAME, TILE_PX, FACTORS = "convbeers-xs-int8", 96, {1, 4, 8}
 
