@@ -40,6 +40,10 @@ class Tally:
         runs: of the network, one for each exposure that a tile asks for.
         brightened: results that were restored at an exposure above 1.
         change_squared: sum of the squares of what the consistency step changed.
+        network_at_ends: as `at_ends`, of what the network gave. The consistency step would hide a network that does
+            not fit, since it gives nearly any image the mean and the coarse structure of the raw one.
+        network_after: as `after`, of what the network gave.
+        network_after_squared: as `after_squared`, of what the network gave.
     """
 
     known: int = 0
@@ -54,6 +58,9 @@ class Tally:
     runs: int = 0
     brightened: int = 0
     change_squared: float = 0.0
+    network_at_ends: int = 0
+    network_after: float = 0.0
+    network_after_squared: float = 0.0
 
     @classmethod
     def of(
@@ -74,21 +81,46 @@ class Tally:
         before, after = stored, restored
         if seen is not None and known is not None:
             at_ends, before, after = at_ends & known, stored[seen], restored[known]
-        counts = cls(after.size, int((before > 1).sum()), int(at_ends.sum()))
+        ends = int(at_ends.sum())
+        counts = cls(after.size, int((before > 1).sum()), ends, network_at_ends=ends)
         if not alike:
             return counts
         before = np.minimum(before, 1)
+        total, squared = float(after.sum()), float((after**2).sum())
         return replace(
             counts,
             compared=before.size,
             before=float(before.sum()),
             before_squared=float((before**2).sum()),
-            after=float(after.sum()),
-            after_squared=float((after**2).sum()),
+            after=total,
+            after_squared=squared,
+            network_after=total,
+            network_after_squared=squared,
+        )
+
+    def changed_from(self, network: "Tally", change_squared: float) -> "Tally":
+        """Return this tally of pixels that the consistency step made of those that `network` is the tally of."""
+        return replace(
+            self,
+            change_squared=change_squared,
+            network_at_ends=network.at_ends,
+            network_after=network.after,
+            network_after_squared=network.after_squared,
         )
 
     def __add__(self, other: "Tally") -> "Tally":
         return Tally(*map(add, astuple(self), astuple(other)))
+
+    @property
+    def network(self) -> "Tally":
+        """The tally of what the network gave, before the consistency step."""
+        return replace(
+            self,
+            at_ends=self.network_at_ends,
+            after=self.network_after,
+            after_squared=self.network_after_squared,
+            change_squared=0.0,
+        )
 
     @property
     def share_at_ends(self) -> float:
@@ -146,21 +178,24 @@ class Tally:
 
     @property
     def doubts(self) -> list[str]:
-        """What a user should look at, a clause each."""
-        found = []
+        """What a user should look at, a clause each; of the network's results, before the consistency step."""
+        found, given = [], self.network
+        before = "before the consistency step, " if self.change_squared else ""
         if self.clipped > MANY_AT_ENDS * max(self.compared, 1):
             found.append(f"{self.clipped} pixels of the image, nearly all, are above full scale")
-        if self.share_at_ends > SOME_AT_ENDS:
-            found.append(f"{self.share_at_ends:.0%} of the results are 0 or full scale where the image is not")
-        if abs(self.moved) > MEAN_KEPT * self.means[0] + DARK:
-            found.append("the mean went from {:.3g} to {:.3g} of full scale".format(*self.means))
-        if self.flat:
-            found.append("the results are constant and the image is not")
+        if given.share_at_ends > SOME_AT_ENDS:
+            share = f"{given.share_at_ends:.0%} of the results"
+            found.append(f"{before}{share} are 0 or full scale where the image is not")
+        if abs(given.moved) > MEAN_KEPT * given.means[0] + DARK:
+            found.append(before + "the mean went from {:.3g} to {:.3g} of full scale".format(*given.means))
+        if given.flat:
+            found.append(f"{before}the results are constant and the image is not")
         return found
 
     def require(self, name: str) -> None:
         """Refuse what no restoration gives of an image, `name` in messages."""
-        impossible = self.share_at_ends > MANY_AT_ENDS or abs(self.moved) > FAR or self.flat
+        given = self.network
+        impossible = given.share_at_ends > MANY_AT_ENDS or abs(given.moved) > FAR or given.flat
         if self.known >= FEW and (impossible or self.clipped > MANY_AT_ENDS * max(self.compared, 1)):
             expected, got = "a network that restores this image", "; ".join(self.doubts)
             remedy = (

@@ -138,20 +138,25 @@ class Restorer:
         missing = self._missing(strip, bands, rows, columns)
         if missing is not None and missing.all():
             return Tile(self._unrestored(strip, missing, bands, rows, columns), Tally())
-        kept, squared = restored[:, down, across], 0.0
+        given = kept = restored[:, down, across]
         if self.consistency:
             change = self._change(strip, restored, at, bands, rows, columns)
-            consistent = np.clip(kept + change, 0, np.float32(self.full_scale))
-            squared = float(np.nansum(np.square((consistent - kept) / self.full_scale), dtype=np.float64))
-            kept = consistent
+            kept = np.clip(given + change, 0, np.float32(self.full_scale))
         seen = None if strip.missing is None else ~strip.missing[strip.kept(bands, rows, columns)]
         raw = strip.pixels[strip.kept(bands, rows, columns)].astype(np.float64) / self.full_scale
-        shares = np.nan_to_num(kept).astype(np.float64) / self.full_scale
-        tally = Tally.of(raw, shares, seen, None if missing is None else ~missing)
+        known = None if missing is None else ~missing
+        tally = Tally.of(raw, self._shares(kept), seen, known)
+        if self.consistency:
+            squared = float(np.nansum(np.square((kept - given) / self.full_scale), dtype=np.float64))
+            tally = tally.changed_from(Tally.of(raw, self._shares(given), seen, known), squared)
         result = as_stored(self.raster, kept if missing is None else np.nan_to_num(kept), self.full_scale)
         if missing is not None:
             result = np.where(missing, self._unrestored(strip, missing, bands, rows, columns), result)
-        return Tile(result, tally + Tally(change_squared=squared))
+        return Tile(result, tally)
+
+    def _shares(self, pixels: np.ndarray) -> np.ndarray:
+        """Pixels in shares of full scale, missing ones 0."""
+        return np.asarray(np.nan_to_num(pixels).astype(np.float64) / self.full_scale)
 
     def _change(
         self, strip: Strip, restored: np.ndarray, at: tuple[int, int], bands: slice, rows: Span, columns: Span

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from onnx import numpy_helper
 from PIL import Image
 
+from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.restoration.options import Compression, Options
 from beers_deploy.restoration.run import restore_file
@@ -236,6 +237,26 @@ def test_a_result_that_no_restoration_has_is_refused(
         restored(folder / "in.tif", scaled(*how))
     assert [path.name for path in folder.iterdir()] == ["in.tif"]
     restored(folder / "in.tif", scaled(*how), any_result=True)
+
+
+@pytest.mark.parametrize("how", [(255.0, 0.0), (0.0, 0.3), (-1.0, 0.0)])
+def test_the_consistency_step_does_not_hide_a_network_that_does_not_fit(
+    scaled: Callable[[float, float], Path], tmp_path: Path, how: tuple[float, float]
+) -> None:
+    rows, columns = np.mgrid[:61, :83]
+    tifffile.imwrite(tmp_path / "in.tif", (900 + 10 * rows + 5 * columns).astype(np.uint16))
+    sensors = {"": load_sensor("pleiades-degraded")}
+    with pytest.raises(ImageError, match=r"before the consistency step.*any_result"):
+        restored(tmp_path / "in.tif", scaled(*how), sensors=sensors)
+    said: list[str] = []
+    row = restore_file(
+        tmp_path / "in.tif",
+        tmp_path / "out.tif",
+        Options(scaled(*how), any_result=True, sensors=sensors),
+        said.append,
+    )
+    assert any("before the consistency step" in each for each in said)
+    assert abs(row.figures["mean moved"].value or 0.0) < 1
 
 
 def test_a_small_departure_is_told(scaled: Callable[[float, float], Path], tmp_path: Path) -> None:
