@@ -28,6 +28,7 @@ from beers_deploy.restoration.run import plan_figures
 from beers_deploy.restoration.runtime import open_runtime, tiles_at_once
 from beers_deploy.restoration.sensor_check import SensorCheck, told_sensor
 from beers_deploy.restoration.source import Raster, open_source
+from beers_deploy.restoration.steps import keeps_pixels
 
 HEADER = "the file's own header"
 PROJECTED, GEOGRAPHIC = 3072, 2048
@@ -119,14 +120,19 @@ def time_here(network: onnx.ModelProto, plan: Plan, options: Options) -> Figure:
         started = perf_counter()
         infer(tile)
         times.append((perf_counter() - started) * plan.tiles)
-    how = f"{RUNS} runs of one tile with every thread ({at_once} at a time in a run), {runtime}, times the tiles"
+    threads = f"every thread ({at_once} at a time in a run)"
+    how = f"{RUNS} runs of one tile with {threads}, {runtime}, times the tiles, one exposure each"
     return predicted(median(times), "s", (min(times), max(times)), how)
 
 
 def time_on_board(model: Path, plan: Plan, target: TargetProfile) -> Figure:
-    """The time of all tiles on a board's DPU, by the cost model, in whole batches."""
+    """The time of all tiles on a board's DPU, by the cost model, in whole batches and with one exposure each.
+
+    The host takes the consistency step where the network gives a pixel for each pixel.
+    """
+    step_px = plan.height_px * plan.width_px * plan.bands / plan.tiles if keeps_pixels(plan.tiling) else 0.0
     try:
-        prediction = predict_file(model, dpu_of(target), max(plan.tile_shape))
+        prediction = predict_file(model, dpu_of(target), max(plan.tile_shape), step_px=step_px)
     except BeersError as error:
         return unavailable("s", f"the cost model takes {error.expected}, got {error.got}")
     return swath_latency(prediction, math.ceil(plan.tiles / prediction.batch))

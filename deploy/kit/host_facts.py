@@ -12,6 +12,7 @@ from beers_deploy.quant.banked.filters import MIDDLE_DN, PART, STEP_DN
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.ends import FINE_MAX
 from beers_deploy.quant.graph import CORRECTION, QUARTER, STEP
+from beers_deploy.restoration.steps import keeps_pixels
 
 UNIT = "unit"
 
@@ -104,7 +105,7 @@ def consistency_facts(network: Network, sensor: Sensor) -> Facts | None:
         out there too.
     """
     tiling = network.tiling
-    if sensor.name == BLIND or tiling.scale != 1 or tiling.channels_in != tiling.channels_out:
+    if sensor.name == BLIND or not keeps_pixels(tiling):
         return None
     step = Consistency.of(sensor.nominal(), sensor.reference.nominal(), full_scale=1.0)
     arrays = {"rows": step.rows, "columns": step.columns, "far": step.far, "means": step.means, "excess": step.excess}
