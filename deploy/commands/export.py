@@ -74,7 +74,7 @@ def export(
     read = [path, apply, *(Path(given) for given in (sensor, target) if given)]
     require_writable(out, board_file, delta, inputs=read)
     deltas = _delta_files(delta, sensor)
-    require_writable(*deltas.values(), inputs=read)
+    require_writable(out, board_file, *deltas.values(), inputs=read)
     if board_file is None:
         refuse(context, ["target"], expected="--board-file beside it")
     if path.suffix != ".onnx":
