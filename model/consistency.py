@@ -186,7 +186,8 @@ class Consistency:
             return _interpolated(residual, down, across)
         share = _interpolated(weights, down, across)
         change = _interpolated(residual * weights, down, across)
-        return change / np.maximum(share, np.float32(LEAST_SHARE))
+        change /= np.maximum(share, np.float32(LEAST_SHARE))
+        return change
 
     def _near(self, wide: Image) -> Image:
         """Block means of the near part of H x, from pixels with NEAR_PX more on every side."""

@@ -279,7 +279,7 @@ BARS_PX, BARS_MEASURED_PX = 144, 64
 """The side is a multiple of all periods, since scenes wrap around at their borders."""
 
 ZONE_CONTRASTS = (0.08, 0.30)
-ZONE_BAND = (0.35, 0.45)
+ZONE_BAND: tuple[float, float] = (0.35, 0.45)
 """Spatial frequencies that are measured, cycles per pixel."""
 ZONE_PX, ZONE_NYQUIST_PX = 288, 96
 """Side, and the radius at which the pattern reaches half a cycle per pixel and ends."""
