@@ -247,7 +247,7 @@ def _graph(file: Path, tile_px: int) -> Network:
     return network_of(model_of(file), tile_px)
 
 
-UNITS = {
+UNITS: dict[str, str] = {
     "board latency": "s",
     "board throughput": "frame/s",
     "board power": "W",
