@@ -15,7 +15,7 @@ from unittest.mock import patch
 import numpy as np
 
 from beers_deploy.export import float_model
-from beers_deploy.network import float_file
+from beers_deploy.network_files import float_file
 from beers_deploy.profiles import load_sensor
 from beers_deploy.quant.calibration import Calibration
 from beers_deploy.quant.gate import compare

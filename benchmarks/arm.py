@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 
 PROJECT = Path(__file__).resolve().parents[1]
 PROCESSORS = ("cortex-a72", "neoverse-n1", "max")

@@ -26,7 +26,7 @@ from rasterio.shutil import copy
 from rasterio.transform import from_origin
 from rasterio.windows import Window
 
-from beers_deploy.bench.tables import parse_size
+from beers_deploy.bench.swath import parse_size
 from beers_deploy.restoration.source import open_source
 
 BLOCK_PX, STRIP_PX, TIFF = 1024, 640, "TIFF"

@@ -19,7 +19,7 @@ import onnxruntime as ort
 
 from beers_deploy.bench.timing import interleaved
 from beers_deploy.model.processor import decided, int8_adds_exactly, processor_name
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.quant.kernels import filled, made_exact
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session, run

@@ -15,7 +15,7 @@ import numpy as np
 import onnx
 import torch
 
-from beers_deploy.bench.tables import PAPER_SIZE, Swath, parse_size, swath_latency
+from beers_deploy.bench.swath import PAPER_SIZE, Swath, parse_size, swath_latency
 from beers_deploy.dpu.board import Dpu, load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import Prediction, predict

@@ -28,7 +28,7 @@ import onnx
 import tifffile
 import torch
 
-from beers_deploy.bench.tables import parse_size
+from beers_deploy.bench.swath import parse_size
 from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import VARIANTS, Variant

@@ -16,7 +16,8 @@ from beers_deploy.model.consistency import REACH_PX
 from beers_deploy.model.exposure import HEADROOM
 from beers_deploy.model.io.files import write_text
 from beers_deploy.model.shipped import INT8, shipped_names
-from beers_deploy.network import Network, NetworkLike, SensorLike, brighter_files, other_sensor
+from beers_deploy.network import Network, NetworkLike, SensorLike
+from beers_deploy.network_files import brighter_files, other_sensor
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Figure, Mode, Row
 from beers_deploy.profiles.sensor import Sensor

@@ -13,7 +13,7 @@ from time import perf_counter
 import numpy as np
 import onnx
 
-from beers_deploy.bench.tables import predict_file, swath_latency
+from beers_deploy.bench.swath import predict_file, swath_latency
 from beers_deploy.dpu.board import dpu_of
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.profiles.errors import BeersError, ImageError

@@ -16,7 +16,8 @@ import onnx
 
 from beers_deploy.model.progress import Progress, no_log, reporting
 from beers_deploy.model.shipped import INT8, VARIANT
-from beers_deploy.network import Network, NetworkLike, SensorLike, brighter_files, conditioned, other_sensor
+from beers_deploy.network import Network, NetworkLike, SensorLike
+from beers_deploy.network_files import brighter_files, conditioned, other_sensor
 from beers_deploy.profiles.errors import ImageError, OptionError, optional
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND

@@ -1,46 +1,27 @@
-"""Networks: a file of the user's, a module of torch, or a shipped one told a sensor.
+"""`Network`: an ONNX network and where it comes from, as the library passes it on."""
 
-`Network` is what the library hands on; the functions say which file a command means.
-
-A shipped network is one set of weights, and one INT8 file, for every sensor in range. NAME is that network in float32
-and NAME-int8 in INT8, each told one sensor: its filters, written in milliseconds from the profile alone. Where a file
-is needed it lies in a folder of this process, which goes with it.
-"""
-
-import atexit
 import hashlib
 import io
-import json
 import os
-import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Union
 
 import numpy as np
 import onnx
 import onnxruntime as ort
 
-from beers_deploy.export import float_for, float_model, require_tile
-from beers_deploy.model.bank import network_bank
-from beers_deploy.model.exposure import brightened, factors_for
-from beers_deploy.model.family import sensor_vector
-from beers_deploy.model.io.files import sha256
-from beers_deploy.model.io.tensors import is_conditioned
-from beers_deploy.model.progress import Log, no_log
-from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
-from beers_deploy.profiles.errors import ModelError, OptionError, OutsideRangeWarning, optional
+from beers_deploy.export import float_model, require_tile
+from beers_deploy.network_files import network_file, process_file
+from beers_deploy.profiles.errors import ModelError, OutsideRangeWarning, optional
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.sensor import Sensor, numbers_of
-from beers_deploy.profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
-from beers_deploy.profiles.toml import unreadable
-from beers_deploy.quant.banked.family import required_family, with_delta
-from beers_deploy.quant.encodings import board_model, host_model, read_core, vint8_model
+from beers_deploy.quant.encodings import board_model, read_core, vint8_model
 from beers_deploy.quant.onnx_file import fixed_tile_px, is_quantised, load_onnx, metadata, read_onnx, save_onnx
 from beers_deploy.quant.reading.external import network_sha256
 from beers_deploy.quant.reading.folding import OPSET
@@ -183,7 +164,7 @@ class Network:
         """A file that holds it: its own, or one that goes with this process."""
         if self.path is not None:
             return self.path
-        path = _place(self.name, self.sha256)
+        path = process_file(self.name, self.sha256)
         return path if path.is_file() else self.save(path)
 
     def __eq__(self, other: object) -> bool:
@@ -225,192 +206,5 @@ def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
     return read_onnx(stream.getvalue(), type(module).__name__)
 
 
-@dataclass(frozen=True)
-class Conditioned:
-    """Weights of a network that is told its sensor, and the name that it is listed under."""
-
-    name: str
-    weights: Path
-
-    def model(self, sensor: Sensor, int8: bool) -> onnx.ModelProto:
-        """The network told a sensor, in float32 or in INT8."""
-        if not int8:
-            return float_for(self.weights, self.name, sensor)
-        shipped = SHIPPED / f"{self.name}{INT8}.onnx"
-        if self.weights.parent != SHIPPED:
-            remedy = f"make one for every sensor: beers-deploy quantize {self.weights} --out {self.name}{INT8}.onnx"
-            raise ModelError(str(self.weights), expected="an INT8 network", got="float weights", remedy=remedy)
-        return told_int8(load_onnx(shipped), sensor)
-
-
-def conditioned(given: Path | None) -> Conditioned | None:
-    """The network to be told its sensor that is meant, None meaning the default one; None for any other file."""
-    if given is None:
-        return Conditioned(VARIANT, shipped_weights(VARIANT))
-    if _is_shipped(given):
-        name = given.name.removesuffix(INT8)
-        return Conditioned(name, shipped_weights(name))
-    return Conditioned(given.stem, given) if given.suffix == ".safetensors" and is_conditioned(given) else None
-
-
-def weights_file(given: Path) -> Path:
-    """The file given, or the shipped one of that name where no such file lies; nothing is read."""
-    if not _is_shipped(given):
-        return given
-    return SHIPPED / f"{given.name}.onnx" if given.name.endswith(INT8) else shipped_weights(given.name)
-
-
-def _is_shipped(given: Path) -> bool:
-    """Whether a shipped network is meant by its name, with INT8 behind it or without."""
-    named = given == Path(given.name) and given.name.removesuffix(INT8) in shipped_names()
-    return named and not given.exists()
-
-
-def in_int8(given: Path) -> Path:
-    """A shipped network's name with INT8 behind it; any other path as it is."""
-    return Path(given.name.removesuffix(INT8) + INT8) if _is_shipped(given) else given
-
-
-def pair_of(floating: Path | None, int8: Path | None) -> tuple[Path, Path]:
-    """A float network and its INT8: the files given, or a shipped pair by its name, the default one if None."""
-    name = Path(VARIANT) if floating is None else floating
-    if int8 is None and not name.suffix and not name.exists():
-        shipped_weights(name.name)
-    elif int8 is None:
-        remedy = "give its INT8 file too, or the name of a shipped pair"
-        raise OptionError("INT8", expected=f"the INT8 network of {name.name}", got="none", remedy=remedy)
-    return name, in_int8(int8 or name)
-
-
-def network_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
-    """The file of a network: the one given, or a conditioned network's for the sensor, INT8 where its name says so.
-
-    Args:
-        given: a file, or a shipped name where no such file lies; None is the default network in INT8.
-        sensor: what a conditioned network is told: the middle of each of its ranges.
-        log: is told what of the sensor lies outside the range that was trained.
-    """
-    if given is not None and not (given.suffix or given.exists() or _is_shipped(given)):
-        expected = f"a file, or a shipped network ({', '.join(shipped_names())}, each also with {INT8})"
-        raise ModelError(str(given), expected=expected, got="neither", remedy="correct the name, or the path")
-    int8 = given is None or given.name.endswith(INT8)
-    return int8_file(given, sensor, log) if int8 else float_file(given, sensor, log)
-
-
-def brighter_files(given: Path | None, sensor: Sensor) -> dict[int, Path]:
-    """Write a conditioned network for the sensor at higher exposures; return the files by factor.
-
-    Args:
-        given: as of `network_file`.
-        sensor: likewise.
-
-    Returns:
-        Empty for any other network, and where the sensor's noise allows no factor above 1.
-    """
-    network = conditioned(given)
-    if network is None:
-        return {}
-    int8 = given is None or given.name.endswith(INT8)
-    factors = factors_for(sensor.nominal())
-    return {factor: _written(network, brightened(sensor, factor), int8, no_log) for factor in factors if factor > 1}
-
-
-def float_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
-    """As `network_file`, a conditioned network always in float32."""
-    found = conditioned(given)
-    return _written(found, sensor, False, log) if found else given or Path()
-
-
-def int8_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
-    """As `network_file`, a conditioned network always in INT8."""
-    found = conditioned(given)
-    return _written(found, sensor, True, log) if found else given or Path()
-
-
-def shipped_pair(name: str = VARIANT, sensor: str = SENSOR) -> tuple[Path, Path]:
-    """A shipped network in float32 and in INT8, told a sensor."""
-    known, given = load_sensor(sensor), Path(shipped_weights(name).stem)
-    return float_file(given, known), int8_file(given, known)
-
-
-def warn_outside(sensor: Sensor, log: Log) -> None:
-    """Tell what of a sensor lies outside the range that was trained."""
-    for sentence in sensor_vector(sensor.nominal()).outside:
-        log(f"warning: {sentence}")
-
-
-def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
-    """Return a warning if a network was made for another sensor than the one named; else nothing."""
-    own = metadata(model).get("sensor", "")
-    if own in ("", BLIND, BLIND_PROFILE, sensor.name):
-        return ""
-    return f"look at the sensor: the network was made for {own}, not for {sensor.name}"
-
-
-def other_precision(model: onnx.ModelProto) -> onnx.ModelProto | None:
-    """A shipped network of the same variant in the other precision, or None; its weights may be others.
-
-    Time depends on the shapes, not on the weights: for a comparison of time any weights will do.
-    """
-    variant = metadata(model).get("variant", "")
-    if variant not in shipped_names():
-        return None
-    find = float_file if is_quantised(model) else int8_file
-    return load_onnx(find(Path(variant), load_sensor(SENSOR)))
-
-
 def _warn(sentence: str) -> None:
     warnings.warn(sentence, OutsideRangeWarning, stacklevel=4)
-
-
-@cache
-def _folder() -> Path:
-    """Where the files of this process lie, until it ends."""
-    folder = TemporaryDirectory(prefix="beers-deploy-", ignore_cleanup_errors=True)
-    atexit.register(folder.cleanup)
-    return Path(folder.name)
-
-
-def _written(network: Conditioned, sensor: Sensor, int8: bool, log: Log) -> Path:
-    warn_outside(sensor, log)
-    stem = network.name + (INT8 if int8 else "")
-    told = json.dumps({"weights": sha256(network.weights), "sensor": numbers_of(sensor)}, sort_keys=True, default=str)
-    path = _place(stem, hashlib.sha256(told.encode()).hexdigest())
-    if not path.is_file():
-        save_onnx(network.model(sensor, int8), path)
-    return path
-
-
-def _place(name: str, digest: str) -> Path:
-    """Of a file of this process, named for the tables that show it."""
-    folder, stem = _folder() / digest[:12], re.sub(r"[^\w.-]+", "-", name)[:40]
-    folder.mkdir(exist_ok=True)
-    return folder / f"{stem}.onnx"
-
-
-def told_int8(
-    model: onnx.ModelProto, sensor: Sensor, more: Mapping[str, str] | None = None, log: Log = no_log
-) -> onnx.ModelProto:
-    """An INT8 network behind a bank told another sensor: its filters, unit and biases written anew.
-
-    Args:
-        model: of whatever sensor.
-        sensor: of which the middle is taken.
-        more: metadata to add.
-        log: is told what of the sensor lies outside the range that was trained.
-    """
-    warn_outside(sensor, log)
-    known = sensor.nominal()
-    core = required_family(model).for_sensor(network_bank(known), sensor_vector(known).values)
-    return host_model(core, {**metadata(model), "sensor": sensor.name, **(more or {})}, fixed_tile_px(model))
-
-
-def told_by_delta(model: onnx.ModelProto, delta: Path) -> onnx.ModelProto:
-    """An INT8 network behind a bank told the sensor of a delta, a file that `export --delta` wrote."""
-    try:
-        packed = delta.read_bytes()
-    except OSError as error:
-        got, remedy = unreadable(delta) or str(error), "give a file that 'export --delta' wrote"
-        raise ModelError(str(delta), expected="a delta", got=got, remedy=remedy) from error
-    core, name = with_delta(required_family(model).core, packed)
-    return host_model(core, {**metadata(model), "sensor": name}, fixed_tile_px(model))

@@ -17,7 +17,8 @@ from beers_deploy.model.io.tensors import read_conditioned
 from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.model.progress import progress as begun
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.network import Conditioned, Network, NetworkLike, SensorLike, conditioned, told_int8
+from beers_deploy.network import Network, NetworkLike, SensorLike
+from beers_deploy.network_files import Conditioned, conditioned, told_int8
 from beers_deploy.profiles.errors import ModelError, OptionError, optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor

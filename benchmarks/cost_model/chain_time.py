@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from beers_deploy.bench.tables import Swath
+from beers_deploy.bench.swath import Swath
 from beers_deploy.bench.traditional import CROP_PX, CROPS, drawn_acquisition
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.model.traditional.nl_bayes import overlap_add, patch_matrix

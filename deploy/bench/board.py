@@ -12,15 +12,12 @@ from pathlib import Path
 import numpy as np
 import onnx
 
+from beers_deploy.bench.swath import PAPER_SIZE, Swath, parse_size, predict_file
 from beers_deploy.bench.tables import (
-    PAPER_SIZE,
     PAPER_TARGET,
-    Swath,
     frame_row,
     host_words,
     layer_rows,
-    parse_size,
-    predict_file,
     predicted_rows,
     processor_row,
     published_rows,

@@ -19,7 +19,7 @@ from beers_deploy.dpu.reading import inputs_of
 from beers_deploy.host_state import cpu_load, resident_bytes
 from beers_deploy.model.consistency import Consistency, Placed
 from beers_deploy.model.processor import require_cores
-from beers_deploy.network import other_precision
+from beers_deploy.network_files import other_precision
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.sensor import Sensor

@@ -1,18 +1,33 @@
-"""What the bench shows and need not measure.
+"""The rows of the bench that need no measurement here.
 
-A network on the DPU and the traditional pipeline on the board's own processor, both predicted, and the paper's
-figures.
+These are a network on the DPU and the traditional pipeline on the board's own processor, both predicted, and the
+paper's figures.
 """
 
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
+from beers_deploy.bench.swath import (
+    COST_SOURCE,
+    Swath,
+    chain_rate,
+    efficiency,
+    energy,
+    exact,
+    fitted_range,
+    host_time,
+    interval_ends,
+    one_thread_latency,
+    predict_file,
+    scaled,
+    swath_figures,
+    swath_latency,
+)
 from beers_deploy.dpu.board import Dpu
-from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import (
     LayerCost,
     Prediction,
@@ -20,83 +35,18 @@ from beers_deploy.dpu.cost.latency import (
     dpu_power,
     energy_source,
     layer_energy_j,
-    predict,
 )
-from beers_deploy.dpu.cost.model import Interval, Task, between
-from beers_deploy.dpu.reading import read_network
+from beers_deploy.dpu.cost.model import Task, between
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Figure, Row, number, predicted, published, unavailable
-from beers_deploy.profiles.target import TILE_PX
-from beers_deploy.restoration.plan import plan_side
-from beers_deploy.restoration.source import SIDE_PX
 
 TABLE, LAYERS = "bench", "layers"
 CHAIN = "chain_s_per_mpx"
 """In a target's [cpu]: time of the traditional pipeline for 10^6 pixels on all cores."""
-COST_SOURCE = "cost model fitted on published networks, docs/explanation/cost-model.md"
-HELD = 0.9
-"""Share of families left out of the fit that an interval is meant to hold."""
-ARITHMETIC = "arithmetic of the tile grid"
 PAPER = "ConvBEERS paper, table of the VCK190 benchmark, 13600 x 9016"
-PAPER_SIZE = "13600x9016"
 PAPER_TARGET = "vck190"
 """The board that the paper measured: its rows stand beside that one alone."""
-
-
-@dataclass(frozen=True)
-class Swath:
-    """The image that all rows are about, and the tiles it is cut into.
-
-    Attributes:
-        width_px: of the image.
-        height_px: of the image.
-        tile_px: side of a tile.
-        halo_px: context around what is kept of a tile.
-        runs: how often the network runs on a tile, once for each exposure that its pixels ask for; a mean.
-        consistency: whether the host takes the consistency step.
-    """
-
-    width_px: int
-    height_px: int
-    tile_px: int = TILE_PX
-    halo_px: int = 0
-    runs: float = 1.0
-    consistency: bool = False
-
-    @property
-    def pixels(self) -> int:
-        """Pixels of the image."""
-        return self.width_px * self.height_px
-
-    @property
-    def frames(self) -> float:
-        """Tiles as the paper counts: pixels of the image over pixels of a tile, a fraction, without halo.
-
-        13600 x 9016 at 640 is 299.4; at the published 7.2 frames a second that is the published 42 s.
-        """
-        return self.pixels / self.tile_px**2
-
-    @property
-    def tiles(self) -> int:
-        """Whole tiles of the grid, the last row and column moved inward: 384 of the paper's swath, halo 35."""
-        rows, columns = (plan_side(side, self.tile_px, self.halo_px) for side in (self.height_px, self.width_px))
-        return len(rows) * len(columns)
-
-    @property
-    def step_px(self) -> float:
-        """Pixels of the image for which the host takes the consistency step, for each run of the network."""
-        return self.pixels / (self.tiles * self.runs) if self.consistency else 0.0
-
-
-def predict_file(
-    model: Path, dpu: Dpu, tile_px: int | None = TILE_PX, task: Task | None = None, step_px: float = 0.0
-) -> Prediction:
-    """What the cost model says of an ONNX file, for tiles of that side or, with None, for the size it is fixed to.
-
-    The `task` of the host is what the file tells, if none is given; `step_px` as of `predict`.
-    """
-    return predict(place(read_network(model, tile_px), dpu), dpu, task, step_px)
 
 
 def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]:
@@ -113,89 +63,9 @@ def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]
     }
     words, name = {"fitted range": fitted_range(prediction)}, f"{name}, INT8 on the DPU ({prediction.dpu.name})"
     return [
-        Row(TABLE, f"{name}, {how}", _swath_figures(prediction, swath, *count) | besides, words)
+        Row(TABLE, f"{name}, {how}", swath_figures(prediction, swath, *count) | besides, words)
         for how, count in counts.items()
     ]
-
-
-def _swath_figures(prediction: Prediction, swath: Swath, frames: float, batches: float) -> dict[str, Figure]:
-    power, latency = dpu_power(prediction.dpu), swath_latency(prediction, batches)
-    step = {"consistency step": step_time(prediction, swath)} if swath.consistency else {}
-    return {
-        "tiles": exact(frames, "tile", ARITHMETIC),
-        "network runs": exact(swath.runs, "run/tile", "exposures that the image's tiles ask for; 1 without an image"),
-        "work factor": exact(frames * swath.tile_px**2 / swath.pixels, "px/px", ARITHMETIC),
-        "latency": latency,
-        "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
-        "power": power,
-        "energy": energy(latency, power),
-        "efficiency": efficiency(swath.pixels, latency, power),
-        **step,
-    }
-
-
-def step_time(prediction: Prediction, swath: Swath) -> Figure:
-    """Time of the consistency step for the swath on the host's cores, in s; it runs while the DPU works."""
-    runs = swath.tiles * swath.runs
-    low_s, high_s = (end_s * runs for end_s in prediction.step_s)
-    source = "counted work of the step at the rates of the board's processor, from the best published to plain code"
-    return predicted(between((low_s, high_s)), "s", (low_s, high_s), source)
-
-
-def host_time(prediction: Prediction, unit: str) -> Figure:
-    """What the host's cores together take for an image, in ms."""
-    low_s, high_s = prediction.host_interval_s
-    return predicted(1e3 * prediction.host_s, unit, (1e3 * low_s, 1e3 * high_s), COST_SOURCE)
-
-
-def one_thread_latency(prediction: Prediction) -> Figure:
-    """From image to result where one thread runs one core's batch and does the host's work itself, in ms."""
-    low_s, high_s = prediction.latency_interval_s
-    handlers = prediction.dpu.handlers
-    images = f"a batch of {handlers}" if handlers > 1 else "one image"
-    source = f"{COST_SOURCE}, its fit to rates with one thread: {images} through one core, then the host"
-    return predicted(1e3 * prediction.latency_s, "ms/batch", (1e3 * low_s, 1e3 * high_s), source)
-
-
-def swath_latency(prediction: Prediction, batches: float) -> Figure:
-    """Time of so many batches, in seconds."""
-    images = batches * prediction.batch
-    slow_s, fast_s = (images / fps for fps in prediction.fps_interval)
-    return predicted(images / prediction.fps, "s", (fast_s, slow_s), COST_SOURCE)
-
-
-def fitted_range(prediction: Prediction) -> str:
-    """Whether the fitted networks speak for this one, and how often the board's intervals held, if too rarely."""
-    found = f"outside: {'; '.join(prediction.outside)}" if prediction.outside else "inside"
-    share = prediction.dpu.value("cost", "families_held")
-    return found if share >= HELD else f"{found}; intervals held {100 * share:.0f} % of families left out"
-
-
-def energy(latency: Figure, power: Figure) -> Figure:
-    """Energy of the swath, in J: time and power, and their ends."""
-    if power.value is None or latency.value is None:
-        return unavailable("J", power.reason or latency.reason)
-    (fast_s, slow_s), (low_w, high_w) = _ends(latency), _ends(power)
-    ends = fast_s * low_w, slow_s * high_w
-    return predicted(latency.value * power.value, "J", ends, f"{latency.source}; {power.source}")
-
-
-def efficiency(pixels: int, latency: Figure, power: Figure) -> Figure:
-    """Pixels a second and watt; its interval pairs the slowest run with the highest power and the reverse."""
-    unit = "px/s/W"
-    if power.value is None or latency.value is None:
-        return unavailable(unit, power.reason or latency.reason)
-    value = pixels / latency.value / power.value
-    if "predicted" not in (latency.mode, power.mode):
-        return Figure(value, unit, latency.mode, f"{latency.source}; {power.source}")
-    (fast_s, slow_s), (low_w, high_w) = _ends(latency), _ends(power)
-    interval = (pixels / slow_s / high_w, pixels / fast_s / low_w)
-    return predicted(value, unit, interval, f"{latency.source}; {power.source}")
-
-
-def _ends(figure: Figure) -> Interval:
-    """The interval, or the value twice where it has none."""
-    return figure.interval or (figure.value or 0.0, figure.value or 0.0)
 
 
 QUOTED = {"latency": "ms", "throughput": "fps"}
@@ -249,12 +119,6 @@ def processor_row(swath: Swath, board: TargetProfile) -> Row:
     return Row(TABLE, name, figures)
 
 
-def chain_rate(swath: Swath, latency: Figure) -> Figure:
-    """Tiles a second, as the paper counts them, of a predicted latency of the swath."""
-    low, high = (swath.frames / end_s for end_s in reversed(_ends(latency)))
-    return predicted(swath.frames / (latency.value or math.inf), "frame/s", (low, high), latency.source)
-
-
 def layer_rows(prediction: Prediction) -> list[Row]:
     """One row a layer; their times add up to that of a batch, the last row.
 
@@ -284,16 +148,6 @@ def _layer_row(layer: LayerCost, prediction: Prediction) -> Row:
     return Row(LAYERS, work.name, figures, {"bound": layer.bound})
 
 
-def exact(value: float, unit: str, source: str = "arithmetic of the graph's shapes, one image") -> Figure:
-    """A number that follows from shapes alone."""
-    return predicted(value, unit, (value, value), source)
-
-
-def scaled(value: float, unit: str, prediction: Prediction) -> Figure:
-    """A part of the prediction, with the relative error of the whole."""
-    return predicted(value, unit, (value / prediction.spread, value * prediction.spread), COST_SOURCE)
-
-
 MOST_TILE_PX = 8192
 """One layer's result of 64 channels has 17 GB there; no board has a tenth of it."""
 
@@ -313,7 +167,7 @@ def swath_row(prediction: Prediction, swath: Swath) -> Row:
     """A swath in whole tiles on one configuration."""
     batches = math.ceil(swath.tiles * swath.runs / prediction.batch)
     kept = [not layer.work.map_bytes for layer in prediction.layers]
-    figures = _swath_figures(prediction, swath, swath.tiles, batches) | {
+    figures = swath_figures(prediction, swath, swath.tiles, batches) | {
         "maps through memory": exact(prediction.streamed_bytes / 1e6, "MB/tile"),
         "layers on chip": exact(100 * sum(kept) / len(kept), "%"),
     }
@@ -341,9 +195,9 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
     each, found = len(rows) // len(boards), dict[str, str]()
     placed = [(boards[k // each].peak_ops_per_s, row) for k, row in enumerate(rows)]
     ends: dict[str, Callable[[Figure], float | None]] = {
-        "by the whole interval": lambda latency: _ends(latency)[1],
+        "by the whole interval": lambda latency: interval_ends(latency)[1],
         "by the prediction": lambda latency: latency.value,
-        "at best": lambda latency: _ends(latency)[0],
+        "at best": lambda latency: interval_ends(latency)[0],
     }
     for how, end in ends.items():
         fits = [(peak, row) for peak, row in placed if (end(row.figures["latency"]) or math.inf) <= within_s]
@@ -392,12 +246,3 @@ def parse_tiles(text: str) -> list[int]:
             "tile", expected=f"tile sides of 16 to {MOST_TILE_PX} pixels", got=repr(text), remedy=remedy
         )
     return [int(part) for part in parts]
-
-
-def parse_size(text: str) -> tuple[int, int]:
-    """WIDTHxHEIGHT in pixels as (width, height)."""
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isdecimal() and 0 < int(part[:9]) <= SIDE_PX for part in parts):
-        expected, remedy = f"WIDTHxHEIGHT of 1 to {SIDE_PX} pixels", f"write it as {PAPER_SIZE}"
-        raise OptionError("size", expected=expected, got=repr(text), remedy=remedy)
-    return int(parts[0]), int(parts[1])

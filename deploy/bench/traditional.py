@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from beers_deploy.bench.host import conditions_of
-from beers_deploy.bench.tables import TABLE, Swath, chain_rate, efficiency
+from beers_deploy.bench.swath import Swath, chain_rate, efficiency
+from beers_deploy.bench.tables import TABLE
 from beers_deploy.bench.timing import timed
 from beers_deploy.host_state import cpu_load
 from beers_deploy.model.simulator.acquire import MARGIN_PX, simulate_pair

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     import numpy as np
 
     from beers_deploy.bench.board import BoardBench, Tables
-    from beers_deploy.bench.tables import Swath
+    from beers_deploy.bench.swath import Swath
 
 
-PAPER_SIZE = "13600x9016"  # as in deploy.bench.tables, which is imported late
+PAPER_SIZE = "13600x9016"  # as in deploy.bench.swath, which is imported late
 BOARD_ONLY = (
     "image",
     "full_scale",
@@ -112,7 +112,7 @@ def bench(
     from beers_deploy.dpu.board import ALL
     from beers_deploy.dpu.cost.model import TASKS
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.network import conditioned, int8_file
+    from beers_deploy.network_files import conditioned, int8_file
     from beers_deploy.results import Table, print_rows
 
     tiles, here, board = parse_tiles(tile), target in HOSTS, target.removesuffix(MODEL_SUFFIX)

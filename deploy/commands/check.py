@@ -38,7 +38,7 @@ def check(
     from beers_deploy.dpu.checker.table import check as placed
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.shipped import VARIANT
-    from beers_deploy.network import in_int8
+    from beers_deploy.network_files import in_int8
     from beers_deploy.results import print_rows
 
     require_picture(picture)

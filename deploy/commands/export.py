@@ -65,7 +65,7 @@ def export(
     from beers_deploy.export import about, float_for, to_onnx
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.io.tensors import is_conditioned, read_plain
-    from beers_deploy.network import warn_outside, weights_file
+    from beers_deploy.network_files import warn_outside, weights_file
     from beers_deploy.quant.onnx_file import require_onnx_name, save_onnx
 
     if not (network.suffix or network.exists()):
@@ -139,7 +139,8 @@ def _export_int8(
         apply: a delta to read in place of the sensor.
     """
     from beers_deploy.export import require_tile
-    from beers_deploy.network import Network, told_by_delta, told_int8
+    from beers_deploy.network import Network
+    from beers_deploy.network_files import told_by_delta, told_int8
     from beers_deploy.quant.encodings import host_model, read_core
     from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
 
@@ -166,7 +167,7 @@ def _save_delta(made: "onnx.ModelProto", sensor: Sensor, factor: int, delta: Pat
     """Write the delta of an INT8 network that is conditioned on a sensor, at one of its exposures."""
     from beers_deploy.model.exposure import brightened
     from beers_deploy.model.io.files import whole_file
-    from beers_deploy.network import told_int8
+    from beers_deploy.network_files import told_int8
     from beers_deploy.quant.banked.family import delta_of_file
 
     # The other exposures of a sensor are no user's choice: what of them lies outside the trained range is not told.

@@ -48,7 +48,8 @@ def gate(
     change no bit.
     """
     from beers_deploy.model.io.files import require_writable, write_text
-    from beers_deploy.network import Network, pair_of
+    from beers_deploy.network import Network
+    from beers_deploy.network_files import pair_of
     from beers_deploy.quant.gate import limits_of
     from beers_deploy.results import print_rows
     from beers_deploy.verdict import gate as judged

@@ -33,7 +33,7 @@ def golden(
     """
     from beers_deploy.kit.golden import compare_golden, write_golden
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.network import in_int8
+    from beers_deploy.network_files import in_int8
     from beers_deploy.results import print_rows
 
     inputs = given, compare, Path(target)

@@ -41,7 +41,7 @@ def info(
     """
     from beers_deploy.info import info_row
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.network import network_file
+    from beers_deploy.network_files import network_file
     from beers_deploy.restoration.index_files import index_files
     from beers_deploy.results import Table, print_rows
 

@@ -101,7 +101,7 @@ def quantize(
 
 def _report_files(folder: Path | None, model: Path) -> tuple[Path, Path] | tuple[None, None]:
     """The page and the figures of --report, which matplotlib draws."""
-    from beers_deploy.network import conditioned
+    from beers_deploy.network_files import conditioned
 
     if folder is None:
         return None, None

@@ -114,7 +114,7 @@ def restore(
     from beers_deploy.model.io.files import require_writable, sha256
     from beers_deploy.model.io.images import require_image_file
     from beers_deploy.model.shipped import INT8
-    from beers_deploy.network import brighter_files, conditioned, network_file
+    from beers_deploy.network_files import brighter_files, conditioned, network_file
     from beers_deploy.restoration.bands import parse_sensors
     from beers_deploy.restoration.cog import write_item
     from beers_deploy.restoration.run import restore_file
@@ -188,7 +188,7 @@ def _require_item(stac: Path | None, cog: bool) -> None:
 
 def _look_at_network(network: Path | None, paths: Mapping[str, Path], known: Mapping[str, Sensor]) -> None:
     """Refuse sensors by band for a network that is for one; say where it was made for another sensor."""
-    from beers_deploy.network import other_sensor
+    from beers_deploy.network_files import other_sensor
     from beers_deploy.quant.onnx_file import load_onnx
 
     if len(known) > 1:

@@ -79,7 +79,7 @@ def train(
     from beers_deploy.model.training.run import FILES, Run
     from beers_deploy.model.training.run import train as run_training
     from beers_deploy.model.training.trainer import joined
-    from beers_deploy.network import weights_file
+    from beers_deploy.network_files import weights_file
     from beers_deploy.quantise import rounding_of
 
     if pairs is not None and (images is not None or drawn):

@@ -7,7 +7,7 @@ import argparse
 from pathlib import Path
 
 from beers_deploy.model.shipped import INT8, shipped_names, shipped_weights
-from beers_deploy.network import Conditioned
+from beers_deploy.network_files import Conditioned
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.quantise import family_model
 

@@ -13,7 +13,7 @@ import pytest
 from beers_deploy.export import to_onnx
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.model.variants import Variant
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.quant.onnx_file import save_onnx
 from tests.deploy.command_line import done
 from tests.deploy.workflow_steps import ACTION, BASH, KEPT, ROOT, Runner, read_yaml

@@ -13,7 +13,7 @@ from beers_deploy.model.convbeers import ConvBEERS, arrays, grow, load_network, 
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.shipped import shipped_names, shipped_weights
 from beers_deploy.model.variants import VARIANTS, Variant
-from beers_deploy.network import brighter_files
+from beers_deploy.network_files import brighter_files
 from beers_deploy.parity import require_parity, torch_network
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError

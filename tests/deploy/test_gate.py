@@ -16,7 +16,8 @@ from onnxruntime.quantization import quantize_static
 
 import beers_deploy as bd
 from beers_deploy.export import float_model
-from beers_deploy.network import Network, shipped_pair
+from beers_deploy.network import Network
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.figures import Bound, Check, Row, measured

@@ -10,7 +10,7 @@ import pytest
 import tifffile
 
 from beers_deploy.info import info_row
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.figures import Row
 from beers_deploy.restoration.options import Options

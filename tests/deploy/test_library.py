@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from beers_deploy.library import restore
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.quant.onnx_file import save_onnx

@@ -14,7 +14,7 @@ import tifffile
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.progress import once
 from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
-from beers_deploy.network import (
+from beers_deploy.network_files import (
     float_file,
     int8_file,
     network_file,

@@ -17,7 +17,7 @@ from onnx import TensorProto, helper, numpy_helper
 from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
 
 from beers_deploy.model.processor import int8_adds_exactly
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.integer.reference import merged_correction, run_core

@@ -7,7 +7,7 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import CORRECTION
 from beers_deploy.quant.integer.reference import run_core

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.quant.session import open_session, run
 
 IMAGE = np.full((1, 1, 96, 96), 0.5, np.float32)

@@ -8,9 +8,9 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from beers_deploy.bench.tables import predict_file
+from beers_deploy.bench.swath import predict_file
 from beers_deploy.dpu.board import load_dpu
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.target import TILE_PX

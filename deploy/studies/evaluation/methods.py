@@ -19,7 +19,7 @@ from beers_deploy.model.shipped import INT8, shipped_names
 from beers_deploy.model.traditional.nl_bayes import QUALITIES
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.pipeline import Chain, Order, restore_traditional
-from beers_deploy.network import Conditioned, conditioned, network_file, warn_outside
+from beers_deploy.network_files import Conditioned, conditioned, network_file, warn_outside
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Instrument, Sensor

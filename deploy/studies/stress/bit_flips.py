@@ -11,7 +11,7 @@ from math import exp
 
 import numpy as np
 
-from beers_deploy.bench.tables import predict_file
+from beers_deploy.bench.swath import predict_file
 from beers_deploy.dpu.board import Dpu, load_dpu
 from beers_deploy.dpu.cost.latency import Prediction
 from beers_deploy.dpu.cost.model import Constants

@@ -16,7 +16,7 @@ from torch.nn.functional import conv2d, pixel_shuffle, pixel_unshuffle
 from beers_deploy.export import float_model
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.network import float_file, int8_file, pair_of
+from beers_deploy.network_files import float_file, int8_file, pair_of
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import BeersError, ModelError
 from beers_deploy.quant.bounds import layer_bounds

@@ -16,7 +16,7 @@ import numpy as np
 import psutil
 
 from beers_deploy import __version__
-from beers_deploy.bench.tables import Swath
+from beers_deploy.bench.swath import Swath
 from beers_deploy.bench.timing import interleaved
 from beers_deploy.bench.traditional import drawn_acquisition
 from beers_deploy.export import float_model

@@ -14,7 +14,7 @@ from pathlib import Path
 import onnx
 
 from beers_deploy.bench import tables
-from beers_deploy.bench.tables import Swath
+from beers_deploy.bench.swath import Swath, chain_rate, efficiency, energy, swath_latency
 from beers_deploy.dpu.board import Dpu, dpu_of
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import dpu_power, predict
@@ -25,7 +25,7 @@ from beers_deploy.model.shipped import INT8 as SUFFIX
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.traditional.nl_bayes import QUALITIES
 from beers_deploy.model.traditional.peers import PEERS
-from beers_deploy.network import brighter_files, float_file, int8_file
+from beers_deploy.network_files import brighter_files, float_file, int8_file
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Figure, predicted, unavailable
@@ -222,7 +222,7 @@ def dpu_latency(variant: Variant, dpu: Dpu, swath: Swath) -> Figure:
         swath: with its tiles and their halo.
     """
     prediction = predict(place(_graph(variant.file or Path(), swath.tile_px), dpu), dpu, step_px=swath.step_px)
-    return tables.swath_latency(prediction, math.ceil(swath.tiles * swath.runs / prediction.batch))
+    return swath_latency(prediction, math.ceil(swath.tiles * swath.runs / prediction.batch))
 
 
 def radius_px(variant: Variant) -> int:
@@ -283,5 +283,5 @@ def board_figures(point: Point, whole: Swath, slower: float | None = None, runs:
         latency = unavailable("s", point.reason or "no time of this method on the board's processor is stated")
     if latency.value is None:
         return {key: unavailable(unit, latency.reason) for key, unit in UNITS.items()}
-    work = tables.energy(latency, power), tables.efficiency(whole.pixels, latency, power)
-    return dict(zip(UNITS, (latency, tables.chain_rate(whole, latency), power, *work), strict=True))
+    work = energy(latency, power), efficiency(whole.pixels, latency, power)
+    return dict(zip(UNITS, (latency, chain_rate(whole, latency), power, *work), strict=True))

@@ -8,7 +8,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from beers_deploy.bench.tables import PAPER_SIZE, PAPER_TARGET, Swath, parse_size, published_rows
+from beers_deploy.bench.swath import PAPER_SIZE, Swath, parse_size
+from beers_deploy.bench.tables import PAPER_TARGET, published_rows
 from beers_deploy.dpu.board import BoardLike, boards_of, dpu_of
 from beers_deploy.dpu.cost.model import Constants
 from beers_deploy.model.io.images import list_images

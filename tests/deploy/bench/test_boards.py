@@ -12,7 +12,8 @@ import tifffile
 import torch
 
 from beers_deploy.bench.board import BoardBench, bench_board
-from beers_deploy.bench.tables import Swath, frame_row, predict_file, sweep_rows, within_words
+from beers_deploy.bench.swath import Swath, predict_file
+from beers_deploy.bench.tables import frame_row, sweep_rows, within_words
 from beers_deploy.commands.bench import HostTask
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.cost.model import TASKS

@@ -11,7 +11,7 @@ import pytest
 from beers_deploy.bench.host import Timed, host_rows, time_networks
 from beers_deploy.export import float_model
 from beers_deploy.host_state import cpu_load, resident_bytes
-from beers_deploy.network import other_precision, shipped_pair
+from beers_deploy.network_files import other_precision, shipped_pair
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Row

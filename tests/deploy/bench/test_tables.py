@@ -7,17 +7,8 @@ import pytest
 import tifffile
 
 from beers_deploy.bench.board import TRAFFIC
-from beers_deploy.bench.tables import (
-    Swath,
-    efficiency,
-    layer_rows,
-    parse_size,
-    parse_tiles,
-    predict_file,
-    predicted_rows,
-    published_rows,
-    sweep_rows,
-)
+from beers_deploy.bench.swath import Swath, efficiency, parse_size, predict_file
+from beers_deploy.bench.tables import layer_rows, parse_tiles, predicted_rows, published_rows, sweep_rows
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import measured, predicted, unavailable

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beers_deploy.bench.tables import PAPER_SIZE, Swath, parse_size, processor_row
+from beers_deploy.bench.swath import PAPER_SIZE, Swath, parse_size
+from beers_deploy.bench.tables import processor_row
 from beers_deploy.bench.traditional import CROP_PX, drawn_acquisition, measure_chain
 from beers_deploy.profiles import load_sensor, load_target
 from tests.deploy.dpu.graphs import integer_convbeers

@@ -19,7 +19,7 @@ from beers_deploy.dpu.reading import network_of, read_network
 from beers_deploy.export import to_onnx
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.variants import Variant
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.quantise import Quantised, quantise_model
 from tests.deploy.dpu.graphs import IntegerSketch

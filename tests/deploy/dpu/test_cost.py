@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from beers_deploy.bench.tables import predict_file
+from beers_deploy.bench.swath import predict_file
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import Prediction, counted_power, layer_energy_j

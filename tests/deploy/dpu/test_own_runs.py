@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from beers_deploy.bench.tables import predict_file
+from beers_deploy.bench.swath import predict_file
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.cost.own_runs import SCATTER, OwnRuns, read_own_runs
 from beers_deploy.profiles.errors import OptionError

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beers_deploy.bench.tables import host_words, predict_file
+from beers_deploy.bench.swath import predict_file
+from beers_deploy.bench.tables import host_words
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import Prediction

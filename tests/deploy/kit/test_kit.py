@@ -20,7 +20,7 @@ from beers_deploy.kit.host_facts import host_facts
 from beers_deploy.kit.record import NAMES
 from beers_deploy.model.consistency import REACH_PX, Consistency, Placed
 from beers_deploy.model.exposure import HEADROOM, choose_factors, factors_for
-from beers_deploy.network import brighter_files
+from beers_deploy.network_files import brighter_files
 from beers_deploy.profiles.errors import OptionError, ProfileError
 from tests.deploy.command_line import done
 from tests.deploy.kit.test_golden import network

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from beers_deploy.model.io.files import sha256
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import MachineError
 from beers_deploy.restoration.cog import disk_bytes
 from beers_deploy.restoration.options import Compression, Options

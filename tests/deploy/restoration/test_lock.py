@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import tifffile
 
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import MachineError
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.restoration import output

@@ -10,7 +10,7 @@ import pytest
 
 from beers_deploy import library
 from beers_deploy.library import restore
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles import load_sensor
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration import method

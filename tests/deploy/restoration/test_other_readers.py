@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.restoration.cog import write_item
 from beers_deploy.restoration.options import Options

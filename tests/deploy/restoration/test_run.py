@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.quant.onnx_file import load_onnx

@@ -16,7 +16,7 @@ import tifffile
 
 from beers_deploy import cluster
 from beers_deploy.cluster import open_cluster
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import MachineError
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.tiling.walk import tiling_of

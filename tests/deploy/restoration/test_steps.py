@@ -15,7 +15,7 @@ import tifffile
 
 import beers_deploy as bd
 from beers_deploy.model.consistency import REACH_PX
-from beers_deploy.network import brighter_files, network_file
+from beers_deploy.network_files import brighter_files, network_file
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import MachineError, OptionError
 from beers_deploy.profiles.sensor import Sensor

@@ -12,7 +12,7 @@ from onnx import TensorProto, helper
 from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS
 from beers_deploy.model.variants import Variant
-from beers_deploy.network import shipped_pair
+from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.reading.folding import HALVES, OPSET, simplest

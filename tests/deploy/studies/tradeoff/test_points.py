@@ -9,7 +9,7 @@ import numpy as np
 import onnx
 import pytest
 
-from beers_deploy.bench.tables import Swath
+from beers_deploy.bench.swath import Swath
 from beers_deploy.export import to_onnx
 from beers_deploy.model.variants import Variant as Shape
 from beers_deploy.profiles import load_sensor, load_target
