@@ -6,7 +6,7 @@ are told to: `simulate`, `restore`, `quantize`, `compare`, `gate`, `check`, `pre
 for. Inside:
 
 - `network`: a network as a value; `library`, `quantise`, `verdict`, `pairs`, `board`: a verb or two each;
-- `restoration`: images of any size through a network or the traditional chain;
+- `restoration`: images of any size through a network or the traditional pipeline;
 - `dpu` and `bench`: the checker of operators, the cost model, and what they say of a swath;
 - `results`, `frames`, `report`: figures as tables, JSON, DataFrames and pages; `differences` of two of them;
 - `studies`: what the verbs are worth: `evaluation`, `characterise`, `stress`, `detection`, `tradeoff`, `demo`;

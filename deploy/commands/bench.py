@@ -67,7 +67,7 @@ def bench(
         ),
     ] = BOARD,
     sensor: Annotated[
-        str, typer.Option(help="What a shipped network is told: a profile, your .toml file, or blind.")
+        str, typer.Option(help="Sensor of a shipped network: a profile, your .toml file, or blind.")
     ] = SENSOR,
     image: Annotated[Path | None, typer.Option(help="Mono image of at most 12 bits: the swath.")] = None,
     full_scale: Annotated[

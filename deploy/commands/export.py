@@ -29,7 +29,7 @@ def export(
     ] = Path(VARIANT),
     sensor: Annotated[
         str | None,
-        typer.Option(help=f"What the network is told: a profile, your .toml file, or blind; {SENSOR} if none."),
+        typer.Option(help=f"Sensor of the network: a profile, your .toml file, or blind; {SENSOR} if none."),
     ] = None,
     tile: Annotated[
         int | None, typer.Option(min=16, max=8192, help="Fix the input to one tile of this side, 640 for a board.")

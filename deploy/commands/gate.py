@@ -23,9 +23,7 @@ def gate(
     target: Annotated[
         str, typer.Option(help=f"Board whose rules the INT8 file must keep: {RULED}.")
     ] = DEFAULT_TARGET,
-    sensor: Annotated[
-        str, typer.Option(help="Profile of the test patches, and what a shipped network is told.")
-    ] = SENSOR,
+    sensor: Annotated[str, typer.Option(help="Sensor of the test patches and of a shipped network.")] = SENSOR,
     images: Annotated[Path | None, typer.Option(help="Folder of scenes; drawn ones if none.")] = None,
     samples: Annotated[
         Path | None,

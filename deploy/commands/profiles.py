@@ -120,7 +120,7 @@ def characterise(
         typer.Option(metavar="FILE:X,Y,WIDTH,HEIGHT", help="A box with one straight edge; searched for if none."),
     ] = None,
     bits: Annotated[
-        int | None, typer.Option(min=1, max=16, help="Of a digital number; told by clipped pixels if none.")
+        int | None, typer.Option(min=1, max=16, help="Bits of a pixel; found from clipped pixels if none.")
     ] = None,
     gain: Annotated[
         float | None, typer.Option(help="DN per W/m2/sr/um; full scale is taken for 400 W/m2/sr/um if none.")

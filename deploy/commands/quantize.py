@@ -22,7 +22,7 @@ TITLES = {
 def quantize(
     context: typer.Context,
     model: Annotated[
-        Path, typer.Argument(help="Float ONNX or weights, or a shipped network's name, then told --sensor.")
+        Path, typer.Argument(help="Float ONNX or weights, or a shipped network's name, then for --sensor.")
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="INT8 ONNX for stock onnxruntime.")],
     target: Annotated[str, typer.Option(help=f"Whose rules to obey: {RULED}.")] = DEFAULT_TARGET,

@@ -32,11 +32,11 @@ NETWORK_ONLY = (
     "consistency",
     "exposure",
 )
-"""Options of which the traditional chain takes none."""
+"""Options of which the traditional pipeline takes none."""
 
 
 class Method(StrEnum):
-    """A network, or the traditional chain."""
+    """A network, or the traditional pipeline."""
 
     network = "network"
     traditional = "traditional"
@@ -47,7 +47,9 @@ def restore(
     image: Annotated[Path, typer.Argument(metavar="IN", help="Image: TIFF or what GDAL reads, of any size, or PNG.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="TIFF to write, of the type of IN.")],
     network: Restoring = None,
-    method: Annotated[Method, typer.Option(help="A network, or the traditional chain of --sensor.")] = Method.network,
+    method: Annotated[
+        Method, typer.Option(help="A network, or the traditional pipeline of --sensor.")
+    ] = Method.network,
     sensor: Annotated[
         str | None,
         typer.Option(

@@ -39,7 +39,7 @@ def stress(
         int, typer.Option(min=1, max=10_000, help="Injections into each memory at each rate, with --bit-flips.")
     ] = 6,
     sensor: Annotated[
-        str, typer.Option(help="What a shipped network is told; with --bit-flips also what sees the patches.")
+        str, typer.Option(help="Sensor of a shipped network; with --bit-flips also of the patches.")
     ] = SENSOR,
     images: Annotated[
         Path | None,

@@ -59,7 +59,7 @@ def tradeoff(
     seed: Seed = 0,
     json: Json = None,
 ) -> None:
-    """Measure networks and traditional chains on the same images, predict their runs on a board, recommend a point.
+    """Measure networks and traditional pipelines on the same images, predict board runs, and recommend a point.
 
     Measurements are kept: a second run, or one that was stopped, measures only what is missing. Exit code 1 where no
     point keeps --budget and --need; the page is written all the same.

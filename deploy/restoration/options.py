@@ -31,7 +31,7 @@ class Options:
     """What a user can choose of a restoration.
 
     Attributes:
-        model: the network's file; none of the traditional chain.
+        model: the network's file; none of the traditional pipeline.
         tile_px: longest side of a tile.
         halo: 'exact', or pixels of context around a tile.
         full_scale: the pixel value that is 1.0 to the network; None leaves it to deploy.restoration.radiometry.

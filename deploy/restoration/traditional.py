@@ -1,6 +1,6 @@
-"""The traditional chain on an image file of any size: what `restore --method traditional` does.
+"""The traditional pipeline on an image file of any size: what `restore --method traditional` does.
 
-Rows come and go in strips, so that memory grows with the width alone. What the chain does is known of the sensor: its
+Rows come and go in strips, so that memory grows with the width alone. The pipeline depends on the sensor alone: its
 MTF, noise and gain. The reference it imitates is seen with the sensor's own gain and bits, so that the output has the
 scale of the input.
 """
@@ -33,14 +33,14 @@ STRIP_PX = 128
 """Rows read at a time."""
 
 FIXED_BYTES, BYTES_PER_COLUMN = 100_000_000, 40_000
-"""Of memory that the chain takes, and more for each pixel of a row: some 700 rows, in several float32 copies.
+"""Of memory that the pipeline takes, and more for each pixel of a row: some 700 rows, in several float32 copies.
 Measured at 400 and 1200 columns: 75 MB and 30 kB."""
 
 
 def restore_file_traditionally(
     image: Path, out: Path, options: Options, log: Log = no_log, beside: Sequence[Path | None] = ()
 ) -> Row:
-    """As `deploy.restoration.run.restore_file`, of a mono image, by the traditional chain of its one sensor."""
+    """As `deploy.restoration.run.restore_file`, of a mono image, by the traditional pipeline of its one sensor."""
     started, sensor = time.perf_counter(), options.sensors[""]
     chain = Chain(sensor.nominal(), sensor.reference.nominal())
     with begun(image, out, options, beside) as source:
@@ -59,7 +59,7 @@ def restore_file_traditionally(
             fitted = _fitted(source, chain, scale.value, str(image))
             _fill(checkpoint, source, fitted, scale.value, str(image))
             write_output(checkpoint, source, options.compression)
-        except BaseException:  # a strip is no place to go on from: the chain looks hundreds of rows back
+        except BaseException:  # a strip is no place to go on from: the pipeline looks hundreds of rows back
             checkpoint.remove()
             raise
     time_s = time.perf_counter() - started
@@ -75,7 +75,7 @@ def restore_file_traditionally(
 
 
 def _fitted(source: Source, chain: Chain, full_scale: float, name: str) -> Chain:
-    """Derive the regularisation of the chain from a first pass over the image, which takes little of the time."""
+    """Derive the regularisation of the pipeline from a first pass over the image, which takes little of the time."""
     to_dn = chain.degraded.max_dn / full_scale
     with steps("measuring noise and contrast", source.raster.height_px) as bar:
         return chain.fitted_to(_counted(_read(source, to_dn, full_scale, name), bar))

@@ -85,7 +85,7 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
         "memory_byte_j": ("J", "energy of a byte through the memory, for the cross-check"),
         "dpu_run_w": ("W", "power of the board while the DPU runs"),
         "dpu_range_w": ("W", "interval of that power"),
-        "cpu_run_w": ("W", "power of the board while its processor runs the traditional chain"),
+        "cpu_run_w": ("W", "power of the board while its processor runs the traditional pipeline"),
     },
     "tile": {"memory_bytes": ("B", "memory of the board, into which maps must fit")},
     "cost": {

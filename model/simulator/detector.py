@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Pixels = TypeVar("Pixels", np.ndarray, "Tensor")
-"""The traditional chain computes with tensors."""
+"""The traditional pipeline computes with tensors."""
 
 NOISE_LIMIT = 6.0
 """Draws are clipped here (two in a billion), so that the effect of noise has a bound."""

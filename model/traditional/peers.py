@@ -1,7 +1,7 @@
 """Restorations of scikit-image, as peers for tables: each made to aim at the reference's MTF, none tuned further.
 
 The three deconvolutions undo the degraded MTF whole; the result is blurred to the reference's. Non-local means stands
-in the place of NL-Bayes in the chain.
+in the place of NL-Bayes in the pipeline.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The two traditional chains. Every number comes from the two sensors and from the image.
+"""The two traditional pipelines. Every number comes from the two sensors and from the image.
 
 - denoise first: stabilise, NL-Bayes, inverse, MTF compensation. NL-Bayes meets the white noise that it supposes;
   what it leaves is amplified afterwards.
@@ -52,7 +52,7 @@ class Chain:
     epsilon: float | None = None
 
     def fitted_to(self, strips: Iterable[Tensor]) -> "Chain":
-        """Return the chain with the epsilon for an image in strips (any, W) of digital numbers, NaN where missing.
+        """Return the pipeline with the epsilon for an image in strips (any, W) of digital numbers, NaN where missing.
 
         A chain that has an epsilon is returned as it is, and no strip is read.
         """
@@ -62,7 +62,7 @@ class Chain:
         return replace(self, epsilon=derived_epsilon(measured, self.degraded))
 
     def kernel(self) -> Tensor:
-        """Return the filter of the MTF compensation, (2 R + 1, 2 R + 1) float64, for the chain's epsilon."""
+        """Return the filter of the MTF compensation, (2 R + 1, 2 R + 1) float64, for the pipeline's epsilon."""
         if self.epsilon is None:
             remedy = "call Chain.fitted_to with the strips of the image first"
             raise OptionError("epsilon", expected="a number", got="None", remedy=remedy)

@@ -1,4 +1,4 @@
-"""The command check: its document, its picture, the traditional chain, and the page made from the rules."""
+"""The command check: its document, its picture, the traditional pipeline, and the page made from the rules."""
 
 import subprocess
 import sys

@@ -40,9 +40,9 @@ CHAINS: dict[str, tuple[str, Order]] = {
     **{f"{name}-{quality}": (quality, order) for name, order in ORDERS.items() for quality in QUALITIES},
     **{name: ("standard", order) for name, order in (ORDERS | dict.fromkeys(PEERS, ORDERS[TRADITIONAL])).items()},
 }
-"""Quality and order of each traditional chain, by name, and of its peers."""
+"""Quality and order of each traditional pipeline, by name, and of its peers."""
 WITHOUT_NETWORK = (DEGRADED, *CHAINS)
-"""The input itself, and the traditional chains and their peers."""
+"""The input itself, and the traditional pipelines and their peers."""
 
 KNOWN, BLIND = "known", "blind"
 """What a method knows of the sensor."""
@@ -72,7 +72,7 @@ class Method:
 
 
 def method_without_network(name: str, degraded: Instrument, reference: Instrument) -> Method:
-    """The input itself, or a traditional chain or a peer of it, which know both sensors: one of WITHOUT_NETWORK."""
+    """Return the method of WITHOUT_NETWORK: the input itself, or a traditional method that knows both sensors."""
     if name == DEGRADED:
         return Method(name, lambda dn: dn, "the input itself")
     (quality, order), run = CHAINS[name], PEERS.get(name, restore_traditional)

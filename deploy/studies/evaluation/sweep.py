@@ -112,7 +112,7 @@ def run_sweep(
 def _trials(
     name: str, sensor: Instrument, methods: Sequence[Method], profile: Sensor
 ) -> list[tuple[str, Instrument, Method]]:
-    """Under a condition the sensors supposed, by name, each with a method; the second of the methods is the chain."""
+    """Return name, sensor and method for each supposed sensor; the second of `methods` is the pipeline."""
     nominal = profile.nominal()
     units = replace(nominal, gain_dn_per_radiance=sensor.gain_dn_per_radiance)
     drifted = [] if name == NOMINAL else [(NOMINAL, units, methods[1])]
@@ -145,7 +145,7 @@ class Found:
 
     Attributes:
         psnr: in dB, (2, N): each image against the reference, and against the reference without noise.
-        mtf: after restoration, where the sensor is known as it is, and of the chain that supposes the nominal one.
+        mtf: after restoration, where the sensor is known as it is, and of the pipeline that supposes the nominal one.
         sites: of the images, (N,).
         seed: of the bootstrap.
         brightness: factor of the scenes' radiance.
@@ -164,7 +164,7 @@ class Found:
 
     @property
     def networks(self) -> list[str]:
-        """Names of the methods that are neither the input nor the chain."""
+        """Names of the methods that are neither the input nor the pipeline."""
         return [name for name in dict.fromkeys(name for *_, name in self.psnr) if name not in (DEGRADED, TRADITIONAL)]
 
     @property
@@ -186,19 +186,19 @@ class Found:
         return [replace(row, table=table_at(self.brightness, row.table)) for row in rows]
 
     def _columns(self, truth: str) -> dict[str, Key]:
-        """The input, the chain that knows the truth, the one that knows the nominal sensor, and each network."""
+        """The input, the pipeline that knows the truth, the one that knows the nominal sensor, and each network."""
         chains = {TRUTH_KNOWN: (truth, truth, TRADITIONAL), NOMINAL_KNOWN: (truth, NOMINAL, TRADITIONAL)}
         networks = {name: (truth, truth, name) for name in self.networks}
         return {DEGRADED: (truth, truth, DEGRADED), **chains, **networks}
 
     def _gains(self) -> list[Row]:
-        """How far each network is ahead of the chain that knows the truth: by condition, then over all of them."""
+        """How far each network is ahead of the pipeline that knows the truth: by condition, then over all of them."""
         psnr = {(truth, name): both[0] for (truth, supposed, name), both in self.psnr.items() if truth == supposed}
         gains = {
             truth: {name: psnr[truth, name] - psnr[truth, TRADITIONAL] for name in self.networks}
             for truth in self.conditions
         }
-        rows = [Row("sweep, gain over the chain", truth, self._means(each)) for truth, each in gains.items()]
+        rows = [Row("sweep, gain over the pipeline", truth, self._means(each)) for truth, each in gains.items()]
         over_all = [self._over_all(n, {truth: each[n] for truth, each in gains.items()}) for n in self.networks]
         return [*rows, *over_all] if over_all else []
 
@@ -206,7 +206,7 @@ class Found:
         least = min(gains, key=lambda truth: float(gains[truth].mean()))
         mean = self._mean(np.mean(list(gains.values()), axis=0))
         figures = {f"mean of {len(gains)} conditions": mean, "least": self._mean(gains[least])}
-        return Row("sweep, gain over the chain, all conditions", network, figures, {"least at": least})
+        return Row("sweep, gain over the pipeline, all conditions", network, figures, {"least at": least})
 
     def _wrong(self) -> list[Row]:
         """PSNR where each method supposes another sensor than the true one, and what it loses by that."""

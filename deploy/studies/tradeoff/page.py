@@ -31,7 +31,7 @@ NEAR_PX = 16
 """Marks no farther apart share a label."""
 PALE = 0.45
 MARKERS = ("o", "s", "D", "^", "v", "P", "X")
-CHAINS, LIBRARIES = "traditional chains", "other libraries"
+CHAINS, LIBRARIES = "traditional pipelines", "other libraries"
 SHOWN_WORDS = ("board", "configuration", "tile", "halo", "sensor")
 
 FRONT_CAPTION = (

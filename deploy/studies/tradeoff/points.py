@@ -165,7 +165,7 @@ def _require_tiles(name: str, tiling: Tiling) -> None:
 
 
 def points_of(networks: Iterable[Variant], boards: Sequence[TargetProfile], whole: Swath) -> list[Point]:
-    """Where networks, traditional chains and other libraries' ways are looked at.
+    """Where networks, traditional pipelines and other libraries' ways are looked at.
 
     Args:
         networks: in float32 and in INT8.
@@ -263,7 +263,7 @@ def board_figures(point: Point, whole: Swath, slower: float | None = None, runs:
     """The figures of a point's board; unavailable, with the reason, where it has none.
 
     Args:
-        point: a network on a DPU, or a traditional chain on the board's processor.
+        point: a network on a DPU, or a traditional pipeline on the board's processor.
         whole: the swath.
         slower: how many times as long a chain takes as CHAIN, measured on this machine.
         runs: how often the network runs on a tile of the measured images, a mean.

@@ -1,4 +1,4 @@
-"""The traditional chain on files: the pixels of the chain on the whole array, whatever the sensor."""
+"""The traditional pipeline on files: the pixels of the chain on the whole array, whatever the sensor."""
 
 from pathlib import Path
 from typing import Any

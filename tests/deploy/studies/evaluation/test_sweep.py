@@ -149,7 +149,7 @@ def known() -> Found:
 
 
 def test_the_interval_of_a_gain_is_that_of_differences_on_the_same_images() -> None:
-    nominal, blurred = (row.figures["net"] for row in by_table(known().rows)["sweep, gain over the chain"])
+    nominal, blurred = (row.figures["net"] for row in by_table(known().rows)["sweep, gain over the pipeline"])
     assert nominal.value == pytest.approx(0.75)
     assert nominal.interval == pytest.approx((0.75, 0.75))
     assert blurred.interval is not None
@@ -157,7 +157,7 @@ def test_the_interval_of_a_gain_is_that_of_differences_on_the_same_images() -> N
 
 
 def test_over_all_conditions_mean_and_least_gain_are_named() -> None:
-    (row,) = by_table(known().rows)["sweep, gain over the chain, all conditions"]
+    (row,) = by_table(known().rows)["sweep, gain over the pipeline, all conditions"]
     assert row.name == "net"
     assert row.figures["mean of 2 conditions"].value == pytest.approx((0.75 + 0.3) / 2)
     assert row.figures["least"].value == pytest.approx(0.3)
