@@ -3,8 +3,8 @@
     python benchmarks/steps_sensors.py --images aerial-test/ --json steps.json [--networks ...] [--part 0/2]
     python benchmarks/steps_sensors.py --table steps.json [...]
 
-One photograph of each site. PSNR of inner pixels against the reference without noise, less that of the same network
-without steps. --part runs every n-th sensor, and --table puts the parts together.
+One photograph of each site, or of every n-th with --every. PSNR of inner pixels against the reference without noise,
+less that of the same network without steps. --part runs every n-th sensor, and --table puts the parts together.
 """
 
 import argparse
@@ -45,6 +45,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     parser.add_argument("--networks", default=",".join(f"{n},{n}-int8" for n in NETWORKS.split(",")))
     parser.add_argument("--part", default="0/1")
+    parser.add_argument("--every", type=int, default=1, help="use every n-th site: large networks take hours")
     parser.add_argument("--table", nargs="+", type=Path, default=[])
     arguments = parser.parse_args()
     if arguments.table:
@@ -53,7 +54,8 @@ def main() -> None:
     scenes = load_scenes(arguments.images, REFERENCE.nominal(), SEED)
     of_sites = {site_of(scene.name): scene for scene in reversed(scenes)}
     part, parts = map(int, arguments.part.split("/"))
-    measure(list(of_sites.values()), arguments.networks.split(","), arguments.json, slice(part, None, parts))
+    sites = list(of_sites.values())[:: arguments.every]
+    measure(sites, arguments.networks.split(","), arguments.json, slice(part, None, parts))
 
 
 def measure(scenes: Sequence[Scene], networks: Sequence[str], out: Path, part: slice) -> None:

@@ -10,7 +10,7 @@ from .pairs import Pair as Pair
 from .pairs import simulate as simulate
 from .profiles.errors import BeersError as BeersError
 from .profiles.sensor import Sensor as Sensor
-from .quant.gate import Limits as Limits
+from .quant.limits import Limits as Limits
 from .quantise import quantize as quantize
 from .results import Table as Table
 from .studies.characterise import characterize as characterize

@@ -93,7 +93,8 @@ class Board(TargetProfile):
         vectors = write_golden(network, folder / "golden", board=self)
         network.core(self, np.load(vectors / "noise" / PICTURE).shape[-1]).save(vectors / "core.onnx")
         if record:
-            write_record(check(network, self, tile=tile), network, folder / "record")
+            sensor_of_it = Sensor.load(BLIND) if known is None else known
+            write_record(check(network, self, tile=tile), network, sensor_of_it, folder / "record")
         words = {"network": network.name, "board": self.name, "tile": tile, "reach": REACH_PX, "headroom": HEADROOM}
         write_text(folder / "README.md", README.read_text(encoding="utf-8").format(**words))
         return folder

@@ -50,6 +50,7 @@ class Network:
         origin: the float network that it was quantised from, where that was done here.
         layers: of a network that was quantised here, a row for each integer layer.
         quantised: its integers and the graph that they were rounded from, where it was quantised here by itself.
+        file_sha256: of the file as it was read; empty of one that is in memory alone.
 
     Examples:
         >>> bd.Network.load("convbeers-s-int8").precision
@@ -62,6 +63,7 @@ class Network:
     origin: "Network | None" = None
     layers: tuple[Row, ...] = ()
     quantised: "Quantised | None" = None
+    file_sha256: str = ""
 
     @classmethod
     def load(
@@ -92,8 +94,12 @@ class Network:
         if isinstance(network, str | os.PathLike):
             given = Path(network)
             path = network_file(given, Sensor.load(sensor), _warn)
+            before = network_sha256(path) if path.is_file() else ""  # which the reader refuses
             model = float_model(path) if to_run or path.suffix == ".safetensors" else load_onnx(path, to_run=False)
-            return cls(model, given.stem if path == given else given.name, path)
+            if before and network_sha256(path) != before:
+                expected = "a file that stays as it is while it is read"
+                raise ModelError(str(path), expected=expected, got="another one now", remedy="run the command again")
+            return cls(model, given.stem if path == given else given.name, path, file_sha256=before)
         return cls(exported(network, example), type(network).__name__)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
@@ -146,8 +152,8 @@ class Network:
 
     @cached_property
     def sha256(self) -> str:
-        """Of its file, or of its bytes where it is in memory alone."""
-        return network_sha256(self.path) if self.path else hashlib.sha256(self.model.SerializeToString()).hexdigest()
+        """SHA-256 of the file that was read, or of the network's bytes if it is in memory alone."""
+        return self.file_sha256 or hashlib.sha256(self.model.SerializeToString()).hexdigest()
 
     @property
     def input(self) -> Input:

@@ -90,6 +90,7 @@ class Table:
                 }
                 for row in self.rows
             ],
+            "notes": list(self.notes),
         }
 
     def save(self, path: str | os.PathLike[str]) -> Path:

@@ -18,6 +18,7 @@ from xml.etree import ElementTree as ET
 
 import onnx
 
+from beers_deploy.baseline import files_input, read_baseline, sensor_input
 from beers_deploy.dpu.board import BoardLike, ruled
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.checker.table import legality
@@ -26,26 +27,32 @@ from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.profiles.errors import OptionError, printable
-from beers_deploy.profiles.figures import Check
+from beers_deploy.profiles.figures import Check, Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, TargetProfile
-from beers_deploy.profiles.toml import read_json, unreadable
-from beers_deploy.quant.gate import METRICS, GateResult, Limits, judge, judge_saturation, limits_of, verdict_row
+from beers_deploy.quant.float_parts import float_note
+from beers_deploy.quant.gate import METRICS, GateResult, judge, judge_saturation, verdict_row
 from beers_deploy.quant.gate import compare as differences
+from beers_deploy.quant.limits import Limits, limits_of
 from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px, metadata, require_quantised
-from beers_deploy.quant.samples import CALIBRATED_ON, OwnSamples, samples_of, without
+from beers_deploy.quant.sample_range import range_row, recorded_range, uncovered
+from beers_deploy.quant.samples import CALIBRATED_ON, OwnSamples, digest_of, samples_of
 from beers_deploy.quant.session import open_any_size
 from beers_deploy.quant.structure import saturated_shares, structure_checks
-from beers_deploy.results import Input, Table, input_of
+from beers_deploy.results import Table
 
 if TYPE_CHECKING:
     from beers_deploy.quant.samples import Patches
 
-PATCHES = ("sensor", "images", "patches", "seed", "samples")
-"""The arguments that say what INT8 and float are compared on."""
+JUNIT_CHARACTERS = 2000
+"""Of a message in JUnit XML, at most."""
 
+LITTLE_CHANGE = 0.02
+"""Mean absolute change of the input, over full scale, up to which the default limit of the MAE suits a network.
+ConvBEERS changes it by 0.008."""
 
-ALL_SEEN = "calibration saw all of these samples"
+CONTRAST = 2.0
+"""By how much the contrast of the results must exceed the limit of the MAE."""
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -55,12 +62,16 @@ class Comparison(Table):
     Attributes:
         result: the differences.
         shares: of each layer's results the share at the ends of 8 bits.
-        float_sha256: of the float network.
+        floating: the float network.
+        int8: the INT8 network.
+        sensor: of the simulated patches, and of shipped networks.
     """
 
     result: GateResult
     shares: Mapping[str, float]
-    float_sha256: str
+    floating: Network
+    int8: Network
+    sensor: Sensor
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -113,14 +124,14 @@ def compare(
     metric: str | None = None,
     progress: Progress = None,
 ) -> Comparison:
-    """Compare an INT8 network with its float network, on patches or samples that calibration did not see.
+    """Compare an INT8 network with its float network, on patches that calibration did not see or on given samples.
 
     Args:
         int8: the INT8 network.
         against: the float one; where it is None, the one that `int8` was quantised from here.
-        samples: a path, arrays or whatever `quantize` takes; None for simulated patches. Of samples that include
-            those of its calibration only the others are used.
-        sensor: of the simulated patches, and what shipped networks are told.
+        samples: a path, arrays or whatever `quantize` takes, none of which calibration should have seen; None for
+            simulated patches.
+        sensor: of the simulated patches and of shipped networks.
         images: folder of scenes for them; None for drawn ones.
         patches: how many of 128 x 128 are simulated.
         seed: of the patches.
@@ -129,7 +140,7 @@ def compare(
 
     Raises:
         ModelError: a file that is not what it should be.
-        OptionError: no float network, or samples that were all calibrated on.
+        OptionError: no float network, or a metric that is none.
         ImageError: samples that the networks do not take.
 
     Examples:
@@ -143,16 +154,42 @@ def compare(
     ours, theirs = _pair(int8, against, known)
     scenes = None if images is None else Path(images)
     with reporting(progress), faults_named(theirs.label):
-        unseen, simulated, notes = _unseen(ours, theirs, known, samples, scenes, patches, seed)
+        judged, simulated, notes = _samples(ours, theirs, known, samples, scenes, patches, seed)
         sessions = open_any_size(theirs.model), open_any_size(ours.model)
-        result = differences(*sessions, unseen.pairs, simulated, metric)
-        shares = saturated_shares(ours.model, unseen.degraded)
+        result = differences(*sessions, judged.pairs, simulated, metric)
+        shares = saturated_shares(ours.model, judged.degraded)
     arguments: dict[str, object] = {"float": theirs.name, "int8": ours.name, "sensor": known.name, "images": images}
     arguments |= {"patches": patches, "seed": seed, "samples": samples if isinstance(samples, str | Path) else None}
-    own = [Path(samples)] if isinstance(samples, str | Path) and Path(samples).is_file() else []
-    inputs = theirs.input, ours.input, *map(input_of, own)
-    table = "compare", arguments, inputs, (verdict_row(result, shares),)
-    return Comparison(*table, notes=notes, result=result, shares=shares, float_sha256=theirs.sha256)
+    inputs = [theirs.input, ours.input, sensor_input(known)]
+    if scenes is not None and simulated:
+        inputs.append(files_input("scenes", scenes))
+    if isinstance(samples, str | Path):
+        inputs.append(files_input("samples", Path(samples)))
+    rows, range_notes = _range_rows(ours, result)
+    return Comparison(
+        "compare",
+        arguments,
+        tuple(inputs),
+        (verdict_row(result, shares), *rows),
+        notes=(*notes, *range_notes),
+        result=result,
+        shares=shares,
+        floating=theirs,
+        int8=ours,
+        sensor=known,
+    )
+
+
+def _range_rows(int8: Network, result: GateResult) -> tuple[list[Row], list[str]]:
+    """Return the range of the samples, the one that the INT8 file records, and a note if bright ground is missing."""
+    judged = result.sample_range
+    assert judged is not None  # noqa: S101 - `quant.gate.compare` measures it
+    rows = [range_row(judged, "judged on", result.source)]
+    recorded = recorded_range(metadata(int8.model))
+    if recorded is not None:
+        rows.append(range_row(recorded, "calibrated on", "recorded in the INT8 file, which nothing verifies"))
+    note = uncovered(judged, recorded)
+    return rows, [note] if note else []
 
 
 def gate(
@@ -177,8 +214,8 @@ def gate(
         against: the float network.
         samples: what both are compared on.
         board: whose rules the INT8 file must keep.
-        limits: names and numbers, such as {"mae": 0.001}, or a TOML file; None for the default of the MAE.
-        baseline: what an earlier gate wrote as JSON: the MAE may not grow.
+        limits: names and numbers, such as {"mae": 0.001}, or a TOML file; what they leave out has its default.
+        baseline: what an earlier gate that passed wrote as JSON: the MAE may not grow.
         sensor: of the simulated patches.
         images: folder of scenes for them.
         patches: how many.
@@ -188,7 +225,7 @@ def gate(
 
     Raises:
         ModelError: a file that is not what it should be.
-        OptionError: as in `compare`, or limits or a baseline that do not fit.
+        OptionError: as in `compare`, limits or a baseline that do not fit, or too little contrast for the limits.
         ImageError: samples that the networks do not take.
         ProfileError: no such board or sensor.
 
@@ -205,7 +242,7 @@ def gate(
     arguments: dict[str, object] = {"max_mae": allowed.mae, "limits": config, "baseline": baseline}
     arguments |= {"target": target.name, "sensor": told, "images": images, "patches": patches, "seed": seed}
     arguments |= {"samples": data} | ({"metric": metric} if metric else {})
-    before = None if baseline is None else baseline_mae(Path(baseline), arguments)
+    before = None if baseline is None else read_baseline(Path(baseline), arguments)
     if before is None and allowed.mae_growth is not None:
         remedy = "give what an earlier 'gate --json' wrote, or leave that limit out"
         raise OptionError("baseline", expected="one beside the limit mae_growth", got="none", remedy=remedy)
@@ -217,14 +254,37 @@ def gate(
         _require_references(samples_of(theirs.model, samples), wanted)
     how: dict[str, Any] = {"sensor": known, "images": images, "patches": patches, "seed": seed, "metric": metric}
     found = compare(ours, theirs, samples, **how, progress=progress)
-    if ALL_SEEN in found.notes:
-        expected, remedy = "samples that calibration did not see", "give others, or quantise with four or more"
-        raise OptionError("samples", expected=expected, got="those of the calibration", remedy=remedy)
-    if baseline is not None:
-        require_same_float(Path(baseline), found)
-    checks = judge(found.result, allowed, before) + judge_saturation(found.shares, allowed)
+    _require_contrast(found.result, allowed)
+    if before is not None:
+        before.require_same(theirs.sha256, found.result.psnr_float_db, found.inputs[2:])
+    checks = judge(found.result, allowed, before.mae if before else None)
+    checks += judge_saturation(found.shares, allowed)
     checks += file_checks(theirs.model, ours, target)
-    return Verdict("gate", arguments, found.inputs, found.rows, tuple(checks), notes=found.notes, comparison=found)
+    notes = (*found.notes, *_mae_note(found.result, allowed, checks), *float_note(ours.model))
+    return Verdict("gate", arguments, found.inputs, found.rows, tuple(checks), notes=notes, comparison=found)
+
+
+def _require_contrast(result: GateResult, limits: Limits) -> None:
+    """Raise OptionError if a network that returned the mean of each sample would keep the limit of the MAE."""
+    if limits.mae is None or not result.contrast < CONTRAST * limits.mae:
+        return
+    expected = f"results with a contrast of at least {CONTRAST * limits.mae:.3g} of full scale, twice the MAE limit"
+    got = f"a mean absolute deviation of {result.contrast:.3g}, so that a network which returns a mean would pass"
+    raise OptionError(
+        "samples", expected=expected, got=got, remedy="give samples with more contrast, or a lower limit"
+    )
+
+
+def _mae_note(result: GateResult, limits: Limits, checks: Sequence[Check]) -> list[str]:
+    """Return a note if the MAE broke its default limit and that does not suit the network."""
+    broken = any(check.name == "MAE" and not check.passed for check in checks)
+    if not broken or limits.mae != Limits().mae or result.input_change <= LITTLE_CHANGE:
+        return []
+    what = "results have another size than the input"
+    if not math.isnan(result.input_change):
+        what = f"float results differ from the input by {result.input_change:.3g} of full scale in the mean"
+    suits = f"the MAE limit of {limits.mae:g} suits networks that change their input little (ConvBEERS by 0.008)"
+    return [f"{suits}; here the {what}: choose --max-mae for this network, and look at the PSNR drop"]
 
 
 def _pair(int8: NetworkLike, against: NetworkLike | None, sensor: Sensor) -> tuple[Network, Network]:
@@ -240,69 +300,31 @@ def _pair(int8: NetworkLike, against: NetworkLike | None, sensor: Sensor) -> tup
     return ours, theirs
 
 
-def _unseen(
+def _samples(
     int8: Network, floating: Network, sensor: Sensor, samples: object, images: Path | None, patches: int, seed: int
 ) -> "tuple[Patches, bool, tuple[str, ...]]":
-    """What the two are compared on, whether it is simulated, and what a reader must know of it."""
+    """Return what the two are compared on, whether it is simulated, and notes for the reader.
+
+    All samples that were given are judged. The INT8 file says which of them it was calibrated on, but it may not
+    choose its judges: that is a note.
+    """
     own = samples_of(floating.model, samples)
     if own is None:
         from beers_deploy.quant.calibration import unseen_patches  # SciPy, which samples of one's own do without
 
         return unseen_patches(sensor, images, patches, seed), True, ()
     calibrated = set(metadata(int8.model).get(CALIBRATED_ON, "").split())
-    found, count = without(own.all, calibrated), len(own.all.pairs)
-    if len(found.pairs) == count:
-        return found, False, ()
-    if not found.pairs:
-        return own.all, False, (ALL_SEEN,)
-    return found, False, (f"{len(found.pairs)} of {count} samples: the others were calibrated on",)
+    count = sum(digest_of(degraded) in calibrated for degraded in own.all.degraded)
+    if count == 0:
+        return own.all, False, ()
+    note = f"by the INT8 file's own record, {count} of the {len(own.all.pairs)} samples were its calibration"
+    return own.all, False, (f"{note}: on those INT8 loses less than on others",)
 
 
 def _require_references(own: OwnSamples | None, wanted: str) -> None:
     if own is not None and not any(reference.size for _, reference in own.all.pairs):
         expected, remedy = f"references for {wanted}", "give images and references, or leave it out"
         raise OptionError("samples", expected=expected, got="images alone", remedy=remedy)
-
-
-def baseline_mae(path: Path, arguments: Mapping[str, Any]) -> float:
-    """The MAE in a document that an earlier `gate --json` wrote, of the same patches as with these arguments."""
-    try:
-        document: Any = read_json(path)
-        before = {name: _plain(name, dict(document["arguments"]).get(name)) for name in PATCHES}
-        mae = float(next(row["figures"]["MAE"]["value"] for row in document["rows"] if row["table"] == "gate"))
-    except (OSError, ValueError, KeyError, TypeError, StopIteration) as error:
-        got = unreadable(path) or "another document"
-        remedy = "give what 'gate --json' wrote"
-        raise OptionError(str(path), expected="a gate's results", got=got, remedy=remedy) from error
-    for name in PATCHES:
-        now = _plain(name, arguments.get(name))
-        if before[name] != now:
-            expected, got = f"a baseline of the same patches ({name} {now})", f"{name} {before[name]}"
-            raise OptionError(str(path), expected=expected, got=got, remedy="make it anew with these")
-    return mae
-
-
-SAME_DB = 0.01
-"""Between the PSNRs of one float network on two processors: most differ by less than a thousandth."""
-
-
-def require_same_float(path: Path, found: Comparison) -> None:
-    """Refuse the baseline of another float network: by its file, or else by its PSNR on the same patches."""
-    document: Any = read_json(path)
-    before = next(row["figures"].get("PSNR float", {}) for row in document["rows"] if row["table"] == "gate")
-    same_psnr = abs(found.result.psnr_float_db - float(before.get("value") or math.nan)) < SAME_DB
-    digests, remedy = [each["sha256"] for each in document["inputs"]], "make it anew with 'gate --json'"
-    if not same_psnr and found.float_sha256 not in digests:
-        raise OptionError(str(path), expected="a baseline of this float network", got="another's", remedy=remedy)
-    own = [each for each in found.inputs[2:] if isinstance(each, Input)]
-    if own and len(digests) > 2 and own[0].sha256 not in digests:
-        expected, got = "a baseline of the same samples", f"one of another {own[0].name}"
-        raise OptionError(str(path), expected=expected, got=got, remedy=remedy)
-
-
-def _plain(name: str, value: object) -> str:
-    """As text; of a folder of images its name, for it may lie elsewhere."""
-    return Path(str(value)).name if name == "images" else str(value)
 
 
 def file_checks(float_model: onnx.ModelProto, int8: Network, target: TargetProfile) -> list[Check]:
@@ -320,6 +342,15 @@ def sentence(checks: Sequence[Check], passed: str) -> str:
     if not failed:
         return f"passed, all {len(checks)} checks: {passed}"
     return f"FAILED, {len(failed)} of {len(checks)} checks: {'; '.join(failed)}"
+
+
+def junit_error(title: str, message: str) -> str:
+    """Return JUnit XML that says that nothing could be judged, and why."""
+    suite = ET.Element("testsuite", name=printable(title), attrib={"tests": "1", "failures": "0", "errors": "1"})
+    case = ET.SubElement(suite, "testcase", classname=printable(title), name="gate")
+    text = printable(message, JUNIT_CHARACTERS)
+    ET.SubElement(case, "error", message=text).text = text
+    return ET.tostring(suite, encoding="unicode") + "\n"
 
 
 def junit_text(title: str, checks: Sequence[Check]) -> str:

@@ -116,7 +116,7 @@ def by_table(rows: Iterable[Row]) -> dict[str, list[Row]]:
 
 Bound = Literal["at most", "at least"]
 
-IN_THE_NAME = {"ratio", "node", "ReLU", "fault", "step", "opset", "size"}
+IN_THE_NAME = {"ratio", "node", "layer", "ReLU", "fault", "step", "opset", "size"}
 """Units that a check's name tells a reader already."""
 
 

@@ -22,6 +22,7 @@ from beers_deploy.model.training.patches import PatchRecipe, turn
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.profiles.sensor_file import reference_for
+from beers_deploy.quant.lighting import CALIBRATION, JUDGING, Lighting, assign_lightings, full_scale_radiance
 from beers_deploy.quant.samples import PATCH_PX, Pair, Patches, Remade
 
 VIEW_CANDIDATES = 8
@@ -62,10 +63,15 @@ class Ground:
         """In W/m2/sr/um, on the scene's grid: a square of side_px * oversampling."""
         return self.exposure * self._part(1)
 
+    @property
+    def sampled_radiance(self) -> np.ndarray:
+        """One scene pixel for each target pixel, in W/m2/sr/um."""
+        return self.exposure * self._part(self.oversampling)
+
     @cached_property
     def brightness(self) -> float:
-        """Its mean radiance, to within what one scene pixel in each target pixel tells."""
-        return self.exposure * float(self._part(self.oversampling).mean())
+        """Its mean radiance in W/m2/sr/um, estimated from `sampled_radiance`."""
+        return float(self.sampled_radiance.mean())
 
     def _part(self, step: int) -> np.ndarray:
         side = self.side_px * self.oversampling
@@ -154,8 +160,9 @@ def draw_patches(
     seed: int,
     patch_px: int = PATCH_PX,
     family: SensorFamily | None = None,
+    lightings: Sequence[Lighting] = (),
 ) -> Patches:
-    """Patches by sensor profile and seed, spread over the profile's ranges and over brightness.
+    """Draw patches by sensor profile and seed, spread over the profile's ranges and over brightness.
 
     Args:
         scenes: that are seen.
@@ -165,6 +172,8 @@ def draw_patches(
         seed: of everything that is drawn.
         patch_px: side of a patch.
         family: of sensors with the gain and bits of `degraded`.
+        lightings: how the ground is lit, so that the patches cover the sensor's range; without any it is as bright as
+            the scenes show it.
 
     Raises:
         ImageError: no scene holds a patch.
@@ -172,6 +181,8 @@ def draw_patches(
     """
     recipe = PatchRecipe(degraded, reference, patch_px=patch_px, family=family)
     views = draw_views(scenes, recipe, count, Draw(seed).generator("views"))
+    if lightings:
+        views = relit(views, lightings, Draw(seed).generator("lighting"))
 
     def pair(number: int) -> Pair:
         view = views[number]
@@ -182,6 +193,17 @@ def draw_patches(
         return _simulate(views[number].ground, (views[number].degraded,), Draw(seed, number))[0]
 
     return Patches(views, Remade(pair, count), Remade(alone, count))
+
+
+def relit(views: Sequence[View], lightings: Sequence[Lighting], generator: np.random.Generator) -> list[View]:
+    """Return the same views, their ground lit in the shares of the lightings."""
+    assigned = assign_lightings(len(views), lightings, generator)
+    result = []
+    for view, lighting in zip(views, assigned, strict=True):
+        full_scale = full_scale_radiance(view.degraded)
+        factor = lighting.factor(view.ground.sampled_radiance, full_scale, generator)
+        result.append(replace(view, ground=replace(view.ground, exposure=factor * view.ground.exposure)))
+    return result
 
 
 def _simulate(ground: Ground, sensors: Sequence[Instrument], draw: Draw) -> list[np.ndarray]:
@@ -229,7 +251,9 @@ class Calibration:
         return {"calibration_sensor": self.sensor.name, "calibration_seed": str(self.seed)}
 
     def _draw(self, count: int, seed: int) -> Patches:
-        return draw_patches(self._scenes, self.sensor, self._reference, count, seed, self.patch_px)
+        return draw_patches(
+            self._scenes, self.sensor, self._reference, count, seed, self.patch_px, lightings=CALIBRATION
+        )
 
     @cached_property
     def _scenes(self) -> list[Scene]:
@@ -251,4 +275,4 @@ def unseen_patches(degraded: Sensor, images: Path | None, patches: int, seed: in
     """
     reference, other = reference_for(degraded), seed + HELD_OUT_SEED
     scenes = load_scenes(images, reference.nominal(), other, patches)
-    return draw_patches(scenes, degraded, reference, patches, other)
+    return draw_patches(scenes, degraded, reference, patches, other, lightings=JUDGING)

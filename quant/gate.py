@@ -1,11 +1,9 @@
-"""The float/INT8 gate: what INT8 changes, and the limits, by name, that say whether that is too much."""
+"""The float/INT8 gate: measure what INT8 changes, and compare it with the limits."""
 
 import math
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import onnxruntime as ort
@@ -13,7 +11,8 @@ import onnxruntime as ort
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Check, Figure, Row, measured, unavailable
-from beers_deploy.profiles.toml import read_toml_text, unreadable
+from beers_deploy.quant.limits import MAE_GROWTH, Limits
+from beers_deploy.quant.sample_range import RangeCounts, SampleRange
 from beers_deploy.quant.session import result_of
 from beers_deploy.quant.untrusted import times
 
@@ -96,7 +95,9 @@ class GateResult:
 
     `same_class` is the share of results whose largest channel is the same: of networks that tell classes, else NaN.
     `metric` is what the user measures results by, `metric_float` and `metric_int8` what was found of the two.
-    `worst_drop_db` is what the patch loses that loses most.
+    `worst_drop_db` is what the patch loses that loses most. `input_change` is the mean absolute difference of the
+    float results from their inputs, NaN where these have another shape. `contrast` is the mean absolute deviation of
+    the float results from their own means. `sample_range` says which part of the range the samples cover.
     """
 
     mae: float
@@ -114,6 +115,9 @@ class GateResult:
     metric: str = ""
     metric_float: float = math.nan
     metric_int8: float = math.nan
+    input_change: float = math.nan
+    contrast: float = math.nan
+    sample_range: SampleRange | None = None
 
     @property
     def metric_loss(self) -> float:
@@ -130,6 +134,16 @@ class GateResult:
     def drop_db(self) -> float:
         """PSNR lost against the reference."""
         return self.psnr_float_db - self.psnr_int8_db
+
+    @property
+    def gain_db(self) -> float:
+        """PSNR that the float network gains over its input."""
+        return self.psnr_float_db - self.psnr_degraded_db
+
+    @property
+    def drop_share(self) -> float:
+        """PSNR lost over PSNR gained by the float network; NaN where that gains nothing, or without references."""
+        return self.drop_db / self.gain_db if self.gain_db > 0 else math.nan
 
     @property
     def std_over_mae(self) -> float:
@@ -159,8 +173,15 @@ def compare(
         ModelError: results of different shapes.
         OptionError: references that the metric does not take.
     """
-    differences, errors, agreeing, measured_by = [], [], [], list[list[Parts]]()
+    differences = []
+    errors = []
+    agreeing = []
+    changes = []
+    contrasts = []
+    counts = RangeCounts()
+    measured_by = list[list[Parts]]()
     for degraded, reference in pairs:
+        counts.add(degraded)
         results = [result_of(s, degraded) for s in (float_session, int8_session)]
         if results[0].shape != results[1].shape:
             expected, got = (times(result.shape) for result in results)
@@ -172,6 +193,9 @@ def compare(
         is_image = results[0].ndim == 4 and results[0].shape[1] == degraded.shape[1] and bool(inside >= MOST)
         in_float, in_int8 = (_as_in_a_file(result, is_image) for result in results)
         differences.append((in_int8 - in_float).ravel())
+        same_shape = in_float.shape == degraded.shape
+        changes.append(float(np.abs(in_float - degraded).mean()) if same_shape else math.nan)
+        contrasts.append(float(np.abs(in_float - in_float.mean()).mean()))
         errors.append([_psnr_db(image, reference) for image in (degraded, in_float, in_int8)])
         if metric is not None:
             measured_by.append([parts_of(metric, result, reference) for result in (in_float, in_int8)])
@@ -193,6 +217,9 @@ def compare(
         metric_float=value_of([parts for parts, _ in measured_by]),
         metric_int8=value_of([parts for _, parts in measured_by]),
         worst_drop_db=float(np.max([in_float - in_int8 for _, in_float, in_int8 in errors])),
+        input_change=float(np.mean(changes)),
+        contrast=float(np.mean(contrasts)),
+        sample_range=counts.range,
     )
 
 
@@ -209,103 +236,6 @@ def _psnr_db(image: np.ndarray, reference: np.ndarray) -> float:
     return psnr_db(image, reference, 1.0) if reference.shape == image.shape else math.nan
 
 
-@dataclass(frozen=True)
-class Limits:
-    """The largest values allowed; None for no limit. Differences and shares in [0, 1], PSNRs in dB.
-
-    Attributes:
-        mae: mean absolute difference of INT8 from float.
-        p999: 99.9th percentile of its size.
-        std_over_mae: 1.25 is rounding alone; clipping drives it up.
-        psnr_drop_db: PSNR lost against the reference.
-        min_psnr_float_int8_db: smallest PSNR of INT8 against float.
-        metric_loss: what INT8 loses by the metric that is chosen.
-        saturated: share of a layer's results at the ends of 8 bits, of the layer with most.
-        mae_growth: how many times a stored baseline's MAE; 1.05 where there is a baseline and no such limit.
-
-    Examples:
-        >>> bd.Limits(psnr_drop_db=0.2).mae
-        0.0007
-    """
-
-    mae: float | None = 0.0007
-    p999: float | None = None
-    std_over_mae: float | None = None
-    psnr_drop_db: float | None = None
-    min_psnr_float_int8_db: float | None = None
-    metric_loss: float | None = None
-    saturated: float | None = None
-    mae_growth: float | None = None
-
-
-MAE_GROWTH = 1.05
-BREAKABLE = {
-    "mae": (0.0, 0.5),
-    "p999": (0.0, 0.9),
-    "std_over_mae": (0.0, 1000.0),
-    "psnr_drop_db": (0.0, 100.0),
-    "min_psnr_float_int8_db": (10.0, 1000.0),
-    "metric_loss": (0.0, 100.0),
-    "saturated": (0.0, 0.9),
-    "mae_growth": (0.0, 100.0),
-}
-"""What limits may be: images in [0, 1] differ by no more, no layer saturates more, and no network is so far off."""
-
-
-def limits_of(
-    given: "Limits | Mapping[str, float] | str | os.PathLike[str] | None", max_mae: float | None = None
-) -> Limits:
-    """Limits by their names, of a TOML file such as `mae = 0.0007`, or the defaults for None; `max_mae` overrides.
-
-    Raises:
-        OptionError: no limits, unknown ones, or some that no network breaks.
-    """
-    if isinstance(given, str | os.PathLike):
-        limits = _parse(Path(given))
-    else:
-        limits = _named("limits", given) if isinstance(given, Mapping) else _breakable("limits", given or Limits())
-    return limits if max_mae is None else _breakable("max_mae", replace(limits, mae=max_mae))
-
-
-def _breakable(where: str, limits: Limits) -> Limits:
-    """Limits that a network can break: a gate that cannot fail is none."""
-    for name, (low, high) in BREAKABLE.items():
-        value = getattr(limits, name)
-        if value is not None and not low <= value <= high:
-            expected, remedy = f"{name} of {low:g} to {high:g}", "set one that a broken network would not keep"
-            raise OptionError(where, expected=expected, got=f"{value:g}", remedy=remedy)
-    return limits
-
-
-def _parse(path: Path) -> Limits:
-    try:
-        raw = read_toml_text(path)
-    except (OSError, ValueError) as error:
-        got, expected = unreadable(path) or str(error), "a TOML file of limits"
-        raise OptionError(str(path), expected=expected, got=got, remedy="write mae = 0.0007") from error
-    return _named(str(path), raw)
-
-
-def _named(where: str, raw: Mapping[str, object]) -> Limits:
-    names = [field.name for field in fields(Limits)]
-    if not raw:
-        expected = f"at least one of {', '.join(names)}"
-        raise OptionError(where, expected=expected, got="no limit", remedy="write mae = 0.0007")
-    for name, value in raw.items():
-        if name not in names or not _is_limit(value):
-            expected = f"numbers above 0 named {', '.join(names)}"
-            raise OptionError(where, expected=expected, got=f"{name} = {value!r}", remedy="correct that line")
-    given: dict[str, Any] = {**dict.fromkeys(names), **raw}
-    return _breakable(where, Limits(**given))
-
-
-def _is_limit(value: object) -> bool:
-    """A number above 0, of no more digits than are compared with others."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return value > 0 and (isinstance(value, float) or value < 1 << 64)
-
-
 def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None) -> list[Check]:
     """Every limit that is set, against what was found."""
     scale = "of full scale"
@@ -315,6 +245,9 @@ def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None)
         _at_most("std / MAE", result.std_over_mae, limits.std_over_mae, "ratio"),
         _at_most("PSNR drop", result.drop_db, limits.psnr_drop_db, "dB"),
     ]
+    if result.gain_db > 0:  # without references it is NaN
+        gained = f"the float network gains {result.gain_db:.2f} dB"
+        checks.append(_at_most("PSNR drop over gain", result.drop_share, limits.drop_share, "ratio", gained))
     if limits.metric_loss is not None and result.metric:
         unit = METRICS[result.metric].unit
         checks.append(_at_most(f"{result.metric} lost", result.metric_loss, limits.metric_loss, unit))

@@ -49,7 +49,7 @@ from beers_deploy.quant.passes.equalise import (
     with_room,
 )
 from beers_deploy.quant.passes.fit_weights import fit_weights
-from beers_deploy.quant.passes.level import Chain, chain_ranges, level
+from beers_deploy.quant.passes.level import Chain, chain_ranges, largest_values, level
 from beers_deploy.quant.passes.lower import lower
 from beers_deploy.quant.passes.stream import (
     MAX_CHANNELS,
@@ -64,6 +64,8 @@ from beers_deploy.quant.passes.stream import (
     window_offsets,
     windowed,
 )
+from beers_deploy.quant.sample_range import KEY as CALIBRATION_RANGE
+from beers_deploy.quant.sample_range import range_of
 from beers_deploy.quant.samples import Patches, Remade
 from beers_deploy.quant.session import TILE_PX, crops, halo_of, open_session, result_of, tensor_values, values_of
 
@@ -74,6 +76,8 @@ SEARCH_CROPS = 16
 """What the equalisation is searched on, a quarter of them with the strongest edges: there int8 clips. Small crops say
 less each, so more of them are taken."""
 MOST_CROPS = 64
+LEAST_CHANGE = 1e-4
+"""Of full scale, added to what a network changes in a crop: a crop that it leaves as it is must not decide alone."""
 
 STREAM_STEP = 2.0**-STREAM_FRAC_BITS
 """The value of one unit of the streams' tensors."""
@@ -201,7 +205,14 @@ def quantise_model(
 
         # Patches that hold few roofs would train the last sum's room away.
         core, steps = tune(core, graph, tuning, still=last_sum, log=log)
-    about = {**metadata(model), "precision": "int8 legal", "calibration_sha256": patches.digest, **about}
+    covered = range_of(patches.degraded).to_words()
+    about = {
+        **metadata(model),
+        "precision": "int8 legal",
+        "calibration_sha256": patches.digest,
+        CALIBRATION_RANGE: covered,
+        **about,
+    }
     about["passes"] = f"{PASSES}, {LOWERED}" if any(getattr(op, "offset", 0.0) for op in final) else PASSES
     if tuning:
         about["finetune"] = f"{steps} steps on {len(tuning.pairs)} patches"
@@ -295,7 +306,7 @@ def _levelled(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray]
     graph = plan.chain.scaled(graph, level(graph, plan.chain, ranges, np.ones(len(ranges)), trial))
     if not plan.ends.offsets:
         return graph
-    largest = chain_ranges(graph, plan.chain, images, plan.ends, quantile=1.0)
+    largest = largest_values(graph, plan.chain, images, plan.ends)
     return plan.chain.scaled(graph, FULL / np.maximum(largest, FULL))
 
 
@@ -345,13 +356,21 @@ def search_targets(graph: Graph, ends: Ends, images: Remade[np.ndarray]) -> Targ
 def crop_costs(model: onnx.ModelProto, targets: Targets) -> Costs:
     """Root mean squared difference of an integer network from the float one, by crop.
 
-    Squared, because clipping is rare and must count; its root, so that no single crop that clips decides alone.
+    Squared, because clipping is rare and must count; its root, so that no single crop that clips decides alone. It is
+    relative to what the float network changes in the crop: a loss of PSNR is relative too, and in absolute terms
+    bright crops with large corrections would outweigh the dark ones, where the same step costs most.
     """
     session = open_session(model, threads=1)
 
     def cost(number: int) -> float:
         image, wanted = targets[number]
-        return float(np.sqrt(np.square(result_of(session, image) - wanted, dtype=np.float64).mean()))
+        return rms(result_of(session, image) - wanted) / changes[number]
+
+    def rms(values: np.ndarray) -> float:
+        return float(np.sqrt(np.square(values, dtype=np.float64).mean()))
+
+    same_size = all(image.shape == wanted.shape for image, wanted in targets)
+    changes = [rms(wanted - image) + LEAST_CHANGE if same_size else 1.0 for image, wanted in targets]
 
     def of(crops: np.ndarray | None) -> np.ndarray:
         # Small crops keep cores busier one to each than all on one: threads that share a crop wait for each other.

@@ -8,7 +8,7 @@ should give beside what it reads, as `image` and `reference`.
 import hashlib
 import os
 import zipfile
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -166,11 +166,6 @@ DIGEST_DIGITS = 16
 def digest_of(sample: np.ndarray) -> str:
     """A sample (1, C, h, w), told from any other."""
     return hashlib.sha256(np.ascontiguousarray(sample, np.float32).tobytes()).hexdigest()[:DIGEST_DIGITS]
-
-
-def without(samples: Patches, calibrated: Collection[str]) -> Patches:
-    """The samples whose digests are not among these."""
-    return _patches([pair for pair in samples.pairs if digest_of(pair[0]) not in calibrated])
 
 
 def split_samples(samples: Patches) -> tuple[Patches, Patches]:

@@ -17,6 +17,7 @@ from beers_deploy.profiles.figures import Check
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import encoding_faults, read_core
 from beers_deploy.quant.ends import ZERO, Ends
+from beers_deploy.quant.float_parts import float_layers_check
 from beers_deploy.quant.graph import CORRECTION, Activation
 from beers_deploy.quant.graph.nodes import Node, OnnxGraph
 from beers_deploy.quant.graph.quantised import Scale, stated
@@ -187,6 +188,7 @@ def structure_checks(float_model: onnx.ModelProto, int8: onnx.ModelProto) -> lis
     checks = [Check("ReLUs lost or added", kept.off_by(wanted), 0, "ReLU", detail=said)]
     if faults is not None:  # of files that `quantize` wrote under the rules of a DPU
         checks.append(Check("faults of the encoding", len(faults), 0, "fault", detail="".join(faults[:1])))
+    checks.append(float_layers_check(int8))
     return [*checks, optimisation]
 
 

@@ -1,8 +1,9 @@
 """`beers-deploy gate`: does INT8 stay close enough to float? Exit code 1 when it does not."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -10,6 +11,12 @@ from beers_deploy.commands.shared import RULED, STDOUT, FloatModel, Int8Model, J
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.target import DEFAULT_TARGET
+
+if TYPE_CHECKING:
+    from beers_deploy.verdict import Verdict
+
+TITLES = {"gate": "float against INT8", "samples": "what the samples cover"}
+"""Of the tables that are shown, by the rows' own."""
 
 
 def gate(
@@ -45,47 +52,79 @@ def gate(
     Also checked: what saturates inside, the DPU's rules, that no ReLU was lost, and that onnxruntime's optimisations
     change no bit.
     """
-    from beers_deploy.model.io.files import require_writable, write_text
-    from beers_deploy.network import Network
+    from beers_deploy.model.io.files import write_text
     from beers_deploy.network_files import pair_of
-    from beers_deploy.quant.gate import limits_of
-    from beers_deploy.results import print_rows
+    from beers_deploy.profiles.errors import BeersError
+    from beers_deploy.quant.limits import limits_of
     from beers_deploy.verdict import gate as judged
+    from beers_deploy.verdict import junit_error
 
     read = (float_model, int8_model, limits, baseline, images, samples, *map(Path, (target, sensor)))
-    if junit == STDOUT:
-        raise OptionError("--junit", expected="a file", got="-", remedy="name one: standard output is for --json -")
-    beside: list[Path] = []
-    if record is not None:  # for which more is loaded than a gate needs
-        from beers_deploy.kit.record import recorded, write_record
-
-        beside = recorded(record)
-    require_writable(json, junit, *beside, inputs=read, folders=(record,))
-    against, int8 = pair_of(float_model, int8_model)
-    allowed = limits_of(limits, max_mae)
-    verdict = judged(
-        int8,
-        against,
-        samples,
-        board=target,
-        limits=allowed,
-        baseline=baseline,
-        sensor=sensor,
-        images=images,
-        patches=patches,
-        seed=seed,
-        metric=metric,
-    )
-    print_rows("float against INT8", verdict.rows)
-    for note in verdict.notes:
-        say(f"note: {note}")
-    for check in verdict.checks:
-        say(f"{'ok    ' if check.passed else 'FAILED'} {check}")
+    _clear((json, junit, *_record_files(record)), read, record)
+    try:
+        against, int8 = pair_of(float_model, int8_model)
+        allowed = limits_of(limits, max_mae)
+        verdict = judged(
+            int8,
+            against,
+            samples,
+            board=target,
+            limits=allowed,
+            baseline=baseline,
+            sensor=sensor,
+            images=images,
+            patches=patches,
+            seed=seed,
+            metric=metric,
+        )
+    except BeersError as error:
+        if junit is not None:
+            write_text(junit, junit_error("INT8 gate", str(error)))
+        raise
+    _show(verdict)
     save(replace(verdict, arguments=arguments(max_mae=allowed.mae)), json)
     if junit is not None:
         write_text(junit, verdict.to_junit())
     if record is not None:
-        write_record(verdict, Network.load(int8, sensor=sensor), record)
+        from beers_deploy.kit.record import write_record
+
+        compared = verdict.comparison
+        write_record(verdict, compared.int8, compared.sensor, record, compared.floating)
     say(str(verdict))
     if not verdict:
         raise typer.Exit(1)
+
+
+def _record_files(folder: Path | None) -> list[Path]:
+    """Return the files of --record, for which more is loaded than a gate needs."""
+    if folder is None:
+        return []
+    from beers_deploy.kit.record import recorded
+
+    return recorded(folder)
+
+
+def _clear(outputs: Sequence[Path | None], inputs: Sequence[Path | None], record: Path | None) -> None:
+    """Require that the outputs can be written, and delete older ones: a refused gate leaves no verdict behind."""
+    from beers_deploy.model.io.files import require_writable
+
+    _, junit, *_ = outputs
+    if junit == STDOUT:
+        raise OptionError("--junit", expected="a file", got="-", remedy="name one: standard output is for --json -")
+    require_writable(*outputs, inputs=inputs, folders=(record,))
+    for path in outputs:
+        if path is not None and path != STDOUT:
+            path.unlink(missing_ok=True)
+
+
+def _show(verdict: "Verdict") -> None:
+    """Print the figures, the notes and the checks."""
+    from beers_deploy.profiles.figures import by_table
+    from beers_deploy.results import print_rows
+
+    for title, rows in by_table(verdict.rows).items():
+        print_rows(TITLES[title], rows)
+    for note in verdict.notes:
+        say(f"note: {note}")
+    for check in verdict.checks:
+        say(f"{'ok    ' if check.passed else 'FAILED'} {check}")

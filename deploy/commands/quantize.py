@@ -62,7 +62,8 @@ def quantize(
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.profiles.figures import by_table
     from beers_deploy.quant.encodings import read_core
-    from beers_deploy.quant.onnx_file import require_onnx_name
+    from beers_deploy.quant.onnx_file import metadata, require_onnx_name
+    from beers_deploy.quant.sample_range import recorded_range
     from beers_deploy.quantise import losses_of, sensitivity_report
     from beers_deploy.quantise import quantize as quantised
     from beers_deploy.report.page import write_report
@@ -83,6 +84,9 @@ def quantize(
     kept = f", {made.quantised.relus} ReLUs kept" if made.quantised else f", told {known.name}"
     say(f"wrote {out}: {len(read_core(made.model).ops)} integer operations{kept}")
     save_core(core, board_file, board)
+    covered = recorded_range(metadata(made.model))
+    if covered is not None:
+        say(f"calibration: {covered}")
     if made.quantised:
         say(losses_of(made, samples, patch_px=patch, **drawn))
     rows = list(made.layers)

@@ -8,16 +8,19 @@ from typing import Any
 from uuid import NAMESPACE_URL, uuid5
 
 from beers_deploy import __version__
+from beers_deploy.export import float_for
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.io.tensors import read_conditioned
-from beers_deploy.model.shipped import shipped_names, shipped_weights
+from beers_deploy.model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
 from beers_deploy.network import Network
+from beers_deploy.network_files import told_int8 as for_sensor
 from beers_deploy.profiles.errors import optional
 from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
 from beers_deploy.quant.encodings.description import KEY
-from beers_deploy.quant.onnx_file import metadata
+from beers_deploy.quant.onnx_file import load_onnx, metadata
 from beers_deploy.quant.samples import CALIBRATED_ON
 from beers_deploy.report.page import Report, Section, write_report
 from beers_deploy.results import Table
@@ -39,30 +42,40 @@ def recorded(folder: Path) -> list[Path]:
     return [folder / name for name in NAMES]
 
 
-def write_record(judged: Table, network: Network, folder: Path) -> None:
+def write_record(
+    judged: Table, network: Network, sensor: Sensor, folder: Path, floating: Network | None = None
+) -> None:
     """Write what is known of a network, and what a verb found of it, as JSON, a page and CycloneDX 1.6.
 
     Args:
         judged: figures and checks, with the inputs that they rest on.
-        network: that they speak of.
+        network: the INT8 network that they speak of.
+        sensor: that it is conditioned on.
         folder: of the three files.
+        floating: the float network that it was compared with.
     """
-    said, (document, page, bill) = record_of(judged, network), recorded(folder)
+    said = record_of(judged, network, sensor, floating)
+    document, page, bill = recorded(folder)
     write_text(document, json.dumps(said, indent=1) + "\n")
     write_report(_page(judged, said), page)
     write_text(bill, bill_of(said))
 
 
-def record_of(judged: Table, network: Network) -> dict[str, Any]:
-    """The record as one document; what a file does not say of itself is null."""
-    about, weights = metadata(network.model), metadata(network.model).get(WEIGHTS)
+def record_of(judged: Table, network: Network, sensor: Sensor, floating: Network | None = None) -> dict[str, Any]:
+    """Return the record as one document; what is not known is null.
+
+    The INT8 file may claim any weights: they, their training and their licence are stated only where they are
+    verified.
+    """
+    about = metadata(network.model)
+    weights = _verified_weights(network, sensor, floating)
     return {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
         "tool": {"name": "beers-deploy", "version": __version__, "code_sha256": code_sha256()},
         "network": {"name": network.name, "precision": network.precision, "sha256": network.sha256},
-        "weights_sha256": weights,
-        "training": _training(weights),
+        "weights_sha256": sha256(weights) if weights else None,
+        "training": read_conditioned(weights).recipe if weights else None,
         "says": {key: text for key, text in about.items() if key not in BULKY},
         "calibration_samples": about.get(CALIBRATED_ON, "").split() or None,
         "sensors_in_range": {key: list(ends) for key, ends in RANGES.items()} if FAMILY in about else None,
@@ -81,10 +94,17 @@ def code_sha256() -> str:
     return digest.hexdigest()
 
 
-def _training(weights: str | None) -> dict[str, Any] | None:
-    """The recipe of the shipped weights of that digest; None of others, which are not here."""
-    found = (shipped_weights(name) for name in shipped_names())
-    return next((read_conditioned(path).recipe for path in found if sha256(path) == weights), None)
+def _verified_weights(network: Network, sensor: Sensor, floating: Network | None) -> Path | None:
+    """Return the shipped weights that an INT8 file claims, if its float network or its integers are made of them."""
+    claimed = metadata(network.model).get(WEIGHTS)
+    name = next((name for name in shipped_names() if sha256(shipped_weights(name)) == claimed), None)
+    if name is None:
+        return None
+    path = shipped_weights(name)
+    if floating is not None and floating.model.graph == float_for(path, name, sensor).graph:
+        return path
+    shipped = for_sensor(load_onnx(SHIPPED / f"{name}{INT8}.onnx"), sensor)
+    return path if network.model.graph == shipped.graph else None
 
 
 def _page(judged: Table, said: dict[str, Any]) -> Report:

@@ -7,7 +7,8 @@ import jsonschema
 import pytest
 
 from beers_deploy.profiles.figures import Check, Figure, Row, measured, number, predicted, published, unavailable
-from beers_deploy.quant.gate import GateResult, Limits, gate_row, judge
+from beers_deploy.quant.gate import GateResult, gate_row, judge
+from beers_deploy.quant.limits import Limits
 from beers_deploy.results import SCHEMA_PATH, Table
 
 SCHEMA = json.loads(SCHEMA_PATH.read_text())

@@ -12,6 +12,7 @@ import tifffile
 import torch
 from typer.testing import CliRunner
 
+from beers_deploy.baseline import PATCHES, read_baseline
 from beers_deploy.cli import app
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.model.convbeers import arrays, load_network
@@ -28,7 +29,6 @@ from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration.output import Checkpoint, part_folder
 from beers_deploy.results import Table
 from beers_deploy.studies.tradeoff.measure import Measurements
-from beers_deploy.verdict import PATCHES, baseline_mae
 from tests.deploy.command_line import refused
 from tests.fuzz.networks import checkpoint_seeds, go_on
 from tests.fuzz.parsers import JOB, SHAPE
@@ -49,7 +49,7 @@ def document(path: Path, value: object, name: str = "int8") -> Path:
 def test_figures_that_are_no_numbers_are_refused(value: str, tmp_path: Path) -> None:
     path = document(tmp_path / "a.json", value)
     with pytest.raises(OptionError, match=r"a\.json"):
-        baseline_mae(path, dict.fromkeys(PATCHES))
+        read_baseline(path, dict.fromkeys(PATCHES))
     result = runner.invoke(app, ["diff", str(document(tmp_path / "b.json", 2.0)), str(path)])
     assert result.exit_code == 2, result.output
     assert result.stderr.strip().count("\n") == 0

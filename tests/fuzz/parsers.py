@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from beers_deploy.baseline import PATCHES, read_baseline
 from beers_deploy.differences import change_rows, changes, read_document
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
@@ -28,11 +29,10 @@ from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.figures import Check, Row, measured, predicted, unavailable
 from beers_deploy.profiles.response import read_response
 from beers_deploy.profiles.scene_call import load_scene_call
-from beers_deploy.quant.gate import limits_of
+from beers_deploy.quant.limits import limits_of
 from beers_deploy.restoration.output import Checkpoint, part_folder
 from beers_deploy.results import Table, by_row, cell
 from beers_deploy.studies.tradeoff.measure import Measurements
-from beers_deploy.verdict import PATCHES, baseline_mae
 from tests.deploy.dpu.graphs import integer_convbeers
 from tests.deploy.studies.detection.folders import coco, voc, yolo
 from tests.fuzz.detection import detect, detector_seeds, label_seeds, names_seeds, read_beside, read_names
@@ -225,7 +225,7 @@ PARSERS: tuple[Parser, ...] = (
     Parser("target TOML", ".toml", lambda _: _files("targets"), board_of, share=0.3),
     Parser("gate limits TOML", ".toml", lambda _: LIMITS, limits_of),
     Parser("results JSON", ".json", document_seeds, read_results, of_json),
-    Parser("gate baseline JSON", ".json", document_seeds, lambda p: baseline_mae(p, GATED), of_json),
+    Parser("gate baseline JSON", ".json", document_seeds, lambda p: read_baseline(p, GATED), of_json),
     Parser("board's runs JSON", ".json", runs_seeds, lambda p: read_own_runs(p, load_dpu("vck190")), of_json, 0.3),
     Parser("kept measurements", ".json", measurement_seeds, Measurements.open, of_json),
     Parser("journal of a run", ".json", journal_seeds, resume, of_json, 0.5),

@@ -12,7 +12,7 @@ from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.errors import BeersError, OptionError, ProfileError
 from beers_deploy.profiles.scene_call import load_scene_call
 from beers_deploy.profiles.toml import JSON_BYTES, QUOTED, TOML_BYTES, parse_json, read_json, read_toml_text
-from beers_deploy.quant.gate import limits_of
+from beers_deploy.quant.limits import limits_of
 
 BAD_TOML = {
     "nested arrays": "a = " + "[" * 20_000,

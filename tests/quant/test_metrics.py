@@ -54,12 +54,12 @@ def test_a_gate_speaks_of_classes() -> None:
     with one_guess():
         int8 = bd.quantize(network, images[:8], progress=False)
     samples = images[8:], classes[8:]
-    verdict = bd.gate(int8, samples=samples, metric="iou", limits={"metric_loss": 0.5, "mae": 0.5}, progress=False)
+    verdict = bd.gate(int8, samples=samples, metric="iou", limits={"metric_loss": 0.5, "mae": 0.1}, progress=False)
     figures = verdict.rows[0].figures
     assert verdict
     assert figures["iou float"].value == 1
     assert figures["iou lost"].value == pytest.approx(1 - float(figures["iou INT8"].value or 0))
-    broken = bd.gate(int8, samples=(samples[0], 1 - samples[1]), metric="top1", limits={"mae": 0.5}, progress=False)
+    broken = bd.gate(int8, samples=(samples[0], 1 - samples[1]), metric="top1", limits={"mae": 0.1}, progress=False)
     assert broken.rows[0].figures["top1 float"].value == 0
     with pytest.raises(OptionError, match="one beside the limit metric_loss"):
         bd.gate(int8, samples=samples, limits={"metric_loss": 0.1}, progress=False)

@@ -1,0 +1,127 @@
+"""The baseline of a gate: the document of an earlier gate, checked before anything is compared with it."""
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from beers_deploy.differences import read_document
+from beers_deploy.model.io.files import sha256
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.sensor import Sensor, numbers_of
+from beers_deploy.results import Input
+
+PATCHES = ("sensor", "images", "patches", "seed", "samples")
+"""The arguments that say what INT8 and float are compared on."""
+
+SAME_DB = 0.01
+"""Between the PSNRs of one float network on two processors: most differ by less than a thousandth."""
+
+SCALE = "of full scale"
+REMEDY = "make it again with 'gate --json' and these arguments"
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """The figures of an earlier gate that passed.
+
+    Attributes:
+        path: of its document.
+        mae: over full scale.
+        psnr_float_db: of the float network against the references; NaN without any.
+        digests: SHA-256 of what it rested on, by name.
+    """
+
+    path: Path
+    mae: float
+    psnr_float_db: float
+    digests: Mapping[str, str]
+
+    def require_same(self, float_sha256: str, psnr_float_db: float, inputs: Iterable[Input]) -> None:
+        """Raise OptionError if the baseline is of another float network, sensor, or of other images or samples.
+
+        Args:
+            float_sha256: digest of the float network that is judged now.
+            psnr_float_db: its PSNR, by which the network is recognised if it was saved again as another file.
+            inputs: everything else that the comparison rests on, networks left out.
+        """
+        same_psnr = abs(psnr_float_db - self.psnr_float_db) < SAME_DB
+        if not same_psnr and float_sha256 not in self.digests.values():
+            raise self._refused("a baseline of this float network", "another's")
+        for each in inputs:
+            before = self.digests.get(each.name)
+            if before is None:
+                raise self._refused(f"a baseline that rests on {each.name}", "one that does not")
+            if before != each.sha256:
+                raise self._refused(f"a baseline of the same {each.name}", f"one of another {each.name}")
+
+    def _refused(self, expected: str, got: str) -> OptionError:
+        return OptionError(str(self.path), expected=expected, got=got, remedy=REMEDY)
+
+
+def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
+    """Read the document of an earlier gate that passed on the same patches.
+
+    Args:
+        path: of the document.
+        arguments: of the gate that is to be compared with it.
+
+    Raises:
+        OptionError: a file that is no results document, of another command, of a gate that failed or of one on other
+            patches, or without an MAE that was measured over full scale.
+    """
+    document: Any = read_document(path)
+    if document["command"] != "gate":
+        got = f"one of {document['command']}"
+        raise OptionError(str(path), expected="what 'gate --json' wrote", got=got, remedy=REMEDY)
+    if document["verdict"] != "passed":
+        remedy = "give that of a version that passed"
+        raise OptionError(str(path), expected="the document of a gate that passed", got="failed", remedy=remedy)
+    before = document["arguments"]
+    for name in PATCHES:
+        then = _plain(name, before.get(name))
+        now = _plain(name, arguments.get(name))
+        if then != now:
+            expected = f"a baseline of the same patches ({name} {now})"
+            raise OptionError(str(path), expected=expected, got=f"{name} {then}", remedy=REMEDY)
+    figures = next((row["figures"] for row in document["rows"] if row["table"] == "gate"), {})
+    mae = figures.get("MAE", {})
+    if mae.get("mode") != "measured" or mae.get("unit") != SCALE or not 0 <= mae["value"] <= 1:
+        raise OptionError(str(path), expected=f"a measured MAE {SCALE}", got=_shown(mae), remedy=REMEDY)
+    psnr_db = figures.get("PSNR float", {}).get("value")
+    digests = {each["name"]: each["sha256"] for each in document["inputs"]}
+    return Baseline(path, float(mae["value"]), math.nan if psnr_db is None else float(psnr_db), digests)
+
+
+def _shown(figure: Mapping[str, Any]) -> str:
+    """Describe a figure, or its absence, for a message."""
+    return f"{figure.get('value')} {figure.get('unit')}, {figure.get('mode')}" if figure else "no MAE"
+
+
+def _plain(name: str, value: object) -> str:
+    """Return an argument as text; of a folder of images its name, because the folder may lie elsewhere."""
+    return Path(str(value)).name if name in ("images", "samples", "sensor") else str(value)
+
+
+def sensor_input(sensor: Sensor) -> Input:
+    """Return a sensor as what figures rest on: its name, and the digest of its numbers."""
+    text = json.dumps(numbers_of(sensor), sort_keys=True, default=str)
+    return Input(f"sensor {sensor.name}", hashlib.sha256(text.encode()).hexdigest())
+
+
+def files_input(kind: str, path: Path) -> Input:
+    """Return a file, or a folder with all files in it, as what figures rest on.
+
+    Args:
+        kind: what it is: "scenes" or "samples".
+        path: of the file or the folder.
+    """
+    if path.is_file():
+        return Input(f"{kind} {path.name}", sha256(path))
+    digest = hashlib.sha256()
+    for file in sorted(each for each in path.rglob("*") if each.is_file()):
+        digest.update(f"{file.relative_to(path).as_posix()} {sha256(file)}\n".encode())
+    return Input(f"{kind} {path.name}", digest.hexdigest())

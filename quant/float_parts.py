@@ -1,0 +1,63 @@
+"""What an INT8 file computes in float.
+
+Such a file may hold a whole float network in front of its integer core or behind it: then the two networks agree and
+the gate would pass what no DPU computes. Its metadata cannot be asked, because the judged file wrote them.
+"""
+
+import onnx
+
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.figures import Check
+from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.graph.nodes import Node, OnnxGraph
+from beers_deploy.quant.graph.quantised import Integers
+
+LAYERS = {
+    "Attention",
+    "Conv",
+    "ConvTranspose",
+    "DeformConv",
+    "Einsum",
+    "FusedConv",
+    "FusedGemm",
+    "FusedMatMul",
+    "GRU",
+    "Gemm",
+    "If",
+    "LSTM",
+    "Loop",
+    "MatMul",
+    "MultiHeadAttention",
+    "NhwcFusedConv",
+    "RNN",
+    "Scan",
+}
+"""Operators with weights, and those that hold a graph of their own."""
+
+
+def float_nodes(model: onnx.ModelProto) -> list[Node]:
+    """Return the nodes that compute in float: all but those on integers and those that only say how to read them."""
+    graph = OnnxGraph(model)
+    integers = Integers(graph)
+    return [node for node in graph.nodes if not integers.is_integer(node) and not integers.is_notation(node)]
+
+
+def float_layers_check(model: onnx.ModelProto) -> Check:
+    """Return the check that an INT8 file computes no layer in float."""
+    layers = [str(node) for node in float_nodes(model) if node.op_type in LAYERS]
+    return Check("layers computed in float", len(layers), 0, "layer", detail=", ".join(layers[:3]))
+
+
+def float_note(model: onnx.ModelProto) -> list[str]:
+    """Return a note that names the float operators of another quantiser's file.
+
+    In a file of ours they are the host part, which `encoding_faults` compares with the integers node by node.
+    """
+    try:
+        read_core(model)
+    except ModelError:
+        kinds = sorted({node.op_type for node in float_nodes(model)} - {"QuantizeLinear", "DequantizeLinear"})
+        if kinds:
+            names = ", ".join(kinds)
+            return [f"the INT8 file computes {names} in float, which the board's processor has to compute alike"]
+    return []

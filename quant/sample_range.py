@@ -1,0 +1,124 @@
+"""Which part of a sensor's range a set of samples covers.
+
+A limit says nothing of brightness that no sample has. So `quantize` records the range of the samples that a network
+was calibrated on, and the gate prints the range of those that it judged by.
+"""
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from beers_deploy.profiles.figures import Row, measured
+from beers_deploy.profiles.toml import parse_json
+
+KEY = "calibration_range"
+"""Of the metadata of an INT8 file."""
+
+BINS = 4096
+"""Of the histogram over [0, 1]: one for each digital number of 12 bits. Pixels in the last one are saturated."""
+
+PERCENTS = (1, 50, 99, 99.9)
+"""The percentiles of a range."""
+
+COVERED = 0.9
+"""Samples whose 99.9th percentile lies at this share of full scale cover bright ground."""
+
+
+@dataclass(frozen=True)
+class SampleRange:
+    """Percentiles of all pixels of a set of samples, over full scale, and the share of pixels that are saturated."""
+
+    p1: float
+    p50: float
+    p99: float
+    p99_9: float
+    saturated: float
+
+    @property
+    def reaches_full_scale(self) -> bool:
+        """Return True if the samples cover bright ground."""
+        return self.p99_9 >= COVERED
+
+    def __str__(self) -> str:
+        shares = f"1, 50, 99 and 99.9 % of the pixels lie below {self.p1:.3f}, {self.p50:.3f}, {self.p99:.3f} and"
+        return f"{shares} {self.p99_9:.3f} of full scale, {100 * self.saturated:.2g} % are saturated"
+
+    def to_words(self) -> str:
+        """Return the range as it stands in the metadata of an INT8 file."""
+        return json.dumps({name: round(value, 6) for name, value in asdict(self).items()})
+
+
+class RangeCounts:
+    """A histogram of pixels, to which one sample after the other is added."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(BINS, np.int64)
+
+    def add(self, sample: np.ndarray) -> None:
+        """Add a sample of any shape, values in [0, 1]."""
+        bins = np.clip(sample * np.float32(BINS), 0, BINS - 1).astype(np.int64)
+        self._counts += np.bincount(bins.ravel(), minlength=BINS)
+
+    @property
+    def range(self) -> SampleRange:
+        """The range of what was added."""
+        shares = np.cumsum(self._counts) / max(int(self._counts.sum()), 1)
+        levels = [float(np.searchsorted(shares, percent / 100)) / (BINS - 1) for percent in PERCENTS]
+        saturated = float(self._counts[-1] / max(int(self._counts.sum()), 1))
+        return SampleRange(*levels, saturated=saturated)
+
+
+def range_of(samples: Iterable[np.ndarray]) -> SampleRange:
+    """Compute the range of samples of any shape, values in [0, 1]."""
+    counts = RangeCounts()
+    for sample in samples:
+        counts.add(sample)
+    return counts.range
+
+
+def recorded_range(about: Mapping[str, str]) -> SampleRange | None:
+    """Return the range that the metadata of an INT8 file records; None if it records none that makes sense.
+
+    It is the file's own claim, which nothing verifies: it may be shown, but no check may depend on it.
+    """
+    try:
+        values: Any = parse_json(about.get(KEY, ""))
+        found = SampleRange(**{name: float(value) for name, value in values.items()})
+    except (ValueError, TypeError, AttributeError):
+        return None
+    in_order = [found.p1, found.p50, found.p99, found.p99_9]
+    plausible = all(math.isfinite(value) and 0 <= value <= 1 for value in (*in_order, found.saturated))
+    return found if plausible and in_order == sorted(in_order) else None
+
+
+def range_row(found: SampleRange, name: str, source: str) -> Row:
+    """Return the range as a row of the table "samples"."""
+    figures = {
+        "1st percentile": measured(found.p1, "of full scale", source),
+        "median": measured(found.p50, "of full scale", source),
+        "99th percentile": measured(found.p99, "of full scale", source),
+        "99.9th percentile": measured(found.p99_9, "of full scale", source),
+        "saturated": measured(100 * found.saturated, "%", source),
+    }
+    return Row("samples", name, figures)
+
+
+def uncovered(judged: SampleRange, calibrated: SampleRange | None) -> str:
+    """Return a sentence if the samples of a gate leave out bright ground; else an empty string.
+
+    Args:
+        judged: the range of the gate's samples.
+        calibrated: the range that the INT8 file claims for its calibration, None if it records none.
+    """
+    if judged.reaches_full_scale:
+        return ""
+    sentence = f"the samples reach {judged.p99_9:.2f} of full scale (99.9th percentile): nothing brighter was judged"
+    if calibrated is None:
+        return f"{sentence}, and the INT8 file does not record what its calibration covered"
+    if not calibrated.reaches_full_scale:
+        return f"{sentence}, and by the INT8 file's own record its calibration reached {calibrated.p99_9:.2f}"
+    return sentence

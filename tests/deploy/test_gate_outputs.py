@@ -1,0 +1,136 @@
+"""What a gate leaves behind: nothing of an older verdict, an error for the CI, and the digest of what was judged."""
+
+import hashlib
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import onnx
+import pytest
+
+import beers_deploy as bd
+from beers_deploy import verdict as gates
+from beers_deploy.export import float_model
+from beers_deploy.kit.record import record_of
+from beers_deploy.network import Network
+from beers_deploy.network_files import shipped_pair
+from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.quant.banked.family import WEIGHTS
+from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
+from tests.deploy.command_line import done, refused
+
+SMALL = ("convbeers-xs", "--patches", 1)
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> tuple[Path, Path]:
+    """A shipped float network and its INT8, as files of the user's own."""
+    paths = tmp_path / "float.onnx", tmp_path / "int8.onnx"
+    for source, path in zip(shipped_pair("convbeers-xs"), paths, strict=True):
+        shutil.copyfile(source, path)
+    return paths
+
+
+def test_a_refused_gate_leaves_no_older_verdict_and_tells_the_ci(tmp_path: Path) -> None:
+    document, junit, record = tmp_path / "gate.json", tmp_path / "gate.xml", tmp_path / "record"
+    done("gate", *SMALL, "--json", document, "--junit", junit, "--record", record)
+    assert json.loads(document.read_text())["verdict"] == "passed"
+    assert sorted(path.name for path in record.iterdir()) == ["record.cdx.json", "record.html", "record.json"]
+    (tmp_path / "none.onnx").write_bytes(b"no network\n<&>\x1b[31m")
+    said = refused("gate", tmp_path / "none.onnx", tmp_path / "none.onnx", "--json", document, "--junit", junit,
+                   "--record", record)  # fmt: skip
+    assert not document.exists()
+    assert list(record.iterdir()) == []
+    suite = ET.fromstring(junit.read_text())  # noqa: S314 - our own text
+    assert [suite.get(name) for name in ("tests", "failures", "errors")] == ["1", "0", "1"]
+    error = suite.find("testcase/error")
+    assert error is not None
+    assert " ".join((error.text or "").split()) in said
+
+
+def test_an_output_that_is_an_input_is_refused_and_stays(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    baseline = tmp_path / "gate.json"
+    baseline.write_text("{}")
+    refused("gate", *pair, "--baseline", baseline, "--json", baseline)
+    assert baseline.read_text() == "{}"
+
+
+def test_notes_stand_in_the_document(tmp_path: Path) -> None:
+    samples = np.random.default_rng(0).random((2, 1, 48, 40), np.float32) * 0.5
+    found = bd.compare("convbeers-xs-int8", "convbeers-xs", samples)
+    assert "nothing brighter was judged" in found.notes[0]
+    found.save(tmp_path / "found.json")
+    assert json.loads((tmp_path / "found.json").read_text())["notes"] == list(found.notes)
+
+
+def test_the_digest_is_that_of_the_bytes_that_were_judged(
+    pair: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The INT8 file is replaced while the gate runs."""
+    int8 = pair[1]
+    before = hashlib.sha256(int8.read_bytes()).hexdigest()
+    compare = gates.differences
+
+    def replaced(*given: object) -> object:
+        int8.write_bytes(b"another file")
+        return compare(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(gates, "differences", replaced)
+    done("gate", *pair, "--patches", 1, "--json", tmp_path / "g.json", "--record", tmp_path / "r")
+    document = json.loads((tmp_path / "g.json").read_text())
+    assert {each["name"]: each["sha256"] for each in document["inputs"]}["int8.onnx"] == before
+    assert json.loads((tmp_path / "r" / "record.json").read_text())["network"]["sha256"] == before
+
+
+def test_a_file_that_changes_while_it_is_read_is_refused(
+    pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def reading(path: Path) -> onnx.ModelProto:
+        model = float_model(path)
+        path.write_bytes(path.read_bytes() + b"\0")
+        return model
+
+    monkeypatch.setattr("beers_deploy.network.float_model", reading)
+    with pytest.raises(ModelError, match="stays as it is"):
+        Network.load(pair[0])
+
+
+def test_too_little_contrast_judges_nothing() -> None:
+    """Samples of 2 DN of contrast: a network that returned their mean would keep the limit."""
+    generator = np.random.default_rng(0)
+    samples = (2000 + generator.integers(0, 3, (3, 1, 48, 40))).astype(np.float32) / np.float32(4095)
+    with pytest.raises(OptionError, match="contrast"):
+        bd.gate("convbeers-xs-int8", "convbeers-xs", samples)
+
+
+def test_a_note_says_if_the_default_limit_does_not_suit(model: Path) -> None:
+    samples = np.random.default_rng(0).random((6, 1, 32, 40), np.float32)
+    verdict = bd.gate(bd.quantize(model, samples), samples=samples)
+    (mae,) = (check for check in verdict.checks if check.name == "MAE")
+    said = [note for note in verdict.notes if "--max-mae" in note]
+    assert len(said) == (not mae.passed)
+    assert not mae.passed  # noise is what this network changes most
+
+
+@pytest.mark.parametrize("claim", ["weights", "none"])
+def test_claims_of_weights_are_verified(claim: str, pair: tuple[Path, Path], tmp_path: Path) -> None:
+    """Licence and training are those of shipped weights: a file that only claims them has neither."""
+    sensor = Sensor.load("pleiades-degraded")
+    int8 = Network.load(pair[1])
+    digest = metadata(int8.model)[WEIGHTS]
+    verdict = bd.gate(int8, Network.load(pair[0]), patches=1)
+    assert record_of(verdict, int8, sensor)["weights_sha256"] == digest
+    assert record_of(verdict, int8, sensor, Network.load(pair[0]))["training"] is not None
+    other = onnx.ModelProto.FromString(int8.model.SerializeToString())
+    if claim == "weights":
+        node = next(tensor for tensor in other.graph.initializer if tensor.name == "body.1.first.bias")
+        node.raw_data = bytes(len(node.raw_data))
+    else:
+        onnx.helper.set_model_props(other, {k: v for k, v in metadata(other).items() if k != WEIGHTS})
+    save_onnx(other, tmp_path / "other.onnx")
+    said = record_of(verdict, replace(int8, model=load_onnx(tmp_path / "other.onnx")), sensor)
+    assert (said["weights_sha256"], said["training"], said["licence"]) == (None, None, None)

@@ -1,0 +1,92 @@
+"""Calibration and gate patches cover the sensor's range, in the stated shares."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.profiles import load_sensor
+from beers_deploy.quant.calibration import Calibration, draw_patches, unseen_patches
+from beers_deploy.quant.lighting import CALIBRATION, JUDGING, Lighting, assign_lightings, full_scale_radiance
+from beers_deploy.quant.sample_range import range_of
+
+SENSOR, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+BY_NAME = {lighting.name: lighting for lighting in JUDGING}
+
+
+@pytest.mark.parametrize("lightings", [CALIBRATION, JUDGING])
+def test_the_shares_add_up(lightings: tuple[Lighting, ...]) -> None:
+    assert sum(lighting.share for lighting in lightings) == 1
+
+
+@given(count=st.integers(1, 400), seed=st.integers(0, 2**31), lightings=st.sampled_from([CALIBRATION, JUDGING]))
+def test_any_number_of_patches_is_lit_in_the_stated_shares(
+    count: int, seed: int, lightings: tuple[Lighting, ...]
+) -> None:
+    assigned = assign_lightings(count, lightings, np.random.default_rng(seed))
+    counts = Counter(lighting.name for lighting in assigned)
+    assert counts.total() == count
+    for lighting in lightings:
+        assert abs(counts[lighting.name] - count * lighting.share) <= 1
+
+
+@settings(max_examples=60)
+@given(
+    full_scale=st.floats(50, 5000),
+    brightness=st.floats(1e-3, 1e4),
+    seed=st.integers(0, 2**31),
+    shape=st.tuples(st.integers(30, 61), st.integers(30, 61)),
+)
+def test_bright_ground_comes_near_full_scale_and_saturated_ground_beyond(
+    full_scale: float, brightness: float, seed: int, shape: tuple[int, int]
+) -> None:
+    generator = np.random.default_rng(seed)
+    radiance = brightness * generator.gamma(2.0, size=shape)
+
+    def lit(name: str) -> np.ndarray:
+        return radiance * BY_NAME[name].factor(radiance, full_scale, generator) / full_scale
+
+    assert 0.7 < np.quantile(lit("bright"), 0.999) <= 1.0001
+    assert np.mean(lit("saturated") > 1) < 0.051
+    assert 0.049 < np.mean(lit("dark")) / np.mean(radiance / full_scale) < 0.251
+    np.testing.assert_array_equal(lit("as drawn"), radiance / full_scale)
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_ground_without_light_stays_finite(name: str) -> None:
+    factor = BY_NAME[name].factor(np.zeros((9, 11)), 400.0, np.random.default_rng(0))
+    assert np.isfinite(factor)
+
+
+def test_default_patches_cover_the_range_and_those_of_the_gate_as_well() -> None:
+    """As scenes are drawn, 99.9 % of their pixels lie in the lower half of the range."""
+    calibration = Calibration(SENSOR, None, patches=32, patch_px=48, seed=0)
+    for patches in (calibration.drawn, unseen_patches(SENSOR, None, 32, 0)):
+        found = range_of(patches.degraded)
+        assert found.p99_9 > 0.75
+        assert found.p1 < 0.05
+
+
+def test_light_changes_nothing_but_the_light() -> None:
+    scenes = [procedural_scene(500, 520, np.random.default_rng(1))]
+    lit, plain = (draw_patches(scenes, SENSOR, REFERENCE, 16, 3, 40, lightings=each) for each in (JUDGING, ()))
+    ratios = set()
+    for one, other in zip(lit.views, plain.views, strict=True):
+        assert (one.degraded, one.ground.top, one.ground.left) == (
+            other.degraded,
+            other.ground.top,
+            other.ground.left,
+        )
+        ratios.add(round(one.ground.exposure / other.ground.exposure, 6))
+    assert 1 in ratios
+    assert len(ratios) > 4
+    again = draw_patches(scenes, SENSOR, REFERENCE, 16, 3, 40, lightings=JUDGING)
+    assert again.digest == lit.digest != plain.digest
+
+
+def test_the_radiance_of_full_scale_leaves_the_offset_out() -> None:
+    sensor = SENSOR.nominal()
+    assert full_scale_radiance(sensor) == sensor.max_dn / sensor.gain_dn_per_radiance

@@ -1,0 +1,61 @@
+"""The range of samples: right percentiles, recorded and read back, and no claim of a file is believed."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beers_deploy.quant.sample_range import KEY, SampleRange, range_of, recorded_range, uncovered
+
+DARK = SampleRange(0.0, 0.01, 0.2, 0.3, 0.0)
+FULL = SampleRange(0.0, 0.2, 0.95, 1.0, 0.01)
+
+
+@given(st.lists(st.integers(0, 4095), min_size=1, max_size=300), st.integers(1, 5))
+def test_percentiles_are_those_of_all_pixels_however_they_are_divided(pixels: list[int], parts: int) -> None:
+    values = np.array(pixels, np.float32) / np.float32(4095)
+    found = range_of(np.array_split(values, parts))
+    expected = np.quantile(values, [0.01, 0.5, 0.99, 0.999], method="inverted_cdf")
+    np.testing.assert_allclose([found.p1, found.p50, found.p99, found.p99_9], expected, atol=2 / 4096)
+    assert found.saturated == pytest.approx(np.mean(np.array(pixels) == 4095))
+
+
+@given(st.lists(st.floats(0, 1), min_size=4, max_size=4), st.floats(0, 1))
+def test_what_is_recorded_is_read_back(values: list[float], saturated: float) -> None:
+    found = SampleRange(*sorted(values), saturated=saturated)
+    again = recorded_range({KEY: found.to_words()})
+    assert again is not None
+    np.testing.assert_allclose(
+        [again.p1, again.p50, again.p99, again.p99_9, again.saturated],
+        [found.p1, found.p50, found.p99, found.p99_9, found.saturated],
+        atol=1e-6,
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "3",
+        "[]",
+        "null",
+        '{"p1": 0}',
+        '{"p1": 0, "p50": 0.5, "p99": 0.4, "p99_9": 1, "saturated": 0}',
+        '{"p1": 0, "p50": 0.5, "p99": 0.6, "p99_9": 7, "saturated": 0}',
+        '{"p1": 0, "p50": 0.5, "p99": 0.6, "p99_9": NaN, "saturated": 0}',
+        '{"p1": 0, "p50": 0.5, "p99": 0.6, "p99_9": 1, "saturated": "much"}',
+        '{"p1": 0, "p50": 0.5, "p99": 0.6, "p99_9": 1, "saturated": 0, "more": 1}',
+        "[" * 5000,
+    ],
+)
+def test_a_record_that_makes_no_sense_is_none(text: str) -> None:
+    assert recorded_range({KEY: text}) is None
+    assert recorded_range({}) is None
+
+
+def test_bright_ground_that_nobody_saw_is_named() -> None:
+    assert uncovered(FULL, None) == uncovered(FULL, DARK) == ""
+    assert "calibration reached 0.30" in uncovered(DARK, DARK)
+    assert "does not record" in uncovered(DARK, None)
+    assert "nothing brighter was judged" in uncovered(DARK, FULL)
+    assert "calibration" not in uncovered(DARK, FULL)
