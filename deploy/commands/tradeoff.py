@@ -108,7 +108,8 @@ def tradeoff(
     )
     study.report(out)
     print_rows(f"front of PSNR against {study.cost}", study.front_rows)
-    say(str(study))
+    for line in study.lines:
+        say(line)
     for path in (out / "tradeoff.json", json):
         save(study, path)
     say(f"wrote {out / FILES[0]}")

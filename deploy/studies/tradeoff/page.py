@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from beers_deploy.model.io.files import write_text
-from beers_deploy.profiles.errors import optional
+from beers_deploy.profiles.errors import one_line, optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.report.plots import data_url
@@ -104,8 +104,13 @@ class Tradeoff(Table):
         write_report(report_of(self, svg), page)
         return page
 
+    @property
+    def lines(self) -> list[str]:
+        """The recommendation, then for each board how its best point compares, or why it has none."""
+        return [self.line, *lines(self.board_rows)]
+
     def __str__(self) -> str:
-        return "\n".join([self.line, *lines(self.board_rows)])
+        return "\n".join(map(one_line, self.lines))
 
 
 def report_of(study: Tradeoff, svg: str) -> Report:
