@@ -1,5 +1,6 @@
 """The one kind of document that commands write with --json: rows of figures that say where they come from."""
 
+import io
 import json
 import os
 import platform
@@ -135,6 +136,14 @@ class Table:
     def __repr__(self) -> str:
         names = ", ".join(row.name for row in self.rows[:3]) + (", ..." if len(self.rows) > 3 else "")
         return f"{type(self).__name__}({self.command}: {len(self.rows)} rows: {printable(names)})"
+
+    def __str__(self) -> str:
+        """Return all tables as the commands print them, and the notes."""
+        stream = io.StringIO()
+        for name, rows in by_table(self.rows).items():
+            print_rows(name, rows, Console(file=stream, width=PIPE_WIDTH, force_jupyter=False))
+        lines = [line.rstrip() for line in stream.getvalue().splitlines()]
+        return "\n".join([*lines, *map(one_line, self.notes)])
 
     def _repr_html_(self) -> str:
         """What a notebook shows: each table, the source of a figure as its tooltip."""
