@@ -67,7 +67,7 @@ class Tradeoff(Table):
     @property
     def board(self) -> str:
         """The board of the recommended point; the first board if there is none."""
-        found = self.best.text.get("board") if self.best else None
+        found = self.best.text["board"] if self.best else ""
         return found if found in self.boards else self.boards[0]
 
     @property

@@ -103,7 +103,8 @@ def _make_room(axes: "Axes") -> None:
     """Narrow the axes until the last label below them, which is centred on its tick, ends within the figure."""
     figure = axes.figure
     width_px = figure.bbox.width
-    over_px = axes.get_tightbbox().x1 + EDGE_PX - width_px
+    box = axes.get_tightbbox()
+    over_px = box.x1 + EDGE_PX - width_px if box is not None else 0.0
     if over_px > 0:
         figure.subplots_adjust(right=RIGHT - over_px / width_px)
 
@@ -181,7 +182,7 @@ def _draw_limits(axes: "Axes", drawn: Drawn) -> None:
             axes.axvline(limit.limit, **style)
             words = f"{AT_MOST if limit.at_most else AT_LEAST} {limit.in_words(limit.limit)}"
             right = limit.limit > np.sqrt(low * high)
-            place = {"ha": "right" if right else "left", "va": "bottom"}
+            place: dict[str, Any] = {"ha": "right" if right else "left", "va": "bottom"}
             axes.annotate(words, (limit.limit, 1.0), (0, 3), ("data", "axes fraction"), "offset points", **place)
         elif limit.key == PSNR and axes.get_ylim()[0] <= limit.limit <= axes.get_ylim()[1]:
             axes.axhline(limit.limit, **style)
