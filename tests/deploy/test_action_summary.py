@@ -48,7 +48,7 @@ def failed(name: str, detail: str) -> dict[str, Any]:
 
 
 def rendered(markdown: str) -> str:
-    return MarkdownIt("commonmark").enable(["table", "strikethrough"]).render(markdown)
+    return str(MarkdownIt("commonmark").enable(["table", "strikethrough"]).render(markdown))
 
 
 @given(st.text(), st.text())

@@ -22,8 +22,8 @@ POWER_W = {"fast": 30.0, "frugal": 12.0, "slow": 20.0}
 def weighed(
     points: Sequence[Measured], boards: Sequence[str], budget: str | None = None, need: str | None = None
 ) -> Tradeoff:
-    limits = [parse_constraints(f"--{name}", text) for name, text in (("budget", budget), ("need", need))]
-    return weigh(points, boards, Question(*limits, COMPARE), arguments={}, inputs=(), notes=())
+    asked = Question(parse_constraints("--budget", budget), parse_constraints("--need", need), COMPARE)
+    return weigh(points, boards, asked, arguments={}, inputs=(), notes=())
 
 
 def on_boards(costs: dict[str, float], psnr_db: dict[str, float]) -> list[Measured]:
