@@ -25,7 +25,7 @@ from beers_deploy.profiles.sensor_file import BLIND, sensor_names
 from beers_deploy.profiles.target import TILE_PX, TargetProfile, board_names
 from beers_deploy.quant.encodings import save_config
 from beers_deploy.quant.session import open_session, tensors_of
-from beers_deploy.results import Table
+from beers_deploy.results import Table, markdown_text
 
 MEASURE, HOST, README = (Path(__file__).parent / "kit" / name for name in ("measure.py", "host.py", "readme.md"))
 
@@ -95,7 +95,13 @@ class Board(TargetProfile):
         if record:
             sensor_of_it = Sensor.load(BLIND) if known is None else known
             write_record(check(network, self, tile=tile), network, sensor_of_it, folder / "record")
-        words = {"network": network.name, "board": self.name, "tile": tile, "reach": REACH_PX, "headroom": HEADROOM}
+        words = {
+            "network": markdown_text(network.name),
+            "board": markdown_text(self.name),
+            "tile": tile,
+            "reach": REACH_PX,
+            "headroom": HEADROOM,
+        }
         write_text(folder / "README.md", README.read_text(encoding="utf-8").format(**words))
         return folder
 

@@ -44,7 +44,14 @@ from beers_deploy.commands import (
 )
 from beers_deploy.commands.shared import results_to, running
 from beers_deploy.model.progress import reporting
-from beers_deploy.profiles.errors import BeersError, OptionError, OutsideRangeWarning, missing_extra, visible
+from beers_deploy.profiles.errors import (
+    BeersError,
+    OptionError,
+    OutsideRangeWarning,
+    missing_extra,
+    one_line,
+    visible,
+)
 
 CRASHED, INTERRUPTED = 70, 130
 """Exit codes of a fault in this program (sysexits' EX_SOFTWARE), and of Ctrl-C."""
@@ -121,7 +128,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             message, code = ending(error, function)
             if verbose or code == CRASHED:
                 traceback.print_exc()
-            typer.echo(f"beers-deploy: {message}", err=True)
+            typer.echo(f"beers-deploy: {visible(message)}", err=True)
             raise typer.Exit(code) from None
 
     signature, more = inspect.signature(function), {"quiet": Quiet, "verbose": Verbose}
@@ -176,7 +183,7 @@ def _pipes_results(context: typer.Context) -> bool:
 
 
 def _print_warning(message: Warning | str, *_: object, **__: object) -> None:
-    typer.echo(visible(str(message)), err=True)
+    typer.echo(one_line(str(message)), err=True)
 
 
 app = typer.Typer(

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from beers_deploy.profiles.errors import OptionError, optional
+from beers_deploy.profiles.errors import OptionError, optional, visible
 from beers_deploy.profiles.figures import Figure, Row
 
 if TYPE_CHECKING:
@@ -106,8 +106,8 @@ def html_table(title: str, rows: Sequence[Row]) -> str:
 
 
 def _cell(tag: str, text: str, tooltip: str = "") -> str:
-    about = f' title="{escape(tooltip)}"' if tooltip else ""
-    return f'<{tag} style="{STYLE}"{about}>{escape(text)}</{tag}>'
+    about = f' title="{escape(visible(tooltip))}"' if tooltip else ""
+    return f'<{tag} style="{STYLE}"{about}>{escape(visible(text))}</{tag}>'
 
 
 def _figure(figure: Figure | None) -> str:

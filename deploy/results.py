@@ -1,8 +1,10 @@
 """The one kind of document that commands write with --json: rows of figures that say where they come from."""
 
+import io
 import json
 import os
 import platform
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from html import escape
@@ -18,7 +20,7 @@ from beers_deploy import __version__
 from beers_deploy.frames import bars, figures_of, html_table, tidy_frame, wide_frame, words_of
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.processor import decided, processor_name
-from beers_deploy.profiles.errors import printable, visible
+from beers_deploy.profiles.errors import one_line, printable, visible
 from beers_deploy.profiles.figures import Check, Figure, Row, by_table
 
 if TYPE_CHECKING:
@@ -136,10 +138,18 @@ class Table:
         names = ", ".join(row.name for row in self.rows[:3]) + (", ..." if len(self.rows) > 3 else "")
         return f"{type(self).__name__}({self.command}: {len(self.rows)} rows: {printable(names)})"
 
+    def __str__(self) -> str:
+        """Return all tables as the commands print them, and the notes."""
+        stream = io.StringIO()
+        for name, rows in by_table(self.rows).items():
+            print_rows(name, rows, Console(file=stream, width=PIPE_WIDTH, force_jupyter=False))
+        lines = [line.rstrip() for line in stream.getvalue().splitlines()]
+        return "\n".join([*lines, *map(one_line, self.notes)])
+
     def _repr_html_(self) -> str:
         """What a notebook shows: each table, the source of a figure as its tooltip."""
         return "".join(html_table(name, rows) for name, rows in by_table(self.rows).items()) + "".join(
-            f"<p>{escape(note)}</p>" for note in self.notes
+            f"<p>{escape(visible(note))}</p>" for note in self.notes
         )
 
 
@@ -198,8 +208,17 @@ def default_console() -> Console:
 
 
 def plain(text: str) -> Text:
-    """Words as they are: no markup, and nothing that a terminal would obey, whatever a file held."""
-    return Text(visible(text))
+    """Return words as they are, on one line: no markup, and nothing that a terminal would obey."""
+    return Text(one_line(text))
+
+
+MARKUP = re.compile(r"[\\`*_\[\]<>&|]")
+"""Characters that Markdown reads as markup within a line or a cell, or as the end of a cell."""
+
+
+def markdown_text(text: str) -> str:
+    """Return text on one line that Markdown shows as it is: a layer's name comes from the network's file."""
+    return MARKUP.sub(lambda found: f"\\{found[0]}", one_line(text))
 
 
 def by_row(rows: list[Row], keys: list[str]) -> rich_table.Table:
@@ -209,7 +228,7 @@ def by_row(rows: list[Row], keys: list[str]) -> rich_table.Table:
     for key in keys:
         mode = common_mode(key, rows)
         about = ", ".join(filter(None, (unit_of(key, rows), mode)))
-        table.add_column(plain(f"{key}\n({about})" if about else key), justify="right")
+        table.add_column(Text("\n").join(map(plain, (key, f"({about})") if about else (key,))), justify="right")
     for word in words:
         table.add_column(plain(word), overflow="fold")
     for row in rows:

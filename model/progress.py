@@ -18,6 +18,8 @@ from types import FrameType
 from rich import progress as rich_progress
 from rich.console import Console
 
+from beers_deploy.profiles.errors import one_line
+
 Log = Callable[[str], None]
 """Is told a sentence, or the name of a step, as the work goes on."""
 
@@ -86,7 +88,7 @@ class Steps:
         if callable(sink):
             sink(Step(shown, self.done, self.total))
         elif self._bar is not None and self._task is not None:
-            self._bar.update(self._task, completed=self.done, description=shown)
+            self._bar.update(self._task, completed=self.done, description=one_line(shown))
         elif sink is not False and (time.monotonic() - self._printed > LINE_EVERY_S or self.done >= self.total):
             self._printed = time.monotonic()
             _line(f"{self.label}: {self.done}/{self.total} {note}".rstrip())
@@ -117,15 +119,15 @@ def progress(label: str) -> Iterator[Log]:
     else:
         with _bar(rich_progress.TimeElapsedColumn()) as shown:
             task = shown.add_task(label, total=None)
-            yield lambda step: shown.update(task, description=f"{label}: {step}")
+            yield lambda step: shown.update(task, description=one_line(f"{label}: {step}"))
 
 
 def _line(text: str) -> None:
-    sys.stderr.write(f"{text}\n")
+    sys.stderr.write(f"{one_line(text)}\n")
 
 
 def _bar(*columns: rich_progress.ProgressColumn) -> rich_progress.Progress:
-    words = rich_progress.TextColumn("{task.description}")
+    words = rich_progress.TextColumn("{task.description}", markup=False)  # a name in brackets is a name
     return rich_progress.Progress(words, *columns, console=Console(stderr=True), transient=True)
 
 

@@ -51,8 +51,16 @@ class BeersError(Exception):
 
 def printable(text: str, longest: int = LONGEST) -> str:
     """One line that a terminal shows as it is, whatever a file held."""
-    shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text[:longest])
-    return shown + ("..." if len(text) > longest else "")
+    return one_line(text[:longest]) + ("..." if len(text) > longest else "")
+
+
+def one_line(text: str) -> str:
+    """Return the whole text on one line, with its escape for each character that is not printable.
+
+    Among these are line breaks, control characters, and those that change the direction of writing: a name from a
+    file must not look like another line of a log.
+    """
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def visible(text: str) -> str:

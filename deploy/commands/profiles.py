@@ -31,7 +31,8 @@ def profiles(
     The keys of a sensor's file, with units and ranges: docs/reference/sensor-profile.md.
     """
     if toml:
-        say(_file_text(name).removesuffix("\n"))
+        for line in _file_text(name).removesuffix("\n").split("\n"):
+            say(line)
         return
     from rich.table import Table
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 import typer
 
 from beers_deploy.model.processor import SEEDS
-from beers_deploy.profiles.errors import OptionError, visible
+from beers_deploy.profiles.errors import OptionError, one_line
 from beers_deploy.profiles.target import TargetProfile, board_names, load_target, npu_names
 
 if TYPE_CHECKING:
@@ -151,5 +151,5 @@ def save_core(core: "Network | None", path: Path | None, board: TargetProfile) -
 
 
 def say(text: str, err: bool = False) -> None:
-    """Print lines on standard output, or on standard error, in characters that a terminal shows and does not obey."""
-    typer.echo(visible(text), err=err)
+    """Print one line on standard output, or on standard error; a terminal shows its characters and obeys none."""
+    typer.echo(one_line(text), err=err)

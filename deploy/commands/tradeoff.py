@@ -31,7 +31,8 @@ def tradeoff(
         ),
     ] = None,
     budget: Annotated[
-        str | None, typer.Option(help="What you can afford: 'latency<=20s', 'energy<=600J,host<=2'. Best PSNR wins.")
+        str | None,
+        typer.Option(help="What you can afford: 'latency<=20s', 'latency<=9s,power<=20W'. Best PSNR wins."),
     ] = None,
     need: Annotated[
         str | None, typer.Option(help="What you must reach: 'psnr>=44'. Without a budget the least latency wins.")
@@ -51,8 +52,8 @@ def tradeoff(
     target: Annotated[
         str,
         typer.Option(
-            help=f"The modelled board: {BOARDS}, or your .toml file; several with commas, or 'all'. All are rows of "
-            "the table, the recommendation is about the first."
+            help=f"The modelled board: {BOARDS}, or your .toml file; several with commas, or 'all'. Several are "
+            "compared, and one is recommended."
         ),
     ] = DEFAULT_TARGET,
     size: Annotated[str, typer.Option(help="Width x height of the swath in pixels.")] = PAPER_SIZE,
@@ -61,6 +62,7 @@ def tradeoff(
 ) -> None:
     """Measure networks and traditional pipelines on the same images, predict board runs, and recommend a point.
 
+    All boards of --target are compared, whatever their order; for each that is not recommended a line says why.
     Measurements are kept: a second run, or one that was stopped, measures only what is missing. Exit code 1 where no
     point keeps --budget and --need; the page is written all the same.
     """
@@ -106,7 +108,8 @@ def tradeoff(
     )
     study.report(out)
     print_rows(f"front of PSNR against {study.cost}", study.front_rows)
-    say(str(study))
+    for line in study.lines:
+        say(line)
     for path in (out / "tradeoff.json", json):
         save(study, path)
     say(f"wrote {out / FILES[0]}")

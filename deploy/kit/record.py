@@ -15,7 +15,7 @@ from beers_deploy.model.io.tensors import read_conditioned
 from beers_deploy.model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
 from beers_deploy.network import Network
 from beers_deploy.network_files import told_int8 as for_sensor
-from beers_deploy.profiles.errors import optional
+from beers_deploy.profiles.errors import one_line, optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
@@ -129,13 +129,16 @@ def bill_of(said: dict[str, Any]) -> str:
 
     def component(kind: ComponentType, name: str, digest: str, **more: Any) -> Component:
         hashes = [HashType(alg=HashAlgorithm.SHA_256, content=digest)]
-        return Component(type=kind, name=name, bom_ref=f"{kind.value}:{name}", hashes=hashes, **more)
+        shown = one_line(name)  # of a file: a reader of the bill may print it as it is
+        return Component(type=kind, name=shown, bom_ref=f"{kind.value}:{shown}", hashes=hashes, **more)
 
     network, tool, bom = said["network"], said["tool"], Bom(serial_number=uuid5(NAMESPACE_URL, json.dumps(said)))
     facts = said["says"] | {
         key: said[key] for key in ("training", "sensors_in_range", "limitations", "passed", "licence")
     }
-    properties = [Property(name=f"beers-deploy:{key}", value=json.dumps(value)) for key, value in facts.items()]
+    properties = [
+        Property(name=one_line(f"beers-deploy:{key}"), value=json.dumps(value)) for key, value in facts.items()
+    ]
     kind = ComponentType.MACHINE_LEARNING_MODEL
     bom.metadata.component = component(kind, network["name"], network["sha256"], properties=properties)
     maker = component(ComponentType.APPLICATION, tool["name"], tool["code_sha256"], version=tool["version"])

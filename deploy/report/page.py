@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import jinja2
+from markupsafe import Markup, escape
 
 from beers_deploy import __version__
 from beers_deploy.model.io.files import write_text
+from beers_deploy.profiles.errors import visible
 from beers_deploy.profiles.figures import Figure, Row
 from beers_deploy.results import missing, unit_of
 
@@ -17,14 +19,23 @@ INTERVAL = re.compile(r"\[[^\[\]]*\]")
 
 def _template() -> jinja2.Template:
     loader, strict = jinja2.FileSystemLoader(Path(__file__).parent), jinja2.StrictUndefined
-    made = jinja2.Environment(loader=loader, autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True)
+    # Autoescape deals with markup; `finalize` sees every value that is written, and escapes what is not printable.
+    made = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True, finalize=_shown
+    )
     made.filters["unbroken"] = _unbroken
     return made.get_template("report.html")
 
 
-def _unbroken(text: str) -> str:
-    """The text with each interval in brackets on one line."""
-    return INTERVAL.sub(lambda found: found[0].replace(" ", "\N{NO-BREAK SPACE}"), text)
+def _unbroken(text: str) -> Markup:
+    """Return the text as markup, with each interval in brackets on one line."""
+    kept = INTERVAL.sub(lambda found: found[0].replace(" ", "\N{NO-BREAK SPACE}"), str(escape(visible(text))))
+    return Markup(kept)  # noqa: S704 - escaped above
+
+
+def _shown(value: object) -> object:
+    """Return a value as a page shows it: text from files without control characters."""
+    return visible(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
 WIDE = 8

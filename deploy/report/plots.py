@@ -135,7 +135,7 @@ def svg_of(figure: "Figure", name: str, titles: Mapping[str, str] | None = None)
         text = text.replace(colour, f"var(--{key})")
     root = ET.fromstring(text)  # noqa: S314 - our own
     width, height = root.get("viewBox", "").split()[2:]
-    root.attrib |= {"width": width, "height": height, "role": "group", "aria-label": name}
+    root.attrib |= {"width": width, "height": height, "role": "group", "aria-label": printable(name)}
     style = ET.Element(f"{{{SVG}}}style")
     style.text = plot_style()
     root.insert(0, style)
@@ -156,8 +156,11 @@ def _name(group: ET.Element, titles: Mapping[str, str]) -> None:
 
 
 def printable(text: str) -> str:
-    """A text with a mark in the place of each letter that XML forbids: names are a user's."""
-    return re.sub("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text)
+    """Return a text with a mark in the place of each control character and each letter that XML forbids.
+
+    Names come from files: some characters would also turn the direction of the words behind them.
+    """
+    return "".join(letter if letter.isprintable() or letter in "\t\n" else "\ufffd" for letter in text)
 
 
 def plot_style() -> str:

@@ -122,6 +122,41 @@ def test_without_an_int8_network_it_quantises_for_the_same_sensor(runner: Runner
     assert (arguments["sensor"], arguments["max_mae"]) == ("mine.toml", 0.001)
 
 
+def test_a_network_that_quantize_refuses_is_an_error_whose_reason_is_in_the_summary(runner: Runner) -> None:
+    """Also where a good version's document lies at the place of the verdict's."""
+    node = onnx.helper.make_node("Sin", ["x"], ["y"], name="odd\n::error::obeyed | `name` <b>")
+    ends = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, 1, "h", "w"]) for name in "xy"]
+    graph = onnx.helper.make_graph([node], "g", ends[:1], ends[1:])
+    (runner.folder / "models").mkdir()
+    save_onnx(
+        onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)]),
+        runner.folder / "models" / "float.onnx",
+    )
+    (runner.folder / "gate.json").write_text('{"verdict": "passed"}')
+    outputs = runner.run_action({"float": "models/float.onnx"})
+    assert runner.red
+    assert outputs["verdict"] == "error"
+    summary = runner.summary.read_text()
+    assert "## INT8 gate: not judged" in summary
+    assert runner.stderr.startswith("beers-deploy: ")
+    assert runner.stderr.splitlines()[-1] in summary
+    assert [call.split()[0] for call in runner.calls.read_text().splitlines()] == ["quantize"]
+    assert obeyed(runner.stdout) == ["error title=INT8 gate%3A not judged"]
+
+
+def obeyed(stdout: str) -> list[str]:
+    """Return the workflow commands that GitHub obeys in an output, without what follows their second colons."""
+    found, token = list[str](), ""
+    for line in stdout.splitlines():
+        if token and line == f"::{token}::":
+            token = ""
+        elif line.startswith("::stop-commands::") and not token:
+            token = line.removeprefix("::stop-commands::")
+        elif line.startswith("::") and not token:
+            found.append(line[2:].partition("::")[0])
+    return found
+
+
 def test_names_are_never_run(runner: Runner) -> None:
     given = dict.fromkeys(("float", "int8", "sensor", "limits"), "$(touch ran) `touch ran` ; touch ran")
     assert runner.run_action(given)["verdict"] == "error"
@@ -152,10 +187,10 @@ def test_installing_puts_the_command_alone_on_the_path(tmp_path: Path) -> None:
     done = subprocess.run([*BASH, step["run"]], cwd=tmp_path, env=given | files, **KEPT)
     assert done.returncode == 0, done.stderr
     venv = tmp_path / "beers-deploy"
-    assert (tmp_path / "log").read_text() == f"-m venv {venv}\n-m pip install --quiet the action[torch]\n"
+    assert (tmp_path / "log").read_text() == f"-m venv {venv}\n-m pip install --quiet the action\n"
     (added,) = (tmp_path / "path").read_text().splitlines()
     assert [path.name for path in Path(added).iterdir()] == ["beers-deploy"]
-    assert step["env"]["PIP_EXTRA_INDEX_URL"] == "https://download.pytorch.org/whl/cpu"
+    assert "PIP_EXTRA_INDEX_URL" not in step["env"]
 
 
 def steps_of_workflow() -> list[dict[str, object]]:
@@ -166,6 +201,8 @@ def steps_of_workflow() -> list[dict[str, object]]:
 
 def test_the_workflow_is_green_with_one(runner: Runner, networks: Path) -> None:
     take(runner, networks / "plain", "float.onnx")
+    (runner.folder / "protected" / ".ci").mkdir(parents=True)  # by its second checkout
+    (runner.folder / "protected" / ".ci" / "gate.toml").write_text("mae = 0.001\npsnr_drop_db = 0.4\n")
     runner.run_steps([step for step in steps_of_workflow() if step.get("name") != OURS], {})
     assert not runner.red, runner.stderr
     assert runner.outputs["steps.gate.outputs.verdict"] == "passed"

@@ -160,3 +160,15 @@ def test_a_host_of_version_2_says_which_kernels_it_took() -> None:
     del sound["host"]["kernels"]
     with pytest.raises(jsonschema.ValidationError, match="'kernels' is a required"):
         jsonschema.validate(sound, SCHEMA)
+
+
+def test_a_printed_table_shows_its_figures_and_notes() -> None:
+    rows = (
+        Row("speed", "here", {"time": measured(1.5, "s", "a clock")}),
+        Row("size", "there", {}, {"word": "small"}),
+    )
+    text = str(Table("bench", {}, (), rows, notes=("a note\nof two lines",)))
+    for word in ("speed", "here", "time", "1.5", "size", "there", "small"):
+        assert word in text
+    assert text.endswith("\na note\\nof two lines")
+    assert not any(line != line.rstrip() for line in text.splitlines())

@@ -42,12 +42,14 @@ class Runner:
         folder: the workspace.
         red: whether a step has failed; those after it are left out, unless they always run.
         stderr: what the failed step wrote there.
+        stdout: what all steps wrote there, workflow commands among it.
         outputs: of the steps, by "steps.ID.outputs.NAME".
     """
 
     folder: Path
     red: bool = False
     stderr: str = ""
+    stdout: str = ""
     outputs: dict[str, str] = field(default_factory=dict)
 
     def prepare(self) -> None:
@@ -90,7 +92,7 @@ class Runner:
         context["steps.python.outputs.python-path"] = sys.executable  # of a step that is left out
         own = Runner(self.folder)  # its steps have ids of their own
         own.run_steps(action["runs"]["steps"], context)
-        self.red, self.stderr = own.red, own.stderr
+        self.red, self.stderr, self.stdout = own.red, own.stderr, self.stdout + own.stdout
         known = context | own.outputs
         return {name: value_of(about["value"], known) for name, about in action["outputs"].items()}
 
@@ -117,6 +119,7 @@ class Runner:
         done = subprocess.run([*BASH, step["run"]], cwd=self.folder, env=self.environment | given, **KEPT)
         lines = [line.partition("=") for line in written.read_text(encoding="utf-8").splitlines()]
         self.outputs |= {f"steps.{step['id']}.outputs.{name}": text for name, _, text in lines}
+        self.stdout += done.stdout
         if done.returncode:
             self.red, self.stderr = True, done.stderr
 

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from beers_deploy.dpu.checker.placement import PlacedNode, Placement
 from beers_deploy.model.io.files import write_text
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, visible
 from beers_deploy.report.plots import look, new_figure, svg_of
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def require_picture(path: Path | None) -> None:
 def write_picture(placement: Placement, title: str, path: Path) -> None:
     """Write the picture, whole or not at all; as a page where the name ends in .html."""
     svg = draw(placement, title)
-    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{escape(title)}</title>{VIEWPORT}'
+    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{escape(visible(title))}</title>{VIEWPORT}'
     write_text(path, f"{head}<body>{svg}</body></html>\n" if path.suffix == ".html" else svg)
 
 

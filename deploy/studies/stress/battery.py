@@ -14,7 +14,7 @@ from beers_deploy.profiles.errors import BeersError, OptionError
 from beers_deploy.profiles.figures import Figure, Row, by_table, measured, predicted
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.integer.reference import INT32_BITS
-from beers_deploy.results import common_mode, missing, unit_of
+from beers_deploy.results import common_mode, markdown_text, missing, unit_of
 from beers_deploy.studies.stress.cases import CASES, SIDE_PX, Case
 from beers_deploy.studies.stress.checks import Limitation, Measure, limitation_of
 from beers_deploy.studies.stress.networks import STAGES, Subject
@@ -235,8 +235,13 @@ def table_lines(rows: Sequence[Row]) -> list[str]:
         figures = [_cell(row.figures.get(key), *both) for key, both in common.items()]
         lines.append([row.name, *figures, *(row.text.get(word, "") for word in words)])
     reasons = missing(found)
-    shown = [f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |" for cells in lines]
-    return [*shown, *(["", *reasons] if reasons else [])]
+    shown = [f"| {' | '.join(map(markdown_text, cells))} |" for cells in lines]
+    return [*shown, *(["", *map(_reason, reasons)] if reasons else [])]
+
+
+def _reason(line: str) -> str:
+    """Return a reason as an item of a list, which it is."""
+    return f"- {markdown_text(line.removeprefix('- '))}"
 
 
 def _cell(figure: Figure | None, unit: str, mode: str) -> str:

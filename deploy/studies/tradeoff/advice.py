@@ -1,4 +1,7 @@
-"""Which point to take: the front of quality against cost, limits such as `latency<=20s`, and one recommended line.
+"""Choose a point: the front of quality against cost, limits such as `latency<=20s`, and one recommended line.
+
+Points of all boards are compared in one list, and ties are broken by the points' own figures and names. So the order
+in which boards were named changes nothing.
 
 Two points are compared on the same images: by the bootstrap interval, over whole sites, of the mean difference of
 their scores. Their own intervals show how images differ, which the points share.
@@ -14,11 +17,12 @@ import numpy as np
 from beers_deploy.model.metrics.bootstrap import site_interval
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.figures import Figure, Row, measured, predicted
+from beers_deploy.profiles.figures import Figure, Row, measured, number, predicted
 from beers_deploy.studies.tradeoff.measure import Scores
 from beers_deploy.studies.tradeoff.points import UNITS, Point
 
-COSTS = ("board latency", "board energy", "host p50")
+LATENCY = "board latency"
+COSTS = (LATENCY, "board energy", "host p50")
 PSNR, MAP50 = "PSNR", "mAP50"
 NAMES: dict[str, tuple[str, str]] = {
     "psnr": (PSNR, "dB"),
@@ -76,14 +80,21 @@ class Measured:
 
 
 def placed(points: Iterable[Measured], cost: str) -> list[Measured]:
-    """The points that have both a cost and a PSNR to compare."""
-    return [point for point in points if not math.isnan(point.value(cost) + point.value(PSNR))]
+    """Return the points that have both a cost and a PSNR to compare, sorted by increasing cost."""
+    found = (point for point in points if not math.isnan(point.value(cost) + point.value(PSNR)))
+    return sorted(found, key=lambda point: _rank(point, cost))
+
+
+def _rank(point: Measured, cost: str) -> tuple[float, float, float, str]:
+    """Return the sort key of a point: its cost, then what breaks ties without regard to the order of the points."""
+    latency_s = point.value(LATENCY)
+    return point.value(cost), -point.value(PSNR), math.inf if math.isnan(latency_s) else latency_s, point.name
 
 
 def pareto_front(points: Sequence[Measured], cost: str) -> list[Measured]:
-    """The points than which none is both cheaper and of better PSNR, by value, from cheap to dear."""
+    """Return the Pareto-optimal points by value, sorted by increasing cost."""
     front: list[Measured] = []
-    for point in sorted(placed(points, cost), key=lambda p: (p.value(cost), -p.value(PSNR))):
+    for point in placed(points, cost):
         if not front or point.value(PSNR) > front[-1].value(PSNR):
             front.append(point)
     return front
@@ -128,10 +139,10 @@ def verdict(difference: Figure) -> str:
 
 
 def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
-    """How many times the cost of `b` that `a` has on the same board, with an interval.
+    """Return the cost of `a` divided by that of `b`, with an interval.
 
     Two predictions of one board share most of their error: the interval of a ratio of latencies is the board's
-    `pair_width`, and nothing where only the count of tiles differs.
+    `pair_width`, and nothing where only the count of tiles differs. Predictions of two boards share none of it.
     """
     value, source = a.value(cost) / b.value(cost), f"{cost} over that of {b.name}"
     if cost.startswith("host"):
@@ -142,7 +153,7 @@ def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
         width = first.dpu.target.tables["cost"].get("pair_width")
         if replace(first, halo_px=second.halo_px) == second:
             interval = value, value
-        elif cost == "board latency" and width is not None:
+        elif cost == LATENCY and width is not None and first.board == second.board:
             interval = value * math.exp(-width.low), value * math.exp(width.low)
     return predicted(value, "x", interval, source)
 
@@ -153,19 +164,24 @@ def ends(figure: Figure) -> tuple[float, float]:
 
 
 def front_rows(front: Sequence[Measured], cost: str, compare: Comparison) -> list[Row]:
-    """A front's members by number, each with its difference from the next cheaper one."""
-    keys = dict.fromkeys((PSNR, cost, *(["board energy"] if cost.startswith("board") else [])))
+    """Return a front's members by number, each with its difference from the next cheaper one."""
     rows: list[Row] = []
-    for number, each in enumerate(front, 1):
-        figures, word = {key: each.figures[key] for key in keys if key in each.figures}, "cheapest"
+    for place, each in enumerate(front, 1):
+        figures, word = figures_to_compare(each, cost), "cheapest"
         if rows:
-            cheaper = front[number - 2]
+            cheaper = front[place - 2]
             gain = compare.difference(each, cheaper)
             figures |= {"PSNR gain": gain, f"{cost} ratio": cost_ratio(each, cheaper, cost)}
             word = verdict(gain)
         text = {"gain over the next cheaper": word}
-        rows.append(Row(f"front of PSNR against {cost}", f"{number}. {each.name}", figures, text))
+        rows.append(Row(f"front of PSNR against {cost}", f"{place}. {each.name}", figures, text))
     return rows
+
+
+def figures_to_compare(point: Measured, cost: str) -> dict[str, Figure]:
+    """Return the figures by which points are compared: PSNR, the cost, and power and energy of a board."""
+    keys = dict.fromkeys((PSNR, cost, "board power", "board energy"))
+    return {key: point.figures[key] for key in keys if key in point.figures}
 
 
 CONSTRAINT = re.compile(
@@ -183,8 +199,16 @@ class Constraint:
     unit: str
 
     def __str__(self) -> str:
-        unit = "" if self.unit in BARE_UNITS else f" {self.unit}"
-        return f"{self.key} {'<=' if self.at_most else '>='} {self.limit:g}{unit}"
+        return f"{self.key} {'<=' if self.at_most else '>='} {self.limit:g}{self._unit}"
+
+    def in_words(self, value: float) -> str:
+        """Return a value of the figure with its unit, with as many digits as tell it apart from the limit."""
+        digits = next((count for count in range(3, 9) if float(f"{value:.{count}g}") != self.limit), 9)
+        return f"{number(value, digits)}{self._unit}"
+
+    @property
+    def _unit(self) -> str:
+        return "" if self.unit in BARE_UNITS else f" {self.unit}"
 
     def violation(self, point: Measured) -> float:
         """By what share of the limit a point misses it: 0 where it keeps it, endless without such a figure."""
@@ -228,46 +252,78 @@ def chosen_cost(points: Sequence[Measured], budget: Sequence[Constraint]) -> str
 def recommend(
     points: Sequence[Measured], budget: Sequence[Constraint], need: Sequence[Constraint], compare: Comparison
 ) -> tuple[Measured | None, str]:
-    """Within a budget the best PSNR, or the cheapest point that is not significantly worse; for a need the cheapest.
+    """Recommend the best PSNR within a budget, or the cheapest point that is not significantly worse.
+
+    For a need without a budget, the cheapest point is recommended.
 
     Args:
-        points: of one board.
+        points: of all boards that are compared.
         budget: what can be afforded.
         need: what must be reached.
         compare: tells which point is better.
 
     Returns:
-        The point to take, None where none keeps the constraints; and a line that says so.
+        The recommended point, None where none keeps the constraints; and a line that says so.
     """
     constraints, cost = [*budget, *need], chosen_cost(points, budget)
-    ranked = placed(points, cost)
-    kept = sorted((p for p in ranked if not _violation(p, constraints)), key=lambda point: point.value(cost))
+    kept = within(points, constraints, cost)
     limits = f" for {' and '.join(map(str, constraints))}" if constraints else ""
     if not kept:
-        return None, _nearest(ranked, constraints, limits)
-    best = max(kept, key=lambda point: point.value(PSNR))
-    taken = kept[0]
-    if budget or not need:
-        taken = next(point for point in kept if not significant(compare.difference(best, point)))
+        return None, f"nothing to recommend{limits}{nearest(placed(points, cost), constraints)}"
+    taken, best = choose(kept, compare, cheapest=bool(need) and not budget)
     line = f"recommended{limits}: {_words(taken, [PSNR, cost, *(each.key for each in constraints)])}"
     gain = compare.difference(best, taken)
     if (budget or not need) and best is not taken and (gain.value or 0.0) >= WORTH_A_WORD_DB:
         line += f"; {best.name} has {gain} dB more, {verdict(gain)}"
     unsure = [str(each) for each in constraints if not each.holds_throughout(taken.figures[each.key])]
-    return taken, line + (f"; {' and '.join(unsure)} holds by value, not over the whole interval" if unsure else "")
+    verb = "holds" if len(unsure) == 1 else "hold"
+    return taken, line + (f"; {' and '.join(unsure)} {verb} by value, not over the whole interval" if unsure else "")
+
+
+def within(points: Iterable[Measured], constraints: Sequence[Constraint], cost: str) -> list[Measured]:
+    """Return the points that keep every constraint by value, sorted by increasing cost."""
+    return [point for point in placed(points, cost) if not _violation(point, constraints)]
+
+
+def choose(kept: Sequence[Measured], compare: Comparison, *, cheapest: bool) -> tuple[Measured, Measured]:
+    """Choose among points that keep the constraints.
+
+    Args:
+        kept: sorted by increasing cost, at least one.
+        compare: tells which point is better.
+        cheapest: choose the cheapest point, however good it is.
+
+    Returns:
+        The chosen point, and the one with the best PSNR.
+    """
+    best = max(kept, key=lambda point: point.value(PSNR))
+    if cheapest:
+        return kept[0], best
+    return next(point for point in kept if not significant(compare.difference(best, point))), best
+
+
+def affordable(points: Sequence[Measured], constraints: Sequence[Constraint], cost: str) -> Sequence[Measured]:
+    """Return the points that keep the limits on figures other than PSNR and cost; all points if none does.
+
+    The front shows PSNR against one cost. Without this, a point that the budget excludes for another reason, such as
+    its power, would hide those that can be recommended.
+    """
+    others = [each for each in constraints if each.key not in (PSNR, cost)]
+    return within(points, others, cost) or points
 
 
 def _violation(point: Measured, constraints: Sequence[Constraint]) -> float:
-    """Of the constraint that a point misses most."""
+    """Return the violation of the constraint that a point misses most."""
     return max((each.violation(point) for each in constraints), default=0.0)
 
 
-def _nearest(points: Sequence[Measured], constraints: Sequence[Constraint], limits: str) -> str:
+def nearest(points: Sequence[Measured], constraints: Sequence[Constraint]) -> str:
+    """Name the point that misses the constraints least, as the end of a sentence."""
     known = [point for point in points if math.isfinite(_violation(point, constraints))]
     if not known:
-        return f"nothing to recommend{limits}: no point has every figure asked for"
-    nearest = min(known, key=lambda point: _violation(point, constraints))
-    return f"nothing to recommend{limits}; nearest is {_words(nearest, [each.key for each in constraints])}"
+        return ": no point has every figure asked for"
+    least = min(known, key=lambda point: _violation(point, constraints))
+    return f"; nearest is {_words(least, [each.key for each in constraints])}"
 
 
 def _words(point: Measured, keys: Sequence[str]) -> str:

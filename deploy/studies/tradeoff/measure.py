@@ -147,9 +147,13 @@ class Benchmark:
         about: dict[str, object] = {"scores": self.depends(point.variant), "images": self.digest}
         if point.halo_px is None:
             return list(kept.make(key_of(**about), lambda: self.score(exact)))
-        about |= {"tile_px": point.tile_px, "halo_px": point.halo_px}
-        restore = restore_in_tiles(point, self.degraded, self.reference)
-        return list(kept.make(key_of(**about), lambda: self.score(restore, exact)))
+        # The images may be smaller than the tile. Then points with other tiles, as of another board, share a score.
+        cuts = sorted({tiles_of_point(point, pair.degraded.shape).tile_px for pair in self.pairs})
+        about |= {"tile_px": cuts, "halo_px": point.halo_px}
+        return list(kept.make(key_of(**about), lambda: self._with_seams(point, exact)))
+
+    def _with_seams(self, point: Point, exact: Restore) -> list[dict[str, float | None]]:
+        return self.score(restore_in_tiles(point, self.degraded, self.reference), exact)
 
     def runs(self, point: Point) -> float:
         """How often the network of a point runs on a tile of the images, once for each exposure; a mean."""

@@ -76,6 +76,7 @@ class Point:
         tile_px: side of a tile.
         halo_px: context around a tile; None for the receptive radius, whose seams are exact.
         reason: why there are no figures of a board.
+        refused_by: the board whose DPU refuses the network, for that reason; empty if none does.
     """
 
     variant: Variant
@@ -84,6 +85,7 @@ class Point:
     tile_px: int = TILE_PX
     halo_px: int | None = None
     reason: str = ""
+    refused_by: str = ""
 
     @property
     def name(self) -> str:
@@ -97,7 +99,7 @@ class Point:
 
 
 def parse_targets(text: str) -> tuple[str, ...]:
-    """The boards of `--target`: one, several with commas, or all of the shipped ones, the default first."""
+    """Read the boards of `--target`: one, several with commas, or all shipped ones, the default first."""
     if text == "all":
         return DEFAULT_TARGET, *(name for name in board_names() if name != DEFAULT_TARGET)
     names = tuple(name.strip() for name in text.split(","))
@@ -179,28 +181,31 @@ def points_of(networks: Iterable[Variant], boards: Sequence[TargetProfile], whol
 
 
 def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swath) -> list[Point]:
-    """Where a network is looked at: in INT8 on each configuration of the boards, on the first in more tiles too."""
+    """Return where a network is compared: in INT8 in each configuration of every board, in the default in more tiles.
+
+    Every board is treated alike, so that the order of the boards changes nothing.
+    """
     if variant.precision == FLOAT:
         return [Point(variant, reason=FLOAT_ON_DPU)]
     found = []
     for board in boards:
         try:
-            found += _on_board(variant, board, whole, more=board is boards[0])
+            found += _on_board(variant, board, whole)
         except ModelError as error:
-            found.append(Point(variant, reason=f"{board.name}: {str(error).rstrip('.')}"))
+            reason = f"{board.name}: {str(error).rstrip('.')}"
+            found.append(Point(variant, reason=reason, refused_by=board.name))
     return found
 
 
-def _on_board(variant: Variant, board: TargetProfile, whole: Swath, *, more: bool) -> list[Point]:
-    """The fastest tile on each configuration; on the default one the paper's tile and smaller halos too."""
+def _on_board(variant: Variant, board: TargetProfile, whole: Swath) -> list[Point]:
+    """Return the fastest tile in each configuration; in the default one the paper's tile and smaller halos too."""
     default = dpu_of(board)
     others = [dpu_of(board, name) for name in board.configurations if name != default.name]
     fastest_px = fastest_tile_px(variant, default, whole)
     points = [Point(variant, board, dpu, fastest_px) for dpu in [default, *others]]
-    if more:
-        points.append(Point(variant, board, default, TILE_PX))
-        smaller = (halo for halo in HALOS_PX if halo < radius_px(variant))
-        points += [Point(variant, board, default, fastest_px, halo) for halo in smaller]
+    points.append(Point(variant, board, default, TILE_PX))
+    smaller = (halo for halo in HALOS_PX if halo < radius_px(variant))
+    points += [Point(variant, board, default, fastest_px, halo) for halo in smaller]
     return list({point.name: point for point in points}.values())
 
 

@@ -20,7 +20,7 @@ from beers_deploy.model.shipped import INT8 as SUFFIX
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.profiles import TargetProfile
-from beers_deploy.profiles.errors import MachineError
+from beers_deploy.profiles.errors import MachineError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.figures import measured as measured_figure
 from beers_deploy.profiles.sensor import Sensor
@@ -30,6 +30,7 @@ from beers_deploy.results import input_of
 from beers_deploy.studies.evaluation.methods import Method, method_named
 from beers_deploy.studies.evaluation.pairs import pairs_of_scenes
 from beers_deploy.studies.tradeoff import advice
+from beers_deploy.studies.tradeoff.boards import Question, board_rows
 from beers_deploy.studies.tradeoff.measure import Benchmark, Labelled, Measurements, make_int8, measure_host
 from beers_deploy.studies.tradeoff.page import Tradeoff
 from beers_deploy.studies.tradeoff.points import (
@@ -70,7 +71,7 @@ def tradeoff(
         images: folder of held-out scenes to simulate from; drawn ones if None.
         sensor: of the degraded images.
         reference: the sensor that is aimed at; the shipped one if None.
-        board: one or several; the front and the recommendation are about the first.
+        board: one or several, compared in one front; "all" for the shipped ones. Their order changes nothing.
         size: (width, height) of the swath in pixels, or as text.
         budget: what can be afforded, such as "latency<=20s".
         need: what must be reached, such as "psnr>=44".
@@ -93,6 +94,7 @@ def tradeoff(
         'int8'
     """
     boards, width_height = boards_of(board), parse_size(size) if isinstance(size, str) else size
+    _require_different(boards)
     for each in boards:
         Constants.of(dpu_of(each))  # a board without them is refused before anything is measured
     limits = advice.parse_constraints("budget", budget), advice.parse_constraints("need", need)
@@ -109,11 +111,11 @@ def tradeoff(
         benchmark = Benchmark(pairs, degraded, aim, weights, seed)
         pictures = Labelled.open(Path(labelled), detector, classes, benchmark) if labelled else None
         measured = _measured(points, benchmark, pictures, kept, swath, log)
-    if boards[0].name == PAPER_TARGET and width_height == parse_size(PAPER_SIZE):
+    if PAPER_TARGET in [each.name for each in boards] and width_height == parse_size(PAPER_SIZE):
         for row in published_rows():  # as printed; the paper's images are others
             figures = {f"board {key}": figure for key, figure in row.figures.items()}
             measured.append(advice.Measured(row.name, figures, {"board": PAPER_TARGET}))
-    notes = (*_notes(benchmark, boards[0].name), *(pictures.notes if pictures else ()), *said)
+    notes = (*_notes(benchmark, [each.name for each in boards]), *(pictures.notes if pictures else ()), *said)
     files = [path for path in map(Path, names) if path.is_file()]
     files += [path for folder in (scenes, calibrated) if folder for path in list_images(folder)]
     files += [path for path in (find_backbone("squeeze", weights), detector) if path]
@@ -123,27 +125,38 @@ def tradeoff(
     arguments |= {"seed": seed, "target": ",".join(each.name for each in boards), "network": ",".join(names)}
     arguments |= {"labelled": labelled, "detector": detector, "classes": classes} if labelled else {}
     about: dict[str, Any] = {"arguments": arguments, "inputs": tuple(map(input_of, files)), "notes": notes}
-    return _weighed(measured, boards[0], advice.Comparison(benchmark.sites, seed), *limits, **about)
+    asked = Question(*limits, advice.Comparison(benchmark.sites, seed))
+    return weigh(measured, [each.name for each in boards], asked, **about)
 
 
-def _weighed(
-    points: Sequence[advice.Measured],
-    board: TargetProfile,
-    compare: advice.Comparison,
-    budget: Sequence[advice.Constraint],
-    need: Sequence[advice.Constraint],
-    **about: Any,
-) -> Tradeoff:
-    """The front and the recommendation, of the points of one board."""
-    here = [each for each in points if each.point and each.point.board in (None, board)]
-    cost = advice.chosen_cost(here, budget)
-    front, (best, line) = advice.pareto_front(here, cost), advice.recommend(here, budget, need, compare)
-    numbered = advice.front_rows(front, cost, compare)
+def _require_different(boards: Sequence[TargetProfile]) -> None:
+    """Raise OptionError if two boards have one name: their points could not be told apart."""
+    names = [each.name for each in boards]
+    if len(set(names)) < len(names):
+        twice = max(names, key=names.count)
+        raise OptionError("board", expected="boards, each once", got=f"two {twice!r}", remedy="leave one out")
+
+
+def weigh(points: Sequence[advice.Measured], boards: Sequence[str], asked: Question, **about: Any) -> Tradeoff:
+    """Find the front, the recommendation, and what each board offers.
+
+    Args:
+        points: of all boards, and published runs.
+        boards: their names.
+        asked: budget and need.
+        **about: the arguments, inputs and notes of the study.
+    """
+    cost = advice.chosen_cost(points, asked.budget)
+    best, line = advice.recommend(points, asked.budget, asked.need, asked.compare)
+    front = advice.pareto_front(advice.affordable(points, asked.constraints, cost), cost)
+    numbered = advice.front_rows(front, cost, asked.compare)
+    by_board = board_rows(points, boards, best, asked)
     name, figures = (best.name, best.figures) if best else ("none", {})
     every = (Row("points", point.name, point.figures, point.text) for point in points)
-    rows = (Row("recommended", name, figures, {"line": line}), *numbered, *every)
+    rows = (Row("recommended", name, figures, {"line": line}), *by_board, *numbered, *every)
     about |= {"points": points, "front": front, "front_rows": numbered, "cost": cost, "best": best, "line": line}
-    return Tradeoff("tradeoff", rows=rows, board=board.name, **about)
+    about |= {"boards": tuple(boards), "board_rows": by_board, "constraints": asked.constraints}
+    return Tradeoff("tradeoff", rows=rows, **about)
 
 
 def _measured(
@@ -212,9 +225,10 @@ def _text(point: Point, method: Method) -> dict[str, str]:
     }
 
 
-def _notes(benchmark: Benchmark, board: str) -> Iterator[str]:
+def _notes(benchmark: Benchmark, boards: Sequence[str]) -> Iterator[str]:
     sites = len(set(benchmark.sites))
-    yield f"No board was used: figures of {board} are predicted, but for the paper's, which are published."
+    names = ", ".join(boards)
+    yield f"No board was used: figures of {names} are predicted, but for the paper's, which are published."
     yield f"PSNR is the mean over {len(benchmark.pairs)} images of {sites} sites; clipped pixels are left out."
     yield (
         "Gains are differences on the same images from the next cheaper point of the front, with 95 % bootstrap "

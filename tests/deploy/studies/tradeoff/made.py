@@ -18,9 +18,17 @@ DPU = load_dpu("vck190")
 
 
 def made(
-    name: str, psnr_db: float, latency_s: float, *, scatter_db: float = 0.01, tile_px: int = 640, method: str = ""
+    name: str,
+    psnr_db: float,
+    latency_s: float,
+    *,
+    scatter_db: float = 0.01,
+    tile_px: int = 640,
+    method: str = "",
+    board: str = "vck190",
+    power_w: float = 30.0,
 ) -> Measured:
-    """An INT8 network of that name: its scores differ from the mean as sites do, and by some scatter."""
+    """Make an INT8 network of that name: its scores differ from the mean as sites do, and by some scatter."""
     noise = np.random.default_rng(sum(map(ord, name))).normal(size=len(SITES))
     values = psnr_db + DIFFICULTY_DB - DIFFICULTY_DB.mean() + scatter_db * (noise - noise.mean())
     variant = Variant(method or name, INT8, Path(f"{method or name}.onnx"))
@@ -31,10 +39,11 @@ def made(
             "SSIM": measured(psnr_db / 50, "ratio", "made up"),
             "host p50": measured(latency_s / 10, "s/Mpx", "made up"),
             "board latency": predicted(latency_s, "s", (latency_s / 1.6, latency_s * 1.6), "made up"),
-            "board energy": predicted(latency_s * 30, "J", (latency_s * 15, latency_s * 60), "made up"),
+            "board power": predicted(power_w, "W", (power_w / 2, power_w * 2), "made up"),
+            "board energy": predicted(latency_s * power_w, "J", (latency_s * 15, latency_s * 60), "made up"),
         },
         {
-            "board": "vck190",
+            "board": board,
             "configuration": DPU.name,
             "tile": "640",
             "halo": "exact",

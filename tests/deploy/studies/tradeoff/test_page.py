@@ -2,58 +2,91 @@
 
 import base64
 import re
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import pytest
 
 from beers_deploy.report.page import render
-from beers_deploy.report.plots import DARK, LIGHT
-from beers_deploy.studies.tradeoff.advice import Measured, front_rows, pareto_front, recommend
-from beers_deploy.studies.tradeoff.page import SIZE_PX, Tradeoff, plot_svg, report_of, series
+from beers_deploy.report.plots import DARK, LIGHT, look
+from beers_deploy.studies.tradeoff.advice import Measured, parse_constraints
+from beers_deploy.studies.tradeoff.boards import Question
+from beers_deploy.studies.tradeoff.page import Tradeoff, report_of
+from beers_deploy.studies.tradeoff.plot import SIZE_PX, figure_of, plot_svg, series
+from beers_deploy.studies.tradeoff.run import weigh
 from tests.deploy.browser import seen
-from tests.deploy.studies.tradeoff.made import COMPARE, family
+from tests.deploy.studies.tradeoff.made import COMPARE, family, made
 
 SVG = "{http://www.w3.org/2000/svg}"
-COST = "board latency"
+BOARDS = ("vck190",)
 
 
-def study(points: list[Measured] | None = None) -> Tradeoff:
+def study(
+    points: list[Measured] | None = None, budget: str | None = None, boards: tuple[str, ...] = BOARDS
+) -> Tradeoff:
     found = list(family()) if points is None else points
-    front = pareto_front(found, COST)
-    best, line = recommend(found, [], [], COMPARE)
-    return Tradeoff(
-        "tradeoff",
-        {},
-        (),
-        (),
-        notes=("No board was used.",),
-        board="vck190",
-        points=found,
-        front=front,
-        front_rows=front_rows(front, COST, COMPARE),
-        cost=COST,
-        best=best,
-        line=line,
-    )
+    asked = Question(parse_constraints("budget", budget), [], COMPARE)
+    return weigh(found, boards, asked, arguments={}, inputs=(), notes=("No board was used.",))
+
+
+def words_of(found: Tradeoff) -> list[str]:
+    """Return the words in a study's plot."""
+    root = ET.fromstring(plot_svg(found.drawn))  # noqa: S314 - our own
+    return [text.text or "" for text in root.iter(f"{SVG}text")]
 
 
 def page() -> str:
     found = study()
-    return render(report_of(found, plot_svg(found)))
+    return render(report_of(found, plot_svg(found.drawn)))
 
 
 def test_the_plot_numbers_the_members_of_the_front_and_the_table_names_them() -> None:
-    root = ET.fromstring(plot_svg(study()))  # noqa: S314 - our own
-    words = [text.text for text in root.iter(f"{SVG}text")]
+    words = words_of(study())
     assert [word for word in words if word in ("1", "2", "3", "4")][-4:] == ["1", "2", "3", "4"]
     assert {"tiny", "small", "medium", "large", "slow"} <= set(words)
     assert "4. large" in page()
 
 
 def test_every_series_has_a_look_of_its_own() -> None:
-    looks = [(colour, marker) for _, colour, marker, _ in series(list(family()))]
+    looks = [(each.colour, each.marker) for each in series(study().drawn)]
     assert len(set(looks)) == len(looks) == 5
+
+
+def test_of_several_boards_a_network_keeps_its_colour_and_a_board_its_marker() -> None:
+    points = [made(f"{name} {board}", 45.0, cost, method=name, board=board) for name, board, cost in PLACES]
+    points = [replace(each, text={**each.text, "method": each.name.split()[0]}) for each in points]
+    found = list(series(study(points, boards=("vck190", "zcu104")).drawn))
+    assert len({(each.name, each.colour) for each in found}) == len({each.colour for each in found}) == 2
+    assert len({(each.board, each.marker) for each in found}) == len({each.marker for each in found}) == 2
+    words = words_of(study(points, boards=("vck190", "zcu104")))
+    assert {"vck190", "zcu104", "one", "other"} <= set(words)
+
+
+PLACES = [("one", "vck190", 1.0), ("one", "zcu104", 2.0), ("other", "vck190", 3.0), ("other", "zcu104", 4.0)]
+
+
+@pytest.mark.parametrize("most_s", [9.9, 99.0, 2_813.0, 9_990.0, 4_200_000.0])
+def test_every_label_lies_within_the_picture(most_s: float) -> None:
+    points = [*family(), made("a network with a rather long name", 44.0, most_s)]
+    with look():
+        figure = figure_of(study(points, "latency<=9s").drawn)
+        found = figure.get_tightbbox()  # in inches
+        width, height = figure.get_size_inches()
+    assert found.x0 >= 0
+    assert found.y0 >= 0
+    assert found.x1 <= width
+    assert found.y1 <= height
+
+
+def test_the_plot_marks_the_recommended_point_and_the_budget() -> None:
+    def words(budget: str | None) -> list[str]:
+        return words_of(study(budget=budget))
+
+    assert "recommended" in words("latency<=3s")
+    assert "\N{LESS-THAN OR EQUAL TO} 3 s" in words("latency<=3s")
+    assert "recommended" not in words("latency<=0.1s")
+    assert not any("\N{LESS-THAN OR EQUAL TO}" in word for word in words(None))
 
 
 def test_a_study_without_points_has_a_page(tmp_path: Path) -> None:

@@ -116,17 +116,17 @@ def test_the_fastest_tile_is_a_multiple_of_the_step_and_no_other_is_faster(varia
     assert seconds(found) == min(seconds(side) for side in range(2 * radius + TILE_STEP_PX, 641, 1) if side % 16 == 0)
 
 
-def test_int8_is_looked_at_on_every_configuration_and_on_the_first_board_in_more_tiles(variant: Variant) -> None:
+def test_int8_is_compared_on_every_board_and_configuration_in_several_tiles_and_halos(variant: Variant) -> None:
     boards = [load_target("vck190"), load_target("zcu102")]
     points = network_points(variant, boards, WHOLE)
     assert len({point.name for point in points}) == len(points)
     for board in boards:
         here = [point for point in points if point.board == board]
         assert {point.dpu.name for point in here if point.dpu} == set(board.configurations)
-    halos = {point.halo_px for point in points if point.board == boards[0]}
-    assert halos == {None, *(halo for halo in HALOS_PX if halo < radius_px(variant))}
-    assert {point.halo_px for point in points if point.board == boards[1]} == {None}
-    assert TILE_PX in {point.tile_px for point in points}
+        assert {point.halo_px for point in here} == {None, *(halo for halo in HALOS_PX if halo < radius_px(variant))}
+        assert TILE_PX in {point.tile_px for point in here}
+    other = network_points(variant, boards[::-1], WHOLE)
+    assert {point.name for point in other} == {point.name for point in points}
 
 
 def test_float_and_what_a_board_refuses_have_no_board_and_the_reason(variant: Variant) -> None:

@@ -1,0 +1,230 @@
+"""The plot of a study: PSNR against cost, with the front, the recommended point and the limits."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from markupsafe import Markup
+
+from beers_deploy.model.traditional.peers import PEERS
+from beers_deploy.profiles.figures import Row
+from beers_deploy.report.plots import LIGHT, SERIES, look, new_figure, set_ticks, svg_of
+from beers_deploy.studies.tradeoff.advice import PSNR, Constraint, Measured, ends, placed
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SIZE_PX, TEXT_PX = (560, 520), 15
+"""Of the plot: wide enough for a desk, and its words large enough on a telephone, where it is scaled down."""
+FRONT_PX2, OTHERS_PX2, RING_PX2 = 90, 34, 330
+"""Areas of marks: of the front, of other points, and of the ring around the recommended point."""
+NEAR_PX = 16
+"""Marks no farther apart share a label."""
+PALE = 0.45
+MARKERS = ("o", "s", "D", "^", "v", "P", "X")
+CHAINS, LIBRARIES = "traditional pipelines", "other libraries"
+RECOMMENDED = "recommended"
+AT_MOST, AT_LEAST = "\N{LESS-THAN OR EQUAL TO}", "\N{GREATER-THAN OR EQUAL TO}"
+HOST = "this machine"
+RIGHT, EDGE_PX = 0.97, 8
+"""Where the axes end as a share of the figure, unless a label needs room; and what is left free at the edge, because
+a browser's font may be wider than the one that was measured."""
+LEGEND_COLUMNS, LEGEND_ROW = 2, 0.045
+"""Of the legend, the height of a row as a share of the figure."""
+
+CAPTION = (
+    "Numbers are those of the front's table; the line is the front, small marks lie below it. The ring is around the "
+    "recommended point, dashed lines are the limits of budget and need. Upright bars: 95 % interval of the gain in "
+    "PSNR over the next cheaper point of the front. Bars across: interval of the cost."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """What the plot shows.
+
+    Attributes:
+        points: of all boards, and of this machine.
+        front: the points on the front, sorted by increasing cost.
+        front_rows: the rows of the front's table.
+        boards: names; of several, each has a marker of its own.
+        constraints: budget and need.
+        cost: the figure on the horizontal axis.
+        best: the recommended point.
+    """
+
+    points: Sequence[Measured]
+    front: Sequence[Measured]
+    front_rows: Sequence[Row]
+    boards: Sequence[str]
+    constraints: Sequence[Constraint]
+    cost: str
+    best: Measured | None
+
+
+@dataclass(frozen=True)
+class Series:
+    """Points that look alike: those of one network, of the pipelines, or of other libraries, on one board."""
+
+    name: str
+    board: str
+    colour: str
+    marker: str
+    points: Sequence[Measured]
+
+
+def plot_svg(drawn: Drawn) -> Markup:
+    """Return the plot as an SVG file, with the numbers of the front's members."""
+    with look():
+        return svg_of(figure_of(drawn), f"{PSNR} against {drawn.cost}; numbers as in the table of the front")
+
+
+def figure_of(drawn: Drawn) -> "Figure":
+    """Draw the plot; for use within `look`."""
+    from matplotlib import rc_context
+
+    with rc_context({"font.size": TEXT_PX}):
+        figure = new_figure(*SIZE_PX)
+        axes = figure.add_subplot()
+        draw(axes, drawn)
+        names = axes.get_legend_handles_labels()[1]
+        if names:
+            figure.legend(loc="lower center", ncols=LEGEND_COLUMNS)
+        rows = -(-len(names) // LEGEND_COLUMNS)
+        figure.subplots_adjust(left=0.13, right=RIGHT, top=0.95, bottom=0.14 + LEGEND_ROW * rows)
+        _make_room(axes)
+        _draw_numbers(axes, drawn)
+    return figure
+
+
+def _make_room(axes: "Axes") -> None:
+    """Narrow the axes until the last label below them, which is centred on its tick, ends within the figure."""
+    figure = axes.figure
+    width_px = figure.bbox.width
+    box = axes.get_tightbbox()
+    over_px = box.x1 + EDGE_PX - width_px if box is not None else 0.0
+    if over_px > 0:
+        figure.subplots_adjust(right=RIGHT - over_px / width_px)
+
+
+def draw(axes: "Axes", drawn: Drawn) -> None:
+    """Draw points, front, limits and recommended point; the numbers are left to whoever sizes the axes."""
+    axes.set(xscale="log", xlabel=_label(drawn, drawn.cost), ylabel=_label(drawn, PSNR))
+    found = list(series(drawn))
+    for each in found:
+        _scatter(axes, each, drawn)
+    _draw_front(axes, drawn)
+    axes.margins(0.1)
+    axes.autoscale_view()
+    _draw_limits(axes, drawn)
+    _draw_best(axes, drawn)
+    _draw_legend(axes, found, drawn)
+    if found:
+        set_ticks(axes.xaxis, 6)
+        set_ticks(axes.yaxis, 8)
+
+
+def series(drawn: Drawn) -> Iterator[Series]:
+    """Yield the points by what they look like: a colour for each network, and of several boards a marker for each."""
+    names: dict[str, int] = {}
+    groups: dict[tuple[str, str], list[Measured]] = {}
+    for point in placed(drawn.points, drawn.cost):
+        name = _kind(point)
+        names.setdefault(name, len(names))
+        groups.setdefault((name, point.text["board"]), []).append(point)
+    places = {board: number for number, board in enumerate([HOST, *sorted(drawn.boards)])}
+    for (name, board), members in groups.items():
+        colour = LIGHT[SERIES[names[name] % len(SERIES)]]
+        number = names[name] if len(drawn.boards) == 1 else places.get(board, 0)
+        yield Series(name, board, colour, MARKERS[number % len(MARKERS)], members)
+
+
+def _kind(point: Measured) -> str:
+    if point.point is not None and point.point.variant.file is not None:
+        return point.text["method"]
+    return LIBRARIES if point.text["method"] in PEERS else CHAINS
+
+
+def _scatter(axes: "Axes", each: Series, drawn: Drawn) -> None:
+    for large in (False, True):  # the front's last, so that they lie on top
+        x, y = _places([point for point in each.points if (point in drawn.front) == large], drawn.cost)
+        size, alpha = (FRONT_PX2, 1.0) if large else (OTHERS_PX2, PALE)
+        style: dict[str, Any] = {"c": each.colour, "marker": each.marker, "alpha": alpha, "zorder": 2 + large}
+        axes.scatter(x, y, s=size, linewidths=0, **style)
+
+
+def _places(points: Sequence[Measured], cost: str) -> tuple[list[float], list[float]]:
+    return [point.value(cost) for point in points], [point.value(PSNR) for point in points]
+
+
+def _draw_front(axes: "Axes", drawn: Drawn) -> None:
+    axes.step(*_places(drawn.front, drawn.cost), where="post", color=LIGHT["soft"], lw=1, zorder=1)
+    for point, row in zip(drawn.front, drawn.front_rows, strict=True):
+        x, y = point.value(drawn.cost), point.value(PSNR)
+        axes.plot(ends(point.figures[drawn.cost]), [y, y], color=LIGHT["line"], lw=2, zorder=0)
+        gain = row.figures.get("PSNR gain")
+        if gain is not None and gain.interval is not None:
+            before = y - (gain.value or 0.0)
+            axes.plot([x, x], [before + end for end in gain.interval], color=LIGHT["soft"], lw=1.5, zorder=1)
+
+
+def _draw_limits(axes: "Axes", drawn: Drawn) -> None:
+    """Draw the limits on cost and PSNR as dashed lines with their words; the axes keep their range if one is outside.
+
+    A limit on another figure, such as power, has no place in the plot.
+    """
+    low, high = axes.get_xlim()
+    style: dict[str, Any] = {"color": LIGHT["ink"], "lw": 1.2, "ls": "--", "zorder": 1}
+    for limit in drawn.constraints:
+        if limit.key == drawn.cost and low <= limit.limit <= high:
+            axes.axvline(limit.limit, **style)
+            words = f"{AT_MOST if limit.at_most else AT_LEAST} {limit.in_words(limit.limit)}"
+            right = limit.limit > np.sqrt(low * high)
+            place: dict[str, Any] = {"ha": "right" if right else "left", "va": "bottom"}
+            axes.annotate(words, (limit.limit, 1.0), (0, 3), ("data", "axes fraction"), "offset points", **place)
+        elif limit.key == PSNR and axes.get_ylim()[0] <= limit.limit <= axes.get_ylim()[1]:
+            axes.axhline(limit.limit, **style)
+
+
+def _draw_best(axes: "Axes", drawn: Drawn) -> None:
+    if drawn.best is None:
+        return
+    x, y = _places([drawn.best], drawn.cost)
+    style: dict[str, Any] = {"facecolors": "none", "edgecolors": LIGHT["ink"], "linewidths": 1.8, "zorder": 4}
+    axes.scatter(x, y, s=RING_PX2, label=RECOMMENDED, **style)
+
+
+def _draw_legend(axes: "Axes", found: Sequence[Series], drawn: Drawn) -> None:
+    """Add what the legend names, as marks without a point: networks by colour, and of several boards the markers."""
+    several = len(drawn.boards) > 1
+    networks = {each.name: (each.colour, MARKERS[0] if several else each.marker) for each in found}
+    boards = {each.board: (LIGHT["soft"], each.marker) for each in found} if several else {}
+    for name, (colour, marker) in (*networks.items(), *sorted(boards.items())):
+        axes.scatter([], [], s=FRONT_PX2, c=colour, marker=marker, label=name, linewidths=0)
+
+
+def _draw_numbers(axes: "Axes", drawn: Drawn) -> None:
+    """Write the members' numbers next to their marks; one label for neighbours whose marks lie on one another."""
+    groups: list[tuple[int, int, Measured]] = []
+    for number, point in enumerate(drawn.front, 1):
+        if groups and _distance_px(axes, point, groups[-1][2], drawn.cost) < NEAR_PX:
+            groups[-1] = (groups[-1][0], number, groups[-1][2])
+        else:
+            groups.append((number, number, point))
+    for first, last, point in groups:
+        words = str(first) if first == last else f"{first}\u2013{last}"
+        at = point.value(drawn.cost), point.value(PSNR)
+        axes.annotate(words, at, (-8, 9), "data", "offset points", ha="right", weight="bold")
+
+
+def _distance_px(axes: "Axes", a: Measured, b: Measured, cost: str) -> float:
+    ends_px = axes.transData.transform([(point.value(cost), point.value(PSNR)) for point in (a, b)])
+    return float(np.hypot(*(ends_px[1] - ends_px[0])))
+
+
+def _label(drawn: Drawn, key: str) -> str:
+    figure = next((point.figures[key] for point in drawn.points if key in point.figures), None)
+    where = f" on {drawn.boards[0]}" if key.startswith("board") and len(drawn.boards) == 1 else ""
+    return f"{key}{where}, {figure.unit}" if figure else key

@@ -1,0 +1,214 @@
+"""Text of others' files in every kind of output: it is shown, on its line, and neither obeyed nor taken for markup.
+
+The files are networks (metadata, names of nodes and tensors), images and samples (names), sensors and boards.
+"""
+
+import io
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from markdown_it import MarkdownIt
+from rich.console import Console
+
+from beers_deploy.commands.shared import say
+from beers_deploy.kit.record import _page, bill_of
+from beers_deploy.model import progress
+from beers_deploy.profiles.errors import one_line, visible
+from beers_deploy.profiles.figures import Check, Row, measured, unavailable
+from beers_deploy.report.page import Picture, Report, Section, render
+from beers_deploy.report.plots import look, new_figure, svg_of
+from beers_deploy.results import PIPE_WIDTH, Input, Table, markdown_text, print_rows
+from beers_deploy.studies.stress.battery import table_lines
+
+HOSTILE = (
+    "a|b\n::error::c\r\x1b[31m\x9b31m\x00 \u202egnp.exe\u2066 ``` <img src=x onerror=y> [l](http://x) "
+    "[red]r[/red] [/b] &lt;"
+)
+TEXT = st.text(alphabet=st.characters(exclude_categories=["Cs"]))
+HEAD = {"html", "head", "meta", "title", "style", "body", "script"}
+TABLES = {"h1", "h2", "p", "div", "table", "thead", "tbody", "tr", "th", "td", "small", "ul", "li", "b"}
+TAGS = HEAD | TABLES
+"""That a page of ours has without a picture."""
+
+
+def rows_with(text: str) -> list[Row]:
+    """Rows that have a text wherever a row may have one."""
+    figure = measured(1.5, text, text)
+    return [Row("t", text, {"size": figure, text: unavailable("px", text)}, {text: text, "word": text})]
+
+
+def shown_alike(text: str, allowed: str = "\n\t\N{NO-BREAK SPACE}") -> bool:
+    return all(letter.isprintable() or letter in allowed for letter in text)
+
+
+class Tags(HTMLParser):
+    """Collects the tags of a page and its text."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags, self.attributes, self.words = set[str](), set[str](), list[str]()
+        self.feed(html)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self.attributes |= {name for name, _ in attrs}
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+
+@given(TEXT)
+@example(HOSTILE)
+def test_a_page_has_the_text_and_no_tag_of_it(text: str) -> None:
+    picture = Picture(text, "data:,", text)
+    html = render(Report(text, text, [Section(text, rows_with(text), text)], [picture], [text], sorts=True))
+    assert shown_alike(html)
+    found = Tags(html)
+    assert found.tags <= TAGS | {"figure", "img", "figcaption"}
+    assert "onerror" not in found.attributes
+    assert visible(text).strip() in "".join(found.words)
+
+
+@given(TEXT)
+@example(HOSTILE)
+def test_a_notebook_has_the_text_and_no_tag_of_it(text: str) -> None:
+    table = Table("check", {}, (), tuple(rows_with(text)), notes=(text,))
+    assert shown_alike(table._repr_html_())
+    assert Tags(table._repr_html_()).tags <= TAGS
+    assert repr(table).isprintable()
+
+
+@given(TEXT)
+@example(HOSTILE)
+def test_a_terminal_has_each_line_of_ours_and_no_other(text: str) -> None:
+    outputs = []
+    for words in (text, "plain"):
+        stream = io.StringIO()
+        row = Row("t", "one", {"size": measured(1.5, "px", "here")}, {"word": words[:20]})
+        print_rows(f"t{words[:20]}", [row] * 2, Console(file=stream, width=PIPE_WIDTH))
+        outputs.append(stream.getvalue())
+    assert shown_alike(outputs[0], "\n")
+    assert outputs[0].count("\n") == outputs[1].count("\n")
+
+
+@given(TEXT)
+@example(HOSTILE)
+def test_a_sentence_is_one_line(text: str) -> None:
+    stream = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.stdout", stream)
+        say(f"wrote {text}")
+    assert stream.getvalue() == f"wrote {one_line(text)}\n"
+
+
+@given(TEXT)
+@example(HOSTILE)
+def test_progress_is_one_line_without_markup(text: str) -> None:
+    stream = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.stderr", stream)
+        with progress.reporting(True), progress.steps("work", 1) as bar:
+            bar.advance(1, text)
+        with progress.reporting(True), progress.progress("work") as log:
+            log(text)
+    lines = stream.getvalue().split("\n")
+    assert len(lines) == 3
+    assert shown_alike("".join(lines), "")
+    shown = io.StringIO()
+    bar_on_terminal = progress._bar()
+    task = bar_on_terminal.add_task(one_line(text))
+    Console(file=shown, width=10_000).print(bar_on_terminal.make_tasks_table(bar_on_terminal.tasks))
+    assert bar_on_terminal.tasks[task].description == one_line(text)
+    assert shown.getvalue().rstrip() == one_line(text).rstrip(), "a name in brackets is no markup"
+
+
+@given(TEXT)
+@example(HOSTILE)
+def test_a_cell_of_markdown_is_one_cell_of_plain_text(text: str) -> None:
+    lines = table_lines([Row("t", text, {"size": measured(1.5, "px", "here")}, {"word": text})])
+    html = MarkdownIt("commonmark").enable(["table", "strikethrough"]).render("\n".join(lines))
+    assert html.count("<tr>") == 2
+    assert html.count("<td>") == 3
+    assert Tags(html).tags == {"table", "thead", "tbody", "tr", "th", "td"}
+    assert shown_alike("\n".join(lines), "\n")
+    assert "\n" not in markdown_text(text)
+
+
+def document(text: str) -> tuple[Table, dict[str, Any]]:
+    """A judged table, and what a record says of its network."""
+    check = Check("MAE", 2.0, 1.0, "dB", detail=text)
+    judged = Table("gate", {}, (Input(text, "0" * 64),), tuple(rows_with(text)), (check,), (text,))
+    network = {"name": text, "precision": "INT8", "sha256": "0" * 64}
+    said = {
+        "tool": {"name": "beers-deploy", "version": "1", "code_sha256": "0" * 64},
+        "network": network,
+        "says": {text: text, "sensor": text},
+        "limitations": [text],
+        "passed": False,
+        "results": {"inputs": [{"name": text, "sha256": "0" * 64}]},
+    }
+    said |= dict.fromkeys(("weights_sha256", "training", "sensors_in_range", "licence"))
+    return judged, said
+
+
+@given(TEXT)
+@example(HOSTILE)
+def test_a_record_has_the_text_of_a_network_s_metadata_escaped(text: str) -> None:
+    judged, said = document(text)
+    html = render(_page(judged, said))
+    assert shown_alike(html)
+    assert Tags(html).tags <= TAGS
+
+
+@given(TEXT)
+@example(HOSTILE)
+def test_a_bill_of_materials_has_names_on_one_line(text: str) -> None:
+    pytest.importorskip("cyclonedx")
+    _, said = document(text)
+    bill = bill_of(said)
+    assert shown_alike(bill, "\n")
+    found = json.loads(bill)
+    component = found["metadata"]["component"]
+    assert component["name"] == one_line(text)
+    assert all(each["name"].isprintable() for each in component["properties"])
+    assert all(each["value"].isprintable() for each in component["properties"])
+
+
+@given(TEXT)
+@example(HOSTILE)
+def test_a_drawing_has_the_text_as_words(text: str) -> None:
+    pytest.importorskip("matplotlib")
+    with look():
+        figure = new_figure(100, 100)
+        figure.text(0.5, 0.5, "word", gid="mark")
+        svg = svg_of(figure, text, {"mark": text})
+    assert shown_alike(svg)
+    root = ET.fromstring(svg)  # noqa: S314 - our own
+    kinds = {element.tag.rpartition("}")[2] for element in root.iter()}
+    assert not kinds & {"img", "script", "foreignObject"}
+
+
+def test_no_output_is_written_past_the_functions_that_escape() -> None:
+    """Words of a file reach a terminal by `say`, `print_rows` and progress alone; each place is looked at once."""
+    folder = Path(__file__).parents[2]
+    found = {
+        path.relative_to(folder).as_posix()
+        for part in ("deploy", "model", "quant", "profiles")
+        for path in (folder / part).rglob("*.py")
+        if re.search(r"typer\.echo\(|\bconsole\.print\(|std(out|err)\.write\(|(?<![.\w>])print\(", _code(path))
+    }
+    known = {"deploy/cli.py", "deploy/commands/shared.py", "deploy/results.py", "model/progress.py"}
+    assert found - known == {"deploy/kit/measure.py"}  # runs on a board, by itself
+
+
+def _code(path: Path) -> str:
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return "\n".join(line for line in lines if not line.strip().startswith((">>>", "...", "#")))
