@@ -93,8 +93,8 @@ class Board(TargetProfile):
         vectors = write_golden(network, folder / "golden", board=self)
         network.core(self, np.load(vectors / "noise" / PICTURE).shape[-1]).save(vectors / "core.onnx")
         if record:
-            sensor_of_it = Sensor.load(BLIND) if known is None else known
-            write_record(check(network, self, tile=tile), network, sensor_of_it, folder / "record")
+            conditioned_on = Sensor.load(BLIND) if known is None else known
+            write_record(check(network, self, tile=tile), network, conditioned_on, folder / "record")
         words = {
             "network": markdown_text(network.name),
             "board": markdown_text(self.name),
