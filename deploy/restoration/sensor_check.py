@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beers_deploy.model.metrics import edge_blur
+from beers_deploy.model.metrics.edge_fit import EdgeBlur, Noise
 from beers_deploy.model.metrics.noise_line import ROUNDING, Blocks, NoiseModel, cut_blocks, fit_noise_model, join
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.progress import Log
@@ -28,6 +29,12 @@ WINDOW_PX, ACROSS = 512, 4
 """Side of a window, and how many at most lie side by side, and below one another."""
 EDGES = 20
 """Enough along an axis: more would take time and tell no more."""
+STEP_PX, CANDIDATES = 4, 400
+"""Every so many rows of a window are searched, and so many of its steepest places compared with plain edges."""
+FITS, FITS_OF_WINDOW = 128, 8
+"""Squares along an axis that are fitted, of all windows and of each at least: 1 ms each (measured)."""
+WINDOWS_AT_ONCE = 4
+"""Whose squares are fitted together: fewer at a time take longer."""
 DRAWS, SEED = 20, 0
 """Of sensors from a profile with ranges."""
 NOISE_KEPT, BLUR_KEPT = 1.25, 1.15
@@ -245,10 +252,13 @@ def _blur(
         yield figure, [what] if off else []
 
 
-def _edges(windows: Sequence[np.ndarray], noise: edge_blur.Noise, clipped_at: float) -> list[edge_blur.EdgeBlur]:
+def _edges(windows: Sequence[np.ndarray], noise: Noise, clipped_at: float) -> list[EdgeBlur]:
     """The blurs across near-vertical edges, of as many windows as it takes to find enough."""
-    found = list[edge_blur.EdgeBlur]()
-    for window in windows:
-        if min(window.shape) > 2 * (edge_blur.HALF_PX + 2) and len(found) < EDGES:
-            found += edge_blur.find_blurs(window, noise, clipped_at)
+    found = list[EdgeBlur]()
+    effort = edge_blur.Effort(STEP_PX, CANDIDATES, max(FITS // len(windows), FITS_OF_WINDOW))
+    for first in range(0, len(windows), WINDOWS_AT_ONCE):
+        if len(found) < EDGES:
+            several = windows[first : first + WINDOWS_AT_ONCE]
+            squares = [edge_blur.plain_squares(window, noise, clipped_at, effort) for window in several]
+            found += edge_blur.blurs_of(np.concatenate(squares), noise)
     return found[:EDGES]
