@@ -56,7 +56,8 @@ def matching_lines(out: Path, files: Iterable[Path]) -> dict[tuple[object, objec
 def _matching(out: Path, text: str) -> Line | None:
     """Return a line without its digests; None if the line or an image does not match them."""
     try:
-        line: dict[str, Any] = dict(parse_json(text))  # type: ignore[call-overload]
+        found: Any = parse_json(text)
+        line: dict[str, Any] = dict(found)
         digests = dict(line.pop(DIGESTS))
         if digests.pop("line") != _digest(line) or not text.endswith("\n"):
             return None

@@ -60,7 +60,8 @@ def read_journal(path: Path, job: Mapping[str, object]) -> list[FinishedRow]:
         TypeError: a value of another type.
         OSError: a journal that cannot be read.
     """
-    content: dict[str, Any] = dict(read_json(path))
+    found: Any = read_json(path)
+    content: dict[str, Any] = dict(found)
     if content.pop("sha256") != _digest(content):
         raise ValueError("damaged")
     if content["job"] != job:

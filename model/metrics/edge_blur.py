@@ -120,7 +120,8 @@ def _steepness(image: np.ndarray, noise: Noise, step_px: int) -> np.ndarray:
         return rows[:, MARGIN_PX + k : width - MARGIN_PX + k]
 
     near = range(-2, 3)
-    lengthwise, step_down = sum(row(k) for k in near), row(2) - row(-2)
+    lengthwise = np.asarray(sum(row(k) for k in near))
+    step_down = row(2) - row(-2)
     across = np.abs(column(lengthwise, 2) - column(lengthwise, -2)) / 5
     down = np.abs(sum(column(step_down, k) for k in near)) / 5
     return np.asarray(np.where(down > across, 0, across / np.sqrt(2 / 5 * noise(column(row(0), 0)))))
