@@ -27,7 +27,7 @@ from beers_deploy.restoration.options import Options, Runtime
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import plan_for
 from beers_deploy.restoration.radiometry import full_scale_of
-from beers_deploy.restoration.run import restore_file, scale_of
+from beers_deploy.restoration.run import check_sensor, restore_file, scale_of
 from beers_deploy.restoration.runtime import Packed, open_runtime, tiles_at_once
 from beers_deploy.restoration.sensor_check import told_sensor
 from beers_deploy.restoration.source import (
@@ -324,7 +324,7 @@ def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndar
     at_once = tiles_at_once(options.threads, plan.tiles)
     infer, _ = open_runtime(options.runtime, network, options.threads, at_once)
     full_scale = scale_of(source, plan, options, NAME).value
-    told_sensor(source, options.sensors, full_scale, NAME, options.strict, warnings.warn)
+    check_sensor(source, [network], options, full_scale, NAME, warnings.warn)
 
     def at_first_call(brighter: onnx.ModelProto) -> Packed:
         return Packed(brighter.SerializeToString(), options.runtime, options.threads, at_once)

@@ -10,7 +10,7 @@ import os
 import shutil
 import sys
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
@@ -20,9 +20,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from beers_deploy.model.io.files import sha256, whole_file, write_text
+from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.io.images import site_of
 from beers_deploy.model.io.tiff import write_tiff
+from beers_deploy.model.manifest import Line, image_of, line_text, matching_lines
+from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
 from beers_deploy.model.simulator.detector import Draw, to_uint16
@@ -35,8 +37,6 @@ from beers_deploy.profiles.sensor_file import reference_beside, sensor_from_json
 from beers_deploy.profiles.toml import parse_json, read_json
 
 DRAWN_SIDE_PX = 3000
-Line = dict[str, object]
-"""Of the manifest: one patch."""
 SensorLike = Sensor | str | os.PathLike[str]
 
 
@@ -161,8 +161,11 @@ def write_dataset(
     resume: bool,
     tick: Callable[[int], None],
     pool: Executor | None = None,
+    log: Log = no_log,
 ) -> dict[str, float]:
     """Write a dataset of 12-bit TIFF patches and its manifest.
+
+    Pairs of an earlier run stay if they match the digests in their lines of the manifest; others are made again.
 
     Args:
         recipe: what decides the pixels.
@@ -171,37 +174,51 @@ def write_dataset(
         resume: whether to go on with a dataset that the folder holds in part.
         tick: is told how many further patches are done.
         pool: makes them instead of processes here; only this process writes.
+        log: is told how many pairs of an earlier run do not match.
 
     Returns:
         patches, and the share of drawn SNR pairs that were impossible and drawn again.
     """
     _check_folder(recipe, out, resume)
-    if (out / "manifest.jsonl").exists():  # nothing was left to do
-        return _read_summary(out / "manifest.jsonl")
     for left_over in out.rglob(".*.part"):  # of a run that was killed
         if not left_over.is_dir():
             left_over.unlink()
-    windows = plan_windows(recipe)
+    windows, manifest = plan_windows(recipe), out / "manifest.jsonl"
     scenes = [list(group) for _, group in groupby(windows, key=lambda w: w.scene)]
     chunks = [scene[first : first + CHUNK] for scene in scenes for first in range(0, len(scene), CHUNK)]
     parts = {out / "parts" / f"{chunk[0].number:08d}.jsonl": chunk for chunk in chunks}
-    tick(sum(len(chunk) for path, chunk in parts.items() if path.exists()))
-    waiting = {path: chunk for path, chunk in parts.items() if not path.exists()}
+    lines = _lines_left(out, windows, parts, log) if resume else {}
+    waiting = {path: [w for w in chunk if w.number not in lines] for path, chunk in parts.items()}
+    waiting = {path: chunk for path, chunk in waiting.items() if chunk}
+    tick(len(lines))
     with ExitStack() as stack:
         if pool is None and workers > 1 and len(waiting) > 1:
             spawn = multiprocessing.get_context("spawn")  # a forked copy of a library's threads can hang
             pool = stack.enter_context(ProcessPoolExecutor(min(workers, MOST_PROCESSES), mp_context=spawn))
         for path, patches in stack.enter_context(closing(_made(recipe, waiting, workers, pool))):
-            for patch in patches:
+            for window, patch in zip(waiting[path], patches, strict=True):
                 for role, dn in (("degraded", patch.degraded), ("reference", patch.reference)):
-                    write_tiff(out / role / f"{patch.line['name']}.tif", dn)
-            write_text(path, "".join(json.dumps(patch.line, sort_keys=True) + "\n" for patch in patches))
+                    write_tiff(image_of(out, role, window.name), dn)
+                lines[window.number] = line_text(out, patch.line)
+            write_text(path, "".join(lines[window.number] for window in parts[path]))
             tick(len(patches))
-    with whole_file(out / "manifest.jsonl") as manifest:
-        manifest.write_bytes(b"".join(path.read_bytes() for path in parts))
-        summary = _read_summary(manifest)
-    shutil.rmtree(out / "parts")
-    return summary
+    content = "".join(lines[window.number] for window in windows)
+    if not manifest.is_file() or manifest.read_bytes() != content.encode():
+        write_text(manifest, content)
+    shutil.rmtree(out / "parts", ignore_errors=True)
+    return _read_summary(manifest)
+
+
+def _lines_left(out: Path, windows: list[Window], parts: Mapping[Path, list[Window]], log: Log) -> dict[int, str]:
+    """Return the lines of the pairs that an earlier run wrote and that match, by number; tell `log` of the others."""
+    manifest = out / "manifest.jsonl"
+    found = matching_lines(out, (manifest, *parts))
+    lines = {w.number: found[w.number, w.name] for w in windows if (w.number, w.name) in found}
+    stated = windows if manifest.exists() else [w for path, chunk in parts.items() if path.exists() for w in chunk]
+    damaged = sum(window.number not in lines for window in stated)
+    if damaged:
+        log(f"{damaged} of {len(stated)} pairs do not match the digests in the manifest: they are made again")
+    return lines
 
 
 def _made(

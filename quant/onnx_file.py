@@ -19,6 +19,7 @@ from beers_deploy.profiles.errors import BeersError, ModelError, OptionError
 from beers_deploy.profiles.toml import read_whole, unreadable
 from beers_deploy.quant.reading.external import take_in
 from beers_deploy.quant.reading.folding import IR_VERSION, OPSET, simplest
+from beers_deploy.quant.reading.training_mode import require_inference
 from beers_deploy.quant.untrusted import FILE_BYTES, check_content, check_runnable, opset_of
 
 REMEDY = "give an ONNX file, as 'beers-deploy export', 'beers-deploy quantize' or PyTorch writes it"
@@ -55,9 +56,10 @@ def read_onnx(content: bytes, where: str) -> onnx.ModelProto:
 
 
 def _simplest(model: onnx.ModelProto, where: str, to_run: bool) -> onnx.ModelProto:
-    if is_quantised(model):
-        return model
     try:
+        require_inference(model, where)
+        if is_quantised(model):
+            return model
         check_runnable(model, where)
         return simplest(model, where)
     except ModelError:

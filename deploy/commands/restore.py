@@ -171,8 +171,9 @@ def restore(
         bands={} if "" in paths else paths,
         brighter={band: files for band, files in brighter.items() if files},
     )
-    row = restore_file(image, out, how, say, (json, stac))
+    # Before the run, which may take hours: it refuses a file that is replaced while it is read.
     networks = [Input(f"{path.name}, {band}" if band else path.name, sha256(path)) for band, path in paths.items()]
+    row = restore_file(image, out, how, say, (json, stac))
     if stac is not None:
         write_item(out, stac)
     print_rows(f"wrote {out}", [row])

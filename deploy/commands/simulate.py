@@ -59,7 +59,12 @@ def simulate(
         str | None, typer.Option(help="Dask scheduler whose workers simulate, such as tcp://host:8786.")
     ] = None,
     seed: Seed = 0,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with an unfinished dataset.")] = False,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume", help="Go on with an unfinished dataset; pairs that do not match the manifest are made again."
+        ),
+    ] = False,
 ) -> None:
     """Write degraded/NAME.tif and reference/NAME.tif for each scene or patch; the same bytes for the same seed.
 
@@ -111,7 +116,7 @@ def simulate(
         return
     with open_cluster(scheduler) as cluster, steps("simulating", len(plan_windows(recipe))) as bar:
         count, pool = (cluster.slots, cluster.pool) if cluster else (workers or os.cpu_count() or 1, None)
-        summary = write_dataset(recipe, out, count, resume, bar.advance, pool)
+        summary = write_dataset(recipe, out, count, resume, bar.advance, pool, say)
     rejected = f"; {summary['rejected_share']:.1%} of the drawn SNR pairs were impossible and drawn again"
     pairs = f"{summary['patches']:.0f} pair{'' if summary['patches'] == 1 else 's'}"
     say(f"wrote {pairs} to {out}" + (rejected if summary["rejected_share"] else ""))

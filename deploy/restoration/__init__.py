@@ -13,6 +13,8 @@ An image passes, in this order:
     steps        the steps around the network: its exposures, and the consistency step
     tiles        the one tile loop, for files, arrays and Dask
     method       a network as a method that studies compare
+    sensor_check what the image shows of its sensor, and whether it is raw at all
+    journal      which rows are finished, and their digests
     output       finished rows in a checkpoint, the lock, the TIFF
     cog          the finished TIFF cloud-optimised, by GDAL; its STAC item for a catalogue
     run          all of this for one file: `restore_file`

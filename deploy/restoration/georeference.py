@@ -75,9 +75,14 @@ UNREAD = (".tfw", ".tifw", ".wld", ".jgw", ".pgw", ".j2w", ".RPB", ".rpb", "_RPC
 """Ends of files beside an image that say where it lies, as GDAL finds them."""
 
 
+def sidecar_of(path: Path) -> Path:
+    """Return where GDAL keeps metadata that IMAGE itself cannot hold: IMAGE.aux.xml."""
+    return path.with_name(f"{path.name}.aux.xml")
+
+
 def of_sidecar(path: Path, raster: Raster) -> Raster:
     """The raster with the nodata value that GDAL keeps in IMAGE.aux.xml, where the image has none of its own."""
-    beside = path.with_name(f"{path.name}.aux.xml")
+    beside = sidecar_of(path)
     if not beside.is_file():
         return raster
     root = read_xml(beside, AUX_BYTES, "metadata as GDAL writes it", "write it again, or remove it")

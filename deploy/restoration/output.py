@@ -4,16 +4,14 @@ One run at a time on one output: the system holds the lock, so that one left by 
 """
 
 import errno
+import hashlib
 import io
-import json
-import math
 import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, astuple, fields
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +23,8 @@ from isal import isal_zlib
 from beers_deploy.model.io.files import TIFF_SUFFIXES
 from beers_deploy.model.io.tiff import MASK
 from beers_deploy.profiles.errors import ImageError, MachineError, MissingExtraError, OptionError, sizes
-from beers_deploy.profiles.toml import read_json
 from beers_deploy.restoration.georeference import enlarged_tags
+from beers_deploy.restoration.journal import FinishedRow, journal_text, read_journal
 from beers_deploy.restoration.options import Compression
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.source import BIG_TIFF_SUFFIXES, RESTORED, RGB_BANDS, Source, strips
@@ -39,11 +37,12 @@ def part_folder(out: Path) -> Path:
 
 
 class Checkpoint:
-    """The finished rows of a restored image (bands, height, width), from the top, and a journal of their number.
+    """The finished rows of a restored image (bands, height, width), from the top, and a journal of their digests.
 
     Attributes:
         rows: how many are finished.
         tally: what was seen of them.
+        damaged_rows: how many an earlier run finished that no longer match its journal, and those below them.
     """
 
     def __init__(
@@ -68,7 +67,11 @@ class Checkpoint:
         self.out, self.shape, self.dtype = out, shape, dtype
         self.folder = part_folder(out)
         self._job = dict(job)
-        self.rows, self.tally = self._left() if resume else (0, Tally())
+        left = self._left() if resume else []
+        self._finished = self._matching(left)
+        self.rows = sum(row.rows_px for row in self._finished)
+        self.tally = sum((row.tally for row in self._finished), Tally())
+        self.damaged_rows = sum(row.rows_px for row in left) - self.rows
         with self.disk():
             if not self.rows:
                 self.remove()
@@ -82,12 +85,17 @@ class Checkpoint:
         """Keep a row of tiles, which must follow those that are kept."""
         with self.disk():
             with (self.folder / "rows.raw").open("r+b") as stream:
+                digest = hashlib.sha256()
                 for band in range(self.shape[0]):
+                    pixels = np.ascontiguousarray(row.pixels[band]).data
                     stream.seek(self._offset(band, self.rows))
-                    stream.write(np.ascontiguousarray(row.pixels[band]).data)
+                    stream.write(pixels)
+                    digest.update(pixels)
                 stream.flush()
                 os.fsync(stream.fileno())
-            self.rows, self.tally = self.rows + row.pixels.shape[1], self.tally + row.tally
+            rows_px = row.pixels.shape[1]
+            self._finished.append(FinishedRow(rows_px, row.pixels.nbytes, digest.hexdigest(), row.tally))
+            self.rows, self.tally = self.rows + rows_px, self.tally + row.tally
             self._write_journal()
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
@@ -123,25 +131,44 @@ class Checkpoint:
             got = error.strerror or str(error)
             raise MachineError(str(self.out), expected="a disk to write to", got=got, remedy=remedy) from error
 
-    def _left(self) -> tuple[int, Tally]:
+    def _left(self) -> list[FinishedRow]:
+        """Return the rows of tiles that an earlier run of this job finished, by its journal."""
         path = self.folder / "journal.json"
         if not path.is_file():
-            return 0, Tally()
-        with suppress(ValueError, KeyError, TypeError, OSError):
-            journal: Any = read_json(path)
-            rows = int(journal["rows"])
-            tally = Tally(**{each.name: journal[each.name] for each in fields(Tally) if each.name in journal})
-            sound = 0 <= rows <= self.shape[1] and 0 <= tally.known <= math.prod(self.shape)
-            if journal["job"] == self._job and sound and min(astuple(tally)) >= 0:
-                return rows, tally
+            return []
+        with suppress(ValueError, LookupError, TypeError, AttributeError, OSError):
+            finished = read_journal(path, self._job)
+            if sum(row.rows_px for row in finished) <= self.shape[1]:
+                return finished
         expected = "the image, the model and the options of the run that was stopped"
         got, remedy = f"others, or a damaged {path}", "run it as before, or start afresh without `resume`"
         raise OptionError("resume", expected=expected, got=got, remedy=remedy)
 
+    def _matching(self, finished: list[FinishedRow]) -> list[FinishedRow]:
+        """Return the rows of tiles down to the first one whose pixels are not those that the journal states."""
+        matching, top = list[FinishedRow](), 0
+        for row in finished:
+            if self._stored(top, row.rows_px) != (row.size_bytes, row.sha256):
+                break
+            matching.append(row)
+            top += row.rows_px
+        return matching
+
+    def _stored(self, top: int, rows_px: int) -> tuple[int, str]:
+        """Return the size in bytes and the digest of rows of pixels that are stored; fewer bytes where it ends."""
+        size_bytes, digest = 0, hashlib.sha256()
+        with suppress(OSError), (self.folder / "rows.raw").open("rb") as stream:
+            for band in range(self.shape[0]):
+                stream.seek(self._offset(band, top))
+                pixels = stream.read(rows_px * self.shape[2] * self.dtype.itemsize)
+                size_bytes += len(pixels)
+                digest.update(pixels)
+        return size_bytes, digest.hexdigest()
+
     def _write_journal(self) -> None:
         path, fresh = self.folder / "journal.json", self.folder / "journal.new"
         with fresh.open("w", encoding="utf-8") as stream:
-            json.dump({"job": self._job, "rows": self.rows, **asdict(self.tally)}, stream)
+            stream.write(journal_text(self._job, self._finished))
             stream.flush()
             os.fsync(stream.fileno())
         fresh.replace(path)

@@ -8,10 +8,11 @@ rows stay in the checkpoint where a later run can go on.
 """
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from functools import partial
+from importlib.metadata import version
 from math import prod
 from pathlib import Path
 
@@ -24,9 +25,10 @@ from beers_deploy.model.io.files import require_writable
 from beers_deploy.model.io.images import require_image_file
 from beers_deploy.model.processor import require_cores
 from beers_deploy.model.progress import Log, held_back, no_log, steps
-from beers_deploy.profiles.errors import BeersError, MachineError, optional
+from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, ModelError, optional
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.profiles.sensor import numbers_of
+from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.reading.external import network_sha256
 from beers_deploy.restoration.bands import in_order, require_alike
@@ -37,15 +39,16 @@ from beers_deploy.restoration.output import Checkpoint, only_run, require_codec,
 from beers_deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
 from beers_deploy.restoration.runtime import Infer, Packed, infer_on, open_runtime, tiles_at_once
-from beers_deploy.restoration.sensor_check import told_sensor
-from beers_deploy.restoration.source import Source, fingerprint, open_source, require_raw
-from beers_deploy.restoration.steps import OFF, consistency_steps, exposed_networks, factor_words
+from beers_deploy.restoration.sensor_check import SensorCheck, restored_already, told_sensor
+from beers_deploy.restoration.source import Source, fingerprint, open_source, require_raw, stamps
+from beers_deploy.restoration.steps import consistency_steps, exposed_networks, factor_words
 from beers_deploy.restoration.tiles.engine import Restorer
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 from beers_deploy.restoration.tiles.rows import RestoredRow, restore_rows, rows_to_run
 
 RUNS_UNTIL_STEADY = 2
 """Of each tile in work at a time: then a runtime takes no more memory."""
+CHECKED = "the comparison of the image's own noise and edges with its sensor: no part of time and throughput"
 MANY = 0.05
 """Share of an image above its full scale that no scene has, but a wrong full scale."""
 
@@ -67,9 +70,10 @@ def restore_file(
     if options.scheduler is None:
         require_cores("threads", options.threads)
     with begun(image, out, options, beside) as source, open_cluster(options.scheduler) as cluster:
-        raster = source.raster
+        raster, begun_with = source.raster, stamps(source.files)
         paths = in_order(options.bands, raster) if options.bands else [options.model]
-        networks = [load_onnx(path) for path in paths]
+        read = [read_network(path) for path in paths]
+        networks, digests = [network for network, _ in read], ", ".join(digest for _, digest in read)
         require_alike(networks, paths)
         plan = plan_for(networks[0], raster.shape, options)
         log(plan.sentence)
@@ -77,32 +81,33 @@ def restore_file(
             log(sentence)
         check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
         scale = scale_of(source, plan, options, str(image))
-        check = told_sensor(source, options.sensors, scale.value, str(image), options.strict, log)
+        check, check_s = timed(
+            partial(check_sensor, source, networks, options, scale.value, name=str(image), log=log)
+        )
         exposed, at_once, runtime = _opened(networks, source, plan, options, cluster, scale.value)
         steps_taken, words = consistency_steps(options, raster, plan.tiling, scale.value)
         clips = not scale.assumed
         restorer = Restorer(raster, exposed, scale.value, plan.tiling, str(image), clips, steps_taken)
         figures = seam_figures(source, plan, restorer)
-        # Another version of the runtime might give other bits: rows of one are not finished by another.
-        brighter = [path for files in options.brighter.values() for path in files.values()]
-        digests = ", ".join(network_sha256(path) for path in paths)
-        job = _job(image, source, digests, plan, runtime, scale.value)
-        job["exposures"] = [network_sha256(path) for path in brighter]
-        job["consistency"] = str([numbers_of(sensor) for sensor in options.sensors.values()]) if steps_taken else OFF
+        job = job_of(source, digests, plan, runtime, scale.value, options, bool(steps_taken))
         cog_bytes = disk_bytes(plan.out_shape, raster.out_dtype.itemsize) if options.cog else 0
         checkpoint = Checkpoint(out, plan.out_shape, raster.out_dtype, job, options.resume, cog_bytes)
+        if checkpoint.damaged_rows:
+            log(f"{checkpoint.damaged_rows} finished rows do not match their digests: they are made again")
         done_rows = checkpoint.rows // plan.scale
         _finish_rows(checkpoint, source, plan, restorer, at_once, options, log)
+        with _kept_for_resuming(checkpoint, log):
+            require_unchanged(source, str(image), begun_with, job["image"])
         with held_back():  # a stop now would save nothing
             about = what_was_done(networks, digests, scale)
             to_cog = partial(write_cog, compression=options.compression, about=about) if options.cog else None
             write_output(checkpoint, source, Compression.none if to_cog else options.compression, to_cog)
-    time_s, tally = time.perf_counter() - started, checkpoint.tally
+    time_s, tally = time.perf_counter() - started - check_s, checkpoint.tally
     if tally.clipped:
         share = tally.clipped / prod(raster.shape)
         doubt = f": {share:.0%} of the image; is that its full scale?" if share > MANY else ""
         log(f"{tally.clipped} pixels above full scale, {scale.words}, were clipped to it{doubt}")
-    figures |= {**check.figures, **tally.figures}
+    figures |= {"sensor check": measured(check_s, "s", CHECKED), **check.figures, **tally.figures}
     text = {**scale.text, **check.text, "consistency": words}
     if options.brighter:
         figures |= tally.exposure_figures
@@ -110,6 +115,33 @@ def restore_file(
     if steps_taken:
         figures |= tally.consistency_figures
     return run_row(image.name, plan, done_rows, time_s, runtime, options, figures, text)
+
+
+def check_sensor(
+    source: Source, networks: Sequence[onnx.ModelProto], options: Options, full_scale: float, name: str, log: Log
+) -> SensorCheck:
+    """Compare an image with the sensor that the user named; without one, log a sentence if it looks restored already.
+
+    Args:
+        source: the image.
+        networks: that are to restore it.
+        options: what the user chose.
+        full_scale: the pixel value that is 1.0 to the networks.
+        name: of the image, for messages.
+        log: is told what is seen.
+    """
+    if any(sensor.name != BLIND for sensor in options.sensors.values()):
+        return told_sensor(source, options.sensors, full_scale, name, options.strict, log)
+    sentence = "" if options.again else restored_already(source, networks, full_scale)
+    if sentence:
+        log(sentence)
+    return SensorCheck()
+
+
+def timed(work: Callable[[], SensorCheck]) -> tuple[SensorCheck, float]:
+    """Return what some work returns, and the seconds that it took."""
+    started = time.perf_counter()
+    return work(), time.perf_counter() - started
 
 
 @contextmanager
@@ -172,16 +204,71 @@ def scale_of(source: Source, plan: Plan, options: Options, name: str) -> FullSca
     return full_scale_of(name, source.raster, extents, options.full_scale, options.sensor_bits)
 
 
-def _job(image: Path, source: Source, model: str, plan: Plan, runtime: str, full_scale: float) -> dict[str, object]:
-    """All that decides the pixels, as the journal keeps it; who computes, on how many machines, is no part of it."""
+def job_of(
+    source: Source, digests: str, plan: Plan, runtime: str, full_scale: float, options: Options, steps: bool
+) -> dict[str, object]:
+    """Return all that decides the pixels; who computes, on how many machines, is no part of it.
+
+    Another version of this program or of the runtime might give other bits: rows of one are not finished by another.
+
+    Args:
+        source: the image.
+        digests: of the networks at factor 1.
+        plan: how the image is cut.
+        runtime: its name and version.
+        full_scale: the pixel value that is 1.0 to the network.
+        options: what the user chose.
+        steps: whether the consistency step is taken.
+    """
+    brighter = [path for files in options.brighter.values() for path in files.values()]
+    sensors = {band: [numbers_of(each), numbers_of(each.reference)] for band, each in options.sensors.items()}
     return {
-        "image": [*fingerprint(source.files), image.stat().st_mtime_ns],
-        "model": model,
+        "program": version("beers-deploy"),
+        "image": fingerprint(source.files),
+        "raster": repr(source.raster),
+        "model": digests,
+        "exposures": [network_sha256(path) for path in brighter],
+        "factors": {band: list(map(str, files)) for band, files in options.brighter.items()},
+        "sensors": repr(sensors),
+        "consistency": steps,
         "tile_px": plan.tile_px,
         "halo_px": plan.halo_px,
         "full_scale": full_scale,
         "runtime": runtime,
     }
+
+
+def read_network(path: Path) -> tuple[onnx.ModelProto, str]:
+    """Read a network and the digest of the bytes that it was read from.
+
+    Raises:
+        ModelError: a file that was replaced while it was read, besides what `load_onnx` raises.
+    """
+    before = network_sha256(path)
+    network = load_onnx(path)
+    if network_sha256(path) != before:
+        remedy = "wait until it is written, then run this again"
+        raise ModelError(
+            str(path), expected="a network that stays as it is", got="a change while it was read", remedy=remedy
+        )
+    return network, before
+
+
+def require_unchanged(source: Source, name: str, before: Sequence[tuple[int, int, int]], digest: object) -> None:
+    """Refuse an image, `name` in messages, that was replaced while its rows were read.
+
+    Args:
+        source: the image.
+        name: of the image.
+        before: its files' stamps before the first row was read.
+        digest: its fingerprint then.
+    """
+    # A file that was only touched or copied back is the same image: its content decides.
+    if stamps(source.files) != before and fingerprint(source.files) != digest:
+        remedy = "wait until it is written, then restore it again"
+        raise ImageError(
+            name, expected="an image that stays as it is", got="a change while it was read", remedy=remedy
+        )
 
 
 def _finish_rows(
@@ -288,7 +375,7 @@ def run_row(
 ) -> Row:
     """The figures of one run, of which `done_rows` were finished before."""
     useful_px = plan.bands * (plan.height_px - done_rows) * plan.width_px
-    source = f"from opening the image to the finished file, {runtime}"
+    source = f"from opening the image to the finished file without the sensor check, {runtime}"
     figures = {
         "time": measured(time_s, "s", source),
         "throughput": measured(useful_px / time_s / 1e6, "Mpx/s", f"the image's own pixels, {source}"),

@@ -3,6 +3,10 @@
 Windows spread over the image give a noise line (`model.metrics.noise_line`) and straight edges
 (`model.metrics.edge_blur`). Where their 95 % intervals lie off what the profile states, a sentence says what was seen
 and what was told. Texture without edges tells no blur, a scene without even ground no noise: then nothing is said.
+
+Without a named sensor `restored_already` compares the noise with that of the quietest sensor in range. Satellite
+products are mostly denoised and sharpened before they are delivered; a network that is not given their sensor takes
+them for images of a middling one, and sharpens them a second time.
 """
 
 import math
@@ -11,9 +15,20 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+import onnx
 
+from beers_deploy.model.family import RANGES
 from beers_deploy.model.metrics import edge_blur
-from beers_deploy.model.metrics.noise_line import ROUNDING, Blocks, NoiseModel, cut_blocks, fit_noise_model, join
+from beers_deploy.model.metrics.edge_fit import EdgeBlur, Noise
+from beers_deploy.model.metrics.noise_line import (
+    LEAST,
+    ROUNDING,
+    Blocks,
+    NoiseModel,
+    cut_blocks,
+    fit_noise_model,
+    join,
+)
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.progress import Log
 from beers_deploy.model.simulator.mtf import sensor_mtf
@@ -21,6 +36,7 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Figure, measured, unavailable
 from beers_deploy.profiles.response import NYQUIST
 from beers_deploy.profiles.sensor import Instrument, Sensor
+from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.source import Source
 
@@ -28,6 +44,12 @@ WINDOW_PX, ACROSS = 512, 4
 """Side of a window, and how many at most lie side by side, and below one another."""
 EDGES = 20
 """Enough along an axis: more would take time and tell no more."""
+STEP_PX, CANDIDATES = 4, 400
+"""Every so many rows of a window are searched, and so many of its steepest places compared with plain edges."""
+FITS, FITS_OF_WINDOW = 128, 8
+"""Squares along an axis that are fitted, of all windows and of each at least: 1 ms each (measured)."""
+WINDOWS_AT_ONCE = 4
+"""Whose squares are fitted together: fewer at a time take longer."""
 DRAWS, SEED = 20, 0
 """Of sensors from a profile with ranges."""
 NOISE_KEPT, BLUR_KEPT = 1.25, 1.15
@@ -128,17 +150,27 @@ def check_source(source: Source, sensors: Sequence[Sensor], full_scale: float) -
         sensors: one of all bands, or one of each.
         full_scale: the pixel value that is the sensors' largest digital number.
     """
-    bands = source.raster.bands
-    windows = [list[np.ndarray]() for _ in range(bands)]
-    for several in _windows(source):
-        for band, window in zip(windows, several, strict=True):
-            band.append(window)
+    bands, windows = source.raster.bands, band_windows(source)
     found = [held_against(seen, sensors[band % len(sensors)], full_scale) for band, seen in enumerate(windows)]
     if bands == 1:
         return found[0]
     named = {f"band {n}: ": each for n, each in enumerate(found, 1)}
     figures = {f"{band}{name}": figure for band, each in named.items() for name, figure in each.figures.items()}
     return SensorCheck(figures, tuple(f"{band}{doubt}" for band, each in named.items() for doubt in each.doubts))
+
+
+def band_windows(source: Source) -> list[list[np.ndarray]]:
+    """Return windows (h, w) of each band, spread evenly over an image, 0 where pixels are missing."""
+    return [list(windows) for windows in zip(*_windows(source), strict=True)]
+
+
+def integer_step(windows: Sequence[np.ndarray]) -> int | None:
+    """Return the largest integer of which all pixels are multiples; None if they are no integers."""
+    if any(window.dtype.kind == "f" for window in windows) and not all(
+        (np.isfinite(window) & (window == np.rint(window))).all() for window in windows
+    ):
+        return None
+    return max(int(np.gcd.reduce([np.gcd.reduce(window.astype(np.int64), axis=None) for window in windows])), 1)
 
 
 def _windows(source: Source) -> Iterator[np.ndarray]:
@@ -167,11 +199,11 @@ def held_against(windows: Sequence[np.ndarray], sensor: Sensor, full_scale: floa
         sensor: the profile; where it states ranges, all between their ends is as told.
         full_scale: the value that is the sensor's largest digital number.
     """
-    if not all((np.isfinite(window) & (window == np.rint(window))).all() for window in windows):
+    step = integer_step(windows)
+    if step is None:
         reason = "the pixels are not whole numbers: they were scaled, and the noise of rounding is not known"
         blurs = {f"MTF {axis} seen": unavailable("%", reason) for axis in AXES}
         return SensorCheck({"SNR seen": unavailable("ratio", reason), **blurs})
-    step = max(int(np.gcd.reduce([np.gcd.reduce(window.astype(np.int64), axis=None) for window in windows])), 1)
     pixels, clipped_at = [window / step for window in windows], full_scale / step
     told = _told(sensor, clipped_at)
     blocks = join([cut_blocks(window, clipped_at) for window in pixels])
@@ -245,10 +277,80 @@ def _blur(
         yield figure, [what] if off else []
 
 
-def _edges(windows: Sequence[np.ndarray], noise: edge_blur.Noise, clipped_at: float) -> list[edge_blur.EdgeBlur]:
+def _edges(windows: Sequence[np.ndarray], noise: Noise, clipped_at: float) -> list[EdgeBlur]:
     """The blurs across near-vertical edges, of as many windows as it takes to find enough."""
-    found = list[edge_blur.EdgeBlur]()
-    for window in windows:
-        if min(window.shape) > 2 * (edge_blur.HALF_PX + 2) and len(found) < EDGES:
-            found += edge_blur.find_blurs(window, noise, clipped_at)
+    found = list[EdgeBlur]()
+    effort = edge_blur.Effort(STEP_PX, CANDIDATES, max(FITS // len(windows), FITS_OF_WINDOW))
+    for first in range(0, len(windows), WINDOWS_AT_ONCE):
+        if len(found) < EDGES:
+            several = windows[first : first + WINDOWS_AT_ONCE]
+            squares = [edge_blur.plain_squares(window, noise, clipped_at, effort) for window in several]
+            found += edge_blur.blurs_of(np.concatenate(squares), noise)
     return found[:EDGES]
+
+
+FAR_BELOW = 0.4
+"""Of the variance that the quietest sensor has, in a tenth of the blocks: less is no raw image.
+
+Four Pleiades products hold 0.01 to 0.04 of it. Of images simulated by sensors of the range, at 1, 1/4 and 1/20 of the
+light, the lowest holds 0.76, and chance alone may leave 0.6. An 11-bit image taken for one of 12 bits keeps half of
+it."""
+OFFSET = 0.01
+"""Of full scale, the largest value of the dark that an image may have."""
+SEEN = 3 * ROUNDING
+"""Least expected variance: below, rounding to integers hides the noise of a raw image as well."""
+FILLED = 1e-9
+"""Variance of blocks that are constant: filled, and not acquired."""
+
+
+def restored_already(source: Source, networks: Sequence[onnx.ModelProto], full_scale: float) -> str:
+    """Return a sentence if an image of no named sensor looks restored already; else nothing.
+
+    Args:
+        source: the image.
+        networks: that are to restore it; the range is known of networks that state their sensor, "blind" included.
+        full_scale: the pixel value that is 1.0 to them.
+    """
+    if not all(metadata(network).get("sensor") for network in networks):
+        return ""
+    shares = [_noise_share(windows, full_scale) for windows in band_windows(source)]
+    quiet = [k for k, share in enumerate(shares, 1) if share is not None and share < FAR_BELOW]
+    if not quiet:
+        return ""
+    least = min(share for share in shares if share is not None)
+    some = "" if len(quiet) == len(shares) else f" in band {', '.join(map(str, quiet))}"
+    return (
+        f"look at the image: it looks restored already{some}, with {least:.0%} of the noise variance of the quietest "
+        f"sensor that the network knows at full scale {full_scale:g}; a restoration over-sharpens it: give the raw "
+        "image, or its own sensor or full scale"
+    )
+
+
+def _noise_share(windows: Sequence[np.ndarray], full_scale: float) -> float | None:
+    """Return the noise's variance over the least of any sensor in range, in quiet blocks; None if it is not seen.
+
+    Args:
+        windows: (h, w) each, raw values; 0 where pixels are missing.
+        full_scale: the value that is the sensors' largest digital number.
+    """
+    step = integer_step(windows)
+    if step is None:  # scaled, so that the noise of rounding is not known
+        return None
+    top = full_scale / step
+    blocks = join([cut_blocks(window / step, top) for window in windows])
+    expected = _least_variance(blocks.mean, top)
+    judged = (expected >= SEEN) & (blocks.fine > FILLED)
+    if int(judged.sum()) < LEAST:
+        return None
+    return float(np.percentile(blocks.fine[judged] / (expected[judged] + ROUNDING), QUIET_PERCENT))
+
+
+def _least_variance(values: np.ndarray, full_scale: float) -> np.ndarray:
+    """Return the least variance of the noise at pixel values, of any sensor that the networks were trained for.
+
+    It is stated at 1/16 and at 1/4 of full scale. A straight line through 0 and the first, and a constant from the
+    second on, lie below the noise line of every sensor of the range, also where the dark is above 0.
+    """
+    light = np.maximum(values / full_scale - OFFSET, 0)
+    dark, bright = RANGES["sigma_dark"][0] ** 2, RANGES["sigma_bright"][0] ** 2
+    return np.asarray(full_scale**2 * np.minimum(16 * dark * light, bright))

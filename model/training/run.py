@@ -4,6 +4,7 @@ RUN/checkpoint.safetensors  RUN/log.csv  RUN/validation.csv  RUN/validation.png 
 """
 
 import csv
+import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -25,7 +26,7 @@ from beers_deploy.model.convbeers import (
     vector_tensor,
 )
 from beers_deploy.model.family import SensorFamily
-from beers_deploy.model.io.files import whole_file
+from beers_deploy.model.io.files import sha256, whole_file
 from beers_deploy.model.io.images import list_images, site_of
 from beers_deploy.model.io.pictures import busiest_windows, grid, stretch_of, strip_row
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
@@ -41,7 +42,7 @@ from beers_deploy.model.training.patches import PatchRecipe, PatchSource, Stored
 from beers_deploy.model.training.trainer import Batches, Precision, Schedule, Trainer, Worker
 from beers_deploy.model.variants import Variant, variant_named
 from beers_deploy.profiles.errors import ModelError, OptionError
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Sensor, numbers_of
 
 STEP = re.compile(r"[0-9]{1,18}(?=,)")
 """What a line of a log begins with."""
@@ -173,6 +174,7 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
     trainer = Trainer(variant, run.recipe, loss, worker, *options)
     if loss.perceptual is not None:
         loss.perceptual.to(trainer.device)
+    trainer.data = data_sha256(run, loss)
     if resume:
         trainer.resume(run.checkpoint)
     elif run.checkpoint.exists():
@@ -221,6 +223,29 @@ def loss_of(run: Run) -> tuple[RestorationLoss, str]:
         return RestorationLoss(run.recipe.loss), f"trains WITHOUT the LPIPS term: {not_found('squeeze')}"
     perceptual = Lpips.load("squeeze", found)
     return RestorationLoss(run.recipe.loss, perceptual), f"LPIPS term over {found.name}"
+
+
+def data_sha256(run: Run, loss: RestorationLoss) -> str:
+    """Return one digest of all that a run learns from: a resumed run must learn from the same, or it is none.
+
+    Args:
+        run: what the options say.
+        loss: with or without LPIPS, whose weights may be missing at the second time.
+    """
+    patches, files = run.patches, list_images(run.images) if run.images else []
+    for pair in pair_files(run.pairs) if run.pairs else []:
+        files += pair
+    stated = [
+        *(numbers_of(sensor) for sensor in (patches.degraded, patches.reference)),
+        patches.family,
+        (patches.patch_px, patches.oversamplings, patches.exposures, patches.margin_px, run.drawn),
+        loss.perceptual is not None,
+        *(
+            (file.name, sha256(file))
+            for file in (*files, *(each for each in (run.start, run.lpips) if each and each.is_file()))
+        ),
+    ]
+    return hashlib.sha256(repr(stated).encode()).hexdigest()
 
 
 def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:

@@ -19,7 +19,7 @@ from torch.nn.parallel import DistributedDataParallel
 from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, Rounding, arrays, initialise
 from beers_deploy.model.io.tensors import write_tensors
 from beers_deploy.model.progress import held_back
-from beers_deploy.model.training.checkpoint import MOMENTS, Guards, TrainingRecipe, read_checkpoint
+from beers_deploy.model.training.checkpoint import MOMENTS, Guards, TrainingRecipe, read_checkpoint, tensors_sha256
 from beers_deploy.model.training.losses import RestorationLoss
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import MachineError, OptionError
@@ -106,6 +106,9 @@ class Trainer:
         precision: what the body is computed in; it is the machine's, and a resumed run may take another.
         conditioned: whether the network is given the sensor of each patch.
         rounding: of a conditioned network's maps, as its INT8 file rounds them; None leaves them as they are.
+
+    Attributes:
+        data: digest of all that the run learns from; a checkpoint belongs to one.
     """
 
     def __init__(
@@ -123,7 +126,7 @@ class Trainer:
         self.recipe, self.worker = recipe, worker or Worker()
         self.loss, self.device = loss or RestorationLoss(recipe.loss), self.worker.device(device)
         require_loss(self.loss)
-        self.step, self.guards = 0, Guards()
+        self.step, self.guards, self.data = 0, Guards(), ""
         self.network: Network = (BankedConvBEERS if conditioned else ConvBEERS)(variant)
         initialise(self.network, torch.Generator().manual_seed(recipe.seed))
         if start is not None:
@@ -218,12 +221,13 @@ class Trainer:
         for name, parameter in self.network.named_parameters():
             for moment, value in self.optimiser.state.get(parameter, {}).items():
                 tensors[f"moment.{name}.{moment}"] = value
-        header = {"step": self.step, "guards": asdict(self.guards), "recipe": asdict(self.recipe)}
+        header: dict[str, object] = {"step": self.step, "guards": asdict(self.guards), "recipe": asdict(self.recipe)}
+        header |= {"data": self.data, "sha256": tensors_sha256(tensors)}
         write_tensors(path, arrays(tensors), header)
 
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint of the same recipe, begun on this processor or another."""
-        tensors, self.step, self.guards = read_checkpoint(path, self.network, self.recipe)
+        tensors, self.step, self.guards = read_checkpoint(path, self.network, self.recipe, self.data)
         self.network.load_state_dict({name: tensors[f"network.{name}"] for name in self.average})
         for name, value in self.average.items():
             value.copy_(tensors[f"average.{name}"])

@@ -1,8 +1,9 @@
 import json
+import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -103,6 +104,65 @@ def test_another_dataset_in_the_folder_is_not_overwritten(scene: Path, made: Pat
         write_dataset(small(scene, patch_px=32), made, 1, resume=True, tick=silent)
     write_dataset(small(scene), made, 1, resume=True, tick=silent)
     assert bytes_of(made) == before
+
+
+def flip(path: Path, share: float = 0.5) -> None:
+    """Flip a bit in the middle of a file."""
+    content = bytearray(path.read_bytes())
+    content[int(share * len(content))] ^= 1
+    path.write_bytes(content)
+
+
+def cut(path: Path) -> None:
+    """Leave less of a file, which ends within a line."""
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def swap(path: Path) -> None:
+    """Put another image of the dataset in an image's place."""
+    path.write_bytes(sorted(path.parent.iterdir())[-1].read_bytes())
+
+
+PAIR = "degraded/0000-scene-00003.tif"
+DAMAGES: dict[str, tuple[str, Callable[[Path], None], int]] = {
+    "flipped": (PAIR, flip, 1),
+    "cut": ("reference/0001-scene-00000.tif", cut, 1),
+    "gone": (PAIR, Path.unlink, 1),
+    "swapped": (PAIR, swap, 1),
+    "manifest flipped": ("manifest.jsonl", flip, 1),
+    "manifest cut": ("manifest.jsonl", cut, 0),
+    "manifest grown": ("manifest.jsonl", lambda path: path.write_bytes(path.read_bytes() * 2) and None, 0),
+}
+"""A file, what happens to it, and how many pairs that concerns (0: not counted here)."""
+
+
+@pytest.mark.parametrize("kind", DAMAGES)
+def test_damaged_pairs_of_a_finished_dataset_are_made_again(
+    kind: str, scene: Path, made: Path, tmp_path: Path
+) -> None:
+    name, damage, count = DAMAGES[kind]
+    folder = Path(shutil.copytree(made, tmp_path / "damaged"))
+    damage(folder / name)
+    said: list[str] = []
+    write_dataset(small(scene), folder, 1, resume=True, tick=silent, log=said.append)
+    assert bytes_of(folder) == bytes_of(made)
+    assert [sentence.split(" ")[0] for sentence in said] == [str(count)] if count else len(said) <= 1
+    assert all("they are made again" in sentence for sentence in said)
+
+
+@pytest.mark.parametrize("damage", [flip, cut, Path.unlink])
+def test_a_damaged_part_of_an_unfinished_dataset_is_made_again(
+    damage: Callable[[Path], None], scene: Path, made: Path, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(made, tmp_path / "unfinished"))
+    (folder / "parts").mkdir()
+    lines = (folder / "manifest.jsonl").read_text().splitlines(keepends=True)
+    part = folder / "parts" / "00000000.jsonl"
+    part.write_text("".join(lines[:5]))
+    (folder / "manifest.jsonl").unlink()
+    damage(part)
+    write_dataset(small(scene), folder, 1, resume=True, tick=silent)
+    assert bytes_of(folder) == bytes_of(made)
 
 
 def test_a_scene_without_room_for_a_patch_is_refused(scene: Path) -> None:

@@ -1,6 +1,7 @@
 """`train` from options to a folder of results."""
 
 import csv
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,31 @@ def test_a_finished_run_resumes_to_the_same_weights(images: Path, tmp_path: Path
     run(images, tmp_path / "a", "--resume")
     again = load_network(tmp_path / "a" / "convbeers-xs.safetensors")[0].state_dict()
     assert all(torch.equal(first[name], again[name]) for name in first)
+
+
+def test_a_run_is_not_resumed_with_other_data(images: Path, tmp_path: Path) -> None:
+    """Another image, another sensor, another patch: each would end in weights that no single run gives."""
+    run(images, tmp_path / "a")
+    other = Path(shutil.copytree(images, tmp_path / "other"))
+    image = sorted(other.glob("*.png"))[0]
+    pixels = np.array(Image.open(image))
+    pixels.flat[pixels.size // 2] ^= 1
+    Image.fromarray(pixels).save(image)
+    begun = ["train", "--out", tmp_path / "a", "--variant", "convbeers-xs", "--steps", 4, "--batch", 2, "--resume"]
+    same = ["--images", images, "--patch", 32]
+    for words in (["--images", other, "--patch", 32], [*same, "--sensor", "dior-high"], [*same, "--drawn", 1]):
+        said = refused(*begun, *words)
+        assert "a checkpoint of these images, sensors and first weights" in said
+
+
+def test_a_checkpoint_with_a_flipped_bit_is_refused(images: Path, tmp_path: Path) -> None:
+    run(images, tmp_path / "a")
+    path = tmp_path / "a" / "checkpoint.safetensors"
+    content = bytearray(path.read_bytes())
+    content[-3000] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(AssertionError, match="do not match their digest"):
+        run(images, tmp_path / "a", "--resume")
 
 
 def test_a_conditioned_run_goes_on_from_others_and_resumes_to_the_same(images: Path, tmp_path: Path) -> None:

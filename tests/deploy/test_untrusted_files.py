@@ -1,9 +1,11 @@
 """Documents, weights and folders that others wrote, each once the end of a run: now a sentence, or no matter."""
 
+import hashlib
 import io
 import json
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +28,8 @@ from beers_deploy.profiles.errors import BeersError, ModelError, OptionError, Pr
 from beers_deploy.profiles.figures import Check, Row, measured
 from beers_deploy.profiles.toml import HERE, read_json, read_toml_text
 from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.restoration.journal import FinishedRow, journal_text
+from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.output import Checkpoint, part_folder
 from beers_deploy.results import Table
 from beers_deploy.studies.tradeoff.measure import Measurements
@@ -141,16 +145,38 @@ def test_an_array_larger_than_its_archive_is_refused(tmp_path: Path) -> None:
         read_tensors(archive(tmp_path / "b.npz", head.getvalue() + bytes(24)), ["a"])
 
 
-@pytest.mark.parametrize("journal", [[], 3, {"rows": 10**9}, {"rows": -1}, {"known": -5}, {"rows": None}, {"job": 1}])
-def test_a_journal_that_counts_rows_that_are_not_there_is_refused(journal: object, tmp_path: Path) -> None:
+def stored_rows(rows_px: int = 4, **counts: int) -> tuple[bytes, FinishedRow]:
+    """Return rows of pixels as a checkpoint stores them, and their line in its journal."""
+    pixels = np.arange(rows_px * SHAPE[2], dtype=np.uint16).tobytes()
+    return pixels, FinishedRow(rows_px, len(pixels), hashlib.sha256(pixels).hexdigest(), Tally(**counts))
+
+
+@pytest.mark.parametrize(
+    "journal",
+    [
+        "[]",
+        "3",
+        "",
+        "[" * 10_000,
+        json.dumps({"job": JOB, "rows": 4, "known": 32}),
+        journal_text({"job": 1}, [stored_rows()[1]]),
+        journal_text(JOB, [stored_rows(known=-5)[1]]),
+        journal_text(JOB, [stored_rows(10**9 // SHAPE[2])[1]]),
+        journal_text(JOB, [replace(stored_rows()[1], rows_px=0)]),
+        journal_text(JOB, [stored_rows()[1]])[:-40],
+        journal_text(JOB, [stored_rows()[1]]).replace('"known": 0', '"known": 1'),
+    ],
+)
+def test_a_journal_that_counts_rows_that_are_not_there_is_refused(journal: str, tmp_path: Path) -> None:
     out = tmp_path / "out.tif"
     part_folder(out).mkdir()
-    sound = {"job": JOB, "rows": 4, "known": 32}
+    pixels, row = stored_rows()
+    (part_folder(out) / "rows.raw").write_bytes(pixels)
     path = part_folder(out) / "journal.json"
-    path.write_text(json.dumps({**sound, **journal} if isinstance(journal, dict) else journal))
+    path.write_text(journal)
     with pytest.raises(OptionError, match="resume"):
         Checkpoint(out, SHAPE, np.dtype(np.uint16), JOB, resume=True)
-    path.write_text(json.dumps(sound))
+    path.write_text(journal_text(JOB, [row]))
     assert Checkpoint(out, SHAPE, np.dtype(np.uint16), JOB, resume=True).rows == 4
 
 

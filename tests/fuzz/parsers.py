@@ -30,6 +30,8 @@ from beers_deploy.profiles.figures import Check, Row, measured, predicted, unava
 from beers_deploy.profiles.response import read_response
 from beers_deploy.profiles.scene_call import load_scene_call
 from beers_deploy.quant.limits import limits_of
+from beers_deploy.restoration.journal import FinishedRow, journal_text
+from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.output import Checkpoint, part_folder
 from beers_deploy.results import Table, by_row, cell
 from beers_deploy.studies.tradeoff.measure import Measurements
@@ -149,7 +151,8 @@ def measurement_seeds(folder: Path) -> list[bytes]:
 
 
 def journal_seeds(_: Path) -> list[bytes]:
-    return [json.dumps({"job": JOB, "rows": 4, "known": 32}).encode()]
+    row = FinishedRow(4, 64, "0" * 64, Tally())
+    return [journal_text(JOB, [row]).encode(), journal_text(JOB, []).encode()]
 
 
 def resume(path: Path) -> None:

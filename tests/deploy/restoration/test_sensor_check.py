@@ -1,6 +1,7 @@
 """An image held against its sensor: what is told rightly passes, what is told wrongly is said, or refused."""
 
 import re
+import time
 from pathlib import Path
 
 import numpy as np
@@ -122,3 +123,24 @@ def test_pairs_that_are_evaluated_are_held_against_it(tmp_path: Path) -> None:
     assert "expected an image of wrong" in refused(*words, "--sensor", wrong, "--strict")
     found = bd.evaluate(["degraded"], pairs, sensor=SENSOR, strict=True, progress=False)
     assert next(row for row in found.rows if "sensor" in row.table).text == {"sensor told": "agrees"}
+
+
+def test_its_time_is_no_part_of_the_restoration_s(
+    raw: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = tmp_path / "raw.tif"
+    tifffile.imwrite(image, raw)
+
+    def slow(*_: object) -> SensorCheck:
+        time.sleep(2)
+        return SensorCheck()
+
+    monkeypatch.setattr("beers_deploy.restoration.run.told_sensor", slow)
+    begun = time.perf_counter()
+    run = bd.restore(image, "convbeers-xs-int8", sensor=SENSOR, out=tmp_path / "out.tif", progress=False)
+    whole_s = time.perf_counter() - begun
+    (row,) = run.rows
+    (check_s, time_s) = (row.figures[name].value or 0 for name in ("sensor check", "time"))
+    assert check_s >= 2
+    assert row.figures["throughput"].value == pytest.approx(raw.size / time_s / 1e6)
+    assert time_s <= whole_s - check_s

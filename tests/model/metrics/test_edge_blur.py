@@ -4,7 +4,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from beers_deploy.model.metrics.edge_blur import FOUND, HALF_PX, POINTED_AT, EdgeBlur, combine, find_blurs, fit_blur
+from beers_deploy.model.metrics.edge_blur import combine, find_blurs
+from beers_deploy.model.metrics.edge_fit import FOUND, HALF_PX, POINTED_AT, EdgeBlur, fit_blur
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.metrics.slanted_edge import slanted_edge
 from beers_deploy.model.simulator.mtf import Blur, gamma_from_mtf, transfer_function

@@ -1,0 +1,72 @@
+"""The manifest of a dataset: a line of JSON for each pair, with the digests of its two images and of the line.
+
+A dataset that is continued trusts no pair for being there: a pair counts if its line and both images match.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from beers_deploy.model.io.files import sha256
+from beers_deploy.profiles.toml import parse_json
+
+Line = dict[str, object]
+"""Of the manifest: one patch."""
+ROLES = ("degraded", "reference")
+DIGESTS = "sha256"
+
+
+def image_of(out: Path, role: str, name: object) -> Path:
+    """Return where a dataset keeps an image of the pair `name`."""
+    return out / role / f"{name}.tif"
+
+
+def line_text(out: Path, line: Line) -> str:
+    """Return a pair's line of the manifest, once both images are written.
+
+    Args:
+        out: the dataset's folder.
+        line: all else that the manifest states of the pair.
+    """
+    digests = {role: sha256(image_of(out, role, line["name"])) for role in ROLES}
+    digests["line"] = _digest(line)
+    return json.dumps(line | {DIGESTS: digests}, sort_keys=True) + "\n"
+
+
+def matching_lines(out: Path, files: Iterable[Path]) -> dict[tuple[object, object], str]:
+    """Return the lines of some manifests that match their digests and images, by number and name of the pair.
+
+    Args:
+        out: the dataset's folder.
+        files: manifests, or parts of one; one that is not there is passed over.
+    """
+    found: dict[tuple[object, object], str] = {}
+    for path in files:
+        if not path.is_file():
+            continue
+        for text in path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True):
+            line = _matching(out, text)
+            if line is not None:
+                found[line["number"], line["name"]] = text
+    return found
+
+
+def _matching(out: Path, text: str) -> Line | None:
+    """Return a line without its digests; None if the line or an image does not match them."""
+    try:
+        found: Any = parse_json(text)
+        line: dict[str, Any] = dict(found)
+        digests = dict(line.pop(DIGESTS))
+        if digests.pop("line") != _digest(line) or not text.endswith("\n"):
+            return None
+        same = digests == {role: sha256(image_of(out, role, line["name"])) for role in ROLES}
+    except (LookupError, OSError, TypeError, ValueError):
+        return None
+    return line if same else None
+
+
+def _digest(line: Line) -> str:
+    """Return the hex digest of a line without its digests."""
+    return hashlib.sha256(json.dumps(line, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,277 @@
+"""The blur across short straight edges, each in a few pixels around it, fitted by the curve that a profile states.
+
+MTF(f) = exp(-gamma f) sinc(f) (`simulator.mtf`) has one number, for which 17 x 17 pixels are enough. Gauss-Newton
+finds it together with the edge's place, its slope and the levels of both sides. Many squares are fitted at once:
+one at a time takes ten times as long (measured), because each step is a few hundred multiplications.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from beers_deploy.model.metrics.refusal import Refusal
+
+HALF_PX = 8
+"""Half the side of the square around a found edge, and how far from an edge pixels are fitted."""
+
+GAMMAS = np.linspace(0.0, 10.0, 101)
+"""For which the edge is tabulated: MTF at Nyquist from 64 to 0.4 %."""
+STEEPER = (4.0, 8.0)
+"""Gaussian parts that are tried on an edge that the profile's curve does not fit."""
+
+PER_PX, REACH_PX = 16, 24
+START_GAMMA, LEAST_GAMMA, LARGEST_GAMMA = 4.0, 0.05, 9.9
+MAX_PLACE_PX, MAX_SLOPE = 3.0, math.tan(math.radians(35))
+MAX_STEP = np.array([0.7, 0.1, 1.5])
+"""Of place, slope and gamma in one pass."""
+PASSES, CONVERGED = 15, 1e-3
+
+Noise = Callable[[np.ndarray], np.ndarray]
+"""Variance of the noise of pixels with these values, of any shape, in the square of their unit."""
+
+
+@dataclass(frozen=True)
+class EdgeBlur:
+    """The blur across one edge.
+
+    Attributes:
+        gamma: of MTF(f) = exp(-gamma f) sinc(f), f in cycles per pixel along the edge's normal.
+        error: standard error of gamma.
+        slope: pixels by which the edge leans each line; 0 runs along the grid.
+        pixels: (H, W) that it was fitted to, over their noise.
+        chi2: sum of squares that the fit leaves of those near the edge.
+        count: how many these are, less the five numbers fitted.
+    """
+
+    gamma: float
+    error: float
+    slope: float
+    pixels: np.ndarray
+    chi2: float
+    count: int
+
+
+Fit = EdgeBlur | Refusal
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What an edge must keep to count.
+
+    Attributes:
+        step_sigma: least difference of the plateaus over the noise of a pixel. A fainter edge may hide in noise that
+            it is none.
+        misfit: largest root mean square of what the noise does not explain, of the step.
+        error: largest standard error of gamma; 0.6 is a third of the MTF.
+    """
+
+    step_sigma: float
+    misfit: float
+    error: float = 0.6
+
+
+FOUND, POINTED_AT, ANY = Limits(30, 0.012), Limits(10, 0.03), Limits(0, math.inf, math.inf)
+"""For edges found by search among much that is none, for those that a person vouches for, and for those known."""
+
+
+@cache
+def _waves() -> tuple[np.ndarray, np.ndarray]:
+    """Return frequencies (F,) and what each adds to a step at each distance: (F, 2 * REACH_PX * PER_PX + 1)."""
+    step = 0.004  # the sum repeats, with the other sign, after 1 / 0.004 = 250 px
+    f = np.arange(step / 2, 2.5, step)
+    distance = np.arange(-REACH_PX * PER_PX, REACH_PX * PER_PX + 1) / PER_PX
+    return f, step * np.sin(2 * math.pi * np.outer(f, distance)) / (math.pi * f)[:, None]
+
+
+@lru_cache(maxsize=16)
+def _responses(shape: float) -> np.ndarray:
+    """A step of 1 at 0, blurred, for each of GAMMAS and each distance: (101, 2 * REACH_PX * PER_PX + 1)."""
+    f, waves = _waves()
+    return np.asarray(0.5 + (np.exp(-np.outer(GAMMAS, f) - shape * f**2) * np.sinc(f)) @ waves)
+
+
+def _at_gammas(gammas: np.ndarray, shape: float) -> np.ndarray:
+    """Return the tabulated edge of each gamma (N,): (N, 2 * REACH_PX * PER_PX + 1)."""
+    table = _responses(shape)
+    row = np.minimum((gammas / GAMMAS[1]).astype(int), GAMMAS.size - 2)
+    part = (gammas / GAMMAS[1] - row)[:, None]
+    return np.asarray(table[row] * (1 - part) + table[row + 1] * part)
+
+
+def _at_distances(lines: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Return tabulated edges (N, T) at the distances (N, P) from each."""
+    count, length = lines.shape
+    place = np.clip((distance + REACH_PX) * PER_PX, 0, length - 1.001)
+    column = place.astype(int)
+    share = place - column
+    column += np.arange(count)[:, None] * length
+    flat = lines.ravel()
+    return np.asarray(flat[column] * (1 - share) + flat[column + 1] * share)
+
+
+def edge_response(distance: np.ndarray, gamma: float, shape: float = 0.0) -> np.ndarray:
+    """What a detector sees of a step of 1 at `distance` pixels (any shape) from it, behind a blur of `gamma`.
+
+    `shape` adds a Gaussian part to the blur: MTF(f) = exp(-gamma f - shape f^2) sinc(f).
+    """
+    lines = _at_gammas(np.array([gamma]), shape)
+    return _at_distances(lines, distance.reshape(1, -1)).reshape(distance.shape)
+
+
+def fit_blur(region: np.ndarray, noise: Noise, limits: Limits) -> Fit:
+    """Fit the blur of the one near-vertical edge that crosses a region (H, W); see `fit_blurs`."""
+    return fit_blurs(region[None], noise, limits)[0]
+
+
+def fit_blurs(regions: np.ndarray, noise: Noise, limits: Limits) -> list[Fit]:
+    """Fit the blur of the one near-vertical edge that crosses each region from top to bottom.
+
+    Args:
+        regions: (N, H, W) finite values of any linear unit, rising or falling from left to right.
+        noise: of the pixels.
+        limits: what an edge must keep to.
+
+    Returns:
+        The blur by the profile's curve, or, of an edge that no shape of the curve fits, why there is none.
+    """
+    pixels = regions / np.sqrt(noise(regions).mean((1, 2)))[:, None, None]
+    found = fit_shape(pixels, limits)
+    refused = [k for k, fit in enumerate(found) if isinstance(fit, Refusal)]
+    steeper = set[int]()
+    for shape in STEEPER:
+        left = [k for k in refused if k not in steeper]
+        fits = fit_shape(pixels[left], limits, shape)
+        steeper |= {k for k, fit in zip(left, fits, strict=True) if isinstance(fit, EdgeBlur)}
+    known = sorted(steeper)
+    for k, fit in zip(known, fit_shape(pixels[known], ANY), strict=True):
+        found[k] = fit
+    return found
+
+
+class _Lines(NamedTuple):
+    """Where edges are thought to run, (N,) each, about the middle of a region, and how soft they are."""
+
+    place: np.ndarray
+    slope: np.ndarray
+    gamma: np.ndarray
+
+    def only(self, chosen: np.ndarray) -> "_Lines":
+        """Return the lines that `chosen`, bool or indices, picks."""
+        return _Lines(*(column[chosen] for column in self))
+
+
+class _Solved(NamedTuple):
+    """The linearised problem of N edges.
+
+    Attributes:
+        change: (N, 3) of place, slope and gamma.
+        variance: (N,) of gamma.
+        step: (N,) range of the fitted pixels near the edge.
+        chi2: (N,) sum of squares that is left of them.
+    """
+
+    change: np.ndarray
+    variance: np.ndarray
+    step: np.ndarray
+    chi2: np.ndarray
+
+
+def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fit]:
+    """As `fit_blurs`, for pixels (N, H, W) whose noise is 1, by the curve with one Gaussian part alone."""
+    count, height, width = pixels.shape
+    fits: list[Fit] = [Refusal("no straight edge near to an axis")] * count
+    if not count:
+        return fits
+    y, x = (np.arange(size) - (size - 1) / 2 for size in (height, width))
+    lines = _centroids(pixels, y, x)
+    across, down = np.tile(x, height), np.repeat(y, width)
+    start, seen, left = lines.place, pixels.reshape(count, -1), np.arange(count)
+    for _ in range(PASSES):
+        near = np.abs(across - lines.place[:, None] - lines.slope[:, None] * down) <= HALF_PX
+        sizes = near.sum(1)
+        for k in np.flatnonzero(sizes < 10 * HALF_PX):
+            fits[left[k]] = Refusal(f"{sizes[k]} pixels near the edge, {10 * HALF_PX} are needed")
+        enough = sizes >= 10 * HALF_PX
+        lines, left, near = lines.only(enough), left[enough], near[enough]
+        solved = _solve(lines, across, down, seen[left], near, shape)
+        moved, lines = _move(lines, solved.change)
+        lost = (np.abs(lines.place - start[left]) > MAX_PLACE_PX) | (np.abs(lines.slope) > MAX_SLOPE)
+        done = ~lost & (moved < CONVERGED)
+        for k in np.flatnonzero(done):
+            at = left[k]
+            fits[at] = _judged(lines, solved, int(k), int(near[k].sum()) - 5, pixels[at], limits, bool(shape))
+        lines, left = lines.only(~lost & ~done), left[~lost & ~done]
+        if not left.size:
+            break
+    return fits
+
+
+def _centroids(regions: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> _Lines:
+    """Return the lines through the centres of what rises in each row."""
+    rise = np.diff(regions, axis=2)
+    rise = np.maximum(rise * np.sign(rise.sum((1, 2)))[:, None, None], 0) * np.hamming(rise.shape[2])
+    centre = (rise * (columns[1:] - 0.5)).sum(2) / np.maximum(rise.sum(2), 1e-9)
+    slope = (centre * rows).sum(1) / max((rows**2).sum(), 1.0)
+    return _Lines(np.median(centre, axis=1), slope, np.full(len(regions), START_GAMMA))
+
+
+def _solve(lines: _Lines, x: np.ndarray, y: np.ndarray, seen: np.ndarray, near: np.ndarray, shape: float) -> _Solved:
+    """Solve for the levels of both sides, then for small changes of all five numbers, of each edge.
+
+    Args:
+        lines: N edges.
+        x: (P,) columns of a region's pixels.
+        y: (P,) their rows.
+        seen: (N, P) pixels.
+        near: (N, P) which of them count.
+        shape: of the curve.
+    """
+    lean = np.sqrt(1 + lines.slope**2)[:, None]
+    distance = (x - lines.place[:, None] - lines.slope[:, None] * y) / lean
+    tables = _at_gammas(lines.gamma, shape)
+    plateaus = np.stack([near.astype(np.float64), _at_distances(tables, distance) * near], axis=1)
+    normal = np.linalg.pinv(plateaus @ plateaus.swapaxes(1, 2), hermitian=True)
+    seen = seen * near
+    levels = (normal @ (plateaus @ seen[:, :, None]))[:, :, 0]
+    fitted = (levels[:, None] @ plateaus)[:, 0]
+    step = levels[:, 1, None] * near
+    rise = _at_distances(tables, distance + 0.1) - _at_distances(tables, distance - 0.1)
+    rise *= step / 0.2 / lean
+    low, high = np.maximum(lines.gamma - 0.15, 0.0), np.minimum(lines.gamma + 0.15, float(GAMMAS[-1]))
+    softer = (_at_gammas(high, shape) - _at_gammas(low, shape)) / (high - low)[:, None]
+    terms = np.stack(
+        [plateaus[:, 0], plateaus[:, 1], -rise, -rise * y, _at_distances(softer, distance) * step], axis=1
+    )
+    covariance = np.linalg.pinv(terms @ terms.swapaxes(1, 2), hermitian=True)
+    rest = seen - fitted
+    change = (covariance @ (terms @ rest[:, :, None]))[:, 2:, 0]
+    span = np.where(near, fitted, -np.inf).max(1) - np.where(near, fitted, np.inf).min(1)
+    return _Solved(change, covariance[:, 4, 4], span, (rest**2).sum(1))
+
+
+def _move(lines: _Lines, change: np.ndarray) -> tuple[np.ndarray, _Lines]:
+    """Take a bounded step; return by how much each gamma changed, and the lines."""
+    place, slope, gamma = np.clip(change, -MAX_STEP, MAX_STEP).T
+    softer = np.clip(lines.gamma + gamma, 0.0, float(GAMMAS[-1]))
+    return np.abs(softer - lines.gamma), _Lines(lines.place + place, lines.slope + slope, softer)
+
+
+def _judged(
+    lines: _Lines, solved: _Solved, k: int, count: int, pixels: np.ndarray, limits: Limits, steeper: bool
+) -> Fit:
+    """Return edge `k` if it keeps to the limits."""
+    gamma, chi2, step = float(lines.gamma[k]), float(solved.chi2[k]), float(solved.step[k])
+    scatter = chi2 / count
+    misfit = math.sqrt(max(scatter - 1, 0.0)) / max(step, 1e-9)
+    error = math.sqrt(float(solved.variance[k]) * max(scatter, 1.0))
+    if limits is not ANY and not LEAST_GAMMA * (not steeper) <= gamma < LARGEST_GAMMA:
+        return Refusal("sharper than a detector's pixel or softer than any profile: no plain edge")
+    if misfit > limits.misfit:
+        return Refusal(f"{misfit:.1%} of the step fit no blurred edge, {limits.misfit:.1%} at most")
+    if step < limits.step_sigma or error > limits.error:
+        return Refusal(f"a step of {step:.3g} times the noise, {limits.step_sigma:g} are needed")
+    return EdgeBlur(gamma, error, float(lines.slope[k]), pixels, chi2, count)

@@ -1,0 +1,213 @@
+"""Files may be damaged or replaced between two runs: the pixels are right, or one sentence says why."""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+import tifffile
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.outcome import Tally
+from beers_deploy.restoration.output import Checkpoint, part_folder
+from beers_deploy.restoration.plan import Span
+from beers_deploy.restoration.run import read_network, restore_file
+from beers_deploy.restoration.tiles.engine import Restorer
+from beers_deploy.restoration.tiles.rows import RestoredRow
+from tests.deploy.restoration.runs import noise, stopped_after
+
+TILE_PX = 64
+JOB: dict[str, object] = {"image": "a"}
+
+Damage = Callable[[bytes], bytes]
+DAMAGES = st.one_of(
+    st.integers(0, 2**16).map(lambda at: lambda raw: raw[: at % (len(raw) + 1)]),
+    st.integers(0, 2**19).map(lambda at: lambda raw: flipped(raw, at)),
+    st.binary(max_size=64).map(lambda more: lambda raw: raw + more),
+    st.binary(max_size=2048).map(lambda other: lambda _: other),
+)
+"""Cut short, a bit flipped, grown, or another file."""
+
+
+def flipped(raw: bytes, bit: int) -> bytes:
+    """Return bytes with one bit flipped."""
+    changed = bytearray(raw)
+    changed[bit // 8 % len(raw)] ^= 1 << bit % 8
+    return bytes(changed)
+
+
+def rows_of(pixels: np.ndarray, heights: list[int]) -> Iterator[RestoredRow]:
+    """Yield pixels (bands, height, width) as rows of tiles."""
+    top = 0
+    for height in heights:
+        part = pixels[:, top : top + height]
+        yield RestoredRow(Span(top, top + height, top, top + height), part, Tally(known=part.size))
+        top += height
+
+
+@given(
+    st.integers(1, 3),
+    st.lists(st.integers(1, 5), min_size=1, max_size=4),
+    st.integers(1, 9),
+    st.sampled_from([np.uint8, np.uint16, np.float32]),
+    DAMAGES,
+)
+def test_rows_that_match_their_digests_are_kept_and_no_others(
+    bands: int, heights: list[int], width: int, kind: type, damage: Damage
+) -> None:
+    pixels = noise(bands, sum(heights), width).astype(kind)
+    with TemporaryDirectory() as name:
+        out = Path(name) / "out.tif"
+        shape = (bands, sum(heights) + 3, width)
+        checkpoint = Checkpoint(out, shape, np.dtype(kind), JOB, resume=False)
+        for row in rows_of(pixels, heights):
+            checkpoint.append(row)
+        raw = part_folder(out) / "rows.raw"
+        raw.write_bytes(damage(raw.read_bytes()))
+        left = Checkpoint(out, shape, np.dtype(kind), JOB, resume=True)
+        assert left.rows + left.damaged_rows == sum(heights)
+        assert left.rows in np.cumsum([0, *heights])
+        assert left.tally.known == bands * left.rows * width
+        for band in range(bands):
+            np.testing.assert_array_equal(left.read(band, 0, left.rows), pixels[band, : left.rows])
+
+
+@given(st.integers(0, 2**16))
+def test_a_journal_with_any_bit_flipped_is_refused_or_the_same(bit: int) -> None:
+    with TemporaryDirectory() as name:
+        out = Path(name) / "out.tif"
+        checkpoint = Checkpoint(out, (1, 8, 5), np.dtype(np.uint16), JOB, resume=False)
+        for row in rows_of(noise(1, 6, 5), [2, 4]):
+            checkpoint.append(row)
+        journal = part_folder(out) / "journal.json"
+        journal.write_bytes(flipped(journal.read_bytes(), bit))
+        try:
+            left = Checkpoint(out, (1, 8, 5), np.dtype(np.uint16), JOB, resume=True)
+        except OptionError:
+            return
+        assert (left.rows, left.tally) == (checkpoint.rows, checkpoint.tally)
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    """An image whose middle is farther than 64 KiB from both ends of its file."""
+    tifffile.imwrite(tmp_path / "in.tif", noise(700, 260), tile=(16, 16))
+    return tmp_path / "in.tif"
+
+
+def test_damaged_rows_are_made_again_and_it_is_said(image: Path, model: Path, tmp_path: Path) -> None:
+    whole, out = tmp_path / "whole.tif", tmp_path / "out.tif"
+    restore_file(image, whole, Options(model, TILE_PX))
+    with stopped_after(40):
+        restore_file(image, out, Options(model, TILE_PX))
+    raw = part_folder(out) / "rows.raw"
+    raw.write_bytes(raw.read_bytes()[:-2000])
+    said: list[str] = []
+    restore_file(image, out, Options(model, TILE_PX, resume=True), said.append)
+    assert out.read_bytes() == whole.read_bytes()
+    assert any("do not match their digests: they are made again" in sentence for sentence in said)
+    assert not part_folder(out).exists()
+
+
+@contextmanager
+def same_size_and_time(path: Path) -> Iterator[None]:
+    """Change a file's content, which stays of the same size and time."""
+    before = path.stat()
+    yield
+    assert path.stat().st_size == before.st_size
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+def write_mask(image: Path, hidden_rows: int) -> None:
+    mask = np.full((700, 260), 255, np.uint8)
+    mask[:hidden_rows] = 0
+    tifffile.imwrite(image.with_name("in.tif.msk"), mask)
+
+
+def write_nodata(image: Path, value: int) -> None:
+    text = f"<PAMDataset><PAMRasterBand><NoDataValue>{value}</NoDataValue></PAMRasterBand></PAMDataset>"
+    image.with_name("in.tif.aux.xml").write_text(text)
+
+
+def flip_the_middle(image: Path) -> None:
+    image.write_bytes(flipped(image.read_bytes(), 8 * image.stat().st_size // 2))
+
+
+BESIDE: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], None]]] = {
+    "middle": ("in.tif", lambda _: None, flip_the_middle),
+    "mask": ("in.tif.msk", lambda image: write_mask(image, 300), lambda image: write_mask(image, 340)),
+    "nodata": ("in.tif.aux.xml", lambda image: write_nodata(image, 1000), lambda image: write_nodata(image, 2000)),
+}
+
+
+@pytest.mark.parametrize("kind", BESIDE)
+def test_whatever_is_read_is_part_of_the_job(kind: str, image: Path, model: Path, tmp_path: Path) -> None:
+    name, before, after = BESIDE[kind]
+    out = tmp_path / "out.tif"
+    before(image)
+    with stopped_after(40):
+        restore_file(image, out, Options(model, TILE_PX))
+    with same_size_and_time(tmp_path / name):
+        after(image)
+    with pytest.raises(OptionError, match="the image, the model and the options"):
+        restore_file(image, out, Options(model, TILE_PX, resume=True))
+    assert not out.exists()
+    with same_size_and_time(tmp_path / name):  # back as it was: the run goes on
+        (flip_the_middle if kind == "middle" else before)(image)
+    restore_file(image, out, Options(model, TILE_PX, resume=True))
+    restore_file(image, tmp_path / "whole.tif", Options(model, TILE_PX))
+    assert out.read_bytes() == (tmp_path / "whole.tif").read_bytes()
+
+
+def test_a_sidecar_that_comes_or_goes_is_another_image(image: Path, model: Path, tmp_path: Path) -> None:
+    with stopped_after(40):
+        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX))
+    write_nodata(image, 1000)
+    with pytest.raises(OptionError, match="the image"):
+        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX, resume=True))
+
+
+@pytest.mark.parametrize("touched", [False, True])
+def test_an_image_that_is_replaced_while_it_is_read_is_refused(
+    touched: bool, image: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish, other = Restorer.finish, tmp_path / "other.tif"
+    tifffile.imwrite(other, noise(700, 260, seed=2), tile=(16, 16))
+
+    def replacing(self: Restorer, *rest: object) -> object:
+        if touched:
+            image.touch()
+        else:
+            with suppress(FileNotFoundError):  # another thread was first
+                other.replace(image)
+        return finish(self, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Restorer, "finish", replacing)
+    if touched:
+        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX))
+        return
+    with pytest.raises(ImageError, match="a change while it was read"):
+        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX))
+    assert not (tmp_path / "out.tif").exists()
+    assert not part_folder(tmp_path / "out.tif").exists()
+
+
+def test_a_network_that_is_replaced_while_it_is_read_is_refused(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "network.onnx"
+    path.write_bytes(model.read_bytes())
+
+    def replacing(path: Path) -> object:
+        path.write_bytes(b"another")
+        return object()
+
+    monkeypatch.setattr("beers_deploy.restoration.run.load_onnx", replacing)
+    with pytest.raises(ModelError, match="a change while it was read"):
+        read_network(path)

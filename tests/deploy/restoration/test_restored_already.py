@@ -1,0 +1,114 @@
+"""Without a sensor: an image that holds no raw noise is told apart, and a raw one of any sensor in range is not."""
+
+import warnings
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter
+
+import beers_deploy as bd
+from beers_deploy.model.family import SNR_BRIGHT, SensorFamily
+from beers_deploy.model.shipped import INT8
+from beers_deploy.model.simulator.acquire import acquire_three, prepare_scene
+from beers_deploy.model.simulator.detector import Draw, to_uint16
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.network_files import network_file
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import BLIND, load_sensor
+from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.restoration.sensor_check import restored_already
+from beers_deploy.restoration.source import ArraySource, Raster
+from tests.deploy.command_line import done
+
+NETWORK = f"convbeers-xs{INT8}"
+SENSOR = Sensor.load("pleiades-degraded")
+SIDE_PX = 256
+
+
+@cache
+def scene() -> np.ndarray:
+    side = SIDE_PX + 64
+    return procedural_scene(side, side, np.random.default_rng(3)).radiance
+
+
+@cache
+def raw(seed: int = 0, light: float = 1.0, snr: tuple[float, float] = SNR_BRIGHT) -> np.ndarray:
+    """A raw image (256, 256) of a sensor of the range, at a share of the light."""
+    sensor = SensorFamily(SENSOR.nominal(), snr).draw(np.random.default_rng(seed))
+    return to_uint16(acquire_three(prepare_scene(light * scene(), 1), sensor, sensor, Draw(seed))[0])
+
+
+def look(image: np.ndarray, full_scale: float = 4095, network: str = NETWORK, nodata: float | None = None) -> str:
+    planes = image if image.ndim == 3 else image[None]
+    source = ArraySource(planes, Raster(*planes.shape, planes.dtype, nodata))
+    return restored_already(source, [load_onnx(network_file(Path(network), load_sensor(BLIND)))], full_scale)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**20), st.sampled_from([1.0, 0.25, 0.05]), st.sampled_from([SNR_BRIGHT, (SNR_BRIGHT[1],) * 2]))
+def test_a_raw_image_of_any_sensor_in_range_is_not_told(seed: int, light: float, snr: tuple[float, float]) -> None:
+    assert look(raw(seed, light, snr)) == ""
+
+
+PROCESSED: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "restored": lambda _: np.asarray(bd.restore(bd.simulate(sensor=SENSOR, size=320).degraded, NETWORK)),
+    "smoothed": lambda image: np.rint(gaussian_filter(image.astype(np.float64), 1.0)).astype(np.uint16),
+    "left-justified": lambda image: 16 * np.rint(gaussian_filter(image.astype(np.float64), 1.0)).astype(np.uint16),
+}
+
+
+@pytest.mark.parametrize("kind", PROCESSED)
+def test_a_processed_image_is_told(kind: str) -> None:
+    image = PROCESSED[kind](raw(1))
+    sentence = look(image, 16 * 4095 if kind == "left-justified" else 4095)
+    assert "it looks restored already, with" in sentence
+    assert "give the raw image, or its own sensor or full scale" in sentence
+    assert sentence.isprintable()
+
+
+def test_bands_are_named_where_not_all_are() -> None:
+    image = raw(1)
+    assert "already in band 2, with" in look(np.stack([image, PROCESSED["smoothed"](image)]))
+
+
+def test_what_cannot_be_seen_is_not_told(model: Path) -> None:
+    smooth = PROCESSED["smoothed"](raw(1))
+    assert look(smooth[:100, :100]) == ""  # too few blocks
+    assert look(smooth.astype(np.float32) * np.float32(0.7)) == ""  # no whole numbers
+    assert look(np.full((300, 300), 900, np.uint16)) == ""  # filled
+    assert look(np.zeros((300, 300), np.uint16)) == ""
+    assert look(smooth, network=str(model)) == ""  # a network of another kind of image
+    assert look(raw(1) // 2, full_scale=2047) == ""
+
+
+@pytest.mark.parametrize("nodata", [None, 0])
+def test_filled_parts_of_a_raw_image_do_not_count(nodata: int | None) -> None:
+    image = raw(2).copy()
+    image[:, :150] = 0 if nodata is not None else 1
+    assert look(image, nodata=nodata) == ""
+
+
+def test_the_command_says_it_and_goes_on(tmp_path: Path) -> None:
+    image, out = tmp_path / "in.tif", tmp_path / "out.tif"
+    tifffile.imwrite(image, PROCESSED["smoothed"](raw(1)))
+    assert "look at the image: it looks restored already" in done("restore", image, out, "--network", NETWORK)
+    assert out.exists()
+    said = done("restore", image, out, "--network", NETWORK, "--sensor", SENSOR.name)
+    assert "look at the image" not in said
+    assert "look at the sensor" in said
+    tifffile.imwrite(image, raw(1))
+    assert "look at the image" not in done("restore", image, out, "--network", NETWORK)
+
+
+def test_the_library_warns() -> None:
+    with pytest.warns(UserWarning, match="it looks restored already"):
+        bd.restore(PROCESSED["smoothed"](raw(1)), NETWORK)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        bd.restore(raw(1), NETWORK)
