@@ -14,6 +14,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper, shape_inference
 
+from beers_deploy.profiles.errors import CODE_FAULTS
 from beers_deploy.quant.onnx_file import constants
 from beers_deploy.quant.reading.folding import OPSET
 from beers_deploy.quant.reading.nodes import attributes_of
@@ -236,6 +237,8 @@ def _inferred(node: Node, known: list[Shape], constants: Mapping[str, np.ndarray
         opsets = [helper.make_opsetid("", OPSET)]
         found = shape_inference.infer_node_outputs(schema, node.proto, types, data, opset_imports=opsets)
         sizes = [d.dim_value for d in found[node.outputs[0]].tensor_type.shape.dim]
+    except CODE_FAULTS:  # a version of onnx that lacks this call would make every size unknown
+        raise
     except Exception:  # noqa: BLE001 - an unknown operator and whatever its own inference raises mean: unknown
         return None
     return (sizes[1], sizes[2], sizes[3]) if len(sizes) == 4 and min(sizes) > 0 else None
