@@ -4,7 +4,7 @@ Nothing is refused here: `quantize` takes a short list of operations of it, tili
 with the sizes of what each node computes of one image.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -153,7 +153,11 @@ class OnnxGraph:
 
     def reads(self, name: str) -> int:
         """How often a tensor is read, by nodes and as a result."""
-        return len(self.readers.get(name, ())) + self.outputs.count(name)
+        return len(self.readers.get(name, ())) + self._written_out[name]
+
+    @cached_property
+    def _written_out(self) -> Counter[str]:
+        return Counter(self.outputs)
 
     def value(self, node: Node, place: int) -> np.ndarray | None:
         """A constant that a node reads, None where it reads none there."""
