@@ -56,6 +56,9 @@ from beers_deploy.profiles.errors import (
 CRASHED, INTERRUPTED = 70, 130
 """Exit codes of a fault in this program (sysexits' EX_SOFTWARE), and of Ctrl-C."""
 
+PIPES_RESULTS = "beers_deploy.pipes_results"
+"""Key in the context of a command line: True if the results are asked for on standard output."""
+
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Show no progress.")]
 Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Show where in the program an error arose.")]
 
@@ -93,18 +96,24 @@ class Stream:
 class Group(TyperGroup):
     """Prints warnings as lines, and keeps standard output for results where they are asked for there."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Note whether the results go to standard output, in which case all else goes to standard error."""
+        # Once parsed, Click keeps the words in an attribute that has another name in each of its versions.
+        ctx.meta[PIPES_RESULTS] = ("--json", "-") in pairwise(args) or "--json=-" in args
+        return super().parse_args(ctx, args)
+
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command; what was lost on standard output ends it with 70 when all is done."""
         closed, out = sys.stdout is None, cast(Any, Stream(sys.stdout))
         sys.stdout, sys.stderr = out, cast(TextIO, Stream(sys.stderr))
         found = self._invoke(ctx)
-        if out.lost or (closed and _pipes_results(ctx)):
+        if out.lost or (closed and ctx.meta[PIPES_RESULTS]):
             typer.echo(f"beers-deploy: standard output: {out.lost or 'closed'}; all else is done", err=True)
             ctx.exit(CRASHED)
         return found
 
     def _invoke(self, ctx: Any) -> Any:
-        with warnings.catch_warnings(), results_to(sys.stdout) if _pipes_results(ctx) else nullcontext():
+        with warnings.catch_warnings(), results_to(sys.stdout) if ctx.meta[PIPES_RESULTS] else nullcontext():
             warnings.simplefilter("always", OutsideRangeWarning)
             warnings.showwarning = _print_warning
             return super().invoke(ctx)
@@ -157,7 +166,23 @@ def ending(error: BaseException, function: Callable[..., None]) -> tuple[str, in
         return "memory: expected enough for this input, got none left; give a smaller image or tile.", 2
     if isinstance(error, KeyboardInterrupt):
         return "interrupted", INTERRUPTED
-    return f"a fault of this program, please report it: {error!r}", CRASHED
+    at_fault = " or of ".join(["this program", *_library_of(error)])
+    return f"a fault of {at_fault}, please report it: {error!r}", CRASHED
+
+
+def _library_of(error: BaseException) -> list[str]:
+    """Return name and version of the library in which an error arose; nothing if it arose in this program."""
+    from importlib.metadata import packages_distributions, version
+
+    distributions = packages_distributions()
+    for frame, _ in reversed(list(traceback.walk_tb(error.__traceback__))):
+        package = str(frame.f_globals.get("__name__")).partition(".")[0]
+        if package == __package__:
+            return []
+        if package in distributions:  # the standard library is in none
+            name = distributions[package][0]
+            return [f"{name} {version(name)}"]
+    return []
 
 
 def in_options(message: str, function: Callable[..., None]) -> str:
@@ -174,12 +199,6 @@ def in_options(message: str, function: Callable[..., None]) -> str:
 
     parameters = inspect.signature(function).parameters
     return re.sub(r"`(\w+)`", option, re.sub(r"^(\w+)(?=:)", option, message))
-
-
-def _pipes_results(context: typer.Context) -> bool:
-    """Whether the results are asked for on standard output: then all else goes to standard error."""
-    words = [*context._protected_args, *context.args]
-    return ("--json", "-") in pairwise(words) or "--json=-" in words
 
 
 def _print_warning(message: Warning | str, *_: object, **__: object) -> None:

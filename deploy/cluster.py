@@ -14,8 +14,8 @@ ANSWER_S, JOIN_S = 10, 30
 """How long a scheduler may take to answer, and a first worker to be there."""
 POLL_S, WORKERLESS_S = 5, 60
 """While a result is waited for: how often workers are counted, and how long there may be none."""
-PACKAGES = ("beers-deploy", "numpy", "onnxruntime", "torch")
-"""They decide the last bits of a result, so every worker must have the versions of this process."""
+PACKAGES = ("beers-deploy", "numpy", "onnxruntime", "scipy")
+"""Workers compute with these, so every worker must have the versions of this process: they decide the last bits."""
 
 T = TypeVar("T")
 

@@ -113,6 +113,13 @@ class OutsideRangeWarning(UserWarning):
     """A sensor that lies outside the range that a network was trained for; the command line prints it as a line."""
 
 
+CODE_FAULTS = (AttributeError, ImportError, NameError, TypeError)
+"""What code raises that does not fit the version of a library.
+
+A damaged file leads a compiled library to none of them. A library that is written in Python may raise them for both.
+"""
+
+
 EXTRAS = {
     "cyclonedx": "record",
     "distributed": "dask",

@@ -201,10 +201,26 @@ def response_from_json(label: str, raw: object) -> Response:
         response: Response = _table(label, raw)
     else:
         check_keys(label, raw, required={"height", "width", "samples_per_px", "samples"})
-        per_px = _samples_per_px(f"{label} samples_per_px", raw["samples_per_px"])
-        response = PointSpread(raw["height"], raw["width"], per_px, raw["samples"])
+        response = _stored_point_spread(label, raw)
     _require_contrast(label, response)
     return response
+
+
+def _stored_point_spread(label: str, raw: Mapping[str, Any]) -> PointSpread:
+    """Read a point-spread function that `packed` stored."""
+    per_px = _samples_per_px(f"{label} samples_per_px", raw["samples_per_px"])
+    point = PointSpread(raw["height"], raw["width"], per_px, raw["samples"])
+    try:
+        # Before unpacking: a size of 0 bytes would unpack as much as the text holds.
+        if not all(type(side) is int and 1 <= side <= KEPT_SIDE for side in (point.height, point.width)):
+            raise ValueError(f"{point.height!r} x {point.width!r} samples")
+        samples = unpacked(point)
+        if not (np.isfinite(samples).all() and samples.sum() > 0):
+            raise ValueError("samples that are not finite or have no sum above 0")
+    except (TypeError, ValueError) as error:
+        expected, remedy = "the samples of a point-spread function, as they were stored", "make the file again"
+        raise ProfileError(label, expected=expected, got=str(error), remedy=remedy) from error
+    return point
 
 
 def _require_contrast(where: str, response: Response) -> None:

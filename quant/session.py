@@ -12,7 +12,7 @@ import onnx
 import onnxruntime as ort
 
 from beers_deploy.model.processor import int8_adds_exactly
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import CODE_FAULTS, ModelError
 from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import PLANES, PLANES_FRAC_BITS, Add, Concat, Conv, Graph, Mul, Op, Pointwise, same
 from beers_deploy.quant.graph.writer import graph_to_onnx
@@ -51,6 +51,8 @@ def open_session(
             known, _ = made_exact(known)
     try:
         return ort.InferenceSession(known.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    except CODE_FAULTS:
+        raise
     except Exception as error:  # onnxruntime raises a class of its own for each status code
         got = " ".join(str(error).split())[:160]
         remedy = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
@@ -83,6 +85,8 @@ def tensors_of(session: ort.InferenceSession, names: list[str] | None, image: np
     """The named outputs, or all, for an image (N, 1, H, W) float32 in [0, 1]."""
     try:
         return [np.asarray(value) for value in session.run(names, {session.get_inputs()[0].name: image})]
+    except CODE_FAULTS:
+        raise
     except Exception as error:  # as above
         raise _unfit(" ".join(str(error).split())[:160]) from error
 

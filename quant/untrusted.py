@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from types import ModuleType
 
 import numpy as np
 import onnx
@@ -45,6 +46,8 @@ def contradictions(where: str) -> Iterator[None]:
     except BeersError:
         raise
     except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+        if isinstance(getattr(error, "obj", None), ModuleType):
+            raise  # the installed version of a library lacks what this program calls, whatever the file holds
         got = f"nodes that contradict it ({' '.join(str(error).split())[:80]})"
         remedy = "check the file with onnx.checker, and export it again"
         raise refused(where, "nodes as ONNX defines them", got, remedy) from error

@@ -18,6 +18,7 @@ from typing import Any
 import onnx
 
 from beers_deploy.model.io.files import write_text
+from beers_deploy.profiles.errors import CODE_FAULTS
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.gdal_source import ENVIRONMENT, LEAST_CACHE_BYTES, OFFLINE
 from beers_deploy.restoration.options import Compression
@@ -75,6 +76,8 @@ def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[s
                 if file.width == 1:  # readers tell how far an overview is reduced from its width
                     options["OVERVIEWS"] = "NONE"
             import_module("rasterio.shutil").copy(plain, cog, driver="COG", **options)
+    except CODE_FAULTS:
+        raise
     except Exception as error:  # rasterio has a class of its own for each of GDAL's
         raise OSError(" ".join(str(error.__cause__ or error).split())) from error
 

@@ -18,7 +18,7 @@ import numpy as np
 import tifffile
 
 from beers_deploy.model.io.tiff import require_small_offset
-from beers_deploy.profiles.errors import BeersError, ImageError, optional
+from beers_deploy.profiles.errors import CODE_FAULTS, BeersError, ImageError, optional
 from beers_deploy.restoration.index_files import dimap_bits, index_files, is_index
 from beers_deploy.restoration.source import (
     GDAL_DRIVERS,
@@ -86,7 +86,7 @@ def _damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
     try:
         with warnings.catch_warnings(action="ignore"):  # an image need not lie on Earth
             yield
-    except (BeersError, MemoryError):
+    except (BeersError, MemoryError, *CODE_FAULTS):
         raise
     except Exception as error:
         cause: BaseException = error

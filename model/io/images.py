@@ -14,8 +14,8 @@ import psutil
 from PIL import Image
 
 from beers_deploy.model.io.files import IMAGE_SUFFIXES, TIFF_SUFFIXES
-from beers_deploy.model.io.tiff import check_page, image_pages, open_tiff
-from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, OptionError, sizes
+from beers_deploy.model.io.tiff import check_page, image_pages, open_tiff, tifffile_works
+from beers_deploy.profiles.errors import CODE_FAULTS, BeersError, ImageError, MachineError, OptionError, sizes
 from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.profiles.toml import read_whole, unreadable
 
@@ -73,6 +73,8 @@ def damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
     except (BeersError, MemoryError):
         raise
     except Exception as error:
+        if isinstance(error, CODE_FAULTS) and not _library_works(path):
+            raise  # the installed version is at fault, not the file
         name = f"{path}, {where}" if where else str(path)
         if isinstance(error, ModuleNotFoundError) or "imagecodecs" in str(error):
             remedy = "pip install 'beers-deploy[codecs]'"
@@ -80,6 +82,23 @@ def damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
             raise MachineError(name, expected=expected, got=str(error), remedy=remedy) from error
         got, remedy = " ".join(str(error).split()) or type(error).__name__, "check that it is a whole image"
         raise ImageError(name, expected="a readable TIFF, PNG or JPEG", got=got[:120], remedy=remedy) from error
+
+
+def _library_works(path: Path) -> bool:
+    """Return True if the library that reads files of this kind reads an intact one.
+
+    Tags of a wrong type in a damaged file make tifffile raise TypeError, as a call with a wrong argument does: the
+    kind of exception alone does not tell which of the two is at fault.
+    """
+    if path.suffix.lower() in TIFF_SUFFIXES:
+        return tifffile_works()
+    stream = io.BytesIO()
+    try:
+        Image.fromarray(np.zeros((2, 2), np.uint8)).save(stream, "PNG")
+        np.asarray(Image.open(stream, formats=("PNG", "JPEG")))
+    except Exception:  # noqa: BLE001 - a version that does not fit ours may raise anything
+        return False
+    return True
 
 
 def image_size_px(path: Path) -> tuple[int, int]:

@@ -3,6 +3,7 @@
 Formats for microscopes name further files to be opened.
 """
 
+import io
 import logging
 import math
 import re
@@ -17,14 +18,13 @@ import tifffile
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.profiles.errors import ImageError, MachineError, sizes
 
-PLAIN: dict[str, Any] = dict.fromkeys(
-    (
-        "is_avs", "is_bif", "is_eer", "is_fluoview", "is_lsm", "is_mdgel", "is_mmstack", "is_ndpi", "is_ndtiff",
-        "is_nih", "is_ome", "is_philips", "is_qpi", "is_scanimage", "is_scn", "is_sis", "is_stk",
-    ),
-    False,
-)  # fmt: skip
+LABORATORIES = {
+    "avs", "bif", "eer", "fluoview", "lsm", "mdgel", "mmstack", "ndpi", "ndtiff", "nih", "ome", "philips", "qpi",
+    "scanimage", "scn", "sis", "stk",
+}  # fmt: skip
 """Laboratories' own kinds of TIFF are read as plain pages: some name other files to be opened."""
+# Each release of tifffile knows more kinds than the one before, and raises TypeError for one that it does not know.
+PLAIN: dict[str, Any] = {f"is_{kind}": False for kind in LABORATORIES & tifffile.TIFF.FILE_FLAGS}
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # who asks for its remarks still has them
 
@@ -32,6 +32,19 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())  # who asks for 
 def open_tiff(path: Path) -> tifffile.TiffFile:
     """A TIFF as plain pages; raises what tifffile raises."""
     return tifffile.TiffFile(path, **PLAIN)
+
+
+def tifffile_works() -> bool:
+    """Return True if the installed tifffile reads a small image that it has written itself."""
+    stream = io.BytesIO()
+    try:
+        tifffile.imwrite(stream, np.zeros((2, 2), np.uint16))
+        stream.seek(0)
+        with tifffile.TiffFile(stream, **PLAIN) as file:
+            file.series[0].asarray()
+    except Exception:  # noqa: BLE001 - a version that does not fit ours may raise anything
+        return False
+    return True
 
 
 REDUCED, MASK = 1, 4

@@ -41,12 +41,13 @@ def with_shuffles(model: onnx.ModelProto) -> OnnxGraph:
         return graph
     inferred = onnx.shape_inference.infer_shapes(model).graph
     known = {value.name: value.type.tensor_type.shape.dim for value in (*inferred.input, *inferred.value_info)}
-    nodes = list(graph.nodes)
+    spelled: dict[Node, Node | None] = {}  # of the nodes of a chain the last one stands for all
     for chain in _chains(graph):
         shuffle = _shuffle(chain, [dim.dim_value for dim in known.get(chain[0].inputs[0], ())], graph)
         if shuffle is not None:
-            nodes = [shuffle if node is chain[-1] else node for node in nodes if node not in chain[:-1]]
-    return OnnxGraph(model, nodes)
+            spelled |= {**dict.fromkeys(chain), chain[-1]: shuffle}
+    written = (spelled.get(node, node) for node in graph.nodes)
+    return OnnxGraph(model, [node for node in written if node is not None])
 
 
 def _chains(graph: OnnxGraph) -> list[list[Node]]:
@@ -54,8 +55,9 @@ def _chains(graph: OnnxGraph) -> list[list[Node]]:
     chains: dict[str, list[Node]] = {}  # by the tensor that they have come to
     for node in graph.nodes:
         if node.op_type in MOVES:
-            before = chains.pop(node.inputs[0], []) if graph.reads(node.inputs[0]) == 1 else []
-            chains[node.outputs[0]] = [*before, node]
+            chain = chains.pop(node.inputs[0], []) if graph.reads(node.inputs[0]) == 1 else []
+            chain.append(node)
+            chains[node.outputs[0]] = chain
     return list(chains.values())
 
 

@@ -1,6 +1,6 @@
 """A network cut where the DPU's part begins and ends, and whether its operations fit together."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -191,12 +191,17 @@ def _size(op: Op, read: Pair) -> Pair:
 def channels_of(graph: Graph, given: Mapping[str, int]) -> dict[str, int]:
     """Channels of every tensor, from those of the given ones."""
     widths = dict(given)
-    for op in graph:
+    add_channels(widths, graph)
+    return widths
+
+
+def add_channels(widths: dict[str, int], ops: Iterable[Op]) -> None:
+    """Add the channels of what operations write to those of the tensors that they read."""
+    for op in ops:
         missing = [name for name in op.inputs if name not in widths]
         if missing:
             raise refused_graph(f"{op.name} behind what it reads", missing[0])
         widths[op.output] = _width(op, [widths[name] for name in op.inputs])
-    return widths
 
 
 def _width(op: Op, read: list[int]) -> int:

@@ -4,7 +4,7 @@ Nothing is refused here: `quantize` takes a short list of operations of it, tili
 with the sizes of what each node computes of one image.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,6 +14,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper, shape_inference
 
+from beers_deploy.profiles.errors import CODE_FAULTS
 from beers_deploy.quant.onnx_file import constants
 from beers_deploy.quant.reading.folding import OPSET
 from beers_deploy.quant.reading.nodes import attributes_of
@@ -152,7 +153,11 @@ class OnnxGraph:
 
     def reads(self, name: str) -> int:
         """How often a tensor is read, by nodes and as a result."""
-        return len(self.readers.get(name, ())) + self.outputs.count(name)
+        return len(self.readers.get(name, ())) + self._written_out[name]
+
+    @cached_property
+    def _written_out(self) -> Counter[str]:
+        return Counter(self.outputs)
 
     def value(self, node: Node, place: int) -> np.ndarray | None:
         """A constant that a node reads, None where it reads none there."""
@@ -236,6 +241,8 @@ def _inferred(node: Node, known: list[Shape], constants: Mapping[str, np.ndarray
         opsets = [helper.make_opsetid("", OPSET)]
         found = shape_inference.infer_node_outputs(schema, node.proto, types, data, opset_imports=opsets)
         sizes = [d.dim_value for d in found[node.outputs[0]].tensor_type.shape.dim]
+    except CODE_FAULTS:  # a version of onnx that lacks this call would make every size unknown
+        raise
     except Exception:  # noqa: BLE001 - an unknown operator and whatever its own inference raises mean: unknown
         return None
     return (sizes[1], sizes[2], sizes[3]) if len(sizes) == 4 and min(sizes) > 0 else None

@@ -80,7 +80,7 @@ class Integers:
 
     def __init__(self, graph: OnnxGraph) -> None:
         self.present = any(node.op_type in FORMATS for node in graph.nodes)
-        self._graph, self._constants = graph, graph.constants
+        self._graph, self._constants, self._results = graph, graph.constants, frozenset(graph.outputs)
         self._int8 = {name for name, kind in graph.types.items() if kind in BYTES}
         self._wide: set[str] = set()
         self._seen: dict[str, str] = {}  # and the int8 tensor that each is
@@ -115,7 +115,7 @@ class Integers:
         result = node.outputs[0]
         if node.op_type == "DequantizeLinear" and result not in self._same:
             readers = self._graph.readers.get(result, [])
-            return result not in self._graph.outputs and all(map(self.is_integer, readers))
+            return result not in self._results and all(map(self.is_integer, readers))
         return result in self._same
 
     def activations(self, node: Node) -> tuple[str, ...]:
@@ -173,10 +173,10 @@ class Integers:
         source, result = node.inputs[0] if node.inputs else "", node.outputs[0]
         if node.op_type == "DequantizeLinear":
             aliases = self._seen if self.constant(source) is None else self._same
-            aliases[result] = source
+            aliases[result] = self.resolve(source)  # at once: a chain of aliases would be walked again by each reader
         elif node.op_type == "QuantizeLinear" and source in self._wide:
             self._int8.add(result)
-            self._same[result] = source
+            self._same[result] = self.resolve(source)
             self._give(source, self._formats[result][0])
         elif self._writes_int8(node):
             self._int8.update(node.outputs)
@@ -202,7 +202,7 @@ class Integers:
         for node in reversed(self._graph.nodes):
             readers = self._graph.readers.get(node.outputs[0], [])
             kinds = {reader.op_type for reader in readers}
-            if node.outputs[0] in self._graph.outputs or not kinds:
+            if node.outputs[0] in self._results or not kinds:
                 continue
             if kinds == {"QuantizeLinear"}:
                 found[node.outputs[0]] = readers[0].outputs[0]

@@ -13,7 +13,7 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph.moves import MOVES, ORDERS, Resizing, with_shuffles
 from beers_deploy.quant.graph.network import (
     Network,
-    channels_of,
+    add_channels,
     check_network,
     cut,
     named_apart,
@@ -106,6 +106,9 @@ class _Reader:
         self.source = with_shuffles(model)
         (self.image, *_), self.result = self.source.inputs, model.graph.output[0].name
         self.ops: list[Op] = []
+        self._places: dict[str, int] = {}  # where the operation that writes a tensor stands
+        self._widths: dict[str, int] = {}  # channels of what the first operations write
+        self._measured = 0  # so many operations
         self.flat = self.softmax = False
 
     def channels(self) -> int:
@@ -145,7 +148,28 @@ class _Reader:
             raise refused_graph("operations that a DPU computes", str(node), remedy)
         op = READERS[node.op_type](self, node)
         if op is not None:
-            self.ops.append(op)
+            self._append(op)
+
+    def _append(self, op: Op) -> None:
+        self._places[op.output] = len(self.ops)
+        self.ops.append(op)
+
+    def _replace(self, place: int, op: Op) -> None:
+        """Put an operation in the place of one whose result has another name."""
+        before = self.ops[place].output
+        self.ops[place] = op
+        del self._places[before]
+        self._places[op.output] = place
+        if before in self._widths:
+            self._widths[op.output] = self._widths[before]
+
+    def _channels_of(self, tensor: str) -> int:
+        """Return the channels of what an operation has written."""
+        if not self._measured:
+            self._widths[self.image] = self.channels()
+        add_channels(self._widths, self.ops[self._measured :])
+        self._measured = len(self.ops)
+        return self._widths[tensor]
 
     def _require(self, sound: bool, node: Node, expected: str, got: str = "another") -> None:
         if not sound:
@@ -193,7 +217,7 @@ class _Reader:
         """At the end, where what is flat is (N, K): inside it stays (N, K, 1, 1)."""
         ends = node.outputs[0] == self.result and bool(self.ops) and node.attributes.get("axis", 1) == 1
         self._require(ends and self.ops[-1].output == node.inputs[0], node, "Flatten at the end alone")
-        self.ops[-1] = renamed(self.ops[-1], {node.inputs[0]: node.outputs[0]})
+        self._replace(len(self.ops) - 1, renamed(self.ops[-1], {node.inputs[0]: node.outputs[0]}))
         self.flat = True
 
     def _softmax(self, node: Node) -> None:
@@ -202,7 +226,7 @@ class _Reader:
         ends = (node.outputs[0] == self.result or rest == ["Flatten"]) and node.attributes.get("axis", -1) in (1, -3)
         last = bool(self.ops) and self.ops[-1].output == node.inputs[0] and self.source.reads(node.inputs[0]) == 1
         self._require(ends and last, node, "Softmax of channels at the end alone")
-        self.ops[-1] = renamed(self.ops[-1], {node.inputs[0]: node.outputs[0]})
+        self._replace(len(self.ops) - 1, renamed(self.ops[-1], {node.inputs[0]: node.outputs[0]}))
         self.softmax = True
 
     def _add_or_mul(self, node: Node) -> Op:
@@ -227,7 +251,7 @@ class _Reader:
             raise refused_graph("a constant of one number a channel", got)
         self._require(node.op_type != "Sub" or place == 1, node, "a constant that is taken off")
         source = node.inputs[1 - place]
-        channels = channels_of(tuple(self.ops), {self.image: self.channels()})[source]
+        channels = self._channels_of(source)
         self._require(value.size in (1, channels), node, f"{channels} numbers", f"{value.size}")
         each = np.broadcast_to(flat.astype(np.float32), (channels,))
         one, none = np.ones(channels, np.float32), np.zeros(channels, np.float32)
@@ -279,7 +303,7 @@ class _Reader:
     def _activation(self, node: Node) -> None:
         activation = self._which(node)
         on_sums = activation not in (Activation.hard_sigmoid, Activation.hard_swish)  # before anything is rounded
-        writer = next((k for k, op in enumerate(self.ops) if op.output == node.inputs[0]), None)
+        writer = self._places.get(node.inputs[0])
         before = self.ops[writer] if writer is not None else None
         fusible = isinstance(before, Conv) or (isinstance(before, Add) and activation is Activation.relu)
         free = getattr(before, "activation", None) is Activation.none and self.source.reads(node.inputs[0]) == 1
@@ -287,9 +311,9 @@ class _Reader:
         phased = isinstance(before, Conv) and before.transposed and activation is Activation.leaky_relu
         if on_sums and fusible and free and not phased and writer is not None:
             assert isinstance(before, Conv | Add)  # noqa: S101
-            self.ops[writer] = replace(before, output=node.outputs[0], activation=activation)
+            self._replace(writer, replace(before, output=node.outputs[0], activation=activation))
         else:
-            self.ops.append(Pointwise(node.name, node.inputs[0], node.outputs[0], activation))
+            self._append(Pointwise(node.name, node.inputs[0], node.outputs[0], activation))
 
     def _which(self, node: Node) -> Activation:
         activation = ACTIVATIONS[node.op_type]

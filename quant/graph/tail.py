@@ -85,16 +85,21 @@ def without_tail(model: ModelProto, known: Collection[str]) -> tuple[ModelProto,
     first = next((k for k, node in enumerate(nodes) if node.op_type not in known), None)
     if first is None or len(model.graph.output) != 1:
         return model, None
+    if any(node.op_type not in PLAIN for node in nodes[first:]):
+        return model, None
     held = {tensor.name for tensor in model.graph.initializer}
-    for start in range(first, 0, -1):
-        tail = nodes[start:]
-        written = {name for node in tail for name in node.output}
-        read = {name for node in tail for name in node.input if name} - written - held
-        if len(read) == 1 and all(node.op_type in PLAIN for node in tail):
+    read: set[str] = set()
+    for start in range(len(nodes) - 1, 0, -1):  # the tail grows towards the front, one node at a time
+        node = nodes[start]
+        if node.op_type not in PLAIN:
+            break
+        read.difference_update(node.output)
+        read.update(name for name in node.input if name and name not in held)
+        if start <= first and len(read) == 1:
             source = read.pop()
-            return (
-                (model, None) if source == model.graph.input[0].name else _parted(model, nodes[:start], tail, source)
-            )
+            if source == model.graph.input[0].name:
+                break
+            return _parted(model, nodes[:start], nodes[start:], source)
     return model, None
 
 

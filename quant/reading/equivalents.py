@@ -197,16 +197,21 @@ def _mean(shapes: Shapes, _: Nodes, node: NodeProto) -> list[NodeProto] | None:
 
 def _in_front(graph: Nodes, shapes: Shapes) -> None:
     """What works on each channel by itself, folded into all the convolutions that read it, where that is exact."""
+    readers = graph.readers()
+    ends, folded = set(graph.ends), set[int]()
     for node in graph.nodes[::-1]:
-        found = _affine(graph, node)
-        readers = [reader for reader in graph.nodes if node.output[0] in reader.input]
-        if found is None or not readers or node.output[0] in graph.ends or not _keeps_channels(*found, shapes):
+        result, found = node.output[0], _affine(graph, node)
+        behind = readers.get(result, [])
+        if found is None or not behind or result in ends or not _keeps_channels(*found, shapes):
             continue
-        if all(_may_scale_inputs(graph, reader, node.output[0], found[1]) for reader in readers):
-            for reader in readers:
+        if all(_may_scale_inputs(graph, reader, result, found[1]) for reader in behind):
+            for reader in behind:
                 _scale_inputs(graph, reader, found[1])
                 reader.input[0] = found[0]
-            graph.nodes = [other for other in graph.nodes if other is not node]
+            others = [reader for reader in readers[found[0]] if reader is not node]
+            readers[found[0]] = others + behind
+            folded.add(id(node))
+    graph.nodes = [node for node in graph.nodes if id(node) not in folded]
 
 
 def _keeps_channels(source: str, affine: Affine, shapes: Shapes) -> bool:

@@ -166,7 +166,7 @@ def _tidy(folded: onnx.ModelProto, model: onnx.ModelProto) -> None:
     read = {name for node in graph.node for name in node.input} | {value.name for value in graph.output}
     kept = sorted((t for t in graph.initializer if t.name in read), key=lambda tensor: str(tensor.name))
     _replace(graph.initializer, kept)
-    taken = {node.name for node in graph.node}
+    taken = dict.fromkeys((node.name for node in graph.node), 0)
     for node in graph.node:
         if not node.name:
             node.name = fresh(node.output[0] or node.op_type, taken)

@@ -1,6 +1,6 @@
 """The nodes of a network while they are rewritten: who writes and reads what, and the numbers they hold."""
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from typing import Any
 
@@ -32,7 +32,8 @@ class Nodes:
         self.nodes = list(graph.node)
         self.constants = {tensor.name: tensor for tensor in graph.initializer}
         self.ends = [value.name for value in graph.output]
-        self._taken = {name for node in graph.node for name in (*node.input, *node.output)} | set(self.constants)
+        names = (name for node in graph.node for name in (*node.input, *node.output))
+        self._taken = dict.fromkeys((*names, *self.constants), 0)
         self._find()
 
     def _find(self) -> None:
@@ -94,6 +95,14 @@ class Nodes:
         """The node that writes a tensor which one node alone reads."""
         return self.writers.get(name) if self.reads[name] == 1 else None
 
+    def readers(self) -> dict[str, list[NodeProto]]:
+        """Return the nodes that read each tensor, in order, each of them once."""
+        found: dict[str, list[NodeProto]] = defaultdict(list)
+        for node in self.nodes:
+            for name in dict.fromkeys(node.input):
+                found[name].append(node)
+        return found
+
     def is_linear(self, node: NodeProto | None) -> bool:
         """Whether it is a convolution of images, transposed or not, of weights and bias that the file holds."""
         if node is None or node.op_type not in LINEAR:
@@ -108,12 +117,20 @@ class Nodes:
         return int(dims[0] if node.op_type == "Conv" else dims[1] * attributes_of(node).get("group", 1))
 
 
-def fresh(name: str, taken: set[str]) -> str:
-    """The name, or one like it, that is not taken; it is from now on."""
-    while name in taken:
-        name += "_"
-    taken.add(name)
-    return name
+def fresh(name: str, taken: dict[str, int]) -> str:
+    """Return the name, or one like it that is free, and note it.
+
+    Args:
+        name: that is wanted.
+        taken: of each name how many others were derived from it, so that a thousand nodes of one name do not try each
+            other's.
+    """
+    found = name
+    while found in taken:
+        taken[name] += 1
+        found = f"{name}_{taken[name] if taken[name] > 1 else ''}"
+    taken[found] = 0
+    return found
 
 
 Step = Callable[[Nodes, NodeProto], list[NodeProto] | None]

@@ -188,9 +188,12 @@ def _subgraphs(operations: tuple[Operation, ...], devices: list[Device]) -> list
 
 def _root(parents: dict[str, str], name: str) -> str:
     """The tensor that stands for all of a piece."""
-    while parents.get(name, name) != name:
-        name = parents[name]
-    return name
+    root = name
+    while parents.get(root, root) != root:
+        root = parents[root]
+    while name != root:  # the way is walked once: in a long chain each node would walk all of it again
+        parents[name], name = root, parents[name]
+    return root
 
 
 def _cuts(network: Network, nodes: Iterable[PlacedNode]) -> Iterable[Cut]:

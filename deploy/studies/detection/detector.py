@@ -16,7 +16,7 @@ import numpy as np
 import onnx
 from onnxruntime import InferenceSession
 
-from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.errors import CODE_FAULTS, ModelError, OptionError
 from beers_deploy.quant.onnx_file import constants, fixed_tile_px, load_onnx, metadata
 from beers_deploy.quant.session import open_session
 from beers_deploy.studies.detection.boxes import MOST, Boxes, Letterbox, suppress
@@ -95,6 +95,8 @@ def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> D
 def _answer(session: InferenceSession, path: Path, image: np.ndarray) -> np.ndarray:
     try:
         return np.asarray(session.run(None, {session.get_inputs()[0].name: image})[0])
+    except CODE_FAULTS:
+        raise
     except Exception as error:  # onnxruntime raises a class of its own for each status code
         got, remedy = " ".join(str(error).split())[:160], "export it again, for one size of image"
         raise ModelError(str(path), expected="a detector that runs", got=got, remedy=remedy) from error

@@ -1,0 +1,134 @@
+"""Measure how the time of `check` grows with the number of nodes: `python -m benchmarks.check_nodes`.
+
+Each kind of network takes another way through reading and checking. The time is that of the process, so that a busy
+machine changes little.
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from beers_deploy.dpu.checker.table import check
+from beers_deploy.model.processor import processor_name
+
+NODES = (1000, 2000, 4000, 8000)
+CHANNELS = 8
+WEIGHT = np.random.default_rng(0).normal(0, 0.05, (CHANNELS, CHANNELS, 3, 3)).astype(np.float32)
+SHUFFLED = ((0, 2, 2, 2, 64, 64), (0, 2, 128, 128))
+"""Two shapes by which exporters spell a pixel shuffle."""
+
+
+class Chain:
+    """A network under construction; `last` is the tensor that it has come to."""
+
+    def __init__(self) -> None:
+        self.last = "image"
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: list[onnx.TensorProto] = []
+
+    def then(self, op_type: str, *inputs: str, domain: str = "", **attributes: object) -> str:
+        """Append a node of these inputs, or of the last tensor, and return its result."""
+        self.last, sources = f"{op_type}{len(self.nodes)}", list(inputs or (self.last,))
+        node = helper.make_node(op_type, sources, [self.last], name=self.last, domain=domain, **attributes)
+        self.nodes.append(node)
+        return self.last
+
+    def constant(self, value: object) -> str:
+        """Add a constant and return its name."""
+        name = f"constant{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(np.asarray(value), name))
+        return name
+
+    def convolve(self) -> str:
+        """Append a convolution with weights of its own."""
+        return self.then("Conv", self.last, self.constant(WEIGHT), pads=[1] * 4)
+
+    def model(self) -> onnx.ModelProto:
+        """Return the network that ends with the last tensor."""
+        ends = (("image", ["N", CHANNELS, "H", "W"]), (self.last, ["N", "C", "H2", "W2"]))
+        image, result = (helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in ends)
+        graph = helper.make_graph(self.nodes, "chain", [image], [result], self.constants)
+        opsets = [helper.make_opsetid("", 17), helper.make_opsetid("com.microsoft", 1)]
+        return helper.make_model(graph, opset_imports=opsets, ir_version=8)
+
+
+def residual(chain: Chain) -> None:
+    """Add a convolution with a ReLU to what it reads."""
+    before = chain.last
+    chain.convolve()
+    chain.then("Add", before, chain.then("Relu"))
+
+
+def scaled(chain: Chain) -> None:
+    """Scale each channel in front of a convolution, which takes the scale in."""
+    chain.then("Relu")
+    chain.then("Mul", chain.last, chain.constant(np.full((1, CHANNELS, 1, 1), 0.9, np.float32)))
+    chain.convolve()
+
+
+def pointwise(chain: Chain) -> None:
+    """Change values by themselves, one node after the other."""
+    chain.then("Relu")
+    chain.then("Mul", chain.last, chain.constant(np.float32(0.99)))
+    chain.then("Sigmoid")
+
+
+def shuffled(chain: Chain) -> None:
+    """Spell a pixel shuffle as exporters do, and take it back."""
+    chain.then("Reshape", chain.last, chain.constant(np.array(SHUFFLED[0])))
+    chain.then("Transpose", perm=[0, 1, 4, 2, 5, 3])
+    chain.then("Reshape", chain.last, chain.constant(np.array(SHUFFLED[1])))
+    chain.then("SpaceToDepth", blocksize=2)
+    chain.convolve()
+
+
+def integers(chain: Chain) -> None:
+    """Convolve, rectify and add on integers."""
+    if chain.last == "image":
+        values = {"scale": np.float32(1 / 64), "zero": np.uint8(64), "weight_zero": np.int8(0)}
+        weight = np.clip(WEIGHT * 64, -127, 127).astype(np.int8)
+        values |= {"weight": weight, "bias": np.zeros(CHANNELS, np.int32)}
+        chain.constants.extend(numpy_helper.from_array(np.asarray(value), name) for name, value in values.items())
+        chain.then("QuantizeLinear", "image", "scale", "zero")
+    before, read = chain.last, ("scale", "zero")
+    weights = ("weight", "scale", "weight_zero", *read, "bias")
+    chain.then("QLinearConv", before, *read, *weights, pads=[1] * 4)
+    chain.then("Max", chain.last, "zero")
+    chain.then("QLinearAdd", before, *read, chain.last, *read, *read, domain="com.microsoft")
+
+
+KINDS: tuple[Callable[[Chain], None], ...] = (residual, scaled, pointwise, shuffled, integers)
+
+
+def network(kind: Callable[[Chain], None], nodes: int) -> onnx.ModelProto:
+    """Return a chain of blocks of a kind, with at least so many nodes."""
+    chain = Chain()
+    while len(chain.nodes) < nodes:
+        kind(chain)
+    return chain.model()
+
+
+def main() -> None:
+    """Print the seconds of each kind and size."""
+    print(f"{processor_name()}; seconds of processor time to read and check a network of so many nodes")
+    print(f"{'kind':12}", *(f"{nodes:>8}" for nodes in NODES))
+    with TemporaryDirectory() as folder:
+        for kind in KINDS:
+            taken_s = [_seconds(network(kind, nodes), Path(folder) / "chain.onnx") for nodes in NODES]
+            print(f"{kind.__name__:12}", *(f"{each_s:8.2f}" for each_s in taken_s), flush=True)
+
+
+def _seconds(model: onnx.ModelProto, path: Path) -> float:
+    onnx.save_model(model, path)
+    start_s = time.process_time()
+    check(str(path))
+    return time.process_time() - start_s
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""A fault of an installed library ends with 70 and the library's name; it is not taken for a damaged file."""
+
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import tifffile
+from PIL import Image, PngImagePlugin
+
+from beers_deploy.cli import CRASHED, ending
+from beers_deploy.commands.restore import restore
+from beers_deploy.model.io import tiff
+from beers_deploy.profiles.errors import CODE_FAULTS, ModelError, printable
+from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.quant.session import open_session
+from beers_deploy.quant.untrusted import contradictions
+from tests.deploy.command_line import done
+
+PIXELS = np.full((20, 30), 900, np.uint16)
+
+
+def test_an_argument_that_tifffile_does_not_know(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tifffile.imwrite(tmp_path / "raw.tif", PIXELS)
+    monkeypatch.setitem(tiff.PLAIN, "is_of_the_future", False)
+    said = done("info", tmp_path / "raw.tif", code=CRASHED)
+    assert f"tifffile {version('tifffile')}" in said
+    assert "is_of_the_future" in said
+    assert "whole image" not in said
+
+
+def test_a_name_that_pillow_lacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Image.fromarray(PIXELS).save(tmp_path / "raw.png")
+    monkeypatch.setattr(PngImagePlugin.PngImageFile, "_open", lambda self: self.of_the_future)
+    said = done("info", tmp_path / "raw.png", code=CRASHED)
+    assert f"pillow {version('pillow')}" in said
+    assert "of_the_future" in said
+
+
+@pytest.mark.parametrize("kind", CODE_FAULTS)
+def test_a_call_that_onnxruntime_does_not_take(
+    kind: type[Exception], model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network = load_onnx(model)
+
+    def refusing(*_: object, **__: object) -> None:
+        raise kind("unexpected keyword argument")
+
+    monkeypatch.setattr(onnxruntime, "InferenceSession", refusing)
+    with pytest.raises(kind, match="unexpected keyword"):
+        open_session(network)
+
+
+def test_a_name_that_a_module_lacks_is_no_contradiction_of_a_network() -> None:
+    with pytest.raises(AttributeError, match="of_the_future"), contradictions("a.onnx"):
+        np.of_the_future  # type: ignore[attr-defined]  # noqa: B018
+    with pytest.raises(ModelError, match=r"a\.onnx"), contradictions("a.onnx"):
+        None.of_the_file  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_a_fault_of_this_program_names_no_library() -> None:
+    with pytest.raises(TypeError) as caught:
+        printable(None)  # type: ignore[arg-type]
+    said, code = ending(caught.value, restore)
+    assert (code, said.partition(",")[0]) == (CRASHED, "a fault of this program")

@@ -1,0 +1,127 @@
+"""The oldest versions of the dependencies that pyproject.toml allows run the main commands, as those installed do.
+
+`.ci/run` runs the tests in a new environment, which has the newest versions. The oldest are installed without
+PyTorch, because these commands work without it.
+"""
+
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from packaging.requirements import Requirement
+
+from tests.deploy.dpu.graphs import Sketch
+
+ROOT = Path(__file__).resolve().parents[2]
+PROJECT = (
+    "deploy",
+    "model",
+    "profiles",
+    "quant",
+    "pyproject.toml",
+    "setup.py",
+    "MANIFEST.in",
+    "README.md",
+    "LICENSE",
+)
+SIDE_PX, SCENE_PX = 96, 400
+SAMPLES = 4
+
+
+def lowest_versions() -> list[str]:
+    """Return `name==version` of each core dependency, by the lower bound that pyproject.toml declares."""
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
+    pins = []
+    for requirement in map(Requirement, declared):
+        (lowest,) = (each.version for each in requirement.specifier if each.operator == ">=")
+        pins.append(f"{requirement.name}=={lowest}")
+    return pins
+
+
+def pip(python: Path, *words: object) -> subprocess.CompletedProcess[str]:
+    # Bytecode is compiled where it is imported: to compile all of SciPy takes longer than to install it.
+    options = ("--quiet", "--disable-pip-version-check", "--no-compile", *map(str, words))
+    return subprocess.run([python, "-m", "pip", "install", *options], capture_output=True, text=True, check=False)
+
+
+def copied_project(folder: Path) -> Path:
+    """Copy what is packed: building in the repository would leave files there."""
+    for name in PROJECT:
+        source = ROOT / name
+        if source.is_dir():
+            shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, folder / name)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def lowest(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the Python of a new environment with the oldest version of every core dependency."""
+    folder = tmp_path_factory.mktemp("lowest")
+    subprocess.run([sys.executable, "-m", "venv", folder / "venv"], check=True)
+    python = folder / "venv" / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
+    reached = pip(python, "--dry-run", "--retries", 0, "--timeout", 15, "filelock")
+    if reached.returncode:
+        pytest.skip(f"the package index cannot be reached: {reached.stderr.strip()[-200:]}")
+    constraints = folder / "constraints.txt"
+    constraints.write_text("\n".join(lowest_versions()), encoding="utf-8")
+    project = copied_project(tmp_path_factory.mktemp("project"))
+    installed = pip(python, "--constraint", constraints, project)
+    assert installed.returncode == 0, installed.stderr
+    return python
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A raw image, a scene, a small network and samples for it."""
+    rng = np.random.default_rng(0)
+    for name, side_px in (("raw.tif", SIDE_PX), ("scene.tif", SCENE_PX)):
+        tifffile.imwrite(tmp_path / name, rng.integers(400, 3000, (side_px, side_px)).astype(np.uint16))
+    np.save(tmp_path / "samples.npy", rng.uniform(0, 1, (SAMPLES, 1, SIDE_PX, SIDE_PX)).astype(np.float32))
+    sketch = Sketch(channels=1)
+    features = sketch.node("Relu", weighted(sketch, rng, "image", 8, 1))
+    sketch.save(tmp_path / "float.onnx", sketch.node("Add", "image", weighted(sketch, rng, features, 1, 8)))
+    return tmp_path
+
+
+def weighted(sketch: Sketch, rng: np.random.Generator, source: str, outputs: int, inputs: int) -> str:
+    weight = sketch.constant(rng.normal(0, 0.1, (outputs, inputs, 3, 3)).astype(np.float32))
+    return sketch.node("Conv", source, weight, pads=[1] * 4)
+
+
+def run_main_commands(python: Path, folder: Path) -> None:
+    def done(*words: str) -> None:
+        command = [python, "-m", "beers_deploy", *words]
+        ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        # A verdict on so small a network may be negative.
+        assert ran.returncode in (0, 1), f"{' '.join(words)}\n{ran.stdout[-2000:]}{ran.stderr[-2000:]}"
+
+    done("--help")
+    done("restore", "--help")
+    done("restore", "raw.tif", "float32.tif", "--network", "convbeers-xs", "--sensor", "pleiades-degraded")
+    done("restore", "raw.tif", "int8.tif", "--network", "convbeers-xs-int8", "--sensor", "pleiades-degraded")
+    done("simulate", "scene.tif", "--sensor", "pleiades-degraded", "--out", "pairs")
+    done("quantize", "float.onnx", "--samples", "samples.npy", "--out", "int8.onnx")
+    done("gate", "float.onnx", "int8.onnx", "--samples", "samples.npy", "--json", "gate.json")
+    done("check", "int8.onnx", "--tile", "64")
+    done("bench", "int8.onnx", "--size", "200x100", "--tile", "64", "--no-traditional")
+
+
+@pytest.mark.slow
+def test_the_oldest_versions_run_the_main_commands(lowest: Path, folder: Path) -> None:
+    run_main_commands(lowest, folder)
+
+
+@pytest.mark.slow
+def test_the_installed_versions_run_the_main_commands(folder: Path) -> None:
+    run_main_commands(Path(sys.executable), folder)
+
+
+def test_every_dependency_has_a_lower_bound() -> None:
+    assert all(pin.partition("==")[2] for pin in lowest_versions())
