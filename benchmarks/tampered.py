@@ -35,7 +35,7 @@ def bias(change: Callable[[np.ndarray], np.ndarray]) -> Change:
 
 
 def _int8(values: np.ndarray) -> np.ndarray:
-    return np.clip(values, -128, 127).astype(np.int8)
+    return np.asarray(np.clip(values, -128, 127), np.int8)
 
 
 def without_channel(weight: np.ndarray, axis: int) -> np.ndarray:

@@ -87,7 +87,7 @@ def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
         if then != now:
             expected = f"a baseline of the same patches ({name} {now})"
             raise OptionError(str(path), expected=expected, got=f"{name} {then}", remedy=REMEDY)
-    figures = next((row["figures"] for row in document["rows"] if row["table"] == "gate"), {})
+    figures: dict[str, Any] = next((row["figures"] for row in document["rows"] if row["table"] == "gate"), {})
     mae = figures.get("MAE", {})
     if mae.get("mode") != "measured" or mae.get("unit") != SCALE or not 0 <= mae["value"] <= 1:
         raise OptionError(str(path), expected=f"a measured MAE {SCALE}", got=_shown(mae), remedy=REMEDY)

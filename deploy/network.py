@@ -23,7 +23,7 @@ from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.quant.encodings import board_model, read_core, vint8_model
 from beers_deploy.quant.onnx_file import fixed_tile_px, is_quantised, load_onnx, metadata, read_onnx, save_onnx
-from beers_deploy.quant.reading.external import network_sha256
+from beers_deploy.quant.reading.external import unchanged
 from beers_deploy.quant.reading.folding import OPSET
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.tiling.walk import Tiling, tiling_of
@@ -94,12 +94,10 @@ class Network:
         if isinstance(network, str | os.PathLike):
             given = Path(network)
             path = network_file(given, Sensor.load(sensor), _warn)
-            before = network_sha256(path) if path.is_file() else ""  # which the reader refuses
-            model = float_model(path) if to_run or path.suffix == ".safetensors" else load_onnx(path, to_run=False)
-            if before and network_sha256(path) != before:
-                expected = "a file that stays as it is while it is read"
-                raise ModelError(str(path), expected=expected, got="another one now", remedy="run the command again")
-            return cls(model, given.stem if path == given else given.name, path, file_sha256=before)
+            to_run = to_run or path.suffix == ".safetensors"
+            with unchanged(path) as digest:
+                model = float_model(path) if to_run else load_onnx(path, to_run=False)
+            return cls(model, given.stem if path == given else given.name, path, file_sha256=digest)
         return cls(exported(network, example), type(network).__name__)
 
     def save(self, path: str | os.PathLike[str]) -> Path:

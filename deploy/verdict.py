@@ -32,14 +32,14 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, TargetProfile
 from beers_deploy.quant.float_parts import float_note
 from beers_deploy.quant.gate import METRICS, GateResult, judge, judge_saturation, verdict_row
-from beers_deploy.quant.gate import compare as differences
+from beers_deploy.quant.gate import compare as differences_of
 from beers_deploy.quant.limits import Limits, limits_of
 from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px, metadata, require_quantised
 from beers_deploy.quant.sample_range import range_row, recorded_range, uncovered
 from beers_deploy.quant.samples import CALIBRATED_ON, OwnSamples, digest_of, samples_of
 from beers_deploy.quant.session import open_any_size
 from beers_deploy.quant.structure import saturated_shares, structure_checks
-from beers_deploy.results import Table
+from beers_deploy.results import Input, Table
 
 if TYPE_CHECKING:
     from beers_deploy.quant.samples import Patches
@@ -65,6 +65,7 @@ class Comparison(Table):
         floating: the float network.
         int8: the INT8 network.
         sensor: of the simulated patches, and of shipped networks.
+        rests_on: what the figures rest on besides the networks.
     """
 
     result: GateResult
@@ -72,6 +73,7 @@ class Comparison(Table):
     floating: Network
     int8: Network
     sensor: Sensor
+    rests_on: tuple[Input, ...]
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -156,20 +158,20 @@ def compare(
     with reporting(progress), faults_named(theirs.label):
         judged, simulated, notes = _samples(ours, theirs, known, samples, scenes, patches, seed)
         sessions = open_any_size(theirs.model), open_any_size(ours.model)
-        result = differences(*sessions, judged.pairs, simulated, metric)
+        result = differences_of(*sessions, judged.pairs, simulated, metric)
         shares = saturated_shares(ours.model, judged.degraded)
     arguments: dict[str, object] = {"float": theirs.name, "int8": ours.name, "sensor": known.name, "images": images}
     arguments |= {"patches": patches, "seed": seed, "samples": samples if isinstance(samples, str | Path) else None}
-    inputs = [theirs.input, ours.input, sensor_input(known)]
+    rests_on = [sensor_input(known)]
     if scenes is not None and simulated:
-        inputs.append(files_input("scenes", scenes))
+        rests_on.append(files_input("scenes", scenes))
     if isinstance(samples, str | Path):
-        inputs.append(files_input("samples", Path(samples)))
+        rests_on.append(files_input("samples", Path(samples)))
     rows, range_notes = _range_rows(ours, result)
     return Comparison(
         "compare",
         arguments,
-        tuple(inputs),
+        (theirs.input, ours.input, *rests_on),
         (verdict_row(result, shares), *rows),
         notes=(*notes, *range_notes),
         result=result,
@@ -177,6 +179,7 @@ def compare(
         floating=theirs,
         int8=ours,
         sensor=known,
+        rests_on=tuple(rests_on),
     )
 
 
@@ -256,7 +259,7 @@ def gate(
     found = compare(ours, theirs, samples, **how, progress=progress)
     _require_contrast(found.result, allowed)
     if before is not None:
-        before.require_same(theirs.sha256, found.result.psnr_float_db, found.inputs[2:])
+        before.require_same(theirs.sha256, found.result.psnr_float_db, found.rests_on)
     checks = judge(found.result, allowed, before.mae if before else None)
     checks += judge_saturation(found.shares, allowed)
     checks += file_checks(theirs.model, ours, target)

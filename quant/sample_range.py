@@ -67,9 +67,9 @@ class RangeCounts:
     def range(self) -> SampleRange:
         """The range of what was added."""
         shares = np.cumsum(self._counts) / max(int(self._counts.sum()), 1)
-        levels = [float(np.searchsorted(shares, percent / 100)) / (BINS - 1) for percent in PERCENTS]
+        p1, p50, p99, p99_9 = (float(np.searchsorted(shares, each / 100)) / (BINS - 1) for each in PERCENTS)
         saturated = float(self._counts[-1] / max(int(self._counts.sum()), 1))
-        return SampleRange(*levels, saturated=saturated)
+        return SampleRange(p1, p50, p99, p99_9, saturated)
 
 
 def range_of(samples: Iterable[np.ndarray]) -> SampleRange:

@@ -25,12 +25,12 @@ from beers_deploy.model.io.files import require_writable
 from beers_deploy.model.io.images import require_image_file
 from beers_deploy.model.processor import require_cores
 from beers_deploy.model.progress import Log, held_back, no_log, steps
-from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, ModelError, optional
+from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, optional
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.profiles.sensor import numbers_of
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.quant.reading.external import network_sha256
+from beers_deploy.quant.reading.external import network_sha256, unchanged
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.cog import disk_bytes, what_was_done, write_cog
 from beers_deploy.restoration.georeference import unread_places
@@ -244,14 +244,9 @@ def read_network(path: Path) -> tuple[onnx.ModelProto, str]:
     Raises:
         ModelError: a file that was replaced while it was read, besides what `load_onnx` raises.
     """
-    before = network_sha256(path)
-    network = load_onnx(path)
-    if network_sha256(path) != before:
-        remedy = "wait until it is written, then run this again"
-        raise ModelError(
-            str(path), expected="a network that stays as it is", got="a change while it was read", remedy=remedy
-        )
-    return network, before
+    with unchanged(path) as digest:
+        network = load_onnx(path)
+    return network, digest
 
 
 def require_unchanged(source: Source, name: str, before: Sequence[tuple[int, int, int]], digest: object) -> None:

@@ -6,6 +6,8 @@ that it lies elsewhere is refused by `quant.untrusted.check_content`, which look
 
 import hashlib
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 import onnx
@@ -43,6 +45,20 @@ def network_sha256(path: Path) -> str:
     apart = [tensor for tensor in model.graph.initializer if tensor.external_data]
     beside = sorted({_beside(tensor, _said(tensor).get("location", ""), path) for tensor in apart})
     return hashlib.sha256("".join([own, *map(sha256, beside)]).encode()).hexdigest() if beside else own
+
+
+@contextmanager
+def unchanged(path: Path) -> Iterator[str]:
+    """Give the digest of a network's file, and raise ModelError if the file is another one after it was read.
+
+    So the digest is that of the bytes that were parsed. It is empty where there is no file, which the reader refuses.
+    """
+    before = network_sha256(path) if path.is_file() else ""
+    yield before
+    if before and network_sha256(path) != before:
+        expected = "a network that stays as it is"
+        remedy = "wait until it is written, then run this again"
+        raise ModelError(str(path), expected=expected, got="a change while it was read", remedy=remedy)
 
 
 def _said(tensor: TensorProto) -> dict[str, str]:

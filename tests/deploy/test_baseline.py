@@ -96,7 +96,8 @@ def test_whatever_stands_in_a_place_of_the_document_it_ends_in_one_sentence(
 def test_files_that_are_no_document_are_refused(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="no such file"):
         read_baseline(tmp_path / "none.json", ASKED)
-    for content in ({}, [], "gate", 3):
+    contents: list[object] = [{}, [], "gate", 3]
+    for content in contents:
         with pytest.raises(OptionError, match="another document"):
             read_baseline(written(tmp_path / "b.json", content), ASKED)
 

@@ -264,7 +264,8 @@ def test_the_judged_file_does_not_choose_its_judges(model: Path) -> None:
 
 def claiming(model: onnx.ModelProto, key: str, text: str) -> onnx.ModelProto:
     """A copy whose metadata say so."""
-    other = onnx.ModelProto.FromString(model.SerializeToString())
+    other = onnx.ModelProto()
+    other.CopyFrom(model)
     onnx.helper.set_model_props(other, {**metadata(model), key: text})
     return other
 

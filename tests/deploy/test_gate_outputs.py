@@ -73,13 +73,13 @@ def test_the_digest_is_that_of_the_bytes_that_were_judged(
     """The INT8 file is replaced while the gate runs."""
     int8 = pair[1]
     before = hashlib.sha256(int8.read_bytes()).hexdigest()
-    compare = gates.differences
+    compare = gates.differences_of  # type: ignore[attr-defined]
 
     def replaced(*given: object) -> object:
         int8.write_bytes(b"another file")
         return compare(*given)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(gates, "differences", replaced)
+    monkeypatch.setattr(gates, "differences_of", replaced)
     done("gate", *pair, "--patches", 1, "--json", tmp_path / "g.json", "--record", tmp_path / "r")
     document = json.loads((tmp_path / "g.json").read_text())
     assert {each["name"]: each["sha256"] for each in document["inputs"]}["int8.onnx"] == before

@@ -22,7 +22,8 @@ def test_percentiles_are_those_of_all_pixels_however_they_are_divided(pixels: li
 
 @given(st.lists(st.floats(0, 1), min_size=4, max_size=4), st.floats(0, 1))
 def test_what_is_recorded_is_read_back(values: list[float], saturated: float) -> None:
-    found = SampleRange(*sorted(values), saturated=saturated)
+    p1, p50, p99, p99_9 = sorted(values)
+    found = SampleRange(p1, p50, p99, p99_9, saturated)
     again = recorded_range({KEY: found.to_words()})
     assert again is not None
     np.testing.assert_allclose(
