@@ -95,8 +95,8 @@ def _steepest(steep: np.ndarray, step_px: int) -> tuple[np.ndarray, np.ndarray]:
     height, width = steep.shape
     down = CELL_ROWS_PX // step_px
     padded = np.pad(steep, ((0, -height % down), (0, -width % CELL_COLUMNS_PX)))
-    cells = padded.reshape(padded.shape[0] // down, down, -1, CELL_COLUMNS_PX).swapaxes(1, 2)
-    cells = cells.reshape(*cells.shape[:2], -1)
+    blocks = padded.reshape(padded.shape[0] // down, down, -1, CELL_COLUMNS_PX).swapaxes(1, 2)
+    cells = blocks.reshape(*blocks.shape[:2], -1)
     inner = cells.argmax(2)
     best = np.take_along_axis(cells, inner[:, :, None], 2)[:, :, 0]
     order = np.argsort(best, axis=None, kind="stable")[::-1][: int((best > MIN_STEEPNESS).sum())]
