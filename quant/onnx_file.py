@@ -15,8 +15,10 @@ from google.protobuf.message import DecodeError
 from onnx import numpy_helper
 
 from beers_deploy.model.io.files import whole_file
+from beers_deploy.model.io.formats import HEAD_BYTES, other_format
 from beers_deploy.profiles.errors import BeersError, ModelError, OptionError
 from beers_deploy.profiles.toml import read_whole, unreadable
+from beers_deploy.quant.domains import functions_of, operator_name
 from beers_deploy.quant.reading.external import take_in
 from beers_deploy.quant.reading.folding import IR_VERSION, OPSET, simplest
 from beers_deploy.quant.reading.training_mode import require_inference
@@ -39,9 +41,6 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
         ModelError: missing, empty, not ONNX, of weights that are not finite, or not to be trusted (see
             `quant.untrusted`).
     """
-    if path.suffix == ".safetensors":
-        remedy = "export it first: beers-deploy export --network FILE --out FILE.onnx"
-        raise ModelError(str(path), expected="an ONNX file", got="safetensors weights", remedy=remedy)
     try:
         content = read_whole(path, FILE_BYTES)
     except (OSError, ValueError) as error:
@@ -72,6 +71,8 @@ def parse_onnx(content: bytes, where: str, to_run: bool = True, path: Path | Non
     """As `load_onnx`, of a file's bytes, and what is read stays as it is; with a path weights may lie beside it."""
     if not content:
         raise ModelError(where, expected="an ONNX file", got="an empty file", remedy=REMEDY)
+    if other := other_format(content[:HEAD_BYTES]):
+        raise ModelError(where, expected="an ONNX file", got=other.name, remedy=other.remedy)
     try:
         model = onnx.ModelProto()
         model.ParseFromString(content)
@@ -182,9 +183,10 @@ def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.Model
 def constants(model: onnx.ModelProto) -> dict[str, np.ndarray]:
     """The constants of a model by name: initializers, and what nodes of the kind Constant hold."""
     found = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+    functions = functions_of(model)
     for node in model.graph.node:
         values = [a.t for a in node.attribute if a.name == "value"]
-        if node.op_type == "Constant" and values:
+        if operator_name(node, functions) == "Constant" and values:
             found[node.output[0]] = numpy_helper.to_array(values[0])
     return found
 

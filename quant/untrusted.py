@@ -10,6 +10,7 @@ import onnx
 from onnx import AttributeProto, NodeProto, TensorProto, helper, numpy_helper
 
 from beers_deploy.profiles.errors import BeersError, ModelError
+from beers_deploy.quant.domains import INLINE, MICROSOFT, STANDARD, foreign_remedy
 
 FILE_BYTES = 1 << 30
 VALUES = 1 << 28
@@ -125,8 +126,8 @@ def _check_place_and_type(tensor: TensorProto, where: str) -> None:
 WINDOW_PX = 1024
 """Kernel, stride, dilation or padding of a window, or a factor of enlargement."""
 
-STANDARD = ("", "ai.onnx")
-ONNXRUNTIMES = {("com.microsoft", "QLinearAdd"), ("com.microsoft", "QLinearMul")}
+ONNXRUNTIMES = {(MICROSOFT, "QLinearAdd"), (MICROSOFT, "QLinearMul")}
+"""Its operators that we write."""
 
 WINDOWS = {"kernel_shape", "strides", "dilations", "pads", "output_padding", "blocksize"}
 SIZES = {"CenterCropPad": (1,), "Expand": (1,), "MaxUnpool": (2,), "OneHot": (1,), "Resize": (3,)}
@@ -142,8 +143,11 @@ KEEPING = {
 
 def check_runnable(model: onnx.ModelProto, where: str) -> None:
     """Refuse a model that no runtime of ours should open."""
-    if model.functions or model.graph.sparse_initializer:
-        raise refused(where, "plain operators and weights", "functions or sparse weights", "export it without them")
+    for function in model.functions:
+        got = f"{function.name} of {function.domain!r}, a function of the file"
+        raise refused(where, "operators of ONNX itself", got, INLINE)
+    if model.graph.sparse_initializer:
+        raise refused(where, "plain weights", "sparse ones", "export it without them")
     constants = _Constants(model, where)
     # What follows from the image is sized by it; what follows from constants alone may have any size.
     of_image = {value.name for value in model.graph.input} - set(constants.values)
@@ -244,8 +248,8 @@ def named(node: NodeProto) -> str:
 
 def _check_operator(node: NodeProto, where: str) -> None:
     if node.domain not in STANDARD and (node.domain, node.op_type) not in ONNXRUNTIMES:
-        got = f"{named(node)} of {node.domain!r}"
-        raise refused(where, "operators of ONNX itself", got, "export it without operators of others")
+        got, remedy = f"{named(node)} of {node.domain!r}", foreign_remedy(node.domain, node.op_type)
+        raise refused(where, "operators of ONNX itself", got, remedy)
     if any(a.HasField("g") or a.graphs or a.HasField("sparse_tensor") for a in node.attribute):
         raise refused(where, "nodes that run once", f"{named(node)} with a graph within", "unroll it")
 

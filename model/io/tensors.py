@@ -16,12 +16,15 @@ from safetensors.numpy import save_file
 
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.files import whole_file
+from beers_deploy.model.io.formats import HEAD_BYTES, SAFETENSORS, OtherFormat, other_format
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.toml import parse_json, unreadable
 
 BANKED = "behind the bank of its sensor"
 """The kind, in the header, of weights that need a sensor before they are a network; plain ones state none."""
+
+TRAINED = "give a file written by 'beers-deploy train'"
 
 FAULTS = (AttributeError, LookupError, TypeError, ValueError, OverflowError, RuntimeError)
 """What reading a header or filling a network may raise on a file that is not ours."""
@@ -55,9 +58,20 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
             # Copies: the library's own lie in the file, which Windows then does not replace, and others may change.
             return {key: np.array(file.get_tensor(key)) for key in file.keys()}, header  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
-        got = unreadable(path) or " ".join(str(error).split())[:120]
-        remedy = "give a file written by 'beers-deploy train'"
+        got, remedy = unreadable(path) or " ".join(str(error).split())[:120], TRAINED
+        if other := _other_format(path):
+            got, remedy = other.name, f"{TRAINED}, or an ONNX file of your own network: {other.remedy}"
         raise ModelError(str(path), expected="safetensors weights", got=got, remedy=remedy) from error
+
+
+def _other_format(path: Path) -> OtherFormat | None:
+    """Return the format of a file whose first bytes are those of another format than safetensors."""
+    try:
+        with path.open("rb") as file:
+            found = other_format(file.read(HEAD_BYTES))
+    except OSError:
+        return None
+    return None if found is SAFETENSORS else found
 
 
 def write_weights(path: Path, weights: Weights) -> None:

@@ -15,6 +15,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper, shape_inference
 
 from beers_deploy.profiles.errors import CODE_FAULTS
+from beers_deploy.quant.domains import Functions, functions_of, operator_name
 from beers_deploy.quant.onnx_file import constants
 from beers_deploy.quant.reading.folding import OPSET
 from beers_deploy.quant.reading.nodes import attributes_of
@@ -87,7 +88,7 @@ class Window:
 class Node:
     """An operator, in ONNX's words; an input that is left out has no name."""
 
-    op_type: str
+    op_type: str  # as `quant.domains.operator_name` has it
     name: str  # its own, or its first result's
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
@@ -95,10 +96,10 @@ class Node:
     proto: onnx.NodeProto  # as the file holds it
 
     @classmethod
-    def of(cls, proto: onnx.NodeProto) -> "Node":
-        """What a file holds of it."""
-        name = proto.name or proto.output[0]
-        return cls(proto.op_type, name, tuple(proto.input), tuple(proto.output), attributes_of(proto), proto)
+    def of(cls, proto: onnx.NodeProto, functions: Functions = ()) -> "Node":
+        """What a file holds of it, which may define functions."""
+        name, op_type = proto.name or proto.output[0], operator_name(proto, functions)
+        return cls(op_type, name, tuple(proto.input), tuple(proto.output), attributes_of(proto), proto)
 
     def __str__(self) -> str:
         return f"{self.op_type} {self.name}"
@@ -135,8 +136,9 @@ class OnnxGraph:
     def __init__(self, model: onnx.ModelProto, nodes: Sequence[Node] | None = None) -> None:
         """Of a model as it is, or with other nodes in the place of its own."""
         self.constants = constants(model)
-        own = (Node.of(node) for node in model.graph.node if node.op_type != "Constant")
-        self.nodes = tuple(own if nodes is None else nodes)
+        functions = functions_of(model)
+        own = (Node.of(node, functions) for node in model.graph.node)
+        self.nodes = tuple(node for node in (own if nodes is None else nodes) if node.op_type != "Constant")
         inputs = {v.name: v.type.tensor_type for v in model.graph.input if v.name not in self.constants}
         self.inputs = {name: [dim.dim_value for dim in tensor.shape.dim] for name, tensor in inputs.items()}
         self.types = {name: tensor.elem_type for name, tensor in inputs.items()}
@@ -237,7 +239,7 @@ def _inferred(node: Node, known: list[Shape], constants: Mapping[str, np.ndarray
         else:  # a scale or a size that is no constant of the file
             return None
     try:
-        schema = onnx.defs.get_schema(node.op_type, OPSET, node.proto.domain)
+        schema = onnx.defs.get_schema(node.op_type, OPSET)
         opsets = [helper.make_opsetid("", OPSET)]
         found = shape_inference.infer_node_outputs(schema, node.proto, types, data, opset_imports=opsets)
         sizes = [d.dim_value for d in found[node.outputs[0]].tensor_type.shape.dim]

@@ -43,7 +43,7 @@ from beers_deploy.quant.graph.operations import (
 )
 from beers_deploy.quant.graph.tail import without_tail
 from beers_deploy.quant.reading.equivalents import per_channel
-from beers_deploy.quant.untrusted import contradictions, times
+from beers_deploy.quant.untrusted import check_runnable, contradictions, times
 
 
 def read_network(model: onnx.ModelProto) -> Network:
@@ -93,6 +93,7 @@ def image_channels(graph: Graph) -> int:
 def refusal(model: onnx.ModelProto) -> str:
     """Why a float network cannot be quantised, as a sentence; empty where it can."""
     try:
+        check_runnable(model, "float model")
         read_network(model)
     except ModelError as error:
         return f"expected {error.expected}, got {error.got}"

@@ -60,7 +60,7 @@ RULES: Mapping[Kind, tuple[Rule, ...]] = {
 SIZES: tuple[Rule, ...] = (other_rules.map_exists, other_rules.maps_aligned, other_rules.map_in_memory)
 """What the tile's size has to allow every node."""
 
-EVERY: tuple[Rule, ...] = (other_rules.int8_operator, *SIZES)
+EVERY: tuple[Rule, ...] = (other_rules.operator_domain, other_rules.int8_operator, *SIZES)
 """What a node of any kind has to keep."""
 
 NUMBERS: tuple[Rule, ...] = (

@@ -7,6 +7,7 @@ from beers_deploy.dpu.checker.conv_rules import alu_padding
 from beers_deploy.dpu.checker.finding import Finding, beyond_range, shown
 from beers_deploy.dpu.graph import CONVOLUTIONS, Operation
 from beers_deploy.profiles.errors import sizes
+from beers_deploy.quant.domains import SEPARATOR, foreign_remedy, is_foreign
 
 # ruff: noqa: ARG001 - every rule takes the operation and the DPU
 
@@ -46,9 +47,6 @@ INSTEAD = {
     "DFT": "use a convolution of at most 16 x 16 where the filter is short; else leave it to the host",
     "TopK": "leave it to the host: the DPU does not compare values across a map",
     "LayerNormalization": "train without normalisation, or with one that folds into the convolution",
-    "FixNeuron": "write the file with QuantizeLinear and DequantizeLinear (QDQ format)",
-    "VitisQuantizeLinear": "write the file with QuantizeLinear and DequantizeLinear (QDQ format)",
-    "ExtendedQuantizeLinear": "write the file with QuantizeLinear and DequantizeLinear (QDQ format)",
     "InstanceNormalization": "train without normalisation, or with one that folds into the convolution",
     "BatchNormalization": "fold it into the convolution before it",
 }
@@ -56,8 +54,18 @@ INSTEAD = {
 
 def known_operator(op: Operation, dpu: Dpu) -> Finding | None:
     """Only operators of the supported list run on the DPU ({documents[operators]})."""
+    if is_foreign(op.op_type):  # `operator_domain` names it
+        return None
     remedy = INSTEAD.get(op.op_type, "leave it to the host before or behind the network, or do without it")
     return Finding(f"{op.op_type} always runs on the CPU", remedy)
+
+
+def operator_domain(op: Operation, dpu: Dpu) -> Finding | None:
+    """An operator is ONNX's own, or onnxruntime's on integers: its domain belongs to its name (ONNX IR, Operators)."""
+    if not is_foreign(op.op_type):
+        return None
+    domain, _, name = op.op_type.rpartition(SEPARATOR)
+    return Finding(f"{op.op_type} is no operator of ONNX, whatever its name", foreign_remedy(domain, name))
 
 
 def int8_operator(op: Operation, dpu: Dpu) -> Finding | None:

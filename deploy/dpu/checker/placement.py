@@ -17,6 +17,7 @@ from typing import Literal
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.operators import Broken, judge, require_known
 from beers_deploy.dpu.graph import CONVOLUTIONS, Network, Operation
+from beers_deploy.quant.domains import is_foreign
 
 Part = Literal["host-front", "dpu-core", "host-back"]
 Device = Literal["host", "DPU", "CPU"]
@@ -115,7 +116,9 @@ def _parts(network: Network) -> list[Part]:
     finished: set[str] = set()
     for op in operations:
         leads, trails = op.output not in behind, op.output not in before
-        if leads and _is_host_front(op, network, trails=trails):
+        if is_foreign(op.op_type):  # what no processor here computes is not the host's either
+            parts.append("dpu-core")
+        elif leads and _is_host_front(op, network, trails=trails):
             parts.append("host-front")
         elif trails and (_is_host_back(op, network, leads=leads) or finished & set(op.inputs)):
             parts.append("host-back")

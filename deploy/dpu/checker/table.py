@@ -22,6 +22,7 @@ from beers_deploy.quant.onnx_file import is_quantised, metadata
 from beers_deploy.results import Table
 
 SOURCE = "operator rules of the target profile"
+OTHERS_NOTE = "quantised by operators that are not ONNX's: judged without their numbers"
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -58,7 +59,8 @@ class Checked(Table):
         lines += [f"{name}: {text}" for name, text in remarks_on(placement, self.dpu, self.tile_px).items()]
         if placement.note:
             refused = refusal(self.network.model)
-            lines += [placement.note, f"'quantize' does not take it: {refused}" if refused else "'quantize' takes it"]
+            note = OTHERS_NOTE if is_quantised(self.network.model) else placement.note
+            lines += [note, f"'quantize' does not take it: {refused}" if refused else "'quantize' takes it"]
         failed = "; ".join(str(check) for check in self.checks if not check.passed)
         sound = "no rule is broken, not compiled" if npu else "the core runs whole on the DPU"
         return [*lines, f"check FAILED: {failed}" if failed else f"check passed: {sound}"]

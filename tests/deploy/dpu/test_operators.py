@@ -72,6 +72,10 @@ CASES: dict[str, tuple[Draw, Draw]] = {
     ),
     "argmax channels": (node("ArgMax", axis=1), behind_conv("Relu")),
     "known operator": (behind_conv("Sigmoid"), behind_conv("HardSigmoid")),
+    "operator domain": (
+        lambda s, x: s.node("FusedRelu", s.conv(x), domain="com.microsoft"),
+        lambda s, x: s.node("Relu", s.conv(x)),
+    ),
 }
 WIDE = {"conv channels", "conv weight bank", "depthwise channels", "transposed channels", "resize channels"}
 WIDE |= {"elementwise channels", "shuffle channels"}

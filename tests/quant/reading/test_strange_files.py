@@ -57,7 +57,9 @@ def test_what_no_runtime_of_ours_may_get_is_named_and_may_be_looked_at(
     path = saved(make(), tmp_path)
     with pytest.raises(ModelError, match=words):
         load_onnx(path)
-    refused = [found.op.op_type for found in place(read_network(path, 32), load_dpu("vck190")).failed]
+    refused = [
+        found.op.op_type.rpartition("::")[2] for found in place(read_network(path, 32), load_dpu("vck190")).failed
+    ]
     assert words.split()[0] in refused
 
 

@@ -1,0 +1,67 @@
+"""Whose operator a node is: ONNX knows an operator by its domain and its name together.
+
+A `Relu` of another domain, or of a function that the file itself defines, may compute anything. So wherever nodes are
+told apart by a name, it is `operator_name`: ONNX's own operators have their bare names, and all others have their
+domain in front of it, so that no table of ours holds them.
+"""
+
+from collections.abc import Collection
+
+from onnx import ModelProto, NodeProto
+
+STANDARD = ("", "ai.onnx")
+MICROSOFT = "com.microsoft"
+SEPARATOR = "::"
+
+INTEGER_OPERATORS = {
+    "DequantizeLinear", "QLinearAdd", "QLinearAveragePool", "QLinearConcat", "QLinearGlobalAveragePool",
+    "QLinearLeakyRelu", "QLinearMul", "QLinearReduceMean", "QLinearSigmoid", "QLinearSoftmax", "QLinearWhere",
+    "QuantizeLinear",
+}  # fmt: skip
+"""Of onnxruntime's domain: what ONNX lacks, and the pair that ONNX has too, with the same meaning for int8 and uint8.
+Not its QLinearConv, which may read (N, H, W, C)."""
+
+INLINE = "inline its functions first: onnx.inliner.inline_local_functions(model)"
+QDQ = "write the file with QuantizeLinear and DequantizeLinear (QDQ format)"
+UNOPTIMISED = (
+    "give the file that onnxruntime read, because what it saves after its optimisation has operators of its own "
+    "(ORT_ENABLE_BASIC adds none)"
+)
+OTHERS = "export the network with operators of ONNX itself"
+
+
+Functions = Collection[tuple[str, str]]
+"""Domain and name of each function that a file defines."""
+
+
+def functions_of(model: ModelProto) -> Functions:
+    """Return domain and name of each function that a file defines."""
+    return {(function.domain, function.name) for function in model.functions}
+
+
+def operator_name(node: NodeProto, functions: Functions = ()) -> str:
+    """Return an operator's name, with its domain in front unless it is ONNX's or onnxruntime's on integers.
+
+    Args:
+        node: of a file.
+        functions: that the file defines; one may have the name of an operator of ONNX.
+    """
+    if (node.domain, node.op_type) in functions:
+        return f"{node.domain}{SEPARATOR}{node.op_type}"
+    transposed = any(attribute.name == "channels_last" and attribute.i for attribute in node.attribute)
+    integer = node.domain == MICROSOFT and node.op_type in INTEGER_OPERATORS and not transposed
+    if node.domain in STANDARD or integer:
+        return str(node.op_type)
+    return f"{node.domain}{SEPARATOR}{node.op_type}"
+
+
+def is_foreign(name: str) -> bool:
+    """Return True if an operator of this name is neither ONNX's nor onnxruntime's on integers."""
+    return SEPARATOR in name
+
+
+def foreign_remedy(domain: str, op_type: str) -> str:
+    """Return what a user can do about a foreign operator."""
+    if "QuantizeLinear" in op_type or op_type == "FixNeuron":
+        return QDQ
+    return UNOPTIMISED if domain.startswith(MICROSOFT) else OTHERS

@@ -1,0 +1,129 @@
+"""An operator of another domain, or of a function of the file, is refused whatever its name and place."""
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import tifffile
+from hypothesis import given
+from hypothesis import strategies as st
+from onnx import helper, numpy_helper
+
+from beers_deploy.dpu.checker.table import check
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.target import board_names, npu_names
+from beers_deploy.quant.domains import INTEGER_OPERATORS, is_foreign, operator_name
+from beers_deploy.quant.graph import refusal
+from beers_deploy.quant.onnx_file import load_onnx
+from tests.deploy.command_line import done, refused
+from tests.deploy.dpu.graphs import Sketch
+
+BOARDS = [*board_names(), *npu_names()]
+DOMAINS = ["my.ops", "com.microsoft", "com.microsoft.nchwc", "pkg.torch.local"]
+PLACES = ["front", "behind a convolution", "between", "behind a host's node", "end"]
+
+
+def network(path: Path, place: str, domain: str) -> Path:
+    """A network of operators that a DPU takes and host parts, one of which is another's."""
+    sketch = Sketch(8)
+
+    def node(here: str, op_type: str, *inputs: str) -> str:
+        return sketch.node(op_type, *inputs, domain=domain if here == place else "")
+
+    scaled = node("front", "Mul", "image", sketch.constant(np.float32(0.5)))
+    first = node("behind a convolution", "Relu", sketch.conv(scaled))
+    deep = sketch.conv(node("between", "Add", first, sketch.conv(first)))
+    limits = sketch.constant(np.float32(0)), sketch.constant(np.float32(1))
+    back = sketch.node("Clip", deep, *limits)
+    behind = node("behind a host's node", "Mul", back, limits[1])
+    sketch.save(path, node("end", "Clip", behind, *limits))
+    model = onnx.load_model(path)
+    model.opset_import.append(helper.make_opsetid(domain, 1))
+    onnx.save_model(model, path)
+    return path
+
+
+@given(place=st.sampled_from(PLACES), domain=st.sampled_from(DOMAINS), board=st.sampled_from(BOARDS))
+def test_a_foreign_domain_is_not_legal_and_not_run(
+    tmp_path_factory: pytest.TempPathFactory, place: str, domain: str, board: str
+) -> None:
+    path = network(tmp_path_factory.mktemp("foreign") / "a.onnx", place, domain)
+    (node,) = (node for node in onnx.load_model(path).graph.node if node.domain == domain)
+    found = check(str(path), board, tile=64)
+    (broken,) = (placed for placed in found.failed if placed.op.name == node.name)
+    assert not found
+    assert f"{domain}::{node.op_type}" in broken.broken[0].finding.reason
+    for said in (refusal(found.network.model), refused_by_load(path)):
+        assert f"{node.op_type} {node.name} of {domain!r}" in said
+
+
+def refused_by_load(path: Path) -> str:
+    with pytest.raises(ModelError) as caught:
+        load_onnx(path)
+    return str(caught.value)
+
+
+def test_the_same_network_without_another_domain_is_legal(tmp_path: Path) -> None:
+    assert check(str(network(tmp_path / "a.onnx", "nowhere", "my.ops")), tile=64)
+
+
+def with_function(path: Path, domain: str) -> Path:
+    """A Relu that the file itself defines, as its negation."""
+    sketch = Sketch(8)
+    sketch.save(path, sketch.conv(sketch.node("Relu", sketch.conv("image"), domain=domain)))
+    model = onnx.load_model(path)
+    body = [helper.make_node("Neg", ["x"], ["y"])]
+    opsets = [helper.make_opsetid("", 17)]
+    model.functions.append(helper.make_function(domain, "Relu", ["x"], ["y"], body, opsets))
+    if domain:
+        model.opset_import.append(helper.make_opsetid(domain, 1))
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+@pytest.mark.parametrize("domain", ["local", ""])
+def test_a_function_of_the_file_is_no_operator_of_onnx(domain: str, tmp_path: Path) -> None:
+    path = with_function(tmp_path / "a.onnx", domain)
+    said = done("check", path, "--tile", "64", code=1)
+    assert f"{domain}::Relu" in said
+    assert f"Relu of {domain!r}, a function of the file; inline" in refused_by_load(path)
+
+
+def test_a_constant_of_another_domain_is_not_dropped(tmp_path: Path) -> None:
+    sketch = Sketch(8)
+    half = helper.make_node("Constant", [], ["half"], domain="my.ops", value=numpy_helper.from_array(np.float32(0.5)))
+    sketch.nodes.append(half)
+    path = sketch.save(tmp_path / "a.onnx", sketch.conv(sketch.node("Mul", sketch.conv("image"), "half")))
+    model = onnx.load_model(path)
+    model.opset_import.append(helper.make_opsetid("my.ops", 1))
+    onnx.save_model(model, path)
+    assert "my.ops::Constant" in done("check", path, "--tile", "64", code=1)
+
+
+@pytest.mark.parametrize("command", ["quantize", "restore", "gate"])
+def test_commands_refuse_it_in_one_sentence(command: str, tmp_path: Path) -> None:
+    path = network(tmp_path / "a.onnx", "between", "my.ops")
+    tifffile.imwrite(tmp_path / "in.tif", np.full((40, 40), 900, np.uint16))
+    words = {
+        "quantize": (path, "--out", tmp_path / "out.onnx"),
+        "restore": (tmp_path / "in.tif", tmp_path / "out.tif", "--network", path),
+        "gate": (path, path),
+    }
+    said = refused(command, *words[command])
+    assert "of 'my.ops'; export the network with operators of ONNX itself." in said
+
+
+def test_onnxruntimes_optimised_file_names_the_remedy(tmp_path: Path) -> None:
+    path = network(tmp_path / "a.onnx", "between", "com.microsoft")
+    assert "give the file that onnxruntime read" in refused_by_load(path)
+
+
+@given(st.sampled_from(sorted(INTEGER_OPERATORS)), st.sampled_from(["", "ai.onnx", "com.microsoft"]))
+def test_onnxruntimes_operators_on_integers_keep_their_names(op_type: str, domain: str) -> None:
+    node = helper.make_node(op_type, ["x"], ["y"], domain=domain)
+    assert operator_name(node) == op_type
+    assert is_foreign(operator_name(node, {(domain, op_type)}))
+    node.domain = "com.microsoft"
+    node.attribute.append(helper.make_attribute("channels_last", 1))
+    assert operator_name(node) == f"com.microsoft::{op_type}"
