@@ -22,7 +22,7 @@ class Limits:
             as ConvBEERS does (0.01 of full scale).
         p999: 99.9th percentile of the size of the difference.
         std_over_mae: standard deviation of the difference over the MAE. Rounding alone gives 1.25 in one image and
-            up to 2.3 over images of all brightnesses; clipping drives it up.
+            up to 2.3 over images of all brightnesses, a few clipped edges give 4; clipped ground drives it up.
         drop_share: PSNR lost against the reference, as a share of what the float network gains over its input. It
             applies where the float network gains anything and where the references have the size of the results.
         psnr_drop_db: PSNR lost against the reference.
@@ -38,7 +38,7 @@ class Limits:
 
     mae: float | None = 0.0007
     p999: float | None = None
-    std_over_mae: float | None = 3.0
+    std_over_mae: float | None = 5.0
     drop_share: float | None = 0.05
     psnr_drop_db: float | None = None
     min_psnr_float_int8_db: float | None = None
