@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from beers_deploy.profiles import TargetProfile, load_target
-from beers_deploy.profiles.constant import Constant
+from beers_deploy.profiles.constant import Constant, check_keys
 from beers_deploy.profiles.errors import OptionError, ProfileError
 from beers_deploy.profiles.target import board_names
 
@@ -26,13 +26,10 @@ def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
     return [TargetProfile.load(each) for each in board]
 
 
-SMALLEST, LARGEST = 1e-30, 1e30
-CONFIGURATION = {"cores": 1.0, "batch_handlers": 1.0, "cpb": 1.0, "peak_tops": SMALLEST}
-"""What every configuration states, and the least that it can be."""
+CONFIGURATION = ("cores", "batch_handlers", "cpb", "peak_tops")
+"""What every configuration states."""
 SIZED = ("array", "memory", "elementwise")
 """Tables whose constants a configuration may state for itself, by their names: a smaller array has smaller banks."""
-DIVISORS = {**dict.fromkeys(SIZED, 1.0), "cost": SMALLEST, "power": SMALLEST}
-"""Tables of widths, rates and energies, by which rules and cost model divide, and the least that each can be."""
 
 
 @dataclass(frozen=True)
@@ -129,16 +126,11 @@ def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
         expected = f"a target with a DPU: {', '.join(board_names())}"
         raise OptionError("target", expected=expected, got=repr(profile.name), remedy="choose another")
     name, constants = profile.configuration(configuration)
-    for key, least in CONFIGURATION.items():
-        _require(f"{profile.name} [configurations.{name}] {key}", constants.get(key), least)
+    check_keys(f"{profile.name} [configurations.{name}]", constants, set(CONFIGURATION), set(constants))
     if not profile.documents:
         got, remedy = "none", "add it, or begin with base = the name of a board with the same DPU"
         raise ProfileError(profile.name, expected="a table [documents]", got=got, remedy=remedy)
-    dpu = Dpu(profile, name, constants)
-    for table, least in DIVISORS.items():
-        for key, constant in dpu.tables.get(table, {}).items():
-            _require(f"{profile.name} [{table}] {key}", constant, least)
-    return dpu
+    return Dpu(profile, name, constants)
 
 
 def ruled(profile: TargetProfile, configuration: str | None = None) -> Dpu:
@@ -149,9 +141,3 @@ def ruled(profile: TargetProfile, configuration: str | None = None) -> Dpu:
         expected, remedy = f"none beside {profile.name}, which has an NPU", "leave it out"
         raise OptionError("dpu", expected=expected, got=repr(configuration), remedy=remedy)
     return Dpu(profile, "NPU", {})
-
-
-def _require(where: str, constant: Constant | None, least: float) -> None:
-    if constant is None or not least <= constant.low <= constant.high < LARGEST:
-        got, expected = str(constant or "none"), f"a number of at least {least:g} that a board can have"
-        raise ProfileError(where, expected=expected, got=got, remedy="correct it")

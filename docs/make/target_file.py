@@ -5,10 +5,10 @@ keeps the page fresh, and fails for a key that the tables below lack or that no 
 """
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from beers_deploy.dpu.board import DIVISORS, SMALLEST
+from beers_deploy.profiles import target_limits
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.target import DOCUMENTS, FUSED, NPU, PLACES, board_names, load_target
 
@@ -151,19 +151,22 @@ def shipped() -> dict[str, dict[str, list[Constant]]]:
     return found
 
 
-def least(table: str) -> str:
-    """The smallest values that a table takes, where they are asked for."""
-    if table == BUILD:
-        return "At least 1, `peak_tops` above 0.\n"
-    fitted = "Fitted, where nothing else is said. " if table == "cost" else ""
-    return {None: "", 1.0: "At least 1.\n", SMALLEST: f"{fitted}Above 0.\n"}[DIVISORS.get(table)]
+def limits(table: str) -> Mapping[str, target_limits.Limits]:
+    """The numbers that the keys of a table can have."""
+    return target_limits.CONFIGURATION if table == BUILD else target_limits.TABLES[table]
 
 
-def line(key: str, unit: str, meaning: str, constants: list[Constant]) -> str:
-    """A key: what it is, its unit, and the values among the shipped boards."""
+def accepted(limit: target_limits.Limits) -> str:
+    """The numbers of a key in a few words."""
+    low = "above 0" if limit.low == target_limits.SMALLEST else f"{limit.low:g}"
+    return f"{'whole, ' if limit.whole else ''}{low} to {limit.high:g}"
+
+
+def line(key: str, unit: str, meaning: str, limit: target_limits.Limits, constants: list[Constant]) -> str:
+    """A key: what it is, its unit, the values among the shipped boards, and those that it can have."""
     low, high = min(c.low for c in constants), max(c.high for c in constants)
     among = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
-    return f"- `{key}`: {meaning} ({among}{f' {unit}' if unit != '1' else ''})"
+    return f"- `{key}`: {meaning} ({among}{f' {unit}' if unit != '1' else ''}; {accepted(limit)})"
 
 
 def document() -> str:
@@ -173,14 +176,15 @@ def document() -> str:
 
 def _constants() -> Iterator[str]:
     yield "## Constants\n"
-    yield "Parentheses have the values among the shipped boards and the unit. A configuration may state these keys of"
-    yield f"other tables for itself: {_names((*SIZES,))}."
+    yield "Parentheses have the values among the shipped boards with the unit, then the numbers that are accepted. A"
+    yield f"configuration may state these keys of other tables for itself: {_names((*SIZES,))}."
     found = shipped()
     for table, keys in KEYS.items():
         yield f"\n### [{table}]\n"
-        yield from filter(None, [least(table)])
+        if table == "cost":
+            yield "Fitted, where nothing else is said.\n"
         shown = {key: stated for key, stated in keys.items() if table != BUILD or key not in SIZES}
-        yield from (line(key, *stated, found[table][key]) for key, stated in shown.items())
+        yield from (line(key, *stated, limits(table)[key], found[table][key]) for key, stated in shown.items())
 
 
 def _words() -> Iterator[str]:

@@ -61,7 +61,7 @@ def known_operator(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def operator_domain(op: Operation, dpu: Dpu) -> Finding | None:
-    """An operator is ONNX's own, or onnxruntime's on integers: its domain belongs to its name (ONNX IR, Operators)."""
+    """An operator is ONNX's, or onnxruntime's on integers: its domain belongs to its name (ONNX IR, Operators)."""
     if not is_foreign(op.op_type):
         return None
     domain, _, name = op.op_type.rpartition(SEPARATOR)

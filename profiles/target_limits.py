@@ -1,0 +1,148 @@
+"""Which numbers a board can have: limits of every key of a target's file, so that no figure follows from nonsense.
+
+The limits are wide: they keep out what no board has (no cores, a negative clock, half a kernel), not what is unusual.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from beers_deploy.profiles.constant import Constant
+from beers_deploy.profiles.errors import ProfileError
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The numbers that a key can have, both ends included."""
+
+    low: float
+    high: float
+    whole: bool = False
+
+    def holds(self, value: float) -> bool:
+        """Return True if the key can have the value."""
+        return self.low <= value <= self.high and not (self.whole and value % 1)
+
+    def __str__(self) -> str:
+        kind = "a whole number" if self.whole else "a number"
+        least = "above 0" if self.low == SMALLEST else f"of at least {self.low:g}"
+        return f"{kind} {least} and at most {self.high:g}"
+
+
+SMALLEST = 1e-30
+"""Stands for what is above 0, and is divided by."""
+
+COUNT = Limits(1, 1e6, whole=True)
+LANES = Limits(1, 1e6)
+BYTES = Limits(1, 1e18, whole=True)
+CLOCK = Limits(1, 1e15)
+RATE = Limits(SMALLEST, 1e24)
+PADDING = Limits(0, 1e6, whole=True)
+BITS = Limits(1, 64, whole=True)
+SHIFT = Limits(-64, 64, whole=True)
+SHARE = Limits(SMALLEST, 1)
+POSITIVE = Limits(SMALLEST, 1e9)
+
+WINDOW = {"kernel": COUNT, "stride": COUNT}
+PADDED = {**WINDOW, "pad_begin": PADDING, "pad_end": PADDING}
+SIZES = {
+    "input_channel_parallel": COUNT,
+    "pixel_parallel": COUNT,
+    "feature_map_bytes": BYTES,
+    "weight_bytes": BYTES,
+    "weight_banks": COUNT,
+    "channels_per_cycle": COUNT,
+    "pixels_per_cycle": LANES,
+}
+"""Keys that a configuration may state as well as the board."""
+
+CONFIGURATION = {
+    "cores": COUNT,
+    "batch_handlers": COUNT,
+    "cpb": COUNT,
+    "aie_cores": COUNT,
+    "peak_tops": POSITIVE,
+    **SIZES,
+}
+"""Of a table [configurations.NAME]."""
+
+TABLES: Mapping[str, Mapping[str, Limits]] = {
+    "array": {
+        "input_channel_parallel": COUNT,
+        "pixel_parallel": COUNT,
+        "column_parallel": COUNT,
+        "input_groups": COUNT,
+        "channel_groups": COUNT,
+        "pl_clock_hz": CLOCK,
+        "aie_clock_hz": CLOCK,
+    },
+    "memory": {
+        "feature_map_bytes": BYTES,
+        "weight_bytes": BYTES,
+        "weight_banks": COUNT,
+        "feature_map_groups": COUNT,
+        "weight_bank_depth": COUNT,
+        "ddr_bytes_per_s": CLOCK,
+    },
+    "conv": {
+        **WINDOW,
+        "weight_bias_depth": PADDING,
+        "window_max": COUNT,
+        "window_channels": COUNT,
+        "area_max": LANES,
+    },
+    "depthwise": {**PADDED, "window_max": COUNT},
+    "transposed": {"kernel_per_stride": COUNT, "output_padding": PADDING},
+    "pool": PADDED,
+    "leaky_relu": {"alpha": SHARE},
+    "elementwise": {"channels_per_cycle": COUNT, "pixels_per_cycle": LANES},
+    "resize": {"bilinear_scale": COUNT, "half_pixel_scale": COUNT},
+    "argmax": {"channels_max": PADDING},
+    "numbers": {
+        **dict.fromkeys(("shift_cut", "shift_bias_max", "shift_read", "shift_write"), SHIFT),
+        "accumulator_bits": BITS,
+        "bias_bits": BITS,
+        "zero_point": Limits(-128, 255, whole=True),
+    },
+    "power": dict.fromkeys(("product_j", "memory_byte_j", "dpu_run_w", "dpu_range_w", "cpu_run_w"), POSITIVE),
+    "tile": {"memory_bytes": BYTES},
+    "cost": {
+        **dict.fromkeys(("array_efficiency", "memory_efficiency", "overlap", "families_held"), SHARE),
+        **dict.fromkeys(("layer_s", "host_image_s", "crowding"), POSITIVE),
+        **dict.fromkeys(("port_bytes_per_cycle", "host_in_bytes_per_s", "host_out_bytes_per_s"), RATE),
+        **dict.fromkeys(("argmax_values_per_s", "softmax_values_per_s"), RATE),
+        **dict.fromkeys(("sort_values_per_s", "image_values_per_s"), RATE),
+        **dict.fromkeys(("width_host", "width_small_maps", "width_large_maps", "width_outside"), POSITIVE),
+        "pair_width": POSITIVE,
+        "fitted_map_bytes": BYTES,
+        "fitted_operations": BYTES,
+    },
+    "cpu": {
+        "cores": COUNT,
+        **dict.fromkeys(("clock_ghz", "product_flops_per_cycle", "chain_s_per_mpx"), POSITIVE),
+        **dict.fromkeys(("moved_bytes_per_s", "decoding_mips_per_ghz"), RATE),
+    },
+    "measurement": {"min_time_s": POSITIVE, "min_runs": COUNT},
+    "file": {"opset_max": COUNT},
+}
+"""Limits of each key by its table."""
+
+QUOTED = ("published_latency_ms", "published_throughput_fps")
+"""Tables whose keys are words of the user's."""
+
+
+def check_limits(where: str, table: str | None, constants: Mapping[str, Constant]) -> None:
+    """Raise ProfileError if a key has a number that no board can have.
+
+    Args:
+        where: names file and table in the message.
+        table: the table's name; None of a configuration.
+        constants: of the table. A key without limits is used by no rule and no prediction.
+    """
+    limits = CONFIGURATION if table is None else TABLES.get(table, {})
+    for key, constant in constants.items():
+        allowed = POSITIVE if table in QUOTED else limits.get(key)
+        values = (constant.low, constant.high)
+        if allowed is not None and not all(map(allowed.holds, values)):
+            got = " to ".join(dict.fromkeys(f"{value:.12g}" for value in values))
+            remedy = "correct it; the unit is in the name"
+            raise ProfileError(f"{where} {key}", expected=str(allowed), got=got, remedy=remedy)

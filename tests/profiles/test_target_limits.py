@@ -1,0 +1,115 @@
+"""Every number of a board's file is one that a board can have."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beers_deploy.profiles import load_target
+from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.target import target_names
+from beers_deploy.profiles.target_limits import CONFIGURATION, TABLES, Limits
+from docs.make.target_file import BUILD, KEYS
+from tests.deploy.command_line import done, refused
+
+LIMITS: dict[tuple[str, str], Limits] = {
+    **{(table, key): limits for table, keys in TABLES.items() for key, limits in keys.items()},
+    **{(BUILD, key): limits for key, limits in CONFIGURATION.items()},
+}
+ANY_KEY = st.sampled_from(sorted(LIMITS))
+NOT_NUMBERS = ("nan", "-nan", "inf", "-inf", '"16"', '""', "true", "[]", "[1]", "[1, 2, 3]", "{}", "1979-05-27")
+
+
+def board(folder: Path, table: str, key: str, value: str) -> str:
+    """A board like the VCK190 but for one key."""
+    path = folder / "my-board.toml"
+    name = "configurations.C32B3" if table == BUILD else table
+    path.write_text(f'base = "vck190"\ndescription = "a test"\n\n[{name}]\n{key} = {value}\n', encoding="utf-8")
+    return str(path)
+
+
+@st.composite
+def outside(draw: st.DrawFn, limits: Limits) -> float:
+    """A number that the key cannot have: too small, too large, or broken where it counts something."""
+    kinds = [st.floats(-1e300, limits.low, exclude_max=True), st.floats(limits.high, 1e300, exclude_min=True)]
+    if limits.whole:
+        kinds.append(st.integers(int(limits.low), 1000).map(lambda whole: whole + 0.5))
+    return draw(st.one_of(kinds))
+
+
+def refusal(path: str) -> str:
+    with pytest.raises(ProfileError) as caught:
+        load_target(path)
+    return str(caught.value)
+
+
+@given(data=st.data(), place=ANY_KEY)
+def test_a_number_that_no_board_has_is_refused(
+    data: st.DataObject, place: tuple[str, str], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    value = data.draw(outside(LIMITS[place]))
+    for written in (f"{value!r}", f"[{min(value, 1.0)!r}, {max(value, 1.0)!r}]"):
+        said = refusal(board(tmp_path_factory.mktemp("board"), *place, written))
+        assert "my-board" in said
+        assert place[1] in said
+        assert f"{value:.12g}" in said
+        assert said.isprintable()
+
+
+@given(place=ANY_KEY, value=st.sampled_from(NOT_NUMBERS))
+def test_what_is_no_number_is_refused(
+    place: tuple[str, str], value: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    said = refusal(board(tmp_path_factory.mktemp("board"), *place, value))
+    assert "my-board" in said
+    assert place[1] in said
+
+
+@given(data=st.data(), place=ANY_KEY)
+def test_every_number_within_the_limits_is_taken(
+    data: st.DataObject, place: tuple[str, str], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    limits = LIMITS[place]
+    real, whole = st.floats(limits.low, limits.high), st.integers(int(limits.low), int(limits.high))
+    value = float(data.draw(whole if limits.whole else real))
+    profile = load_target(board(tmp_path_factory.mktemp("board"), *place, repr(value)))
+    constants = profile.configuration("C32B3")[1] if place[0] == BUILD else profile.tables[place[0]]
+    assert constants[place[1]].value == value
+
+
+@pytest.mark.parametrize("key", ["cores", "aie_cores", "batch_handlers", "cpb"])
+@pytest.mark.parametrize("value", ["0", "-1", "2.5"])
+def test_commands_name_file_key_and_value(key: str, value: str, tmp_path: Path) -> None:
+    path = board(tmp_path, BUILD, key, value)
+    for words in (("check", "--tile", "64", "--target", path), ("bench", "--target", path), ("profiles", path)):
+        said = refused(*words)
+        assert f"my-board.toml [configurations.C32B3] {key}: expected a whole number of at least 1" in said
+        assert f"got {value}" in said
+
+
+def test_every_key_of_the_reference_has_limits() -> None:
+    documented = {(table, key) for table, keys in KEYS.items() for key in keys}
+    assert documented <= set(LIMITS)
+
+
+@pytest.mark.parametrize("name", target_names())
+def test_shipped_targets_state_no_key_without_limits(name: str) -> None:
+    target = load_target(name)
+    stated = {(table, key) for table, keys in target.tables.items() for key in keys if "published" not in table}
+    stated |= {(BUILD, key) for keys in target.configurations.values() for key in keys}
+    assert stated <= set(LIMITS)
+
+
+def test_a_published_figure_is_above_0(tmp_path: Path) -> None:
+    assert "published_latency_ms" in refusal(board(tmp_path, "published_latency_ms", '"a network"', "-3"))
+    assert done("profiles", board(tmp_path, "published_latency_ms", '"a network"', "3"))
+
+
+def test_limits_say_whole_and_above_0() -> None:
+    limits = Limits(1, 8, whole=True)
+    assert (str(limits), str(replace(limits, whole=False))) == (
+        "a whole number of at least 1 and at most 8",
+        "a number of at least 1 and at most 8",
+    )
