@@ -7,8 +7,9 @@ import numpy as np
 import onnx
 from onnx import NodeProto, TensorProto, numpy_helper
 
+from beers_deploy.quant.domains import STANDARD
 from beers_deploy.quant.reading.nodes import attributes_of
-from beers_deploy.quant.untrusted import STANDARD, opset_of, refused
+from beers_deploy.quant.untrusted import opset_of, refused
 
 IS_TEST_UNTIL = 6
 """The last opset whose operators state by `is_test` whether they are in use; without it they are in training."""

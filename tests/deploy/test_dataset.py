@@ -123,6 +123,11 @@ def swap(path: Path) -> None:
     path.write_bytes(sorted(path.parent.iterdir())[-1].read_bytes())
 
 
+def grow(path: Path) -> None:
+    """Repeat the content of a file."""
+    path.write_bytes(path.read_bytes() * 2)
+
+
 PAIR = "degraded/0000-scene-00003.tif"
 DAMAGES: dict[str, tuple[str, Callable[[Path], None], int]] = {
     "flipped": (PAIR, flip, 1),
@@ -131,7 +136,7 @@ DAMAGES: dict[str, tuple[str, Callable[[Path], None], int]] = {
     "swapped": (PAIR, swap, 1),
     "manifest flipped": ("manifest.jsonl", flip, 1),
     "manifest cut": ("manifest.jsonl", cut, 0),
-    "manifest grown": ("manifest.jsonl", lambda path: path.write_bytes(path.read_bytes() * 2) and None, 0),
+    "manifest grown": ("manifest.jsonl", grow, 0),
 }
 """A file, what happens to it, and how many pairs that concerns (0: not counted here)."""
 

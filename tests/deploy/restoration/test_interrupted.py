@@ -61,7 +61,7 @@ def rows_of(pixels: np.ndarray, heights: list[int]) -> Iterator[RestoredRow]:
 def test_rows_that_match_their_digests_are_kept_and_no_others(
     bands: int, heights: list[int], width: int, kind: type, damage: Damage
 ) -> None:
-    pixels = noise(bands, sum(heights), width).astype(kind)
+    pixels: np.ndarray = noise(bands, sum(heights), width).astype(kind)
     with TemporaryDirectory() as name:
         out = Path(name) / "out.tif"
         shape = (bands, sum(heights) + 3, width)

@@ -46,7 +46,8 @@ def raw(seed: int = 0, light: float = 1.0, snr: tuple[float, float] = SNR_BRIGHT
 
 def look(image: np.ndarray, full_scale: float = 4095, network: str = NETWORK, nodata: float | None = None) -> str:
     planes = image if image.ndim == 3 else image[None]
-    source = ArraySource(planes, Raster(*planes.shape, planes.dtype, nodata))
+    bands, height, width = planes.shape
+    source = ArraySource(planes, Raster(bands, height, width, planes.dtype, nodata))
     return restored_already(source, [load_onnx(network_file(Path(network), load_sensor(BLIND)))], full_scale)
 
 

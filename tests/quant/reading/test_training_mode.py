@@ -1,6 +1,7 @@
 """A network in training mode is refused wherever it is run; the same nodes in use are folded as before."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -20,13 +21,13 @@ def constant(value: object, name: str) -> NodeProto:
     return helper.make_node("Constant", [], [name], value=numpy_helper.from_array(np.array(value)))
 
 
-def dropout(*mode: NodeProto, **about: int) -> list[NodeProto]:
+def dropout(*mode: NodeProto, **about: Any) -> list[NodeProto]:
     given = ["c", "ratio", "mode"] if mode else ["c"]
     ratio = [helper.make_node("Constant", [], ["ratio"], value=RATIO)] if mode else []
     return [*ratio, *mode, helper.make_node("Dropout", given, ["d"], name="drop", **about)]
 
 
-def normalisation(*more: str, **about: int) -> list[NodeProto]:
+def normalisation(*more: str, **about: Any) -> list[NodeProto]:
     given = ["c", "gain", "offset", "mean", "variance"]
     return [helper.make_node("BatchNormalization", given, ["d", *more], name="normalise", **about)]
 
