@@ -31,10 +31,11 @@ class Chain:
         self.nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
 
-    def then(self, op_type: str, *inputs: str, domain: str = "", **attributes: object) -> str:
+    def then(self, op_type: str, *inputs: str, domain: str = "", **attributes: int | list[int]) -> str:
         """Append a node of these inputs, or of the last tensor, and return its result."""
         self.last, sources = f"{op_type}{len(self.nodes)}", list(inputs or (self.last,))
-        node = helper.make_node(op_type, sources, [self.last], name=self.last, domain=domain, **attributes)
+        node = helper.make_node(op_type, sources, [self.last], name=self.last, domain=domain)
+        node.attribute.extend(helper.make_attribute(key, value) for key, value in attributes.items())
         self.nodes.append(node)
         return self.last
 
@@ -50,8 +51,8 @@ class Chain:
 
     def model(self) -> onnx.ModelProto:
         """Return the network that ends with the last tensor."""
-        ends = (("image", ["N", CHANNELS, "H", "W"]), (self.last, ["N", "C", "H2", "W2"]))
-        image, result = (helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in ends)
+        image = helper.make_tensor_value_info("image", TensorProto.FLOAT, ["N", CHANNELS, "H", "W"])
+        result = helper.make_tensor_value_info(self.last, TensorProto.FLOAT, ["N", "C", "H2", "W2"])
         graph = helper.make_graph(self.nodes, "chain", [image], [result], self.constants)
         opsets = [helper.make_opsetid("", 17), helper.make_opsetid("com.microsoft", 1)]
         return helper.make_model(graph, opset_imports=opsets, ir_version=8)
@@ -90,10 +91,14 @@ def shuffled(chain: Chain) -> None:
 def integers(chain: Chain) -> None:
     """Convolve, rectify and add on integers."""
     if chain.last == "image":
-        values = {"scale": np.float32(1 / 64), "zero": np.uint8(64), "weight_zero": np.int8(0)}
-        weight = np.clip(WEIGHT * 64, -127, 127).astype(np.int8)
-        values |= {"weight": weight, "bias": np.zeros(CHANNELS, np.int32)}
-        chain.constants.extend(numpy_helper.from_array(np.asarray(value), name) for name, value in values.items())
+        values: dict[str, np.ndarray] = {
+            "scale": np.array(1 / 64, np.float32),
+            "zero": np.array(64, np.uint8),
+            "weight_zero": np.array(0, np.int8),
+            "weight": np.clip(WEIGHT * 64, -127, 127).astype(np.int8),
+            "bias": np.zeros(CHANNELS, np.int32),
+        }
+        chain.constants.extend(numpy_helper.from_array(value, name) for name, value in values.items())
         chain.then("QuantizeLinear", "image", "scale", "zero")
     before, read = chain.last, ("scale", "zero")
     weights = ("weight", "scale", "weight_zero", *read, "bias")

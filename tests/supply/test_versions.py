@@ -97,7 +97,7 @@ def weighted(sketch: Sketch, rng: np.random.Generator, source: str, outputs: int
 
 def run_main_commands(python: Path, folder: Path) -> None:
     def done(*words: str) -> None:
-        command = [python, "-m", "beers_deploy", *words]
+        command = [str(python), "-m", "beers_deploy", *words]
         ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         # A verdict on so small a network may be negative.
         assert ran.returncode in (0, 1), f"{' '.join(words)}\n{ran.stdout[-2000:]}{ran.stderr[-2000:]}"

@@ -31,10 +31,10 @@ def network(path: Path, place: str, domain: str) -> Path:
     def node(here: str, op_type: str, *inputs: str) -> str:
         return sketch.node(op_type, *inputs, domain=domain if here == place else "")
 
-    scaled = node("front", "Mul", "image", sketch.constant(np.float32(0.5)))
+    scaled = node("front", "Mul", "image", sketch.constant(np.array(0.5, np.float32)))
     first = node("behind a convolution", "Relu", sketch.conv(scaled))
     deep = sketch.conv(node("between", "Add", first, sketch.conv(first)))
-    limits = sketch.constant(np.float32(0)), sketch.constant(np.float32(1))
+    limits = sketch.constant(np.array(0, np.float32)), sketch.constant(np.array(1, np.float32))
     back = sketch.node("Clip", deep, *limits)
     behind = node("behind a host's node", "Mul", back, limits[1])
     sketch.save(path, node("end", "Clip", behind, *limits))
@@ -92,7 +92,9 @@ def test_a_function_of_the_file_is_no_operator_of_onnx(domain: str, tmp_path: Pa
 
 def test_a_constant_of_another_domain_is_not_dropped(tmp_path: Path) -> None:
     sketch = Sketch(8)
-    half = helper.make_node("Constant", [], ["half"], domain="my.ops", value=numpy_helper.from_array(np.float32(0.5)))
+    half = helper.make_node(
+        "Constant", [], ["half"], domain="my.ops", value=numpy_helper.from_array(np.array(0.5, np.float32))
+    )
     sketch.nodes.append(half)
     path = sketch.save(tmp_path / "a.onnx", sketch.conv(sketch.node("Mul", sketch.conv("image"), "half")))
     model = onnx.load_model(path)

@@ -4,12 +4,15 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import onnx
 import pytest
 
 from beers_deploy.dpu.checker.table import check
 from benchmarks.check_nodes import KINDS, Chain, network
+
+TraceFunction = Callable[[FrameType, str, Any], Any]
 
 FEWEST = 60
 """Nodes: the number is doubled twice."""
@@ -22,12 +25,12 @@ def steps(model: onnx.ModelProto, path: Path) -> int:
     onnx.save_model(model, path)
     count = 0
 
-    def step(_frame: FrameType, event: str, _argument: object) -> Callable[..., object]:
+    def step(_frame: FrameType, event: str, _argument: object) -> TraceFunction:
         nonlocal count
         count += event == "opcode"
         return step
 
-    def called(frame: FrameType, _event: str, _argument: object) -> Callable[..., object] | None:
+    def called(frame: FrameType, _event: str, _argument: object) -> TraceFunction | None:
         if not str(frame.f_globals.get("__name__")).startswith("beers_deploy"):
             return None
         frame.f_trace_opcodes, frame.f_trace_lines = True, False
