@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 import onnx
@@ -32,10 +31,11 @@ class Chain:
         self.nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
 
-    def then(self, op_type: str, *inputs: str, domain: str = "", **attributes: Any) -> str:
+    def then(self, op_type: str, *inputs: str, domain: str = "", **attributes: int | list[int]) -> str:
         """Append a node of these inputs, or of the last tensor, and return its result."""
         self.last, sources = f"{op_type}{len(self.nodes)}", list(inputs or (self.last,))
-        node = helper.make_node(op_type, sources, [self.last], name=self.last, domain=domain, **attributes)
+        node = helper.make_node(op_type, sources, [self.last], name=self.last, domain=domain)
+        node.attribute.extend(helper.make_attribute(key, value) for key, value in attributes.items())
         self.nodes.append(node)
         return self.last
 

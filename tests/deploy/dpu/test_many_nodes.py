@@ -12,6 +12,8 @@ import pytest
 from beers_deploy.dpu.checker.table import check
 from benchmarks.check_nodes import KINDS, Chain, network
 
+TraceFunction = Callable[[FrameType, str, Any], Any]
+
 FEWEST = 60
 """Nodes: the number is doubled twice."""
 QUADRATIC = 2.5
@@ -23,12 +25,12 @@ def steps(model: onnx.ModelProto, path: Path) -> int:
     onnx.save_model(model, path)
     count = 0
 
-    def step(_frame: FrameType, event: str, _argument: object) -> Any:
+    def step(_frame: FrameType, event: str, _argument: object) -> TraceFunction:
         nonlocal count
         count += event == "opcode"
         return step
 
-    def called(frame: FrameType, _event: str, _argument: object) -> Any:
+    def called(frame: FrameType, _event: str, _argument: object) -> TraceFunction | None:
         if not str(frame.f_globals.get("__name__")).startswith("beers_deploy"):
             return None
         frame.f_trace_opcodes, frame.f_trace_lines = True, False
