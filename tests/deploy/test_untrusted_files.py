@@ -92,7 +92,7 @@ def test_a_target_with_constants_that_no_board_has_is_refused(line: str, changed
     path.write_text(shipped)
     load_dpu(str(path))
     path.write_text(shipped.replace(line, changed))
-    with pytest.raises(ProfileError, match="the key 'cpb'|a whole number of at least 1"):
+    with pytest.raises(ProfileError, match=r"the key 'cpb'|a whole number of at least 1"):
         load_dpu(str(path))
 
 
