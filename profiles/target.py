@@ -12,7 +12,7 @@ from typing import Self
 
 from beers_deploy.profiles.constant import Constant, Words, check_keys, read_constant, read_words
 from beers_deploy.profiles.errors import OptionError, ProfileError
-from beers_deploy.profiles.target_limits import check_limits
+from beers_deploy.profiles.target_limits import CONFIGURATIONS, check_limits
 from beers_deploy.profiles.toml import profile_path, read_toml, shipped_names
 
 TILE_PX = 640
@@ -125,7 +125,7 @@ def load_target(name: str) -> TargetProfile:
     check_keys(label, {k: v for k, v in raw.items() if k in special}, {"description"}, special)
     tables = {k: _table(f"{label} [{k}]", k, v) for k, v in raw.items() if k not in special}
     configurations = {
-        k: _table(f"{label} [configurations.{k}]", None, v)
+        k: _table(f"{label} [configurations.{k}]", CONFIGURATIONS, v)
         for k, v in _mapping(label, raw.get("configurations", {})).items()
     }
     default = raw.get("default_configuration")
@@ -181,7 +181,7 @@ def _whole_table(label: str, raw: Mapping[str, object], name: str, keys: frozens
     return table
 
 
-def _table(where: str, name: str | None, raw: object) -> dict[str, Constant]:
+def _table(where: str, name: str, raw: object) -> dict[str, Constant]:
     constants = {key: read_constant(f"{where} {key}", value) for key, value in _mapping(where, raw).items()}
     check_limits(where, name, constants)
     return constants

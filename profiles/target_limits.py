@@ -22,6 +22,11 @@ class Limits:
         """Return True if the key can have the value."""
         return self.low <= value <= self.high and not (self.whole and value % 1)
 
+    @property
+    def expected(self) -> str:
+        """What a message expects."""
+        return f"{self} that a board can have"
+
     def __str__(self) -> str:
         kind = "a whole number" if self.whole else "a number"
         least = "above 0" if self.low == SMALLEST else f"of at least {self.low:g}"
@@ -41,6 +46,7 @@ BITS = Limits(1, 64, whole=True)
 SHIFT = Limits(-64, 64, whole=True)
 SHARE = Limits(SMALLEST, 1)
 POSITIVE = Limits(SMALLEST, 1e9)
+OPEN = Limits(SMALLEST, 1e30)
 
 WINDOW = {"kernel": COUNT, "stride": COUNT}
 PADDED = {**WINDOW, "pad_begin": PADDING, "pad_end": PADDING}
@@ -54,6 +60,8 @@ SIZES = {
     "pixels_per_cycle": LANES,
 }
 """Keys that a configuration may state as well as the board."""
+
+CONFIGURATIONS = "configurations"
 
 CONFIGURATION = {
     "cores": COUNT,
@@ -126,23 +134,28 @@ TABLES: Mapping[str, Mapping[str, Limits]] = {
 }
 """Limits of each key by its table."""
 
-QUOTED = ("published_latency_ms", "published_throughput_fps")
-"""Tables whose keys are words of the user's."""
+ANY_KEY = dict.fromkeys(
+    ("published_latency_ms", "published_throughput_fps", "array", "memory", "elementwise", "cost", "power"), OPEN
+)
+"""Tables in which other keys may stand than are known here, such as a quoted network's name, and their limits."""
 
 
-def check_limits(where: str, table: str | None, constants: Mapping[str, Constant]) -> None:
-    """Raise ProfileError if a key has a number that no board can have.
+def check_limits(where: str, table: str, constants: Mapping[str, Constant]) -> None:
+    """Refuse a number that no board can have.
 
     Args:
         where: names file and table in the message.
-        table: the table's name; None of a configuration.
+        table: its name; that of a configuration is `CONFIGURATIONS`.
         constants: of the table. A key without limits is used by no rule and no prediction.
+
+    Raises:
+        ProfileError: the key, its limits and its number.
     """
-    limits = CONFIGURATION if table is None else TABLES.get(table, {})
+    limits = CONFIGURATION if table == CONFIGURATIONS else TABLES.get(table, {})
     for key, constant in constants.items():
-        allowed = POSITIVE if table in QUOTED else limits.get(key)
+        allowed = limits.get(key, ANY_KEY.get(table))
         values = (constant.low, constant.high)
         if allowed is not None and not all(map(allowed.holds, values)):
             got = " to ".join(dict.fromkeys(f"{value:.12g}" for value in values))
             remedy = "correct it; the unit is in the name"
-            raise ProfileError(f"{where} {key}", expected=str(allowed), got=got, remedy=remedy)
+            raise ProfileError(f"{where} {key}", expected=allowed.expected, got=got, remedy=remedy)

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from beers_deploy.profiles import TargetProfile, load_target
-from beers_deploy.profiles.constant import Constant, check_keys
+from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError, ProfileError
 from beers_deploy.profiles.target import board_names
+from beers_deploy.profiles.target_limits import CONFIGURATION
 
 BoardLike = TargetProfile | str | os.PathLike[str]
 """A board: what was read of it, its name, or the path of its .toml file."""
@@ -26,7 +27,7 @@ def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
     return [TargetProfile.load(each) for each in board]
 
 
-CONFIGURATION = ("cores", "batch_handlers", "cpb", "peak_tops")
+REQUIRED = ("cores", "batch_handlers", "cpb", "peak_tops")
 """What every configuration states."""
 SIZED = ("array", "memory", "elementwise")
 """Tables whose constants a configuration may state for itself, by their names: a smaller array has smaller banks."""
@@ -126,7 +127,9 @@ def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
         expected = f"a target with a DPU: {', '.join(board_names())}"
         raise OptionError("target", expected=expected, got=repr(profile.name), remedy="choose another")
     name, constants = profile.configuration(configuration)
-    check_keys(f"{profile.name} [configurations.{name}]", constants, set(CONFIGURATION), set(constants))
+    for key in (key for key in REQUIRED if key not in constants):
+        where = f"{profile.name} [configurations.{name}] {key}"
+        raise ProfileError(where, expected=CONFIGURATION[key].expected, got="none", remedy="add it")
     if not profile.documents:
         got, remedy = "none", "add it, or begin with base = the name of a board with the same DPU"
         raise ProfileError(profile.name, expected="a table [documents]", got=got, remedy=remedy)
