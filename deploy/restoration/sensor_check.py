@@ -44,11 +44,11 @@ WINDOW_PX, ACROSS = 512, 4
 """Side of a window, and how many at most lie side by side, and below one another."""
 EDGES = 20
 """Enough along an axis: more would take time and tell no more."""
-STEP_PX, FEW_WINDOWS = 4, 4
-"""Every so many rows are searched for edges; every row of an image of few windows, which may have few edges."""
+STEP_PX, CELL_PX, FEW_WINDOWS = 4, (8, 4), 4
+"""Every so many rows are searched for edges, by such cells; an image of few windows may have few: it is searched as
+thoroughly as by `characterise`."""
 CANDIDATES, CANDIDATES_OF_WINDOW = 6000, 400
-"""Steepest places along an axis that are compared with plain edges, of all windows and of each at least. Of a town of
-one window 1000 find no more wrong MTFs than 400, and 6000 half as many again (measured)."""
+"""Steepest places along an axis that are compared with plain edges, of all windows and of each at least."""
 FITS, FITS_OF_WINDOW = 128, 8
 """Squares along an axis that are fitted, of all windows and of each at least: 1 ms each (measured)."""
 WINDOWS_AT_ONCE = 4
@@ -286,6 +286,7 @@ def _edges(windows: Sequence[np.ndarray], noise: Noise, clipped_at: float) -> li
     count = len(windows)
     effort = edge_blur.Effort(
         step_px=1 if count <= FEW_WINDOWS else STEP_PX,
+        cell_px=edge_blur.THOROUGH.cell_px if count <= FEW_WINDOWS else CELL_PX,
         candidates=max(CANDIDATES // count, CANDIDATES_OF_WINDOW),
         fits=max(FITS // count, FITS_OF_WINDOW),
     )

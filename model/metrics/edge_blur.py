@@ -27,8 +27,6 @@ MAX_ROUGHNESS = 0.03
 """Of the outer columns of a square, beyond noise, of the step: more is no plateau."""
 MARGIN_PX = HALF_PX + 2
 """Room that a square needs around its middle, and the gradient there."""
-CELL_ROWS_PX, CELL_COLUMNS_PX = HALF_PX, 4
-"""Of the places in a cell only the steepest is tried: squares do not overlap by more."""
 
 
 @dataclass(frozen=True)
@@ -37,16 +35,19 @@ class Effort:
 
     Attributes:
         step_px: only every so many rows are searched; edges are longer than that.
+        cell_px: rows, in multiples of `step_px`, and columns of the cells of which only the steepest place is tried.
         candidates: steepest places of which squares are compared with plain edges.
         fits: squares that are fitted, the steepest first.
     """
 
     step_px: int
+    cell_px: tuple[int, int]
     candidates: int
     fits: int
 
 
-THOROUGH = Effort(1, 6000, 400)
+THOROUGH = Effort(step_px=1, cell_px=(4, 2), candidates=6000, fits=400)
+"""With cells twice as large fewer edges are found: of 80 wrong MTFs of drawn towns 41 are seen, not 47 (measured)."""
 
 
 def find_blurs(image: np.ndarray, noise: Noise, clipped_at: float, effort: Effort = THOROUGH) -> list[EdgeBlur]:
@@ -77,7 +78,7 @@ def plain_squares(image: np.ndarray, noise: Noise, clipped_at: float, effort: Ef
 
 def _squares(image: np.ndarray, noise: Noise, effort: Effort) -> np.ndarray:
     """Squares (N, S, S) around the steepest places, no centre in another's middle."""
-    rows, columns = _steepest(_steepness(image, noise, effort.step_px), effort.step_px)
+    rows, columns = _steepest(_steepness(image, noise, effort.step_px), effort)
     taken, chosen = np.zeros(image.shape, bool), list[int]()
     for k, (row, column) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
         if not taken[row, column]:
@@ -90,20 +91,20 @@ def _squares(image: np.ndarray, noise: Noise, effort: Effort) -> np.ndarray:
     return np.asarray(image[rows + reach[:, None], columns + reach])
 
 
-def _steepest(steep: np.ndarray, step_px: int) -> tuple[np.ndarray, np.ndarray]:
+def _steepest(steep: np.ndarray, effort: Effort) -> tuple[np.ndarray, np.ndarray]:
     """Return rows and columns of the steepest place of each cell that is steep, the steepest of all first."""
     height, width = steep.shape
-    down = CELL_ROWS_PX // step_px
-    padded = np.pad(steep, ((0, -height % down), (0, -width % CELL_COLUMNS_PX)))
-    blocks = padded.reshape(padded.shape[0] // down, down, -1, CELL_COLUMNS_PX).swapaxes(1, 2)
+    down, across = effort.cell_px[0] // effort.step_px, effort.cell_px[1]
+    padded = np.pad(steep, ((0, -height % down), (0, -width % across)))
+    blocks = padded.reshape(padded.shape[0] // down, down, -1, across).swapaxes(1, 2)
     cells = blocks.reshape(*blocks.shape[:2], -1)
     inner = cells.argmax(2)
     best = np.take_along_axis(cells, inner[:, :, None], 2)[:, :, 0]
     order = np.argsort(best, axis=None, kind="stable")[::-1][: int((best > MIN_STEEPNESS).sum())]
     cell_row, cell_column = np.divmod(order, best.shape[1])
-    inner_row, inner_column = np.divmod(inner.ravel()[order], CELL_COLUMNS_PX)
-    rows, columns = cell_row * down + inner_row, cell_column * CELL_COLUMNS_PX + inner_column
-    return MARGIN_PX + rows * step_px, MARGIN_PX + columns
+    inner_row, inner_column = np.divmod(inner.ravel()[order], across)
+    rows, columns = cell_row * down + inner_row, cell_column * across + inner_column
+    return MARGIN_PX + rows * effort.step_px, MARGIN_PX + columns
 
 
 def _steepness(image: np.ndarray, noise: Noise, step_px: int) -> np.ndarray:

@@ -56,6 +56,7 @@ def test_parts_add_up_to_the_whole() -> None:
     assert parts.mean_bound == pytest.approx(whole.mean_bound)
 
 
+@pytest.mark.filterwarnings("ignore:look at the sensor")  # that is another matter
 @settings(deadline=None, max_examples=12)
 @given(st.integers(0, 2**20), st.sampled_from([1.0, 0.25, 0.05, 0.01]), st.booleans())
 def test_shipped_networks_are_not_told(seed: int, light: float, known: bool) -> None:
