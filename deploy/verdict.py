@@ -51,8 +51,9 @@ LITTLE_CHANGE = 0.02
 """Mean absolute change of the input, over full scale, up to which the default limit of the MAE suits a network.
 ConvBEERS changes it by 0.008."""
 
-CONTRAST = 2.0
-"""By how much the contrast of the results must exceed the limit of the MAE."""
+LEAST_CONTRAST = 0.0014
+"""Mean absolute deviation of the results from the mean of their sample, over full scale: twice the default limit of
+the MAE."""
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -257,7 +258,7 @@ def gate(
         _require_references(samples_of(theirs.model, samples), wanted)
     how: dict[str, Any] = {"sensor": known, "images": images, "patches": patches, "seed": seed, "metric": metric}
     found = compare(ours, theirs, samples, **how, progress=progress)
-    _require_contrast(found.result, allowed)
+    _require_contrast(found.result)
     if before is not None:
         before.require_same(theirs.sha256, found.result.psnr_float_db, found.rests_on)
     checks = judge(found.result, allowed, before.mae if before else None)
@@ -267,15 +268,13 @@ def gate(
     return Verdict("gate", arguments, found.inputs, found.rows, tuple(checks), notes=notes, comparison=found)
 
 
-def _require_contrast(result: GateResult, limits: Limits) -> None:
-    """Raise OptionError if a network that returned the mean of each sample would keep the limit of the MAE."""
-    if limits.mae is None or not result.contrast < CONTRAST * limits.mae:
+def _require_contrast(result: GateResult) -> None:
+    """Raise OptionError if a network that returned the mean of each sample would nearly keep the default limit."""
+    if not result.contrast < LEAST_CONTRAST:
         return
-    expected = f"results with a contrast of at least {CONTRAST * limits.mae:.3g} of full scale, twice the MAE limit"
-    got = f"a mean absolute deviation of {result.contrast:.3g}, so that a network which returns a mean would pass"
-    raise OptionError(
-        "samples", expected=expected, got=got, remedy="give samples with more contrast, or a lower limit"
-    )
+    expected = f"results with a mean absolute deviation of at least {LEAST_CONTRAST:g} of full scale"
+    got = f"{result.contrast:.3g}: a network that returned the mean of each sample would hardly differ"
+    raise OptionError("samples", expected=expected, got=got, remedy="give samples with more contrast")
 
 
 def _mae_note(result: GateResult, limits: Limits, checks: Sequence[Check]) -> list[str]:

@@ -65,7 +65,7 @@ def test_gate_in_ci(tmp_path: Path) -> None:
     (given,) = (step["with"] for step in workflow["jobs"]["gate"]["steps"] if step.get("id") == "gate")
     assert set(given) <= set(action["inputs"])
     assert all((tmp_path / path.removeprefix("protected/")).is_file() for path in given.values())
-    assert 'failures="3"' in (tmp_path / "gate.xml").read_text(encoding="utf-8")
+    assert 'failures="5"' in (tmp_path / "gate.xml").read_text(encoding="utf-8")
 
 
 def test_accuracy_and_time(tmp_path: Path) -> None:
