@@ -30,7 +30,7 @@ def files(images: Path | None, variants: list[str]) -> None:
         shipped = integers(load_onnx(SHIPPED / f"{variant}{INT8}.onnx"))
         for name in board_names():
             start, target = time.perf_counter(), load_target(name)
-            made = family_model(network, images, shifts=target_shifts(target))
+            made = family_model(network, [images] if images else [], shifts=target_shifts(target))
             found = integers(made)
             first = first or found
             refused = len(place(network_of(made, 640), dpu_of(target)).failed)

@@ -35,7 +35,8 @@ from beers_deploy.model.processor import processor_name
 from beers_deploy.model.progress import steps
 from beers_deploy.model.simulator.sampling import read_scene
 from beers_deploy.model.training.losses import LossWeights, RestorationLoss
-from beers_deploy.model.training.patches import PatchRecipe, PatchSource
+from beers_deploy.model.training.patches import PatchRecipe
+from beers_deploy.model.training.source import PatchSource
 from beers_deploy.network import Network
 from beers_deploy.profiles import load_sensor
 from beers_deploy.quant.calibration import Calibration, draw_patches

@@ -19,13 +19,13 @@ from typing import get_args
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from beers_deploy.model.processor import processor_name
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.training.checkpoint import TrainingRecipe
 from beers_deploy.model.training.losses import LossWeights, RestorationLoss
-from beers_deploy.model.training.patches import PatchRecipe, PatchSource
+from beers_deploy.model.training.patches import PatchRecipe
+from beers_deploy.model.training.source import Batch, PatchSource
 from beers_deploy.model.training.trainer import Precision, Trainer
 from beers_deploy.model.variants import VARIANTS
 from beers_deploy.profiles import load_sensor
@@ -46,13 +46,13 @@ def main() -> None:
     recipe = TrainingRecipe(steps=(TURNS + 1) * arguments.steps, batch=BATCH, loss=LOSS)
     variant, steps = VARIANTS[arguments.variant], arguments.steps
     trainers = {name: Trainer(variant, recipe, precision=name) for name in get_args(Precision)}
-    made = [tuple(map(torch.from_numpy, batch)) for batch in islice(source.batches(), steps)]
+    made = list(islice(source.batches(), steps))
     batches = source.batches()
     bare: dict[str, list[float]] = {name: [] for name in trainers}
     whole: dict[str, list[float]] = {name: [] for name in trainers}
     with tempfile.TemporaryDirectory() as folder:
         for _, (name, trainer) in product(range(TURNS + 1), trainers.items()):
-            bare[name].append(rate(steps, partial(bare_loop, Trainer(variant, recipe, precision=name), made)))
+            bare[name].append(rate(steps, partial(bare_loop, Trainer(variant, recipe, precision=name), made, name)))
             whole[name].append(rate(steps, partial(run, trainer, batches, steps, Path(folder) / "c")))
     print(f"{arguments.variant} on {processor_name()}, {torch.get_num_threads()} threads")
     for name in trainers:
@@ -68,22 +68,22 @@ def rate(steps: int, work: Callable[[], None]) -> float:
     return steps * BATCH / (time.perf_counter() - started)
 
 
-def bare_loop(trainer: Trainer, batches: list[tuple[Tensor, ...]]) -> None:
+def bare_loop(trainer: Trainer, batches: list[Batch], precision: Precision) -> None:
     """What anybody would write: forward, loss, backward, step."""
     loss = RestorationLoss(LOSS)
     optimiser = torch.optim.Adam(trainer.network.parameters(), lr=1e-4)
-    for degraded, reference in batches:
-        degraded = degraded.to(memory_format=torch.channels_last)
-        total, _ = loss(trainer.network(degraded, bfloat16=trainer.bfloat16), reference)
+    for batch in batches:
+        degraded = batch.degraded.to(memory_format=torch.channels_last)
+        total, _ = loss(trainer.network(degraded, bfloat16=precision == "bfloat16"), batch.reference)
         optimiser.zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
 
 
-def run(trainer: Trainer, batches: Iterator[tuple[np.ndarray, ...]], steps: int, checkpoint: Path) -> None:
+def run(trainer: Trainer, batches: Iterator[Batch], steps: int, checkpoint: Path) -> None:
     """So many further steps of a run, simulation included, and a checkpoint."""
     for batch in islice(batches, steps):
-        trainer.train_step(*map(torch.from_numpy, batch))
+        trainer.train_step(batch)
     trainer.save(checkpoint)
 
 

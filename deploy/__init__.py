@@ -9,7 +9,8 @@ for. Inside:
 - `restoration`: images of any size through a network or the traditional pipeline;
 - `dpu` and `bench`: the checker of operators, the cost model, and what they say of a swath;
 - `results`, `frames`, `report`: figures as tables, JSON, DataFrames and pages; `differences` of two of them;
-- `studies`: what the verbs are worth: `evaluation`, `characterise`, `stress`, `detection`, `tradeoff`, `demo`;
+- `studies`: what takes hours and writes pages: `evaluation`, `characterise`, `stress`, `detection`, `tradeoff`,
+  `demo`, and `recipes`, which make the shipped networks;
 - `cli` and `commands`: a file a command, which parses options, calls one function and prints.
 """
 

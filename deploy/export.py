@@ -60,7 +60,7 @@ def banked_to_onnx(
         about: metadata.
         tile_px: side of a fixed square image, or None for any number and size.
     """
-    variant, bank = weights.variant, network_bank(sensor)
+    variant, bank = weights.variant, network_bank(sensor, weights.kernels)
     scale, pixels = variant.scale, variant.pixels
     require_tile(tile_px, scale)
     vector = np.array(sensor_vector(sensor).values, np.float32)

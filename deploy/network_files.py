@@ -20,10 +20,11 @@ import onnx
 
 from beers_deploy.export import float_for
 from beers_deploy.model.bank import network_bank
+from beers_deploy.model.curves import Kernels, departure
 from beers_deploy.model.exposure import brightened, factors_for
 from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.files import sha256
-from beers_deploy.model.io.tensors import is_conditioned
+from beers_deploy.model.io.tensors import is_conditioned, read_conditioned
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
 from beers_deploy.profiles.errors import ModelError, OptionError
@@ -44,6 +45,11 @@ class Conditioned:
 
     name: str
     weights: Path
+
+    @property
+    def kernels(self) -> Kernels:
+        """What the kernels of its banks are."""
+        return read_conditioned(self.weights).kernels
 
     def model(self, sensor: Sensor, int8: bool) -> onnx.ModelProto:
         """The network told a sensor, in float32 or in INT8."""
@@ -146,10 +152,12 @@ def shipped_pair(name: str = VARIANT, sensor: str = SENSOR) -> tuple[Path, Path]
     return float_file(given, known), int8_file(given, known)
 
 
-def warn_outside(sensor: Sensor, log: Log) -> None:
-    """Tell what of a sensor lies outside the range that was trained."""
-    for sentence in sensor_vector(sensor.nominal()).outside:
-        log(f"warning: {sentence}")
+def warn_outside(sensor: Sensor, kernels: Kernels, log: Log) -> None:
+    """Tell what of a sensor lies outside of what a network was trained on, whose banks have these kernels."""
+    known = sensor.nominal()
+    for sentence in (*sensor_vector(known).outside, departure(known, kernels)):
+        if sentence:
+            log(f"warning: {sentence}")
 
 
 def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
@@ -181,7 +189,7 @@ def _folder() -> Path:
 
 
 def _written(network: Conditioned, sensor: Sensor, int8: bool, log: Log) -> Path:
-    warn_outside(sensor, log)
+    warn_outside(sensor, network.kernels, log)
     stem = network.name + (INT8 if int8 else "")
     told = json.dumps({"weights": sha256(network.weights), "sensor": numbers_of(sensor)}, sort_keys=True, default=str)
     path = process_file(stem, hashlib.sha256(told.encode()).hexdigest())
@@ -208,9 +216,10 @@ def told_int8(
         more: metadata to add.
         log: is told what of the sensor lies outside the range that was trained.
     """
-    warn_outside(sensor, log)
+    family = required_family(model)
+    warn_outside(sensor, family.kernels, log)
     known = sensor.nominal()
-    core = required_family(model).for_sensor(network_bank(known), sensor_vector(known).values)
+    core = family.for_sensor(network_bank(known, family.kernels), sensor_vector(known).values)
     return host_model(core, {**metadata(model), "sensor": sensor.name, **(more or {})}, fixed_tile_px(model))
 
 

@@ -22,7 +22,7 @@ def torch_network(path: Path, sensor: Instrument | None = None) -> ConvBEERS | O
     """The network of torch that an exported one must compute as: of weights, for a sensor where they need one."""
     network = network_of(read_plain(path) if sensor is None else read_conditioned(path))
     if sensor is not None and isinstance(network, BankedConvBEERS):
-        return OfOneSensor(network, vector_tensor(sensor), network_bank(sensor))
+        return OfOneSensor(network, vector_tensor(sensor), network_bank(sensor, network.kernels))
     return cast(ConvBEERS, network)  # what `read_plain` read
 
 

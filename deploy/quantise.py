@@ -24,7 +24,7 @@ from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile, board_names, npu_names
-from beers_deploy.quant.banked.family import FAMILY, WEIGHTS, required_family
+from beers_deploy.quant.banked.family import FAMILY, KERNELS, WEIGHTS, required_family
 from beers_deploy.quant.core import SHIFTS, Shifts, target_shifts
 from beers_deploy.quant.encodings import host_model, read_core
 from beers_deploy.quant.gate import compare, gate_row
@@ -143,7 +143,7 @@ def _by_itself(origin: Network, calibration: Source, target: TargetProfile, step
 
 def _banked(network: Conditioned, calibration: "Calibration", sensor: Sensor, target: TargetProfile) -> Network:
     """A network behind a bank, told a sensor; each integer layer on its patches."""
-    family = family_model(network, calibration.images, calibration.seed, _shifts_of(target))
+    family = family_model(network, _folders(calibration.images), calibration.seed, _shifts_of(target))
     host = told_int8(family, sensor, {"target": target.name})
     layers = integer_rows(network.model(sensor, int8=False), read_core(host), host, calibration.drawn.degraded)
     return Network(host, f"{network.name}-int8", layers=layers)
@@ -194,7 +194,7 @@ def rounding_of(int8: Path, weights: Path) -> "Rounding":
 
     from beers_deploy.model.convbeers import Rounding
     from beers_deploy.quant.banked.calibrate import map_steps
-    from beers_deploy.quant.banked.filters import gain_of
+    from beers_deploy.quant.banked.filters import gains_of
 
     model, given = load_onnx(int8), read_conditioned(weights)
     if metadata(model).get(WEIGHTS) != sha256(weights):
@@ -203,17 +203,21 @@ def rounding_of(int8: Path, weights: Path) -> "Rounding":
     with contradictions(str(int8)):
         found = map_steps(required_family(model), given)
     stream, *inner = (torch.from_numpy(np.float32(steps))[:, None, None] for steps in found)
-    return Rounding(stream, tuple(inner), gain_of)
+    return Rounding(stream, tuple(inner), gains_of)
+
+
+def _folders(images: Path | None) -> list[Path]:
+    return [] if images is None else [images]
 
 
 def family_model(
-    network: Conditioned, images: Path | None = None, seed: int = 0, shifts: Shifts = SHIFTS
+    network: Conditioned, images: Sequence[Path] = (), seed: int = 0, shifts: Shifts = SHIFTS
 ) -> onnx.ModelProto:
     """The INT8 file of a network behind a bank, for the middle of the family; any sensor can be told to it.
 
     Args:
         network: of weights that 'train --conditioned' wrote.
-        images: folder of photographs, beside which about as many drawn scenes are seen; None takes these alone.
+        images: folders of photographs, beside which about as many drawn scenes are seen; none takes these alone.
         seed: of the patches.
         shifts: the windows of the target.
     """
@@ -223,11 +227,13 @@ def family_model(
     weights = read_conditioned(network.weights)
     aim, scale = load_sensor(REFERENCE).nominal(), weights.variant.scale
     scenes = load_scenes(None, aim, seed)
-    if images is not None:  # drawn scenes have stronger edges, photographs finer ground
-        photographs = load_scenes(images, aim, seed)
+    if images:  # drawn scenes have stronger edges, photographs finer ground
+        photographs = [scene for folder in images for scene in load_scenes(folder, aim, seed)]
         scenes = photographs + scenes * max(len(photographs) // len(scenes), 1)
     with begun(f"calibrating {network.name} over the family of sensors") as log:
-        seen, middle = family_images(scenes, scale, seed), bank_of_vector((0.0,) * len(RANGES))
+        seen = family_images(scenes, scale, seed, weights.kernels)
+        middle = bank_of_vector((0.0,) * len(RANGES), weights.kernels)
         family = quantise_family(weights, middle, seen, shifts, log)
     said = {"variant": network.name, "reference": REFERENCE, "precision": "int8 legal", "calibration_seed": str(seed)}
-    return host_model(family.core, {**said, FAMILY: family.to_words(), WEIGHTS: sha256(network.weights)})
+    known = {FAMILY: family.to_words(), KERNELS: weights.kernels, WEIGHTS: sha256(network.weights)}
+    return host_model(family.core, {**said, **known})

@@ -21,11 +21,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from beers_deploy.model.io.files import require_writable, whole_file
-from beers_deploy.model.simulator.acquire import acquire
-from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene
-from beers_deploy.model.training.patches import PatchRecipe, PatchSource, Visited, cut, prepare, turn
+from beers_deploy.model.training.looks import Look
+from beers_deploy.model.training.passes import Pass, Visited, detected, folded_signals, prepare
+from beers_deploy.model.training.patches import PatchRecipe, draw_turn
+from beers_deploy.model.training.source import PatchSource, cut, turned
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import BeersError, ImageError, OptionError
 from examples.networks import NETWORKS
@@ -54,7 +55,7 @@ def batches(name: str, scenes: Sequence[Scene], seed: int) -> Iterator[Batch]:
         return gratings(torch.Generator().manual_seed(seed), example.side_px or PATCH_PX)
     if example.inputs == len(GAINS):
         return banded(scenes, np.random.default_rng(seed))
-    pairs = (map(torch.from_numpy, pair) for pair in PatchSource(list(scenes), RECIPE, BATCH, seed).batches())
+    pairs = (batch[:2] for batch in PatchSource(list(scenes), RECIPE, BATCH, seed).batches())
     if name == "segment":
         return ((image, bright(reference)) for image, reference in pairs)
     if example.scale > 1:
@@ -94,31 +95,29 @@ def banded(scenes: Sequence[Scene], generator: np.random.Generator) -> Iterator[
     while True:
         drawn = [passes[generator.integers(len(passes))] for _ in range(MIXED)]
         pieces = [_mixed(_acquire_bands(scene, ratio, generator), generator)[:MOST] for scene, ratio in drawn]
-        for patches in torch.split(torch.from_numpy(_mixed(np.concatenate(pieces), generator)), BATCH):
+        for patches in torch.split(_mixed(torch.cat(pieces), generator), BATCH):
             yield patches[:, : len(GAINS)], patches[:, len(GAINS) :]
 
 
 def _fits(scene: Visited, ratio: int) -> bool:
-    return bool(min(scene.spectrum.shape[-2], scene.width) // ratio >= PATCH_PX + 2 * RECIPE.margin_px)
+    return bool(min(scene.sides) // ratio >= PATCH_PX + 2 * RECIPE.margin_px)
 
 
-def _mixed(patches: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+def _mixed(patches: Tensor, generator: np.random.Generator) -> Tensor:
     """Patches (N, C, P, P) in another order."""
-    return patches[generator.permutation(len(patches))]
+    return patches[torch.from_numpy(generator.permutation(len(patches)))]
 
 
-def _acquire_bands(scene: Visited, ratio: int, generator: np.random.Generator) -> np.ndarray:
+def _acquire_bands(scene: Visited, ratio: int, generator: np.random.Generator) -> Tensor:
     """The patches of one pass over a scene, (N, 8, P, P) in [0, 1]: four degraded bands, then their references."""
     phase_y, phase_x = (float(offset) for offset in generator.uniform(-ratio / 2, ratio / 2, 2))
-    exposure, seed = float(generator.uniform(*RECIPE.exposures)), int(generator.integers(2**31))
+    look = Look(float(generator.uniform(*RECIPE.looks.exposures)))
+    sensors = RECIPE.degraded.draw(generator), RECIPE.reference.draw(generator)
+    signals = folded_signals(scene, sensors, Pass(ratio, (phase_y, phase_x), look, RECIPE.margin_px))
     images = []
-    for profile, role in ((RECIPE.degraded, "degraded"), (RECIPE.reference, "reference")):
-        sensor = profile.draw(generator)
-        for band, gain in enumerate(GAINS):
-            spectrum, draw = scene.spectrum * (exposure * gain), Draw(seed, band)
-            dn = acquire(spectrum, scene.width, sensor, ratio, draw, role, (phase_y, phase_x), RECIPE.margin_px)
-            images.append(dn / sensor.max_dn)
-    return turn(cut(np.stack(images), PATCH_PX, generator), generator)
+    for signal, sensor, role in zip(signals, sensors, ("degraded", "reference"), strict=True):
+        images += [detected(signal * gain, sensor, role, generator) for gain in GAINS]
+    return turned(cut(torch.stack(images), PATCH_PX, generator), *draw_turn(generator, quarters=True))
 
 
 def batches_of(name: str, folder: Path | None, seed: int) -> Iterator[Batch]:

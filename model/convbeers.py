@@ -20,16 +20,18 @@ Trained in the end with its maps rounded as its INT8 file rounds them (`Rounding
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, pad, pixel_shuffle, pixel_unshuffle
 
 from beers_deploy.model.bank import FILTERS, LARGEST, SIDE_PX, Bank, bank_of_vector, in_places
+from beers_deploy.model.curves import Kernels
 from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.tensors import Weights, read_weights, write_weights
 from beers_deploy.model.variants import BANK_PLANES, SENSOR_VALUES, Variant
@@ -92,17 +94,17 @@ class Rounding:
     Attributes:
         stream: what a 1 stands for in the maps between head and tail, (F, 1, 1), at a gain of 1.
         inner: the same of the map within each block.
-        gain_of: how many times finer a sensor's steps are, of its bank.
+        gains_of: how many times finer sensors' steps are, of the noise of their banks (N,).
     """
 
     stream: Tensor
     inner: tuple[Tensor, ...]
-    gain_of: Callable[[Bank], float]
+    gains_of: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
-    def steps(self, banks: Sequence[Bank], image: Tensor) -> list[Tensor]:
-        """Those of images (N, 1, H, W), each with its bank: (N, F, 1, 1) of the stream, then of each block."""
-        shares = 1 / image.new_tensor([self.gain_of(bank) for bank in banks])[:, None, None, None]
-        return [step.to(image) * shares for step in (self.stream, *self.inner)]
+    def steps(self, sigmas: Tensor) -> list[Tensor]:
+        """Those of images, each with the noise of its sensor (N,): (N, F, 1, 1) of the stream, then of each block."""
+        gains = torch.from_numpy(self.gains_of(sigmas.cpu().double().numpy())).to(sigmas)
+        return [step.to(sigmas) / gains[:, None, None, None] for step in (self.stream, *self.inner)]
 
 
 class ConvBEERS(Layers):
@@ -116,41 +118,81 @@ class ConvBEERS(Layers):
         return image + self.corrected(self.head(pixel_unshuffle(image, self.variant.scale)), bfloat16)
 
 
-class BankedConvBEERS(Layers):
-    """Images (N, 1, H, W) in [0, 1] of full scale and sensor vectors (N, 4) to (N, 1, H, W), not clipped."""
+@dataclass(frozen=True)
+class Told:
+    """What a network behind a bank is told of the sensors of N images, float32.
 
-    def __init__(self, variant: Variant) -> None:
+    Attributes:
+        vectors: the sensor vectors (N, 4).
+        filters: (N, 5, 7, 7), see `Bank.filters`.
+        units: (N,) what the network adds is in these shares of full scale.
+        sigmas: (N,) noise over full scale.
+    """
+
+    vectors: Tensor
+    filters: Tensor
+    units: Tensor
+    sigmas: Tensor
+
+    @classmethod
+    def of(cls, vectors: Tensor, banks: Sequence[Bank]) -> "Told":
+        """Of the sensor vectors (N, 4) and as many banks."""
+        filters = torch.from_numpy(np.stack([bank.filters for bank in banks])).to(vectors)
+        units, sigmas = (vectors.new_tensor(each) for each in zip(*((b.unit, b.sigma) for b in banks), strict=True))
+        return cls(vectors, filters, units, sigmas)
+
+    @property
+    def parts(self) -> tuple[Tensor, ...]:
+        """All of it, in its order."""
+        return self.vectors, self.filters, self.units, self.sigmas
+
+    def to(self, device: torch.device) -> "Told":
+        """The same on a device."""
+        return Told(*(each.to(device, non_blocking=True) for each in self.parts))
+
+    def repeated(self, count: int) -> "Told":
+        """What is told of one image, for as many."""
+        return Told(*(each.expand(count, *each.shape[1:]) for each in self.parts))
+
+    def some(self, which: slice | Tensor) -> "Told":
+        """What is told of some of the images."""
+        return Told(*(each[which] for each in self.parts))
+
+
+class BankedConvBEERS(Layers):
+    """Images (N, 1, H, W) in [0, 1] of full scale and what is told of their sensors to (N, 1, H, W), not clipped.
+
+    `kernels` says what banks it was trained behind.
+    """
+
+    def __init__(self, variant: Variant, kernels: Kernels = "fitted") -> None:
         super().__init__(variant, BANK_PLANES)
+        self.kernels = kernels
         self.bias = nn.Linear(SENSOR_VALUES, variant.features, bias=False)
         nn.init.zeros_(self.bias.weight)
 
     def forward(
         self,
         image: Tensor,
-        vectors: Tensor,
-        banks: Sequence[Bank] | None = None,
+        told: Told,
         bfloat16: bool = False,
-        rounding: Rounding | None = None,
+        steps: Sequence[Tensor] = (),
     ) -> Tensor:
         """Restore each image as its own sensor asks for.
 
         Args:
             image: (N, 1, H, W).
-            vectors: (N, 4).
-            banks: of each sensor; None makes them of the vectors.
+            told: of the sensor of each.
             bfloat16: for the blocks alone.
-            rounding: rounds the maps as INT8 does; None leaves them as they are.
+            steps: that the maps are rounded to, see `Rounding.steps`; without any they stay as they are.
         """
-        banks = banks or [bank_of_vector(tuple(vector.tolist())) for vector in vectors]
-        kernels = np.stack([[*bank.planes, bank.analytic / bank.unit] for bank in banks])
-        filtered = each_by_its_own(image, torch.from_numpy(kernels).to(image)).clamp(-LARGEST, LARGEST)
+        filtered = each_by_its_own(image, told.filters).clamp(-LARGEST, LARGEST)
         read = pixel_unshuffle(torch.cat([image - 0.5, filtered[:, :FILTERS]], 1), self.variant.scale)
-        shallow = (self.head(read) + self.bias(vectors)[:, :, None, None]).contiguous(
+        shallow = (self.head(read) + self.bias(told.vectors)[:, :, None, None]).contiguous(
             memory_format=torch.channels_last
         )
-        correction = self.corrected(shallow, bfloat16, rounding.steps(banks, image) if rounding else ())
-        unit = image.new_tensor([bank.unit for bank in banks])[:, None, None, None]
-        restored: Tensor = image + unit * (filtered[:, FILTERS:] + correction)
+        correction = self.corrected(shallow, bfloat16, steps)
+        restored: Tensor = image + told.units[:, None, None, None] * (filtered[:, FILTERS:] + correction)
         return restored
 
 
@@ -166,8 +208,9 @@ class OfOneSensor(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """Restore (N, 1, H, W)."""
-        banks = [self.bank] * len(image) if self.bank else None
-        restored: Tensor = self.network(image, self.vector.expand(len(image), -1), banks)
+        bank = self.bank or bank_of_vector(tuple(self.vector.tolist()), self.network.kernels)
+        known = Told.of(self.vector[None], [bank])
+        restored: Tensor = self.network(image, known.repeated(len(image)))
         return restored
 
 
@@ -175,9 +218,9 @@ Network = ConvBEERS | BankedConvBEERS
 """What can be trained and kept: a plain network, or one for every sensor in range."""
 
 
-def told(network: Network, vector: Tensor) -> ConvBEERS | OfOneSensor:
+def told(network: Network, vector: Tensor, bank: Bank | None = None) -> ConvBEERS | OfOneSensor:
     """A network that takes images alone: one behind a bank told the sensor of a vector (4,), a plain one as it is."""
-    return OfOneSensor(network, vector) if isinstance(network, BankedConvBEERS) else network
+    return OfOneSensor(network, vector, bank) if isinstance(network, BankedConvBEERS) else network
 
 
 def each_by_its_own(image: Tensor, kernels: Tensor) -> Tensor:
@@ -284,15 +327,19 @@ def arrays(tensors: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
 
 def network_of(weights: Weights) -> Network:
     """A network of those weights, plain or behind a bank, in evaluation mode, on the CPU."""
-    network = (BankedConvBEERS if weights.conditioned else ConvBEERS)(weights.variant)
+    network: Network = ConvBEERS(weights.variant)
+    if weights.conditioned:
+        network = BankedConvBEERS(weights.variant, weights.kernels)
     network.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.tensors.items()})
     return network.eval()
 
 
 def save_network(path: Path, network: Network, recipe: Mapping[str, object]) -> None:
     """Write a network's weights, its variant and the recipe that made them."""
-    conditioned = isinstance(network, BankedConvBEERS)
-    write_weights(path, Weights(arrays(network.state_dict()), network.variant, dict(recipe), conditioned))
+    made = Weights(arrays(network.state_dict()), network.variant, dict(recipe))
+    if isinstance(network, BankedConvBEERS):
+        made = replace(made, conditioned=True, kernels=network.kernels)
+    write_weights(path, made)
 
 
 def load_network(path: Path) -> tuple[Network, dict[str, object]]:

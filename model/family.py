@@ -7,10 +7,11 @@ torch.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from beers_deploy.model.curves import draw_table
 from beers_deploy.profiles.sensor import Instrument
 
 RANGES: Mapping[str, tuple[float, float]] = {
@@ -89,11 +90,15 @@ def sensor_vector(sensor: Instrument) -> SensorVector:
 class SensorFamily:
     """The sensors that a network is trained on: every number log-uniform over its range.
 
-    `like` gives gain and bits; its MTF and noise do not matter.
+    Attributes:
+        like: gives gain and bits; its MTF and noise do not matter.
+        snr_bright: at a quarter of full scale.
+        other_curves: share of the sensors whose MTF has another curve than the formula's, see `model.curves`.
     """
 
     like: Instrument
     snr_bright: tuple[float, float] = SNR_BRIGHT
+    other_curves: float = 0.0
 
     def draw(self, generator: np.random.Generator) -> Instrument:
         """One sensor. The MTF along the track is more often near that across than far below it."""
@@ -106,7 +111,11 @@ class SensorFamily:
         dark = sigma * _log_uniform(generator, 0.5, 1.0)
         alpha = max(sigma**2 - dark**2, 0.0) / (full_scale * 3 / 16)
         beta = max(dark**2 - alpha * full_scale / 16, 0.0)
-        return Instrument(mtf, alpha, beta, self.like.gain_dn_per_radiance, self.like.bits, {}, along, full_scale / 4)
+        gain, bits = self.like.gain_dn_per_radiance, self.like.bits
+        made = Instrument(mtf, alpha, beta, gain, bits, {}, along, full_scale / 4)
+        if self.other_curves and generator.random() < self.other_curves:
+            return replace(made, response=draw_table(mtf, along, generator))
+        return made
 
 
 def _log_uniform(generator: np.random.Generator, low: float, high: float) -> float:

@@ -145,7 +145,7 @@ def _ground(place: tuple[Scene, int], recipe: PatchRecipe, generator: np.random.
     scene, oversampling = place
     side_px = recipe.patch_px + 2 * MARGIN_PX
     top, left = (int(generator.integers(size - side_px * oversampling + 1)) for size in scene.radiance.shape)
-    return Ground(scene, top, left, side_px, oversampling, float(generator.uniform(*recipe.exposures)))
+    return Ground(scene, top, left, side_px, oversampling, float(generator.uniform(*recipe.looks.exposures)))
 
 
 ROLES = "degraded", "reference"

@@ -64,7 +64,7 @@ def export(
     """
     from beers_deploy.export import about, float_for, to_onnx
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.model.io.tensors import is_conditioned, read_plain
+    from beers_deploy.model.io.tensors import is_conditioned, read_conditioned, read_plain
     from beers_deploy.network_files import warn_outside, weights_file
     from beers_deploy.quant.onnx_file import require_onnx_name, save_onnx
 
@@ -88,7 +88,7 @@ def export(
         return
     known = load_sensor(sensor or SENSOR) if is_conditioned(path) else None
     if known is not None:
-        warn_outside(known, partial(say, err=True))
+        warn_outside(known, read_conditioned(path).kernels, partial(say, err=True))
         model = float_for(path, path.stem, known, tile)
     elif sensor is not None:
         expected, remedy = "weights of 'train --conditioned'", "leave --sensor out, or give such weights"

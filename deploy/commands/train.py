@@ -23,8 +23,15 @@ class Precision(StrEnum):
 def train(
     context: typer.Context,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of checkpoint, logs, pictures and weights.")],
+    recipe: Annotated[
+        str | None,
+        typer.Option(help="Make a shipped network: its name, or a recipe of your own (.toml), which says all else."),
+    ] = None,
     images: Annotated[
-        Path | None, typer.Option(help="Folder of sharp aerial images (8-bit RGB, or 16-bit mono) to simulate from.")
+        list[Path] | None,
+        typer.Option(
+            help="Folder of sharp aerial images (8-bit RGB, or 16-bit mono) to simulate from; several if repeated."
+        ),
     ] = None,
     pairs: Annotated[Path | None, typer.Option(help="Folder of pairs that 'simulate' wrote, instead.")] = None,
     variant: Annotated[str, typer.Option(help="Size of the network.")] = "convbeers-s",
@@ -82,6 +89,11 @@ def train(
     from beers_deploy.network_files import weights_file
     from beers_deploy.quantise import rounding_of
 
+    folders = tuple(images or ())
+    if recipe is not None:
+        _refuse_beside_recipe(context)
+        _make(recipe, folders, out, resume, device)
+        return
     if pairs is not None and (images is not None or drawn):
         expected, remedy = "neither --images nor --drawn beside it", "leave one out"
         raise OptionError("--pairs", expected=expected, got="both", remedy=remedy)
@@ -92,13 +104,13 @@ def train(
         expected, remedy = "--conditioned and --start beside it", "give both, or leave it out"
         raise OptionError("--rounding", expected=expected, got="not both", remedy=remedy)
     _refuse_unused(context)
-    stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
+    stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else list(folders)
     start = weights_file(start) if start else None
     rounding = weights_file(rounding) if rounding else None
     read = (*stored, lpips, start, rounding, *(Path(name) for name in (sensor, reference) if name))
     require_writable(*(out / name for name in (*FILES, f"{variant}.safetensors")), inputs=read)
     rounded = rounding_of(rounding, start) if rounding and start else None
-    recipe = TrainingRecipe(
+    numbers = TrainingRecipe(
         steps=steps,
         batch=batch,
         learning_rate=learning_rate,
@@ -112,18 +124,18 @@ def train(
     patches = PatchRecipe(degraded, wanted, patch_px=patch, family=family)
     run = Run(
         variant,
-        recipe,
+        numbers,
         patches,
-        images,
+        folders,
         pairs,
         out,
-        drawn,
-        lpips,
-        start,
-        validate_every,
-        device,
-        precision.value,
-        rounded,
+        drawn=drawn,
+        lpips=lpips,
+        start=start,
+        validate_steps=validate_every,
+        device=device,
+        precision=precision.value,
+        rounding=rounded,
     )
     with joined(device) as worker:
         run_training(run, resume, worker, say)
@@ -131,10 +143,38 @@ def train(
             say(f"wrote {run.weights}")
 
 
+BESIDE_RECIPE = ("recipe", "images", "out", "resume", "device")
+"""Options that a recipe leaves open."""
+
+
+def _refuse_beside_recipe(context: typer.Context) -> None:
+    """Refuse options that the recipe states."""
+    stated = [name for name in context.params if name not in BESIDE_RECIPE]
+    expected, remedy = "no --recipe beside it, which states it", "leave it out, or give a recipe of your own"
+    refuse(context, stated, expected=expected, got="both", remedy=remedy)
+
+
+def _make(name: str, images: tuple[Path, ...], out: Path, resume: bool, device: str) -> None:
+    """Make a network from its recipe."""
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.model.shipped import INT8
+    from beers_deploy.model.training.recipe import load_recipe, recipe_file
+    from beers_deploy.studies.recipes import make_network
+
+    recipe = load_recipe(name)
+    if not images:
+        remedy = "give the folders of the photographs that the model card names"
+        raise OptionError("--recipe", expected="--images beside it", got="none", remedy=remedy)
+    written = [out / f"{recipe.variant}{end}" for end in (".safetensors", f"{INT8}.onnx", ".md")]
+    require_writable(*written, inputs=images)
+    toml = recipe_file(name).read_text(encoding="utf-8")
+    make_network(recipe, toml, images, out, resume, device, say)
+
+
 def _refuse_unused(context: typer.Context) -> None:
     """Refuse options that would do nothing beside the others."""
     remedy = "leave it out, or give what it needs"
-    if context.params["images"] is None:
+    if not context.params["images"]:
         expected = "--images, of which whole sites are held out, beside it"
         refuse(context, ["validate_every"], expected=expected, got="no images: nothing to validate on", remedy=remedy)
     if not context.params["lpips_weight"]:

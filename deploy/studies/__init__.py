@@ -1,1 +1,1 @@
-"""Studies of what the verbs do: nothing outside this package and its commands imports it."""
+"""Long work on top of the verbs, studies and the making of networks: only its commands import it."""

@@ -18,7 +18,7 @@ def main() -> None:
     """Make them one by one."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", default=shipped_names())
-    parser.add_argument("--images", type=Path, required=True, help="folder of photographs; drawn scenes are added")
+    parser.add_argument("--images", type=Path, required=True, nargs="+", help="folders of photographs")
     arguments = parser.parse_args()
     for name in arguments.names:
         shipped = WEIGHTS / f"{name}{INT8}.onnx"

@@ -37,7 +37,9 @@ PATHS = {
     "profiles": Paths({}, (), ("name",)),
     "characterise": Paths({"out": FILE, "json": FILE}, ("images",)),
     "simulate": Paths({"out": FOLDER}, ("scenes",), ("sensor", "reference", "scene")),
-    "train": Paths({"out": FOLDER}, ("images", "pairs", "lpips", "start", "rounding"), ("sensor", "reference")),
+    "train": Paths(
+        {"out": FOLDER}, ("images", "pairs", "lpips", "start", "rounding"), ("sensor", "reference", "recipe")
+    ),
     "export": Paths({"out": FILE, "board_file": FILE, "delta": FILE}, ("network", "apply"), ("sensor", "target")),
     "quantize": Paths(
         {"out": FILE, "board_file": FILE, "report": FOLDER, "json": FILE},
@@ -119,6 +121,7 @@ WORDS = {
     "need": "limits",
     "network": "network",
     "preset": "data set",
+    "recipe": "recipe",
     "reference": "profile",
     "scene": "scene",
     "scheduler": "address",
@@ -160,6 +163,7 @@ REFUSED = {
         Refused(("workers", "scheduler", "resume"), without="--out"),
     ],
     "train": [
+        Refused(("sensor", "variant", "steps", "seed", "validate_every"), "--recipe convbeers-xs --images aerial/"),
         Refused(("images", "drawn", "conditioned"), "--pairs PAIRS"),
         Refused(("validate_every",), without="--images"),
         Refused(("lpips",), "--lpips-weight 0"),

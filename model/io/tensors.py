@@ -14,6 +14,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from beers_deploy.model.curves import Kernels
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.formats import HEAD_BYTES, SAFETENSORS, OtherFormat, other_format
@@ -35,12 +36,16 @@ Arrays = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Weights:
-    """What a file of weights holds; a conditioned network is told its sensor, and stands behind the bank of it."""
+    """What a file of weights holds; a conditioned network is told its sensor, and stands behind the bank of it.
+
+    `kernels` says what the kernels of that bank are.
+    """
 
     tensors: Arrays
     variant: Variant
     recipe: dict[str, object]
     conditioned: bool = False
+    kernels: Kernels = "fitted"
 
 
 def write_tensors(path: Path, tensors: Arrays, header: Mapping[str, object]) -> None:
@@ -78,7 +83,7 @@ def write_weights(path: Path, weights: Weights) -> None:
     """Write a network's weights, its variant and recipe; of one that is told its sensor the ranges it knows, too."""
     header: dict[str, object] = {"variant": asdict(weights.variant), "recipe": weights.recipe}
     if weights.conditioned:
-        header |= {"kind": BANKED, "ranges": dict(RANGES)}
+        header |= {"kind": BANKED, "ranges": dict(RANGES), "kernels": weights.kernels}
     write_tensors(path, weights.tensors, header)
 
 
@@ -95,7 +100,8 @@ def read_weights(path: Path) -> Weights:
     except FAULTS as error:
         raise _not_weights(path, "the weights of a ConvBEERS", error) from error
     recipe = header.get("recipe")
-    return Weights(tensors, variant, recipe if isinstance(recipe, dict) else {}, conditioned)
+    kernels: Kernels = "fitted" if header.get("kernels") == "fitted" else "cut"
+    return Weights(tensors, variant, recipe if isinstance(recipe, dict) else {}, conditioned, kernels)
 
 
 def read_plain(path: Path) -> Weights:

@@ -4,6 +4,7 @@ That is safetensors, with all that an exact resume needs; nothing is unpickled.
 """
 
 import hashlib
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -125,9 +126,13 @@ def _error(step: int, expected: str, got: str) -> ModelError:
     return ModelError(f"training step {step}", expected=expected, got=got, remedy=remedy)
 
 
-def tensors_sha256(tensors: Mapping[str, Tensor]) -> str:
-    """Return the hex digest of named tensors: safetensors has none, and a flipped bit is a plausible weight."""
-    digest = hashlib.sha256()
+def checkpoint_sha256(tensors: Mapping[str, Tensor], header: Mapping[str, object]) -> str:
+    """Return the hex digest of named tensors and of what the header states beside it.
+
+    Safetensors has none, and a flipped bit is a plausible weight or another step.
+    """
+    stated = {key: value for key, value in header.items() if key != "sha256"}
+    digest = hashlib.sha256(json.dumps(stated, sort_keys=True).encode())
     for name, array in sorted(arrays(dict(tensors)).items()):
         digest.update(f"{name} {array.shape} {array.dtype} ".encode())
         digest.update(np.ascontiguousarray(array).data)
@@ -155,6 +160,8 @@ def read_checkpoint(
         expected = "a checkpoint of these images, sensors and first weights"
         raise ModelError(str(path), expected=expected, got="one of others", remedy=remedy)
     try:
+        if header["sha256"] != checkpoint_sha256(tensors, header):
+            raise ValueError("a content that does not match its digest")
         _check_parts(tensors, network, recipe.steps)
         kept: Any = header["guards"]
         best = None if kept["best"] is None else float(kept["best"])
@@ -162,11 +169,9 @@ def read_checkpoint(
         step = int(str(header["step"]))
         if not 0 <= step <= recipe.steps:
             raise ValueError(f"step {step} of {recipe.steps}")
-        if header["sha256"] != tensors_sha256(tensors):
-            raise ValueError("tensors that do not match their digest")
     except (AttributeError, LookupError, TypeError, ValueError, OverflowError) as error:
         got = " ".join(str(error).split())[:120]
-        remedy = "choose the variant it was begun with"
+        remedy = "choose the variant it was begun with, or begin anew where the file is damaged"
         raise ModelError(str(path), expected="a checkpoint of this network", got=got, remedy=remedy) from error
     return tensors, step, guards
 
@@ -191,7 +196,7 @@ def _check_parts(tensors: dict[str, Tensor], network: Network, steps: int) -> No
         value, moment = tensors[name], name.rsplit(".", 1)[1]
         if value.shape != like.shape or value.dtype != like.dtype:
             raise ValueError(f"a tensor {tuple(value.shape)} of {value.dtype} in place of {tuple(like.shape)}")
-        least, most = {"step": (1, steps), "exp_avg_sq": (0, math.inf)}.get(moment, (-math.inf, math.inf))
+        least, most = {"step": (0, steps), "exp_avg_sq": (0, math.inf)}.get(moment, (-math.inf, math.inf))
         if not bool(((value >= least) & (value <= most)).all()):
             raise ValueError(f"{name} that Adam cannot have")
     if len(tensors) != len(wanted) or not all_finite(arrays(tensors)):

@@ -4,6 +4,10 @@ Besides, an L2 term for who wants the highest PSNR, which is a mean of squares: 
 PSNR term, its mean over the patches, in which a sharp and quiet sensor's small errors count as much as a blurred and
 noisy one's large ones (as in NAFNet, Chen et al., ECCV 2022).
 
+The consistency step of a restoration removes what an image errs at low spatial frequencies, because the raw image
+shows them as they are. `coarse` below 1 makes an error there count less, so that a network spends itself on the rest:
+G of `model.consistency` is taken of the error, and all but that share of it is left out.
+
 LPIPS needs weights that are not shipped; without them the loss is L1 + FFT-L1, and the recipe says so.
 """
 
@@ -12,19 +16,25 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
 
+from beers_deploy.model.consistency import BLOCK_PX
 from beers_deploy.model.metrics.perceptual import Lpips
 from beers_deploy.profiles.sensor import MAX_DN
 
 
 @dataclass(frozen=True)
 class LossWeights:
-    """How much each term counts; a term of weight 0 is not computed."""
+    """How much each term counts, one of weight 0 is not computed.
+
+    `coarse` is the share, in all of them, of what the consistency step removes from an error.
+    """
 
     l1: float = 1.0
     lpips: float = 0.5
     fft: float = 0.1
     psnr: float = 0.0
+    coarse: float = 1.0
 
 
 PAPER = LossWeights()
@@ -42,6 +52,8 @@ class RestorationLoss:
         # In bfloat16 the differences of nearly equal images would lose most of their digits.
         with torch.autocast(restored.device.type, enabled=False):
             restored, reference = restored.float(), reference.float()
+            if weights.coarse != 1:
+                restored = restored - (1 - weights.coarse) * coarse(restored - reference)
             terms = {"l1": (restored - reference).abs().mean()}
             total = weights.l1 * terms["l1"]
             for name, term in {"fft": fft_l1, "psnr": log_mse}.items():
@@ -52,6 +64,13 @@ class RestorationLoss:
                 terms["lpips"] = self.perceptual(restored, reference).mean()
                 total = total + weights.lpips * terms["lpips"]
         return total, {name: term.detach() for name, term in terms.items()}
+
+
+def coarse(error: Tensor) -> Tensor:
+    """Means over blocks, interpolated bilinearly between their centres: of (N, 1, H, W), whole blocks, the same."""
+    means = avg_pool2d(error, BLOCK_PX)
+    found: Tensor = interpolate(means, size=error.shape[-2:], mode="bilinear", align_corners=False)
+    return found
 
 
 def log_mse(restored: Tensor, reference: Tensor) -> Tensor:

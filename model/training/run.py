@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from beers_deploy.model.bank import network_bank
 from beers_deploy.model.convbeers import (
     BankedConvBEERS,
     ConvBEERS,
@@ -33,16 +34,19 @@ from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.model.metrics.perceptual import Lpips, find_backbone, not_found
 from beers_deploy.model.progress import steps
 from beers_deploy.model.simulator.acquire import LEAST_SIDE_PX, fitting_oversampling, simulate_pair
+from beers_deploy.model.simulator.chart import draw_charts
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import draw_scenes
 from beers_deploy.model.simulator.sampling import Scene, read_scene
 from beers_deploy.model.training.checkpoint import TrainingRecipe, finish, require_finite_output
 from beers_deploy.model.training.losses import RestorationLoss
-from beers_deploy.model.training.patches import PatchRecipe, PatchSource, StoredPairs, pair_files
-from beers_deploy.model.training.trainer import Batches, Precision, Schedule, Trainer, Worker
+from beers_deploy.model.training.patches import PatchRecipe, pair_files
+from beers_deploy.model.training.source import PatchSource
+from beers_deploy.model.training.stored import StoredPairs
+from beers_deploy.model.training.trainer import Batches, Precision, Schedule, Speed, Trainer, Worker
 from beers_deploy.model.variants import Variant, variant_named
 from beers_deploy.profiles.errors import ModelError, OptionError
-from beers_deploy.profiles.sensor import Sensor, numbers_of
+from beers_deploy.profiles.sensor import Instrument, Sensor, numbers_of
 
 STEP = re.compile(r"[0-9]{1,18}(?=,)")
 """What a line of a log begins with."""
@@ -55,15 +59,21 @@ SENSOR_VIEWS = 4
 
 @dataclass(frozen=True)
 class Run:
-    """What the command's options say."""
+    """What the command's options say, or a stage of a recipe.
+
+    Attributes:
+        held_out: sites that are not trained on; where none is named, a twentieth of the images is.
+    """
 
     variant: str
     recipe: TrainingRecipe
     patches: PatchRecipe
-    images: Path | None
+    images: tuple[Path, ...]
     pairs: Path | None
     out: Path
     drawn: int = 0
+    charts: int = 0
+    held_out: tuple[str, ...] = ()
     lpips: Path | None = None
     start: Path | None = None
     validate_steps: int = 1000
@@ -93,16 +103,26 @@ SIDE_PX = 192
 OVERSAMPLINGS = (4, 3, 2, 1)
 
 
-def split_by_site(names: Sequence[str]) -> tuple[list[int], list[int]]:
+def split_by_site(names: Sequence[str], wanted: Sequence[str] = ()) -> tuple[list[int], list[int]]:
     """Numbers of the images to train on, and of those held out: whole sites, always the same ones.
 
-    Fewer than three sites are all trained on: nothing is held out.
+    Args:
+        names: of the images.
+        wanted: sites to hold out; without any, those with the fewest images are, and of fewer than three none is.
+
+    Raises:
+        OptionError: no image shows a wanted site.
     """
     sites: dict[str, list[int]] = {}
     for number, name in enumerate(names):
         sites.setdefault(site_of(name), []).append(number)
     held: list[int] = []
-    if len(sites) >= 3:
+    for site in wanted:
+        if site not in sites:
+            remedy = "give the folders of all its images"
+            raise OptionError("held out", expected=f"images of {site}", got="none", remedy=remedy)
+        held += sites[site]
+    if len(sites) >= 3 and not wanted:
         for site in sorted(sites, key=lambda s: (len(sites[s]), s)):
             if len(held) >= SHARE * len(names):
                 break
@@ -117,7 +137,7 @@ class Validation:
     """
 
     def __init__(self, scenes: Sequence[Scene], degraded: Sensor | SensorFamily, reference: Sensor) -> None:
-        self.names, self.pairs, self.vectors = list[str](), list[tuple[Tensor, Tensor]](), list[Tensor]()
+        self.names, self.pairs, self.sensors = list[str](), list[tuple[Tensor, Tensor]](), list[Instrument]()
         for number, scene in enumerate(scenes):
             ratio = fitting_oversampling(scene.radiance, OVERSAMPLINGS, LEAST_SIDE_PX)
             if ratio is None:
@@ -130,7 +150,7 @@ class Validation:
             degraded_image, reference_image = (torch.from_numpy(image[None, None, :height, :width]) for image in both)
             self.names.append(scene.name)
             self.pairs.append((degraded_image, reference_image))
-            self.vectors.append(vector_tensor(sensors[0]))
+            self.sensors.append(sensors[0])
 
     def restore(self, network: Network) -> list[np.ndarray]:
         """Each degraded image through the network in float32, (H, W), clipped to [0, 1].
@@ -139,8 +159,8 @@ class Validation:
         multiples of the network's scale is extended by copies of its last row and column, as in a restoration.
         """
         restored = []
-        for (degraded, _), vector in zip(self.pairs, self.vectors, strict=True):
-            plain = told(network, vector)
+        for (degraded, _), sensor in zip(self.pairs, self.sensors, strict=True):
+            plain = told(network, vector_tensor(sensor), network_bank(sensor))
             height, width = degraded.shape[-2:]
             lack = (-size % plain.variant.scale for size in (width, height))
             extended = pad(degraded, [each for side in lack for each in (0, side)], mode="replicate")
@@ -232,13 +252,20 @@ def data_sha256(run: Run, loss: RestorationLoss) -> str:
         run: what the options say.
         loss: with or without LPIPS, whose weights may be missing at the second time.
     """
-    patches, files = run.patches, list_images(run.images) if run.images else []
+    patches, files = run.patches, [file for folder in run.images for file in list_images(folder)]
     for pair in pair_files(run.pairs) if run.pairs else []:
         files += pair
     stated = [
         *(numbers_of(sensor) for sensor in (patches.degraded, patches.reference)),
         patches.family,
-        (patches.patch_px, patches.oversamplings, patches.exposures, patches.margin_px, run.drawn),
+        (
+            patches.patch_px,
+            patches.oversamplings,
+            patches.looks,
+            patches.margin_px,
+            patches.noisy_reference,
+        ),
+        (run.drawn, run.charts, run.held_out),
         loss.perceptual is not None,
         *(
             (file.name, sha256(file))
@@ -260,23 +287,25 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
         source = StoredPairs(files, *given, trainer.worker.rank, trainer.worker.count, turns, mirrors)
         return source.batches, Validation([], *sensors), [degraded.name for degraded, _ in files]
     scenes = read_scenes(run)
-    kept, held = split_by_site([scene.name for scene in scenes])
+    kept, held = split_by_site([scene.name for scene in scenes], run.held_out)
     views = SENSOR_VIEWS if run.patches.family else 1
     validation = Validation([scenes[k] for k in held for _ in range(views)], *sensors)
-    train_on = [scenes[k] for k in kept] + draw_scenes(run.drawn, recipe.seed)
+    drawn = draw_scenes(run.drawn, recipe.seed) + draw_charts(run.charts, recipe.seed)
+    train_on = [scenes[k] for k in kept] + drawn
     if not train_on:
         remedy = "give `images`, `pairs` or `drawn`"
         raise OptionError("training data", expected="images, pairs or drawn scenes", got="none", remedy=remedy)
     worker = trainer.worker
-    patches = PatchSource(train_on, run.patches, recipe.batch, recipe.seed, worker.rank, worker.count)
+    ranks = worker.rank, worker.count
+    patches = PatchSource(train_on, run.patches, recipe.batch, recipe.seed, *ranks, trainer.device)
     return patches.batches, validation, [scene.name for scene in train_on]
 
 
 def read_scenes(run: Run) -> list[Scene]:
-    """The images of the run's folder."""
-    if run.images is None:
+    """The images of the run's folders."""
+    files, scenes = [file for folder in run.images for file in list_images(folder)], list[Scene]()
+    if not files:
         return []
-    files, scenes = list_images(run.images), []
     with steps("reading", len(files)) as bar:
         for file in files:
             scenes.append(read_scene(file, run.patches.reference.nominal()))
@@ -290,10 +319,11 @@ def _train(run: Run, trainer: Trainer, batches: Batches, validation: Validation)
     with steps("training", run.recipe.steps) as bar:
         bar.advance(trainer.step)
 
-        def report(step: int, terms: Mapping[str, float], patches_per_s: float) -> None:
-            log.write(step, {**terms, "patches_per_s": patches_per_s})
+        def report(step: int, terms: Mapping[str, float], speed: Speed) -> None:
+            log.write(step, {**terms, "patches_per_s": speed.patches_per_s, "waited": speed.waited})
             shown = ", ".join(f"{name} {value:.5f}" for name, value in terms.items())
-            bar.advance(step - bar.done, f"{shown}, {patches_per_s:.0f} patches/s in {run.precision}")
+            rate = f"{speed.patches_per_s:.0f} patches/s in {run.precision}, waits {speed.waited:.0%}"
+            bar.advance(step - bar.done, f"{shown}, {rate}")
 
         def validate(step: int, network: Network) -> None:
             require_finite_output(network, f"training step {step}")
@@ -351,7 +381,7 @@ def about(run: Run, images: Sequence[str], held_out: Sequence[str], loss: Restor
         "reference": patches.reference.name,
         "patch_px": patches.patch_px,
         "oversamplings": patches.oversamplings if run.pairs is None else "as stored",
-        "exposures": patches.exposures if run.pairs is None else "as stored",
+        "looks": asdict(patches.looks) if run.pairs is None else "as stored",
         "images": list(images),
         "held_out": list(dict.fromkeys(held_out)),
     }

@@ -19,8 +19,10 @@ from torch.nn.parallel import DistributedDataParallel
 from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, Rounding, arrays, initialise
 from beers_deploy.model.io.tensors import write_tensors
 from beers_deploy.model.progress import held_back
-from beers_deploy.model.training.checkpoint import MOMENTS, Guards, TrainingRecipe, read_checkpoint, tensors_sha256
+from beers_deploy.model.training.checkpoint import MOMENTS, Guards, TrainingRecipe, checkpoint_sha256, read_checkpoint
 from beers_deploy.model.training.losses import RestorationLoss
+from beers_deploy.model.training.source import Batch
+from beers_deploy.model.training.step import Step
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import MachineError, OptionError
 
@@ -71,9 +73,11 @@ def joined(device: str) -> Iterator[Worker]:
         torch.distributed.destroy_process_group()
 
 
-Batches = Callable[[int], Iterator[tuple[np.ndarray, ...]]]
-"""The batches from a number on: (degraded, reference), (N, 1, P, P) in [0, 1] each, of patches made on the fly or of
-stored pairs; for a conditioned network (degraded, reference, sensor vectors (N, 4))."""
+Batches = Callable[[int], Iterator[Batch]]
+"""The batches from a number on, of patches made on the fly or of stored pairs."""
+
+UNSEEN_STEPS = 25
+"""On a GPU so many steps are taken before anybody looks at what they gave."""
 
 Precision = Literal["float32", "bfloat16"]
 """The number format of the blocks. Head, tail and what is added stay float32: 8 bits would round a 12-bit image."""
@@ -83,14 +87,52 @@ Precision = Literal["float32", "bfloat16"]
 class Schedule:
     """How often a run reports, looks at the validation images, and saves.
 
-    `report` is told the step, the means of the loss's terms since the last report, and patches a second.
+    `report` is told the step, the means of the loss's terms since the last report, and how fast it went.
     """
 
     report_steps: int = 100
     save_s: float = 120.0
     validate_steps: int = 0  # 0: never
-    report: Callable[[int, Mapping[str, float], float], None] = field(default=lambda *_: None)
+    report: Callable[[int, Mapping[str, float], "Speed"], None] = field(default=lambda *_: None)
     validate: Callable[[int, Network], None] = field(default=lambda *_: None)
+
+
+@dataclass(frozen=True)
+class Speed:
+    """How fast some steps went.
+
+    Attributes:
+        patches_per_s: trained on.
+        waited: share of the time in which the steps waited for patches.
+    """
+
+    patches_per_s: float
+    waited: float
+
+
+class Spent:
+    """Time since it was made, and how much of it went into waiting for patches."""
+
+    def __init__(self) -> None:
+        self.begun, self.waited_s = time.monotonic(), 0.0
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        """Count the time of what is done within as waiting."""
+        begun = time.monotonic()
+        yield
+        self.waited_s += time.monotonic() - begun
+
+    def figures(self, patches: int) -> Speed:
+        """How fast so many patches were trained on."""
+        elapsed_s = max(time.monotonic() - self.begun, 1e-9)
+        return Speed(patches / elapsed_s, self.waited_s / elapsed_s)
+
+
+def largest_of_all(flag: Tensor) -> Tensor:
+    """The largest flag of all workers."""
+    torch.distributed.all_reduce(flag, torch.distributed.ReduceOp.MAX)
+    return flag
 
 
 class Trainer:
@@ -132,12 +174,14 @@ class Trainer:
         if start is not None:
             self.network.load_state_dict(start.state_dict())
         self.network.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.bfloat16 = precision == "bfloat16"
-        self.rounding = {"rounding": rounding} if rounding else {}
+        several = self.worker.count > 1
         # Gradients are averaged over the workers.
-        self.forward: nn.Module = self.network if self.worker.count == 1 else DistributedDataParallel(self.network)
-        self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
-        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=recipe.learning_rate)
+        forward: nn.Module = DistributedDataParallel(self.network) if several else self.network
+        agree = largest_of_all if several else None
+        options = (recipe.gradient_norm, precision == "bfloat16", rounding, agree)
+        self._take = Step(self.network, self.loss, forward, *options)
+        self.average, self.optimiser = self._take.average, self._take.optimiser
+        self._unseen = list[Tensor]()
 
     def run(self, batches: Batches, checkpoint: Path, schedule: Schedule) -> None:
         """Train to the last step. Ctrl-C leaves a checkpoint of the last whole step.
@@ -148,19 +192,26 @@ class Trainer:
             schedule: see there; of several workers, the first keeps to it.
         """
         schedule = schedule if self.worker.first else Schedule()
-        seen, begun, saved = list[Mapping[str, Tensor]](), time.monotonic(), time.monotonic()
+        spent, saved = Spent(), time.monotonic()
+        rows = list[list[float]]()
         with held_back() as interrupt:
             following = batches(self.step)
             while self.step < self.recipe.steps and not self.worker.any(interrupt.asked, self.device):
-                seen.append(self.train_step(*map(torch.from_numpy, next(following))))
+                with spent.waiting():
+                    batch = next(following)
+                self.train_step(batch)
+                save = time.monotonic() - saved > schedule.save_s
+                if save or self._due(schedule.report_steps) or self._due(schedule.validate_steps) or self._full:
+                    rows += self.seen()
                 if self._due(schedule.report_steps):
-                    schedule.report(self.step, *self._summary(seen, time.monotonic() - begun))
-                    seen, begun = [], time.monotonic()
+                    schedule.report(self.step, self._means(rows), spent.figures(self._patches(len(rows))))
+                    rows, spent = [], Spent()
                 if self._due(schedule.validate_steps):
                     schedule.validate(self.step, self.averaged())
-                if time.monotonic() - saved > schedule.save_s:
+                if save:
                     self.save(checkpoint)
                     saved = time.monotonic()
+        self.seen()
         self.save(checkpoint)
         if self.step < self.recipe.steps:
             raise KeyboardInterrupt
@@ -169,42 +220,44 @@ class Trainer:
         """Whether so many steps have passed again, or it is the end; of 0 it never is."""
         return every > 0 and (self.step % every == 0 or self.step == self.recipe.steps)
 
-    def _summary(self, seen: Sequence[Mapping[str, Tensor]], elapsed_s: float) -> tuple[dict[str, float], float]:
-        """Of the steps since the last report: the means of their terms, but of those skipped; patches a second."""
-        kept = [terms for terms in seen if terms]
-        means = {name: sum(float(terms[name]) for terms in kept) / len(kept) for name in (kept or [{}])[0]}
-        return means, len(seen) * self.recipe.batch * self.worker.count / max(elapsed_s, 1e-9)
+    @property
+    def _full(self) -> bool:
+        """Whether it is time to look at what the last steps gave: a GPU is not made to wait for it at each."""
+        return len(self._unseen) >= (UNSEEN_STEPS if self.device.type == "cuda" else 1)
 
-    def train_step(self, degraded: Tensor, reference: Tensor, *vectors: Tensor) -> Mapping[str, Tensor]:
-        """One step on a batch, (N, 1, P, P) each; the loss's terms, none for a step that was skipped.
+    def _patches(self, steps: int) -> int:
+        return steps * self.recipe.batch * self.worker.count
 
-        A conditioned network takes the sensor vectors (N, 4) too.
-        """
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.recipe.rate_at(self.step)
-        degraded = degraded.to(self.device, memory_format=torch.channels_last)
-        known = (vector.to(self.device) for vector in vectors)
-        restored = self.forward(degraded, *known, bfloat16=self.bfloat16, **self.rounding)
-        total, terms = self.loss(restored, reference.to(self.device))
-        self.optimiser.zero_grad(set_to_none=True)
-        total.backward()  # type: ignore[no-untyped-call]
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.gradient_norm)
-        self.step += 1
-        # All workers skip a step that is bad for one of them, or their weights would part.
-        bad = not bool(torch.isfinite(total) & torch.isfinite(norm))
-        if self.worker.any(bad, self.device):
-            self.guards.skipped(self.step)
+    def _means(self, rows: Sequence[Sequence[float]]) -> dict[str, float]:
+        """Of the steps since the last report: the means of their terms, but of those skipped."""
+        kept = [terms for bad, _, *terms in rows if not bad]
+        if not kept:
             return {}
-        self.optimiser.step()
-        self._average()
-        self.guards.passed(self.step, float(total.detach()))
-        return terms
+        return dict(zip(self._take.names, np.mean(kept, 0).tolist(), strict=True))
 
-    def _average(self) -> None:
+    def train_step(self, batch: Batch) -> None:
+        """One step on a batch; what it gave is kept for `seen`."""
         # Early on the average follows fast, or the first random weights would stay in it for long.
-        decay = min(self.recipe.ema_decay, (1 + self.step) / (10 + self.step))
-        for name, value in self.network.state_dict().items():
-            self.average[name].lerp_(value, 1 - decay)
+        step = self.step + 1
+        decay = min(self.recipe.ema_decay, (1 + step) / (10 + step))
+        self._unseen.append(self._take(batch, self.recipe.rate_at(self.step), 1 - decay))
+        self.step = step
+
+    def seen(self) -> list[list[float]]:
+        """Look at what the steps since the last look gave, and stop a run that has gone wrong.
+
+        Returns:
+            Of each step 1 if it was skipped, else 0; its loss; and the loss's terms.
+        """
+        rows: list[list[float]] = torch.stack(self._unseen).tolist() if self._unseen else []
+        first = self.step - len(rows) + 1
+        self._unseen = []
+        for number, (bad, total, *_) in enumerate(rows, first):
+            if bad:
+                self.guards.skipped(number)
+            else:
+                self.guards.passed(number, total)
+        return rows
 
     def averaged(self) -> Network:
         """The network with its running-average weights, on the CPU: the one to ship."""
@@ -222,7 +275,8 @@ class Trainer:
             for moment, value in self.optimiser.state.get(parameter, {}).items():
                 tensors[f"moment.{name}.{moment}"] = value
         header: dict[str, object] = {"step": self.step, "guards": asdict(self.guards), "recipe": asdict(self.recipe)}
-        header |= {"data": self.data, "sha256": tensors_sha256(tensors)}
+        header["data"] = self.data
+        header["sha256"] = checkpoint_sha256(tensors, header)
         write_tensors(path, arrays(tensors), header)
 
     def resume(self, path: Path) -> None:
@@ -234,9 +288,10 @@ class Trainer:
         if len(tensors) == 2 * len(self.average):  # from before the first step
             return
         for name, parameter in self.network.named_parameters():
-            # Adam keeps its step count on the CPU and its moments with (and laid out as) the parameter.
+            # Adam keeps its step count and its moments with (and laid out as) the parameter.
             moments = {key: torch.empty_like(parameter).copy_(tensors[f"moment.{name}.{key}"]) for key in MOMENTS}
-            self.optimiser.state[parameter] = {"step": tensors[f"moment.{name}.step"], **moments}
+            taken = tensors[f"moment.{name}.step"].to(self.device)
+            self.optimiser.state[parameter] = {"step": taken, **moments}
 
 
 def require_loss(loss: RestorationLoss) -> None:

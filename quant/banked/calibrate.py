@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from beers_deploy.model.bank import FILTERS, UNIT_STEPS, Bank, network_bank
+from beers_deploy.model.curves import Kernels
 from beers_deploy.model.family import SensorFamily, sensor_vector
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.progress import Log, no_log
@@ -214,13 +215,16 @@ PATCHES, SNR = 80, (90.0, 165.0)
 """Of calibration: sensors whose gain lies near 1, so that the body sees what all others will show it at theirs."""
 
 
-def family_images(scenes: list[Scene], scale: int, seed: int, patch_px: int = PATCH_PX) -> Remade[np.ndarray]:
+def family_images(
+    scenes: list[Scene], scale: int, seed: int, kernels: Kernels, patch_px: int = PATCH_PX
+) -> Remade[np.ndarray]:
     """What a family is calibrated on: scenes as many sensors of it see them, behind the bank of each.
 
     Args:
         scenes: that are seen.
         scale: of the network.
         seed: of everything that is drawn.
+        kernels: of the banks.
         patch_px: side of a patch.
     """
     like, reference = load_sensor(LIKE), load_sensor(REFERENCE)
@@ -228,6 +232,8 @@ def family_images(scenes: list[Scene], scale: int, seed: int, patch_px: int = PA
 
     def results(number: int) -> np.ndarray:
         sensor = patches.views[number].degraded
-        return bank_results(patches.degraded[number], network_bank(sensor), sensor_vector(sensor).values, scale)
+        return bank_results(
+            patches.degraded[number], network_bank(sensor, kernels), sensor_vector(sensor).values, scale
+        )
 
     return Remade(results, len(patches.views))

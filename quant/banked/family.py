@@ -19,6 +19,7 @@ import onnx
 from numpy.typing import NDArray
 
 from beers_deploy.model.bank import Bank
+from beers_deploy.model.curves import Kernels
 from beers_deploy.model.variants import SENSOR_VALUES
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.banked.filters import BITS, gain_of, whole_bank
@@ -33,6 +34,9 @@ WEIGHTS = "weights_sha256"
 FAMILY = "family"
 """In the metadata of an INT8 file: what tells it another sensor."""
 
+KERNELS = "bank_kernels"
+"""In its metadata: what the kernels of the banks are that it stands behind."""
+
 BANK = "bank"
 """The tensor between a sensor's filters and what is the same for all."""
 
@@ -46,11 +50,13 @@ class Family:
         biases: of the body's convolutions, by name, at a gain of 1: (O, 1), and of those that read the bank (O, 5),
             the bias for the middle of the family and what each of a sensor's values adds.
         shifts: the windows of the target.
+        kernels: of the banks that it stands behind.
     """
 
     core: IntCore
     biases: Mapping[str, np.ndarray]
     shifts: Shifts = SHIFTS
+    kernels: Kernels = "fitted"
 
     def for_sensor(self, bank: Bank, vector: Sequence[float]) -> IntCore:
         """The core for one sensor, of its bank and its sensor vector (4,)."""
@@ -85,7 +91,8 @@ def family_of(model: onnx.ModelProto) -> Family | None:
         wanted = {name: (len(op.bias), 1 + SENSOR_VALUES * (op.input == BANK)) for name, op in body.items()}
         if {name: values.shape for name, values in biases.items()} != wanted:
             raise ValueError("biases that are not its convolutions'")
-        return Family(core, biases)
+        kernels: Kernels = "fitted" if metadata(model).get(KERNELS) == "fitted" else "cut"
+        return Family(core, biases, kernels=kernels)
 
 
 def required_family(model: onnx.ModelProto) -> Family:

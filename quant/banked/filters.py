@@ -93,7 +93,12 @@ def gain_of(bank: Bank) -> float:
 
     The image's one weight, which no copy corrects, is a whole number so.
     """
-    return float(np.clip(np.rint(8 * bank.sigma / SIGMA) / 8, *GAINS))
+    return float(gains_of(np.array([bank.sigma]))[0])
+
+
+def gains_of(sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
+    """As `gain_of`, of the noise (N,) of as many banks."""
+    return np.asarray(np.clip(np.rint(8 * sigmas / SIGMA) / 8, *GAINS))
 
 
 def whole_bank(bank: Bank, scale: int, gain: float) -> WholeBank:

@@ -9,7 +9,8 @@ from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.export import banked_to_onnx, float_for, to_onnx
-from beers_deploy.model.convbeers import ConvBEERS, arrays, grow, load_network, save_network, vector_tensor
+from beers_deploy.model.bank import network_bank
+from beers_deploy.model.convbeers import ConvBEERS, arrays, grow, load_network, save_network, told, vector_tensor
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.shipped import shipped_names, shipped_weights
 from beers_deploy.model.variants import VARIANTS, Variant
@@ -55,9 +56,8 @@ def test_a_network_behind_a_bank_is_exported_for_one_sensor(scale: int, rows: in
     banked, sensor = behind_a_bank(Variant(1, 8, scale), 0.1), load_sensor("pleiades-degraded").nominal()
     model = banked_to_onnx(Weights(arrays(banked.state_dict()), banked.variant, {}), sensor, {})
     image = np.random.default_rng(1).random((2, 1, rows, columns), dtype=np.float32) * 0.02 + 0.4
-    vectors = vector_tensor(sensor).expand(2, -1)
     with torch.inference_mode():
-        expected = banked(torch.from_numpy(image), vectors).numpy()
+        expected = told(banked, vector_tensor(sensor), network_bank(sensor))(torch.from_numpy(image)).numpy()
     np.testing.assert_allclose(run(open_session(model), image), expected, atol=2e-6)
     placed = place(network_of(model, 64), load_dpu("vck190", "C32B6"))
     assert [node.op.name for node in placed.nodes if node.broken] == []
@@ -106,10 +106,11 @@ def test_conditioned_weights_become_the_sensors(conditioned: Path, sensor: str, 
     for file in (path, again):
         assert "warning" not in done("export", "--network", conditioned, "--sensor", sensor, "--out", file)
     assert path.read_bytes() == again.read_bytes()
-    unfolded, vector = load_network(conditioned)[0], vector_tensor(load_sensor(sensor).nominal())
+    unfolded, nominal = load_network(conditioned)[0], load_sensor(sensor).nominal()
+    plain = told(unfolded, vector_tensor(nominal), network_bank(nominal))
     image = np.random.default_rng(1).random((1, 1, 27, 35), dtype=np.float32)
     with torch.inference_mode():
-        expected = unfolded(torch.from_numpy(image), vector[None]).numpy()
+        expected = plain(torch.from_numpy(image)).numpy()
     assert float(np.abs(run(open_session(path), image) - expected).max()) < 1e-6
     assert metadata(onnx.load(path))["sensor"] == sensor
 

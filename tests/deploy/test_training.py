@@ -14,8 +14,8 @@ from beers_deploy.model.convbeers import load_network, save_network, told
 from beers_deploy.model.io.tensors import read_tensors
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.training import run as training
-from beers_deploy.model.training.patches import StoredPairs
 from beers_deploy.model.training.run import Log
+from beers_deploy.model.training.stored import StoredPairs
 from beers_deploy.model.variants import VARIANTS
 from tests.deploy.command_line import done, refused
 from tests.model.networks import behind_a_bank
@@ -51,7 +51,7 @@ def test_a_run_leaves_logs_pictures_and_weights_that_tell_how_they_were_made(
     output = run(images, tmp_path / "r", "--validate-every", "2")
     assert "WITHOUT the LPIPS term" in output
     assert [row["step"] for row in rows(tmp_path / "r" / "validation.csv")] == ["2", "4"]
-    assert set(rows(tmp_path / "r" / "log.csv")[0]) == {"step", "l1", "fft", "patches_per_s"}
+    assert set(rows(tmp_path / "r" / "log.csv")[0]) == {"step", "l1", "fft", "patches_per_s", "waited"}
     with Image.open(tmp_path / "r" / "validation.png") as picture:
         assert picture.width > 200
     _, recipe = load_network(tmp_path / "r" / "convbeers-xs.safetensors")
@@ -86,11 +86,15 @@ def test_a_run_is_not_resumed_with_other_data(images: Path, tmp_path: Path) -> N
 def test_a_checkpoint_with_a_flipped_bit_is_refused(images: Path, tmp_path: Path) -> None:
     run(images, tmp_path / "a")
     path = tmp_path / "a" / "checkpoint.safetensors"
-    content = bytearray(path.read_bytes())
-    content[-3000] ^= 1
-    path.write_bytes(content)
-    with pytest.raises(AssertionError, match="do not match their digest"):
-        run(images, tmp_path / "a", "--resume")
+    whole = path.read_bytes()
+    for damaged in (
+        whole[:-3000] + bytes([whole[-3000] ^ 1]) + whole[-2999:],
+        whole.replace(b'"step":"4"', b'"step":"2"'),
+    ):
+        assert damaged != whole
+        path.write_bytes(damaged)
+        with pytest.raises(AssertionError, match="does not match its digest"):
+            run(images, tmp_path / "a", "--resume")
 
 
 def test_a_conditioned_run_goes_on_from_others_and_resumes_to_the_same(images: Path, tmp_path: Path) -> None:

@@ -33,6 +33,13 @@ LEFT_OUT = {
     "xdputil query": "is a program of the board",
     "xdputil benchmark core.xmodel 3": "is a program of the board",
     "beers-deploy gate FLOAT INT8": "is a form: the page's own commands fill it in",
+    **{
+        f"beers-deploy train --recipe {name} --images aerial-train/ --images aerial-train2/ {more}": "takes hours"
+        for name, more in (
+            ("convbeers-xs", "--out runs/convbeers-xs"),
+            ("convbeers-s", "--device cuda --out runs/convbeers-s"),
+        )
+    },
 }
 """Commands that are not run, and why."""
 

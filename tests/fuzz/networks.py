@@ -13,6 +13,7 @@ from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, save_network
 from beers_deploy.model.training.checkpoint import TrainingRecipe
+from beers_deploy.model.training.source import Batch
 from beers_deploy.model.training.trainer import Trainer
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import BeersError
@@ -92,7 +93,7 @@ def _checkpoint(path: Path, steps: int) -> None:
 
 
 def _step(trainer: Trainer) -> None:
-    trainer.train_step(torch.ones(1, 1, 5, 5), torch.zeros(1, 1, 5, 5))
+    trainer.train_step(Batch(torch.ones(1, 1, 5, 5), torch.zeros(1, 1, 5, 5)))
 
 
 def go_on(path: Path) -> None:

@@ -2,7 +2,8 @@
 
 import torch
 
-from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, initialise
+from beers_deploy.model.bank import bank_of_vector
+from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Told, initialise
 from beers_deploy.model.variants import Variant
 
 
@@ -18,6 +19,11 @@ def behind_a_bank(variant: Variant, spread: float) -> BankedConvBEERS:
     initialise(network, generator)
     torch.nn.init.normal_(network.bias.weight, 0.0, spread, generator)
     return network.eval()
+
+
+def told_of(vectors: torch.Tensor) -> Told:
+    """What networks are told of the sensors of some vectors (N, 4)."""
+    return Told.of(vectors, [bank_of_vector(tuple(vector.tolist())) for vector in vectors])
 
 
 def radius_px(variant: Variant) -> int:

@@ -5,7 +5,7 @@ from torch.nn.functional import conv2d, pad
 from beers_deploy.model.bank import bank_of_vector
 from beers_deploy.model.convbeers import ConvBEERS, told
 from beers_deploy.model.variants import VARIANTS, Variant
-from tests.model.networks import behind_a_bank, plain, radius_px
+from tests.model.networks import behind_a_bank, plain, radius_px, told_of
 
 
 @pytest.mark.parametrize(("name", "parameters"), [("convbeers", 1_219_841), ("convbeers-s", 157_825)])
@@ -85,7 +85,7 @@ def test_each_image_of_a_batch_meets_its_own_sensor() -> None:
         torch.rand(3, 1, 13, 17, generator=torch.Generator().manual_seed(0)),
     )
     with torch.inference_mode():
-        together = network(images, VECTORS)
+        together = network(images, told_of(VECTORS))
         for number in range(3):
             alone, other = (told(network, VECTORS[k])(images[number : number + 1])[0] for k in (number, number - 1))
             assert float((together[number] - alone).abs().max()) <= 1e-6
@@ -100,4 +100,4 @@ def test_a_body_that_adds_nothing_leaves_the_analytic_restoration(scale: int) ->
     kernel = torch.from_numpy(bank_of_vector(tuple(VECTORS[1].tolist())).analytic).float()[None, None]
     wanted = image + conv2d(pad(image, [3] * 4, mode="reflect"), kernel)
     with torch.inference_mode():
-        torch.testing.assert_close(network(image, VECTORS[1:2]), wanted, rtol=0, atol=1e-6)
+        torch.testing.assert_close(network(image, told_of(VECTORS[1:2])), wanted, rtol=0, atol=1e-6)

@@ -114,7 +114,7 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, log: Log = no_l
         restore = with_steps(model, {}, sensor, reference.nominal(), around)
         return Method(name, restore, knowledge_of(model, degraded.name))
     model = found.model(sensor, network.endswith(INT8))
-    warn_outside(sensor, log)
+    warn_outside(sensor, found.kernels, log)
     specialise = None if other else _network_specialise(network, found, degraded, reference.nominal(), around, log)
     restore = _conditioned_restore(network, found, sensor, reference.nominal(), around)
     return Method(name, restore, knowledge_of(model, degraded.name), specialise)
@@ -127,7 +127,7 @@ def _network_specialise(
 
     def specialise(sensor: Instrument) -> Restore:
         known = profile_of(sensor, like)
-        warn_outside(known, log)
+        warn_outside(known, network.kernels, log)
         return _conditioned_restore(name, network, known, reference, around)
 
     return specialise

@@ -8,7 +8,8 @@ import numpy as np
 from beers_deploy.model.family import SensorFamily
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene
-from beers_deploy.model.training.patches import PatchRecipe, PatchSource
+from beers_deploy.model.training.patches import PatchRecipe
+from beers_deploy.model.training.source import PatchSource
 from beers_deploy.profiles import load_sensor
 
 

@@ -6,27 +6,40 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from beers_deploy.model.family import SensorFamily
+from beers_deploy.model.exposure import HEADROOM, factors_for
+from beers_deploy.model.family import SensorFamily, noise_over_full_scale
 from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene
-from beers_deploy.model.training.patches import PatchSource, StoredPairs, cut, draw_turn, pair_files, turn
+from beers_deploy.model.training.looks import VARIED
+from beers_deploy.model.training.patches import draw_turn, pair_files, turn
+from beers_deploy.model.training.source import Batch, PatchSource, cut
+from beers_deploy.model.training.stored import StoredPairs
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.response import MtfTable, PointSpread, packed
 from beers_deploy.profiles.sensor import Instrument
-from tests.model.training.sources import source
+from tests.model.training.sources import small_scene, source
+
+NOMINAL = load_sensor("pleiades-degraded").nominal()
 
 
 def test_the_same_seed_gives_the_same_batches_from_anywhere() -> None:
     straight, later = source().batches(), source().batches(first=18)
     batches = [next(straight) for _ in range(20)]
-    for degraded, reference in batches[18:]:
-        again = next(later)
-        assert np.array_equal(degraded, again[0])
-        assert np.array_equal(reference, again[1])
-    assert not np.array_equal(batches[0][0], next(source(seed=1).batches())[0])
+    for batch in batches[18:]:
+        assert equal(batch, next(later))
+    assert not equal(batches[0], next(source(seed=1).batches()))
+
+
+def parts(batch: Batch) -> list[torch.Tensor]:
+    return [batch.degraded, batch.reference, *(batch.told.parts if batch.told else ())]
+
+
+def equal(one: Batch, other: Batch) -> bool:
+    return all(torch.equal(a, b) for a, b in zip(parts(one), parts(other), strict=True))
 
 
 class OneSensor(SensorFamily):
@@ -36,33 +49,59 @@ class OneSensor(SensorFamily):
         return replace(self.like, mtf_nyquist=0.15, mtf_nyquist_along=0.03, alpha=0.0, beta=0.0)
 
 
-def steps(image: np.ndarray) -> tuple[float, float]:
+class Alike(SensorFamily):
+    """A family of one."""
+
+    def draw(self, _generator: np.random.Generator) -> Instrument:
+        return self.like
+
+
+def steps(image: torch.Tensor) -> tuple[float, float]:
     """Mean difference of neighbours, along a row and down a column."""
-    return float(np.abs(np.diff(image, axis=-1)).mean()), float(np.abs(np.diff(image, axis=-2)).mean())
+    return float(image.diff(dim=-1).abs().mean()), float(image.diff(dim=-2).abs().mean())
 
 
 def test_a_turned_patch_comes_with_the_sensor_as_it_lies() -> None:
-    """Against its reference, a patch has lost more along the axis that its vector calls the more blurred one."""
+    """A patch has lost more along the axis that its vector and its bank call the more blurred one."""
     scene = Scene("noise", 100 + 60 * np.random.default_rng(0).random((420, 480), np.float32))
     recipe = replace(
         source().recipe, family=OneSensor(load_sensor("pleiades-degraded").nominal()), oversamplings=(2,)
     )
     ways = set()
-    for degraded, reference, vectors in islice(PatchSource([scene], recipe, 3, 0).batches(), 30):
-        for one, other, vector in zip(degraded, reference, vectors, strict=True):
+    for batch in islice(PatchSource([scene], recipe, 3, 0).batches(), 30):
+        assert batch.told is not None
+        seen = zip(batch.degraded, batch.reference, batch.told.vectors, batch.told.filters, strict=True)
+        for one, other, vector, filters in seen:
             across, along = (a / b for a, b in zip(steps(one), steps(other), strict=True))
             assert (across > along) == bool(vector[0] > vector[1])
+            sharpened = steps(filters[-1])  # the axis that lost more is sharpened more
+            assert (across > along) == (sharpened[0] < sharpened[1])
             ways.add(across > along)
     assert ways == {True, False}
 
 
 def test_conditioned_patches_come_with_vectors_of_many_sensors_and_the_same_again() -> None:
     first, again = ([*islice(source(conditioned=True).batches(k), 20 - k)] for k in (0, 17))
-    vectors = np.concatenate([batch[2] for batch in first])
+    vectors = torch.cat([batch.told.vectors for batch in first if batch.told is not None])
     assert vectors.shape == (60, 4)
-    assert vectors.std(0).min() > 0.3
-    for one, two in zip(first[17:], again, strict=True):
-        assert all(np.array_equal(a, b) for a, b in zip(one, two, strict=True))
+    assert float(vectors.std(0).min()) > 0.3
+    assert all(equal(one, two) for one, two in zip(first[17:], again, strict=True))
+
+
+def test_dark_patches_are_those_of_a_brighter_sensor_as_a_restoration_shows_them() -> None:
+    """No patch could be brightened once more, and the noise that the network is told grows with the factor."""
+    family = Alike(replace(NOMINAL, alpha=0.0, beta=(100 / 200) ** 2))
+    recipe = replace(source().recipe, family=family, looks=replace(VARIED, lit_share=1.0))
+    told = set()
+    for batch in islice(PatchSource([small_scene()], recipe, 3, 0).batches(), 40):
+        assert batch.told is not None
+        for patch, sigma in zip(batch.degraded, batch.told.sigmas, strict=True):
+            factor = round(float(sigma) / noise_over_full_scale(family.like))
+            told.add(factor)
+            larger = [each for each in factors_for(family.like) if each > factor]
+            assert all(float(patch.max()) * each / factor > HEADROOM for each in larger)
+            assert factor == 1 or float(patch.max()) <= HEADROOM
+    assert len(told) > 1
 
 
 def test_a_blind_network_sees_the_axes_of_one_sensor_as_they_are() -> None:
@@ -72,8 +111,8 @@ def test_a_blind_network_sees_the_axes_of_one_sensor_as_they_are() -> None:
     across, along = (replace(profile.mtf_nyquist, value=value) for value in (0.3, 0.03))
     anisotropic = replace(profile, mtf_nyquist=across, mtf_nyquist_along=along)
     recipe = replace(source().recipe, degraded=anisotropic, oversamplings=(2,))
-    for degraded, reference in islice(PatchSource([scene], recipe, 3, 0).batches(), 30):
-        kept = [a / b for a, b in zip(steps(degraded), steps(reference), strict=True)]
+    for batch in islice(PatchSource([scene], recipe, 3, 0).batches(), 30):
+        kept = [a / b for a, b in zip(steps(batch.degraded), steps(batch.reference), strict=True)]
         assert kept[0] > kept[1]
 
 
@@ -102,7 +141,7 @@ def test_a_lopsided_blur_is_neither_mirrored_nor_turned() -> None:
 
 
 def test_patches_lie_within_full_scale_and_a_pair_shows_the_same_ground() -> None:
-    degraded, reference = next(source().batches())
+    degraded, reference, _ = next(source().batches())
     assert degraded.shape == reference.shape == (3, 1, 32, 32)
     for image in (degraded, reference):
         assert 0 <= float(image.min()) <= float(image.max()) <= 1
@@ -116,21 +155,21 @@ def test_scenes_too_small_for_a_patch_are_refused() -> None:
 
 
 def test_cut_takes_whole_patches_and_turn_keeps_pairs_together() -> None:
-    image = np.arange(2 * 30 * 41).reshape(2, 30, 41)
+    image = torch.arange(2 * 30 * 41).reshape(2, 30, 41)
     rng = np.random.default_rng(0)
     patches = cut(image, 8, rng)
     assert patches.shape[1:] == (2, 8, 8)
-    turned = turn(patches, rng)
+    turned = turn(patches.numpy(), rng)
     assert (turned[:, 1] - turned[:, 0] == 30 * 41).all()
 
 
 def test_two_workers_share_the_batches_of_one() -> None:
     """Shard by shard in turn: together they see what one alone would see."""
     alone = source().batches()
-    shards = [[next(alone)[0] for _ in range(PatchSource.SHARD_BATCHES)] for _ in range(2)]
+    shards = [list(islice(alone, PatchSource.SHARD_BATCHES)) for _ in range(2)]
     for rank in range(2):
         own = source(rank=rank, workers=2).batches()
-        assert all(np.array_equal(next(own)[0], batch) for batch in shards[rank])
+        assert all(equal(next(own), batch) for batch in shards[rank])
 
 
 def stored(folder: Path, *degraded: np.ndarray) -> StoredPairs:
@@ -146,18 +185,18 @@ def test_stored_pairs_are_cut_alike_and_the_same_from_anywhere(tmp_path: Path) -
     pairs = stored(tmp_path)
     straight = pairs.batches()
     batches = [next(straight) for _ in range(4)]
-    degraded, reference = batches[3]
+    degraded, reference, _ = batches[3]
     assert degraded.shape == reference.shape == (4, 1, 24, 24)
-    np.testing.assert_array_equal(np.rint(reference * 4095), 2 * np.rint(degraded * 4095))
-    assert np.array_equal(next(pairs.batches(first=3))[0], degraded)
-    assert not np.array_equal(batches[0][0], degraded)
+    assert torch.equal((reference * 4095).round(), 2 * (degraded * 4095).round())
+    assert equal(next(pairs.batches(first=3)), batches[3])
+    assert not equal(batches[0], batches[3])
 
 
 @pytest.mark.parametrize("quarters", [True, False])
 def test_stored_pairs_of_two_different_axes_keep_them(quarters: bool, tmp_path: Path) -> None:
     """Rows of one brightness each stay rows, unless a patch may be turned by a quarter."""
     rows = np.repeat(np.arange(41, dtype=np.uint16)[:, None] * 45, 53, 1)
-    patches, _ = next(replace(stored(tmp_path, rows), batch=32, quarters=quarters).batches())
+    patches, *_ = next(replace(stored(tmp_path, rows), batch=32, quarters=quarters).batches())
     kept = [bool((patch == patch[..., :1]).all()) for patch in patches]
     assert any(kept)
     assert all(kept) is not quarters

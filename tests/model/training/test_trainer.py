@@ -23,8 +23,8 @@ from beers_deploy.model.training.checkpoint import (
     TrainingRecipe,
     finish,
 )
-from beers_deploy.model.training.patches import PatchSource
-from beers_deploy.model.training.trainer import Precision, Schedule, Trainer
+from beers_deploy.model.training.source import Batch, PatchSource
+from beers_deploy.model.training.trainer import Precision, Schedule, Speed, Trainer
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
 from tests.model.training.sources import small_scene, source
@@ -109,9 +109,10 @@ class Poisoned(PatchSource):
 
     bad: frozenset[int] | None = None
 
-    def batches(self, first: int = 0) -> Iterator[tuple[np.ndarray, ...]]:
-        for number, (degraded, reference) in enumerate(super().batches(first), first):
-            yield (degraded * float("nan") if self.bad is None or number in self.bad else degraded), reference
+    def batches(self, first: int = 0) -> Iterator[Batch]:
+        for number, batch in enumerate(super().batches(first), first):
+            bad = self.bad is None or number in self.bad
+            yield batch._replace(degraded=batch.degraded * float("nan")) if bad else batch
 
 
 def poisoned(bad: frozenset[int] | None = None) -> Poisoned:
@@ -220,7 +221,7 @@ def test_a_run_goes_on_in_the_other_format_and_the_loss_with_it(first: Precision
     checkpoint, seen = tmp_path / "checkpoint.safetensors", list[tuple[int, float]]()
     recipe = TrainingRecipe(steps=40, batch=3, warm_up_steps=2, learning_rate=3e-3)
 
-    def note(step: int, terms: Mapping[str, float], _: float) -> None:
+    def note(step: int, terms: Mapping[str, float], _: Speed) -> None:
         seen.append((step, terms["l1"]))
         if len(seen) == 2:
             raise KeyboardInterrupt
@@ -254,10 +255,11 @@ with joined("cpu") as worker:
 class Together:
     """The batches of two workers as one."""
 
-    def batches(self, first: int = 0) -> Iterator[tuple[np.ndarray, ...]]:
+    def batches(self, first: int = 0) -> Iterator[Batch]:
         each = [source(rank=rank, workers=2).batches(first) for rank in range(2)]
         for one, other in zip(*each, strict=True):
-            yield tuple(map(np.concatenate, zip(one, other, strict=True)))
+            degraded, reference = (torch.cat(both) for both in zip(one[:2], other[:2], strict=True))
+            yield Batch(degraded, reference)
 
 
 @pytest.mark.slow

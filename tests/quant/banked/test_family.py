@@ -17,7 +17,7 @@ from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.banked.calibrate import bank_results, map_steps, quantise_family
 from beers_deploy.quant.banked.family import FAMILY, Family, delta_of_file, family_of, required_family, with_delta
-from beers_deploy.quant.banked.filters import channels, gain_of
+from beers_deploy.quant.banked.filters import channels, gain_of, gains_of
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.core import IntConv, IntCore, shift_faults
 from beers_deploy.quant.encodings import board_model, encoding_faults, host_model, read_core
@@ -25,6 +25,7 @@ from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.samples import Remade
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.walk import tiling_of
+from tests.model.networks import told_of
 from tests.quant.banked.test_filters import textured
 
 SENSORS = [(0.2, 0.1, -0.3, -0.2), (-0.9, -0.8, 0.4, 0.5), (0.6, 0.3, 0.8, 0.9), (-0.2, -0.4, -0.7, -0.9)]
@@ -63,7 +64,7 @@ def test_int8_is_near_the_float_network_for_every_sensor(
     made, family = pair
     image = 0.3 + 0.3 * textured(46, 58, 9)  # within eight units of the quietest sensor, where int8 ends
     with torch.inference_mode():
-        wanted = made(torch.from_numpy(image), torch.tensor([vector])).clamp(0, 1).numpy()
+        wanted = made(torch.from_numpy(image), told_of(torch.tensor([vector]))).clamp(0, 1).numpy()
     found = run(open_session(host_model(core_of(family, vector), {})), image)
     unit = bank_of_vector(vector).unit
     assert np.sqrt(np.square(found - wanted).mean()) < 0.05 * unit
@@ -75,11 +76,12 @@ def test_a_float_network_rounded_as_its_file_errs_as_that_does(
     pair: tuple[BankedConvBEERS, Family], vector: tuple[float, ...]
 ) -> None:
     made, family = pair
-    image, told = 0.3 + 0.3 * textured(46, 58, 9), torch.tensor([vector])
+    image, told = 0.3 + 0.3 * textured(46, 58, 9), told_of(torch.tensor([vector]))
     stream, *inner = (torch.from_numpy(each)[:, None, None] for each in map_steps(family, weights_of(made)))
     with torch.inference_mode():
         plain = made(torch.from_numpy(image), told)
-        rounded = made(torch.from_numpy(image), told, rounding=Rounding(stream, tuple(inner), gain_of))
+        steps = Rounding(stream, tuple(inner), gains_of).steps(told.sigmas)
+        rounded = made(torch.from_numpy(image), told, steps=steps)
     file = run(open_session(host_model(core_of(family, vector), {})), image)
     errors = file - plain.clamp(0, 1).numpy(), (rounded - plain).numpy()
     ratio = np.linalg.norm(errors[1]) / np.linalg.norm(errors[0])

@@ -1,0 +1,163 @@
+"""A shipped network made from its recipe: stage after stage, its INT8 file, and its model card.
+
+OUT/1-float/      checkpoint, logs, pictures and weights of the first stage
+OUT/2-rounded/    of the second; start-int8.onnx is the INT8 file whose roundings it trains with
+OUT/NAME.safetensors  OUT/NAME-int8.onnx  OUT/NAME.md
+"""
+
+import hashlib
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+
+from beers_deploy.model.family import SensorFamily
+from beers_deploy.model.io.files import sha256, whole_file
+from beers_deploy.model.io.images import list_images, site_of
+from beers_deploy.model.processor import processor_name
+from beers_deploy.model.shipped import INT8, SENSOR, shipped_weights
+from beers_deploy.model.training.checkpoint import TrainingRecipe
+from beers_deploy.model.training.patches import PatchRecipe
+from beers_deploy.model.training.recipe import NetworkRecipe, Stage
+from beers_deploy.model.training.run import Run, train
+from beers_deploy.model.training.trainer import Worker
+from beers_deploy.model.variants import VARIANTS, Variant
+from beers_deploy.network_files import Conditioned
+from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
+from beers_deploy.quant.onnx_file import save_onnx
+from beers_deploy.quantise import family_model, rounding_of
+
+Say = Callable[[str], None]
+
+
+def make_network(
+    recipe: NetworkRecipe, toml: str, images: Sequence[Path], out: Path, resume: bool, device: str, say: Say
+) -> None:
+    """Run a recipe to its end.
+
+    Args:
+        recipe: of the network.
+        toml: its text, for the model card.
+        images: folders of photographs.
+        out: folder of what is made.
+        resume: whether to go on with what lies there; else it holds no run.
+        device: cpu or cuda.
+        say: is told what was written.
+    """
+    weights = shipped_weights(recipe.start) if recipe.start else None
+    for number, stage in enumerate(recipe.stages, 1):
+        run = stage_run(recipe, number, stage, images, out, weights, device)
+        goes_on = resume and run.checkpoint.exists()
+        train(run, goes_on, Worker(), say)
+        weights = run.weights
+        say(f"stage {number} of {len(recipe.stages)}, {stage.name}: wrote {weights}")
+    assert weights is not None  # noqa: S101 - a recipe has a stage
+    finished = out / f"{recipe.variant}.safetensors"
+    shutil.copyfile(weights, finished)
+    int8 = out / f"{recipe.variant}{INT8}.onnx"
+    save_onnx(family_model(Conditioned(recipe.variant, finished), images), int8)
+    card = out / f"{recipe.variant}.md"
+    with whole_file(card) as temporary:
+        temporary.write_text(model_card(recipe, toml, images), encoding="utf-8")
+    for path in (finished, int8, card):
+        say(f"wrote {path}")
+
+
+def stage_run(
+    recipe: NetworkRecipe,
+    number: int,
+    stage: Stage,
+    images: Sequence[Path],
+    out: Path,
+    start: Path | None,
+    device: str,
+) -> Run:
+    """Return the run of a stage; the INT8 file whose roundings it trains with is made where it is not there."""
+    folder = out / f"{number}-{stage.name}"
+    rounding, digest = None, ""
+    if stage.rounding and start is not None:
+        int8 = folder / "start-int8.onnx"
+        if not int8.exists():
+            save_onnx(family_model(Conditioned(recipe.variant, start), images), int8)
+        rounding, digest = rounding_of(int8, start), sha256(int8)
+    degraded, reference = load_sensor(SENSOR), load_sensor(REFERENCE)
+    family = SensorFamily(degraded.nominal(), other_curves=recipe.other_curves)
+    patches = PatchRecipe(
+        degraded,
+        reference,
+        patch_px=recipe.patch_px,
+        looks=recipe.looks,
+        family=family,
+        noisy_reference=False,
+    )
+    numbers = TrainingRecipe(
+        steps=stage.steps,
+        batch=stage.batch,
+        learning_rate=stage.learning_rate,
+        ema_decay=stage.average,
+        loss=recipe.loss,
+        seed=recipe.seed + number - 1,
+        rounding=digest,
+    )
+    return Run(
+        recipe.variant,
+        numbers,
+        patches,
+        tuple(images),
+        None,
+        folder,
+        charts=recipe.charts,
+        held_out=recipe.held_out,
+        start=start,
+        device=device,
+        precision=stage.precision,
+        rounding=rounding,
+    )
+
+
+def model_card(recipe: NetworkRecipe, toml: str, images: Sequence[Path]) -> str:
+    """Return the text of a network's card: how it is made, from what, and on what it was made."""
+    variant = VARIANTS[recipe.variant]
+    files = [file for folder in images for file in list_images(folder)]
+    digests = "".join(f"{file.name} {sha256(file)}\n" for file in sorted(files, key=lambda file: file.name))
+    seen = [file for file in files if site_of(file.name) not in recipe.held_out]
+    data = hashlib.sha256(digests.encode()).hexdigest()
+    attribution = "".join(f"- {line}\n" for line in recipe.attribution)
+    notes = "".join(f"{line}\n\n" for line in recipe.notes)
+    patches = sum(stage.steps * stage.batch for stage in recipe.stages)
+    return f"""# {recipe.variant}
+
+{described(variant)} behind the bank of its sensor: one set of weights and one INT8 file for every sensor in range.
+
+**Made by**
+
+    beers-deploy train --recipe {recipe.variant} --images aerial/ --out runs/{recipe.variant}
+
+on {processor_name()} with PyTorch {torch.__version__}: {patches} patches of {len(seen)} photographs, whose list of \
+names and digests has the SHA-256 `{data[:16]}`, and {recipe.charts} drawn charts. Sites that are held out choose; \
+{len(files) - len(seen)} photographs show them. The recipe:
+
+```toml
+{toml.strip()}
+```
+
+{notes}**Data**
+
+{attribution}"""
+
+
+def described(variant: Variant) -> str:
+    """Return blocks, features, resolution and parameters in words."""
+    parameters = sum(_size(shape) for shape in variant.banked_shapes.values())
+    at = f" at 1/{variant.scale} of the resolution" if variant.scale > 1 else ""
+    return (
+        f"{variant.blocks} residual blocks of {variant.features} features{at}, {parameters / 1000:.0f} k parameters,"
+    )
+
+
+def _size(shape: Sequence[int]) -> int:
+    size = 1
+    for side in shape:
+        size *= side
+    return size

@@ -1,0 +1,138 @@
+"""Curves of the MTF that a training draws, besides the formula's: all instruments of one contrast at Nyquist differ.
+
+A curve is what the optics leave, times sinc(f) of the square detector. Of the optics:
+
+    formula     exp(-gamma f)
+    Gaussian    exp(-a f^2): optics and electronics with several small blurs
+    pupil       the autocorrelation of a circular pupil, with or without a central obscuration
+    bent        the formula, less or more by a smooth hill at middle frequencies
+
+and along the track any of them times sinc(s f), the motion during an exposure. Each is scaled so that its contrast at
+Nyquist is the one asked for.
+"""
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beers_deploy.model.simulator.mtf import sensor_mtf
+from beers_deploy.profiles.response import NYQUIST, MtfTable
+from beers_deploy.profiles.sensor import Instrument
+
+Curve = NDArray[np.float64]
+
+Kernels = Literal["cut", "fitted"]
+"""How the filters in front of a network become kernels of 7 x 7: cut out of the whole, or fitted. The second kind
+was trained on the curves that are drawn here."""
+
+FREQUENCIES: Curve = np.linspace(0, NYQUIST, 26)
+"""Of a drawn table, in cycles per target pixel."""
+
+OBSCURATIONS = (0.0, 0.15, 0.3, 0.45)
+"""Diameter of the central obscuration over that of the pupil."""
+DEEPEST_BEND = 0.25
+LONGEST_SMEAR_PX = 1.0
+PUPIL_GRID = 256
+"""Samples across twice the pupil, from which its autocorrelation is computed."""
+
+
+def draw_table(across: float, along: float, generator: np.random.Generator) -> MtfTable:
+    """Draw a curve that is not the formula's.
+
+    Args:
+        across: contrast at Nyquist across the track.
+        along: contrast at Nyquist along it; the curve is of the same kind.
+        generator: of the kind and of its numbers.
+    """
+    optics = _drawn_optics(generator)
+    smear_px = float(generator.choice([0.0, generator.uniform(0, LONGEST_SMEAR_PX)]))
+    detector = np.sinc(FREQUENCIES)
+    motion = np.sinc(smear_px * FREQUENCIES)
+    left = min(along / float(detector[-1] * motion[-1]), 1.0)
+    curves = optics(across / float(detector[-1])) * detector, optics(left) * detector * motion
+    return MtfTable(*(tuple(values.tolist()) for values in (FREQUENCIES, *curves)))
+
+
+def _drawn_optics(generator: np.random.Generator) -> Callable[[float], Curve]:
+    """Draw a kind of optics: its contrast at FREQUENCIES, for a wanted contrast at Nyquist."""
+    kind = generator.choice(["Gaussian", "pupil", "bent"], p=[0.25, 0.35, 0.4])
+    share = FREQUENCIES / NYQUIST
+    if kind == "Gaussian":
+        return lambda contrast: np.asarray(contrast ** (share**2))
+    if kind == "pupil":
+        obscuration = float(generator.choice(OBSCURATIONS))
+        return lambda contrast: pupil_contrast(contrast, obscuration)
+    depth = float(generator.uniform(-DEEPEST_BEND, DEEPEST_BEND))
+    middle, width = float(generator.uniform(0.3, 0.6)), float(generator.uniform(0.15, 0.35))
+    hill = np.exp(-(((share - middle) / width) ** 2)) * np.sin(math.pi * share)
+    return lambda contrast: np.asarray(np.minimum(contrast**share * (1 + depth * hill), 1.0))
+
+
+def pupil_contrast(contrast: float, obscuration: float) -> Curve:
+    """The contrast at FREQUENCIES behind a pupil whose cut-off frequency leaves `contrast` at Nyquist."""
+    frequency, left = _pupil(obscuration)
+    # It falls, but for rounding: read backwards it can be searched.
+    at_nyquist = float(np.interp(contrast, left[::-1], frequency[::-1]))
+    return np.asarray(np.interp(FREQUENCIES / NYQUIST * at_nyquist, frequency, left))
+
+
+@lru_cache
+def _pupil(obscuration: float) -> tuple[Curve, Curve]:
+    """Frequencies over the cut-off frequency, and the contrast that a pupil with an obscuration leaves there."""
+    place = (np.arange(2 * PUPIL_GRID) - PUPIL_GRID + 0.5) / (PUPIL_GRID / 2)
+    radius = np.hypot(place[:, None], place[None, :])
+    pupil = ((radius <= 1) & (radius >= obscuration)).astype(np.float64)
+    overlap = np.fft.ifft2(np.abs(np.fft.fft2(pupil)) ** 2).real[0, : PUPIL_GRID + 1]
+    left = np.minimum.accumulate(np.maximum(overlap / overlap[0], 0.0))
+    return np.linspace(0, 1, PUPIL_GRID + 1), np.asarray(left)
+
+
+MARGIN = 0.05
+"""How far a curve may lie outside those of training, as a share: networks lose 0.1 dB and more from there on
+(measured)."""
+
+
+def departure(sensor: Instrument, kernels: Kernels) -> str:
+    """Say where a sensor's curve departs from the curves that a network was trained on; "" if it does not.
+
+    Args:
+        sensor: its MTF and smear.
+        kernels: of the network's banks: networks of before they were fitted know the formula's curve alone.
+    """
+    zero = np.zeros((1, 1))
+    for axis, contrast in zip(("across", "along"), sensor.mtf_axes, strict=True):
+        frequency = FREQUENCIES[None]
+        seen = sensor_mtf(frequency, zero, sensor) if axis == "across" else sensor_mtf(zero, frequency.T, sensor)
+        curve = np.abs(np.ravel(seen))
+        smeared = axis == "along" and bool(sensor.smear_px)
+        at_nyquist = float(curve[-1]) if smeared else contrast
+        known = np.stack(_known_curves(at_nyquist, kernels))
+        low, high = known.min(0) * (1 - MARGIN), known.max(0) * (1 + MARGIN)
+        outside = np.maximum(low / np.maximum(curve, 1e-9), curve / high)
+        worst = int(outside[:-1].argmax())
+        if outside[worst] > 1:
+            return (
+                f"the MTF {axis} the track is {curve[worst]:.3g} at {FREQUENCIES[worst]:.2g} cycles per pixel, where "
+                f"the network was trained on {low[worst]:.3g} to {high[worst]:.3g} for that contrast at Nyquist: it "
+                "may restore worse than the traditional pipeline"
+            )
+    return ""
+
+
+def _known_curves(contrast: float, kernels: Kernels) -> list[Curve]:
+    """Curves at FREQUENCIES that training draws for a contrast at Nyquist: the outermost of each kind."""
+    detector = np.sinc(FREQUENCIES)
+    left = min(contrast / float(detector[-1]), 1.0)
+    share = FREQUENCIES / NYQUIST
+    formula = left**share
+    if kernels == "cut":
+        return [formula * detector]
+    hills = [np.exp(-(((share - middle) / 0.35) ** 2)) * np.sin(math.pi * share) for middle in (0.3, 0.45, 0.6)]
+    lower = [formula * (1 - DEEPEST_BEND * hill) for hill in hills]
+    higher = [np.minimum(formula * (1 + DEEPEST_BEND * hill), 1.0) for hill in hills]
+    pupils = [pupil_contrast(left, obscuration) for obscuration in OBSCURATIONS]
+    return [np.asarray(curve * detector) for curve in (formula, left ** (share**2), *pupils, *lower, *higher)]

@@ -1,0 +1,111 @@
+"""A drawn chart: squares of flat ground, faint bars, zone plates, soft texture, discs and points, dark and bright.
+
+Photographs show faint and fine patterns rarely, and never without a camera's noise. What a network should do with
+them it learns from charts: to keep what the raw image shows, and to add nothing to what is flat.
+"""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beers_deploy.model.simulator.procedural import texture
+from beers_deploy.model.simulator.sampling import Scene
+
+SIDE_PX, SQUARE_PX = 1080, 180
+"""Of a chart, and of each square: whole target pixels at every oversampling from 2 to 6."""
+
+LEVELS = (3.0, 390.0)
+"""Radiance of the ground in W/m2/sr/um, log-uniform."""
+PERIODS_PX = (3.0, 24.0)
+"""Of bars, in scene pixels, log-uniform."""
+CONTRASTS = (0.01, 0.6)
+"""Of bars, plates and discs: half of the difference over the mean, log-uniform."""
+POINTS = (50.0, 20_000.0)
+"""Radiance of a point of one scene pixel, log-uniform."""
+
+Pattern = NDArray[np.float64]
+
+
+def draw_charts(count: int, seed: int) -> list[Scene]:
+    """Draw charts, each with its own generator."""
+    generators = np.random.default_rng(seed).spawn(count)
+    return [Scene(f"chart {number}", chart(generator)) for number, generator in enumerate(generators)]
+
+
+def chart(generator: np.random.Generator) -> NDArray[np.float32]:
+    """Draw a chart (SIDE_PX, SIDE_PX) of radiance in W/m2/sr/um."""
+    kinds = (flat, bars, zone_plate, soft_texture, discs, points)
+    radiance = np.empty((SIDE_PX, SIDE_PX))
+    for top in range(0, SIDE_PX, SQUARE_PX):
+        for left in range(0, SIDE_PX, SQUARE_PX):
+            kind: Callable[[float, np.random.Generator], Pattern] = kinds[int(generator.integers(len(kinds)))]
+            level = _log_uniform(generator, LEVELS)
+            radiance[top : top + SQUARE_PX, left : left + SQUARE_PX] = kind(level, generator)
+    return radiance.astype(np.float32)
+
+
+def flat(level: float, _generator: np.random.Generator) -> Pattern:
+    """One radiance everywhere."""
+    return np.full((SQUARE_PX, SQUARE_PX), level)
+
+
+def bars(level: float, generator: np.random.Generator) -> Pattern:
+    """Bars of any direction, between a sine and a square wave."""
+    y, x = _coordinates()
+    angle = float(generator.uniform(0, math.pi))
+    if generator.random() < 0.5:  # rows and columns are the commonest direction, and the hardest: they alias
+        angle = float(generator.choice([0.0, math.pi / 2]))
+    phase = 2 * math.pi / _log_uniform(generator, PERIODS_PX) * (x * math.cos(angle) + y * math.sin(angle))
+    return _wave(level, phase + generator.uniform(0, 2 * math.pi), generator)
+
+
+def zone_plate(level: float, generator: np.random.Generator) -> Pattern:
+    """Rings whose period falls from the middle outwards, to PERIODS_PX[0] at the most."""
+    y, x = _coordinates()
+    # The local frequency of a r^2 is a r / pi.
+    steepest = math.pi / (PERIODS_PX[0] * SQUARE_PX / math.sqrt(2))
+    return _wave(level, steepest * generator.uniform(0.3, 1) * (x**2 + y**2), generator)
+
+
+def soft_texture(level: float, generator: np.random.Generator) -> Pattern:
+    """Texture of fields, lawn and water: 1/f, of little contrast."""
+    pattern = np.log(texture(SQUARE_PX, SQUARE_PX, generator))
+    return np.asarray(level * np.exp(pattern * float(generator.uniform(0.05, 1.0))), np.float64)
+
+
+def discs(level: float, generator: np.random.Generator) -> Pattern:
+    """Discs a little brighter or darker than the ground."""
+    y, x = _coordinates()
+    found = np.full((SQUARE_PX, SQUARE_PX), level)
+    for _ in range(12):
+        middle_y, middle_x = generator.uniform(-SQUARE_PX / 2, SQUARE_PX / 2, 2)
+        inside = np.hypot(y - middle_y, x - middle_x) < generator.uniform(2, 30)
+        found[inside] = level * (1 + float(generator.choice([-1, 1])) * _log_uniform(generator, CONTRASTS))
+    return found
+
+
+def points(level: float, generator: np.random.Generator) -> Pattern:
+    """Points of light on flat ground."""
+    found = np.full((SQUARE_PX, SQUARE_PX), level)
+    for _ in range(30):
+        row, column = generator.integers(SQUARE_PX, size=2)
+        found[row, column] += _log_uniform(generator, POINTS)
+    return found
+
+
+def _coordinates() -> tuple[Pattern, Pattern]:
+    places = np.asarray(np.arange(SQUARE_PX) - (SQUARE_PX - 1) / 2, np.float64)
+    return places[:, None], places[None, :]
+
+
+def _wave(level: float, phase: Pattern, generator: np.random.Generator) -> Pattern:
+    steepness = float(generator.uniform(1, 4))
+    contrast = _log_uniform(generator, CONTRASTS)
+    return np.asarray(level * (1 + contrast * np.clip(steepness * np.sin(phase), -1, 1)))
+
+
+def _log_uniform(generator: np.random.Generator, ends: tuple[float, float]) -> float:
+    low, high = ends
+    return low * math.exp(float(generator.uniform()) * math.log(high / low))

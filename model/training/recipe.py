@@ -1,0 +1,169 @@
+"""A recipe: everything that makes a shipped network, as a TOML file.
+
+`model/recipes/NAME.toml` holds the recipe of each shipped network. `beers-deploy train --recipe NAME` runs it.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, field, fields
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+from beers_deploy.model.training.looks import Looks
+from beers_deploy.model.training.losses import LossWeights
+from beers_deploy.model.training.trainer import Precision
+from beers_deploy.model.variants import variant_named
+from beers_deploy.profiles.constant import check_keys, is_number
+from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.toml import read_toml_text
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+
+T = TypeVar("T")
+
+
+def _whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _number(value: Any) -> bool:
+    return is_number(value) and value >= 0
+
+
+def _list_of(value: Any, fits: Callable[[Any], bool]) -> bool:
+    return isinstance(value, list) and all(map(fits, value))
+
+
+KINDS: Mapping[object, tuple[Callable[[Any], bool], str]] = {
+    bool: (lambda value: isinstance(value, bool), "true or false"),
+    str: (lambda value: isinstance(value, str), "a text"),
+    int: (_whole, "a whole number from 0 on"),
+    float: (_number, "a number from 0 on"),
+    tuple[float, float]: (lambda value: _list_of(value, _number) and len(value) == 2, "two numbers from 0 on"),
+    tuple[str, ...]: (lambda value: _list_of(value, lambda each: isinstance(each, str)), "a list of texts"),
+    Precision: (lambda value: value in get_args(Precision), f"one of {', '.join(get_args(Precision))}"),
+}
+"""What a field of each kind takes, and how a message says it."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of a training with one learning rate schedule.
+
+    Attributes:
+        name: of its folder.
+        steps: gradient steps.
+        batch: patches a step.
+        learning_rate: the highest; a cosine leads it down to 0.
+        rounding: whether maps are rounded as in the INT8 file of the weights that the stage begins with.
+        precision: of the blocks, float32 or bfloat16.
+        average: decay a step of the running average of the weights, which is what is kept.
+    """
+
+    name: str
+    steps: int
+    batch: int = 8
+    learning_rate: float = 1e-3
+    rounding: bool = False
+    precision: Precision = "bfloat16"
+    average: float = 0.999
+
+
+@dataclass(frozen=True)
+class NetworkRecipe:
+    """All that makes a network.
+
+    Attributes:
+        variant: its size.
+        stages: in their order; each begins with the weights of the one before.
+        start: shipped network whose weights, grown, the first stage begins with; "" draws weights.
+        seed: of weights, charts and patches; each stage adds its number.
+        patch_px: side of a patch.
+        charts: drawn charts beside the images.
+        held_out: sites that are not trained on; one is chosen by them.
+        other_curves: share of sensors with an MTF of another curve than the formula's.
+        looks: of the ground.
+        loss: weights of its terms.
+        attribution: of the images.
+        notes: sentences for the model card.
+    """
+
+    variant: str
+    stages: tuple[Stage, ...]
+    start: str = ""
+    seed: int = 0
+    patch_px: int = 96
+    charts: int = 0
+    held_out: tuple[str, ...] = ()
+    other_curves: float = 0.0
+    looks: Looks = field(default_factory=Looks)
+    loss: LossWeights = field(default_factory=LossWeights)
+    attribution: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def recipe_names() -> list[str]:
+    """The names of the shipped recipes."""
+    return sorted(path.stem for path in RECIPES.glob("*.toml"))
+
+
+def recipe_file(name: str) -> Path:
+    """Where a recipe lies: a shipped name, or the path of one's own .toml file."""
+    if name.endswith(".toml"):
+        return Path(name)
+    if name not in recipe_names():
+        expected = f"one of {', '.join(recipe_names())}, or the path of a .toml file"
+        raise ProfileError(f"recipe {name!r}", expected=expected, got=repr(name), remedy="choose one of them")
+    return RECIPES / f"{name}.toml"
+
+
+def load_recipe(name: str) -> NetworkRecipe:
+    """Read a recipe.
+
+    Args:
+        name: a shipped recipe's, or the path of a .toml file.
+
+    Raises:
+        ProfileError: no such recipe, a key that is unknown or missing, or a value that no training can have.
+    """
+    path = recipe_file(name)
+    try:
+        raw = read_toml_text(path)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ProfileError(str(path), expected="a readable file", got=reason, remedy="check the path") from error
+    except ValueError as error:
+        raise ProfileError(str(path), expected="TOML text", got=str(error), remedy="correct that line") from error
+    where = f"recipe {path.name}"
+    tables = raw.get("stages")
+    if not isinstance(tables, list) or not tables:
+        raise ProfileError(
+            where, expected="one [[stages]] or more", got="none", remedy="add the stages of the training"
+        )
+    stages = tuple(_made(Stage, f"{where}: stage {number}", each) for number, each in enumerate(tables, 1))
+    parts: dict[str, Any] = {"stages": stages}
+    for key, kind in (("looks", Looks), ("loss", LossWeights)):
+        if key in raw:
+            parts[key] = _made(kind, f"{where}: {key}", raw[key])
+    recipe = _made(NetworkRecipe, where, {**raw, **parts})
+    variant_named(recipe.variant)
+    return recipe
+
+
+def _made(kind: type[T], where: str, raw: object) -> T:
+    """A dataclass of a table's values, each of the kind of the field's default."""
+    if not isinstance(raw, Mapping):
+        raise ProfileError(where, expected="a table", got=repr(raw), remedy="write it as a table")
+    known = {each.name: each for each in fields(kind)}  # type: ignore[arg-type]
+    required = {n for n, each in known.items() if each.default is MISSING and each.default_factory is MISSING}
+    check_keys(where, raw, required, set(known) - required)
+    return kind(**{key: _value(f"{where}: {key}", known[key].type, value) for key, value in raw.items()})
+
+
+def _value(where: str, kind: object, value: object) -> object:
+    """A value of a file as its field has it; a part that is read already stays as it is."""
+    if kind not in KINDS:
+        return value
+    fits, expected = KINDS[kind]
+    if not fits(value):
+        raise ProfileError(where, expected=expected, got=repr(value), remedy="correct it")
+    return tuple(value) if isinstance(value, list) else value

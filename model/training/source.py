@@ -1,0 +1,192 @@
+"""Training patches, simulated as they are needed from whole scenes.
+
+A scene's spectrum is computed once; each visit blurs, samples and folds it anew with another sensor, scale, phase
+and look. Visiting whole scenes yields many patches for one transform.
+"""
+
+import os
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beers_deploy.model.bank import Bank, network_bank
+from beers_deploy.model.convbeers import Told, vector_tensor
+from beers_deploy.model.exposure import HEADROOM, factors_for
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.sampling import Scene
+from beers_deploy.model.training.passes import Pass, Visited, detected, folded_signals, noiseless, prepare
+from beers_deploy.model.training.patches import PatchRecipe, draw_turn
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.sensor import Instrument
+
+
+class Batch(NamedTuple):
+    """Patches (N, 1, P, P) in [0, 1]; of a network that is told its sensor also what it is told.
+
+    Attributes:
+        degraded: what the network sees.
+        reference: what it should give.
+        told: of the sensor of each, as the patch lies; None for a plain network.
+    """
+
+    degraded: Tensor
+    reference: Tensor
+    told: Told | None = None
+
+
+class Visit(NamedTuple):
+    """The patches of one pass over a scene.
+
+    Attributes:
+        patches: (N, 2, P, P), degraded and reference in [0, 1].
+        told: what a network is told of each; None without a family of sensors.
+    """
+
+    patches: Tensor
+    told: Told | None
+
+
+class PatchSource:
+    """Endless batches of patches; the same for the same seed."""
+
+    SHARD_BATCHES = 16
+    """Batches mixed together: enough scenes in one batch, little memory."""
+    MOST_THREADS = 8
+    """Shards are made ahead by so many: each is some tens of megabytes."""
+
+    def __init__(
+        self,
+        scenes: list[Scene],
+        recipe: PatchRecipe,
+        batch: int,
+        seed: int,
+        rank: int = 0,
+        workers: int = 1,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.recipe, self.batch, self.seed, self.rank, self.workers = recipe, batch, seed, rank, workers
+        common = int(np.lcm.reduce(recipe.oversamplings))
+        self._scenes = [prepare(scene, common, device) for scene in scenes]
+
+    def batches(self, first: int = 0) -> Iterator[Batch]:
+        """Batch number `first` and all that follow: a resumed run goes on where it stopped.
+
+        The next shards are made while the present one is used, on half of the cores: a GPU waits for patches.
+        """
+        number, within = divmod(first, self.SHARD_BATCHES)
+        threads = min(max((os.cpu_count() or 1) // 2, 1), self.MOST_THREADS)
+        # One core a thread: each would start as many more as there are cores otherwise.
+        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as ahead:
+            waiting = deque(ahead.submit(self._shard, number + k) for k in range(threads))
+            while True:
+                shard = waiting.popleft().result()
+                number += 1
+                waiting.append(ahead.submit(self._shard, number + threads - 1))
+                for k in range(within, self.SHARD_BATCHES):
+                    yield _part(shard, slice(k * self.batch, (k + 1) * self.batch))
+                within = 0
+
+    def _shard(self, number: int) -> Batch:
+        # Keyed by its number and not drawn in sequence: a resumed run makes the same shard.
+        generator = Draw(self.seed, number * self.workers + self.rank).generator("shard")
+        wanted, visits, count = self.batch * self.SHARD_BATCHES, list[Visit](), 0
+        for _ in range(50 * wanted):
+            made = visit(self._scenes[generator.integers(len(self._scenes))], self.recipe, generator)
+            if made is None:
+                continue
+            visits.append(made)
+            count += len(made.patches)
+            if count >= wanted:
+                # Mixed, because neighbours of one scene would make a batch whose gradient knows one scene.
+                order = generator.permutation(count)[:wanted]
+                return _mixed(visits, order)
+        expected = f"scenes that hold a patch of {self.recipe.patch_px} target pixels"
+        remedy = "give larger images or a smaller patch"
+        raise ImageError("training images", expected=expected, got="none large enough", remedy=remedy)
+
+
+def _mixed(visits: Sequence[Visit], order: np.ndarray) -> Batch:
+    places = torch.from_numpy(order)
+    patches = torch.cat([each.patches for each in visits])[places.to(visits[0].patches.device)]
+    pair = patches[:, :1].contiguous(), patches[:, 1:].contiguous()
+    told = [each.told.parts for each in visits if each.told is not None]
+    if not told:
+        return Batch(*pair)
+    return Batch(*pair, Told(*(torch.cat(part)[places] for part in zip(*told, strict=True))))
+
+
+def _part(shard: Batch, part: slice) -> Batch:
+    told = None if shard.told is None else shard.told.some(part)
+    return Batch(shard.degraded[part], shard.reference[part], told)
+
+
+def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -> Visit | None:
+    """All the patches of one simulated pass over a scene; None where it holds none."""
+    ratio = int(generator.choice(recipe.oversamplings))
+    room = min(scene.sides) // ratio - 2 * recipe.margin_px
+    if room < recipe.patch_px:
+        return None
+    images, sensor = _acquire_pair(scene, recipe, ratio, generator)
+    patches = cut(images, recipe.patch_px, generator)
+    # A conditioned network learns that a sensor's axes changed places, and is told so; a plain one cannot.
+    mirrors, quarters = sensor.symmetry
+    quarter, mirrored = draw_turn(generator, quarters or recipe.family is not None, mirrors)
+    if recipe.family is None:
+        return Visit(turned(patches, quarter, mirrored), None)
+    return _told(turned(patches, quarter, mirrored), sensor, quarter, mirrored)
+
+
+def _acquire_pair(
+    scene: Visited, recipe: PatchRecipe, ratio: int, generator: np.random.Generator
+) -> tuple[Tensor, Instrument]:
+    """Degraded and reference, (2, H, W) over full scale, and the sensor of the degraded one."""
+    look = recipe.looks.draw(generator)
+    phase_y, phase_x = (float(v) for v in generator.uniform(-ratio / 2, ratio / 2, 2))
+    sensors = (recipe.family or recipe.degraded).draw(generator), recipe.reference.draw(generator)
+    signals = folded_signals(scene, sensors, Pass(ratio, (phase_y, phase_x), look, recipe.margin_px))
+    degraded = detected(signals[0], sensors[0], "degraded", generator)
+    if recipe.noisy_reference:
+        return torch.stack([degraded, detected(signals[1], sensors[1], "reference", generator)]), sensors[0]
+    return torch.stack([degraded, noiseless(signals[1], sensors[1])]), sensors[0]
+
+
+def _told(patches: Tensor, sensor: Instrument, quarter: int, mirrored: bool) -> Visit:
+    """Brighten dark patches (N, 2, P, P) as a restoration does, and add what a network is told of each."""
+    factors = np.ones(len(patches), np.int64)
+    brightest = patches[:, 0].amax((1, 2)).cpu().numpy()
+    for factor in factors_for(sensor):
+        factors[brightest * factor <= HEADROOM] = factor
+    used, places = np.unique(factors, return_inverse=True)
+    each = [_told_of(sensor, int(factor), quarter, mirrored) for factor in used]
+    told = Told.of(torch.stack([vector for vector, _ in each]), [bank for _, bank in each])
+    scale = torch.from_numpy(factors).to(patches)[:, None, None, None]
+    return Visit(patches * scale, told.some(torch.from_numpy(places)))
+
+
+def _told_of(sensor: Instrument, factor: int, quarter: int, mirrored: bool) -> tuple[Tensor, Bank]:
+    """The vector (4,) and the bank of a sensor of `factor` times the gain, for patches that were turned."""
+    brighter = replace(sensor, gain_dn_per_radiance=sensor.gain_dn_per_radiance * factor)
+    vector, bank = vector_tensor(brighter), network_bank(brighter)
+    if quarter % 2:
+        vector = vector[[1, 0, 2, 3]]
+    details = turned(torch.from_numpy(bank.details), quarter, mirrored)
+    return vector, Bank(details.numpy(), bank.sigma)
+
+
+def cut(images: Tensor, patch_px: int, generator: np.random.Generator) -> Tensor:
+    """Cut (C, H, W) into as many whole patches as fit, from a random corner: (N, C, P, P)."""
+    top, left = (int(generator.integers(size % patch_px + 1)) for size in images.shape[-2:])
+    windows = images[:, top:, left:].unfold(1, patch_px, patch_px).unfold(2, patch_px, patch_px)
+    return windows.permute(1, 2, 0, 3, 4).reshape(-1, len(images), patch_px, patch_px)
+
+
+def turned(patches: Tensor, quarter: int, mirrored: bool) -> Tensor:
+    """Patches (..., P, P) turned by quarters, then mirrored."""
+    rotated = torch.rot90(patches, quarter, (-2, -1))
+    return rotated.flip(-1) if mirrored else rotated

@@ -1,0 +1,164 @@
+"""One gradient step, as a device computes it: nothing in it waits for a result.
+
+So a GPU records the step once as a CUDA graph and replays it: the launch of some hundred kernels, which takes longer
+than they do for a small network, is paid once. A step whose loss or gradient is not finite changes no weight.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils import clip_grad_norm_
+
+from beers_deploy.model.convbeers import Network, Rounding, Told
+from beers_deploy.model.training.losses import RestorationLoss
+from beers_deploy.model.training.source import Batch
+
+WARM_UPS = 3
+"""Forward and backward passes before a recording, in which the libraries choose their kernels."""
+
+Agree = Callable[[Tensor], Tensor]
+"""Of several workers, whether any has raised a flag; of one, the flag."""
+
+
+@dataclass
+class Inputs:
+    """What a step reads, on its device; a recorded step reads the same memory each time.
+
+    Attributes:
+        batch: the patches, and what the network is told.
+        steps: what maps are rounded to; none leaves them as they are.
+        rate: learning rate.
+        share: of the new weights in their running average.
+    """
+
+    batch: Batch
+    steps: list[Tensor]
+    rate: Tensor
+    share: Tensor
+
+    def tensors(self) -> list[Tensor]:
+        """All of it, in one order."""
+        told = () if self.batch.told is None else self.batch.told.parts
+        return [self.batch.degraded, self.batch.reference, *told, *self.steps, self.rate, self.share]
+
+
+class Step:
+    """Forward, loss, backward, clipped gradients, Adam and the running average.
+
+    Args:
+        network: on its device.
+        loss: of what it gives.
+        forward: the network, or what averages its gradients over workers.
+        gradient_norm: larger gradients are cut to it.
+        bfloat16: whether the blocks are computed in it.
+        rounding: how maps are rounded; None leaves them as they are.
+        agree: see there; None for a single worker.
+
+    Attributes:
+        average: the running average of the weights by name.
+        optimiser: Adam.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        loss: RestorationLoss,
+        forward: nn.Module,
+        gradient_norm: float,
+        bfloat16: bool,
+        rounding: Rounding | None,
+        agree: Agree | None,
+    ) -> None:
+        self.network, self.loss, self.forward, self.agree = network, loss, forward, agree
+        self.gradient_norm, self.bfloat16, self.rounding = gradient_norm, bfloat16, rounding
+        self.device = next(network.parameters()).device
+        self.average = {k: v.detach().clone() for k, v in network.state_dict().items()}
+        rate = torch.zeros((), device=self.device)
+        on_gpu = self.device.type == "cuda"
+        self.optimiser = torch.optim.Adam(network.parameters(), lr=rate, fused=True, capturable=on_gpu)
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._inputs: Inputs | None = None
+        self._outputs: Tensor | None = None
+        self.names: tuple[str, ...] = ()
+
+    def __call__(self, batch: Batch, rate: float, share: float) -> Tensor:
+        """Take a step.
+
+        Args:
+            batch: of patches.
+            rate: learning rate.
+            share: of the new weights in their running average.
+
+        Returns:
+            (2 + T,) 1 for a step that changed nothing, the loss, and its terms in the order of `names`.
+        """
+        inputs = self._on_device(batch, rate, share)
+        if self.device.type != "cuda" or self.agree is not None:
+            return self._taken(inputs)
+        if self._graph is None:
+            self._record(inputs)
+        assert self._graph is not None and self._inputs is not None and self._outputs is not None  # noqa: S101, PT018
+        for kept, given in zip(self._inputs.tensors(), inputs.tensors(), strict=True):
+            kept.copy_(given)
+        self._graph.replay()
+        return self._outputs.clone()
+
+    def _on_device(self, batch: Batch, rate: float, share: float) -> Inputs:
+        told: Told | None = None
+        steps = list[Tensor]()
+        if batch.told is not None:
+            told = batch.told.to(self.device)
+            if self.rounding is not None:
+                steps = [each.to(self.device) for each in self.rounding.steps(batch.told.sigmas)]
+        degraded = batch.degraded.to(self.device, memory_format=torch.channels_last)
+        placed = Batch(degraded, batch.reference.to(self.device), told)
+        return Inputs(placed, steps, *(torch.tensor(value, device=self.device) for value in (rate, share)))
+
+    def _taken(self, inputs: Inputs) -> Tensor:
+        total, terms = self._backward(inputs)
+        norm = clip_grad_norm_(self.network.parameters(), self.gradient_norm)
+        bad = (~(torch.isfinite(total) & torch.isfinite(norm))).float()
+        if self.agree is not None:
+            # All workers skip a step that is bad for one of them, or their weights would part.
+            bad = self.agree(bad)
+        for group in self.optimiser.param_groups:
+            group["lr"].copy_(inputs.rate)
+        self.optimiser.found_inf = bad  # type: ignore[attr-defined]
+        self.optimiser.step()
+        share = inputs.share * (1 - bad)
+        for name, value in self.network.state_dict().items():
+            self.average[name].lerp_(value, share)
+        self.names = tuple(terms)
+        return torch.stack([bad, total.detach(), *terms.values()])
+
+    def _backward(self, inputs: Inputs) -> tuple[Tensor, Mapping[str, Tensor]]:
+        batch = inputs.batch
+        known = () if batch.told is None else (batch.told, self.bfloat16, inputs.steps)
+        plain = {"bfloat16": self.bfloat16} if batch.told is None else {}
+        restored = self.forward(batch.degraded, *known, **plain)
+        total, terms = self.loss(restored, batch.reference)
+        self.optimiser.zero_grad(set_to_none=True)
+        total.backward()  # type: ignore[no-untyped-call]
+        return total, terms
+
+    def _record(self, inputs: Inputs) -> None:
+        """Record a step; neither weights nor moments change."""
+        # TF32 has the mantissa of 10 bits: the filters of the bank and a 12-bit image need more.
+        torch.backends.cudnn.allow_tf32 = False
+        torch.backends.cudnn.benchmark = True
+        self._inputs = inputs
+        stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            for _ in range(WARM_UPS):
+                self._backward(inputs)
+            # Adam makes its moments in its first step: outside the recording, and without a change.
+            self.optimiser.found_inf = torch.ones((), device=self.device)  # type: ignore[attr-defined]
+            self.optimiser.step()
+            self.optimiser.zero_grad(set_to_none=True)
+        torch.cuda.current_stream().wait_stream(stream)
+        self._graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self._graph):
+            self._outputs = self._taken(inputs)

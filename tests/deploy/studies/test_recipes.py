@@ -1,0 +1,104 @@
+"""`train --recipe`: stages, INT8 file and card, the same bytes where a run was stopped, and what it refuses."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from beers_deploy.model.io.tensors import read_conditioned, read_tensors
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.quant.onnx_file import load_onnx, metadata
+from tests.deploy.command_line import done, refused
+
+RECIPE = """
+variant = "convbeers-half-xs"
+charts = 1
+patch_px = 32
+other_curves = 0.5
+held_out = ["town"]
+attribution = ["Drawn for a test, CC0 1.0"]
+[looks]
+lit_share = 0.5
+[loss]
+l1 = 0.0
+lpips = 0.0
+fft = 0.0
+psnr = 0.01
+coarse = 0.5
+[[stages]]
+name = "float"
+steps = 3
+batch = 2
+[[stages]]
+name = "rounded"
+steps = 2
+batch = 2
+rounding = true
+"""
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    made = []
+    for number, site in enumerate(("coast_1", "town_1")):
+        radiance = procedural_scene(420, 420, np.random.default_rng(number)).radiance
+        grey = np.clip(255 * (radiance / 400) ** (1 / 2.2), 0, 255).astype(np.uint8)
+        made.append(tmp_path_factory.mktemp(site))
+        Image.fromarray(grey).save(made[-1] / f"{site}.png")
+    return made
+
+
+def given(folders: list[Path]) -> list[str]:
+    return [word for folder in folders for word in ("--images", str(folder))]
+
+
+@pytest.mark.slow
+def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes(
+    folders: list[Path], tmp_path: Path
+) -> None:
+    recipe, out = tmp_path / "own.toml", tmp_path / "run"
+    recipe.write_text(RECIPE)
+    command = ["train", "--recipe", recipe, *given(folders), "--out", out]
+    done(*command)
+    names = [f"convbeers-half-xs{end}" for end in (".safetensors", "-int8.onnx", ".md")]
+    first = [(out / name).read_bytes() for name in names]
+    weights = read_conditioned(out / names[0])
+    assert weights.kernels == "fitted"
+    assert metadata(load_onnx(out / names[1]))["bank_kernels"] == "fitted"
+    card = (out / names[2]).read_text()
+    assert RECIPE.strip() in card
+    assert "- Drawn for a test, CC0 1.0" in card
+    assert "10 patches of 1 photographs" in card
+    trained = read_tensors(out / "1-float" / names[0])[1]["recipe"]
+    assert isinstance(trained, dict)
+    assert trained["held_out"] == ["town_1.png"]
+    # As if it had been stopped between the stages, and within the second one before its first checkpoint.
+    for name in names:
+        (out / name).unlink()
+    for path in (out / "2-rounded").iterdir():
+        path.unlink()
+    assert "add --resume" in refused(*command)
+    done(*command, "--resume")
+    assert [(out / name).read_bytes() for name in names] == first
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--variant", "convbeers-s"], "--variant: expected no --recipe beside it, which states it"),
+        (["--steps", "5"], "--steps: expected no --recipe beside it"),
+        (["--conditioned"], "--conditioned: expected no --recipe"),
+        (["--images", "nowhere"], "no such folder"),
+        ([], "--images beside it"),
+    ],
+)
+def test_what_a_recipe_states_or_needs_is_said(options: list[str], words: str, tmp_path: Path) -> None:
+    assert words in refused("train", "--recipe", "convbeers-xs", "--out", tmp_path / "run", *options)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_held_out_site_that_no_folder_shows_is_refused(folders: list[Path], tmp_path: Path) -> None:
+    (tmp_path / "own.toml").write_text(RECIPE)
+    said = refused("train", "--recipe", tmp_path / "own.toml", *given(folders[:1]), "--out", tmp_path / "run")
+    assert "held out: expected images of town, got none" in said

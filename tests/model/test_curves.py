@@ -1,0 +1,82 @@
+"""Curves of the MTF that training draws: such as an instrument may have, of the contrast at Nyquist asked for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beers_deploy.model.curves import FREQUENCIES, OBSCURATIONS, departure, draw_table, pupil_contrast
+from beers_deploy.model.family import SensorFamily, sensor_vector
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.response import READING, MtfTable
+from beers_deploy.profiles.sensor import Instrument
+
+NOMINAL = load_sensor("pleiades-degraded").nominal()
+CONTRAST = st.floats(0.015, 0.15)
+
+
+@given(CONTRAST, st.floats(0.4, 1), st.integers(0, 2**20))
+def test_a_drawn_curve_has_the_contrast_asked_for_and_is_one_that_optics_can_have(
+    across: float, ratio: float, seed: int
+) -> None:
+    table = draw_table(across, ratio * across, np.random.default_rng(seed))
+    assert table.at_nyquist == pytest.approx((across, ratio * across), rel=1e-6)
+    for contrast in (table.across, table.along):
+        values = np.array(contrast)
+        assert values[0] == 1
+        assert values.min() > 0
+        assert (values <= np.sinc(FREQUENCIES) + READING).all()
+
+
+@pytest.mark.parametrize("obscuration", OBSCURATIONS)
+def test_a_pupil_has_its_closed_form(obscuration: float) -> None:
+    """Of a clear pupil: 2 / pi (arccos s - s sqrt(1 - s^2)); an obscuration lowers the middle frequencies."""
+    found = pupil_contrast(0.2, obscuration)
+    assert found[-1] == pytest.approx(0.2, abs=1e-3)
+    assert (np.diff(found) <= 1e-9).all()
+    clear = pupil_contrast(0.2, 0.0)
+    if obscuration:
+        assert found[len(found) // 2] < clear[len(found) // 2]
+        return
+    shares = np.linspace(0, 1, 4001)
+    closed = 2 / np.pi * (np.arccos(shares) - shares * np.sqrt(1 - shares**2))
+    cutoff = float(np.interp(0.2, closed[::-1], shares[::-1]))
+    np.testing.assert_allclose(found, np.interp(FREQUENCIES / 0.5 * cutoff, shares, closed), atol=0.005)
+
+
+def of_curve(contrast: np.ndarray) -> Instrument:
+    values = tuple(contrast.tolist())
+    table = MtfTable(tuple(FREQUENCIES.tolist()), values, values)
+    across, along = table.at_nyquist
+    return replace(NOMINAL, response=table, mtf_nyquist=across, mtf_nyquist_along=along)
+
+
+@given(CONTRAST, st.floats(0.4, 1), st.integers(0, 2**20))
+def test_no_sensor_that_is_drawn_departs_from_what_was_trained(contrast: float, ratio: float, seed: int) -> None:
+    table = draw_table(contrast, ratio * contrast, np.random.default_rng(seed))
+    across, along = table.at_nyquist
+    sensor = replace(NOMINAL, response=table, mtf_nyquist=across, mtf_nyquist_along=along)
+    assert departure(sensor, "fitted") == ""
+    formula = replace(NOMINAL, mtf_nyquist=contrast, mtf_nyquist_along=ratio * contrast)
+    assert departure(formula, "fitted") == departure(formula, "cut") == ""
+
+
+def test_curves_that_no_training_drew_are_said() -> None:
+    formula = (0.07 / np.sinc(0.5)) ** (FREQUENCIES / 0.5) * np.sinc(FREQUENCIES)
+    hill = np.exp(-(((FREQUENCIES - 0.25) / 0.1) ** 2))
+    for bend, cut, fitted in ((-0.1, True, False), (0.1, True, False), (-0.45, True, True), (0.02, False, False)):
+        sensor = of_curve(formula * (1 + bend * hill))
+        assert [departure(sensor, "cut") != "", departure(sensor, "fitted") != ""] == [cut, fitted]
+    said = departure(of_curve(formula * (1 - 0.45 * hill)), "fitted")
+    assert said.startswith("the MTF across the track is 0.1")
+    assert "where the network was trained on" in said
+
+
+def test_a_family_draws_other_curves_in_their_share_and_none_is_outside_the_ranges() -> None:
+    family = SensorFamily(load_sensor("pleiades-degraded").nominal(), other_curves=0.5)
+    generator = np.random.default_rng(0)
+    drawn = [family.draw(generator) for _ in range(400)]
+    assert np.mean([sensor.response is not None for sensor in drawn]) == pytest.approx(0.5, abs=0.08)
+    assert all(sensor_vector(sensor).outside == () for sensor in drawn)

@@ -1,0 +1,117 @@
+"""A pass simulated in torch shows what the simulator shows, and gives the ground the look that was drawn."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beers_deploy.model.curves import draw_table
+from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.simulator.sampling import crop_divisible, scene_spectrum
+from beers_deploy.model.training.looks import VARIED, Look
+from beers_deploy.model.training.passes import Pass, detected, folded_signals, looked, noiseless, prepare
+from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.effects import AntiAlias, Offset, Smear
+from beers_deploy.profiles.sensor import Instrument
+from tests.model.simulator.stages import lopsided_point, with_response
+
+NOMINAL = load_sensor("pleiades-degraded").nominal()
+PLAIN = Look(1.0)
+
+
+def of_table(seed: int) -> Instrument:
+    table = draw_table(0.1, 0.06, np.random.default_rng(seed))
+    across, along = table.at_nyquist
+    return replace(NOMINAL, response=table, mtf_nyquist=across, mtf_nyquist_along=along)
+
+
+SENSORS = {
+    "formula": NOMINAL,
+    "two axes": replace(NOMINAL, mtf_nyquist_along=0.03),
+    "smear": replace(NOMINAL, effects={"smear": Smear(0.8)}),
+    "anti-alias": replace(NOMINAL, effects={"antialias": AntiAlias(0.3)}),
+    "table": of_table(0),
+    "another table": of_table(1),
+    "point-spread function": with_response(NOMINAL, lopsided_point()),
+}
+
+
+@pytest.mark.parametrize("ratio", [2, 3, 5])
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_pass_shows_what_the_simulator_shows(name: str, ratio: int) -> None:
+    scene, sensor = procedural_scene(307, 331, np.random.default_rng(4)), SENSORS[name]
+    phase = (0.3, -0.8)
+    radiance = crop_divisible(scene.radiance, ratio)
+    skip = ("noise", "digitising")
+    wanted = acquire(scene_spectrum(radiance), radiance.shape[1], sensor, ratio, Draw(0), "degraded", phase, 8, skip)
+    (signal,) = folded_signals(prepare(scene, ratio), (sensor,), Pass(ratio, phase, PLAIN, 8))
+    found = noiseless(signal, sensor) * sensor.max_dn
+    np.testing.assert_allclose(found.numpy(), wanted, atol=0.5)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0.02, 3), st.floats(0.05, 1), st.floats(0, 1.5))
+def test_a_look_keeps_the_mean_times_its_light_and_the_contrast_that_it_says(
+    light: float, contrast: float, softness_px: float
+) -> None:
+    radiance = torch.rand(36, 44, generator=torch.Generator().manual_seed(0))
+    fy, fx = torch.fft.fftfreq(36), torch.fft.rfftfreq(44)
+    made = looked(torch.fft.rfft2(radiance), Look(light, contrast, softness_px), fy, fx)
+    found = torch.fft.irfft2(made, s=radiance.shape)
+    assert float(found.mean()) == pytest.approx(light * float(radiance.mean()), rel=1e-4)
+    kept = float(found.std()) / (light * contrast * float(radiance.std()))
+    assert kept <= 1.0001
+    if softness_px == 0:
+        assert kept == pytest.approx(1, rel=1e-4)
+        torch.testing.assert_close(
+            found - found.mean(), light * contrast * (radiance - radiance.mean()), rtol=0, atol=1e-5
+        )
+
+
+def test_softness_is_a_gaussian_of_that_width() -> None:
+    point = torch.zeros(64, 64)
+    point[32, 32] = 1
+    frequency = torch.fft.fftfreq(64), torch.fft.rfftfreq(64)
+    soft = torch.fft.irfft2(looked(torch.fft.rfft2(point), Look(1, 1, 1.3), *frequency))
+    places = torch.arange(64) - 32.0
+    spread = float((soft.sum(0) * places**2).sum()) ** 0.5
+    assert spread == pytest.approx(1.3, rel=1e-3)
+
+
+def test_looks_reach_deep_shade_and_saturation_and_most_are_ordinary() -> None:
+    generator = np.random.default_rng(0)
+    drawn = [VARIED.draw(generator) for _ in range(2000)]
+    lights = np.array([look.light for look in drawn])
+    assert lights.min() < 0.05
+    assert lights.max() > 2
+    ordinary = (lights >= 0.5) & (lights <= 1.25)
+    assert ordinary.mean() > 0.6
+    assert np.mean([look.contrast < 1 for look in drawn]) == pytest.approx(VARIED.calm_share, abs=0.05)
+    assert np.mean([look.softness_px > 0 for look in drawn]) == pytest.approx(VARIED.soft_share, abs=0.05)
+
+
+@pytest.mark.parametrize("level", [0.0, 5.0, 100.0, 390.0])
+def test_noise_has_the_sensors_standard_deviation_at_every_level(level: float) -> None:
+    signal = torch.full((300, 300), level)
+    found = detected(signal, NOMINAL, "degraded", np.random.default_rng(1)) * NOMINAL.max_dn
+    clipped = level == 0
+    wanted = float(np.hypot(NOMINAL.noise_sigma(level) * NOMINAL.gain_dn_per_radiance, 12**-0.5))
+    if not clipped:
+        assert float(found.std()) == pytest.approx(wanted, rel=0.03)
+        assert float(found.mean()) == pytest.approx(level * NOMINAL.gain_dn_per_radiance, abs=5 * wanted / 300)
+    assert float(found.min()) >= 0
+    assert torch.equal(found, found.round())
+
+
+def test_effects_of_a_profile_are_the_simulators() -> None:
+    """An offset, which torch does not know, is added."""
+    sensor = replace(NOMINAL, effects={"offset": Offset(64.0)})
+    signal = torch.full((40, 50), 80.0)
+    plain, shifted = (detected(signal, each, "degraded", np.random.default_rng(1)) for each in (NOMINAL, sensor))
+    assert float((shifted - plain).mean() * NOMINAL.max_dn) == pytest.approx(64, abs=1)
+    assert float(noiseless(signal, sensor)[0, 0] - noiseless(signal, NOMINAL)[0, 0]) == pytest.approx(64 / 4095)

@@ -1,0 +1,67 @@
+"""Recipes: the shipped ones can be run, and a wrong one gets one sentence."""
+
+from pathlib import Path
+
+import pytest
+
+from beers_deploy.model.shipped import shipped_names
+from beers_deploy.model.training.recipe import RECIPES, load_recipe, recipe_names
+from beers_deploy.model.variants import VARIANTS
+from beers_deploy.profiles.errors import BeersError
+
+STAGE = '[[stages]]\nname = "float"\nsteps = 5\n'
+WHOLE = f'variant = "convbeers-xs"\n{STAGE}'
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_a_shipped_recipe_is_that_of_the_network_of_its_name(name: str) -> None:
+    recipe = load_recipe(name)
+    assert recipe.variant == name
+    assert recipe.patch_px % (8 * VARIANTS[name].scale) == 0  # whole blocks of the consistency step
+    assert recipe.stages[-1].rounding
+    assert recipe.start in ("", *shipped_names())
+    assert recipe.held_out
+
+
+def test_every_recipe_is_of_a_shipped_network() -> None:
+    assert set(recipe_names()) <= set(shipped_names())
+    assert all(path.suffix == ".toml" for path in RECIPES.iterdir() if path.name != "__pycache__")
+
+
+def test_what_a_recipe_leaves_out_has_its_default(tmp_path: Path) -> None:
+    (tmp_path / "own.toml").write_text(WHOLE)
+    recipe = load_recipe(str(tmp_path / "own.toml"))
+    assert (recipe.seed, recipe.patch_px, recipe.stages[0].batch, recipe.looks.lit_share) == (0, 96, 8, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (STAGE, "expected the key 'variant'"),
+        ('variant = "convbeers-xs"\n', "one [[stages]] or more"),
+        (WHOLE.replace("convbeers-xs", "huge"), "'huge'"),
+        (WHOLE + "[looks]\nlit = 0.4\n", "write 'lit_share'"),
+        (WHOLE + "[loss]\npsnr = -1.0\n", "loss: psnr: expected a number from 0 on, got -1.0"),
+        (WHOLE.replace("steps = 5", "steps = 5.5"), "stage 1: steps: expected a whole number from 0 on, got 5.5"),
+        (WHOLE.replace("steps = 5", "steps = true"), "expected a whole number from 0 on, got True"),
+        (WHOLE + 'precision = "int8"\n', "expected one of float32, bfloat16, got 'int8'"),
+        (WHOLE + 'rounding = "yes"\n', "expected true or false, got 'yes'"),
+        (WHOLE + "steps_more = 5\n", "stage 1"),
+        (WHOLE + "[looks]\nlights = [0.1]\n", "lights: expected two numbers from 0 on, got [0.1]"),
+        ("held_out = [3]\n" + WHOLE, "held_out: expected a list of texts, got [3]"),
+        ("variant = [", "TOML"),
+    ],
+)
+def test_a_wrong_recipe_gets_one_sentence(text: str, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text(text)
+    with pytest.raises(BeersError) as error:
+        load_recipe(str(path))
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["none.toml", "convbeers-huge"])
+def test_no_such_recipe_is_said(name: str) -> None:
+    with pytest.raises(BeersError, match=name):
+        load_recipe(name)
