@@ -1,6 +1,7 @@
 """Families of networks that a DPU could like, each trained with equal effort: what they restore, and predicted time.
 
     python benchmarks/families.py --images aerial/ --out families/ [--families 4x64@2,u48@2] [--steps 1000]
+                                  [--device cuda]
 
 Each is trained from scratch for one sensor, which it is not told, on as many patches as any other, and judged on the
 sites that training keeps apart: PSNR in float32 and in INT8 (calibrated on drawn scenes), and predicted seconds of a
@@ -8,8 +9,11 @@ swath of 13600 x 9016 with exact seams on a VCK190, each with its best tile and 
 folder; a network whose weights lie there is not trained again.
 
 Names: BLOCKSxFEATURES as the paper's blocks, uFEATURES a U-Net of two levels, dBLOCKSxFEATURES blocks of a widening
-1 x 1, a depthwise 5 x 5 and a narrowing 1 x 1 convolution, kBLOCKSxFEATURES blocks of 5 x 5 convolutions; @SCALE: at
-1 / SCALE of the resolution. What a family is worth in the end, longer training tells: `beers-deploy train`.
+1 x 1, a depthwise 5 x 5 and a narrowing 1 x 1 convolution, kBLOCKSxFEATURES blocks of 5 x 5 convolutions,
+aBLOCKSxFEATURES the paper's blocks with dilated convolutions in the middle ones, wBLOCKSxFEATURES blocks four times
+as wide inside, bBLOCKSxFEATURES the paper's blocks and beside them half as many at half the resolution; @SCALE: at
+1 / SCALE of the resolution. The last three see farther or say more at equal time. What a family is worth in the
+end, longer training tells: `beers-deploy train`.
 """
 
 import argparse
@@ -45,7 +49,7 @@ from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.tiling.walk import tiling_of
 
 FAMILIES = "4x64@2,8x48@2,2x32@2,u48@2,u64@2,d8x64@2,d8x96@2,k2x32@2,k3x48@2,u32,8x32"
-NAME = re.compile(r"(?P<kind>[udk]?)(?:(?P<blocks>\d+)x)?(?P<features>\d+)(?:@(?P<scale>\d+))?")
+NAME = re.compile(r"(?P<kind>[udkawb]?)(?:(?P<blocks>\d+)x)?(?P<features>\d+)(?:@(?P<scale>\d+))?")
 CORRECTIONS = ("second", "project", "tail", "end")
 """What is added to something else starts small, so that a network starts near the identity."""
 SENSOR, REFERENCE = "pleiades-degraded", "pleiades-reference"
@@ -94,6 +98,40 @@ class Depthwise(nn.Module):
         return x + correction
 
 
+def dilated_blocks(blocks: int, features: int) -> Iterable[nn.Module]:
+    """Residual blocks whose first convolution reaches twice or four times as far in the middle."""
+    for number in range(blocks):
+        block = ResidualBlock(features)
+        distance = min(number, blocks - 1 - number)
+        reach = (1, 2, 4)[min(distance, 2)]
+        block.first = nn.Conv2d(features, features, 3, padding=reach, dilation=reach)
+        yield block
+
+
+def widening_block(features: int) -> ResidualBlock:
+    """A residual block four times as wide inside (WDSR, Yu et al. 2018)."""
+    block = ResidualBlock(features)
+    block.first, block.second = conv(features, 4 * features), conv(4 * features, features)
+    return block
+
+
+class Beside(nn.Module):
+    """What is given, the paper's blocks of it, and half as many blocks at half the resolution, added up."""
+
+    def __init__(self, blocks: int, features: int) -> None:
+        super().__init__()
+        self.fine = nn.Sequential(*(ResidualBlock(features) for _ in range(blocks)), conv(features, features))
+        self.down = nn.Conv2d(features, features, 3, stride=2, padding=1)
+        self.coarse = nn.Sequential(*(ResidualBlock(features) for _ in range(blocks // 2)))
+        self.end = conv(features, 4 * features)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, F, H, W) of even sides to the same."""
+        coarse = pixel_shuffle(self.end(self.coarse(torch.relu(self.down(x)))), 2)
+        correction: Tensor = self.fine(x) + coarse
+        return correction
+
+
 class Levels(nn.Module):
     """A block, two more at half the resolution with twice the features, and a block; the skip is added."""
 
@@ -128,6 +166,9 @@ def build(name: str, generator: torch.Generator) -> Restoring:
         "k": lambda: [*(wide_block(features) for _ in range(blocks)), conv(features, features)],
         "d": lambda: [*(Depthwise(features) for _ in range(blocks)), conv(features, features)],
         "u": lambda: [Levels(features)],
+        "a": lambda: [*dilated_blocks(blocks, features), conv(features, features)],
+        "w": lambda: [*(widening_block(features) for _ in range(blocks)), conv(features, features)],
+        "b": lambda: [Beside(blocks, features)],
     }
     network = Restoring(features, scale, nn.Sequential(*kinds[found["kind"]]()))
     for path, module in network.named_modules():
@@ -140,19 +181,19 @@ def build(name: str, generator: torch.Generator) -> Restoring:
     return network
 
 
-def trained(name: str, source: PatchSource, count: int, path: Path) -> Restoring:
+def trained(name: str, source: PatchSource, count: int, path: Path, device: str) -> Restoring:
     """The network after so many steps by Adam, L1, the rate falling to 0 as a half cosine; kept in `path`."""
     network = build(name, torch.Generator().manual_seed(0))
     if path.exists():
         network.load_state_dict(load_file(path))
         return network.eval()
+    network.to(device)
     optimiser = torch.optim.Adam(network.parameters(), RATE)
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, count)
     begun = time.process_time()
     with steps(f"training {name}", count) as bar:
         for batch in islice(source.batches(), count):
-            degraded, reference = map(torch.from_numpy, batch)
-            loss, _ = LOSS(network(degraded), reference)
+            loss, _ = LOSS(network(batch.degraded), batch.reference)
             optimiser.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]
             nn.utils.clip_grad_norm_(network.parameters(), 0.1)
@@ -160,6 +201,7 @@ def trained(name: str, source: PatchSource, count: int, path: Path) -> Restoring
             falling.step()
             bar.advance()
     print(f"{name}: trained in {time.process_time() - begun:.0f} s of processor time", flush=True)
+    network.cpu()
     save_file(network.state_dict(), path)
     return network.eval()
 
@@ -188,6 +230,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--families", default=FAMILIES)
     parser.add_argument("--steps", type=int, default=1000, help=f"of {BATCH} patches")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda, of the training")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     sensors = load_sensor(SENSOR), load_sensor(REFERENCE)
@@ -196,13 +239,14 @@ def main() -> None:
     held = [scene for scene in scenes if site_of(scene.name) in apart]
     kept = [scene for scene in scenes if site_of(scene.name) not in apart]
     judging = draw_patches(held, *sensors, HELD_OUT, 1)
-    source = PatchSource(kept, PatchRecipe(*sensors, patch_px=PATCH_PX), BATCH, 0)
+    source = PatchSource(kept, PatchRecipe(*sensors, patch_px=PATCH_PX), BATCH, 0, device=arguments.device)
     drawn = Calibration(load_sensor(SENSOR), None, 64, 128, 0).drawn
     print(f"{processor_name()}, {arguments.steps * BATCH} patches each, judged by {HELD_OUT} of {len(apart)} sites")
     heads = "family", "1000 parameters", "halo, px", "float32 dB", "INT8 dB", "s a swath, best tile"
     print("|", " | ".join(heads), "|\n" + "|---" * len(heads) + "|")
     for name in arguments.families.split(","):
-        network = trained(name, source, arguments.steps, arguments.out / f"{name}.safetensors")
+        weights_file = arguments.out / f"{name}.safetensors"
+        network = trained(name, source, arguments.steps, weights_file, arguments.device)
         model = Network.load(network).model
         made = quantise_model(model, drawn, {}).host
         scores = [psnr_cell(each, judging) for each in (model, made)]
