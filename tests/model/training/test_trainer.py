@@ -280,3 +280,16 @@ def test_two_workers_do_the_steps_of_one_with_a_batch_twice_as_large(tmp_path: P
     for name, value in alone.network.state_dict().items():
         moved = float((value - start.network.state_dict()[name]).abs().max())
         torch.testing.assert_close(two.network.state_dict()[name], value, rtol=0, atol=0.1 * moved)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("conditioned", [False, True])
+def test_a_recorded_step_learns_as_the_processor_does(conditioned: bool, tmp_path: Path) -> None:
+    losses: dict[str, list[float]] = {}
+    for device in ("cpu", "cuda"):
+        seen = losses.setdefault(device, [])
+        trainer = Trainer(VARIANT, TrainingRecipe(steps=60, batch=3), device=device, conditioned=conditioned)
+        note = Schedule(20, report=lambda _, terms, __, seen=seen: seen.append(terms["l1"]))  # type: ignore[misc]
+        # Patches of the processor for both: a GPU draws other noise.
+        trainer.run(source(conditioned=conditioned).batches, tmp_path / device, note)
+    np.testing.assert_allclose(losses["cuda"], losses["cpu"], rtol=0.02)
