@@ -33,12 +33,14 @@ class Baseline:
         mae: over full scale.
         psnr_float_db: of the float network against the references; NaN without any.
         digests: SHA-256 of what it rested on, by name.
+        checks: names of its checks.
     """
 
     path: Path
     mae: float
     psnr_float_db: float
     digests: Mapping[str, str]
+    checks: frozenset[str] = frozenset()
 
     def require_same(self, float_sha256: str, psnr_float_db: float, inputs: Iterable[Input]) -> None:
         """Raise OptionError if the baseline is of another float network, sensor, or of other images or samples.
@@ -93,7 +95,8 @@ def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
         raise OptionError(str(path), expected=f"a measured MAE {SCALE}", got=_shown(mae), remedy=REMEDY)
     psnr_db = figures.get("PSNR float", {}).get("value")
     digests = {each["name"]: each["sha256"] for each in document["inputs"]}
-    return Baseline(path, float(mae["value"]), math.nan if psnr_db is None else float(psnr_db), digests)
+    checks = frozenset(check["name"] for check in document["checks"])
+    return Baseline(path, float(mae["value"]), math.nan if psnr_db is None else float(psnr_db), digests, checks)
 
 
 def _shown(figure: Mapping[str, Any]) -> str:

@@ -38,7 +38,7 @@ from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px, metadata, 
 from beers_deploy.quant.sample_range import range_row, recorded_range, uncovered
 from beers_deploy.quant.samples import CALIBRATED_ON, OwnSamples, digest_of, samples_of
 from beers_deploy.quant.session import open_any_size
-from beers_deploy.quant.structure import saturated_shares, structure_checks
+from beers_deploy.quant.structure import ENCODING, saturated_shares, structure_checks
 from beers_deploy.results import Input, Table
 
 if TYPE_CHECKING:
@@ -263,8 +263,9 @@ def gate(
         before.require_same(theirs.sha256, found.result.psnr_float_db, found.rests_on)
     checks = judge(found.result, allowed, before.mae if before else None)
     checks += judge_saturation(found.shares, allowed)
-    checks += file_checks(theirs.model, ours, target)
-    notes = (*found.notes, *_mae_note(found.result, allowed, checks), *float_note(ours.model))
+    must_describe = before is not None and ENCODING in before.checks
+    checks += file_checks(theirs.model, ours, target, must_describe)
+    notes = (*found.notes, *_mae_note(found.result, allowed, checks), *float_note(ours.model), *_unchecked(checks))
     return Verdict("gate", arguments, found.inputs, found.rows, tuple(checks), notes=notes, comparison=found)
 
 
@@ -329,12 +330,23 @@ def _require_references(own: OwnSamples | None, wanted: str) -> None:
         raise OptionError("samples", expected=expected, got="images alone", remedy=remedy)
 
 
-def file_checks(float_model: onnx.ModelProto, int8: Network, target: TargetProfile) -> list[Check]:
-    """What the INT8 file itself shows: the rules of the target's DPU or NPU, then what `quant.structure` looks at."""
-    checks = structure_checks(float_model, int8.model)
+def _unchecked(checks: Sequence[Check]) -> list[str]:
+    """Return a note if the encoding was not checked: the judged file itself decides whether it describes integers."""
+    if any(check.name == ENCODING for check in checks):
+        return []
+    reason = "the INT8 file does not describe its integers, as a file that 'quantize' wrote does"
+    return [f"not checked: {ENCODING}, because {reason}"]
+
+
+def file_checks(
+    float_model: onnx.ModelProto, int8: Network, target: TargetProfile, must_describe: bool = False
+) -> list[Check]:
+    """Check the INT8 file itself: the rules of the target's DPU or NPU, then what `structure_checks` looks at."""
+    checks = structure_checks(float_model, int8.model, must_describe)
     if not (target.configurations or target.npu):
         return checks
-    read = network_of(int8.model, fixed_tile_px(int8.model) or TILE_PX, int8.name)
+    with faults_named(int8.label):
+        read = network_of(int8.model, fixed_tile_px(int8.model) or TILE_PX, int8.name)
     return [legality(place(read, ruled(target)), npu=bool(target.npu)), *checks]
 
 

@@ -22,6 +22,7 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.banked.family import WEIGHTS
 from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
 from tests.deploy.command_line import done, refused
+from tests.quant.quick import change
 
 SMALL = ("convbeers-xs", "--patches", 1)
 
@@ -134,3 +135,23 @@ def test_claims_of_weights_are_verified(claim: str, pair: tuple[Path, Path], tmp
     save_onnx(other, tmp_path / "other.onnx")
     said = record_of(verdict, replace(int8, model=load_onnx(tmp_path / "other.onnx")), sensor)
     assert (said["weights_sha256"], said["training"], said["licence"]) == (None, None, None)
+
+
+def test_a_file_without_its_description_loses_no_check_silently(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    """A changed constant of the host part is a fault of the encoding, which only the description shows."""
+    int8 = pair[1]
+    baseline = tmp_path / "before.json"
+    done("gate", *pair, "--patches", 1, "--json", baseline)
+    model = load_onnx(int8)
+    change(model, "max_dn", lambda value: value * 1.002)
+    about = {key: text for key, text in metadata(model).items() if key not in ("core", "precision")}
+    save_onnx(model, int8)
+    assert "faults of the encoding" in done("gate", *pair, "--patches", 1, code=1)
+    onnx.helper.set_model_props(model, about)
+    save_onnx(model, int8)
+    assert "note: not checked: faults of the encoding" in " ".join(done("gate", *pair, "--patches", 1).split())
+    said = done("gate", *pair, "--patches", 1, "--baseline", baseline, code=1)
+    assert "does not describe its integers" in said
+    onnx.helper.set_model_props(model, about | {"core": "{}"})
+    save_onnx(model, int8)
+    assert "int8.onnx: expected metadata 'core'" in refused("gate", *pair, "--patches", 1)
