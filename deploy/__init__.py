@@ -29,5 +29,5 @@ def __getattr__(name: str) -> Any:
     """What is offered under a name, loaded now."""
     try:
         return _loaded(name)
-    except ModuleNotFoundError as error:
+    except ImportError as error:
         raise missing_extra(error, name) from error

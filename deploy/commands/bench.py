@@ -157,7 +157,7 @@ def bench(
             try:
                 rows = [*rows, _traditional_row(found.dn, found.swath)]
                 print_rows("the traditional pipeline, measured on crops here", rows[-1:])
-            except ModuleNotFoundError as error:
+            except ImportError as error:
                 say(f"The traditional pipeline is not measured here: {missing_extra(error, 'bench')}")
     inputs = tuple(file for file in (path, image, measured) if file)
     save(Table("bench", arguments(), inputs, tuple(rows)), json)

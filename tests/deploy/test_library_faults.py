@@ -9,10 +9,10 @@ import pytest
 import tifffile
 from PIL import Image, PngImagePlugin
 
-from beers_deploy.cli import CRASHED, ending
+from beers_deploy.cli import ending
 from beers_deploy.commands.restore import restore
 from beers_deploy.model.io import tiff
-from beers_deploy.profiles.errors import CODE_FAULTS, ModelError, printable
+from beers_deploy.profiles.errors import CODE_FAULTS, CRASHED, ModelError, printable
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.untrusted import contradictions
