@@ -28,6 +28,8 @@ def read_toml_text(path: Path) -> dict[str, object]:
         raise ValueError(_line_at_fault(text, str(error))) from None
     except RecursionError:
         raise ValueError(TOO_DEEP) from None
+    except ValueError:  # Python converts no more than 4300 digits, and names a setting of its own
+        raise ValueError("a number of too many digits") from None
 
 
 def _line_at_fault(text: str, reason: str) -> str:

@@ -143,6 +143,7 @@ def test_limits_come_from_a_file(tmp_path: Path) -> None:
     assert (limits.mae, limits.psnr_drop_db, limits.p999) == (0.0007, 0.25, None)
     assert limits_of(path, 0.001).mae == 0.001
     assert limits_of(None) == Limits()
+    assert limits_of({"mae": 0}).mae == limits_of(None, 0.0).mae == 0
     path.write_text("mae_growth = 1.2")
     assert limits_of(path) == Limits(mae_growth=1.2)  # what is left out has its default
 
@@ -165,10 +166,10 @@ def test_a_limit_that_no_network_breaks_is_refused(text: str, tmp_path: Path) ->
 NO_LIMITS = ["mae = 'small'", "mae = true", "mea = 0.1", "mae = -1", "mae = nan", "= 3", "[mae]", "", "# none"]
 
 
-@pytest.mark.parametrize("text", [*NO_LIMITS, "mae = [1]", "mae = 0x" + "f" * 400])
+@pytest.mark.parametrize("text", [*NO_LIMITS, "mae = [1]", "mae = 0x" + "f" * 400, "mae = " + "9" * 5000])
 def test_limits_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "gate.toml").write_text(text)
-    with pytest.raises(OptionError, match=r"gate\.toml"):
+    with pytest.raises(OptionError, match=r"gate\.toml: (?!.*sys\.set)"):
         limits_of(tmp_path / "gate.toml")
     with pytest.raises(OptionError, match="no such file"):
         limits_of(tmp_path / "none.toml")
