@@ -152,6 +152,9 @@ def compare(
         True
     """
     known = Sensor.load(sensor)
+    if samples is not None and images is not None:
+        remedy = "leave one of them out: images are for simulated patches"
+        raise OptionError("images", expected="none together with samples", got=str(images), remedy=remedy)
     if metric not in (None, *METRICS):
         raise OptionError("metric", expected=f"one of {', '.join(METRICS)}", got=repr(metric), remedy="choose one")
     ours, theirs = _pair(int8, against, known)
