@@ -31,7 +31,7 @@ from beers_deploy.profiles.figures import Check, Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, TargetProfile
 from beers_deploy.quant.float_parts import float_note
-from beers_deploy.quant.gate import METRICS, GateResult, judge, judge_saturation, verdict_row
+from beers_deploy.quant.gate import METRICS, GateResult, judge, judge_saturation, unfit_reference, verdict_row
 from beers_deploy.quant.gate import compare as differences_of
 from beers_deploy.quant.limits import Limits, limits_of
 from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px, metadata, require_quantised
@@ -155,14 +155,13 @@ def compare(
     if samples is not None and images is not None:
         remedy = "leave one of them out: images are for simulated patches"
         raise OptionError("images", expected="none together with samples", got=str(images), remedy=remedy)
-    if metric not in (None, *METRICS):
-        raise OptionError("metric", expected=f"one of {', '.join(METRICS)}", got=repr(metric), remedy="choose one")
+    _require_metric(metric)
     ours, theirs = _pair(int8, against, known)
     scenes = None if images is None else Path(images)
     with reporting(progress), faults_named(theirs.label):
         judged, simulated, notes = _samples(ours, theirs, known, samples, scenes, patches, seed)
         sessions = open_any_size(theirs.model), open_any_size(ours.model)
-        result = differences_of(*sessions, judged.pairs, simulated, metric)
+        result = differences_of(*sessions, judged.pairs, simulated, metric, judged.names)
         shares = saturated_shares(ours.model, judged.degraded)
     arguments: dict[str, object] = {"float": theirs.name, "int8": ours.name, "sensor": known.name, "images": images}
     arguments |= {"patches": patches, "seed": seed, "samples": samples if isinstance(samples, str | Path) else None}
@@ -242,6 +241,7 @@ def gate(
         >>> bool(verdict)
         True
     """
+    _require_metric(metric)
     allowed, target, known = limits_of(limits), TargetProfile.load(board), Sensor.load(sensor)
     ours, theirs = _pair(int8, against, known)
     config, data = (each if isinstance(each, str | os.PathLike) else None for each in (limits, samples))
@@ -257,11 +257,15 @@ def gate(
         remedy = "name the metric, or leave that limit out"
         raise OptionError("metric", expected="one beside the limit metric_loss", got="none", remedy=remedy)
     wanted = "psnr_drop_db" if allowed.psnr_drop_db is not None else "a metric" if metric else ""
-    if wanted and samples is not None:
-        _require_references(samples_of(theirs.model, samples), wanted)
+    own = samples_of(theirs.model, samples) if wanted and samples is not None else None
+    if own is not None:
+        _require_references(own, wanted)
     how: dict[str, Any] = {"sensor": known, "images": images, "patches": patches, "seed": seed, "metric": metric}
     found = compare(ours, theirs, samples, **how, progress=progress)
     _require_contrast(found.result)
+    psnr_missing = math.isnan(found.result.psnr_float_db) and not math.isnan(found.result.mae)
+    if own is not None and allowed.psnr_drop_db is not None and psnr_missing:
+        raise unfit_reference(own.all.names[0], own.all.pairs[0][1].shape, "psnr_drop_db")
     if before is not None:
         before.require_same(theirs.sha256, found.result.psnr_float_db, found.rests_on)
     checks = judge(found.result, allowed, before.mae if before else None)
@@ -327,8 +331,13 @@ def _samples(
     return own.all, False, (f"{note}: on those INT8 loses less than on others",)
 
 
-def _require_references(own: OwnSamples | None, wanted: str) -> None:
-    if own is not None and not any(reference.size for _, reference in own.all.pairs):
+def _require_metric(metric: str | None) -> None:
+    if metric not in (None, *METRICS):
+        raise OptionError("metric", expected=f"one of {', '.join(METRICS)}", got=repr(metric), remedy="choose one")
+
+
+def _require_references(own: OwnSamples, wanted: str) -> None:
+    if not any(reference.size for _, reference in own.all.pairs):
         expected, remedy = f"references for {wanted}", "give images and references, or leave it out"
         raise OptionError("samples", expected=expected, got="images alone", remedy=remedy)
 

@@ -380,3 +380,21 @@ def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(t
     assert "nan" not in said.lower()
     limits.write_text("psnr_drop_db = 0.25\n", encoding="utf-8")
     assert "references for psnr_drop_db, got images alone" in refused(*command, "--limits", limits)
+
+
+def test_references_that_do_not_fit_are_refused_and_the_sample_is_named(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).uniform(0.1, 0.9, (2, 1, 40, 40)).astype(np.float32)
+    path, limits = tmp_path / "s.npz", tmp_path / "limits.toml"
+    limits.write_text("mae = 0.1\npsnr_drop_db = 20\n", encoding="utf-8")
+    command = ["gate", *shipped_pair(SMALL), "--samples", path, "--limits", limits]
+    np.savez(path, image=image, reference=image * 4095)
+    assert "s.npz[0]: expected a reference with values in [0, 1]" in refused(*command)
+    np.savez(path, image=image, reference=image[..., :20])
+    assert "s.npz[0]: expected a reference of the results' size for psnr_drop_db, got 1 x 40 x 20" in refused(
+        *command
+    )
+    assert "gate passed" in done(*command[:-2], "--max-mae", 0.1)  # no check needs them
+    assert "--metric: expected one of psnr" in refused(*command, "--metric", "PSNR")
+    mixed = [(image[:1], image[:1]), (image[1:], image[1:, ..., :20])]
+    with pytest.raises(ImageError, match=r"samples\[1\]: expected a reference of the results' size"):
+        bd.compare("convbeers-xs-int8", SMALL, mixed)
