@@ -18,7 +18,7 @@ from xml.etree import ElementTree as ET
 
 import onnx
 
-from beers_deploy.baseline import files_input, read_baseline, sensor_input
+from beers_deploy.baseline import data_inputs, read_baseline, sensor_input
 from beers_deploy.dpu.board import BoardLike, ruled
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.checker.table import legality
@@ -164,12 +164,11 @@ def compare(
         result = differences_of(*sessions, judged.pairs, simulated, metric, judged.names)
         shares = saturated_shares(ours.model, judged.degraded)
     arguments: dict[str, object] = {"float": theirs.name, "int8": ours.name, "sensor": known.name, "images": images}
-    arguments |= {"patches": patches, "seed": seed, "samples": samples if isinstance(samples, str | Path) else None}
-    rests_on = [sensor_input(known)]
-    if scenes is not None and simulated:
-        rests_on.append(files_input("scenes", scenes))
-    if isinstance(samples, str | Path):
-        rests_on.append(files_input("samples", Path(samples)))
+    arguments |= {"patches": patches, "seed": seed, "samples": _named(samples)}
+    given = Path(samples) if isinstance(samples, str | os.PathLike) else None
+    rests_on = [sensor_input(known), *data_inputs(scenes, given)]
+    if samples is not None and given is None:
+        rests_on.append(Input(f"samples {IN_MEMORY}", judged.digest))
     rows, range_notes = _range_rows(ours, result)
     return Comparison(
         "compare",
@@ -184,6 +183,17 @@ def compare(
         sensor=known,
         rests_on=tuple(rests_on),
     )
+
+
+IN_MEMORY = "in memory"
+"""What arguments and inputs call samples that are no file."""
+
+
+def _named(samples: object) -> str | None:
+    """Return what a document calls samples; None of simulated patches."""
+    if isinstance(samples, str | os.PathLike):
+        return os.fspath(samples)
+    return None if samples is None else IN_MEMORY
 
 
 def _range_rows(int8: Network, result: GateResult) -> tuple[list[Row], list[str]]:
@@ -244,11 +254,11 @@ def gate(
     _require_metric(metric)
     allowed, target, known = limits_of(limits), TargetProfile.load(board), Sensor.load(sensor)
     ours, theirs = _pair(int8, against, known)
-    config, data = (each if isinstance(each, str | os.PathLike) else None for each in (limits, samples))
+    config = limits if isinstance(limits, str | os.PathLike) else None
     told = sensor if isinstance(sensor, str) else known.name
     arguments: dict[str, object] = {"max_mae": allowed.mae, "limits": config, "baseline": baseline}
     arguments |= {"target": target.name, "sensor": told, "images": images, "patches": patches, "seed": seed}
-    arguments |= {"samples": data} | ({"metric": metric} if metric else {})
+    arguments |= {"samples": _named(samples)} | ({"metric": metric} if metric else {})
     before = None if baseline is None else read_baseline(Path(baseline), arguments)
     if before is None and allowed.mae_growth is not None:
         remedy = "give what an earlier 'gate --json' wrote, or leave that limit out"

@@ -67,6 +67,11 @@ def one_line(text: str) -> str:
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
+def encodable(text: str) -> str:
+    """Return the text with an escape for what UTF-8 cannot hold: bytes of a file's name in another encoding."""
+    return text.encode(errors="backslashreplace").decode()
+
+
 def visible(text: str) -> str:
     """The text, lines and tabs kept, with each other character that a terminal would obey or hide as its escape."""
     return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)

@@ -5,6 +5,7 @@ import math
 import re
 import stat
 import tomllib
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 
@@ -49,10 +50,21 @@ def read_json(path: Path) -> object:
 def parse_json(text: str) -> object:
     """Read JSON text as plain values of Python."""
     try:
-        found: object = json.loads(text, parse_constant=_number, parse_float=_number, parse_int=_whole)
+        found: object = json.loads(
+            text, parse_constant=_number, parse_float=_number, parse_int=_whole, object_pairs_hook=_unique
+        )
         json.dumps(found, ensure_ascii=False).encode()  # half a surrogate pair cannot be printed
     except RecursionError:
         raise ValueError(TOO_DEEP) from None
+    return found
+
+
+def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    """Return an object; raise ValueError for a key that stands in it twice, of which readers take either."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
+        raise ValueError(f"the key {twice[:QUOTED]!r} twice")
     return found
 
 

@@ -59,6 +59,7 @@ def quantize(
     Taken is any network that a DPU computes; see docs/reference/any-network.md, and ask 'check' about a float file.
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
+    from beers_deploy.baseline import data_inputs
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.profiles.figures import by_table
     from beers_deploy.quant.encodings import read_core
@@ -98,7 +99,7 @@ def quantize(
         say(f"wrote {page}: {written.headline}")
         rows = [*found, *rows]
     origin = made.origin.input if made.origin else model
-    document = Table("quantize", arguments(), (origin, out), tuple(rows))
+    document = Table("quantize", arguments(), (origin, out, *data_inputs(images, samples)), tuple(rows))
     for path in (figures, json):
         save(document, path)
 

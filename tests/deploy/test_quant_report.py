@@ -153,7 +153,9 @@ def test_a_report_on_samples_shows_the_worst_of_them(tmp_path: Path) -> None:
     np.save(tmp_path / "s.npy", np.random.default_rng(0).random((8, 1, 40, 48), np.float32))
     options = ["--samples", tmp_path / "s.npy", "--out", tmp_path / "i.onnx", "--report", tmp_path / "r"]
     assert "dB" not in done("quantize", tmp_path / "f.onnx", *options).splitlines()[-1]
-    rows = json.loads((tmp_path / "r" / "report.json").read_text())["rows"]
+    document = json.loads((tmp_path / "r" / "report.json").read_text())
+    rows = document["rows"]
+    assert [each["name"] for each in document["inputs"]] == ["f.onnx", "i.onnx", "samples s.npy"]
     assert {row["name"] for row in rows if row["table"] == "worst samples"} == {"sample 0", "sample 1"}
     judged = done(
         "gate", tmp_path / "f.onnx", tmp_path / "i.onnx", "--samples", tmp_path / "s.npy", "--max-mae", "0.1"
