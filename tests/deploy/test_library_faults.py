@@ -12,6 +12,7 @@ from PIL import Image, PngImagePlugin
 from beers_deploy.cli import ending
 from beers_deploy.commands.restore import restore
 from beers_deploy.model.io import tiff
+from beers_deploy.model.processor import int8_adds_exactly
 from beers_deploy.profiles.errors import CODE_FAULTS, CRASHED, ModelError, printable
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session
@@ -64,3 +65,18 @@ def test_a_fault_of_this_program_names_no_library() -> None:
         printable(None)  # type: ignore[arg-type]
     said, code = ending(caught.value, restore)
     assert (code, said.partition(",")[0]) == (CRASHED, "a fault of this program")
+
+
+def test_a_run_of_onnxruntime_that_fails_is_no_fault_of_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the processor is asked how it adds, with a network of this program."""
+
+    def moved(*_: object, **__: object) -> None:
+        raise AttributeError("moved")
+
+    monkeypatch.setattr(onnxruntime.InferenceSession, "run", moved)
+    int8_adds_exactly.cache_clear()
+    try:
+        said = done("gate", "convbeers-xs", "--patches", 1, code=CRASHED)
+    finally:
+        int8_adds_exactly.cache_clear()
+    assert f"onnxruntime {version('onnxruntime')}" in said or "fault of this program" in said
