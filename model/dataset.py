@@ -282,7 +282,8 @@ def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
         write_text(path, wanted)
         return
     expected = "a folder without a dataset"
-    if not path.is_file() or path.read_bytes() != wanted.encode():
+    # An editor or Git may have changed how its lines end.
+    if not path.is_file() or path.read_bytes().replace(b"\r\n", b"\n") != wanted.encode():
         raise OptionError("out", expected=expected, got="another dataset", remedy="choose another folder")
     if not resume:
         remedy = "add `resume` or choose another folder"

@@ -48,7 +48,9 @@ def read_json(path: Path) -> object:
 
 
 def parse_json(text: str) -> object:
-    """Read JSON text as plain values of Python."""
+    """Read JSON text as plain values of Python; raise ValueError with the reason if it is none."""
+    if not text.strip():
+        raise ValueError("an empty file")
     try:
         found: object = json.loads(
             text, parse_constant=_number, parse_float=_number, parse_int=_whole, object_pairs_hook=_unique

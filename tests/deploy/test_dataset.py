@@ -183,6 +183,13 @@ def test_a_forged_line_with_its_digest_is_made_again(kind: str, scene: Path, mad
     assert said[0].startswith("1 of ")
 
 
+def test_a_recipe_whose_lines_end_otherwise_is_the_same(scene: Path, made: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(made, tmp_path / "other"))
+    recipe = folder / "recipe.json"
+    recipe.write_bytes(recipe.read_bytes().replace(b"\n", b"\r\n"))
+    assert write_dataset(small(scene), folder, 1, resume=True, tick=silent)["patches"]
+
+
 def test_left_overs_of_a_run_are_deleted_and_nothing_else(scene: Path, made: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(made, tmp_path / "left"))
     ours = [folder / "degraded" / ".a.tif.123.part", folder / ".manifest.jsonl.9.part"]
