@@ -15,10 +15,10 @@ from beers_deploy.model.io.tensors import read_conditioned
 from beers_deploy.model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
 from beers_deploy.network import Network
 from beers_deploy.network_files import told_int8 as for_sensor
-from beers_deploy.profiles.errors import one_line, optional
+from beers_deploy.profiles.errors import ModelError, one_line, optional, printable
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
+from beers_deploy.quant.banked.family import FAMILY, WEIGHTS, family_of
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.onnx_file import load_onnx, metadata
 from beers_deploy.report.page import Report, Section, render
@@ -72,8 +72,7 @@ def record_of(judged: Table, network: Network, sensor: Sensor, floating: Network
     """
     about = metadata(network.model)
     weights = _verified_weights(network, sensor, floating)
-    conditioned = weights is not None and FAMILY in about
-    in_range = {key: list(ends) for key, ends in RANGES.items()} if conditioned else None
+    in_range = {key: list(ends) for key, ends in RANGES.items()} if weights and _has_family(network) else None
     return {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
@@ -88,6 +87,14 @@ def record_of(judged: Table, network: Network, sensor: Sensor, floating: Network
         "passed": bool(judged),
         "results": judged.to_dict(),
     }
+
+
+def _has_family(network: Network) -> bool:
+    """Return True if the file holds what conditions it on other sensors; a damaged one conditions it on none."""
+    try:
+        return family_of(network.model) is not None
+    except ModelError:
+        return False
 
 
 def code_sha256() -> str:
@@ -115,7 +122,7 @@ def _page(judged: Table, said: dict[str, Any]) -> Report:
     known = ("weights_sha256", "training", "sensors_in_range", "licence")
     facts = said["network"] | {key: said[key] for key in known}
     rows = [Row("network", key, {}, {"value": str(value)}) for key, value in facts.items()]
-    claims = [Row("claims", key, {}, {"claim": str(value)}) for key, value in said["says"].items()]
+    claims = [Row("claims", key, {}, {"claim": printable(value)}) for key, value in said["says"].items()]
     checks = [
         Row("checks", each.name, {}, {"found": each.found, "allowed": each.allowed, "passed": str(each.passed)})
         for each in judged.checks
