@@ -19,7 +19,7 @@ def stored(folder: Path, kind: str) -> Path:
         if kind == "npy":
             np.save(stream, HELD["image"])
         else:
-            np.savez_compressed(stream, **HELD)
+            np.savez_compressed(stream, image=HELD["image"], reference=HELD["reference"])
     return path
 
 
