@@ -3,7 +3,8 @@
 import sys
 import traceback
 
-from beers_deploy.profiles.errors import CRASHED
+CRASHED = 70
+"""As in `profiles.errors`, which NumPy is loaded for: it may be what does not load."""
 
 
 def main() -> None:

@@ -65,14 +65,15 @@ def gate(
     Also checked: what saturates inside, the DPU's rules, that no ReLU was lost, and that onnxruntime's optimisations
     change no bit.
     """
-    from beers_deploy.model.io.files import write_text
-    from beers_deploy.network_files import pair_of
-    from beers_deploy.quant.limits import limits_of
-    from beers_deploy.verdict import gate as judged
-
     read = (float_model, int8_model, limits, baseline, images, samples, *map(Path, (target, sensor)))
     try:
         _clear((json, junit, *_record_files(record)), read, record)
+        # Loaded only now: if a library fails, no older verdict is left either.
+        from beers_deploy.model.io.files import write_text
+        from beers_deploy.network_files import pair_of
+        from beers_deploy.quant.limits import limits_of
+        from beers_deploy.verdict import gate as judged
+
         if samples is not None:
             refuse(context, ("images", "patches", "seed"), expected="none together with --samples", got="one")
         against, int8 = pair_of(float_model, int8_model)

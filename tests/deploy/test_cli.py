@@ -250,7 +250,7 @@ def test_no_stream_loses_an_image(closing: str, code: int, tmp_path: Path) -> No
     assert found == code or (found == 0 and "true" in closing)  # the pipe may live until the last word
 
 
-@pytest.mark.parametrize("module", ["typing_extensions", "psutil"])
+@pytest.mark.parametrize("module", ["typing_extensions", "psutil", "numpy"])
 def test_an_installation_that_does_not_work_is_no_failed_gate(module: str, tmp_path: Path) -> None:
     """Python ends a program whose libraries do not load with 1, which is the code of a failed gate."""
     (tmp_path / f"{module}.py").write_text("raise RuntimeError('broken')\n", encoding="utf-8")
