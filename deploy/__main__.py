@@ -15,7 +15,7 @@ def main() -> None:
         app(prog_name="beers-deploy")
     except Exception as error:  # noqa: BLE001 - Python itself would end with 1
         traceback.print_exc()
-        print(f"beers-deploy: this installation does not work, install it again: {error!r}", file=sys.stderr)  # noqa: T201
+        print(f"beers-deploy: this installation does not work, install it again: {error!a}", file=sys.stderr)  # noqa: T201
         sys.exit(CRASHED)
 
 

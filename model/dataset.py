@@ -282,12 +282,15 @@ def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
         write_text(path, wanted)
         return
     expected = "a folder without a dataset"
+    found = path.read_bytes() if path.is_file() else b""
     # An editor or Git may have changed how its lines end.
-    if not path.is_file() or path.read_bytes().replace(b"\r\n", b"\n") != wanted.encode():
+    if found.replace(b"\r\n", b"\n") != wanted.encode():
         raise OptionError("out", expected=expected, got="another dataset", remedy="choose another folder")
     if not resume:
         remedy = "add `resume` or choose another folder"
         raise OptionError("out", expected=expected, got="this dataset", remedy=remedy)
+    if found != wanted.encode():
+        write_text(path, wanted)
 
 
 def _read_summary(path: Path) -> dict[str, float]:

@@ -1,5 +1,6 @@
 """`beers-deploy gate`: does INT8 stay close enough to float? Exit code 1 when it does not."""
 
+import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -101,7 +102,7 @@ def gate(
         if junit is not None:
             write_text(junit, verdict.to_junit())
     except BeersError as error:
-        _explain(error, junit, read)
+        _explain(error, junit, (json, *_record_files(record)), read)
         raise
     say(str(verdict))
     if not verdict:
@@ -136,12 +137,15 @@ def _clear(outputs: Sequence[Path | None], inputs: Sequence[Path | None], record
         require_library()
 
 
-def _explain(error: BeersError, junit: Path | None, inputs: Sequence[Path | None]) -> None:
+def _explain(
+    error: BeersError, junit: Path | None, others: Sequence[Path | None], inputs: Sequence[Path | None]
+) -> None:
     """Write the reason why nothing could be judged to the JUnit file, if there is one that may be written."""
     from beers_deploy.model.io.files import require_writable, write_text
     from beers_deploy.verdict import junit_error
 
-    if junit is None or junit == STDOUT:
+    taken = {os.path.realpath(path).casefold() for path in others if path is not None}
+    if junit is None or junit == STDOUT or os.path.realpath(junit).casefold() in taken:
         return
     with suppress(BeersError):
         require_writable(junit, inputs=inputs)
