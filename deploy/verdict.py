@@ -268,8 +268,7 @@ def gate(
         raise OptionError("metric", expected="one beside the limit metric_loss", got="none", remedy=remedy)
     wanted = "psnr_drop_db" if allowed.psnr_drop_db is not None else "a metric" if metric else ""
     own = samples_of(theirs.model, samples) if wanted and samples is not None else None
-    if own is not None:
-        _require_references(own, wanted)
+    _require_references(own, wanted)
     how: dict[str, Any] = {"sensor": known, "images": images, "patches": patches, "seed": seed, "metric": metric}
     found = compare(ours, theirs, samples, **how, progress=progress)
     _require_contrast(found.result)
@@ -346,18 +345,17 @@ def _require_metric(metric: str | None) -> None:
         raise OptionError("metric", expected=f"one of {', '.join(METRICS)}", got=repr(metric), remedy="choose one")
 
 
-def _require_references(own: OwnSamples, wanted: str) -> None:
-    if not any(reference.size for _, reference in own.all.pairs):
+def _require_references(own: OwnSamples | None, wanted: str) -> None:
+    if own is not None and not any(reference.size for _, reference in own.all.pairs):
         expected, remedy = f"references for {wanted}", "give images and references, or leave it out"
         raise OptionError("samples", expected=expected, got="images alone", remedy=remedy)
 
 
 def _unchecked(checks: Sequence[Check]) -> list[str]:
     """Return a note if the encoding was not checked: the judged file itself decides whether it describes integers."""
-    if any(check.name == ENCODING for check in checks):
-        return []
     reason = "the INT8 file does not describe its integers, as a file that 'quantize' wrote does"
-    return [f"not checked: {ENCODING}, because {reason}"]
+    checked = any(check.name == ENCODING for check in checks)
+    return [] if checked else [f"not checked: {ENCODING}, because {reason}"]
 
 
 def file_checks(
