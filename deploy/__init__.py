@@ -19,7 +19,6 @@ from typing import Any
 import lazy_loader
 
 import beers_deploy.quant  # noqa: F401  # switches telemetry off before a module here loads a runtime
-from beers_deploy.profiles.errors import missing_extra
 
 __version__ = "1.0.0"
 
@@ -30,5 +29,7 @@ def __getattr__(name: str) -> Any:
     """What is offered under a name, loaded now."""
     try:
         return _loaded(name)
-    except ModuleNotFoundError as error:
+    except ImportError as error:
+        from beers_deploy.profiles.errors import missing_extra  # NumPy, which `__main__` has to survive without
+
         raise missing_extra(error, name) from error

@@ -1,5 +1,23 @@
-"""`python -m beers_deploy` is the command line, for environments whose scripts are not on the PATH."""
+"""The command line's entry: `beers-deploy`, or `python -m beers_deploy` where scripts are not on the PATH."""
 
-from beers_deploy.cli import app
+import sys
+import traceback
 
-app(prog_name="beers-deploy")
+CRASHED = 70
+"""As in `profiles.errors`, which NumPy is loaded for: it may be what does not load."""
+
+
+def main() -> None:
+    """Run the command line; a library that does not load ends with 70, because 1 means that a gate failed."""
+    try:
+        from beers_deploy.cli import app
+
+        app(prog_name="beers-deploy")
+    except Exception as error:  # noqa: BLE001 - Python itself would end with 1
+        traceback.print_exc()
+        print(f"beers-deploy: this installation does not work, install it again: {error!a}", file=sys.stderr)  # noqa: T201
+        sys.exit(CRASHED)
+
+
+if __name__ == "__main__":
+    main()

@@ -10,8 +10,11 @@ from typing import Any
 
 from beers_deploy.differences import read_document
 from beers_deploy.model.io.files import sha256
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.model.io.images import list_images
+from beers_deploy.profiles.errors import OptionError, encodable
+from beers_deploy.profiles.figures import Check
 from beers_deploy.profiles.sensor import Sensor, numbers_of
+from beers_deploy.quant.samples import sample_files
 from beers_deploy.results import Input
 
 PATCHES = ("sensor", "images", "patches", "seed", "samples")
@@ -32,13 +35,15 @@ class Baseline:
         path: of its document.
         mae: over full scale.
         psnr_float_db: of the float network against the references; NaN without any.
-        digests: SHA-256 of what it rested on, by name.
+        digests: SHA-256 of what it rested on, by name; two networks may have one file name.
+        checks: names of its checks.
     """
 
     path: Path
     mae: float
     psnr_float_db: float
-    digests: Mapping[str, str]
+    digests: Mapping[str, frozenset[str]]
+    checks: frozenset[str] = frozenset()
 
     def require_same(self, float_sha256: str, psnr_float_db: float, inputs: Iterable[Input]) -> None:
         """Raise OptionError if the baseline is of another float network, sensor, or of other images or samples.
@@ -49,13 +54,13 @@ class Baseline:
             inputs: everything else that the comparison rests on, networks left out.
         """
         same_psnr = abs(psnr_float_db - self.psnr_float_db) < SAME_DB
-        if not same_psnr and float_sha256 not in self.digests.values():
+        if not same_psnr and not any(float_sha256 in known for known in self.digests.values()):
             raise self._refused("a baseline of this float network", "another's")
         for each in inputs:
-            before = self.digests.get(each.name)
+            before = self.digests.get(encodable(each.name))
             if before is None:
                 raise self._refused(f"a baseline that rests on {each.name}", "one that does not")
-            if before != each.sha256:
+            if before != {each.sha256}:
                 raise self._refused(f"a baseline of the same {each.name}", f"one of another {each.name}")
 
     def _refused(self, expected: str, got: str) -> OptionError:
@@ -71,7 +76,7 @@ def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
 
     Raises:
         OptionError: a file that is no results document, of another command, of a gate that failed or of one on other
-            patches, or without an MAE that was measured over full scale.
+            patches, one that contradicts itself, or one without an MAE that was measured over full scale.
     """
     document: Any = read_document(path)
     if document["command"] != "gate":
@@ -87,13 +92,35 @@ def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
         if then != now:
             expected = f"a baseline of the same patches ({name} {now})"
             raise OptionError(str(path), expected=expected, got=f"{name} {then}", remedy=REMEDY)
-    figures: dict[str, Any] = next((row["figures"] for row in document["rows"] if row["table"] == "gate"), {})
+    rows = [row for row in document["rows"] if row["table"] == "gate"]
+    figures: dict[str, Any] = rows[0]["figures"] if rows else {}
     mae = figures.get("MAE", {})
     if mae.get("mode") != "measured" or mae.get("unit") != SCALE or not 0 <= mae["value"] <= 1:
         raise OptionError(str(path), expected=f"a measured MAE {SCALE}", got=_shown(mae), remedy=REMEDY)
+    contradiction = _contradiction(document["checks"], len(rows), mae["value"])
+    if contradiction:
+        raise OptionError(str(path), expected="a baseline that agrees with itself", got=contradiction, remedy=REMEDY)
     psnr_db = figures.get("PSNR float", {}).get("value")
-    digests = {each["name"]: each["sha256"] for each in document["inputs"]}
-    return Baseline(path, float(mae["value"]), math.nan if psnr_db is None else float(psnr_db), digests)
+    digests: dict[str, frozenset[str]] = {}
+    for each in document["inputs"]:
+        digests[each["name"]] = digests.get(each["name"], frozenset()) | {each["sha256"]}
+    checks = frozenset(check["name"] for check in document["checks"])
+    return Baseline(path, float(mae["value"]), math.nan if psnr_db is None else float(psnr_db), digests, checks)
+
+
+def _contradiction(checks: Iterable[Mapping[str, Any]], rows: int, mae: float) -> str:
+    """Return what in a document contradicts itself, in words; empty if nothing does."""
+    if rows > 1:
+        return f"{rows} rows of the table gate"
+    for each in checks:
+        name, value, limit = (each[key] for key in ("name", "value", "limit"))
+        if name == "MAE" and value != mae:
+            return f"an MAE of {mae} in the figures and of {value} in the checks"
+        if value is None or limit is None:  # infinite or NaN, for which JSON has no number
+            continue
+        if Check(name, value, limit, each["unit"], each["bound"]).passed != each["passed"]:
+            return f"{name} {value} with the limit {limit} and passed {each['passed']}"
+    return ""
 
 
 def _shown(figure: Mapping[str, Any]) -> str:
@@ -103,7 +130,7 @@ def _shown(figure: Mapping[str, Any]) -> str:
 
 def _plain(name: str, value: object) -> str:
     """Return an argument as text; of a folder of images its name, because the folder may lie elsewhere."""
-    return Path(str(value)).name if name in ("images", "samples", "sensor") else str(value)
+    return encodable(Path(str(value)).name if name in ("images", "samples", "sensor") else str(value))
 
 
 def sensor_input(sensor: Sensor) -> Input:
@@ -112,16 +139,26 @@ def sensor_input(sensor: Sensor) -> Input:
     return Input(f"sensor {sensor.name}", hashlib.sha256(text.encode()).hexdigest())
 
 
-def files_input(kind: str, path: Path) -> Input:
-    """Return a file, or a folder with all files in it, as what figures rest on.
+def data_inputs(images: Path | None, samples: Path | None) -> list[Input]:
+    """Return the images and the samples as what figures rest on.
 
     Args:
-        kind: what it is: "scenes" or "samples".
-        path: of the file or the folder.
+        images: folder of scenes; None if there is none.
+        samples: file or folder of a user's own samples; None if there is none.
     """
+    found = []
+    if images is not None:
+        found.append(_files_input("scenes", images, list_images(images)))
+    if samples is not None:
+        found.append(_files_input("samples", samples, sample_files(samples)))
+    return found
+
+
+def _files_input(kind: str, path: Path, files: Iterable[Path]) -> Input:
+    """Return a file, or the files of a folder that are read: others that lie there change no figure."""
     if path.is_file():
         return Input(f"{kind} {path.name}", sha256(path))
     digest = hashlib.sha256()
-    for file in sorted(each for each in path.rglob("*") if each.is_file()):
-        digest.update(f"{file.relative_to(path).as_posix()} {sha256(file)}\n".encode())
+    for file in sorted(files):
+        digest.update(f"{file.relative_to(path).as_posix()} {sha256(file)}\n".encode(errors="surrogateescape"))
     return Input(f"{kind} {path.name}", digest.hexdigest())

@@ -11,7 +11,7 @@ import numpy as np
 from beers_deploy.dpu.checker.table import check
 from beers_deploy.kit.golden import PICTURE, save_array, write_golden
 from beers_deploy.kit.host_facts import host_facts
-from beers_deploy.kit.record import recorded, write_record
+from beers_deploy.kit.record import require_library, write_record
 from beers_deploy.model.consistency import REACH_PX
 from beers_deploy.model.exposure import HEADROOM
 from beers_deploy.model.io.files import write_text
@@ -77,7 +77,7 @@ class Board(TargetProfile):
         if known is not None and known.name != BLIND and (doubt := other_sensor(network.model, known)):
             warnings.warn(doubt, stacklevel=2)
         if record:
-            recorded(folder / "record")  # refused before anything is written
+            require_library()  # refused before anything is written
         core, brighter = network.core(self, tile), _brighter(int8, known)
         facts = host_facts(network, tile, known, brighter)
         core.save(folder / "core.onnx")

@@ -45,6 +45,7 @@ from beers_deploy.commands import (
 from beers_deploy.commands.shared import results_to, running
 from beers_deploy.model.progress import reporting
 from beers_deploy.profiles.errors import (
+    CRASHED,
     BeersError,
     OptionError,
     OutsideRangeWarning,
@@ -53,8 +54,8 @@ from beers_deploy.profiles.errors import (
     visible,
 )
 
-CRASHED, INTERRUPTED = 70, 130
-"""Exit codes of a fault in this program (sysexits' EX_SOFTWARE), and of Ctrl-C."""
+INTERRUPTED = 130
+"""Exit code of Ctrl-C."""
 
 PIPES_RESULTS = "beers_deploy.pipes_results"
 """Key in the context of a command line: True if the results are asked for on standard output."""
@@ -158,7 +159,7 @@ def _require_values(named: Mapping[str, object]) -> None:
 
 def ending(error: BaseException, function: Callable[..., None]) -> tuple[str, int]:
     """What a command says of an error that ends it, and its exit code."""
-    if isinstance(error, ModuleNotFoundError):
+    if isinstance(error, ImportError) and not isinstance(error, BeersError):
         error = missing_extra(error, function.__name__)
     if isinstance(error, BeersError):
         return in_options(str(error), function), 2

@@ -230,5 +230,5 @@ def told_by_delta(model: onnx.ModelProto, delta: Path) -> onnx.ModelProto:
     except OSError as error:
         got, remedy = unreadable(delta) or str(error), "give a file that 'export --delta' wrote"
         raise ModelError(str(delta), expected="a delta", got=got, remedy=remedy) from error
-    core, name = with_delta(required_family(model).core, packed)
+    core, name = with_delta(required_family(model).core, packed, str(delta))
     return host_model(core, {**metadata(model), "sensor": name}, fixed_tile_px(model))

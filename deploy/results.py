@@ -20,7 +20,7 @@ from beers_deploy import __version__
 from beers_deploy.frames import bars, figures_of, html_table, tidy_frame, wide_frame, words_of
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.processor import decided, processor_name
-from beers_deploy.profiles.errors import one_line, printable, visible
+from beers_deploy.profiles.errors import OptionError, encodable, one_line, printable, visible
 from beers_deploy.profiles.figures import Check, Figure, Row, by_table
 
 if TYPE_CHECKING:
@@ -41,6 +41,20 @@ class Input(NamedTuple):
 def input_of(path: Path) -> Input:
     """A file's name and digest."""
     return Input(path.name, sha256(path))
+
+
+def inputs_of(*paths: Path | None) -> tuple[Input, ...]:
+    """Return name and digest of each file that exists: taken before the files are read."""
+    return tuple(input_of(path) for path in paths if path is not None and path.is_file())
+
+
+def require_same(before: Iterable[Input], *paths: Path | None) -> None:
+    """Raise OptionError if a file was replaced since `inputs_of`: the digest would be that of another one."""
+    for then, now in zip(before, inputs_of(*paths), strict=False):
+        if then != now:
+            expected = "a file that stays as it is"
+            remedy = "wait until it is written, then run this again"
+            raise OptionError(then.name, expected=expected, got="a change during this run", remedy=remedy)
 
 
 @dataclass(frozen=True, repr=False)
@@ -74,7 +88,7 @@ class Table:
         """The whole as the schema of results documents wants it."""
         inputs = [each if isinstance(each, Input) else input_of(each) for each in self.inputs]
         checks = [check.to_json() for check in self.checks]
-        return {
+        document: dict[str, object] = {
             "schema": SCHEMA_NAME,
             "schema_version": SCHEMA_VERSION,
             "tool_version": __version__,
@@ -94,6 +108,7 @@ class Table:
             ],
             "notes": list(self.notes),
         }
+        return {key: _encodable(value) for key, value in document.items()}
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write `to_dict` as a JSON file, whole or not at all."""
@@ -168,6 +183,15 @@ def host() -> dict[str, object]:
         "load_1_min": None if platform.system() == "Windows" else round(psutil.getloadavg()[0], 2),
         "kernels": decided(),
     }
+
+
+def _encodable(value: object) -> object:
+    """Return a value of a document with text that any reader of JSON takes."""
+    if isinstance(value, dict):
+        return {encodable(key): _encodable(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_encodable(each) for each in value]
+    return encodable(value) if isinstance(value, str) else value
 
 
 def _plain(value: object) -> object:

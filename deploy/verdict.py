@@ -18,7 +18,7 @@ from xml.etree import ElementTree as ET
 
 import onnx
 
-from beers_deploy.baseline import files_input, read_baseline, sensor_input
+from beers_deploy.baseline import data_inputs, read_baseline, sensor_input
 from beers_deploy.dpu.board import BoardLike, ruled
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.checker.table import legality
@@ -31,14 +31,14 @@ from beers_deploy.profiles.figures import Check, Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, TargetProfile
 from beers_deploy.quant.float_parts import float_note
-from beers_deploy.quant.gate import METRICS, GateResult, judge, judge_saturation, verdict_row
+from beers_deploy.quant.gate import METRICS, GateResult, judge, judge_saturation, unfit_reference, verdict_row
 from beers_deploy.quant.gate import compare as differences_of
 from beers_deploy.quant.limits import Limits, limits_of
 from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px, metadata, require_quantised
 from beers_deploy.quant.sample_range import range_row, recorded_range, uncovered
 from beers_deploy.quant.samples import CALIBRATED_ON, OwnSamples, digest_of, samples_of
 from beers_deploy.quant.session import open_any_size
-from beers_deploy.quant.structure import saturated_shares, structure_checks
+from beers_deploy.quant.structure import ENCODING, saturated_shares, structure_checks
 from beers_deploy.results import Input, Table
 
 if TYPE_CHECKING:
@@ -152,22 +152,23 @@ def compare(
         True
     """
     known = Sensor.load(sensor)
-    if metric not in (None, *METRICS):
-        raise OptionError("metric", expected=f"one of {', '.join(METRICS)}", got=repr(metric), remedy="choose one")
+    if samples is not None and images is not None:
+        remedy = "leave one of them out: images are for simulated patches"
+        raise OptionError("images", expected="none together with samples", got=str(images), remedy=remedy)
+    _require_metric(metric)
     ours, theirs = _pair(int8, against, known)
     scenes = None if images is None else Path(images)
     with reporting(progress), faults_named(theirs.label):
         judged, simulated, notes = _samples(ours, theirs, known, samples, scenes, patches, seed)
         sessions = open_any_size(theirs.model), open_any_size(ours.model)
-        result = differences_of(*sessions, judged.pairs, simulated, metric)
+        result = differences_of(*sessions, judged.pairs, simulated, metric, judged.names)
         shares = saturated_shares(ours.model, judged.degraded)
     arguments: dict[str, object] = {"float": theirs.name, "int8": ours.name, "sensor": known.name, "images": images}
-    arguments |= {"patches": patches, "seed": seed, "samples": samples if isinstance(samples, str | Path) else None}
-    rests_on = [sensor_input(known)]
-    if scenes is not None and simulated:
-        rests_on.append(files_input("scenes", scenes))
-    if isinstance(samples, str | Path):
-        rests_on.append(files_input("samples", Path(samples)))
+    arguments |= {"patches": patches, "seed": seed, "samples": _named(samples)}
+    given = Path(samples) if isinstance(samples, str | os.PathLike) else None
+    rests_on = [sensor_input(known), *data_inputs(scenes, given)]
+    if samples is not None and given is None:
+        rests_on.append(Input(f"samples {IN_MEMORY}", judged.digest))
     rows, range_notes = _range_rows(ours, result)
     return Comparison(
         "compare",
@@ -182,6 +183,17 @@ def compare(
         sensor=known,
         rests_on=tuple(rests_on),
     )
+
+
+IN_MEMORY = "in memory"
+"""What arguments and inputs call samples that are no file."""
+
+
+def _named(samples: object) -> str | None:
+    """Return what a document calls samples; None of simulated patches."""
+    if isinstance(samples, str | os.PathLike):
+        return os.fspath(samples)
+    return None if samples is None else IN_MEMORY
 
 
 def _range_rows(int8: Network, result: GateResult) -> tuple[list[Row], list[str]]:
@@ -239,13 +251,14 @@ def gate(
         >>> bool(verdict)
         True
     """
+    _require_metric(metric)
     allowed, target, known = limits_of(limits), TargetProfile.load(board), Sensor.load(sensor)
     ours, theirs = _pair(int8, against, known)
-    config, data = (each if isinstance(each, str | os.PathLike) else None for each in (limits, samples))
+    config = limits if isinstance(limits, str | os.PathLike) else None
     told = sensor if isinstance(sensor, str) else known.name
     arguments: dict[str, object] = {"max_mae": allowed.mae, "limits": config, "baseline": baseline}
     arguments |= {"target": target.name, "sensor": told, "images": images, "patches": patches, "seed": seed}
-    arguments |= {"samples": data} | ({"metric": metric} if metric else {})
+    arguments |= {"samples": _named(samples)} | ({"metric": metric} if metric else {})
     before = None if baseline is None else read_baseline(Path(baseline), arguments)
     if before is None and allowed.mae_growth is not None:
         remedy = "give what an earlier 'gate --json' wrote, or leave that limit out"
@@ -254,17 +267,21 @@ def gate(
         remedy = "name the metric, or leave that limit out"
         raise OptionError("metric", expected="one beside the limit metric_loss", got="none", remedy=remedy)
     wanted = "psnr_drop_db" if allowed.psnr_drop_db is not None else "a metric" if metric else ""
-    if wanted and samples is not None:
-        _require_references(samples_of(theirs.model, samples), wanted)
+    own = samples_of(theirs.model, samples) if wanted and samples is not None else None
+    _require_references(own, wanted)
     how: dict[str, Any] = {"sensor": known, "images": images, "patches": patches, "seed": seed, "metric": metric}
     found = compare(ours, theirs, samples, **how, progress=progress)
     _require_contrast(found.result)
+    psnr_missing = math.isnan(found.result.psnr_float_db) and not math.isnan(found.result.mae)
+    if own is not None and allowed.psnr_drop_db is not None and psnr_missing:
+        raise unfit_reference(own.all.names[0], own.all.pairs[0][1].shape, "psnr_drop_db")
     if before is not None:
         before.require_same(theirs.sha256, found.result.psnr_float_db, found.rests_on)
     checks = judge(found.result, allowed, before.mae if before else None)
     checks += judge_saturation(found.shares, allowed)
-    checks += file_checks(theirs.model, ours, target)
-    notes = (*found.notes, *_mae_note(found.result, allowed, checks), *float_note(ours.model))
+    must_describe = before is not None and ENCODING in before.checks
+    checks += file_checks(theirs.model, ours, target, must_describe)
+    notes = (*found.notes, *_mae_note(found.result, allowed, checks), *float_note(ours.model), *_unchecked(checks))
     return Verdict("gate", arguments, found.inputs, found.rows, tuple(checks), notes=notes, comparison=found)
 
 
@@ -323,18 +340,33 @@ def _samples(
     return own.all, False, (f"{note}: on those INT8 loses less than on others",)
 
 
+def _require_metric(metric: str | None) -> None:
+    if metric not in (None, *METRICS):
+        raise OptionError("metric", expected=f"one of {', '.join(METRICS)}", got=repr(metric), remedy="choose one")
+
+
 def _require_references(own: OwnSamples | None, wanted: str) -> None:
     if own is not None and not any(reference.size for _, reference in own.all.pairs):
         expected, remedy = f"references for {wanted}", "give images and references, or leave it out"
         raise OptionError("samples", expected=expected, got="images alone", remedy=remedy)
 
 
-def file_checks(float_model: onnx.ModelProto, int8: Network, target: TargetProfile) -> list[Check]:
-    """What the INT8 file itself shows: the rules of the target's DPU or NPU, then what `quant.structure` looks at."""
-    checks = structure_checks(float_model, int8.model)
+def _unchecked(checks: Sequence[Check]) -> list[str]:
+    """Return a note if the encoding was not checked: the judged file itself decides whether it describes integers."""
+    reason = "the INT8 file does not describe its integers, as a file that 'quantize' wrote does"
+    checked = any(check.name == ENCODING for check in checks)
+    return [] if checked else [f"not checked: {ENCODING}, because {reason}"]
+
+
+def file_checks(
+    float_model: onnx.ModelProto, int8: Network, target: TargetProfile, must_describe: bool = False
+) -> list[Check]:
+    """Check the INT8 file itself: the rules of the target's DPU or NPU, then what `structure_checks` looks at."""
+    checks = structure_checks(float_model, int8.model, must_describe)
     if not (target.configurations or target.npu):
         return checks
-    read = network_of(int8.model, fixed_tile_px(int8.model) or TILE_PX, int8.name)
+    with faults_named(int8.label):
+        read = network_of(int8.model, fixed_tile_px(int8.model) or TILE_PX, int8.name)
     return [legality(place(read, ruled(target)), npu=bool(target.npu)), *checks]
 
 

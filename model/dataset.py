@@ -23,7 +23,7 @@ import numpy as np
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.io.images import site_of
 from beers_deploy.model.io.tiff import write_tiff
-from beers_deploy.model.manifest import Line, image_of, line_text, matching_lines
+from beers_deploy.model.manifest import DIGESTS, ROLES, Line, image_of, line_text, matching_lines
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
@@ -32,7 +32,7 @@ from beers_deploy.model.simulator.plan import TOLERANCE_DN, make_plan
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene, read_scene, resample
 from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.profiles.sensor import Sensor, require_same_units, same_instrument
+from beers_deploy.profiles.sensor import Instrument, Sensor, require_same_units, same_instrument
 from beers_deploy.profiles.sensor_file import reference_beside, sensor_from_json
 from beers_deploy.profiles.toml import parse_json, read_json
 
@@ -136,16 +136,40 @@ def _make_patch(recipe: DatasetRecipe, window: Window, radiance: np.ndarray) -> 
     bottom, right = window.top + window.height, window.left + window.width
     part = prepare_scene(radiance[window.top : bottom, window.left : right], recipe.oversampling)
     draw = Draw(recipe.seed, window.number)
-    line: Line = {"number": window.number, "name": window.name, "seed": recipe.seed}
-    line |= {"source": window.name.split("-", 1)[1], "top_px": window.top, "left_px": window.left}
+    line, sensors = _drawn(recipe, window)
     images = []
-    for role, profile in (("degraded", recipe.degraded), ("reference", recipe.reference)):
-        sensor, rejected = profile.draw_counted(draw.generator(f"sensor-{role}"))
+    for role, sensor in sensors.items():
         plan = make_plan(sensor, part.stats, recipe.tolerance_dn)
         images.append(to_uint16(simulate_planned(part, sensor, draw, plan, role)))
-        drawn = asdict(replace(sensor, response=None))  # a response is the same for all: the recipe keeps it
-        line[role] = {"sensor": drawn, "rejected_snr_pairs": rejected, "plan": plan.to_json()}
+        line[role] = {**line[role], PLAN: plan.to_json()}
     return Patch(images[0], images[1], line)
+
+
+PLAN = "plan"
+"""Key of what was simulated of a role, which depends on the scene's pixels."""
+
+
+def _drawn(recipe: DatasetRecipe, window: Window) -> tuple[dict[str, Any], dict[str, Instrument]]:
+    """Return a pair's line of the manifest without its plans, and its sensors by role: no pixel decides them."""
+    draw = Draw(recipe.seed, window.number)
+    line: dict[str, Any] = {"number": window.number, "name": window.name, "seed": recipe.seed}
+    line |= {"source": window.name.split("-", 1)[1], "top_px": window.top, "left_px": window.left}
+    sensors = {}
+    for role, profile in (("degraded", recipe.degraded), ("reference", recipe.reference)):
+        sensors[role], rejected = profile.draw_counted(draw.generator(f"sensor-{role}"))
+        drawn = asdict(replace(sensors[role], response=None))  # the same for all: the recipe keeps it
+        line[role] = {"sensor": drawn, "rejected_snr_pairs": rejected}
+    return line, sensors
+
+
+def _is_drawn(recipe: DatasetRecipe, window: Window, text: str) -> bool:
+    """Return True if a line of the manifest states what the recipe draws: whoever forges it can make its digest."""
+    line: Any = parse_json(text)
+    del line[DIGESTS]
+    for role in ROLES:
+        line[role] = {key: value for key, value in line[role].items() if key != PLAN}
+    wanted, _ = _drawn(recipe, window)
+    return json.dumps(line, sort_keys=True) == json.dumps(wanted, sort_keys=True)
 
 
 CHUNK = 32
@@ -180,14 +204,12 @@ def write_dataset(
         patches, and the share of drawn SNR pairs that were impossible and drawn again.
     """
     _check_folder(recipe, out, resume)
-    for left_over in out.rglob(".*.part"):  # of a run that was killed
-        if not left_over.is_dir():
-            left_over.unlink()
+    _remove_left_overs(out)
     windows, manifest = plan_windows(recipe), out / "manifest.jsonl"
     scenes = [list(group) for _, group in groupby(windows, key=lambda w: w.scene)]
     chunks = [scene[first : first + CHUNK] for scene in scenes for first in range(0, len(scene), CHUNK)]
     parts = {out / "parts" / f"{chunk[0].number:08d}.jsonl": chunk for chunk in chunks}
-    lines = _lines_left(out, windows, parts, log) if resume else {}
+    lines = _lines_left(recipe, out, windows, parts, log) if resume else {}
     waiting = {path: [w for w in chunk if w.number not in lines] for path, chunk in parts.items()}
     waiting = {path: chunk for path, chunk in waiting.items() if chunk}
     tick(len(lines))
@@ -209,11 +231,22 @@ def write_dataset(
     return _read_summary(manifest)
 
 
-def _lines_left(out: Path, windows: list[Window], parts: Mapping[Path, list[Window]], log: Log) -> dict[int, str]:
+def _remove_left_overs(out: Path) -> None:
+    """Delete the files that a run which was killed left half-written: `whole_file` names them so."""
+    for folder in (out, out / "parts", *(out / role for role in ROLES)):
+        for path in folder.glob(".*.[0-9]*.part"):
+            if not path.is_dir():
+                path.unlink()
+
+
+def _lines_left(
+    recipe: DatasetRecipe, out: Path, windows: list[Window], parts: Mapping[Path, list[Window]], log: Log
+) -> dict[int, str]:
     """Return the lines of the pairs that an earlier run wrote and that match, by number; tell `log` of the others."""
     manifest = out / "manifest.jsonl"
     found = matching_lines(out, (manifest, *parts))
-    lines = {w.number: found[w.number, w.name] for w in windows if (w.number, w.name) in found}
+    known = ((w, found[w.number, w.name]) for w in windows if (w.number, w.name) in found)
+    lines = {window.number: text for window, text in known if _is_drawn(recipe, window, text)}
     stated = windows if manifest.exists() else [w for path, chunk in parts.items() if path.exists() for w in chunk]
     damaged = sum(window.number not in lines for window in stated)
     if damaged:
@@ -249,11 +282,15 @@ def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
         write_text(path, wanted)
         return
     expected = "a folder without a dataset"
-    if not path.is_file() or path.read_bytes() != wanted.encode():
+    found = path.read_bytes() if path.is_file() else b""
+    # An editor or Git may have changed how its lines end.
+    if found.replace(b"\r\n", b"\n") != wanted.encode():
         raise OptionError("out", expected=expected, got="another dataset", remedy="choose another folder")
     if not resume:
         remedy = "add `resume` or choose another folder"
         raise OptionError("out", expected=expected, got="this dataset", remedy=remedy)
+    if found != wanted.encode():
+        write_text(path, wanted)
 
 
 def _read_summary(path: Path) -> dict[str, float]:

@@ -35,31 +35,33 @@ def line_text(out: Path, line: Line) -> str:
     return json.dumps(line | {DIGESTS: digests}, sort_keys=True) + "\n"
 
 
-def matching_lines(out: Path, files: Iterable[Path]) -> dict[tuple[object, object], str]:
+def matching_lines(out: Path, files: Iterable[Path]) -> dict[tuple[int, str], str]:
     """Return the lines of some manifests that match their digests and images, by number and name of the pair.
 
     Args:
         out: the dataset's folder.
         files: manifests, or parts of one; one that is not there is passed over.
     """
-    found: dict[tuple[object, object], str] = {}
+    found: dict[tuple[int, str], str] = {}
     for path in files:
         if not path.is_file():
             continue
         for text in path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True):
             line = _matching(out, text)
             if line is not None:
-                found[line["number"], line["name"]] = text
+                found[line["number"], str(line["name"])] = text
     return found
 
 
-def _matching(out: Path, text: str) -> Line | None:
+def _matching(out: Path, text: str) -> dict[str, Any] | None:
     """Return a line without its digests; None if the line or an image does not match them."""
     try:
         found: Any = parse_json(text)
         line: dict[str, Any] = dict(found)
         digests = dict(line.pop(DIGESTS))
         if digests.pop("line") != _digest(line) or not text.endswith("\n"):
+            return None
+        if not (isinstance(line["number"], int) and all(isinstance(line[role], dict) for role in ROLES)):
             return None
         same = digests == {role: sha256(image_of(out, role, line["name"])) for role in ROLES}
     except (LookupError, OSError, TypeError, ValueError):

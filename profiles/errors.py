@@ -15,7 +15,11 @@ A gate that fails is no error: its command exits with 1.
 
 from functools import partial
 from importlib import import_module
+from traceback import walk_tb
 from typing import Any
+
+CRASHED = 70
+"""Exit code of a fault in this program or its installation (sysexits' EX_SOFTWARE)."""
 
 LONGEST = 400
 """Characters of a file that a message shows at most."""
@@ -61,6 +65,11 @@ def one_line(text: str) -> str:
     file must not look like another line of a log.
     """
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def encodable(text: str) -> str:
+    """Return the text with an escape for what UTF-8 cannot hold: bytes of a file's name in another encoding."""
+    return text.encode(errors="backslashreplace").decode()
 
 
 def visible(text: str) -> str:
@@ -139,19 +148,24 @@ def optional(package: str, where: str) -> Any:
     try:
         return import_module(package)
     except ImportError as error:  # not there, or there and unable to load what it needs
-        name = package.split(".")[0]
-        got = "none" if error.name == name else f"one that does not load ({error})"
-        raise _without(name, where, got) from error
+        raise _without(package.split(".")[0], where, error) from error
 
 
-def missing_extra(error: ModuleNotFoundError, where: str) -> Exception:
-    """The error of an optional package that is not installed; the error itself of any other module."""
-    package = (error.name or "").split(".")[0]
-    if package not in EXTRAS:
-        return error
-    return _without(package, where, "none")
+def missing_extra(error: ImportError, where: str) -> Exception:
+    """Return the error of an optional package that is missing or does not load, else `error`."""
+    package = _imported(error)
+    return error if package is None else _without(package, where, error)
 
 
-def _without(package: str, where: str, got: str) -> MissingExtraError:
+def _imported(error: ImportError) -> str | None:
+    """Return the optional package whose import failed, by the module's name or by the code that imported it."""
+    at_import = (frame for frame, _ in walk_tb(error.__traceback__) if frame.f_code.co_name == "<module>")
+    names = (error.name, *(frame.f_globals.get("__name__") for frame in at_import))
+    packages = (str(name).partition(".")[0] for name in names)
+    return next((package for package in packages if package in EXTRAS), None)
+
+
+def _without(package: str, where: str, error: ImportError) -> MissingExtraError:
+    got = "none" if error.name == package else f"one that does not load ({error})"
     remedy = f"pip install 'beers-deploy[{EXTRAS[package]}]'"
     return MissingExtraError(where, expected=f"the package {package}", got=got, remedy=remedy)

@@ -5,6 +5,7 @@ import math
 import re
 import stat
 import tomllib
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 
@@ -28,6 +29,8 @@ def read_toml_text(path: Path) -> dict[str, object]:
         raise ValueError(_line_at_fault(text, str(error))) from None
     except RecursionError:
         raise ValueError(TOO_DEEP) from None
+    except ValueError:  # Python converts no more than 4300 digits, and names a setting of its own
+        raise ValueError("a number of too many digits") from None
 
 
 def _line_at_fault(text: str, reason: str) -> str:
@@ -45,12 +48,25 @@ def read_json(path: Path) -> object:
 
 
 def parse_json(text: str) -> object:
-    """Read JSON text as plain values of Python."""
+    """Read JSON text as plain values of Python; raise ValueError with the reason if it is none."""
+    if not text.strip():
+        raise ValueError("an empty file")
     try:
-        found: object = json.loads(text, parse_constant=_number, parse_float=_number, parse_int=_whole)
+        found: object = json.loads(
+            text, parse_constant=_number, parse_float=_number, parse_int=_whole, object_pairs_hook=_unique
+        )
         json.dumps(found, ensure_ascii=False).encode()  # half a surrogate pair cannot be printed
     except RecursionError:
         raise ValueError(TOO_DEEP) from None
+    return found
+
+
+def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    """Return an object; raise ValueError for a key that stands in it twice, of which readers take either."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
+        raise ValueError(f"the key {twice[:QUOTED]!r} twice")
     return found
 
 

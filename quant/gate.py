@@ -9,10 +9,11 @@ import numpy as np
 import onnxruntime as ort
 
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
-from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.figures import Check, Figure, Row, measured, unavailable
 from beers_deploy.quant.limits import MAE_GROWTH, Limits
 from beers_deploy.quant.sample_range import RangeCounts, SampleRange
+from beers_deploy.quant.samples import LARGEST
 from beers_deploy.quant.session import result_of
 from beers_deploy.quant.untrusted import times
 
@@ -157,6 +158,7 @@ def compare(
     pairs: "Iterable[Pair]",
     simulated: bool = True,
     metric: str | None = None,
+    names: Sequence[str] = (),
 ) -> GateResult:
     """Run both networks on (degraded, reference) pairs of (1, C, H, W) in [0, 1]; images clipped as a file would.
 
@@ -168,9 +170,11 @@ def compare(
         pairs: what both are run on.
         simulated: whether these are simulated patches.
         metric: one of `METRICS`, by which results are held against the references too.
+        names: of the samples, for messages.
 
     Raises:
         ModelError: results of different shapes.
+        ImageError: a reference of the results' size outside [0, 1], or a sample without one where others have it.
         OptionError: references that the metric does not take.
     """
     differences = []
@@ -180,7 +184,8 @@ def compare(
     contrasts = []
     counts = RangeCounts()
     measured_by = list[list[Parts]]()
-    for degraded, reference in pairs:
+    lacking = dict[str, tuple[int, ...]]()
+    for number, (degraded, reference) in enumerate(pairs):
         counts.add(degraded)
         results = [result_of(s, degraded) for s in (float_session, int8_session)]
         if results[0].shape != results[1].shape:
@@ -196,9 +201,19 @@ def compare(
         same_shape = in_float.shape == degraded.shape
         changes.append(float(np.abs(in_float - degraded).mean()) if same_shape else math.nan)
         contrasts.append(float(np.abs(in_float - in_float.mean()).mean()))
+        name = names[number] if names else f"sample {number}"
+        if reference.shape != in_float.shape:
+            lacking[name] = reference.shape
+        elif metric is None or not METRICS[metric].of_classes:
+            _require_full_scale(name, reference)
         errors.append([_psnr_db(image, reference) for image in (degraded, in_float, in_int8)])
         if metric is not None:
             measured_by.append([parts_of(metric, result, reference) for result in (in_float, in_int8)])
+    if (
+        lacking and not np.isnan([in_float for _, in_float, _ in errors]).all()
+    ):  # a mean over some of them would be NaN, and its check left out
+        name, shape = next(iter(lacking.items()))
+        raise unfit_reference(name, shape, "the PSNRs, as other samples have one")
     difference = np.concatenate(differences).astype(np.float64)
     degraded_db, float_db, int8_db = np.mean(errors, axis=0)
     return GateResult(
@@ -220,6 +235,22 @@ def compare(
         input_change=float(np.mean(changes)),
         contrast=float(np.mean(contrasts)),
         sample_range=counts.range,
+    )
+
+
+def _require_full_scale(name: str, reference: np.ndarray) -> None:
+    low, high = float(reference.min()), float(reference.max())
+    if not (low >= 0 and high <= LARGEST):
+        got, remedy = f"{low:.4g} to {high:.4g}", "divide it by full scale"
+        raise ImageError(name, expected="a reference with values in [0, 1]", got=got, remedy=remedy)
+
+
+def unfit_reference(name: str, shape: Sequence[int], wanted: str) -> ImageError:
+    """Return the error of a reference of another size than the network's results, which `wanted` needs."""
+    expected = f"a reference of the results' size for {wanted}"
+    got = times(shape[1:]) if math.prod(shape) else "none"
+    return ImageError(
+        name, expected=expected, got=got, remedy="give references of that size for all samples, or none"
     )
 
 

@@ -113,14 +113,14 @@ def _named(where: str, raw: Mapping[str, object]) -> Limits:
         raise OptionError(where, expected=expected, got="no limit", remedy="write mae = 0.0007")
     for name, value in raw.items():
         if name not in names or not _is_limit(value):
-            expected = f"numbers above 0 named {', '.join(names)}"
+            expected = f"numbers from 0 on named {', '.join(names)}"
             raise OptionError(where, expected=expected, got=f"{name} = {value!r}", remedy="correct that line")
     values: dict[str, Any] = dict(raw)
     return _require_breakable(where, Limits(**values))
 
 
 def _is_limit(value: object) -> bool:
-    """Return True for a number above 0 that has no more digits than are compared with others."""
+    """Return True for a number from 0 on that has no more digits than are compared with others."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
-    return value > 0 and (isinstance(value, float) or value < 1 << 64)
+    return value >= 0 and (isinstance(value, float) or value < 1 << 64)

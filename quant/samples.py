@@ -7,7 +7,6 @@ should give beside what it reads, as `image` and `reference`.
 
 import hashlib
 import os
-import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,9 +18,9 @@ import onnx
 
 from beers_deploy.model.io.files import IMAGE_SUFFIXES
 from beers_deploy.model.io.images import read_pixels
+from beers_deploy.profiles.arrays import load_arrays
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.sensor import MAX_DN
-from beers_deploy.profiles.toml import unreadable
 from beers_deploy.quant.onnx_file import fixed_tile_px
 from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.quant.untrusted import times
@@ -30,9 +29,12 @@ if TYPE_CHECKING:
     from beers_deploy.quant.calibration import View
 
 PATCH_PX = 128
+ARRAY_SUFFIX = ".npy"
 T = TypeVar("T")
 Pair = tuple[np.ndarray, np.ndarray]
 """(degraded, reference) of a patch; the reference of a user's own sample that has none is empty."""
+Named = tuple[str, Pair]
+"""A user's own sample with its name."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +64,13 @@ class Patches:
         views: what each shows, and the sensors that saw it.
         pairs: (degraded, reference) of each.
         degraded: the same degraded patches alone, for half the work.
+        names: of a user's own samples, for messages; empty of simulated ones.
     """
 
     views: "list[View]"
     pairs: Remade[Pair]
     degraded: Remade[np.ndarray]
+    names: tuple[str, ...] = ()
 
     @cached_property
     def digest(self) -> str:
@@ -96,15 +100,15 @@ def read_samples(given: Path | Sequence[Pair], channels: int, fixed_px: int | No
         multiple_px: what sides must be multiples of; the rest is cut off.
     """
     named = _samples(given) if isinstance(given, Path) else ((f"{IN_MEMORY}[{k}]", *p) for k, p in enumerate(given))
-    pairs = [
-        pair
-        for name, image, reference in named
-        for pair in _cut(_sound(name, image, channels), reference, name, fixed_px, multiple_px)
-    ]
-    if not pairs:
+    found = list[Named]()
+    for name, image, reference in named:
+        seen = _sound(name, image, channels)
+        meant = _sound_reference(name, reference)
+        found += [(name, pair) for pair in _cut(seen, meant, name, fixed_px, multiple_px)]
+    if not found:
         where = str(given) if isinstance(given, Path) else IN_MEMORY
         raise ImageError(where, expected="at least one sample", got="none", remedy=REMEDY)
-    return _patches(pairs)
+    return _patches(found)
 
 
 IN_MEMORY = "samples"
@@ -127,8 +131,8 @@ def samples_in(given: object) -> list[Pair]:
     if isinstance(given, tuple) and len(given) == 2 and all(hasattr(each, "ndim") for each in given):
         seen, meant = _batch(given[0]), _plain(given[1])  # a reference may be a class, or a class for each pixel
         meant = meant[None] if np.ndim(given[0]) == 3 else meant
-        if len(seen) != len(meant):
-            got = f"{len(seen)} images and {len(meant)} references"
+        if meant.ndim == 0 or len(seen) != len(meant):
+            got = f"images of {times(seen.shape)} and references of {_shape(meant)}"
             raise ImageError(IN_MEMORY, expected="a reference for each image", got=got, remedy=REMEDY)
         return list(zip(seen, meant, strict=True))
     if not isinstance(given, Iterable) or isinstance(given, str | bytes | Mapping):
@@ -154,8 +158,14 @@ def _plain(array: Any) -> np.ndarray:
 NO_REFERENCE = np.empty(0, np.float32)
 
 
-def _patches(pairs: Sequence[Pair]) -> Patches:
-    return Patches([], Remade(lambda k: pairs[k], len(pairs)), Remade(lambda k: pairs[k][0], len(pairs)))
+def _patches(samples: Sequence[Named]) -> Patches:
+    names = tuple(name for name, _ in samples)
+    pairs = [pair for _, pair in samples]
+    return Patches([], Remade(lambda k: pairs[k], len(pairs)), Remade(lambda k: pairs[k][0], len(pairs)), names)
+
+
+def _named(samples: Patches) -> list[Named]:
+    return list(zip(samples.names, samples.pairs, strict=True))
 
 
 CALIBRATED_ON = "calibration_samples"
@@ -170,32 +180,45 @@ def digest_of(sample: np.ndarray) -> str:
 
 def split_samples(samples: Patches) -> tuple[Patches, Patches]:
     """What to calibrate on, and every fourth sample to look at what INT8 changes; of fewer both are all."""
-    pairs = list(samples.pairs)
+    pairs = _named(samples)
     held_out = pairs[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY]
     if not held_out:
         return samples, samples
     return _patches([pair for k, pair in enumerate(pairs) if (k + 1) % HELD_OUT_EVERY]), _patches(held_out)
 
 
+def sample_files(path: Path) -> list[Path]:
+    """Return the files that samples are read from: those of a folder in their order, or the file itself."""
+    if not path.is_dir():
+        return [path]
+    return sorted(file for file in path.iterdir() if file.suffix.lower() in {ARRAY_SUFFIX, *IMAGE_SUFFIXES})
+
+
 def _samples(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Name, image (C, H, W) and reference of each."""
-    if path.is_dir():
-        for file in sorted(path.iterdir()):
-            if file.suffix.lower() == ".npy":
-                image, _ = _stored(file)
-                if image.ndim != 3:
-                    got = times(image.shape)
-                    raise ImageError(str(file), expected="one image (C, H, W)", got=got, remedy=REMEDY)
-                yield file.name, image, NO_REFERENCE
-            elif file.suffix.lower() in IMAGE_SUFFIXES:
-                yield file.name, _bands_first(file, read_pixels(file)), NO_REFERENCE
+    """Yield name, image (C, H, W) and reference of each sample."""
+    if not path.is_dir():
+        yield from _batch_in(path)
         return
+    for file in sample_files(path):
+        if file.suffix.lower() != ARRAY_SUFFIX:
+            yield file.name, _bands_first(file, read_pixels(file)), NO_REFERENCE
+            continue
+        image, _ = _stored(file)
+        if image.ndim != 3:
+            raise ImageError(str(file), expected="one image (C, H, W)", got=_shape(image), remedy=REMEDY)
+        yield file.name, image, NO_REFERENCE
+
+
+def _batch_in(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield the samples of one file, as `_samples` does."""
     images, references = _stored(path)
-    if images.ndim != 4 or (references.size and len(references) != len(images)):
-        got = times(images.shape) + (f" and references of {times(references.shape)}" if references.size else "")
-        raise ImageError(str(path), expected="a batch of (N, C, H, W)", got=got, remedy=REMEDY)
+    if images.ndim != 4:
+        raise ImageError(str(path), expected="a batch of (N, C, H, W)", got=_shape(images), remedy=REMEDY)
+    if references.ndim == 0 or (references is not NO_REFERENCE and len(references) != len(images)):
+        expected = f"as many references as images ({len(images)})"
+        raise ImageError(str(path), expected=expected, got=f"references of {_shape(references)}", remedy=REMEDY)
     for number, image in enumerate(images):
-        yield f"{path.name}[{number}]", image, references[number] if references.size else references
+        yield f"{path.name}[{number}]", image, references[number] if references.size else NO_REFERENCE
 
 
 def _stored(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -203,17 +226,11 @@ def _stored(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     Nothing is unpickled.
     """
-    got = unreadable(path)
-    if got is not None:
-        raise ImageError(str(path), expected="a .npy or .npz file", got=got, remedy="check the path")
     try:
-        if path.suffix.lower() != ".npz":
-            return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False)), NO_REFERENCE
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as held:  # NumPy leaves a broken one open
-            arrays = {name: held[name] for name in held.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        arrays = load_arrays(path)
+    except ValueError as error:
         expected = "a .npy or .npz file of numbers, or a folder of images"
-        raise ImageError(str(path), expected=expected, got="another file", remedy=REMEDY) from error
+        raise ImageError(str(path), expected=expected, got=str(error), remedy=REMEDY) from error
     image = "image" if "image" in arrays else next(iter(arrays)) if len(arrays) == 1 else None
     if image is None:
         got = ", ".join(arrays) or "no array"
@@ -231,10 +248,33 @@ def _bands_first(path: Path, pixels: np.ndarray) -> np.ndarray:
     return bands / np.float32(FULL_SCALE_8 if bands.dtype.itemsize == 1 else MAX_DN)
 
 
+def _shape(array: np.ndarray) -> str:
+    return times(array.shape) or "no dimension"
+
+
+def _sound_reference(name: str, reference: np.ndarray) -> np.ndarray:
+    """Return a reference as float32; raise ImageError if it is not made of real, finite numbers.
+
+    Whether it must be an image in [0, 1] of the result's size depends on what is measured: `quant.gate.compare`.
+    """
+    if reference.dtype.kind not in "fuib":
+        got = f"{reference.dtype}"
+        raise ImageError(name, expected="a reference of real numbers", got=got, remedy=REMEDY)
+    values = np.asarray(reference, np.float32)
+    lost = np.count_nonzero(~np.isfinite(values))
+    if lost:
+        remedy = "leave out samples whose references lack pixels"
+        got = f"{lost} values that are NaN or infinite"
+        raise ImageError(name, expected="a reference of finite numbers", got=got, remedy=remedy)
+    return values
+
+
 def _sound(name: str, image: np.ndarray, channels: int) -> np.ndarray:
     if image.dtype.kind not in "fui" or len(image) != channels:
         got = f"{len(image)} channels of {image.dtype}"
         raise ImageError(name, expected=f"{channels} channels of numbers", got=got, remedy=REMEDY)
+    if not image.size:
+        raise ImageError(name, expected="an image with pixels", got=_shape(image), remedy=REMEDY)
     values = np.asarray(image, np.float32)
     low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
     if not (low >= 0 and high <= LARGEST):
@@ -255,7 +295,7 @@ def _cut(
         expected, got = f"images of multiples of {multiple_px} pixels beside a reference", times((height, width))
         raise ImageError(name, expected=expected, got=got, remedy="cut both")
     if reference.size:
-        yield image[None], np.asarray(reference, np.float32)[None]
+        yield image[None], reference[None]
         return
     side = fixed_px or PATCH_PX // multiple_px * multiple_px
     sizes = [side if n >= side else n // multiple_px * multiple_px for n in (height, width)]
@@ -280,7 +320,7 @@ class OwnSamples:
     def all(self) -> Patches:
         """Every sample with contrast: any network keeps what is constant, and a mean over such hides errors."""
         found = read_samples(self.given, self.channels, self.fixed_px, self.multiple_px)
-        kept = [pair for pair in found.pairs if np.ptp(pair[0]) >= LEAST_CONTRAST]
+        kept = [(name, pair) for name, pair in _named(found) if np.ptp(pair[0]) >= LEAST_CONTRAST]
         if not kept:
             name = str(self.given) if isinstance(self.given, Path) else IN_MEMORY
             raise ImageError(name, expected="samples with contrast", got="constant ones", remedy="give real images")

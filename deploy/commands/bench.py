@@ -113,13 +113,14 @@ def bench(
     from beers_deploy.dpu.cost.model import TASKS
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.network_files import conditioned, int8_file
-    from beers_deploy.results import Table, print_rows
+    from beers_deploy.results import Table, inputs_of, print_rows, require_same
 
     tiles, here, board = parse_tiles(tile), target in HOSTS, target.removesuffix(MODEL_SUFFIX)
     _refuse_unused(context, here)
     require_writable(json, inputs=(model, image, measured, Path(target), Path(sensor)))
     known = load_sensor(sensor)
     path = int8_file(model, known, partial(say, err=True))
+    read = inputs_of(path, image, measured) if json else ()
     if here:
         from beers_deploy.bench.host import host_rows
 
@@ -157,10 +158,10 @@ def bench(
             try:
                 rows = [*rows, _traditional_row(found.dn, found.swath)]
                 print_rows("the traditional pipeline, measured on crops here", rows[-1:])
-            except ModuleNotFoundError as error:
+            except ImportError as error:
                 say(f"The traditional pipeline is not measured here: {missing_extra(error, 'bench')}")
-    inputs = tuple(file for file in (path, image, measured) if file)
-    save(Table("bench", arguments(), inputs, tuple(rows)), json)
+    require_same(read, path, image, measured)
+    save(Table("bench", arguments(), read, tuple(rows)), json)
 
 
 def _required_layers(found: "BoardBench") -> "Tables":

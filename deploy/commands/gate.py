@@ -1,15 +1,28 @@
 """`beers-deploy gate`: does INT8 stay close enough to float? Exit code 1 when it does not."""
 
+import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import RULED, STDOUT, FloatModel, Int8Model, Json, Seed, arguments, save, say
+from beers_deploy.commands.shared import (
+    RULED,
+    STDOUT,
+    FloatModel,
+    Int8Model,
+    Json,
+    Seed,
+    arguments,
+    refuse,
+    save,
+    say,
+)
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import BeersError, OptionError
 from beers_deploy.profiles.target import DEFAULT_TARGET
 
 if TYPE_CHECKING:
@@ -20,10 +33,11 @@ TITLES = {"gate": "float against INT8", "samples": "what the samples cover"}
 
 
 def gate(
+    context: typer.Context,
     float_model: FloatModel = None,
     int8_model: Int8Model = None,
     max_mae: Annotated[
-        float | None, typer.Option(min=0, help="Largest mean absolute difference, of full scale; 0.0007 if none.")
+        float | None, typer.Option(help="Largest mean absolute difference, of full scale; 0.0007 if none.")
     ] = None,
     limits: Annotated[Path | None, typer.Option(help="TOML file of limits; see docs/how-to/gate.md.")] = None,
     baseline: Annotated[Path | None, typer.Option(help="What 'gate --json' wrote before: MAE may not grow.")] = None,
@@ -52,16 +66,17 @@ def gate(
     Also checked: what saturates inside, the DPU's rules, that no ReLU was lost, and that onnxruntime's optimisations
     change no bit.
     """
-    from beers_deploy.model.io.files import write_text
-    from beers_deploy.network_files import pair_of
-    from beers_deploy.profiles.errors import BeersError
-    from beers_deploy.quant.limits import limits_of
-    from beers_deploy.verdict import gate as judged
-    from beers_deploy.verdict import junit_error
-
     read = (float_model, int8_model, limits, baseline, images, samples, *map(Path, (target, sensor)))
-    _clear((json, junit, *_record_files(record)), read, record)
     try:
+        _clear((json, junit, *_record_files(record)), read, record)
+        # Loaded only now: if a library fails, no older verdict is left either.
+        from beers_deploy.model.io.files import write_text
+        from beers_deploy.network_files import pair_of
+        from beers_deploy.quant.limits import limits_of
+        from beers_deploy.verdict import gate as judged
+
+        if samples is not None:
+            refuse(context, ("images", "patches", "seed"), expected="none together with --samples", got="one")
         against, int8 = pair_of(float_model, int8_model)
         allowed = limits_of(limits, max_mae)
         verdict = judged(
@@ -77,19 +92,18 @@ def gate(
             seed=seed,
             metric=metric,
         )
-    except BeersError as error:
-        if junit is not None:
-            write_text(junit, junit_error("INT8 gate", str(error)))
-        raise
-    _show(verdict)
-    save(replace(verdict, arguments=arguments(max_mae=allowed.mae)), json)
-    if junit is not None:
-        write_text(junit, verdict.to_junit())
-    if record is not None:
-        from beers_deploy.kit.record import write_record
+        _show(verdict)
+        if record is not None:  # first: its library may fail, and then no verdict may stand in the other files
+            from beers_deploy.kit.record import write_record
 
-        compared = verdict.comparison
-        write_record(verdict, compared.int8, compared.sensor, record, compared.floating)
+            compared = verdict.comparison
+            write_record(verdict, compared.int8, compared.sensor, record, compared.floating)
+        save(replace(verdict, arguments=arguments(max_mae=allowed.mae)), json)
+        if junit is not None:
+            write_text(junit, verdict.to_junit())
+    except BeersError as error:
+        _explain(error, junit, (json, *_record_files(record)), read)
+        raise
     say(str(verdict))
     if not verdict:
         raise typer.Exit(1)
@@ -105,16 +119,37 @@ def _record_files(folder: Path | None) -> list[Path]:
 
 
 def _clear(outputs: Sequence[Path | None], inputs: Sequence[Path | None], record: Path | None) -> None:
-    """Require that the outputs can be written, and delete older ones: a refused gate leaves no verdict behind."""
+    """Delete older outputs, and require that new ones can be written: a refused gate leaves no verdict behind."""
     from beers_deploy.model.io.files import require_writable
 
+    for path in outputs:
+        if path is not None and path != STDOUT:
+            with suppress(BeersError):  # raised below, when the other outputs are deleted
+                require_writable(path, inputs=inputs)
+                path.unlink(missing_ok=True)
     _, junit, *_ = outputs
     if junit == STDOUT:
         raise OptionError("--junit", expected="a file", got="-", remedy="name one: standard output is for --json -")
     require_writable(*outputs, inputs=inputs, folders=(record,))
-    for path in outputs:
-        if path is not None and path != STDOUT:
-            path.unlink(missing_ok=True)
+    if record is not None:
+        from beers_deploy.kit.record import require_library
+
+        require_library()
+
+
+def _explain(
+    error: BeersError, junit: Path | None, others: Sequence[Path | None], inputs: Sequence[Path | None]
+) -> None:
+    """Write the reason why nothing could be judged to the JUnit file, if there is one that may be written."""
+    from beers_deploy.model.io.files import require_writable, write_text
+    from beers_deploy.verdict import junit_error
+
+    taken = {os.path.realpath(path).casefold() for path in others if path is not None}
+    if junit is None or junit == STDOUT or os.path.realpath(junit).casefold() in taken:
+        return
+    with suppress(BeersError):
+        require_writable(junit, inputs=inputs)
+        write_text(junit, junit_error("INT8 gate", str(error)))
 
 
 def _show(verdict: "Verdict") -> None:

@@ -59,6 +59,7 @@ def quantize(
     Taken is any network that a DPU computes; see docs/reference/any-network.md, and ask 'check' about a float file.
     Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
     """
+    from beers_deploy.baseline import data_inputs
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.profiles.figures import by_table
     from beers_deploy.quant.encodings import read_core
@@ -70,8 +71,7 @@ def quantize(
     from beers_deploy.results import Table, print_rows
 
     page, figures = _report_files(report, model)
-    if board_file is None:
-        refuse(context, ["tile"], expected="--board-file beside it")
+    _refuse_unused(context, board_file, samples)
     read = (model, images, samples, *map(Path, (target, sensor)))
     require_writable(out, board_file, json, page, figures, inputs=read)
     require_onnx_name(out, board_file)
@@ -98,9 +98,18 @@ def quantize(
         say(f"wrote {page}: {written.headline}")
         rows = [*found, *rows]
     origin = made.origin.input if made.origin else model
-    document = Table("quantize", arguments(), (origin, out), tuple(rows))
+    document = Table("quantize", arguments(), (origin, out, *data_inputs(images, samples)), tuple(rows))
     for path in (figures, json):
         save(document, path)
+
+
+def _refuse_unused(context: typer.Context, board_file: Path | None, samples: Path | None) -> None:
+    """Refuse options that would do nothing."""
+    if board_file is None:
+        refuse(context, ["tile"], expected="--board-file beside it")
+    if samples is not None:
+        unused = ("images", "patches", "patch", "seed")
+        refuse(context, unused, expected="none together with --samples", got="one")
 
 
 def _report_files(folder: Path | None, model: Path) -> tuple[Path, Path] | tuple[None, None]:

@@ -60,7 +60,7 @@ def stress(
     """
     from beers_deploy.model.io.files import require_writable, write_text
     from beers_deploy.quant.calibration import Calibration
-    from beers_deploy.results import Table, print_rows
+    from beers_deploy.results import Table, inputs_of, print_rows, require_same
     from beers_deploy.studies.stress.battery import TITLES, chosen, finding_rows, markdown, run_battery, shown_rows
     from beers_deploy.studies.stress.bit_flips import flip_curves_svg, flip_rows
     from beers_deploy.studies.stress.cases import CASES
@@ -73,6 +73,7 @@ def stress(
     names = chosen(cases, [case.name for case in CASES], "--cases")
     wanted = chosen(stages, STAGES, "--stages")
     subject = open_subject(float_model, int8_model, sensor, partial(say, err=True))
+    inputs = inputs_of(*subject.paths) if json else ()
     if bit_flips:
         results, shown = [], flip_rows(subject, Calibration(load_sensor(sensor), images, draws, side, seed), target)
     else:
@@ -80,7 +81,8 @@ def stress(
         shown = shown_rows(subject, results)
     for table, rows in by_table(shown).items():
         print_rows(TITLES[table], rows)
-    save(Table("stress", arguments(), subject.paths, (*shown, *finding_rows(results))), json)
+    require_same(inputs, *subject.paths)
+    save(Table("stress", arguments(), inputs, (*shown, *finding_rows(results))), json)
     if out is not None:
         write_text(out, markdown(shown))
     if picture is not None:

@@ -19,6 +19,7 @@ import numpy as np
 from beers_deploy import __version__
 from beers_deploy.model.io.files import whole_file, write_text
 from beers_deploy.network import Network, NetworkLike
+from beers_deploy.profiles.arrays import ALONE, load_arrays
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Check, Row, measured
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
@@ -29,6 +30,7 @@ from beers_deploy.quant.graph import PLANES, Op
 from beers_deploy.quant.integer.diagnosis import Seen, explain, where
 from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px
+from beers_deploy.quant.untrusted import times
 from beers_deploy.results import Input, Table
 
 SCHEMA, SCHEMA_VERSION = "beers-deploy/golden", 1
@@ -61,6 +63,7 @@ def write_golden(
     images = _images(network, core.ends.image_channels, tile, generator)
     planes = {case: core.ends.split(image) for case, image in images.items()}
     planes[EXTREMES] = generator.choice(np.array([-128, 127], np.int8), planes["noise"].shape)
+    _remove_older(folder)
     digests = dict[str, dict[str, str]]()
     for case, seen in planes.items():
         tensors, _ = run_core(core, seen, half_even)
@@ -74,6 +77,19 @@ def write_golden(
     index |= {"network": network.input._asdict(), "half_even": half_even, "layers": _layers(core, names)}
     write_text(folder / INDEX, json.dumps(index, indent=1) + "\n")
     return folder
+
+
+def _remove_older(folder: Path) -> None:
+    """Delete the golden vectors that a folder holds: files of layers that are not written again would stay."""
+    index = folder / INDEX
+    if not index.is_file():
+        return
+    index.unlink()  # first: what is left, if this stops, must not pass as whole
+    for case in CASES:
+        if (folder / case).is_symlink():
+            continue
+        for path in ((folder / case / PICTURE), *(folder / case).glob("[0-9]*-*.npy")):
+            path.unlink(missing_ok=True)
 
 
 def files_of(core: IntCore) -> dict[str, str]:
@@ -95,6 +111,7 @@ def _layers(core: IntCore, names: Mapping[str, str]) -> list[dict[str, object]]:
 
 EXTREMES = "extremes"
 """The case whose planes are int8's ends in random order, which no image makes."""
+CASES = ("scene", "noise", "steps", "black", "white", "odd", EXTREMES)
 
 
 def _images(
@@ -152,7 +169,7 @@ class Golden:
         core: the network's integers.
         half_even: how ties are rounded.
         cases: every sound tensor of each case.
-        network: its name and digest.
+        network: name and digest of the network's file in the folder.
     """
 
     core: IntCore
@@ -162,34 +179,72 @@ class Golden:
 
 
 def read_golden(folder: Path) -> Golden:
-    """Read a folder that `write_golden` made; its tensors are computed again and held to their digests."""
-    remedy = "make it anew with 'beers-deploy golden'"
-    try:
-        said: Any = read_json(folder / INDEX)
-        if (said["schema"], said["schema_version"]) != (SCHEMA, SCHEMA_VERSION):
-            raise ValueError(said["schema"])
-        digests = {str(case): dict(files) for case, files in said["cases"].items()}
-        half_even, network = bool(said["half_even"]), Input(**said["network"])
-    except (AttributeError, LookupError, OSError, TypeError, ValueError) as error:
-        expected = f"a folder of golden vectors with its {INDEX}"
-        raise OptionError(str(folder), expected=expected, got="none", remedy=remedy) from error
-    core = read_core(Network.load(folder / NETWORK).model)
-    names, cases = files_of(core), {}
+    """Read a folder that `write_golden` made; its tensors are computed again and compared with their digests.
+
+    Raises:
+        OptionError: a folder without an index, with a damaged one, or with other numbers than were written.
+    """
+    digests, half_even = _index(folder / INDEX)
+    network = Network.load(folder / NETWORK)
+    with faults_named(network.label):
+        core = read_core(network.model)
+    names = files_of(core)
+    cases = {}
     for case, files in digests.items():
-        cases[case], _ = run_core(core, _array(folder / case / names[PLANES]), half_even)
+        planes = _planes(folder / case / names[PLANES], core)
+        try:
+            cases[case], _ = run_core(core, planes, half_even)
+        except (LookupError, ValueError) as error:  # of a size that the network cannot rearrange
+            got = f"{times(planes.shape)} in {case}"
+            expected = "planes of a size that the network takes"
+            raise OptionError(str(folder), expected=expected, got=got, remedy=REMEDY) from error
         wrong = [file for name, file in names.items() if files.get(file) != _digest(cases[case][name])]
         if wrong:
             got = f"other numbers in {case}/{wrong[0]}"
-            raise OptionError(str(folder), expected="the vectors that were written", got=got, remedy=remedy)
-    return Golden(core, half_even, cases, network)
+            raise OptionError(str(folder), expected="the vectors that were written", got=got, remedy=REMEDY)
+    return Golden(core, half_even, cases, network.input)
+
+
+REMEDY = "make it again with 'beers-deploy golden'"
+
+
+def _index(path: Path) -> tuple[dict[str, dict[str, str]], bool]:
+    """Return the digests of the files of each case, and whether ties were rounded to even."""
+    try:
+        said: Any = read_json(path)
+        if (said["schema"], said["schema_version"]) != (SCHEMA, SCHEMA_VERSION):
+            raise ValueError(f"the schema {said['schema']}")
+        digests = {str(case): dict(files) for case, files in said["cases"].items()}
+        # A case is a folder beside the index: another path would lead to files that nobody named.
+        foreign = [case for case in digests if case in ("", ".", "..") or set(case) & set("/\\:")]
+        if foreign:
+            raise ValueError(f"the case {foreign[0]!r}")
+        return digests, bool(said["half_even"])
+    except (AttributeError, LookupError, OSError, TypeError, ValueError) as error:
+        got = unreadable(path) or f"a damaged one ({type(error).__name__}: {' '.join(str(error).split())[:80]})"
+        expected = f"the index of a folder of golden vectors ({INDEX})"
+        raise OptionError(str(path), expected=expected, got=got, remedy=REMEDY) from error
+
+
+def _planes(path: Path, core: IntCore) -> np.ndarray:
+    """Read the planes that a core reads, (N, C, H, W) int8."""
+    planes = _array(path)
+    channels = core.ends.planes * core.ends.channels
+    if planes.dtype != np.int8 or planes.ndim != 4 or planes.shape[1] != channels or not planes.size:
+        got = f"{planes.dtype} of shape {planes.shape}"
+        raise ImageError(str(path), expected=f"int8 planes (N, {channels}, H, W)", got=got, remedy=REMEDY)
+    return planes
 
 
 def _array(path: Path) -> np.ndarray:
     try:
-        return np.asarray(np.load(path, allow_pickle=False))
-    except (OSError, ValueError, EOFError) as error:
-        got = unreadable(path) or "another file"
-        raise ImageError(str(path), expected="an array (.npy)", got=got, remedy="write it with numpy.save") from error
+        arrays = load_arrays(path)
+        if list(arrays) != [ALONE]:
+            raise ValueError("an archive of arrays")
+    except ValueError as error:
+        remedy = "write it with numpy.save"
+        raise ImageError(str(path), expected="an array (.npy)", got=str(error), remedy=remedy) from error
+    return arrays[ALONE]
 
 
 def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[str]) -> Table:
@@ -242,6 +297,9 @@ def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
     if values.shape != shape:
         got, remedy = f"{values.shape}", "write the tensor whole, of the tile that the vectors have"
         raise ImageError(str(path), expected=f"shape {shape}", got=got, remedy=remedy)
+    if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+        got = f"{values.dtype} values, or some that are not finite"
+        raise ImageError(str(path), expected="real numbers", got=got, remedy="write int8")
     whole = values.astype(np.float64)
     if values.dtype == np.uint8:
         whole -= 128

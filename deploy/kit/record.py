@@ -15,14 +15,13 @@ from beers_deploy.model.io.tensors import read_conditioned
 from beers_deploy.model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
 from beers_deploy.network import Network
 from beers_deploy.network_files import told_int8 as for_sensor
-from beers_deploy.profiles.errors import one_line, optional
+from beers_deploy.profiles.errors import ModelError, one_line, optional, printable
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
+from beers_deploy.quant.banked.family import FAMILY, WEIGHTS, family_of
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.onnx_file import load_onnx, metadata
-from beers_deploy.quant.samples import CALIBRATED_ON
-from beers_deploy.report.page import Report, Section, write_report
+from beers_deploy.report.page import Report, Section, render
 from beers_deploy.results import Table
 
 SCHEMA, SCHEMA_VERSION = "beers-deploy/record", 1
@@ -32,14 +31,18 @@ LIMITATIONS = (
     "INT8 is judged on onnxruntime; a DPU rounds ties up, which moves single results by one unit.",
     "Images that no sensor in range makes (restored, resampled or compressed ones) were not judged.",
 )
-BULKY = {KEY, FAMILY, CALIBRATED_ON}
+BULKY = {KEY, FAMILY}
 """Of what a file says of itself: numbers, not words."""
 
 
 def recorded(folder: Path) -> list[Path]:
-    """The files that a record will be, refused where the library for one of them is missing."""
-    optional("cyclonedx", "record")
+    """Return the files of a record."""
     return [folder / name for name in NAMES]
+
+
+def require_library() -> None:
+    """Raise MissingExtraError if the library that writes the bill of materials is missing or does not load."""
+    optional("cyclonedx.output.json", "record")
 
 
 def write_record(
@@ -55,20 +58,21 @@ def write_record(
         floating: the float network that it was compared with.
     """
     said = record_of(judged, network, sensor, floating)
-    document, page, bill = recorded(folder)
-    write_text(document, json.dumps(said, indent=1) + "\n")
-    write_report(_page(judged, said), page)
-    write_text(bill, bill_of(said))
+    # All three are made before the first is written: a record is whole or not there.
+    texts = json.dumps(said, indent=1) + "\n", render(_page(judged, said)), bill_of(said)
+    for path, text in zip(recorded(folder), texts, strict=True):
+        write_text(path, text)
 
 
 def record_of(judged: Table, network: Network, sensor: Sensor, floating: Network | None = None) -> dict[str, Any]:
     """Return the record as one document; what is not known is null.
 
-    The INT8 file may claim any weights: they, their training and their licence are stated only where they are
-    verified.
+    The INT8 file may claim anything: its claims stand under "says". Weights, their training, their licence and the
+    range of sensors that they were trained on are stated only where the weights are verified.
     """
     about = metadata(network.model)
     weights = _verified_weights(network, sensor, floating)
+    in_range = {key: list(ends) for key, ends in RANGES.items()} if weights and _has_family(network) else None
     return {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
@@ -77,13 +81,20 @@ def record_of(judged: Table, network: Network, sensor: Sensor, floating: Network
         "weights_sha256": sha256(weights) if weights else None,
         "training": read_conditioned(weights).recipe if weights else None,
         "says": {key: text for key, text in about.items() if key not in BULKY},
-        "calibration_samples": about.get(CALIBRATED_ON, "").split() or None,
-        "sensors_in_range": {key: list(ends) for key, ends in RANGES.items()} if FAMILY in about else None,
+        "sensors_in_range": in_range,
         "limitations": [*LIMITATIONS, *judged.notes],
         "licence": of_package("beers-deploy")["License-Expression"] if weights else None,
         "passed": bool(judged),
         "results": judged.to_dict(),
     }
+
+
+def _has_family(network: Network) -> bool:
+    """Return True if the file holds what conditions it on other sensors; a damaged one conditions it on none."""
+    try:
+        return family_of(network.model) is not None
+    except ModelError:
+        return False
 
 
 def code_sha256() -> str:
@@ -108,14 +119,20 @@ def _verified_weights(network: Network, sensor: Sensor, floating: Network | None
 
 
 def _page(judged: Table, said: dict[str, Any]) -> Report:
-    facts = said["network"] | said["says"]
-    facts |= {key: said[key] for key in ("weights_sha256", "training", "sensors_in_range", "licence")}
-    rows = [Row("network", key, {}, {"said": str(value)}) for key, value in facts.items()]
+    known = ("weights_sha256", "training", "sensors_in_range", "licence")
+    facts = said["network"] | {key: said[key] for key in known}
+    rows = [Row("network", key, {}, {"value": str(value)}) for key, value in facts.items()]
+    claims = [Row("claims", key, {}, {"claim": printable(value)}) for key, value in said["says"].items()]
     checks = [
         Row("checks", each.name, {}, {"found": each.found, "allowed": each.allowed, "passed": str(each.passed)})
         for each in judged.checks
     ]
-    tables = [Section("What it is", rows), Section("Checks", checks), Section("Figures", judged.rows)]
+    tables = [
+        Section("What it is", rows),
+        Section("Checks", checks),
+        Section("Figures", judged.rows),
+        Section("What the file says of itself", claims, "Its own metadata, which nothing verifies."),
+    ]
     verdict = "All checks passed." if judged else "A check failed."
     return Report(f"Record of {said['network']['name']}", verdict, tables, [], said["limitations"])
 
@@ -130,7 +147,8 @@ def bill_of(said: dict[str, Any]) -> str:
     def component(kind: ComponentType, name: str, digest: str, **more: Any) -> Component:
         hashes = [HashType(alg=HashAlgorithm.SHA_256, content=digest)]
         shown = one_line(name)  # of a file: a reader of the bill may print it as it is
-        return Component(type=kind, name=shown, bom_ref=f"{kind.value}:{shown}", hashes=hashes, **more)
+        # Two files may have one name, and a reference must be unique.
+        return Component(type=kind, name=shown, bom_ref=f"{kind.value}:{shown}:{digest}", hashes=hashes, **more)
 
     network, tool, bom = said["network"], said["tool"], Bom(serial_number=uuid5(NAMESPACE_URL, json.dumps(said)))
     facts = said["says"] | {

@@ -67,9 +67,16 @@ def read_journal(path: Path, job: Mapping[str, object]) -> list[FinishedRow]:
     if content["job"] != job:
         raise ValueError("another job")
     finished = [FinishedRow(**{**row, "tally": Tally(**row["tally"])}) for row in content["finished"]]
-    if any(row.rows_px <= 0 or min(astuple(row.tally)) < 0 for row in finished):
+    if not all(map(_possible, finished)):
         raise ValueError("impossible counts")
     return finished
+
+
+def _possible(row: FinishedRow) -> bool:
+    """Return True if counts are integers, and nothing that is counted or summed is below zero."""
+    tally = zip(astuple(row.tally), astuple(Tally()), strict=True)
+    numbers = all(isinstance(value, int | type(zero)) and value >= 0 for value, zero in tally)
+    return numbers and isinstance(row.rows_px, int) and row.rows_px > 0
 
 
 def _digest(content: Mapping[str, object]) -> str:

@@ -1,39 +1,33 @@
-"""What a run leaves: finished rows in a checkpoint, so that one killed at any moment goes on; at the end one TIFF.
+"""What a run leaves: finished rows in a checkpoint, so that one killed at any moment goes on; at the end one TIFF."""
 
-One run at a time on one output: the system holds the lock, so that one left by a killed process blocks nobody.
-"""
-
-import errno
 import hashlib
 import io
 import os
 import shutil
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tifffile
-from filelock import BaseFileLock, FileLock, Timeout
 from isal import isal_zlib
 
-from beers_deploy.model.io.files import TIFF_SUFFIXES
+from beers_deploy.model.io.files import TIFF_SUFFIXES, require_regular
 from beers_deploy.model.io.tiff import MASK
 from beers_deploy.profiles.errors import ImageError, MachineError, MissingExtraError, OptionError, sizes
 from beers_deploy.restoration.georeference import enlarged_tags
 from beers_deploy.restoration.journal import FinishedRow, journal_text, read_journal
+from beers_deploy.restoration.lock import part_folder
 from beers_deploy.restoration.options import Compression
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.source import BIG_TIFF_SUFFIXES, RESTORED, RGB_BANDS, Source, strips
 from beers_deploy.restoration.tiles.rows import RestoredRow
 
-
-def part_folder(out: Path) -> Path:
-    """The folder beside `out` in which a run keeps what it needs for it."""
-    return out.with_name(f".{out.name}.part")
+ROWS_FILES = ("journal.json", "journal.new", "rows.raw")
+"""Files of a checkpoint; the journal first, because it counts on the rows."""
 
 
 class Checkpoint:
@@ -53,6 +47,7 @@ class Checkpoint:
         job: Mapping[str, object],
         resume: bool,
         cog_bytes: int = 0,
+        row_ends: Sequence[int] = (),
     ) -> None:
         """Begin, or go on with what an earlier run left.
 
@@ -63,10 +58,14 @@ class Checkpoint:
             job: all that decides the pixels; a run is resumed only by one of the same job.
             resume: go on; where nothing was left, begin.
             cog_bytes: of disk that the output takes beside the rows and the plain TIFF.
+            row_ends: at which row of pixels each row of tiles ends; a journal of other rows is refused.
         """
         self.out, self.shape, self.dtype = out, shape, dtype
         self.folder = part_folder(out)
+        for name in ROWS_FILES:
+            require_regular(self.folder / name)
         self._job = dict(job)
+        self._row_ends = list(row_ends)
         left = self._left() if resume else []
         self._finished = self._matching(left)
         self.rows = sum(row.rows_px for row in self._finished)
@@ -112,7 +111,7 @@ class Checkpoint:
 
     def remove(self) -> None:
         """Throw the rows away; the journal first, so that nothing is left that counts on them."""
-        for name in ("journal.json", "journal.new", "rows.raw"):
+        for name in ROWS_FILES:
             (self.folder / name).unlink(missing_ok=True)
         self._remove_outputs()
 
@@ -138,7 +137,9 @@ class Checkpoint:
             return []
         with suppress(ValueError, LookupError, TypeError, AttributeError, OSError):
             finished = read_journal(path, self._job)
-            if sum(row.rows_px for row in finished) <= self.shape[1]:
+            ends = list(accumulate(row.rows_px for row in finished))
+            planned = not self._row_ends or ends == self._row_ends[: len(ends)]
+            if planned and max(ends, default=0) <= self.shape[1]:
                 return finished
         expected = "the image, the model and the options of the run that was stopped"
         got, remedy = f"others, or a damaged {path}", "run it as before, or start afresh without `resume`"
@@ -227,6 +228,8 @@ def require_codec(compression: Compression) -> None:
     try:
         tifffile.imwrite(io.BytesIO(), np.zeros((16, 16), np.uint16), compression=compression.value)
     except (ValueError, KeyError, ImportError) as error:
+        if not isinstance(error, ImportError) and "imagecodecs" not in str(error):
+            raise  # a fault of the writer, whatever is installed
         got, remedy = " ".join(str(error).split()), "pip install 'beers-deploy[codecs]' or use zlib"
         raise MissingExtraError("compression", expected="an installed codec", got=got, remedy=remedy) from error
 
@@ -347,54 +350,3 @@ def padded_px(shape: tuple[int, int, int], tile_px: int) -> int:
     """Pixels of an image (bands, height, width) in whole tiles."""
     bands, height, width = shape
     return bands * _padded(height, tile_px) * _padded(width, tile_px)
-
-
-NAME = "lock"
-GRACE_S = 0.2
-"""How long to wait for a run that ends just now: it takes the lock's file along, and who waits makes a new one."""
-ENOTSUPP = 524
-"""Linux's own number beside ENOTSUP, which some network file systems let out."""
-NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, ENOTSUPP)
-
-
-@contextmanager
-def only_run(out: Path) -> Iterator[None]:
-    """Hold the folder where a run keeps what it needs for `out`; in the end it is gone, unless rows were left in it.
-
-    Folders above it that were made for it are gone then, too, unless something was written there. It locks nothing on
-    a disk that has no locks, as some of networks.
-    """
-    folder = part_folder(out)
-    new = [parent for parent in folder.parents if not parent.exists()]
-    lock = _take(out, folder)
-    try:
-        yield
-    finally:
-        with suppress(OSError):  # Windows removes no open file: there it goes with the release
-            (folder / NAME).unlink()  # while it is ours: whoever has opened it finds out and begins again
-        with suppress(OSError):
-            lock.release()
-        with suppress(OSError):  # rows for --resume lie there
-            for each in (folder, *new):
-                each.rmdir()
-
-
-def _take(out: Path, folder: Path) -> BaseFileLock:
-    """The lock, held; where there are no locks it holds nothing."""
-    # A file that only stands for a lock would outlive a killed run: rather none where the system has none.
-    lock = FileLock(folder / NAME, timeout=GRACE_S, thread_local=False, fallback_to_soft=False)
-    until_s = time.monotonic() + GRACE_S
-    while True:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            lock.acquire()
-        except Timeout as error:
-            got, remedy = "another one at work", "wait for its end or choose another output"
-            raise MachineError(str(out), expected="no other run on this output", got=got, remedy=remedy) from error
-        except OSError as error:
-            if isinstance(error, FileNotFoundError) and time.monotonic() < until_s:
-                continue  # the folder went with a run that ended just now
-            if error.errno not in NO_LOCKS:
-                got, remedy = error.strerror or str(error), "choose another path"
-                raise MachineError(str(folder), expected="a folder to write to", got=got, remedy=remedy) from error
-        return lock

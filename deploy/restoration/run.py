@@ -34,8 +34,9 @@ from beers_deploy.quant.reading.external import network_sha256, unchanged
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.cog import disk_bytes, what_was_done, write_cog
 from beers_deploy.restoration.georeference import unread_places
+from beers_deploy.restoration.lock import only_run
 from beers_deploy.restoration.options import Compression, Options
-from beers_deploy.restoration.output import Checkpoint, only_run, require_codec, require_tiff_name, write_output
+from beers_deploy.restoration.output import Checkpoint, require_codec, require_tiff_name, write_output
 from beers_deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
 from beers_deploy.restoration.runtime import Infer, Packed, infer_on, open_runtime, tiles_at_once
@@ -91,7 +92,8 @@ def restore_file(
         figures = seam_figures(source, plan, restorer)
         job = job_of(source, digests, plan, runtime, scale.value, options, bool(steps_taken))
         cog_bytes = disk_bytes(plan.out_shape, raster.out_dtype.itemsize) if options.cog else 0
-        checkpoint = Checkpoint(out, plan.out_shape, raster.out_dtype, job, options.resume, cog_bytes)
+        ends = [row.keep_stop * plan.scale for row in plan.rows]
+        checkpoint = Checkpoint(out, plan.out_shape, raster.out_dtype, job, options.resume, cog_bytes, ends)
         if checkpoint.damaged_rows:
             log(f"{checkpoint.damaged_rows} finished rows do not match their digests: they are made again")
         done_rows = checkpoint.rows // plan.scale

@@ -23,7 +23,7 @@ READ_SUFFIXES = IMAGE_SUFFIXES | {".onnx", ".safetensors", ".pth"}
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename it to `path` when the block ends well, else remove it."""
-    _require_regular(path)
+    require_regular(path)
     temporary = _part_of(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -56,7 +56,7 @@ def require_writable(
         if os.path.lexists(folder) and not folder.is_dir():
             raise _unwritable(folder, "something else", expected="a folder")
     for path in outputs:
-        _require_regular(path)
+        require_regular(path)
         _probe(path)
 
 
@@ -75,7 +75,7 @@ def _require_apart(outputs: list[Path], filled: list[Path], inputs: Iterable[Pat
             raise _taken(other, f"a place that another output takes: {one}")
 
 
-def _require_regular(path: Path) -> None:
+def require_regular(path: Path) -> None:
     """Refuse an output at which a folder, a link, a pipe or a device stands; a regular file or nothing may."""
     if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
         got = "a symbolic link" if path.is_symlink() else "a folder" if path.is_dir() else "no regular file"

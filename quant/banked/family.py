@@ -129,8 +129,17 @@ def _numbers(op: IntConv) -> list[np.ndarray]:
     return [op.weight, op.bias] if op.input == PLANES else [op.bias]
 
 
-def with_delta(core: IntCore, delta: bytes) -> tuple[IntCore, str]:
-    """A core of the network that a delta was made for, told the delta's sensor; and the name of that."""
+def with_delta(core: IntCore, delta: bytes, where: str = "delta") -> tuple[IntCore, str]:
+    """Return a core conditioned on the sensor of a delta, and that sensor's name.
+
+    Args:
+        core: of the network that the delta was made for.
+        delta: its bytes.
+        where: what messages call it.
+
+    Raises:
+        ModelError: damaged bytes, or a delta of another network.
+    """
     try:
         line, _, numbers = zlib.decompressobj().decompress(delta, LARGEST_DELTA).partition(b"\n")
         said = json.loads(line)
@@ -146,8 +155,9 @@ def with_delta(core: IntCore, delta: bytes) -> tuple[IntCore, str]:
         return replace(core, ops=tuple(ops), ends=replace(core.ends, unit=float(said["unit"]))), str(said["sensor"])
     except (zlib.error, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
         remedy = "give a file that 'export --delta' wrote for the same network"
-        got = " ".join(f"{type(error).__name__}: {error}".split())[:80]
-        raise ModelError("delta", expected="one of this network", got=got, remedy=remedy) from error
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:80]
+        got = "damaged bytes" if isinstance(error, zlib.error) else f"another one ({reason})"
+        raise ModelError(where, expected="a delta of this network", got=got, remedy=remedy) from error
 
 
 LARGEST_DELTA = 1 << 20

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import (
@@ -55,7 +56,20 @@ def _plain(op: IntConv | Op) -> dict[str, Any]:
 
 
 def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
-    """The core that a description and the constants of its file make."""
+    """Return the core that a description and the constants of its file make.
+
+    Raises:
+        ModelError: metadata that are damaged, or that do not fit the constants.
+    """
+    try:
+        return _described(text, constants)
+    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+        got = f"damaged ones ({type(error).__name__}: {' '.join(str(error).split())[:80]})"
+        expected = f"metadata {KEY!r} that describe its integers"
+        raise ModelError("INT8 core", expected=expected, got=got, remedy="quantise the network again") from error
+
+
+def _described(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
     said = json.loads(text)
     _require_small({**said, "ends": {**said["ends"], "offsets": []}})  # values, of any size
     frac_bits = {str(name): int(bits) for name, bits in said["frac_bits"].items()}

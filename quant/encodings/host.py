@@ -43,6 +43,8 @@ from beers_deploy.quant.onnx_file import constants, fixed_tile_px, image_info, m
 from beers_deploy.quant.untrusted import contradictions
 
 MICROSOFT = "com.microsoft"
+LEGAL = "int8 legal"
+"""What the metadata of a file that `quantize` wrote state as its precision."""
 
 
 def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
@@ -227,21 +229,23 @@ def read_core(model: onnx.ModelProto) -> IntCore:
     """
     said = metadata(model).get(KEY)
     if said is not None:
-        with contradictions("INT8 model"):
-            return described_core(said, constants(model))
+        return described_core(said, constants(model))
     expected, remedy = "a file that describes its integers", "make it with 'beers-deploy quantize'"
-    raise ModelError("INT8 core", expected=expected, got="one that does not", remedy=remedy)
+    raise ModelError("INT8 core", expected=expected, got="a file without a description", remedy=remedy)
 
 
 def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
     """Where a file of `quantize` is not what its integers ask for: the host's ends, ReLUs, a reader's scale.
 
-    None for files of others.
+    None for a file that does not describe its integers and does not state that `quantize` wrote it.
     """
+    about = metadata(model)
+    if KEY not in about and about.get("precision") != LEGAL:
+        return None
     try:
         core = read_core(model)
     except ModelError as error:
-        return [error.got] if metadata(model).get("precision") == "int8 legal" else None
+        return [f"no integers to compare with: {error.got}"]
     with contradictions("INT8 model"):
         meant, faults = host_model(core, {}, fixed_tile_px(model)).graph, list[str]()
     for kind, found, wanted in (

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import beers_deploy as bd
-from beers_deploy.baseline import Baseline, files_input, read_baseline, sensor_input
+from beers_deploy.baseline import Baseline, data_inputs, read_baseline, sensor_input
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Check, Row, measured
@@ -20,6 +20,9 @@ from beers_deploy.results import Input, Table
 from tests.deploy.command_line import done, refused
 
 ASKED: dict[str, Any] = {"sensor": "pleiades-degraded", "images": None, "patches": 2, "seed": 0}
+
+
+MAE, KEPT = measured(5e-4, "of full scale", "here"), Check("MAE", 5e-4, 1.0, "of full scale")
 
 
 def document(mae: float = 5e-4, **arguments: object) -> dict[str, Any]:
@@ -38,7 +41,8 @@ def written(path: Path, content: object) -> Path:
 def test_what_a_gate_wrote_is_read(tmp_path: Path) -> None:
     found = read_baseline(written(tmp_path / "b.json", document()), ASKED)
     assert (found.mae, found.psnr_float_db) == (5e-4, 50.0)
-    assert found.digests == {"float.onnx": "a" * 64, "sensor s": "b" * 64}
+    assert found.digests == {"float.onnx": {"a" * 64}, "sensor s": {"b" * 64}}
+    assert found.checks == {"MAE"}
 
 
 def failed(content: dict[str, Any]) -> None:
@@ -61,6 +65,14 @@ def without_mae(content: dict[str, Any]) -> None:
     del content["rows"][0]["figures"]["MAE"]
 
 
+def check(**values: object) -> Callable[[dict[str, Any]], None]:
+    return lambda content: content["checks"][0].update(values)
+
+
+def two_rows(content: dict[str, Any]) -> None:
+    content["rows"] *= 2
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -72,6 +84,10 @@ def without_mae(content: dict[str, Any]) -> None:
         (figure("value", -1e-9), "a measured MAE of full scale"),
         (figure("value", "inf"), "a results document"),
         (figure("mode", "published"), "a measured MAE of full scale"),
+        (figure("value", 6e-4), "agrees with itself, got an MAE of 0.0006"),
+        (check(limit=1e-4), "agrees with itself, got MAE 0.0005 with the limit 0.0001"),
+        (check(bound="at least"), "agrees with itself"),
+        (two_rows, "2 rows of the table gate"),
     ],
 )
 def test_a_document_that_is_no_baseline_is_refused(
@@ -91,6 +107,23 @@ def test_whatever_stands_in_a_place_of_the_document_it_ends_in_one_sentence(
     content = {**document(), path: junk}
     with pytest.raises(OptionError):
         read_baseline(written(tmp_path_factory.mktemp("b") / "b.json", content), ASKED)
+
+
+@pytest.mark.parametrize("key", ["verdict", "MAE"])
+def test_a_key_that_stands_twice_is_refused(key: str, tmp_path: Path) -> None:
+    text = json.dumps(document())
+    (tmp_path / "b.json").write_text(text.replace(f'"{key}":', f'"{key}": 0, "{key}":'))
+    with pytest.raises(OptionError, match=f"key '{key}' twice"):
+        read_baseline(tmp_path / "b.json", ASKED)
+
+
+def test_a_name_that_is_not_utf_8_comes_back(tmp_path: Path) -> None:
+    inputs = (Input("float.onnx", "a" * 64), Input("samples n\udcff.npy", "b" * 64))
+    made = document(samples="n\udcff.npy")
+    table = Table("gate", {**ASKED, "samples": "n\udcff.npy"}, inputs, (Row("gate", "n", {"MAE": MAE}),), (KEPT,))
+    found = read_baseline(table.save(tmp_path / "b.json"), {**ASKED, "samples": Path("n\udcff.npy")})
+    found.require_same("a" * 64, 0.0, inputs[1:])
+    assert "\udcff" not in made["arguments"]["samples"]
 
 
 def test_files_that_are_no_document_are_refused(tmp_path: Path) -> None:
@@ -116,7 +149,8 @@ def test_a_baseline_of_other_patches_is_refused_and_a_folder_may_lie_elsewhere(
         read_baseline(path, {**same, **other})
 
 
-BEFORE = Baseline(Path("b.json"), 5e-4, 50.0, {"float.onnx": "a" * 64, "sensor s": "b" * 64})
+DIGESTS = {"net.onnx": frozenset({"a" * 64, "d" * 64}), "sensor s": frozenset({"b" * 64})}
+BEFORE = Baseline(Path("b.json"), 5e-4, 50.0, DIGESTS)
 
 
 def test_the_float_network_is_known_by_its_digest_or_its_psnr() -> None:
@@ -135,6 +169,9 @@ def test_what_else_it_rests_on_must_be_the_same(digest: str) -> None:
         BEFORE.require_same("a" * 64, 50.0, [Input("sensor s", digest)])
     with pytest.raises(OptionError, match="rests on samples"):
         BEFORE.require_same("a" * 64, 50.0, [Input("samples", digest)])
+    twice = replace(BEFORE, digests={**DIGESTS, "sensor s": DIGESTS["sensor s"] | {"e" * 64}})
+    with pytest.raises(OptionError, match="the same sensor s"):
+        twice.require_same("a" * 64, 50.0, [Input("sensor s", "b" * 64)])
 
 
 def test_a_sensor_of_the_same_name_and_other_numbers_is_another() -> None:
@@ -150,14 +187,15 @@ def test_a_folder_is_known_by_its_files(change: str, tmp_path: Path) -> None:
     folder.mkdir()
     (folder / "a.tif").write_bytes(b"1")
     (folder / "b.tif").write_bytes(b"2")
-    before = files_input("scenes", folder)
+    before = data_inputs(folder, None)
+    (folder / "gate.json").touch()  # not read as a scene
     if change == "content":
         (folder / "a.tif").write_bytes(b"3")
     elif change == "name":
         (folder / "a.tif").rename(folder / "c.tif")
     elif change == "one more":
         (folder / "c.tif").write_bytes(b"")
-    assert (files_input("scenes", folder) == before) == (change == "none")
+    assert (data_inputs(folder, None) == before) == (change == "none")
 
 
 def test_a_baseline_holds_the_mae(scenes: Path, tmp_path: Path) -> None:
@@ -182,9 +220,21 @@ def test_the_baseline_of_another_float_network_is_refused(scenes: Path, tmp_path
 
 
 def test_the_baseline_of_other_samples_is_refused(model: Path, tmp_path: Path) -> None:
-    samples, int8, before = (tmp_path / name for name in ("s.npy", "int8.onnx", "before.json"))
-    np.save(samples, np.random.default_rng(0).random((12, 1, 32, 40), np.float32))
+    """Also where both networks are files of one name, and where samples are no file."""
+    folder, samples, before = (tmp_path / name for name in ("int8", "s.npy", "before.json"))
+    folder.mkdir()
+    int8 = folder / model.name
+    values = np.random.default_rng(0).random((12, 1, 32, 40), np.float32)
+    np.save(samples, values)
     bd.quantize(model, samples).save(int8)
-    done("gate", model, int8, "--samples", samples, "--max-mae", 0.1, "--json", before)
+    command = ["gate", model, int8, "--max-mae", 0.1]
+    done(*command, "--samples", samples, "--json", before)
+    done(*command, "--samples", samples, "--baseline", before)
     np.save(samples, np.random.default_rng(1).random((12, 1, 32, 40), np.float32))
-    assert "same samples" in refused("gate", model, int8, "--samples", samples, "--baseline", before)
+    assert "same samples" in refused(*command, "--samples", samples, "--baseline", before)
+    limits = {"mae": 0.1}
+    bd.gate(int8, model, values, limits=limits).save(before)
+    assert bd.gate(int8, model, values, limits=limits, baseline=before)
+    assert "same patches (samples None), got samples in memory" in refused(*command, "--baseline", before)
+    with pytest.raises(OptionError, match="same samples in memory"):
+        bd.gate(int8, model, values[::-1], limits=limits, baseline=before)

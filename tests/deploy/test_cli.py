@@ -17,7 +17,7 @@ from beers_deploy import __version__
 from beers_deploy.cli import COMMANDS, app
 from beers_deploy.model.io.images import read_acquisition
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.errors import CRASHED, ImageError
 from beers_deploy.studies.demo import load_sensors, read_input
 from tests.deploy.command_line import done, refused
 from tests.profiles.own_sensor import SHIPPED, edited, own_sensor
@@ -248,3 +248,15 @@ def test_no_stream_loses_an_image(closing: str, code: int, tmp_path: Path) -> No
     assert tifffile.imread(tmp_path / "out.tif").shape == (40, 50)
     assert "Traceback" not in said
     assert found == code or (found == 0 and "true" in closing)  # the pipe may live until the last word
+
+
+@pytest.mark.parametrize("module", ["typing_extensions", "psutil", "numpy"])
+def test_an_installation_that_does_not_work_is_no_failed_gate(module: str, tmp_path: Path) -> None:
+    """Python ends a program whose libraries do not load with 1, which is the code of a failed gate."""
+    (tmp_path / f"{module}.py").write_text("raise RuntimeError('broken')\n", encoding="utf-8")
+    command = [sys.executable, "-m", "beers_deploy", "--version", "-v"]
+    found = subprocess.run(
+        command, env={**os.environ, "PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=False
+    )
+    assert found.returncode == CRASHED
+    assert found.stderr.splitlines()[-1].startswith("beers-deploy: this installation does not work")

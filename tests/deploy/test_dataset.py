@@ -14,6 +14,7 @@ from PIL import Image
 
 from beers_deploy.cluster import open_cluster
 from beers_deploy.model.dataset import CHUNK, DatasetRecipe, make_patches, plan_windows, write_dataset
+from beers_deploy.model.manifest import DIGESTS, Line, line_text
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import TABLES
 from beers_deploy.profiles.errors import ImageError, OptionError
@@ -153,6 +154,52 @@ def test_damaged_pairs_of_a_finished_dataset_are_made_again(
     assert bytes_of(folder) == bytes_of(made)
     assert [sentence.split(" ")[0] for sentence in said] == [str(count)] if count else len(said) <= 1
     assert all("they are made again" in sentence for sentence in said)
+
+
+def rejected(value: object) -> Callable[[Line], None]:
+    return lambda line: line["degraded"].update(rejected_snr_pairs=value)  # type: ignore[attr-defined]
+
+
+FORGED: dict[str, Callable[[Line], object]] = {
+    "number as a list": lambda line: line.update(number=[0]),
+    "number as a float": lambda line: line.update(number=0.0),
+    "many rejected": rejected(10**9),
+    "rejected as text": rejected("x"),
+    "no sensor": lambda line: line.update(degraded=3),
+}
+
+
+@pytest.mark.parametrize("kind", FORGED)
+def test_a_forged_line_with_its_digest_is_made_again(kind: str, scene: Path, made: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(made, tmp_path / "forged"))
+    lines = (folder / "manifest.jsonl").read_text().splitlines(keepends=True)
+    line = json.loads(lines[0])
+    del line[DIGESTS]
+    FORGED[kind](line)
+    (folder / "manifest.jsonl").write_text("".join([line_text(folder, line), *lines[1:]]))
+    said: list[str] = []
+    write_dataset(small(scene), folder, 1, resume=True, tick=silent, log=said.append)
+    assert bytes_of(folder) == bytes_of(made)
+    assert said[0].startswith("1 of ")
+
+
+def test_a_recipe_whose_lines_end_otherwise_is_the_same(scene: Path, made: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(made, tmp_path / "other"))
+    recipe = folder / "recipe.json"
+    recipe.write_bytes(recipe.read_bytes().replace(b"\n", b"\r\n"))
+    write_dataset(small(scene), folder, 1, resume=True, tick=silent)
+    assert bytes_of(folder) == bytes_of(made)
+
+
+def test_left_overs_of_a_run_are_deleted_and_nothing_else(scene: Path, made: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(made, tmp_path / "left"))
+    ours = [folder / "degraded" / ".a.tif.123.part", folder / ".manifest.jsonl.9.part"]
+    foreign = [folder / "mine" / ".b.tif.123.part", folder / ".mine.part"]
+    foreign[0].parent.mkdir()
+    for path in (*ours, *foreign):
+        path.touch()
+    write_dataset(small(scene), folder, 1, resume=True, tick=silent)
+    assert [path.exists() for path in (*ours, *foreign)] == [False, False, True, True]
 
 
 @pytest.mark.parametrize("damage", [flip, cut, Path.unlink])

@@ -72,7 +72,7 @@ def test_a_written_comparison_is_a_document_again(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [(None, "no such file"), ("", "Expecting value"), ("[]", "another document"), ("{}", "required")],
+    [(None, "no such file"), ("", "an empty file"), ("[]", "another document"), ("{}", "required")],
 )
 def test_what_is_no_document_gets_one_sentence(content: str | None, words: str, tmp_path: Path) -> None:
     if content is not None:

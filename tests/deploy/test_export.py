@@ -165,6 +165,12 @@ def test_where_no_higher_exposure_is_allowed_there_is_one_delta(tmp_path: Path) 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["d", "x.onnx"]
 
 
+def test_a_damaged_delta_is_named(tmp_path: Path) -> None:
+    (tmp_path / "bad.delta").write_bytes(b"none")
+    said = refused("export", "--network", SMALL, "--out", tmp_path / "x.onnx", "--apply", tmp_path / "bad.delta")
+    assert "bad.delta: expected a delta of this network, got damaged bytes" in said
+
+
 def test_the_files_of_exposures_are_refused_before_any_work(tmp_path: Path) -> None:
     """Where one is an input, another output or cannot be written; and where the sensor does not exist."""
     sensor = own_sensor(tmp_path).rename(tmp_path / "my-x4.toml")

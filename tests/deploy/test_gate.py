@@ -143,6 +143,7 @@ def test_limits_come_from_a_file(tmp_path: Path) -> None:
     assert (limits.mae, limits.psnr_drop_db, limits.p999) == (0.0007, 0.25, None)
     assert limits_of(path, 0.001).mae == 0.001
     assert limits_of(None) == Limits()
+    assert limits_of({"mae": 0}).mae == limits_of(None, 0.0).mae == 0
     path.write_text("mae_growth = 1.2")
     assert limits_of(path) == Limits(mae_growth=1.2)  # what is left out has its default
 
@@ -165,10 +166,10 @@ def test_a_limit_that_no_network_breaks_is_refused(text: str, tmp_path: Path) ->
 NO_LIMITS = ["mae = 'small'", "mae = true", "mea = 0.1", "mae = -1", "mae = nan", "= 3", "[mae]", "", "# none"]
 
 
-@pytest.mark.parametrize("text", [*NO_LIMITS, "mae = [1]", "mae = 0x" + "f" * 400])
+@pytest.mark.parametrize("text", [*NO_LIMITS, "mae = [1]", "mae = 0x" + "f" * 400, "mae = " + "9" * 5000])
 def test_limits_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "gate.toml").write_text(text)
-    with pytest.raises(OptionError, match=r"gate\.toml"):
+    with pytest.raises(OptionError, match=r"gate\.toml: (?!.*sys\.set)"):
         limits_of(tmp_path / "gate.toml")
     with pytest.raises(OptionError, match="no such file"):
         limits_of(tmp_path / "none.toml")
@@ -379,3 +380,21 @@ def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(t
     assert "nan" not in said.lower()
     limits.write_text("psnr_drop_db = 0.25\n", encoding="utf-8")
     assert "references for psnr_drop_db, got images alone" in refused(*command, "--limits", limits)
+
+
+def test_references_that_do_not_fit_are_refused_and_the_sample_is_named(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).uniform(0.1, 0.9, (2, 1, 40, 40)).astype(np.float32)
+    path, limits = tmp_path / "s.npz", tmp_path / "limits.toml"
+    limits.write_text("mae = 0.1\npsnr_drop_db = 20\n", encoding="utf-8")
+    command = ["gate", *shipped_pair(SMALL), "--samples", path, "--limits", limits]
+    np.savez(path, image=image, reference=image * 4095)
+    assert "s.npz[0]: expected a reference with values in [0, 1]" in refused(*command)
+    np.savez(path, image=image, reference=image[..., :20])
+    assert "s.npz[0]: expected a reference of the results' size for psnr_drop_db, got 1 x 40 x 20" in refused(
+        *command
+    )
+    assert "gate passed" in done(*command[:-2], "--max-mae", 0.1)  # no check needs them
+    assert "--metric: expected one of psnr" in refused(*command, "--metric", "PSNR")
+    mixed = [(image[:1], image[:1]), (image[1:], image[1:, ..., :20])]
+    with pytest.raises(ImageError, match=r"samples\[1\]: expected a reference of the results' size"):
+        bd.compare("convbeers-xs-int8", SMALL, mixed)

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -14,14 +15,16 @@ import pytest
 import beers_deploy as bd
 from beers_deploy import verdict as gates
 from beers_deploy.export import float_model
-from beers_deploy.kit.record import record_of
+from beers_deploy.kit.record import bill_of, record_of, write_record
 from beers_deploy.network import Network
 from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.banked.family import WEIGHTS
+from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
 from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
+from beers_deploy.quant.samples import CALIBRATED_ON
 from tests.deploy.command_line import done, refused
+from tests.quant.quick import change
 
 SMALL = ("convbeers-xs", "--patches", 1)
 
@@ -134,3 +137,91 @@ def test_claims_of_weights_are_verified(claim: str, pair: tuple[Path, Path], tmp
     save_onnx(other, tmp_path / "other.onnx")
     said = record_of(verdict, replace(int8, model=load_onnx(tmp_path / "other.onnx")), sensor)
     assert (said["weights_sha256"], said["training"], said["licence"]) == (None, None, None)
+
+
+def test_a_file_without_its_description_loses_no_check_silently(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    """A changed constant of the host part is a fault of the encoding, which only the description shows."""
+    int8 = pair[1]
+    baseline = tmp_path / "before.json"
+    done("gate", *pair, "--patches", 1, "--json", baseline)
+    model = load_onnx(int8)
+    change(model, "max_dn", lambda value: value * 1.002)
+    about = {key: text for key, text in metadata(model).items() if key not in ("core", "precision")}
+    save_onnx(model, int8)
+    assert "faults of the encoding" in done("gate", *pair, "--patches", 1, code=1)
+    onnx.helper.set_model_props(model, about)
+    save_onnx(model, int8)
+    assert "note: not checked: faults of the encoding" in " ".join(done("gate", *pair, "--patches", 1).split())
+    said = done("gate", *pair, "--patches", 1, "--baseline", baseline, code=1)
+    assert "does not describe its integers" in said
+    onnx.helper.set_model_props(model, about | {"core": "{}"})
+    save_onnx(model, int8)
+    assert "int8.onnx: expected metadata 'core'" in refused("gate", *pair, "--patches", 1)
+
+
+def test_what_refuses_the_outputs_deletes_an_older_verdict_and_says_why(tmp_path: Path) -> None:
+    document, junit, file = tmp_path / "gate.json", tmp_path / "gate.xml", tmp_path / "file"
+    file.touch()
+    outputs = ["--json", document, "--junit", junit]
+    for words in (["--record", file], ["--max-mae", "nan"], ["--samples", file, "--patches", 2]):
+        document.write_text('"passed"')
+        said = refused("gate", *SMALL[:1], *outputs, *words)
+        assert not document.exists()
+        error = ET.fromstring(junit.read_text()).find("testcase/error")  # noqa: S314 - our own text
+        assert error is not None
+        assert (error.text or "").rpartition(":")[2] in said
+    document.write_text('"passed"')
+    refused("gate", *SMALL, "--json", document, "--junit", tmp_path)
+    assert not document.exists()
+
+
+def test_a_record_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    document, folder = tmp_path / "gate.json", tmp_path / "record"
+
+    def failing(*_: object, **__: object) -> str:
+        raise RuntimeError("moved")
+
+    monkeypatch.setattr("cyclonedx.output.json.JsonV1Dot6.output_as_string", failing)
+    done("gate", *SMALL, "--json", document, "--record", folder, code=70)
+    assert not document.exists()
+    assert not folder.exists()
+    monkeypatch.setitem(sys.modules, "cyclonedx.output.json", None)
+    said = refused("gate", *SMALL, "--json", document, "--record", folder)
+    assert "the package cyclonedx, got one that does not load" in said
+
+
+def test_claims_of_the_file_are_shown_as_claims(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    claims = {
+        "sha256": "0" * 64,
+        "name": "convbeers-gold",
+        CALIBRATED_ON: "deadbeef cafe",
+        FAMILY: "garbage",
+        "sensor": "s" * 100_000,
+    }
+    model = load_onnx(pair[1])
+    onnx.helper.set_model_props(model, {**metadata(model), **claims})
+    save_onnx(model, tmp_path / "int8.onnx")
+    int8 = Network.load(tmp_path / "int8.onnx")
+    verdict = bd.gate(int8, Network.load(pair[0]), patches=1)
+    write_record(verdict, int8, Sensor.load("pleiades-degraded"), tmp_path / "r", verdict.comparison.floating)
+    said = json.loads((tmp_path / "r" / "record.json").read_text())
+    assert said["sensors_in_range"] is None
+    assert said["says"][CALIBRATED_ON] == "deadbeef cafe"
+    assert "calibration_samples" not in said
+    known, claimed = (tmp_path / "r" / "record.html").read_text().split("What the file says of itself")
+    assert int8.sha256 in known
+    assert "0" * 64 not in known
+    assert "convbeers-gold" in claimed
+    assert len(claimed) < 100_000
+
+
+def test_a_bill_names_two_inputs_of_one_name(pair: tuple[Path, Path]) -> None:
+    int8 = Network.load(pair[1])
+    verdict = bd.gate(int8, Network.load(pair[0]), patches=1)
+    said = record_of(verdict, int8, Sensor.load("pleiades-degraded"))
+    for each in said["results"]["inputs"][:2]:
+        each["name"] = "net.onnx"
+    bill = json.loads(bill_of(said))
+    (depends,) = (each["dependsOn"] for each in bill["dependencies"] if "dependsOn" in each)
+    assert set(depends) == {each["bom-ref"] for each in bill["components"]}
+    assert len(depends) == len(said["results"]["inputs"])

@@ -1,5 +1,6 @@
 """A fault of an installed library ends with 70 and the library's name; it is not taken for a damaged file."""
 
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
@@ -9,13 +10,16 @@ import pytest
 import tifffile
 from PIL import Image, PngImagePlugin
 
-from beers_deploy.cli import CRASHED, ending
+from beers_deploy.cli import ending
 from beers_deploy.commands.restore import restore
 from beers_deploy.model.io import tiff
-from beers_deploy.profiles.errors import CODE_FAULTS, ModelError, printable
+from beers_deploy.model.processor import int8_adds_exactly
+from beers_deploy.profiles.errors import CODE_FAULTS, CRASHED, MissingExtraError, ModelError, printable
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.untrusted import contradictions
+from beers_deploy.restoration.options import Compression
+from beers_deploy.restoration.output import require_codec
 from tests.deploy.command_line import done
 
 PIXELS = np.full((20, 30), 900, np.uint16)
@@ -64,3 +68,33 @@ def test_a_fault_of_this_program_names_no_library() -> None:
         printable(None)  # type: ignore[arg-type]
     said, code = ending(caught.value, restore)
     assert (code, said.partition(",")[0]) == (CRASHED, "a fault of this program")
+
+
+def test_a_run_of_onnxruntime_that_fails_is_no_fault_of_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the processor is asked how it adds, with a network of this program."""
+
+    def moved(*_: object, **__: object) -> None:
+        raise AttributeError("moved")
+
+    monkeypatch.setattr(onnxruntime.InferenceSession, "run", moved)
+    int8_adds_exactly.cache_clear()
+    try:
+        said = done("gate", "convbeers-xs", "--patches", 1, code=CRASHED)
+    finally:
+        int8_adds_exactly.cache_clear()
+    assert f"onnxruntime {version('onnxruntime')}" in said or "fault of this program" in said
+
+
+def test_a_fault_of_the_writer_is_no_missing_codec(monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(reason: str) -> Callable[..., None]:
+        def write(*_: object, **__: object) -> None:
+            raise ValueError(reason)
+
+        return write
+
+    monkeypatch.setattr(tifffile, "imwrite", failing("odd"))
+    with pytest.raises(ValueError, match=r"^odd$"):
+        require_codec(Compression.zlib)
+    monkeypatch.setattr(tifffile, "imwrite", failing("<LZW> requires the 'imagecodecs' package"))
+    with pytest.raises(MissingExtraError, match="an installed codec"):
+        require_codec(Compression.zlib)

@@ -23,7 +23,7 @@ from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, save_onnx
 from beers_deploy.quant.sensitivity import Spread, kind_of_error, worst_row
 from beers_deploy.quantise import steps_of
 from beers_deploy.report.plots import FONT_PX, MOST_BARS, bins, histogram_url
-from tests.deploy.command_line import done
+from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 from tests.deploy.report.svg import style_of, text_width
 from tests.model.networks import plain
@@ -152,8 +152,11 @@ def test_a_report_on_samples_shows_the_worst_of_them(tmp_path: Path) -> None:
     save_onnx(to_onnx(plain(Variant(1, 4)), {}), tmp_path / "f.onnx")
     np.save(tmp_path / "s.npy", np.random.default_rng(0).random((8, 1, 40, 48), np.float32))
     options = ["--samples", tmp_path / "s.npy", "--out", tmp_path / "i.onnx", "--report", tmp_path / "r"]
+    assert "none together with --samples" in refused("quantize", tmp_path / "f.onnx", *options, "--patches", 3)
     assert "dB" not in done("quantize", tmp_path / "f.onnx", *options).splitlines()[-1]
-    rows = json.loads((tmp_path / "r" / "report.json").read_text())["rows"]
+    document = json.loads((tmp_path / "r" / "report.json").read_text())
+    rows = document["rows"]
+    assert [each["name"] for each in document["inputs"]] == ["f.onnx", "i.onnx", "samples s.npy"]
     assert {row["name"] for row in rows if row["table"] == "worst samples"} == {"sample 0", "sample 1"}
     judged = done(
         "gate", tmp_path / "f.onnx", tmp_path / "i.onnx", "--samples", tmp_path / "s.npy", "--max-mae", "0.1"

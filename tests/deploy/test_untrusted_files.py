@@ -29,8 +29,9 @@ from beers_deploy.profiles.figures import Check, Row, measured
 from beers_deploy.profiles.toml import HERE, read_json, read_toml_text
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration.journal import FinishedRow, journal_text
+from beers_deploy.restoration.lock import part_folder
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.output import Checkpoint, part_folder
+from beers_deploy.restoration.output import Checkpoint
 from beers_deploy.results import Table
 from beers_deploy.studies.tradeoff.measure import Measurements
 from tests.deploy.command_line import refused
@@ -151,6 +152,10 @@ def stored_rows(rows_px: int = 4, **counts: int) -> tuple[bytes, FinishedRow]:
     return pixels, FinishedRow(rows_px, len(pixels), hashlib.sha256(pixels).hexdigest(), Tally(**counts))
 
 
+ENDS = (4, SHAPE[1])
+"""Rows of pixels at which the rows of tiles of a plan end."""
+
+
 @pytest.mark.parametrize(
     "journal",
     [
@@ -163,6 +168,9 @@ def stored_rows(rows_px: int = 4, **counts: int) -> tuple[bytes, FinishedRow]:
         journal_text(JOB, [stored_rows(known=-5)[1]]),
         journal_text(JOB, [stored_rows(10**9 // SHAPE[2])[1]]),
         journal_text(JOB, [replace(stored_rows()[1], rows_px=0)]),
+        journal_text(JOB, [replace(stored_rows()[1], rows_px=4.0)]),  # type: ignore[arg-type]
+        journal_text(JOB, [stored_rows(known=1.5)[1]]),  # type: ignore[arg-type]
+        journal_text(JOB, [stored_rows(2)[1]]),
         journal_text(JOB, [stored_rows()[1]])[:-40],
         journal_text(JOB, [stored_rows()[1]]).replace('"known": 0', '"known": 1'),
     ],
@@ -175,9 +183,9 @@ def test_a_journal_that_counts_rows_that_are_not_there_is_refused(journal: str, 
     path = part_folder(out) / "journal.json"
     path.write_text(journal)
     with pytest.raises(OptionError, match="resume"):
-        Checkpoint(out, SHAPE, np.dtype(np.uint16), JOB, resume=True)
+        Checkpoint(out, SHAPE, np.dtype(np.uint16), JOB, resume=True, row_ends=ENDS)
     path.write_text(journal_text(JOB, [row]))
-    assert Checkpoint(out, SHAPE, np.dtype(np.uint16), JOB, resume=True).rows == 4
+    assert Checkpoint(out, SHAPE, np.dtype(np.uint16), JOB, resume=True, row_ends=ENDS).rows == 4
 
 
 @pytest.mark.parametrize("line", ["", "{}", "[]", "3", "[" * 5000, '{"degraded": {"rejected_snr_pairs": "x"}}'])

@@ -31,8 +31,9 @@ from beers_deploy.profiles.response import read_response
 from beers_deploy.profiles.scene_call import load_scene_call
 from beers_deploy.quant.limits import limits_of
 from beers_deploy.restoration.journal import FinishedRow, journal_text
+from beers_deploy.restoration.lock import part_folder
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.output import Checkpoint, part_folder
+from beers_deploy.restoration.output import Checkpoint
 from beers_deploy.results import Table, by_row, cell
 from beers_deploy.studies.tradeoff.measure import Measurements
 from tests.deploy.dpu.graphs import integer_convbeers

@@ -1,6 +1,7 @@
 """Errors come back whole from worker processes, which hand them over pickled; what they say can be read."""
 
 import sys
+from importlib import import_module
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from beers_deploy.profiles.errors import (
     ModelError,
     OptionError,
     ProfileError,
+    missing_extra,
     optional,
     sizes,
     visible,
@@ -62,3 +64,19 @@ def test_a_package_that_cannot_load_is_one_sentence(
     monkeypatch.delitem(sys.modules, "rasterio", raising=False)
     with pytest.raises(MissingExtraError, match=r"^cog: .*one that does not load.*beers-deploy\[gdal\]"):
         optional("rasterio", "cog")
+
+
+@pytest.mark.parametrize("lacks", ["import affine_of_nobody", "raise ImportError('libtorch.so: no such file')"])
+def test_a_package_that_cannot_load_is_no_fault_of_the_program(
+    lacks: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "rasterio.py").write_text(lacks, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "rasterio", raising=False)
+    with pytest.raises(ImportError) as caught:
+        import_module("rasterio")
+    assert "train: expected the package rasterio, got one that does not load" in str(
+        missing_extra(caught.value, "train")
+    )
+    other = ImportError("no part of an extra")
+    assert missing_extra(other, "train") is other

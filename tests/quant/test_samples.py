@@ -79,6 +79,14 @@ def cut_off(folder: Path) -> Path:
     return folder / "x.npz"
 
 
+def with_reference(reference: np.ndarray, image: np.ndarray = RAMP[:, :1, :8, :8]) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        np.savez(folder / "x.npz", image=image, reference=reference)
+        return folder / "x.npz"
+
+    return write
+
+
 @pytest.mark.parametrize(
     ("write", "said"),
     [
@@ -92,6 +100,15 @@ def cut_off(folder: Path) -> Path:
         (pickled, "a .npy or .npz file of numbers, or a folder"),
         (two_arrays, "got first, second"),
         (cut_off, "a .npy or .npz file of numbers"),
+        (with_reference(np.array(0.5)), "as many references as images"),
+        (with_reference(np.zeros((2, 1))), "as many references as images"),
+        (with_reference(np.full((3, 2), "text")), r"x.npz\[0\]: expected a reference of real numbers"),
+        (with_reference(np.zeros((3, 2), np.complex64)), "got complex64"),
+        (with_reference(np.zeros((3, 2), "datetime64[s]")), "got datetime64"),
+        (with_reference(np.zeros((3, 2), [("a", "f4")])), "a reference of real numbers"),
+        (with_reference(np.array([0.5, np.nan, 0.5])), r"x.npz\[1\]: expected a reference of finite numbers"),
+        (with_reference(np.array([0.5, 0.5, np.inf])), r"x.npz\[2\]: expected a reference of finite numbers"),
+        (with_reference(np.zeros((3, 2)), RAMP[:, :1, :0]), "an image with pixels"),
         (lambda folder: folder / "missing.npy", "no such file"),
         (lambda folder: folder, "at least one sample"),
     ],

@@ -1,11 +1,13 @@
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import tifffile
 
+from beers_deploy.bench import board as boards
 from beers_deploy.bench.board import TRAFFIC
 from beers_deploy.bench.swath import Swath, efficiency, parse_size, predict_file
 from beers_deploy.bench.tables import layer_rows, parse_tiles, predicted_rows, published_rows, sweep_rows
@@ -178,3 +180,19 @@ def test_the_paper_counts_fractions() -> None:
 )
 def test_whole_tiles_of_the_published_swath(halo_px: int, tiles: int) -> None:
     assert Swath(13600, 9016, 640, halo_px).tiles == tiles
+
+
+def test_a_file_that_is_replaced_during_the_run_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its digest would be that of a network for which nothing was predicted."""
+    model, out = integer_convbeers(tmp_path / "net.onnx", 1, 8), tmp_path / "out.json"
+    predict = boards.bench_board
+
+    def replaced(*given: Any, **more: Any) -> Any:
+        found = predict(*given, **more)
+        model.write_bytes(model.read_bytes() + b"\0")
+        return found
+
+    monkeypatch.setattr(boards, "bench_board", replaced)
+    said = refused("bench", model, "--size", "41x33", "--tile", 32, "--no-traditional", "--json", out)
+    assert "net.onnx: expected a file that stays as it is" in said
+    assert not out.exists()

@@ -1,5 +1,6 @@
 """Golden vectors, held against boards that compute wrongly in ways of our own making."""
 
+import json
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -11,7 +12,8 @@ import pytest
 import torch
 
 import beers_deploy as bd
-from beers_deploy.kit.golden import Golden, compare_golden, files_of, read_golden, write_golden
+from beers_deploy.kit.golden import INDEX, Golden, compare_golden, files_of, read_golden, write_golden
+from beers_deploy.network import Network
 from beers_deploy.profiles.errors import BeersError
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.graph import PLANES, Add, Op
@@ -202,7 +204,69 @@ def test_the_command_writes_and_compares(tmp_path: Path) -> None:
     np.save(path, np.load(path) + 1)
     assert "the first to differ is joined" in done("golden", seen, "--compare", out, code=1)
     assert "expected one of --out and --compare" in refused("golden", seen)
-    assert "expected a folder of golden vectors" in refused("golden", seen, "--compare", seen)
+    assert "golden.json: expected the index" in refused("golden", seen, "--compare", seen)
     assert "multiple of 2 px" in refused("golden", "convbeers-half-xs", "--tile", 33, "--out", tmp_path / "x")
     np.save(out / "noise" / "00-planes.npy", np.zeros((1, 4, 38, 38), np.int8))
     assert "other numbers in noise" in refused("golden", seen, "--compare", out)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_golden(network(SHIPPED[0]), tmp_path_factory.mktemp("small"), tile=TILE_PX)
+
+
+@pytest.fixture
+def copied(small: Path, tmp_path: Path) -> Path:
+    """A copy of golden vectors with one case, which a test damages."""
+    shutil.copytree(small, tmp_path / "golden")
+    index = json.loads((tmp_path / "golden" / INDEX).read_text())
+    index["cases"] = {"noise": index["cases"]["noise"]}
+    (tmp_path / "golden" / INDEX).write_text(json.dumps(index))
+    return tmp_path / "golden"
+
+
+STRANGE = {
+    "text": np.full((1, 4, 8, 8), "a"),
+    "number": np.array(3),
+    "complex": np.zeros((1, 4, 38, 38), np.complex64),
+    "datetime": np.zeros((1, 4, 38, 38), "datetime64[s]"),
+    "structured": np.zeros((1, 4, 38, 38), [("a", "i1")]),
+    "infinite": np.full((1, 4, 38, 38), np.inf),
+    "size": np.zeros((1, 4, 7, 9), np.int8),
+}
+
+
+@pytest.mark.parametrize("kind", STRANGE)
+def test_arrays_that_are_no_tensors_are_refused(kind: str, copied: Path, tmp_path: Path) -> None:
+    planes = copied / "noise" / "00-planes.npy"
+    (tmp_path / "seen" / "noise").mkdir(parents=True)
+    sound = np.load(planes)
+    shape = sound.shape if STRANGE[kind].ndim == 4 and kind != "size" else STRANGE[kind].shape
+    strange = np.resize(STRANGE[kind], shape)
+    np.save(tmp_path / "seen" / "noise" / planes.name, strange)
+    refused("golden", tmp_path / "seen", "--compare", copied)
+    np.save(planes, strange)
+    refused("golden", tmp_path / "seen", "--compare", copied)
+    planes.write_bytes(b"\x93NUMPY\x01\x00\x06\x00(((((\n")
+    refused("golden", tmp_path / "seen", "--compare", copied)
+
+
+def test_an_index_leads_nowhere_else_and_its_claims_are_no_inputs(copied: Path, tmp_path: Path) -> None:
+    shutil.copytree(copied / "noise", tmp_path / "seen" / "noise")
+    index = json.loads((copied / INDEX).read_text())
+    (copied / INDEX).write_text(json.dumps(index | {"network": {"name": 5, "sha256": "0" * 64}}))
+    found = compare_golden(copied, tmp_path / "seen")
+    assert found.to_dict()["inputs"][0] == Network.load(copied / "int8.onnx").input._asdict()  # type: ignore[index]
+    shutil.copytree(copied / "noise", tmp_path / "noise")
+    (copied / INDEX).write_text(json.dumps(index | {"cases": {"../noise": index["cases"]["noise"]}}))
+    assert "got a damaged one (ValueError: the case '../noise')" in refused("golden", tmp_path, "--compare", copied)
+
+
+def test_older_vectors_do_not_stay(copied: Path) -> None:
+    stale = copied / "odd" / "99-gone.npy"
+    np.save(stale, np.zeros(1))
+    (copied / "odd" / "notes.txt").touch()
+    write_golden(network(SHIPPED[0]), copied, tile=TILE_PX)
+    assert not stale.exists()
+    assert (copied / "odd" / "notes.txt").exists()
+    assert read_golden(copied)

@@ -13,9 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
+from beers_deploy.restoration.lock import part_folder
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.output import Checkpoint, part_folder
+from beers_deploy.restoration.output import Checkpoint
 from beers_deploy.restoration.plan import Span
 from beers_deploy.restoration.run import read_network, restore_file
 from beers_deploy.restoration.tiles.engine import Restorer

@@ -13,9 +13,9 @@ import tifffile
 from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import MachineError
 from beers_deploy.profiles.sensor_file import BLIND
-from beers_deploy.restoration import output
+from beers_deploy.restoration import lock
+from beers_deploy.restoration.lock import only_run
 from beers_deploy.restoration.options import Options
-from beers_deploy.restoration.output import only_run
 from beers_deploy.restoration.run import restore_file
 from tests.deploy.restoration.runs import begin, noise, until
 
@@ -58,13 +58,13 @@ def test_a_killed_run_stands_in_nobody_s_way(image: Path, tmp_path: Path) -> Non
     out = tmp_path / "out.tif"
     with begun(image, out) as running:
         running.kill()
-    assert (tmp_path / ".out.tif.part" / output.NAME).is_file()
+    assert (tmp_path / ".out.tif.part" / lock.NAME).is_file()
     restore(image, out, resume=True)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.tif", "out.tif"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="flock is what POSIX systems lock by")
-@pytest.mark.parametrize("number", output.NO_LOCKS)
+@pytest.mark.parametrize("number", lock.NO_LOCKS)
 def test_a_disk_without_locks_locks_nothing_and_is_left_clean(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -124,14 +124,14 @@ def test_a_run_that_ends_just_then_takes_no_lock_along(tmp_path: Path, monkeypat
 
     def ending(handle: int, operation: int) -> None:
         if operation & fcntl.LOCK_EX and next(ends):
-            (folder / output.NAME).unlink()
+            (folder / lock.NAME).unlink()
             folder.rmdir()
         taken(handle, operation)
 
     monkeypatch.setattr(fcntl, "flock", ending)
     with only_run(tmp_path / "out"):
         monkeypatch.undo()
-        assert (folder / output.NAME).is_file()
+        assert (folder / lock.NAME).is_file()
         with pytest.raises(MachineError, match="no other run"), only_run(tmp_path / "out"):
             pass
 
@@ -158,3 +158,22 @@ def test_many_that_try_are_never_two_at_once(tmp_path: Path) -> None:
     assert most[0] == 1
     assert refused[0] < 400
     assert not list(tmp_path.iterdir())
+
+
+def test_links_in_the_place_of_a_run_s_files_are_refused_and_nothing_behind_them_changes(
+    image: Path, tmp_path: Path
+) -> None:
+    model = shipped_pair("convbeers-xs", BLIND)[1]
+    mine, out = tmp_path / "mine", tmp_path / "out.tif"
+    mine.mkdir()
+    for name in ("out.tif", "cog.tif.aux", "rows.raw"):
+        (mine / name).write_bytes(b"mine")
+    lock.part_folder(out).symlink_to(mine, target_is_directory=True)
+    with pytest.raises(MachineError, match="a symbolic link"):
+        restore_file(image, out, Options(model, TILE_PX))
+    lock.part_folder(out).unlink()
+    lock.part_folder(out).mkdir()
+    (lock.part_folder(out) / "rows.raw").symlink_to(mine / "rows.raw")
+    with pytest.raises(MachineError, match="a symbolic link"):
+        restore_file(image, out, Options(model, TILE_PX, resume=True))
+    assert {path.read_bytes() for path in mine.iterdir()} == {b"mine"}

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from beers_deploy.restoration.lock import part_folder
 from beers_deploy.restoration.options import Options
-from beers_deploy.restoration.output import part_folder
 from beers_deploy.restoration.run import restore_file
 from tests.deploy.restoration import images
 from tests.deploy.restoration.runs import begin

@@ -1,0 +1,59 @@
+"""Files of NumPy are read by what they hold, and any damage is one ValueError."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beers_deploy.profiles.arrays import ALONE, load_arrays
+
+HELD = {"image": np.arange(40.0).reshape(4, 10), "reference": np.arange(7)}
+
+
+def stored(folder: Path, kind: str) -> Path:
+    path = folder / "held.npy"
+    with path.open("wb") as stream:
+        if kind == "npy":
+            np.save(stream, HELD["image"])
+        else:
+            np.savez_compressed(stream, image=HELD["image"], reference=HELD["reference"])
+    return path
+
+
+def test_the_content_tells_an_archive_from_an_array(tmp_path: Path) -> None:
+    np.testing.assert_array_equal(load_arrays(stored(tmp_path, "npy"))[ALONE], HELD["image"])
+    found = load_arrays(stored(tmp_path, "npz"))
+    assert {name: values.shape for name, values in found.items()} == {"image": (4, 10), "reference": (7,)}
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    kind=st.sampled_from(["npy", "npz"]), places=st.dictionaries(st.floats(0, 0.999), st.integers(0, 255), max_size=4)
+)
+def test_whatever_bytes_are_damaged_it_is_a_value_error(
+    kind: str, places: dict[float, int], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = stored(tmp_path_factory.mktemp("a"), kind)
+    content = bytearray(path.read_bytes())
+    for place, value in places.items():
+        content[int(place * len(content))] = value
+    path.write_bytes(content)
+    try:
+        load_arrays(path)
+    except ValueError as error:
+        assert str(error)  # noqa: PT017 - some damage changes nothing but a value
+
+
+HEADERS = ["(((((", "{'descr': '<f4', 'fortran_order': False, 'shape': (-1, 3)}"]
+HEADERS += [f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({size},)}}" for size in (10**12, 10**20)]
+
+
+@pytest.mark.parametrize("header", HEADERS)
+def test_a_header_that_cannot_be_is_a_value_error(header: str, tmp_path: Path) -> None:
+    text = header.encode().ljust(117) + b"\n"
+    (tmp_path / "x.npy").write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text)
+    with pytest.raises(ValueError, match="another file"):
+        load_arrays(tmp_path / "x.npy")
