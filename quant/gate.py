@@ -209,9 +209,9 @@ def compare(
         errors.append([_psnr_db(image, reference) for image in (degraded, in_float, in_int8)])
         if metric is not None:
             measured_by.append([parts_of(metric, result, reference) for result in (in_float, in_int8)])
-    if (
-        lacking and not np.isnan([in_float for _, in_float, _ in errors]).all()
-    ):  # a mean over some of them would be NaN, and its check left out
+    some_have_one = not np.isnan([in_float for _, in_float, _ in errors]).all()
+    if lacking and some_have_one:
+        # A mean over some of them would be NaN, and its check left out.
         name, shape = next(iter(lacking.items()))
         raise unfit_reference(name, shape, "the PSNRs, as other samples have one")
     difference = np.concatenate(differences).astype(np.float64)

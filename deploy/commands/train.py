@@ -76,6 +76,7 @@ def train(
     which is said and kept in the recipe. A twentieth of the images, whole sites, is held out for validation. Several
     GPUs: start it with torchrun. --conditioned weights become the network of any sensor in range; --start then takes
     such weights, and plain ones without. --rounding prepares such weights for INT8: quantised anew they lose less.
+    --recipe runs all stages of a shipped network, or of your own recipe, to weights, INT8 file and model card.
     """
     from beers_deploy.model.dataset import profiles_for, read_pairs_recipe
     from beers_deploy.model.family import SensorFamily

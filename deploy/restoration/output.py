@@ -16,11 +16,11 @@ import tifffile
 from isal import isal_zlib
 
 from beers_deploy.model.io.files import TIFF_SUFFIXES, require_regular
+from beers_deploy.model.io.lock import part_folder
 from beers_deploy.model.io.tiff import MASK
 from beers_deploy.profiles.errors import ImageError, MachineError, MissingExtraError, OptionError, sizes
 from beers_deploy.restoration.georeference import enlarged_tags
 from beers_deploy.restoration.journal import FinishedRow, journal_text, read_journal
-from beers_deploy.restoration.lock import part_folder
 from beers_deploy.restoration.options import Compression
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.source import BIG_TIFF_SUFFIXES, RESTORED, RGB_BANDS, Source, strips

@@ -23,6 +23,7 @@ from beers_deploy.cluster import Cluster, open_cluster
 from beers_deploy.host_state import peak_memory
 from beers_deploy.model.io.files import require_writable
 from beers_deploy.model.io.images import require_image_file
+from beers_deploy.model.io.lock import only_run
 from beers_deploy.model.processor import require_cores
 from beers_deploy.model.progress import Log, held_back, no_log, steps
 from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, optional
@@ -34,7 +35,6 @@ from beers_deploy.quant.reading.external import network_sha256, unchanged
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.cog import disk_bytes, what_was_done, write_cog
 from beers_deploy.restoration.georeference import unread_places
-from beers_deploy.restoration.lock import only_run
 from beers_deploy.restoration.options import Compression, Options
 from beers_deploy.restoration.output import Checkpoint, require_codec, require_tiff_name, write_output
 from beers_deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes

@@ -37,9 +37,7 @@ PATHS = {
     "profiles": Paths({}, (), ("name",)),
     "characterise": Paths({"out": FILE, "json": FILE}, ("images",)),
     "simulate": Paths({"out": FOLDER}, ("scenes",), ("sensor", "reference", "scene")),
-    "train": Paths(
-        {"out": FOLDER}, ("images", "pairs", "lpips", "start", "rounding"), ("sensor", "reference", "recipe")
-    ),
+    "train": Paths({"out": FOLDER}, ("images", "pairs", "lpips", "start", "rounding"), ("sensor", "reference")),
     "export": Paths({"out": FILE, "board_file": FILE, "delta": FILE}, ("network", "apply"), ("sensor", "target")),
     "quantize": Paths(
         {"out": FILE, "board_file": FILE, "report": FOLDER, "json": FILE},

@@ -174,15 +174,15 @@ def test_a_kit_holds_what_a_board_computes(int8: bd.Network, tmp_path: Path) -> 
 def test_a_pair_is_read_as_evaluate_reads_it(pair: bd.Pair, tmp_path: Path) -> None:
     degraded, reference = pair
     assert degraded.shape == reference.shape == pair.clean.shape == (70, 70)
-    saved = bd.evaluate(["traditional-fast"], pair.save(tmp_path / "pairs"), progress=False)
-    ways: dict[str, Any] = {"chain": "traditional-fast", "half": lambda dn: dn / 2, "mine": Tiny()}
+    saved = bd.evaluate(["convbeers-half-xs"], pair.save(tmp_path / "pairs"), progress=False)
+    ways: dict[str, Any] = {"network": "convbeers-half-xs", "half": lambda dn: dn / 2, "mine": Tiny()}
     held = bd.evaluate(ways, [pair], progress=False)
     names = {row.name: row.figures for row in held.rows if row.table == "mean"}
-    assert set(names) >= {"degraded", "chain", "half", "mine"}
-    assert names["chain"]["PSNR"].value == next(
-        row.figures["PSNR"].value for row in saved.rows if row.name == "traditional-fast"
+    assert set(names) >= {"degraded", "network", "half", "mine"}
+    assert names["network"]["PSNR"].value == next(
+        row.figures["PSNR"].value for row in saved.rows if row.name == "convbeers-half-xs"
     )
-    assert (names["chain"]["PSNR"].value or 0) > (names["half"]["PSNR"].value or 0)
+    assert (names["network"]["PSNR"].value or 0) > (names["half"]["PSNR"].value or 0)
     assert pair._repr_html_().count("<img") == 3
     assert repr(pair) == "Pair(70 x 70 px, pleiades-degraded -> pleiades-reference)"
     assert pair.ssim(pair.reference) == 1 > pair.ssim(pair.degraded) > 0

@@ -12,8 +12,8 @@ import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
 
+from beers_deploy.model.io.lock import part_folder
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
-from beers_deploy.restoration.lock import part_folder
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.output import Checkpoint

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from beers_deploy.restoration.lock import part_folder
+from beers_deploy.model.io.lock import part_folder
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
 from tests.deploy.restoration import images
