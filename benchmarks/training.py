@@ -2,15 +2,16 @@
 
     python benchmarks/training.py --variant convbeers-s
 
-Both are timed in float32 and in bfloat16, and the one that `train` would choose here is named. What the ratio lacks
-of 1 is what simulating, guarding, averaging and logging cost. All are interleaved, so that what else the machine does
-falls on each of them.
+Both are timed in float32 and in bfloat16; and how fast patches are simulated, as photographs show them and varied as
+recipes vary them. What the ratio lacks of 1 is what simulating, guarding, averaging and logging cost. All are
+interleaved, so that what else the machine does falls on each of them.
 """
 
 import argparse
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from itertools import islice, product
 from pathlib import Path
@@ -20,9 +21,11 @@ from typing import get_args
 import numpy as np
 import torch
 
+from beers_deploy.model.family import SensorFamily
 from beers_deploy.model.processor import processor_name
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.training.checkpoint import TrainingRecipe
+from beers_deploy.model.training.looks import VARIED
 from beers_deploy.model.training.losses import LossWeights, RestorationLoss
 from beers_deploy.model.training.patches import PatchRecipe
 from beers_deploy.model.training.source import Batch, PatchSource
@@ -30,7 +33,7 @@ from beers_deploy.model.training.trainer import Precision, Trainer
 from beers_deploy.model.variants import VARIANTS
 from beers_deploy.profiles import load_sensor
 
-BATCH, PATCH_PX, TURNS = 8, 96, 5
+BATCH, PATCH_PX, TURNS, SIMULATED = 8, 96, 5, 256
 LOSS = LossWeights(lpips=0.0)
 
 
@@ -55,10 +58,28 @@ def main() -> None:
             bare[name].append(rate(steps, partial(bare_loop, Trainer(variant, recipe, precision=name), made, name)))
             whole[name].append(rate(steps, partial(run, trainer, batches, steps, Path(folder) / "c")))
     print(f"{arguments.variant} on {processor_name()}, {torch.get_num_threads()} threads")
+    for kind, recipe_of_patches in kinds_of_patches().items():
+        made_alone = PatchSource(scenes, recipe_of_patches, BATCH, 0).batches()
+        next(made_alone)
+        print(f"simulated alone, {kind}: {rate(SIMULATED, partial(drawn, made_alone, SIMULATED)):.0f} patches/s")
     for name in trainers:
         ratio = median(ours / theirs for ours, theirs in zip(whole[name][1:], bare[name][1:], strict=True))
         rates = f"bare loop {median(bare[name][1:]):.1f} patches/s, training run {median(whole[name][1:]):.1f}"
         print(f"{name}: {rates}, ratio {ratio:.2f}")  # the first turn warms up
+
+
+def kinds_of_patches() -> dict[str, PatchRecipe]:
+    """Recipes of patches for any sensor, by name."""
+    degraded, reference = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+    plain = PatchRecipe(degraded, reference, PATCH_PX, family=SensorFamily(degraded.nominal()))
+    family = SensorFamily(degraded.nominal(), other_curves=0.4)
+    return {"ordinary": plain, "varied": replace(plain, family=family, looks=VARIED, noisy_reference=False)}
+
+
+def drawn(batches: Iterator[Batch], count: int) -> None:
+    """So many batches, and nothing else."""
+    for _ in islice(batches, count):
+        pass
 
 
 def rate(steps: int, work: Callable[[], None]) -> float:

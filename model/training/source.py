@@ -81,7 +81,9 @@ class PatchSource:
         """
         number, within = divmod(first, self.SHARD_BATCHES)
         threads = min(max((os.cpu_count() or 1) // 2, 1), self.MOST_THREADS)
-        # One core a thread: each would start as many more as there are cores otherwise.
+        # One core a thread: each would start as many more as there are cores otherwise. A thread that has not asked
+        # for its number before takes the last one that any thread has set: this one must ask first.
+        torch.get_num_threads()
         with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as ahead:
             waiting = deque(ahead.submit(self._shard, number + k) for k in range(threads))
             while True:

@@ -1,5 +1,8 @@
 """Patches made on the fly, and from pairs on disk."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -40,6 +43,23 @@ def parts(batch: Batch) -> list[torch.Tensor]:
 
 def equal(one: Batch, other: Batch) -> bool:
     return all(torch.equal(a, b) for a, b in zip(parts(one), parts(other), strict=True))
+
+
+THREADS = """
+import torch
+from tests.model.training.sources import source
+next(source().batches())
+assert torch.get_num_threads() == 3, torch.get_num_threads()
+"""
+
+
+def test_who_takes_the_patches_keeps_its_threads() -> None:
+    """In a process of its own: a thread decides once how many it has."""
+    root = Path(__file__).parents[3]
+    three = {**os.environ, "OMP_NUM_THREADS": "3"}
+    command = [sys.executable, "-c", THREADS]
+    done = subprocess.run(command, cwd=root, env=three, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 class OneSensor(SensorFamily):
