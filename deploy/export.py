@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 
 from beers_deploy import __version__
-from beers_deploy.model.bank import FILTERS, LARGEST, in_places, network_bank
+from beers_deploy.model.bank import FILTERS, in_places, network_bank
 from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.tensors import Weights, read_conditioned, read_plain
 from beers_deploy.profiles.errors import OptionError
@@ -52,7 +52,8 @@ def banked_to_onnx(
     """A network behind the bank of a sensor as an ONNX model: its filters are the first convolution.
 
     That convolution gives the image, the planes and the analytic restoration; the last one reads what the body gives
-    and, at one tap, the analytic restoration. The image's borders are mirrored in front.
+    and, at one tap, the analytic restoration, which another convolution picks. The image's borders are mirrored in
+    front.
 
     Args:
         weights: of a `BankedConvBEERS`.
@@ -68,9 +69,11 @@ def banked_to_onnx(
     unread = np.zeros((variant.features, pixels, 3, 3), np.float32)
     tensors["head.weight"] = np.concatenate([tensors["head.weight"], unread], 1)
     tensors["head.bias"] = tensors["head.bias"] + tensors.pop("bias.weight") @ vector
-    analytic = np.zeros((pixels, (2 + FILTERS) * pixels, 3, 3), np.float32)
-    analytic[range(pixels), range(-pixels, 0), 1, 1] = 1
-    tensors["tail.weight"] = np.concatenate([tensors["tail.weight"], analytic], 1) * np.float32(bank.unit)
+    added = np.zeros((pixels, pixels, 3, 3), np.float32)
+    added[range(pixels), range(pixels), 1, 1] = 1
+    tensors["tail.weight"] = np.concatenate([tensors["tail.weight"], added], 1) * np.float32(bank.unit)
+    tensors["analytic.weight"] = np.zeros((pixels, (2 + FILTERS) * pixels, 1, 1), np.float32)
+    tensors["analytic.weight"][range(pixels), range(-pixels, 0)] = 1
     tensors["tail.bias"] = tensors["tail.bias"] * np.float32(bank.unit)
     tensors["bank.weight"] = in_places(bank.kernels, scale).astype(np.float32)
     tensors["bank.bias"] = np.repeat(np.array([-0.5, *[0] * (1 + FILTERS)], np.float32), pixels)
@@ -82,10 +85,19 @@ def banked_to_onnx(
     widened = writer.node("Pad", "widened", ["image", around], mode="reflect")
     read = _moved(writer, "SpaceToDepth", "unshuffled", widened, scale)
     found = writer.node("Conv", "bank", [read, "bank.weight", "bank.bias"], pads=[0] * 4, kernel_shape=[side, side])
-    ends = [writer.constant(name, np.array(end, np.float32)) for name, end in (("low", -LARGEST), ("high", LARGEST))]
-    planes = writer.node("Clip", "planes", [found, *ends])
-    deep = writer.node("Concat", "deep", [_deep(writer, variant.blocks, planes), planes], axis=1)
+    reach, wide_reach = bank.reach(weights.kernels)
+    planes = _held(writer, "planes", found, reach)
+    picked = writer.node("Conv", "picked", [found, "analytic.weight"], kernel_shape=[1, 1])
+    analytic = _held(writer, "analytic", picked, wide_reach)
+    deep = writer.node("Concat", "deep", [_deep(writer, variant.blocks, planes), analytic], axis=1)
     return _ended(writer, _conv(writer, "tail", deep), scale, about, tile_px)
+
+
+def _held(writer: GraphWriter, name: str, source: str, most: float) -> str:
+    """Write what holds a tensor within so many units."""
+    ends = [(f"{name}.low", -most), (f"{name}.high", most)]
+    limits = [writer.constant(end, np.array(value, np.float32)) for end, value in ends]
+    return writer.node("Clip", name, [source, *limits])
 
 
 def _deep(writer: GraphWriter, blocks: int, source: str) -> str:

@@ -24,7 +24,7 @@ from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile, board_names, npu_names
-from beers_deploy.quant.banked.family import FAMILY, KERNELS, WEIGHTS, required_family
+from beers_deploy.quant.banked.family import FAMILY, WEIGHTS, required_family
 from beers_deploy.quant.core import SHIFTS, Shifts, target_shifts
 from beers_deploy.quant.encodings import host_model, read_core
 from beers_deploy.quant.gate import compare, gate_row
@@ -194,7 +194,6 @@ def rounding_of(int8: Path, weights: Path) -> "Rounding":
 
     from beers_deploy.model.convbeers import Rounding
     from beers_deploy.quant.banked.calibrate import map_steps
-    from beers_deploy.quant.banked.filters import gains_of
 
     model, given = load_onnx(int8), read_conditioned(weights)
     if metadata(model).get(WEIGHTS) != sha256(weights):
@@ -203,7 +202,7 @@ def rounding_of(int8: Path, weights: Path) -> "Rounding":
     with contradictions(str(int8)):
         found = map_steps(required_family(model), given)
     stream, *inner = (torch.from_numpy(np.float32(steps))[:, None, None] for steps in found)
-    return Rounding(stream, tuple(inner), gains_of)
+    return Rounding(stream, tuple(inner))
 
 
 def _folders(images: Path | None) -> list[Path]:
@@ -235,5 +234,5 @@ def family_model(
         middle = bank_of_vector((0.0,) * len(RANGES), weights.kernels)
         family = quantise_family(weights, middle, seen, shifts, log)
     said = {"variant": network.name, "reference": REFERENCE, "precision": "int8 legal", "calibration_seed": str(seed)}
-    known = {FAMILY: family.to_words(), KERNELS: weights.kernels, WEIGHTS: sha256(network.weights)}
+    known = {FAMILY: family.to_words(), WEIGHTS: sha256(network.weights)}
     return host_model(family.core, {**said, **known})

@@ -19,18 +19,17 @@ A larger network can begin where a smaller one stands (`grow`): wider, deeper or
 Trained in the end with its maps rounded as its INT8 file rounds them (`Rounding`), a network loses less in INT8.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, pad, pixel_shuffle, pixel_unshuffle
 
-from beers_deploy.model.bank import FILTERS, LARGEST, SIDE_PX, Bank, bank_of_vector, in_places
+from beers_deploy.model.bank import FILTERS, LARGEST, SIDE_PX, WIDE, Bank, bank_of_vector, in_places
 from beers_deploy.model.curves import Kernels
 from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.tensors import Weights, read_weights, write_weights
@@ -94,17 +93,14 @@ class Rounding:
     Attributes:
         stream: what a 1 stands for in the maps between head and tail, (F, 1, 1), at a gain of 1.
         inner: the same of the map within each block.
-        gains_of: how many times finer sensors' steps are, of the noise of their banks (N,).
     """
 
     stream: Tensor
     inner: tuple[Tensor, ...]
-    gains_of: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
-    def steps(self, sigmas: Tensor) -> list[Tensor]:
-        """Those of images, each with the noise of its sensor (N,): (N, F, 1, 1) of the stream, then of each block."""
-        gains = torch.from_numpy(self.gains_of(sigmas.cpu().double().numpy())).to(sigmas)
-        return [step.to(sigmas) / gains[:, None, None, None] for step in (self.stream, *self.inner)]
+    def steps(self, gains: Tensor) -> list[Tensor]:
+        """Those of images, each with the gain of its bank (N,): (N, F, 1, 1) of the stream, then of each block."""
+        return [step.to(gains) / gains[:, None, None, None] for step in (self.stream, *self.inner)]
 
 
 class ConvBEERS(Layers):
@@ -126,25 +122,26 @@ class Told:
         vectors: the sensor vectors (N, 4).
         filters: (N, 5, 7, 7), see `Bank.filters`.
         units: (N,) what the network adds is in these shares of full scale.
-        sigmas: (N,) noise over full scale.
+        gains: (N,) see `Bank.gain`.
     """
 
     vectors: Tensor
     filters: Tensor
     units: Tensor
-    sigmas: Tensor
+    gains: Tensor
 
     @classmethod
     def of(cls, vectors: Tensor, banks: Sequence[Bank]) -> "Told":
         """Of the sensor vectors (N, 4) and as many banks."""
         filters = torch.from_numpy(np.stack([bank.filters for bank in banks])).to(vectors)
-        units, sigmas = (vectors.new_tensor(each) for each in zip(*((b.unit, b.sigma) for b in banks), strict=True))
-        return cls(vectors, filters, units, sigmas)
+        units = vectors.new_tensor([bank.unit for bank in banks])
+        gains = vectors.new_tensor([bank.gain for bank in banks])
+        return cls(vectors, filters, units, gains)
 
     @property
     def parts(self) -> tuple[Tensor, ...]:
         """All of it, in its order."""
-        return self.vectors, self.filters, self.units, self.sigmas
+        return self.vectors, self.filters, self.units, self.gains
 
     def to(self, device: torch.device) -> "Told":
         """The same on a device."""
@@ -186,14 +183,23 @@ class BankedConvBEERS(Layers):
             bfloat16: for the blocks alone.
             steps: that the maps are rounded to, see `Rounding.steps`; without any they stay as they are.
         """
-        filtered = each_by_its_own(image, told.filters).clamp(-LARGEST, LARGEST)
-        read = pixel_unshuffle(torch.cat([image - 0.5, filtered[:, :FILTERS]], 1), self.variant.scale)
+        filtered = each_by_its_own(image, told.filters)
+        planes, analytic = self._held(filtered, told.gains)
+        read = pixel_unshuffle(torch.cat([image - 0.5, planes], 1), self.variant.scale)
         shallow = (self.head(read) + self.bias(told.vectors)[:, :, None, None]).contiguous(
             memory_format=torch.channels_last
         )
         correction = self.corrected(shallow, bfloat16, steps)
-        restored: Tensor = image + told.units[:, None, None, None] * (filtered[:, FILTERS:] + correction)
+        restored: Tensor = image + told.units[:, None, None, None] * (analytic + correction)
         return restored
+
+    def _held(self, filtered: Tensor, gains: Tensor) -> tuple[Tensor, Tensor]:
+        """Planes and analytic restoration, (N, 5, H, W) in units, held as `Bank.reach` says."""
+        planes, analytic = filtered[:, :FILTERS], filtered[:, FILTERS:]
+        if self.kernels == "cut":
+            return planes.clamp(-LARGEST, LARGEST), analytic.clamp(-LARGEST, LARGEST)
+        reach = LARGEST / gains[:, None, None, None]
+        return planes.clamp(-reach, reach), analytic.clamp(-WIDE * reach, WIDE * reach)
 
 
 class OfOneSensor(nn.Module):

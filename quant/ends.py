@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from onnx import TensorProto, helper
 
-from beers_deploy.model.bank import SIDE_PX, UNIT_STEPS
+from beers_deploy.model.bank import SIDE_PX, UNIT_STEPS, WIDE
 from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.quant.banked.filters import ANALYTIC_COPIES, BITS, MIDDLE_DN, PART, STEP_DN, split_planes
 from beers_deploy.quant.graph import (
@@ -49,6 +49,7 @@ class Ends:
         banked: whether the core begins with the bank of a sensor (`quant.banked`): the image's borders are mirrored,
             the planes are the bank's, and the analytic restoration comes in copies behind the correction's gains.
         unit: the share of full scale that is 1 in the core's result.
+        wide: whether the last copy of the analytic restoration is coarse by `WIDE`, for what the others clip.
         direct: whether the image is planes already, whole multiples of 1/128: what follows a bank by itself.
         gains: 2 where the correction's channels come twice, fine and coarse by `GAIN`.
         outputs: channels of the correction, gains and windows not counted.
@@ -71,6 +72,7 @@ class Ends:
     banked: bool = False
     unit: float = 1.0
     direct: bool = False
+    wide: bool = False
 
     @property
     def border_px(self) -> int:
@@ -113,12 +115,24 @@ class Ends:
         value = np.where(np.abs(fine) <= limit, fine, coarse * np.float32(GAIN))
         if not analytic:
             return value
-        units = value + np.sum(analytic, 0) * np.float32(self.analytic_gain(scale))
-        return np.asarray(units * np.float32(self.unit))
+        added = np.sum(analytic[: self.fine_copies], 0) * np.float32(self.analytic_gain(scale))
+        if self.wide:
+            coarse = analytic[-1] * np.float32(self.coarse_gain(scale))
+            added = np.where(np.abs(analytic[0]) <= limit, added, coarse)
+        return np.asarray((value + added) * np.float32(self.unit))
+
+    @property
+    def fine_copies(self) -> int:
+        """Of the analytic restoration."""
+        return ANALYTIC_COPIES - self.wide
 
     def analytic_gain(self, scale: float) -> float:
-        """What the sum of the analytic copies is multiplied with, where one step is said to be `scale`."""
-        return 1 / (UNIT_STEPS * ANALYTIC_COPIES * scale)
+        """What the sum of the fine analytic copies is multiplied with, where one step is said to be `scale`."""
+        return 1 / (UNIT_STEPS * self.fine_copies * scale)
+
+    def coarse_gain(self, scale: float) -> float:
+        """Likewise the coarse copy; 0 if there is none."""
+        return WIDE / (UNIT_STEPS * scale) if self.wide else 0.0
 
     def whole(self, correction: np.ndarray) -> np.ndarray:
         """One correction from all its copies in float, which rounding has not touched: (N, C, H, W)."""
@@ -317,6 +331,16 @@ def _write_merge(w: HostWriter, ends: Ends, scale: float) -> None:
     chosen = "host_back.chosen" if analytic else "host_back.correction"
     w.node("Where", chosen, ["host_back.fits", "host_back.fine", "host_back.wide"])
     if analytic:
-        w.node("Sum", "host_back.analytic", analytic)
+        w.node("Sum", "host_back.analytic", analytic[: ends.fine_copies])
         w.node("Mul", "host_back.added", ["host_back.analytic", w.scalar("analytic_gain", ends.analytic_gain(scale))])
-        w.node("Add", "host_back.correction", [chosen, "host_back.added"])
+        added = _write_wide(w, ends, analytic, scale) if ends.wide else "host_back.added"
+        w.node("Add", "host_back.correction", [chosen, added])
+
+
+def _write_wide(w: HostWriter, ends: Ends, analytic: list[str], scale: float) -> str:
+    """Write the nodes that take the coarse analytic copy where the fine ones are at their end."""
+    w.node("Abs", "host_back.analytic_size", [analytic[0]])
+    limit = w.scalar("analytic_max", (FINE_MAX + 0.5) * scale)
+    w.node("LessOrEqual", "host_back.analytic_fits", ["host_back.analytic_size", limit])
+    w.node("Mul", "host_back.far", [analytic[-1], w.scalar("coarse_gain", ends.coarse_gain(scale))])
+    return w.node("Where", "host_back.reached", ["host_back.analytic_fits", "host_back.added", "host_back.far"])

@@ -13,7 +13,7 @@ import numpy as np
 import onnx
 
 from beers_deploy.dpu.graph import Network, Operation, Shape, Window
-from beers_deploy.model.bank import LARGEST
+from beers_deploy.model.bank import GAINS, LARGEST, WIDE
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, as_on_board
 from beers_deploy.quant.graph.moves import with_shuffles
@@ -22,8 +22,10 @@ from beers_deploy.quant.graph.quantised import Integers
 from beers_deploy.quant.onnx_file import load_onnx, metadata
 from beers_deploy.quant.untrusted import contradictions
 
-BANK_ENDS = [float(np.float32(-LARGEST)), float(np.float32(LARGEST))]
-"""Of the planes of a float network behind a bank."""
+BANK_GAINS = np.arange(8 * GAINS[0], 8 * GAINS[1] + 1) / 8
+BANK_REACHES = np.outer([LARGEST, WIDE * LARGEST], 1 / BANK_GAINS).astype(np.float32).ravel().tolist()
+BANK_ENDS = [[-reach, reach] for reach in BANK_REACHES]
+"""Of the planes, and of the analytic restoration, of a float network behind a bank, for each gain of a sensor."""
 
 PLACE_MAX_PX = 64
 """Beyond what any network rearranges: a place of more pixels is a damaged file."""
@@ -128,7 +130,7 @@ class _Reader:
         if node.op_type == "Max":
             return self.integers.is_integer(node) and len(known) == len(node.inputs) - 1 == 1
         limits = [float(value.ravel()[0]) for value in known if value.size == 1]
-        return node.op_type == "Clip" and limits in ([0.0, 6.0], BANK_ENDS)
+        return node.op_type == "Clip" and limits in ([0.0, 6.0], *BANK_ENDS)
 
     def _constant_shape(self, node: Node, kind: Kind, inputs: Sequence[str]) -> tuple[int, ...] | None:
         """Shape of the constant operand of an element-wise operator."""

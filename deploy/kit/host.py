@@ -49,7 +49,12 @@ def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
             value = np.where(np.abs(window) <= F(S["fine_max"]), window + np.array(offset, F)[:, None, None], value)
     elif others:  # fine, coarse, and the copies of the analytic restoration
         value = np.where(np.abs(value) <= F(S["fine_max"]), value, others[0] * F(8))
-        value = value + np.sum(others[1:], 0) * F(S["analytic"]) if others[1:] else value
+        if others[1:]:
+            fine = others[1 : 1 + S["fine_copies"]]
+            added = np.sum(fine, 0) * F(S["analytic"])
+            if S["coarse_analytic"]:  # the last copy reaches farther, for what the others clip
+                added = np.where(np.abs(fine[0]) <= F(S["fine_max"]), added, others[-1] * F(S["coarse_analytic"]))
+            value = value + added
     value = shuffled(value, S["back"], up=True) * F(unit)
     return shuffled(np.asarray(np.clip(image + value, 0, 1) if S["adds_image"] else value), S["last"], up=True)
 

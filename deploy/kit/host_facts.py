@@ -77,6 +77,8 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
         "offsets": ends.offsets,
         "fine_max": (FINE_MAX + 0.5) * scale,
         "analytic": ends.analytic_gain(scale),
+        "fine_copies": ends.fine_copies,
+        "coarse_analytic": ends.coarse_gain(scale),
         UNIT: ends.unit,
         "adds_image": ends.adds_image,
     }

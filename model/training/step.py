@@ -111,7 +111,7 @@ class Step:
         if batch.told is not None:
             told = batch.told.to(self.device)
             if self.rounding is not None:
-                steps = [each.to(self.device) for each in self.rounding.steps(batch.told.sigmas)]
+                steps = [each.to(self.device) for each in self.rounding.steps(batch.told.gains)]
         degraded = batch.degraded.to(self.device, memory_format=torch.channels_last)
         placed = Batch(degraded, batch.reference.to(self.device), told)
         return Inputs(placed, steps, *(torch.tensor(value, device=self.device) for value in (rate, share)))

@@ -57,28 +57,35 @@ ANALYTIC, BODY = "analytic", "body.correction"
 """The results that lie side by side: the analytic restoration, and the body's correction of it."""
 
 
-def _assembled(body: IntCore, bank: Bank, scale: int, shifts: Shifts) -> IntCore:
+def _assembled(body: IntCore, bank: Bank, scale: int, shifts: Shifts, kernels: Kernels) -> IntCore:
     """The whole core: a body that reads a bank's results as `PLANES`, behind it, beside the analytic restoration."""
     result = body.frac_bits[CORRECTION]
     named = (renamed(op, {PLANES: BANK, CORRECTION: BODY}) for op in body.ops)
     joined = Concat("joined", (BODY, ANALYTIC), CORRECTION)
     frac_bits = dict(body.frac_bits) | {BANK: BITS, BODY: result, ANALYTIC: result}
-    ends = replace(front_ends(scale), gains=2, outputs=scale**2, unit=float(np.float32(bank.unit)))
-    ops = (bank_layer(bank, scale, shifts), *named, _analytic(scale, result, shifts), joined)
+    unit = float(np.float32(bank.unit))
+    ends = replace(front_ends(scale), gains=2, outputs=scale**2, unit=unit, wide=kernels == "fitted")
+    analytic = _analytic(scale, result, shifts, kernels)
+    ops = (bank_layer(bank, scale, shifts, kernels), *named, analytic, joined)
     return IntCore(ops, frac_bits, ends)
 
 
-def _analytic(scale: int, result: int, shifts: Shifts) -> IntConv:
+def _analytic(scale: int, result: int, shifts: Shifts, kernels: Kernels) -> IntConv:
     """The mean of the bank's copies of the analytic restoration, rounded at other places of a step each time.
 
-    Its results are said to have as many fractional bits as the correction's, `result`, beside which they lie.
+    Behind fitted kernels the last result is the coarse copy alone. The results are said to have as many fractional
+    bits as the correction's, `result`, beside which they lie.
     """
-    pixels, copies, inputs = scale**2, COPIES[2], len(channels())
-    shift, rows = int(np.floor(np.log2(127 * copies))), range(pixels)
+    coarse = int(kernels == "fitted")
+    pixels, copies, inputs = scale**2, COPIES[2] - coarse, len(channels(kernels))
+    fine, rows = ANALYTIC_COPIES - coarse, range(pixels)
+    # A single weight must hold what the weights of all fine copies add up to.
+    shift = 6 if coarse else int(np.floor(np.log2(127 * copies)))
     weight = np.zeros((ANALYTIC_COPIES, pixels, inputs, pixels, 1, 1), np.int8)
     for k, share in enumerate(_spread(2**shift, copies)):
-        weight[:, rows, inputs - copies + k, rows] = share
-    offsets = np.repeat(np.array(spread_over_a_step(ANALYTIC_COPIES)), pixels)
+        weight[:fine, rows, inputs - COPIES[2] + k, rows] = share
+    weight[fine:, rows, inputs - 1, rows] = 2**shift if coarse else 0
+    offsets = np.repeat(np.array(spread_over_a_step(fine) + [0.0] * coarse), pixels)
     bias = quantise_bias(offsets * 2.0**-result, shift + result, shifts)
     whole = weight.reshape(ANALYTIC_COPIES * pixels, -1, 1, 1)
     return IntConv("analytic", BANK, ANALYTIC, whole, shift + result - BITS, *bias)
@@ -117,7 +124,7 @@ def _head(weights: Weights) -> Conv:
     counts, units = COPIES, 2.0**BITS / UNIT_STEPS
     copies = [(0, counts[0], 1.0), *((1 + k, counts[1], units) for k in range(FILTERS))]
     read = [given[:, kernel] * (unit / count) for kernel, count, unit in copies for _ in range(count)]
-    unread = np.zeros((variant.features, counts[2] * variant.pixels, 3, 3))
+    unread = np.zeros((variant.features, counts[2] * variant.pixels, 3, 3))  # the coarse one among them
     told = np.zeros((variant.features, SENSOR_VALUES, 3, 3))
     told[:, :, 1, 1] = 2 * weights.tensors["bias.weight"]  # of planes that hold half of each value
     weight = np.concatenate([*read, unread, told], 1).astype(np.float32)
@@ -132,12 +139,14 @@ def front_ends(scale: int) -> Ends:
     return Ends(scale**2, PLANES_PER_CHANNEL, front=(front,), back=(back,), banked=True)
 
 
-def bank_results(image: np.ndarray, bank: Bank, vector: Sequence[float], scale: int) -> np.ndarray:
+def bank_results(
+    image: np.ndarray, bank: Bank, vector: Sequence[float], scale: int, kernels: Kernels = "fitted"
+) -> np.ndarray:
     """What the body of a family is calibrated on, of an image (1, 1, H, W) in [0, 1]: (1, C, H / S, W / S) float32.
 
     The bank's results over 128 at a gain of 1, and planes of the halves of a sensor's values.
     """
-    whole = whole_bank(bank, scale, 1)
+    whole = whole_bank(bank, scale, 1, kernels)
     sums = convolve(front_ends(scale).split(image), whole.weight, Window())
     results = np.floor(sums / 2.0**whole.frac_bits + whole.offsets[:, None, None] + 0.5).clip(-128, 127)
     told = np.ones((1, SENSOR_VALUES, *results.shape[2:])) * np.asarray(vector)[:, None, None] / 2
@@ -159,7 +168,8 @@ def quantise_family(
     body, *_ = rounded(_plan(weights, shifts), images, log)
     biases = {op.name: _biases(op) for op in body.convolutions}
     ops = tuple(map(_without_values, body.ops))
-    family = Family(_assembled(replace(body, ops=ops), bank, weights.variant.scale, shifts), biases, shifts)
+    core = _assembled(replace(body, ops=ops), bank, weights.variant.scale, shifts, weights.kernels)
+    family = Family(core, biases, shifts, weights.kernels)
     return replace(family, core=family.for_sensor(bank, (0.0,) * SENSOR_VALUES))
 
 
@@ -232,8 +242,8 @@ def family_images(
 
     def results(number: int) -> np.ndarray:
         sensor = patches.views[number].degraded
-        return bank_results(
-            patches.degraded[number], network_bank(sensor, kernels), sensor_vector(sensor).values, scale
-        )
+        bank = network_bank(sensor, kernels)
+        vector = sensor_vector(sensor).values
+        return bank_results(patches.degraded[number], bank, vector, scale, kernels)
 
     return Remade(results, len(patches.views))

@@ -4,7 +4,7 @@
                                         -> analytic restoration, in four copies
 
 All weights and scales behind the bank are one for the family. What the body reads and makes of a sensor is finer by
-its gain (`filters.gain_of`), so its biases are multiplied with that, and the unit is divided by it: ReLU and sums
+its gain (`Bank.gain`), so its biases are multiplied with that, and the unit is divided by it: ReLU and sums
 pass a factor on. A sensor's filters, its unit and the biases are written in milliseconds; the host adds both results,
 times the unit, to the image.
 """
@@ -22,7 +22,7 @@ from beers_deploy.model.bank import Bank
 from beers_deploy.model.curves import Kernels
 from beers_deploy.model.variants import SENSOR_VALUES
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.banked.filters import BITS, gain_of, whole_bank
+from beers_deploy.quant.banked.filters import BITS, whole_bank
 from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantise_bias
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import PLANES, Op
@@ -33,9 +33,6 @@ WEIGHTS = "weights_sha256"
 """In the metadata of an INT8 network behind a bank: the SHA-256 of its float weights."""
 FAMILY = "family"
 """In the metadata of an INT8 file: what tells it another sensor."""
-
-KERNELS = "bank_kernels"
-"""In its metadata: what the kernels of the banks are that it stands behind."""
 
 BANK = "bank"
 """The tensor between a sensor's filters and what is the same for all."""
@@ -60,13 +57,13 @@ class Family:
 
     def for_sensor(self, bank: Bank, vector: Sequence[float]) -> IntCore:
         """The core for one sensor, of its bank and its sensor vector (4,)."""
-        gain = gain_of(bank)
+        gain = bank.gain
         ops = tuple(self._told(op, bank, gain * np.array([1.0, *vector])) for op in self.core.ops)
         return replace(self.core, ops=ops, ends=replace(self.core.ends, unit=float(np.float32(bank.unit / gain))))
 
     def _told(self, op: IntConv | Op, bank: Bank, values: NDArray[np.float64]) -> IntConv | Op:
         if isinstance(op, IntConv) and op.input == PLANES:
-            return bank_layer(bank, self.core.ends.place_px, self.shifts)
+            return bank_layer(bank, self.core.ends.place_px, self.shifts, self.kernels)
         if not (isinstance(op, IntConv) and op.name in self.biases):
             return op
         added = self.biases[op.name]
@@ -91,8 +88,8 @@ def family_of(model: onnx.ModelProto) -> Family | None:
         wanted = {name: (len(op.bias), 1 + SENSOR_VALUES * (op.input == BANK)) for name, op in body.items()}
         if {name: values.shape for name, values in biases.items()} != wanted:
             raise ValueError("biases that are not its convolutions'")
-        kernels: Kernels = "fitted" if metadata(model).get(KERNELS) == "fitted" else "cut"
-        return Family(core, biases, kernels=kernels)
+        # Only behind fitted kernels does the analytic restoration have a coarse copy.
+        return Family(core, biases, kernels="fitted" if core.ends.wide else "cut")
 
 
 def required_family(model: onnx.ModelProto) -> Family:
@@ -104,9 +101,9 @@ def required_family(model: onnx.ModelProto) -> Family:
     return family
 
 
-def bank_layer(bank: Bank, scale: int, shifts: Shifts) -> IntConv:
+def bank_layer(bank: Bank, scale: int, shifts: Shifts, kernels: Kernels) -> IntConv:
     """The first convolution of a network of that scale, for one sensor."""
-    whole = whole_bank(bank, scale, gain_of(bank))
+    whole = whole_bank(bank, scale, bank.gain, kernels)
     bias = quantise_bias(whole.offsets * 2.0**-BITS, whole.frac_bits + BITS, shifts)
     return IntConv("bank", PLANES, BANK, whole.weight, whole.frac_bits, *bias)
 

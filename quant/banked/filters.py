@@ -5,10 +5,11 @@ that for finer weights. The first two share a filter's weights, which may be twi
 Weights are rounded so that they sum to exactly 0, for flat ground must leave nothing, and so that their errors lie
 where natural images hold little.
 
-What the filters give is int8 in steps of 1/24 of a unit of a sensor whose noise is `SIGMA`. A sensor's own steps are
-the same share of full scale, within limits (`gain_of`): the strongest edges are a share of full scale, not of noise,
-so that noisy sensors can have finer steps in their units. Each result comes several times, rounded at other places of
-a step: together the copies hold what one cannot. The image itself comes in steps of 32 / gain, about the middle.
+What the filters give is int8 in steps of 1/24 of a unit of a sensor whose noise is `model.bank.SIGMA`. A sensor's
+own steps are the same share of full scale, within limits (`Bank.gain`): the strongest edges are a share of full
+scale, not of noise, so that noisy sensors can have finer steps in their units. Each result comes several times,
+rounded at other places of a step: together the copies hold what one cannot. The image itself comes in steps of 32 /
+gain, about the middle.
 """
 
 from collections.abc import Sequence
@@ -17,7 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beers_deploy.model.bank import FILTERS, SIDE_PX, UNIT_STEPS, Bank, in_places
+from beers_deploy.model.bank import FILTERS, SIDE_PX, UNIT_STEPS, WIDE, Bank, in_places
+from beers_deploy.model.curves import Kernels
 from beers_deploy.profiles.sensor import MAX_DN
 
 STEP_DN, MIDDLE_DN, PART = 16, 2048, 2
@@ -29,23 +31,21 @@ PLANE_ENDS = (-128, -128, -8, -4), (127, 127, 15, 8)
 
 IMAGE_STEP_DN = 32
 
-SIGMA = 0.0016
-"""Noise over full scale of sensors with a gain of 1: unseen photographs lost least with it."""
-
-GAINS = 0.5, 2.0
-"""The smallest and the largest: with more, the image itself would not fit int8."""
-
 BITS = 7
 """Fractional bits that a result is said to have: int8 then stands for -1 to 1, 5.3 units or half of full scale."""
 
 ANALYTIC_COPIES = 4
-"""Of the analytic restoration, in a network's result."""
+"""Of the analytic restoration, in a network's result; behind fitted kernels the last one is coarse by `WIDE`."""
 
 LARGEST = 2 * 124
 """Of two coarse weights before they are rounded: what sums and copies make up for still fits int8."""
 
 COPIES = (1, 2, 7)
-"""Of the image, of each plane, and of the analytic restoration: 16 channels for each pixel of a place."""
+"""Of the image, of each plane, and of the analytic restoration: 16 channels for each pixel of a place. Behind fitted
+kernels the last one of the analytic restoration is coarse by `WIDE`, for what the others clip."""
+
+COARSE = 2 + FILTERS
+"""The kernel of that one: behind the image's, the planes' and the analytic restoration's."""
 
 GRID_BITS = 16
 """Fractional bits of what weights are fitted with: weights below 2^8, a covariance of at most 1, 49 products."""
@@ -77,9 +77,10 @@ def split_planes(image: np.ndarray) -> np.ndarray:
     return np.concatenate([coarse, coarse, remainder, np.rint(remainder / PART)], axis=1).astype(np.int8)
 
 
-def channels() -> list[tuple[int, float]]:
+def channels(kernels: Kernels = "fitted") -> list[tuple[int, float]]:
     """Of each output, before pixels become channels: which of the bank's kernels it is, and its offset in steps."""
-    copies = [COPIES[0], *[COPIES[1]] * FILTERS, COPIES[2]]
+    coarse = int(kernels == "fitted")
+    copies = [COPIES[0], *[COPIES[1]] * FILTERS, COPIES[2] - coarse, coarse]
     return [(kernel, offset) for kernel, count in enumerate(copies) for offset in spread_over_a_step(count)]
 
 
@@ -88,26 +89,14 @@ def spread_over_a_step(count: int) -> list[float]:
     return [(k + 0.5) / count - 0.5 for k in range(count)]
 
 
-def gain_of(bank: Bank) -> float:
-    """How many times finer than 1/24 of a unit a sensor's steps are, and than 32 the image's: whole eighths.
-
-    The image's one weight, which no copy corrects, is a whole number so.
-    """
-    return float(gains_of(np.array([bank.sigma]))[0])
-
-
-def gains_of(sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
-    """As `gain_of`, of the noise (N,) of as many banks."""
-    return np.asarray(np.clip(np.rint(8 * sigmas / SIGMA) / 8, *GAINS))
-
-
-def whole_bank(bank: Bank, scale: int, gain: float) -> WholeBank:
+def whole_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted") -> WholeBank:
     """The whole numbers of a bank, for a network of that scale, in steps finer by `gain`."""
-    wanted = bank.kernels * (gain * UNIT_STEPS / MAX_DN)  # steps for one digital number
+    wanted = np.concatenate([bank.kernels, bank.kernels[-1:] / WIDE])
+    wanted *= gain * UNIT_STEPS / MAX_DN  # steps for one digital number
     wanted[0] *= MAX_DN / UNIT_STEPS / IMAGE_STEP_DN
     frac_bits = int(np.floor(np.log2(LARGEST / np.abs(STEP_DN * wanted).max())))
-    kernels, offsets = zip(*channels(), strict=True)
-    exact = _copies(wanted * 2.0**frac_bits, kernels)
+    read, offsets = zip(*channels(kernels), strict=True)
+    exact = _copies(wanted * 2.0**frac_bits, read)
     planes = [in_places(exact[:, plane].astype(np.float64), scale) for plane in range(PLANES_PER_CHANNEL)]
     return WholeBank(np.concatenate(planes, 1).astype(np.int8), frac_bits, np.repeat(offsets, scale**2))
 

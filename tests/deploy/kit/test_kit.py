@@ -18,13 +18,22 @@ import beers_deploy as bd
 from beers_deploy.kit.golden import read_golden
 from beers_deploy.kit.host_facts import host_facts
 from beers_deploy.kit.record import NAMES
+from beers_deploy.model.bank import bank_of_vector
 from beers_deploy.model.consistency import REACH_PX, Consistency, Placed
+from beers_deploy.model.convbeers import arrays
 from beers_deploy.model.exposure import HEADROOM, choose_factors, factors_for
+from beers_deploy.model.io.tensors import Weights
+from beers_deploy.model.variants import Variant
 from beers_deploy.network_files import brighter_files
 from beers_deploy.profiles.errors import OptionError, ProfileError
+from beers_deploy.quant.banked.calibrate import bank_results, quantise_family
+from beers_deploy.quant.encodings import host_model
+from beers_deploy.quant.samples import Remade
 from tests.deploy.command_line import done
 from tests.deploy.kit.test_golden import network
+from tests.model.networks import behind_a_bank
 from tests.profiles.own_sensor import edited, own_sensor
+from tests.quant.banked.test_filters import textured
 
 BARE = """
 import sys
@@ -39,10 +48,20 @@ runpy.run_path("host.py", run_name="__main__")
 """
 
 
-@pytest.mark.parametrize("name", ["convbeers-xs-int8", "convbeers-half-xs-int8", "unet", "espcn"])
+def behind_fitted_kernels() -> bd.Network:
+    """A small network whose analytic restoration has a coarse copy."""
+    made = behind_a_bank(Variant(1, 8, 2), 0.1)
+    weights = Weights(arrays(made.state_dict()), made.variant, {}, conditioned=True)
+    middle = bank_of_vector((0.0,) * 4)
+    seen = [bank_results(textured(48, 48, k), middle, (0.0,) * 4, 2) for k in range(2)]
+    family = quantise_family(weights, middle, Remade(seen.__getitem__, len(seen)))
+    return bd.Network.load(host_model(family.core, {}))
+
+
+@pytest.mark.parametrize("name", ["convbeers-xs-int8", "convbeers-half-xs-int8", "unet", "espcn", "fitted kernels"])
 def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> None:
     """On a Python with NumPy and onnxruntime alone, on a swath of odd sides."""
-    int8 = network(name)
+    int8 = behind_fitted_kernels() if name == "fitted kernels" else network(name)
     folder = bd.Board.load("vck190").kit(int8, tmp_path / "kit", tile=96)
     image = np.random.default_rng(1).random((1, 131, 203), dtype=np.float32)
     np.save(tmp_path / "image.npy", image)

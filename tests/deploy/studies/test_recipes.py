@@ -8,7 +8,8 @@ from PIL import Image
 
 from beers_deploy.model.io.tensors import read_conditioned, read_tensors
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.quant.onnx_file import load_onnx, metadata
+from beers_deploy.quant.banked.family import required_family
+from beers_deploy.quant.onnx_file import load_onnx
 from tests.deploy.command_line import done, refused
 
 RECIPE = """
@@ -65,7 +66,7 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
     first = [(out / name).read_bytes() for name in names]
     weights = read_conditioned(out / names[0])
     assert weights.kernels == "fitted"
-    assert metadata(load_onnx(out / names[1]))["bank_kernels"] == "fitted"
+    assert required_family(load_onnx(out / names[1])).kernels == "fitted"
     card = (out / names[2]).read_text()
     assert RECIPE.strip() in card
     assert "- Drawn for a test, CC0 1.0" in card

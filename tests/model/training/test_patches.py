@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from beers_deploy.model.exposure import HEADROOM, factors_for
-from beers_deploy.model.family import SensorFamily, noise_over_full_scale
+from beers_deploy.model.family import RANGES, SensorFamily, noise_over_full_scale
 from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene
@@ -116,8 +116,10 @@ def test_dark_patches_are_those_of_a_brighter_sensor_as_a_restoration_shows_them
     told = set()
     for batch in islice(PatchSource([small_scene()], recipe, 3, 0).batches(), 40):
         assert batch.told is not None
-        for patch, sigma in zip(batch.degraded, batch.told.sigmas, strict=True):
-            factor = round(float(sigma) / noise_over_full_scale(family.like))
+        for patch, vector in zip(batch.degraded, batch.told.vectors, strict=True):
+            low, high = RANGES["sigma_bright"]
+            sigma = low * (high / low) ** ((float(vector[3]) + 1) / 2)
+            factor = round(sigma / noise_over_full_scale(family.like))
             told.add(factor)
             larger = [each for each in factors_for(family.like) if each > factor]
             assert all(float(patch.max()) * each / factor > HEADROOM for each in larger)

@@ -5,9 +5,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from beers_deploy.model.bank import FILTERS, SIDE_PX, UNIT_STEPS, Bank, bank_of_vector
+from beers_deploy.model.bank import FILTERS, SIDE_PX, UNIT_STEPS, WIDE, Bank, bank_of_vector
+from beers_deploy.model.curves import Kernels
 from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.quant.banked.filters import (
+    COARSE,
     COPIES,
     IMAGE_STEP_DN,
     MIDDLE_DN,
@@ -15,7 +17,6 @@ from beers_deploy.quant.banked.filters import (
     PLANE_ENDS,
     STEP_DN,
     channels,
-    gain_of,
     split_planes,
     whole_bank,
 )
@@ -27,7 +28,7 @@ VECTOR = st.tuples(*[st.floats(-1, 1)] * 4)
 
 def sums(image: np.ndarray, own: Bank) -> np.ndarray:
     """What the first convolution makes of an image (1, 1, H, W), in steps, before anything is rounded or added."""
-    whole = whole_bank(own, 1, gain_of(own))
+    whole = whole_bank(own, 1, own.gain)
     return convolve(split_planes(image), whole.weight, Window()) / 2.0**whole.frac_bits
 
 
@@ -62,21 +63,22 @@ def test_flat_ground_leaves_nothing_but_its_own_brightness(vector: tuple[float, 
     own = bank_of_vector(vector)
     found = sums(flat, own)[0, :, 0, 0]
     np.testing.assert_array_equal(found[COPIES[0] :], 0)
-    assert abs(found[0] - (dn - MIDDLE_DN) * gain_of(own) / IMAGE_STEP_DN) <= 0.5 * gain_of(own)
+    assert abs(found[0] - (dn - MIDDLE_DN) * own.gain / IMAGE_STEP_DN) <= 0.5 * own.gain
 
 
 @settings(max_examples=15)
 @given(VECTOR)
 def test_the_weights_are_int8_and_near_the_filters(vector: tuple[float, ...]) -> None:
     own = bank_of_vector(vector)
-    gain = gain_of(own)
+    gain = own.gain
     whole = whole_bank(own, 1, gain)
     coarse_pair = whole.weight[:, :2].astype(int)
     assert 62 <= np.abs(coarse_pair).max() < 127  # no finer scale would hold them, and none is cut off
     assert np.ptp(coarse_pair, axis=1).max() <= 1
     for channel, (kernel, _) in enumerate(channels()):
         steps_per_dn = gain * (UNIT_STEPS / MAX_DN if kernel else 1 / IMAGE_STEP_DN)
-        wanted = own.kernels[kernel] * steps_per_dn * 2.0**whole.frac_bits
+        known = own.kernels[-1] / WIDE if kernel == COARSE else own.kernels[kernel]
+        wanted = known * steps_per_dn * 2.0**whole.frac_bits
         one, two, fine, part = whole.weight[channel].astype(float)
         assert np.abs((one + two) / STEP_DN - wanted).max() < 5 / STEP_DN
         assert kernel == 0 or np.abs(fine + part / PART - wanted).max() < 5 / PART
@@ -89,17 +91,20 @@ def test_the_mean_of_the_copies_is_what_the_filter_gives(vector: tuple[float, ..
     own, image = bank_of_vector(vector), textured(90, 101)
     centred = np.lib.stride_tricks.sliding_window_view(image[0, 0].astype(np.float64), (SIDE_PX, SIDE_PX))
     found, read = sums(image, own)[0], [kernel for kernel, _ in channels()]
-    for kernel in range(1, 2 + FILTERS):
-        wanted = gain_of(own) * UNIT_STEPS * np.einsum("ijkl,kl->ij", centred, own.kernels[kernel])
+    for kernel in range(1, COARSE + 1):
+        known = own.kernels[-1] / WIDE if kernel == COARSE else own.kernels[kernel]
+        wanted = own.gain * UNIT_STEPS * np.einsum("ijkl,kl->ij", centred, known)
         mean = found[[place for place, each in enumerate(read) if each == kernel]].mean(0)
         assert np.sqrt(np.square(mean - wanted).mean()) < 0.3 + 0.05 * np.sqrt(np.square(wanted).mean())
 
 
 def test_copies_are_rounded_at_places_spread_over_a_step() -> None:
-    offsets = [offset for kernel, offset in channels() if kernel == 1 + FILTERS]
-    assert len(offsets) == COPIES[2]
-    np.testing.assert_allclose(np.diff(offsets), 1 / COPIES[2])
-    assert sum(offsets) == pytest.approx(0)
+    counts: dict[Kernels, int] = {"cut": COPIES[2], "fitted": COPIES[2] - 1}
+    for kernels, count in counts.items():
+        offsets = [offset for kernel, offset in channels(kernels) if kernel == 1 + FILTERS]
+        assert len(offsets) == count
+        np.testing.assert_allclose(np.diff(offsets), 1 / count)
+        assert sum(offsets) == pytest.approx(0)
 
 
 def test_at_half_resolution_the_same_filters_meet_the_same_pixels() -> None:
