@@ -53,6 +53,18 @@ def write_tensors(path: Path, tensors: Arrays, header: Mapping[str, object]) -> 
     whole = {name: np.asarray(array, order="C") for name, array in tensors.items()}
     with whole_file(path) as temporary:
         save_file(whole, temporary, metadata={key: json.dumps(value) for key, value in header.items()})
+        _sort_metadata(temporary)
+
+
+def _sort_metadata(path: Path) -> None:
+    """Put the keys of a safetensors file's metadata in order: the library writes them in another one each time."""
+    content = path.read_bytes()
+    end = 8 + int.from_bytes(content[:8], "little")
+    known = json.loads(content[8:end])
+    known["__metadata__"] = dict(sorted(known.get("__metadata__", {}).items()))
+    text = json.dumps(known, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)  # the tensors begin at a multiple of 8
+    path.write_bytes(len(text).to_bytes(8, "little") + text + content[end:])
 
 
 def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
