@@ -20,13 +20,14 @@ import onnx
 
 from beers_deploy.export import float_for
 from beers_deploy.model.bank import network_bank
-from beers_deploy.model.curves import Kernels, departure
+from beers_deploy.model.departure import departure
 from beers_deploy.model.exposure import brightened, factors_for
 from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.io.tensors import is_conditioned, read_conditioned
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
+from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.sensor import Sensor, numbers_of
 from beers_deploy.profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor

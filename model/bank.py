@@ -24,9 +24,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beers_deploy.model.curves import Kernels
 from beers_deploy.model.family import RANGES, noise_over_full_scale
 from beers_deploy.model.simulator.mtf import sensor_mtf
+from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.response import NYQUIST
 from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor

@@ -30,10 +30,9 @@ from torch import Tensor, nn
 from torch.nn.functional import conv2d, pad, pixel_shuffle, pixel_unshuffle
 
 from beers_deploy.model.bank import FILTERS, LARGEST, SIDE_PX, WIDE, Bank, bank_of_vector, in_places
-from beers_deploy.model.curves import Kernels
 from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.tensors import Weights, read_weights, write_weights
-from beers_deploy.model.variants import BANK_PLANES, SENSOR_VALUES, Variant
+from beers_deploy.model.variants import BANK_PLANES, SENSOR_VALUES, Kernels, Variant
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Instrument
 

@@ -6,8 +6,13 @@ four channels, and so works at half resolution: its maps have a quarter of the p
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 from beers_deploy.profiles.errors import OptionError
+
+Kernels = Literal["cut", "fitted"]
+"""How the filters in front of a network become kernels of 7 x 7: cut out of the whole, or fitted. Networks behind the
+second kind were trained on many curves of the MTF (`model.curves`)."""
 
 BANK_PLANES, SENSOR_VALUES = 5, 4
 """What a head behind a bank reads: the image and four planes of each pixel, and the numbers of a sensor vector."""

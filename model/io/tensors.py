@@ -14,11 +14,10 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from beers_deploy.model.curves import Kernels
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.formats import HEAD_BYTES, SAFETENSORS, OtherFormat, other_format
-from beers_deploy.model.variants import Variant
+from beers_deploy.model.variants import Kernels, Variant
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.toml import parse_json, unreadable
 

@@ -10,12 +10,11 @@ from dataclasses import replace
 import numpy as np
 
 from beers_deploy.model.bank import FILTERS, UNIT_STEPS, Bank, network_bank
-from beers_deploy.model.curves import Kernels
 from beers_deploy.model.family import SensorFamily, sensor_vector
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.simulator.sampling import Scene
-from beers_deploy.model.variants import SENSOR_VALUES
+from beers_deploy.model.variants import SENSOR_VALUES, Kernels
 from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
 from beers_deploy.quant.banked.family import BANK, Family, bank_layer
 from beers_deploy.quant.banked.filters import (

@@ -19,8 +19,7 @@ import onnx
 from numpy.typing import NDArray
 
 from beers_deploy.model.bank import Bank
-from beers_deploy.model.curves import Kernels
-from beers_deploy.model.variants import SENSOR_VALUES
+from beers_deploy.model.variants import SENSOR_VALUES, Kernels
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.banked.filters import BITS, whole_bank
 from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantise_bias

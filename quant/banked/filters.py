@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beers_deploy.model.bank import FILTERS, SIDE_PX, UNIT_STEPS, WIDE, Bank, in_places
-from beers_deploy.model.curves import Kernels
+from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.sensor import MAX_DN
 
 STEP_DN, MIDDLE_DN, PART = 16, 2048, 2

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beers_deploy.model.curves import FREQUENCIES, OBSCURATIONS, departure, draw_table, pupil_contrast
+from beers_deploy.model.curves import FREQUENCIES, OBSCURATIONS, draw_table, pupil_contrast
+from beers_deploy.model.departure import departure
 from beers_deploy.model.family import SensorFamily, sensor_vector
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.response import READING, MtfTable

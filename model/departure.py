@@ -1,0 +1,57 @@
+"""Where a sensor's MTF departs from the curves that a network was trained on."""
+
+import math
+
+import numpy as np
+
+from beers_deploy.model.curves import DEEPEST_BEND, FREQUENCIES, OBSCURATIONS, Curve, pupil_contrast
+from beers_deploy.model.simulator.mtf import sensor_mtf
+from beers_deploy.model.variants import Kernels
+from beers_deploy.profiles.response import NYQUIST
+from beers_deploy.profiles.sensor import Instrument
+
+MARGIN = 0.05
+"""How far a curve may lie outside those of training, as a share: networks lose 0.1 dB and more from there on
+(measured)."""
+
+
+def departure(sensor: Instrument, kernels: Kernels) -> str:
+    """Say where a sensor's curve departs from the curves that a network was trained on; "" if it does not.
+
+    Args:
+        sensor: its MTF and smear.
+        kernels: of the network's banks: networks of before they were fitted know the formula's curve alone.
+    """
+    zero = np.zeros((1, 1))
+    for axis, contrast in zip(("across", "along"), sensor.mtf_axes, strict=True):
+        frequency = FREQUENCIES[None]
+        seen = sensor_mtf(frequency, zero, sensor) if axis == "across" else sensor_mtf(zero, frequency.T, sensor)
+        curve = np.abs(np.ravel(seen))
+        smeared = axis == "along" and bool(sensor.smear_px)
+        at_nyquist = float(curve[-1]) if smeared else contrast
+        known = np.stack(_known_curves(at_nyquist, kernels))
+        low, high = known.min(0) * (1 - MARGIN), known.max(0) * (1 + MARGIN)
+        outside = np.maximum(low / np.maximum(curve, 1e-9), curve / high)
+        worst = int(outside[:-1].argmax())
+        if outside[worst] > 1:
+            return (
+                f"the MTF {axis} the track is {curve[worst]:.3g} at {FREQUENCIES[worst]:.2g} cycles per pixel, where "
+                f"the network was trained on {low[worst]:.3g} to {high[worst]:.3g} for that contrast at Nyquist: it "
+                "may restore worse than the traditional pipeline"
+            )
+    return ""
+
+
+def _known_curves(contrast: float, kernels: Kernels) -> list[Curve]:
+    """Curves at FREQUENCIES that training draws for a contrast at Nyquist: the outermost of each kind."""
+    detector = np.sinc(FREQUENCIES)
+    left = min(contrast / float(detector[-1]), 1.0)
+    share = FREQUENCIES / NYQUIST
+    formula = left**share
+    if kernels == "cut":
+        return [formula * detector]
+    hills = [np.exp(-(((share - middle) / 0.35) ** 2)) * np.sin(math.pi * share) for middle in (0.3, 0.45, 0.6)]
+    lower = [formula * (1 - DEEPEST_BEND * hill) for hill in hills]
+    higher = [np.minimum(formula * (1 + DEEPEST_BEND * hill), 1.0) for hill in hills]
+    pupils = [pupil_contrast(left, obscuration) for obscuration in OBSCURATIONS]
+    return [np.asarray(curve * detector) for curve in (formula, left ** (share**2), *pupils, *lower, *higher)]
