@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from beers_deploy.model.curves import DEEPEST_BEND, FREQUENCIES, OBSCURATIONS, Curve, pupil_contrast
+from beers_deploy.model.curves import DEEPEST_BEND, FREQUENCIES, LONGEST_SMEAR_PX, OBSCURATIONS, Curve, pupil_contrast
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.response import NYQUIST
@@ -43,15 +43,19 @@ def departure(sensor: Instrument, kernels: Kernels) -> str:
 
 
 def _known_curves(contrast: float, kernels: Kernels) -> list[Curve]:
-    """Curves at FREQUENCIES that training draws for a contrast at Nyquist: the outermost of each kind."""
+    """Curves at FREQUENCIES that hold between them all that training draws for a contrast at Nyquist."""
     detector = np.sinc(FREQUENCIES)
-    left = min(contrast / float(detector[-1]), 1.0)
     share = FREQUENCIES / NYQUIST
-    formula = left**share
     if kernels == "cut":
-        return [formula * detector]
-    hills = [np.exp(-(((share - middle) / 0.35) ** 2)) * np.sin(math.pi * share) for middle in (0.3, 0.45, 0.6)]
-    lower = [formula * (1 - DEEPEST_BEND * hill) for hill in hills]
-    higher = [np.minimum(formula * (1 + DEEPEST_BEND * hill), 1.0) for hill in hills]
-    pupils = [pupil_contrast(left, obscuration) for obscuration in OBSCURATIONS]
-    return [np.asarray(curve * detector) for curve in (formula, left ** (share**2), *pupils, *lower, *higher)]
+        return [np.asarray(min(contrast / float(detector[-1]), 1.0) ** share * detector)]
+    # A hill in the middle raises or lowers the formula by no more than this.
+    bend = DEEPEST_BEND * np.sin(math.pi * share)
+    curves = list[Curve]()
+    for smear_px in np.linspace(0, LONGEST_SMEAR_PX, 9):
+        kept = detector * np.sinc(smear_px * FREQUENCIES)
+        left = min(contrast / float(kept[-1]), 1.0)
+        formula = left**share
+        pupils = [pupil_contrast(left, obscuration) for obscuration in OBSCURATIONS]
+        optics = [left ** (share**2), *pupils, formula * (1 - bend), np.minimum(formula * (1 + bend), 1.0)]
+        curves += [np.asarray(each * kept) for each in optics]
+    return curves
