@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import onnx
 
@@ -35,9 +34,6 @@ from beers_deploy.profiles.toml import unreadable
 from beers_deploy.quant.banked.family import required_family, with_delta
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.onnx_file import fixed_tile_px, is_quantised, load_onnx, metadata, save_onnx
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)

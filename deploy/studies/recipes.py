@@ -6,6 +6,7 @@ OUT/NAME.safetensors  OUT/NAME-int8.onnx  OUT/NAME.md
 """
 
 import hashlib
+import math
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -149,15 +150,8 @@ names and digests has the SHA-256 `{data[:16]}`, and {recipe.charts} drawn chart
 
 def described(variant: Variant) -> str:
     """Return blocks, features, resolution and parameters in words."""
-    parameters = sum(_size(shape) for shape in variant.banked_shapes.values())
+    parameters = sum(math.prod(shape) for shape in variant.banked_shapes.values())
     at = f" at 1/{variant.scale} of the resolution" if variant.scale > 1 else ""
     return (
         f"{variant.blocks} residual blocks of {variant.features} features{at}, {parameters / 1000:.0f} k parameters,"
     )
-
-
-def _size(shape: Sequence[int]) -> int:
-    size = 1
-    for side in shape:
-        size *= side
-    return size

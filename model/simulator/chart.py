@@ -41,7 +41,7 @@ def chart(generator: np.random.Generator) -> NDArray[np.float32]:
     for top in range(0, SIDE_PX, SQUARE_PX):
         for left in range(0, SIDE_PX, SQUARE_PX):
             kind: Callable[[float, np.random.Generator], Pattern] = kinds[int(generator.integers(len(kinds)))]
-            level = _log_uniform(generator, LEVELS)
+            level = log_uniform(generator, LEVELS)
             radiance[top : top + SQUARE_PX, left : left + SQUARE_PX] = kind(level, generator)
     return radiance.astype(np.float32)
 
@@ -57,7 +57,7 @@ def bars(level: float, generator: np.random.Generator) -> Pattern:
     angle = float(generator.uniform(0, math.pi))
     if generator.random() < 0.5:  # rows and columns are the commonest direction, and the hardest: they alias
         angle = float(generator.choice([0.0, math.pi / 2]))
-    phase = 2 * math.pi / _log_uniform(generator, PERIODS_PX) * (x * math.cos(angle) + y * math.sin(angle))
+    phase = 2 * math.pi / log_uniform(generator, PERIODS_PX) * (x * math.cos(angle) + y * math.sin(angle))
     return _wave(level, phase + generator.uniform(0, 2 * math.pi), generator)
 
 
@@ -82,7 +82,7 @@ def discs(level: float, generator: np.random.Generator) -> Pattern:
     for _ in range(12):
         middle_y, middle_x = generator.uniform(-SQUARE_PX / 2, SQUARE_PX / 2, 2)
         inside = np.hypot(y - middle_y, x - middle_x) < generator.uniform(2, 30)
-        found[inside] = level * (1 + float(generator.choice([-1, 1])) * _log_uniform(generator, CONTRASTS))
+        found[inside] = level * (1 + float(generator.choice([-1, 1])) * log_uniform(generator, CONTRASTS))
     return found
 
 
@@ -91,7 +91,7 @@ def points(level: float, generator: np.random.Generator) -> Pattern:
     found = np.full((SQUARE_PX, SQUARE_PX), level)
     for _ in range(30):
         row, column = generator.integers(SQUARE_PX, size=2)
-        found[row, column] += _log_uniform(generator, POINTS)
+        found[row, column] += log_uniform(generator, POINTS)
     return found
 
 
@@ -102,10 +102,11 @@ def _coordinates() -> tuple[Pattern, Pattern]:
 
 def _wave(level: float, phase: Pattern, generator: np.random.Generator) -> Pattern:
     steepness = float(generator.uniform(1, 4))
-    contrast = _log_uniform(generator, CONTRASTS)
+    contrast = log_uniform(generator, CONTRASTS)
     return np.asarray(level * (1 + contrast * np.clip(steepness * np.sin(phase), -1, 1)))
 
 
-def _log_uniform(generator: np.random.Generator, ends: tuple[float, float]) -> float:
+def log_uniform(generator: np.random.Generator, ends: tuple[float, float]) -> float:
+    """Draw a number whose logarithm is uniform."""
     low, high = ends
     return low * math.exp(float(generator.uniform()) * math.log(high / low))

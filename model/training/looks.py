@@ -4,10 +4,11 @@ Aerial photographs are bright, sharp and rich in contrast, more so than most of 
 learns from nothing else restores dark, hazy and soft ground worse than it could.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
+
+from beers_deploy.model.simulator.chart import log_uniform
 
 Range = tuple[float, float]
 
@@ -66,9 +67,3 @@ ORDINARY = Looks()
 
 VARIED = Looks(lit_share=0.4, calm_share=0.3, soft_share=0.3)
 """All that a satellite may see: what networks are trained on."""
-
-
-def log_uniform(generator: np.random.Generator, ends: Range) -> float:
-    """Draw a number whose logarithm is uniform."""
-    low, high = ends
-    return low * math.exp(float(generator.uniform()) * math.log(high / low))

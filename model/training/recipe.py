@@ -146,6 +146,9 @@ def load_recipe(name: str) -> NetworkRecipe:
             parts[key] = _made(kind, f"{where}: {key}", raw[key])
     recipe = _made(NetworkRecipe, where, {**raw, **parts})
     variant_named(recipe.variant)
+    if stages[0].rounding and not recipe.start:
+        expected = "weights to make an INT8 file of before a stage with rounding"
+        raise ProfileError(where, expected=expected, got="none", remedy="put a stage without rounding in front")
     return recipe
 
 

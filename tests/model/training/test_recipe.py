@@ -47,6 +47,7 @@ def test_what_a_recipe_leaves_out_has_its_default(tmp_path: Path) -> None:
         (WHOLE + 'precision = "int8"\n', "expected one of float32, bfloat16, got 'int8'"),
         (WHOLE + 'rounding = "yes"\n', "expected true or false, got 'yes'"),
         (WHOLE + "steps_more = 5\n", "stage 1"),
+        (WHOLE + "rounding = true\n", "put a stage without rounding in front"),
         (WHOLE + "[looks]\nlights = [0.1]\n", "lights: expected two numbers from 0 on, got [0.1]"),
         ("held_out = [3]\n" + WHOLE, "held_out: expected a list of texts, got [3]"),
         ("variant = [", "TOML"),
