@@ -2,10 +2,11 @@
 
     python benchmarks/characterise.py --images aerial-test/ --weights convbeers-s.safetensors
 
-Each sensor sees six of the folder's photographs; then with a checkerboard laid into one of them (60 m a side at
+Each sensor sees twelve of the folder's photographs; then with a checkerboard laid into one of them (60 m a side at
 0.5 m, two by two fields, as calibration sites have), searched for and pointed at. MTF 2 to 12 %, along the track down
-to 0.4 of that across; noise as networks are trained for (`model.family.SensorFamily`). With weights, a network
-told the profile that was written restores one of the photographs, beside the same network told the truth.
+to 0.4 of that across, every other sensor with another curve than the formula's (`model.curves`); noise as networks
+are trained for (`model.family.SensorFamily`). With weights, a network told the profile that was written restores one
+of the photographs, beside the same network told the truth.
 """
 
 import argparse
@@ -19,32 +20,27 @@ import numpy as np
 import tifffile
 import torch
 
+from beers_deploy.model.curves import draw_table
 from beers_deploy.model.family import LEAST_ALONG, SensorFamily
 from beers_deploy.model.io.images import list_images
-from beers_deploy.model.metrics.edge_blur import AxisMtf
 from beers_deploy.model.metrics.fidelity import fidelity_db
 from beers_deploy.model.metrics.slanted_edge import slanted_edge
 from beers_deploy.model.simulator.acquire import acquire, fitting_oversampling
 from beers_deploy.model.simulator.detector import Draw, to_uint16
+from beers_deploy.model.simulator.mtf import mtf
 from beers_deploy.model.simulator.sampling import Scene, crop_divisible, read_scene, scene_spectrum
 from beers_deploy.parity import torch_network
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.studies.characterise import (
-    AXES,
-    Characterised,
-    Snr,
-    characterise,
-    measured_noise,
-    profile_toml,
-    snr_at,
-)
+from beers_deploy.studies.characterise import Characterised, Stated, characterise, profile_toml
+from beers_deploy.studies.characterise.instrument import AXES
+from beers_deploy.studies.characterise.profile import SHOWN_CPX
 from beers_deploy.studies.evaluation.pairs import simulate_pairs
 
 LIKE, REFERENCE = (load_sensor(name).nominal() for name in ("pleiades-degraded", "pleiades-reference"))
 MTF_RANGE = (0.02, 0.12)
-RATIO, SCENES, LEAST_SIDE_PX, TARGET_PX, LEAN_DEG = 4, 6, 140, 120, 7.0
+RATIO, SCENES, LEAST_SIDE_PX, TARGET_PX, LEAN_DEG = 4, 12, 140, 120, 7.0
 DARK, BRIGHT = 30.0, 160.0
 
 
@@ -62,7 +58,7 @@ def main() -> None:
     lost = list[float]()
     generator = np.random.default_rng(arguments.seed)
     for number in range(arguments.sensors):
-        sensor = draw(generator)
+        sensor = draw(generator, shaped=number % 2 == 1)
         chosen = [scenes[i] for i in generator.permutation(len(scenes))[:SCENES]]
         with tempfile.TemporaryDirectory() as folder:
             found = look(ways, sensor, chosen, number, Path(folder))
@@ -70,7 +66,7 @@ def main() -> None:
                 profile = Path(folder) / "found.toml"
                 profile.write_text(profile_toml(found), encoding="utf-8")
                 lost.append(psnr_lost(arguments.weights, chosen[0], sensor, load_sensor(str(profile)).nominal()))
-    print("| figure | images | found | error, median | mean, signed | worst | in the 95 % interval |")
+    print("| figure | images | found | error, median | mean, signed | worst | in the interval |")
     print("|---|---|---|---|---|---|---|")
     for name, findings in ways.items():
         for line in findings.lines(name):
@@ -110,11 +106,26 @@ def psnr_lost(weights: Path, scene: Scene, sensor: Instrument, found: Instrument
     return scores[0] - scores[1]
 
 
-def draw(generator: np.random.Generator) -> Instrument:
-    """A sensor with the family's noise and an MTF of 2 to 12 %."""
-    mtf = math.exp(generator.uniform(*np.log(MTF_RANGE)))
-    along = max(mtf * LEAST_ALONG ** float(generator.uniform() ** 2), MTF_RANGE[0])
-    return replace(SensorFamily(LIKE).draw(generator), mtf_nyquist=mtf, mtf_nyquist_along=along)
+def draw(generator: np.random.Generator, shaped: bool) -> Instrument:
+    """A sensor with the family's noise and an MTF of 2 to 12 %, its curve the formula's or another."""
+    contrast = math.exp(generator.uniform(*np.log(MTF_RANGE)))
+    along = max(contrast * LEAST_ALONG ** float(generator.uniform() ** 2), MTF_RANGE[0])
+    sensor = replace(SensorFamily(LIKE).draw(generator), mtf_nyquist=contrast, mtf_nyquist_along=along)
+    if not shaped:
+        return sensor
+    table = draw_table(contrast, along, generator)
+    across, along = table.at_nyquist
+    return replace(sensor, response=table, mtf_nyquist=across, mtf_nyquist_along=along)
+
+
+def true_contrast(sensor: Instrument, axis: str, frequency: float) -> float:
+    """The sensor's MTF at a frequency along one axis."""
+    none = np.zeros((1, 1))
+    place = np.full((1, 1), frequency)
+    x, y = (place, none) if axis == "across" else (none, place)
+    if sensor.response is not None:
+        return float(abs(sensor.response.at(x, y)[0, 0]))
+    return float(mtf(x, y, sensor.mtf_axes)[0, 0])
 
 
 def written(
@@ -146,38 +157,38 @@ def with_target(radiance: np.ndarray) -> np.ndarray:
 class Findings:
     """Relative error, and whether the interval held the truth, of each figure that was found."""
 
-    mtf: list[tuple[float, bool]] = field(default_factory=list)
+    contrasts: dict[str, list[tuple[float, bool]]] = field(default_factory=lambda: {words: [] for words in SHOWN_CPX})
     snr: list[tuple[float, bool]] = field(default_factory=list)
     asked: int = 0
 
     def look(self, sensor: Instrument, paths: tuple[Path, ...], boxes: tuple[str, ...] = ()) -> Characterised | None:
-        """Characterise one sensor; where its edges are refused, its noise alone."""
+        """Characterise one sensor."""
         self.asked += 2
-        found = None
-        snrs: Sequence[Snr] = ()
         try:
-            found = characterise(paths, boxes, bits=sensor.bits, gain=sensor.gain_dn_per_radiance)
-        except ImageError:
-            try:
-                noise = measured_noise(paths, sensor.max_dn)
-                snrs = [snr_at(noise, sensor.max_dn / part, sensor.gain_dn_per_radiance) for part in (16, 4)]
-            except ImageError as error:
-                print(f"- {error}")
-        else:
-            snrs = found.snrs
-            for axis, true in zip(map(found.axes.get, AXES), sensor.mtf_axes, strict=True):
-                self.mtf += [judged(axis.mtf_nyquist, axis.interval, true)] if isinstance(axis, AxisMtf) else []
-        for snr in snrs:
+            found = characterise(paths, boxes, Stated(sensor.bits, sensor.gain_dn_per_radiance))
+        except ImageError as error:
+            print(f"- {error}")
+            return None
+        for axis in AXES:
+            curve = found.mtf.curves.get(axis)
+            if curve is None:
+                continue
+            for words, frequency in SHOWN_CPX.items():
+                value, interval = curve.at(frequency)
+                self.contrasts[words].append(judged(value, interval, true_contrast(sensor, axis, frequency)))
+        for snr in found.snrs:
             self.snr.append(judged(snr.value, snr.interval, snr.radiance / sensor.noise_sigma(snr.radiance)))
-        return found
+        return found if found.mtf.curves else None
 
     def lines(self, name: str) -> Iterator[str]:
         """Rows of the table."""
-        for figure, pairs in (("MTF at Nyquist", self.mtf), ("SNR", self.snr)):
+        figures = {f"MTF {words}": pairs for words, pairs in self.contrasts.items()}
+        for figure, pairs in {**figures, "SNR": self.snr}.items():
             if not pairs:
                 yield f"| {figure} | {name} | 0 of {self.asked}, refused | | | | |"
                 continue
-            errors, held = np.array([e for e, _ in pairs]), sum(inside for _, inside in pairs)
+            errors = np.array([error for error, _ in pairs])
+            held = sum(inside for _, inside in pairs)
             sizes = np.abs(errors)
             shown = f"{np.median(sizes):.1%} | {errors.mean():+.1%} | {sizes.max():.1%} | {held} of {len(pairs)}"
             yield f"| {figure} | {name} | {len(pairs)} of {self.asked} | {shown} |"

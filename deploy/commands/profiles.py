@@ -1,5 +1,6 @@
 """`beers-deploy profiles` shows sensors, scenes and boards; `characterise` makes a sensor of raw images."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +15,7 @@ from beers_deploy.profiles.effects import Table
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.response import MtfTable
 from beers_deploy.profiles.scene_call import load_scene_call, scene_names
-from beers_deploy.profiles.sensor import TABLES, constant_keys
+from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX, TABLES, constant_keys
 from beers_deploy.profiles.toml import profile_path, read_toml
 
 Row = tuple[str, ...]
@@ -114,11 +115,20 @@ def _row(key: str, constant: Constant | Words) -> Row:
 
 
 def characterise(
-    images: Annotated[list[Path], typer.Argument(help="Raw images of one sensor: whole digital numbers, one band.")],
+    images: Annotated[
+        list[Path], typer.Argument(help="Raw images of one sensor, or folders of them: whole numbers, one band.")
+    ],
     out: Annotated[Path, typer.Option("-o", "--out", help="The sensor profile, a TOML file.")],
     edge: Annotated[
         list[str] | None,
         typer.Option(metavar="FILE:X,Y,WIDTH,HEIGHT", help="A box with one straight edge; searched for if none."),
+    ] = None,
+    mtf: Annotated[
+        str | None,
+        typer.Option(metavar="ACROSS[,ALONG]", help="MTF at Nyquist if you know it, 0.07 is 7 %; measured if none."),
+    ] = None,
+    black_level: Annotated[
+        float | None, typer.Option(help="Value of the dark in the images; 0 counts as dark if none.")
     ] = None,
     bits: Annotated[
         int | None, typer.Option(min=1, max=16, help="Bits of a pixel; found from clipped pixels if none.")
@@ -131,19 +141,36 @@ def characterise(
 ) -> None:
     """Measure MTF and noise on raw images and write them as a sensor profile, for every --sensor.
 
-    The MTF needs straight edges between even areas: a target, a large roof, an apron. The noise needs raw pixels:
-    what was denoised, sharpened or resampled is refused.
+    The MTF needs straight edges: a target, roofs, kerbs, shadows. Where they give none, --mtf or an assumption takes
+    its place. The noise needs raw pixels: what was denoised, sharpened or resampled is refused.
     """
     from beers_deploy.model.io.files import require_writable, write_text
     from beers_deploy.results import Table as Results
     from beers_deploy.results import print_rows
+    from beers_deploy.studies.characterise import Stated, profile_toml
     from beers_deploy.studies.characterise import characterise as measure
-    from beers_deploy.studies.characterise import profile_toml
 
     require_writable(out, json, inputs=images)
-    found = measure(images, edge or (), bits=bits, gain=gain, gsd_m=gsd)
+    found = measure(images, edge or (), Stated(bits, gain, gsd, black_level, _contrasts(mtf)))
     rows = found.rows()
-    print_rows(f"sensor of {len(images)} image{'' if len(images) == 1 else 's'}", rows)
+    count = len(found.frames.paths)
+    print_rows(f"sensor of {count} image{'' if count == 1 else 's'}", rows)
+    for note in found.notes():
+        say(f"note: {note}")
     write_text(out, profile_toml(found))
-    save(Results("characterise", arguments(), tuple(images), tuple(rows)), json)
+    save(Results("characterise", arguments(), found.frames.paths, tuple(rows)), json)
     say(f"wrote {out}: beers-deploy profiles {out}")
+
+
+def _contrasts(words: str | None) -> tuple[float, float] | None:
+    """The contrast at Nyquist across and along the track that --mtf states, one number for both or two."""
+    if words is None:
+        return None
+    try:
+        across, along = (float(part) for part in (words.split(",") * 2)[:2])
+    except ValueError:
+        across = along = math.nan
+    if words.count(",") > 1 or not (0 < across <= MTF_NYQUIST_MAX and 0 < along <= MTF_NYQUIST_MAX):
+        expected = f"one or two ratios above 0 and up to {MTF_NYQUIST_MAX:.4f}"
+        raise OptionError("mtf", expected=expected, got=repr(words), remedy="write 0.07 for 7 %, or 0.09,0.05")
+    return across, along

@@ -72,6 +72,7 @@ PATHS = {
 UNITS = {
     "batch": "patches",
     "bits": "bit",
+    "black_level": "number",
     "budget": "s",
     "drawn": "scenes",
     "draws": "draws",
@@ -115,6 +116,7 @@ WORDS = {
     "halo": "px",
     "methods": "names",
     "metric": "name",
+    "mtf": "ratios",
     "name": "profile",
     "need": "limits",
     "network": "network",

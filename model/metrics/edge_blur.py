@@ -67,13 +67,18 @@ def blurs_of(squares: np.ndarray, noise: Noise) -> list[EdgeBlur]:
     return [fit for fit in fit_blurs(squares, noise, FOUND) if isinstance(fit, EdgeBlur)]
 
 
-def plain_squares(image: np.ndarray, noise: Noise, clipped_at: float, effort: Effort) -> np.ndarray:
-    """The squares (N, S, S), S = 2 * HALF_PX + 1, of an image that may hold an edge; see `find_blurs`."""
+def plain_squares(
+    image: np.ndarray, noise: Noise, clipped_at: float, effort: Effort, roughness: float = MAX_ROUGHNESS
+) -> np.ndarray:
+    """The squares (N, S, S), S = 2 * HALF_PX + 1, of an image that may hold an edge; see `find_blurs`.
+
+    Their outer columns scatter by `roughness` of the step at most, beyond noise.
+    """
     if min(image.shape) <= 2 * MARGIN_PX:
         return np.empty((0, 2 * HALF_PX + 1, 2 * HALF_PX + 1))
     squares = _squares(image, noise, effort)
     sound = ((squares > 0) & (squares < clipped_at)).all((1, 2))
-    return np.asarray(squares[sound & _flat(squares, noise)][: effort.fits])
+    return np.asarray(squares[sound & _flat(squares, noise, roughness)][: effort.fits])
 
 
 def _squares(image: np.ndarray, noise: Noise, effort: Effort) -> np.ndarray:
@@ -128,13 +133,13 @@ def _steepness(image: np.ndarray, noise: Noise, step_px: int) -> np.ndarray:
     return np.asarray(np.where(down > across, 0, across / np.sqrt(2 / 5 * noise(column(row(0), 0)))))
 
 
-def _flat(squares: np.ndarray, noise: Noise) -> np.ndarray:
+def _flat(squares: np.ndarray, noise: Noise, roughness: float) -> np.ndarray:
     """Whether the three outer columns on either side scatter by noise alone: (N,) of bool."""
     left, right = squares[:, :, :3], squares[:, :, -3:]
     step = np.abs(right.mean((1, 2)) - left.mean((1, 2)))
     # The tails of the blur slope: what a column does along itself is what counts.
     scatter = [_scatter(side) - noise(side).mean((1, 2)) for side in (left, right)]
-    return np.asarray(np.sqrt(np.maximum(np.maximum(*scatter), 0)) < MAX_ROUGHNESS * step)
+    return np.asarray(np.sqrt(np.maximum(np.maximum(*scatter), 0)) < roughness * step)
 
 
 def _scatter(side: np.ndarray) -> np.ndarray:

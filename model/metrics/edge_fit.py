@@ -44,6 +44,7 @@ class EdgeBlur:
         gamma: of MTF(f) = exp(-gamma f) sinc(f), f in cycles per pixel along the edge's normal.
         error: standard error of gamma.
         slope: pixels by which the edge leans each line; 0 runs along the grid.
+        place: column in which it crosses the middle line, from the middle of the pixels.
         pixels: (H, W) that it was fitted to, over their noise.
         chi2: sum of squares that the fit leaves of those near the edge.
         count: how many these are, less the five numbers fitted.
@@ -52,6 +53,7 @@ class EdgeBlur:
     gamma: float
     error: float
     slope: float
+    place: float
     pixels: np.ndarray
     chi2: float
     count: int
@@ -188,7 +190,7 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
     if not count:
         return fits
     y, x = (np.arange(size) - (size - 1) / 2 for size in (height, width))
-    lines = _centroids(pixels, y, x)
+    lines = centroids(pixels, y, x)
     across, down = np.tile(x, height), np.repeat(y, width)
     start, seen, left = lines.place, pixels.reshape(count, -1), np.arange(count)
     for _ in range(PASSES):
@@ -211,8 +213,8 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
     return fits
 
 
-def _centroids(regions: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> _Lines:
-    """Return the lines through the centres of what rises in each row."""
+def centroids(regions: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> _Lines:
+    """The lines through the centres of what rises in each row of regions (N, H, W)."""
     rise = np.diff(regions, axis=2)
     rise = np.maximum(rise * np.sign(rise.sum((1, 2)))[:, None, None], 0) * np.hamming(rise.shape[2])
     centre = (rise * (columns[1:] - 0.5)).sum(2) / np.maximum(rise.sum(2), 1e-9)
@@ -275,4 +277,4 @@ def _judged(
         return Refusal(f"{misfit:.1%} of the step fit no blurred edge, {limits.misfit:.1%} at most")
     if step < limits.step_sigma or error > limits.error:
         return Refusal(f"a step of {step:.3g} times the noise, {limits.step_sigma:g} are needed")
-    return EdgeBlur(gamma, error, float(lines.slope[k]), pixels, chi2, count)
+    return EdgeBlur(gamma, error, float(lines.slope[k]), float(lines.place[k]), pixels, chi2, count)

@@ -11,8 +11,9 @@ corners of the spectrum, beyond 0.55 cycles per pixel, and noise is white.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,8 @@ from beers_deploy.model.metrics.refusal import Refusal
 SIDE_PX, PART_BLOCKS = 16, 4
 SLOW, MIDDLE, FINE = 0.2, 0.5, 0.55
 """Cycles per pixel."""
+SPECTRUM = (0.3, 0.4, 0.5, 0.55, 0.6, 0.65, 0.7071)
+"""Ends of the bands in which noise is shown, cycles per pixel; the last is the corner of the spectrum."""
 
 STRUCTURES = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
 """How much structure a block may have, of its noise: the least that leaves enough blocks."""
@@ -51,6 +54,7 @@ class Blocks(NamedTuple):
         structure: (N,) mean square of the waves up to 0.2 cycles per pixel, for white noise its variance in DN^2.
         middle: (N,) that of the waves from 0.5 to 0.55.
         fine: (N,) that of the waves beyond.
+        spectrum: (N, 6) that of the waves between the frequencies of SPECTRUM.
         part: (N,) which part of which image a block lies in.
     """
 
@@ -58,6 +62,7 @@ class Blocks(NamedTuple):
     structure: np.ndarray
     middle: np.ndarray
     fine: np.ndarray
+    spectrum: np.ndarray
     part: np.ndarray
 
     def only(self, chosen: np.ndarray) -> "Blocks":
@@ -78,16 +83,44 @@ def join(images: Sequence[Blocks]) -> Blocks:
 
 def cut_blocks(image: np.ndarray, clipped_at: float) -> Blocks:
     """Cut (H, W) digital numbers into blocks side by side, without those with a pixel at 0 or at `clipped_at`."""
-    rows, columns = (size // SIDE_PX for size in image.shape)
+    pixels, part = _side_by_side(image)
+    sound = ((pixels > 0) & (pixels < clipped_at)).all((1, 2))
+    pixels = pixels[sound]
+    return _measured(pixels.mean((1, 2)), pixels, part[sound])
+
+
+def cut_pair(first: np.ndarray, second: np.ndarray, clipped_at: float) -> Blocks:
+    """Blocks of the noise alone, of two images (H, W) of one still scene: their difference over the root of 2.
+
+    This is photon transfer: the scene cancels, and so does what every detector does always.
+    """
+    ones, part = _side_by_side(first)
+    others, _ = _side_by_side(second)
+    low = np.minimum(ones, others).min((1, 2))
+    high = np.maximum(ones, others).max((1, 2))
+    sound = (low > 0) & (high < clipped_at)
+    ones = ones[sound]
+    others = others[sound]
+    return _measured((ones + others).mean((1, 2)) / 2, (ones - others) / math.sqrt(2), part[sound])
+
+
+def _side_by_side(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the blocks (N, S, S) of an image, and the part that each lies in."""
+    rows = image.shape[0] // SIDE_PX
+    columns = image.shape[1] // SIDE_PX
     pixels = np.asarray(image[: rows * SIDE_PX, : columns * SIDE_PX], np.float64)
     pixels = pixels.reshape(rows, SIDE_PX, columns, SIDE_PX).swapaxes(1, 2).reshape(-1, SIDE_PX, SIDE_PX)
-    sound = ((pixels > 0) & (pixels < clipped_at)).all((1, 2))
     across = columns // PART_BLOCKS + 1
-    part = (np.arange(rows)[:, None] // PART_BLOCKS * across + np.arange(columns) // PART_BLOCKS).ravel()
-    pixels = pixels[sound]
+    part = np.arange(rows)[:, None] // PART_BLOCKS * across + np.arange(columns) // PART_BLOCKS
+    return pixels, part.ravel()
+
+
+def _measured(mean: np.ndarray, pixels: np.ndarray, part: np.ndarray) -> Blocks:
+    """Return blocks (N, S, S) with these means and parts by the energies of their bands."""
     # Not by matrix products: the threads of BLAS wait for each other longer than these small sums take.
-    slow, middle, fine = np.einsum("nk,kb->bn", _energies(pixels).reshape(-1, SIDE_PX**2), _band_means())
-    return Blocks(pixels.mean((1, 2)), slow, middle, fine, part[sound])
+    bands = np.einsum("nk,kb->bn", _energies(pixels).reshape(-1, SIDE_PX**2), _band_means())
+    slow, middle, fine, *spectrum = bands
+    return Blocks(mean, slow, middle, fine, np.stack(spectrum, axis=1), part)
 
 
 def _energies(pixels: np.ndarray) -> np.ndarray:
@@ -104,10 +137,10 @@ def _energies(pixels: np.ndarray) -> np.ndarray:
 
 @cache
 def _band_means() -> np.ndarray:
-    """Return the weights (S * S, 3) that average the energies of the slow, the middle and the fine waves."""
+    """Return the weights (S * S, 9) that average the energies of slow, middle and fine waves and of SPECTRUM."""
     place = np.arange(SIDE_PX)
     frequency = np.hypot(place[:, None], place).ravel() / (2 * SIDE_PX)
-    bands = ((1.5 / (2 * SIDE_PX), SLOW), (MIDDLE, FINE), (FINE, 1.0))
+    bands = ((1.5 / (2 * SIDE_PX), SLOW), (MIDDLE, FINE), (FINE, 1.0), *pairwise(SPECTRUM))
     weights = np.stack([(frequency > low) & (frequency <= high) for low, high in bands], axis=1)
     return np.asarray(weights / weights.sum(0))
 
@@ -132,6 +165,10 @@ class NoiseModel:
         blocks: how many were used.
         measured_dn: means that the blocks reach from and to.
         leak: share of texture in the corners of the spectrum, taken off.
+        colour: noise at middle frequencies over that at the finest; 1 for white noise. The line is that of the
+            stronger of the two.
+        white: whether the two are equal, but for chance.
+        spectrum: noise in the bands of SPECTRUM over that beyond FINE.
     """
 
     alpha: float
@@ -140,6 +177,9 @@ class NoiseModel:
     blocks: int
     measured_dn: tuple[float, float]
     leak: float
+    colour: float = 1.0
+    white: bool = True
+    spectrum: tuple[float, ...] = ()
 
     def total(self, dn: np.ndarray) -> np.ndarray:
         """Variance in the pixels, of the values `dn` of any shape: the rounding included."""
@@ -157,8 +197,14 @@ class NoiseModel:
         return Variance(value, (max(low - model * value, 0.0), high + model * value), beyond > 0)
 
 
-def fit_noise_model(blocks: Blocks, generator: np.random.Generator) -> NoiseModel | Refusal:
-    """Fit the line to blocks of any number of images of one instrument; or say why there is none."""
+def fit_noise_model(blocks: Blocks, generator: np.random.Generator, coloured: bool = False) -> NoiseModel | Refusal:
+    """Fit the line to blocks of any number of images of one instrument; or say why there is none.
+
+    Args:
+        blocks: of all images.
+        generator: for the draws of the interval.
+        coloured: whether noise that is not white is taken as well.
+    """
     if blocks.mean.size < LEAST:
         return Refusal(f"{blocks.mean.size} blocks of 16 x 16 unclipped pixels, {LEAST} are needed")
     quietest = float(np.percentile(blocks.fine, QUIET_PERCENT))
@@ -177,7 +223,12 @@ def fit_noise_model(blocks: Blocks, generator: np.random.Generator) -> NoiseMode
     alpha, beta = _unrounded(fit)
     shown = np.array([_unrounded(draw) for draw in draws])
     model = NoiseModel(alpha, beta, shown, used.mean.size, (dark, bright), leak)
-    return _doubtful(used, model) or model
+    if leak > MAX_LEAK:
+        return Refusal(f"{leak:.0%} of the finest detail is texture, {MAX_LEAK:.0%} at most")
+    model = _with_colour(used, model)
+    if not model.white and not coloured:
+        return Refusal(f"noise {model.colour:.2f} times as strong at middle frequencies: not white")
+    return model
 
 
 def _choose(blocks: Blocks) -> tuple[Blocks, np.ndarray]:
@@ -205,11 +256,11 @@ def _quiet(blocks: Blocks, limit: float) -> tuple[Blocks, np.ndarray]:
     return blocks.only((blocks.structure <= limit * noise) & alike), fit
 
 
-def _fitted(blocks: Blocks, weights: np.ndarray, band: str = "fine") -> np.ndarray:
-    """(alpha, beta, leak), none negative, of a band; a mean square scatters by its own size."""
+def _fitted(blocks: Blocks, weights: np.ndarray, seen: np.ndarray | None = None) -> np.ndarray:
+    """(alpha, beta, leak), none negative, of a band (N,), the finest if none; a mean square scatters by its size."""
     from scipy.optimize import nnls
 
-    seen = getattr(blocks, band)
+    seen = blocks.fine if seen is None else seen
     size, fit = np.full(seen.size, max(float(weights @ seen / weights.sum()), ROUNDING)), np.zeros(3)
     for _ in range(4):
         noise = blocks.noise(fit) if fit.any() else size
@@ -231,14 +282,26 @@ def _unrounded(fit: np.ndarray) -> tuple[float, float]:
     return float(fit[0]), max(float(fit[1]) - ROUNDING, 0.0)
 
 
-def _doubtful(used: Blocks, model: NoiseModel) -> Refusal | None:
-    """Texture that passes for noise, or noise that is not white; both would be told to a network as they stand."""
-    if model.leak > MAX_LEAK:
-        return Refusal(f"{model.leak:.0%} of the finest detail is texture, {MAX_LEAK:.0%} at most")
-    place = (float(np.median(used.mean)), 1.0)
-    fine = (model.alpha, model.beta) @ np.array(place)
-    coarse = _fitted(used, np.ones(used.mean.size), "middle")[:2] @ place - ROUNDING
+def _with_colour(used: Blocks, model: NoiseModel) -> NoiseModel:
+    """Return the line with the spectrum of the noise; where that is not flat, the line of its stronger part.
+
+    What is told to a restoration should rather be too much noise than too little: noise that it takes for detail
+    comes out amplified.
+    """
+    place = np.array([float(np.median(used.mean)), 1.0])
+    ones = np.ones(used.mean.size)
+    fine = float((model.alpha, model.beta) @ place)
+    bands = np.column_stack([used.middle, used.spectrum])
+    middle, *spectrum = ((_fitted(used, ones, band)[:2] @ place - ROUNDING) / fine for band in bands.T)
     scatter = float((model.draws @ place).std()) / fine
-    if abs(coarse / fine - 1) > MAX_COLOUR + COLOUR_SCATTER * scatter:
-        return Refusal(f"noise {coarse / fine:.2f} times as strong at middle frequencies: not white")
-    return None
+    white = abs(middle - 1) <= MAX_COLOUR + COLOUR_SCATTER * scatter
+    stronger = 1.0 if white else max(middle, 1.0)
+    return replace(
+        model,
+        alpha=model.alpha * stronger,
+        beta=model.beta * stronger,
+        draws=model.draws * stronger,
+        colour=float(middle),
+        white=bool(white),
+        spectrum=tuple(float(each) for each in spectrum),
+    )

@@ -14,9 +14,9 @@ from beers_deploy.model.convbeers import save_network
 from beers_deploy.model.shipped import SHIPPED
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.toml import HERE as PROFILES
+from tests.deploy.studies.characterise.test_characterise import acquisition
 from tests.deploy.studies.detection.folders import Object, dior
 from tests.deploy.studies.detection.networks import detector, raw
-from tests.deploy.studies.test_characterise import acquisition
 from tests.docs.walk import ROOT, Walk
 from tests.model.networks import plain
 

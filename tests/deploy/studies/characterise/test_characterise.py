@@ -15,7 +15,8 @@ from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import BeersError, OptionError
 from beers_deploy.profiles.sensor import Instrument, noise_from_snr
-from beers_deploy.studies.characterise import characterise, cut_box, profile_toml
+from beers_deploy.studies.characterise import Stated, characterise, profile_toml
+from beers_deploy.studies.characterise.frames import Frames, cut_box
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 
@@ -50,13 +51,23 @@ def raw(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return paths
 
 
+FREQUENCIES = np.array([0.1, 0.25, 0.5])
+
+
 def test_the_profile_is_that_of_the_sensor(raw: tuple[Path, Path], tmp_path: Path) -> None:
-    out, figures = tmp_path / "mine.toml", tmp_path / "mine.json"
+    out = tmp_path / "mine.toml"
+    figures = tmp_path / "mine.json"
     options = "--bits", 12, "--gain", GAIN, "--gsd", 0.7
     done("characterise", *raw, *options, "--out", out, "--json", figures)
     profile = load_sensor(str(out))
     sensor = profile.nominal()
-    assert sensor.mtf_axes == pytest.approx(SENSOR.mtf_axes, rel=0.1)
+    assert sensor.response is not None
+    none = np.zeros((1, 1))
+    for table, truth in (
+        (sensor.response.at(FREQUENCIES[None], none)[0], transfer(FREQUENCIES, SENSOR.mtf_axes[0])),
+        (sensor.response.at(none, FREQUENCIES[:, None])[:, 0], transfer(FREQUENCIES, SENSOR.mtf_axes[1])),
+    ):
+        assert table == pytest.approx(truth, rel=0.12)
     for radiance, snr in zip((25, 100), SNRS, strict=True):
         assert radiance / sensor.noise_sigma(radiance) == pytest.approx(snr, rel=0.1)
     assert (sensor.bits, sensor.gain_dn_per_radiance, profile.gsd_m.low) == (12, GAIN, 0.7)
@@ -65,19 +76,22 @@ def test_the_profile_is_that_of_the_sensor(raw: tuple[Path, Path], tmp_path: Pat
     done("characterise", *raw, *options, "--out", tmp_path / "again.toml")
     assert (tmp_path / "again.toml").read_bytes() == out.read_bytes()
     shown = valid(figures)["rows"][0]["figures"]
-    truths = (9.0, 5.0, *SNRS)
+    truths = [100 * c for mtf in SENSOR.mtf_axes for c in transfer(FREQUENCIES, mtf)] + list(SNRS)
     assert {figure["mode"] for figure in shown.values()} == {"measured"}
-    intervals = [figure["interval"] for figure in shown.values()]
-    assert sum(low <= true <= high for (low, high), true in zip(intervals, truths, strict=True)) >= 3
-    text = out.read_text(encoding="utf-8")
-    assert text.count("95 % interval") == len(truths)
-    assert f"95 % interval {intervals[2][0]:.3g} to {intervals[2][1]:.3g}" in text
+    intervals = [figure["interval"] for figure in shown.values()][: len(truths)]
+    assert sum(low <= true <= high for (low, high), true in zip(intervals, truths, strict=True)) >= 6
+    assert f"95 % interval {intervals[6][0]:.3g} to {intervals[6][1]:.3g}" in out.read_text(encoding="utf-8")
+
+
+def transfer(frequencies: np.ndarray, mtf_nyquist: float) -> np.ndarray:
+    """The profile's formula, exp(-gamma f) sinc(f)."""
+    return np.asarray((mtf_nyquist * math.pi / 2) ** (2 * frequencies) * np.sinc(frequencies))
 
 
 def test_without_a_gain_the_noise_over_full_scale_stands(raw: tuple[Path, Path]) -> None:
     """To a network only that matters: any gain leaves it."""
-    stated = characterise(raw, bits=12, gain=3.0)
-    assumed = characterise(raw, bits=12)
+    stated = characterise(raw, stated=Stated(bits=12, gain=3.0))
+    assumed = characterise(raw, stated=Stated(bits=12))
     assert assumed.gain == pytest.approx(4095 / 400)
     for one, other in zip(stated.snrs, assumed.snrs, strict=True):
         assert one.value == pytest.approx(other.value)
@@ -94,23 +108,65 @@ def edge_box(raw: tuple[Path, Path]) -> str:
 
 
 def test_a_box_gives_one_axis_for_both(raw: tuple[Path, Path]) -> None:
-    found = characterise(raw, (edge_box(raw),), bits=12)
-    assert list(found.axes) == ["across"]
-    assert found.axes["across"].edges == 1
-    low, high = found.axes["across"].interval
-    assert low <= 0.09 <= high < 1.5 * low
-    text = profile_toml(found)
-    assert "mtf_nyquist_along" not in text
-    assert "across the track" in text
-    assert "no edge shows the other axis" in text
+    found = characterise(raw, (edge_box(raw),), Stated(bits=12))
+    assert list(found.mtf.curves) == ["across"]
+    value, (low, high) = found.mtf.curves["across"].at(0.5)
+    assert low <= 0.09 <= high < 2 * low
+    assert low <= value <= high
+    table = tomllib.loads(profile_toml(found))["mtf"]
+    assert table["across"]["value"] == table["along"]["value"]
+    assert "no curve along the track" in table["along"]["source"]
     assert found.rows()[0].figures["MTF along at Nyquist"].mode == "unavailable"
 
 
-def test_images_without_an_edge_are_refused(raw: tuple[Path, Path], tmp_path: Path) -> None:
-    said = refused("characterise", raw[1], "--bits", 12, "--out", tmp_path / "mine.toml")
-    assert list(tmp_path.iterdir()) == []
-    assert "expected 3 straight edges" in said
-    assert "--edge FILE:X,Y,WIDTH,HEIGHT" in said
+def test_without_an_edge_the_mtf_is_assumed_and_said_so(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "mine.toml"
+    said = done("characterise", raw[1], "--bits", 12, "--out", out)
+    assert "the profile's MTF is an assumption" in said
+    profile = load_sensor(str(out))
+    assert profile.mtf_nyquist.status == "assumed"
+    assert profile.snr_pair[1].status == "measured"
+
+
+def test_the_mtf_may_be_stated(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "mine.toml"
+    said = done("characterise", raw[1], "--bits", 12, "--mtf", "0.08,0.04", "--out", out)
+    profile = load_sensor(str(out))
+    assert profile.nominal().mtf_axes == (0.08, 0.04)
+    assert profile.mtf_nyquist.status == "stated"
+    assert "assumption" not in said
+
+
+def test_steps_and_a_black_level_change_nothing_but_the_units(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    """Ten bits stored in sixteen, above a pedestal: the noise above the dark is the same."""
+    plain = characterise(raw, stated=Stated(bits=12, mtf=(0.1, 0.1)))
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for path in raw:
+        tifffile.imwrite(folder / path.name, ((tifffile.imread(path) + 200) * 8).astype(np.uint16))
+    found = characterise([folder], stated=Stated(bits=15, black_level=1600, mtf=(0.1, 0.1)))
+    assert (found.frames.step, found.frames.bits, found.frames.stored_full_scale) == (8, 12, 32760)
+    for one, other in zip(found.snrs, plain.snrs, strict=True):
+        assert one.value == pytest.approx(other.value, rel=0.02)
+    assert tomllib.loads(profile_toml(found))["offset"]["offset_dn"]["value"] == 200
+    assert any("--full-scale 32760" in note for note in found.notes())
+    assert not any("black level" in note for note in found.notes())
+    hidden = characterise([folder], stated=Stated(bits=15, mtf=(0.1, 0.1)))
+    assert any("black level" in note for note in hidden.notes())
+
+
+def test_pairs_of_one_scene_give_the_noise_alone(tmp_path: Path) -> None:
+    """Texture as fine as the noise cancels; without the pair it counts as noise."""
+    generator = np.random.default_rng(4)
+    scene = np.linspace(300, 3000, 320)[:, None] + generator.normal(0, 40, (320, 320))
+    for number in range(2):
+        noisy = scene + generator.normal(size=scene.shape) * np.sqrt(0.5 * scene)
+        tifffile.imwrite(tmp_path / f"{number}.tif", np.clip(noisy.round(), 1, 4094).astype(np.uint16))
+    found = characterise([tmp_path], stated=Stated(bits=12, mtf=(0.1, 0.1)))
+    assert found.noise.pairs == 1
+    assert found.noise.model.at(1000).value == pytest.approx(500, rel=0.05)
+    alone = characterise([tmp_path / "0.tif"], stated=Stated(bits=12, mtf=(0.1, 0.1)))
+    assert alone.noise.model.at(1000).value > 1500
 
 
 @pytest.mark.parametrize(
@@ -124,7 +180,7 @@ def test_images_without_an_edge_are_refused(raw: tuple[Path, Path], tmp_path: Pa
 )
 def test_a_box_written_wrongly_is_refused(box: str, words: str) -> None:
     with pytest.raises(OptionError, match=words):
-        cut_box(box, [Path("board.tif")])
+        cut_box(box, Frames((Path("board.tif"),), 1, 12, True, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(
@@ -150,7 +206,10 @@ WRONG: dict[str, tuple[np.ndarray, tuple[str, ...], str]] = {
     "negative": (FLAT.astype(np.int16) - 2000, ("--bits", "12"), "from 0 to 65535"),
     "wide": (FLAT.astype(np.uint32) * 70, ("--bits", "16"), "from 0 to 65535"),
     "all missing": (np.full((200, 200), np.nan, np.float32), ("--bits", "12"), "unclipped"),
-    "steps": (FLAT.astype(np.uint16) * 16, ("--bits", "16"), "divide it by 16"),
+    "steps": (FLAT.astype(np.uint16) * 16 + 3, ("--bits", "16"), "divide it by 16"),
+    "black": (FLAT.astype(np.uint16), ("--bits", "12", "--black-level", "1500"), "below the images' median"),
+    "mtf": (FLAT.astype(np.uint16), ("--bits", "12", "--mtf", "7"), "write 0.07 for 7 %"),
+    "three contrasts": (FLAT.astype(np.uint16), ("--bits", "12", "--mtf", "0.1,0.1,0.1"), "one or two ratios"),
     "open bits": (FLAT.astype(np.uint16), (), "--bits: expected --bits beside images"),
     "wrong bits": (FLAT.astype(np.uint16), ("--bits", "8"), "up to 255"),
     "gain": (FLAT.astype(np.uint16), ("--bits", "12", "--gain", "0"), "above 0"),
@@ -188,7 +247,7 @@ def test_pixels_clipped_at_full_scale_tell_the_bits(raw: tuple[Path, Path], tmp_
     pixels[:4, :4] = 4095
     image = tiff(tmp_path, pixels)
     found = characterise((image, raw[1]))
-    assert found.bits == 12
+    assert found.frames.bits == 12
     assert tomllib.loads(profile_toml(found))["digitiser"]["bits"]["status"] == "measured"
     with pytest.raises(BeersError, match="clipped pixels"):
         characterise((image, raw[1]), (f"{image}:0,0,30,30",))
@@ -200,14 +259,14 @@ def test_pixels_clipped_at_full_scale_tell_the_bits(raw: tuple[Path, Path], tmp_
 def test_names_cannot_break_the_profile(raw: tuple[Path, Path], tmp_path: Path) -> None:
     odd = tmp_path / 'a "quoted" \x7f\u202e name.tif'
     odd.write_bytes(raw[0].read_bytes())
-    text = profile_toml(characterise((odd, raw[1]), bits=12))
+    text = profile_toml(characterise((odd, raw[1]), stated=Stated(bits=12)))
     assert "\x7f" not in text
     assert "quoted" in tomllib.loads(text)["description"]
 
 
 def test_the_noise_of_a_bound_is_a_profile_that_loads(raw: tuple[Path, Path], tmp_path: Path) -> None:
     """All noise in beta, or in alpha: decimals must not put the SNR beyond what physics allows."""
-    found = characterise(raw, bits=12)
+    found = characterise(raw, stated=Stated(bits=12))
     full_scale = 4095 / found.gain
     for dark in (math.sqrt(1 / 4), 1 / 4):
         bright = replace(found.snrs[1], radiance=full_scale / 4, value=100 / 3)

@@ -1,0 +1,148 @@
+"""A sensor profile from raw frames of the sensor's own: what `characterise` does between options and TOML.
+
+- `frames`: which frames, what one digital number is, where the dark lies
+- `instrument`: noise and MTF, with intervals
+- `profile`: the TOML file
+
+Gain, ground sampling distance, black level, and bits unless pixels are clipped at full scale, are asked for or
+assumed. Where no edge gives an MTF, the user's word or an assumption stands in its place, marked so.
+"""
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from beers_deploy.model.io.tiff import write_tiff
+from beers_deploy.model.progress import Progress, reporting
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.results import Table, input_of
+from beers_deploy.studies.characterise.frames import cut_box, open_frames
+from beers_deploy.studies.characterise.instrument import Mtf, measure_mtf, measure_noise, snr_at
+from beers_deploy.studies.characterise.profile import PARTS, Characterised, profile_toml
+
+__all__ = ["Characterised", "MeasuredSensor", "Stated", "characterise", "characterize", "profile_toml"]
+
+FULL_SCALE_RADIANCE = 400.0
+"""W/m2/sr/um, where no gain is given."""
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What the user says of a camera; None of what pixels are to tell, or what is assumed.
+
+    Attributes:
+        bits: of a digital number.
+        gain: DN per W/m2/sr/um.
+        gsd_m: ground sampling distance.
+        black_level: value of the dark in the files.
+        mtf: contrast at Nyquist across and along the track, instead of a measurement.
+    """
+
+    bits: int | None = None
+    gain: float | None = None
+    gsd_m: float | None = None
+    black_level: float | None = None
+    mtf: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        for option, value in (("gain", self.gain), ("gsd", self.gsd_m)):
+            if value is not None and not 0 < value < math.inf:
+                raise OptionError(option, expected="a finite number above 0", got=f"{value:g}", remedy="correct it")
+
+
+def characterise(images: Sequence[Path], edges: Sequence[str] = (), stated: Stated | None = None) -> Characterised:
+    """Measure a sensor on its own frames.
+
+    Args:
+        images: raw ones of one sensor at one setting: files, and folders of them.
+        edges: boxes with one straight edge as FILE:X,Y,WIDTH,HEIGHT; none searches for edges.
+        stated: what the user says.
+    """
+    stated = stated or Stated()
+    frames = open_frames(images, stated.bits, stated.black_level)
+    regions = {words: cut_box(words, frames) for words in edges}
+    noise = measure_noise(frames)
+    mtf = Mtf({}, {})
+    if stated.mtf is None:
+        mtf = measure_mtf(frames, regions, noise.model)
+    gain = stated.gain or frames.full_scale_dn / FULL_SCALE_RADIANCE
+    low, high = (snr_at(noise.model, frames.full_scale_dn / part, gain) for part in PARTS)
+    return Characterised(frames, noise, mtf, (low, high), gain, stated.gain is not None, stated.gsd_m, stated.mtf)
+
+
+class MeasuredSensor(Sensor):
+    """A sensor measured on its own images; `evidence` holds the figures with their intervals."""
+
+    evidence: Table | None = None
+
+
+def characterize(
+    images: Any,
+    *,
+    bits: int | None = None,
+    gain: float | None = None,
+    gsd_m: float | None = None,
+    black_level: float | None = None,
+    mtf: tuple[float, float] | None = None,
+    edges: Sequence[str] = (),
+    progress: Progress = None,
+) -> MeasuredSensor:
+    """Measure MTF and noise of a sensor on its own raw images.
+
+    Args:
+        images: one or several, each a path (a folder holds several) or an array (H, W) of whole digital numbers, of
+            one sensor at one setting.
+        bits: of a digital number; None where clipped pixels must tell.
+        gain: DN per W/m2/sr/um; None assumes 400 W/m2/sr/um at full scale.
+        gsd_m: ground sampling distance; None assumes one.
+        black_level: value of the dark; None counts 0 as dark.
+        mtf: contrast at Nyquist across and along the track, where it is known; None measures the whole curve.
+        edges: boxes with one straight edge as FILE:X,Y,WIDTH,HEIGHT; none searches for edges.
+        progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
+
+    Raises:
+        ImageError: images that are not raw, or that do not hold what is needed; the message says what that is.
+        OptionError: an option that contradicts the pixels.
+
+    Examples:
+        >>> raw = bd.simulate(size=256, seed=1).degraded
+        >>> found = bd.characterize(raw, bits=12, gain=10.2375)
+        >>> 0.05 < found.mtf_nyquist.low < 0.09  # the truth is 0.07
+        True
+    """
+    several = images if isinstance(images, list | tuple) else [images]
+    stated = Stated(bits, gain, gsd_m, black_level, mtf)
+    with TemporaryDirectory(prefix="beers-deploy-") as folder, reporting(progress):
+        paths = [_as_file(image, Path(folder) / f"image{number}.tif") for number, image in enumerate(several)]
+        found = characterise(paths, edges, stated)
+        profile = Path(folder) / "measured.toml"
+        profile.write_text(profile_toml(found), encoding="utf-8")
+        sensor = MeasuredSensor(**vars(load_sensor(str(profile))))
+        arguments: dict[str, float | str | None] = {"bits": bits, "gain": gain, "gsd": gsd_m}
+        arguments |= {"black_level": black_level, "mtf": ",".join(map(str, mtf)) if mtf else None}
+        arguments["edge"] = ", ".join(edges) or None
+        evidence = Table("characterise", arguments, tuple(map(input_of, found.frames.paths)), tuple(found.rows()))
+    object.__setattr__(sensor, "evidence", evidence)
+    return sensor
+
+
+def _as_file(image: Any, path: Path) -> Path:
+    if isinstance(image, str | os.PathLike):
+        return Path(image)
+    pixels = np.asarray(getattr(image, "values", image))
+    if pixels.ndim == 3 and len(pixels) == 1:
+        pixels = pixels[0]
+    if pixels.ndim != 2 or pixels.dtype.kind not in "ui":
+        got = f"{pixels.dtype} of shape {pixels.shape}"
+        remedy = "give raw pixels of one band"
+        raise ImageError("images", expected="whole digital numbers (H, W)", got=got, remedy=remedy)
+    write_tiff(path, pixels.astype(np.uint16))
+    return path

@@ -1,0 +1,109 @@
+"""A falling MTF as a sum of simple ones, and the edge that each of them would show.
+
+    MTF(f) = sinc(f) * sum_k w_k P_k(f),    w_k >= 0,    sum w_k = 1
+
+sinc is the square detector. P_k falls linearly from 1 to 0 within one step of 0.05 cycles per pixel, each at its own
+frequency; the last one never falls. Any curve that falls from 1 is such a sum, and the image of an edge is the same
+sum of the edges' images: that makes finding the curve a linear problem.
+"""
+
+import math
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+STEP_CPX = 0.05
+"""Cycles per pixel over which one part falls."""
+CORNERS = np.linspace(0, 1, 21)
+"""Frequencies between which the parts fall."""
+PARTS = CORNERS.size
+"""The last part stands for what is left beyond 1 cycle per pixel."""
+
+SAMPLES_PER_PX, REACH_PX = 16, 24
+HIGHEST_CPX, WAVES = 2.5, 1250
+"""Waves that make the tabulated edge: it repeats after 500 pixels."""
+
+BEND = 0.04
+"""Standard deviation of the second differences of the weights, before any edge is seen.
+
+exp(-gamma f), a Gaussian and diffraction with 2 to 30 % at Nyquist have at most 0.01 to 0.03 (computed); where a pupil
+cuts off, 0.06."""
+FIRST_BEND = 0.1
+"""That of the first of them: a curve may begin with a sudden loss (a veil of stray light, far tails)."""
+
+
+def parts_at(frequencies: ArrayLike) -> np.ndarray:
+    """P_k at frequencies of any shape (...): (..., PARTS)."""
+    frequency = np.asarray(frequencies, np.float64)[..., None]
+    falling = np.clip((CORNERS[1:] - frequency) / STEP_CPX, 0.0, 1.0)
+    return np.concatenate([falling, np.ones(frequency.shape)], axis=-1)
+
+
+def mtf_at(frequencies: ArrayLike, weights: np.ndarray) -> np.ndarray:
+    """The MTF of weights (PARTS,) at frequencies of any shape, in cycles per pixel."""
+    frequency = np.asarray(frequencies, np.float64)
+    return np.asarray(np.sinc(frequency) * (parts_at(frequency) @ weights))
+
+
+def weights_of(contrast: np.ndarray) -> np.ndarray:
+    """The weights (PARTS,) of optics with these contrasts at CORNERS, 1 at the first."""
+    return np.append(-np.diff(contrast), contrast[-1])
+
+
+def softened(weights: np.ndarray, softness_px: float) -> np.ndarray:
+    """The weights of a curve times exp(-softness f)."""
+    contrast = np.append(1.0, 1.0 - np.cumsum(weights[:-1]))
+    return weights_of(contrast * np.exp(-softness_px * CORNERS))
+
+
+@cache
+def responses() -> tuple[np.ndarray, np.ndarray]:
+    """What a detector sees of a step of 1 at 0, and of a thin line there, behind each part.
+
+    The step behind an MTF is 1/2 + the sum over f of MTF(f) sin(2 pi f d) / (pi f); the line is its derivative.
+
+    Returns:
+        Edges and lines, (2 * REACH_PX * SAMPLES_PER_PX + 1, PARTS) each.
+    """
+    frequency = (np.arange(WAVES) + 0.5) * HIGHEST_CPX / WAVES
+    distance = np.arange(-REACH_PX * SAMPLES_PER_PX, REACH_PX * SAMPLES_PER_PX + 1) / SAMPLES_PER_PX
+    phase = 2 * math.pi * distance[:, None] * frequency
+    transfer = np.sinc(frequency)[:, None] * parts_at(frequency) * HIGHEST_CPX / WAVES
+    edges = 0.5 + np.sin(phase) @ (transfer / (math.pi * frequency[:, None]))
+    return edges, np.cos(phase) @ (2 * transfer)
+
+
+def at_distances(table: np.ndarray, distance_px: np.ndarray) -> np.ndarray:
+    """A tabulated edge or line, (T,) or (T, PARTS), at distances (N,) from it: (N,) or (N, PARTS)."""
+    place = np.clip((distance_px + REACH_PX) * SAMPLES_PER_PX, 0, len(table) - 1.001)
+    row = place.astype(int)
+    share = place - row
+    if table.ndim == 2:
+        share = share[:, None]
+    return np.asarray(table[row] * (1 - share) + table[row + 1] * share)
+
+
+BENDS = np.pad(np.diff(np.eye(PARTS - 1), 2, axis=0), ((0, 0), (0, 1)))
+BENDS /= np.append(FIRST_BEND, np.full(PARTS - 4, BEND))[:, None]
+"""(PARTS - 3, PARTS): second differences of the weights over what is expected of them."""
+
+
+def solve(gram: np.ndarray, moment: np.ndarray, bends: np.ndarray | None = None) -> np.ndarray:
+    """The weights that fit best, none negative and of sum 1.
+
+    Args:
+        gram: (PARTS, PARTS) of the least-squares problem, in units of the noise.
+        moment: (PARTS,) its right side.
+        bends: (PARTS - 3,) what the second differences are expected to be, over their deviations; 0 without.
+    """
+    from scipy.optimize import nnls  # here: who tells no sensor need not wait for SciPy
+
+    gram = gram + BENDS.T @ BENDS
+    if bends is not None:
+        moment = moment + BENDS.T @ bends
+    # A sum of 1 is held by a weight far above all others', and exactly by the division below.
+    hold = 100.0 * np.trace(gram)
+    root = np.linalg.cholesky(gram + hold + 1e-9 * np.trace(gram) * np.eye(PARTS))
+    weights, _ = nnls(root.T, np.linalg.solve(root, moment + hold))
+    return np.asarray(weights / weights.sum())

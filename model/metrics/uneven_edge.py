@@ -1,0 +1,242 @@
+"""One straight edge between uneven sides: where it runs, what lies on either side, and what it says of the MTF.
+
+Roofs, kerbs and shadows are no calibration targets. Each side is a plane of its own, and what remains of its texture
+counts as noise: it lowers the weight of the edge instead of refusing it.
+
+    pixel = left plane * (1 - E(d)) + right plane * E(d),    d = distance to the edge along its normal
+
+E is the image of a step (`mtf_basis`). Gauss-Newton with Huber's weights finds the line and the planes for a known E;
+what they leave over is linear in the weights of E, and is handed on as normal equations.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from beers_deploy.model.metrics.mtf_basis import PARTS, at_distances, responses, softened
+
+HALF_PX = 8.0
+"""How far from the edge pixels are fitted."""
+STRIP_PX = 5
+"""Length of the strips along the edge that count as independent looks: longer than blurred texture."""
+
+GRADIENT = 0.08
+"""Standard deviation of what a plane changes away from the edge over HALF_PX, of the step. Far tails of the blur look
+the same; a wider one lets gradients take their place."""
+BOW_PX = 0.3
+"""Standard deviation of how far an edge bends off a straight line at its ends: distortion, kerbs."""
+HUBER = 2.5
+"""Robust deviations from which a pixel counts less: cars, branches and drains lie beside edges."""
+MAD = 1.4826
+"""Standard deviation over the median absolute deviation, of normal values."""
+
+LEVELS, NUMBERS = 6, 9
+"""Numbers of both planes; with those of the line."""
+MAX_STEP = np.array([0.7, 0.1, 0.3])
+"""Of place, slope and bow in one pass."""
+SOFTER_PX = 0.05
+"""Small change of softness by which the derivative is taken."""
+
+
+@dataclass(frozen=True)
+class EdgePixels:
+    """The pixels around one near-vertical edge.
+
+    Attributes:
+        values: (H, W) digital numbers.
+        variance: (H, W) of their noise.
+        label: names the edge to the user.
+    """
+
+    values: np.ndarray
+    variance: np.ndarray
+    label: str
+
+
+class EdgeLine(NamedTuple):
+    """Where an edge runs: x = place + slope * y + bow * (2 y / H)^2, from the middle of its pixels."""
+
+    place_px: float
+    slope: float
+    bow_px: float = 0.0
+
+
+class Side(NamedTuple):
+    """Pixels within HALF_PX of an edge, (P,) each: distance and place along it in pixels, values and variance."""
+
+    distance_px: np.ndarray
+    along_px: np.ndarray
+    values: np.ndarray
+    variance: np.ndarray
+
+
+@dataclass(frozen=True)
+class FittedEdge:
+    """An edge whose line and planes are known for one curve.
+
+    Attributes:
+        pixels: of the edge.
+        line: where it runs.
+        levels: (6,) left and right plane: in the middle, change over half the length, change over HALF_PX.
+        weights: (P,) one over the standard deviation of each pixel near the edge, texture and Huber's weight in it.
+        step: difference of the planes at the edge.
+        unevenness: root mean square of the texture that the planes leave, of the step.
+        normal: (P + 9, 9) derivatives by planes and line, weighted, with what is expected of them.
+        curve: (P + 9, PARTS) derivatives by the weights of the curve.
+        rest: (P + 9,) what is left over.
+        strip: (P,) number of the strip that each pixel lies in.
+    """
+
+    pixels: EdgePixels
+    line: EdgeLine
+    levels: np.ndarray
+    weights: np.ndarray
+    step: float
+    unevenness: float
+    normal: np.ndarray
+    curve: np.ndarray
+    rest: np.ndarray
+    strip: np.ndarray
+
+
+def fit_edge(pixels: EdgePixels, line: EdgeLine, weights: np.ndarray, passes: int) -> FittedEdge | None:
+    """Fit the line and both planes of an edge to a known curve.
+
+    Args:
+        pixels: around the edge.
+        line: where it runs roughly, within a pixel or two.
+        weights: (PARTS,) of the curve.
+        passes: of Gauss-Newton.
+
+    Returns:
+        The edge, or None where it leaves its pixels or has no step.
+    """
+    edges, lines = responses()
+    edge_table = edges @ weights
+    line_table = lines @ weights
+    height = pixels.values.shape[0]
+    levels = None
+    texture = 0.0
+    fitted = None
+    for _ in range(passes):
+        near = _near(pixels, line)
+        left = near.distance_px < -2
+        right = near.distance_px > 2
+        if min(left.sum(), right.sum()) < 4 * HALF_PX:
+            return None
+        if levels is None:
+            levels = np.array([np.median(near.values[left]), 0, 0, np.median(near.values[right]), 0, 0])
+        step = levels[3] - levels[0]
+        if step == 0:
+            return None
+        plane = _plane(near, height)
+        share = at_distances(edge_table, near.distance_px)[:, None]
+        by_levels = np.hstack([plane * (1 - share), plane * share])
+        rest = near.values - by_levels @ levels
+        scale = max(MAD * float(np.median(np.abs(rest))), 1e-9)
+        huber = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(rest), 1e-9))
+        texture = max(float(np.average(rest**2, weights=huber)) - float(near.variance.mean()), 0.0)
+        pixel_weights = np.sqrt(huber / (near.variance + texture))
+        rise = plane @ (levels[3:] - levels[:3])
+        by_line = _by_line(near, line, rise * at_distances(line_table, near.distance_px), height)
+        expected, expected_rest = _expectations(levels, line, step)
+        normal = np.vstack([np.hstack([by_levels, by_line]) * pixel_weights[:, None], expected])
+        curve = np.vstack(
+            [(rise * pixel_weights)[:, None] * at_distances(edges, near.distance_px), np.zeros((NUMBERS, PARTS))]
+        )
+        weighted_rest = np.concatenate([rest * pixel_weights, expected_rest])
+        strip = np.floor((near.along_px + height / 2) / STRIP_PX).astype(int)
+        unevenness = math.sqrt(texture) / abs(step)
+        fitted = FittedEdge(
+            pixels, line, levels, pixel_weights, abs(step), unevenness, normal, curve, weighted_rest, strip
+        )
+        change = np.linalg.lstsq(normal, weighted_rest, rcond=None)[0]
+        levels = levels + change[:LEVELS]
+        line = EdgeLine(*(np.array(line) + np.clip(change[LEVELS:], -MAX_STEP, MAX_STEP)).tolist())
+    return fitted
+
+
+def _near(pixels: EdgePixels, line: EdgeLine) -> Side:
+    """The pixels within HALF_PX of the line, a side both."""
+    height, width = pixels.values.shape
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    y -= (height - 1) / 2
+    x -= (width - 1) / 2
+    across = x - line.place_px - line.slope * y - line.bow_px * (2 * y / height) ** 2
+    distance_px = across / math.hypot(1, line.slope)
+    near = np.abs(distance_px) <= HALF_PX
+    return Side(distance_px[near], y[near], pixels.values[near], pixels.variance[near])
+
+
+def _plane(near: Side, height: int) -> np.ndarray:
+    """(P, 3) what each number of a plane adds to each pixel."""
+    return np.stack([np.ones_like(near.along_px), 2 * near.along_px / height, near.distance_px / HALF_PX], axis=1)
+
+
+def _by_line(near: Side, line: EdgeLine, slope: np.ndarray, height: int) -> np.ndarray:
+    """(P, 3) derivatives of the pixels by place, slope and bow; `slope` (P,) is that by the distance."""
+    by_place = -slope / math.hypot(1, line.slope)
+    along = near.along_px
+    return np.stack([by_place, by_place * along, by_place * (2 * along / height) ** 2], axis=1)
+
+
+def _expectations(levels: np.ndarray, line: EdgeLine, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (9, 9) that hold gradients and bow near 0, and their right side (9,)."""
+    rows = np.zeros((NUMBERS, NUMBERS))
+    right = np.zeros(NUMBERS)
+    gradient = GRADIENT * abs(step)
+    for number in (2, 5):
+        rows[number, number] = 1 / gradient
+        right[number] = -levels[number] / gradient
+    rows[-1, -1] = 1 / BOW_PX
+    right[-1] = -line.bow_px / BOW_PX
+    return rows, right
+
+
+def normal_equations(
+    edge: FittedEdge, weights: np.ndarray, counts: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """What one edge says of the curve, whatever its line and planes.
+
+    Args:
+        edge: fitted to `weights`.
+        weights: (PARTS,) of the curve.
+        counts: how often each strip along the edge counts; once each without.
+
+    Returns:
+        (PARTS, PARTS) and (PARTS,): left and right side for the weights of the curve.
+    """
+    normal, curve, rest = edge.normal, edge.curve, edge.rest
+    if counts is not None:
+        times = np.sqrt(counts[np.minimum(edge.strip, len(counts) - 1)])
+        times = np.append(times, np.ones(NUMBERS))
+        normal = normal * times[:, None]
+        curve = curve * times[:, None]
+        rest = rest * times
+    basis, _ = np.linalg.qr(normal)
+    curve = curve - basis @ (basis.T @ curve)
+    rest = rest - basis @ (basis.T @ rest)
+    return curve.T @ curve, curve.T @ (rest + curve @ weights)
+
+
+def strips_of(edge: FittedEdge) -> int:
+    """How many independent looks along the edge there are."""
+    return max(int(edge.pixels.values.shape[0]) // STRIP_PX, 2)
+
+
+def softness(edge: FittedEdge, weights: np.ndarray) -> tuple[float, float]:
+    """By how much an edge is softer than a curve: s of a further factor exp(-s f), in pixels; and its standard error.
+
+    The error is the larger of what noise and texture leave and of what the strips along the edge differ by.
+    """
+    by_softness = edge.curve @ (softened(weights, SOFTER_PX) - weights) / SOFTER_PX
+    basis, _ = np.linalg.qr(edge.normal)
+    by_softness = by_softness - basis @ (basis.T @ by_softness)
+    rest = edge.rest - basis @ (basis.T @ edge.rest)
+    size = float(by_softness @ by_softness)
+    value = float(by_softness @ rest) / size
+    left = (by_softness * (rest - value * by_softness))[: edge.strip.size]
+    by_strip = np.bincount(edge.strip - edge.strip.min(), weights=left)
+    return value, max(size**-0.5, math.sqrt(float((by_strip**2).sum())) / size)

@@ -1,0 +1,158 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beers_deploy.model.metrics.edge_curve import (
+    FREQUENCIES,
+    Edge,
+    MtfCurve,
+    apart,
+    edge_in,
+    find_edges,
+    measure_curve,
+    search_curve,
+    sharpest,
+)
+from beers_deploy.model.metrics.mtf_basis import CORNERS, at_distances, mtf_at, responses, weights_of
+from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.model.metrics.uneven_edge import EdgeLine, EdgePixels, fit_edge
+
+NOISE_DN = 4.0
+SHOWN = [2, 5, 10]
+"""Places of 0.1, 0.25 and 0.5 cycles per pixel in the table."""
+CURVES = {
+    "exponential": np.exp(-4.0 * CORNERS),
+    "gaussian": np.exp(-8.0 * CORNERS**2),
+    "steep at first": np.exp(-3.6 * CORNERS**0.9),
+}
+
+
+def noise(values: np.ndarray) -> np.ndarray:
+    return np.full(np.shape(values), NOISE_DN**2)
+
+
+def drawn(
+    weights: np.ndarray, generator: np.random.Generator, texture: float = 0.0, size: tuple[int, int] = (23, 19)
+) -> tuple[np.ndarray, EdgeLine]:
+    """A region (H, W) with an edge between sloping sides, its texture some pixels wide, and its line."""
+    height, width = size
+    y, x = np.mgrid[:height, :width].astype(float)
+    y -= (height - 1) / 2
+    x -= (width - 1) / 2
+    line = EdgeLine(generator.uniform(-1, 1), generator.uniform(-0.4, 0.4))
+    distance = (x - line.place_px - line.slope * y) / np.hypot(1, line.slope)
+    share = at_distances(responses()[0] @ weights, distance.ravel()).reshape(size)
+    left = 400 + generator.normal(0, 4) * y / height
+    right = 1400 + generator.normal(0, 4) * y / height
+    grain = generator.normal(size=(height + 2, width + 2))
+    smooth = sum(grain[i : i + height, j : j + width] for i in range(3) for j in range(3)) / 3
+    pixels = left * (1 - share) + right * share + texture * 1000 * smooth
+    return pixels + generator.normal(0, NOISE_DN, size), line
+
+
+def edges_of(weights: np.ndarray, count: int, seed: int, texture: float = 0.0) -> list[Edge]:
+    generator = np.random.default_rng(seed)
+    found = []
+    for number in range(count):
+        pixels, _ = drawn(weights, generator, texture)
+        edge = edge_in(pixels, noise, f"edge {number}")
+        assert not isinstance(edge, Refusal)
+        found.append(edge)
+    return found
+
+
+@settings(max_examples=10)
+@given(st.integers(0, 10_000), st.sampled_from(sorted(CURVES)))
+def test_line_and_sides_are_found_whatever_the_curve(seed: int, name: str) -> None:
+    weights = weights_of(CURVES[name])
+    pixels, line = drawn(weights, np.random.default_rng(seed))
+    rough = EdgeLine(line.place_px + 0.6, line.slope - 0.05)
+    fitted = fit_edge(EdgePixels(pixels, noise(pixels), ""), rough, weights, 8)
+    assert fitted is not None
+    assert fitted.line.place_px == pytest.approx(line.place_px, abs=0.05)
+    assert fitted.line.slope == pytest.approx(line.slope, abs=0.01)
+    assert fitted.step == pytest.approx(1000, abs=25)
+    assert fitted.unevenness < 0.005
+
+
+@pytest.mark.parametrize("name", CURVES)
+def test_the_curve_is_found_whatever_its_shape(name: str) -> None:
+    weights = weights_of(CURVES[name])
+    curve = measure_curve(edges_of(weights, 9, seed=2), np.random.default_rng(0))
+    assert isinstance(curve, MtfCurve)
+    truth = mtf_at(FREQUENCIES, weights)
+    assert curve.contrast[SHOWN] == pytest.approx(truth[SHOWN], rel=0.06)
+    assert (np.diff(curve.contrast) <= 0).all()
+    assert (curve.low <= curve.contrast).all()
+    assert (curve.contrast <= curve.high).all()
+    assert curve.missing_edges == 0
+
+
+def test_texture_widens_the_interval_which_holds_the_truth() -> None:
+    weights = weights_of(CURVES["exponential"])
+    truth = mtf_at(FREQUENCIES, weights)[SHOWN]
+    widths = []
+    held = []
+    for seed in range(6):
+        for texture in (0.0, 0.05):
+            curve = measure_curve(edges_of(weights, 3, 10 + seed, texture), np.random.default_rng(0))
+            assert isinstance(curve, MtfCurve)
+            widths.append(curve.high[SHOWN] / curve.low[SHOWN])
+            held.append((curve.low[SHOWN] <= truth) & (truth <= curve.high[SHOWN]))
+    assert np.mean(held) >= 0.8
+    assert (np.median(widths[1::2], axis=0) > np.median(widths[::2], axis=0)).all()
+
+
+def test_edges_that_contradict_the_others_are_named() -> None:
+    sharp = edges_of(weights_of(CURVES["exponential"]), 6, seed=3)
+    soft = edges_of(weights_of(np.exp(-7.0 * CORNERS)), 1, seed=4)
+    odd = [(EdgePixels(pixels.values, pixels.variance, "the hedge"), line) for pixels, line in soft]
+    curve = measure_curve([*sharp, *odd], np.random.default_rng(0))
+    assert isinstance(curve, MtfCurve)
+    assert curve.contradicting == ("the hedge",)
+
+
+def test_search_takes_the_sharpest_and_leaves_hedges() -> None:
+    """Steps and twice as many softer edges: the steps' curve is found."""
+    weights = weights_of(CURVES["exponential"])
+    mixed = edges_of(weights, 12, seed=5)
+    for number, softness_px in enumerate(np.random.default_rng(6).uniform(0.6, 4, 24)):
+        mixed += edges_of(weights_of(np.exp(-(4 + softness_px) * CORNERS)), 1, seed=20 + number)
+    curve = search_curve(mixed, np.random.default_rng(0))
+    assert isinstance(curve, MtfCurve)
+    assert curve.contrast[SHOWN] == pytest.approx(mtf_at(FREQUENCIES, weights)[SHOWN], rel=0.1)
+
+
+def test_few_edges_are_refused_with_their_number() -> None:
+    found = search_curve(edges_of(weights_of(CURVES["gaussian"]), 2, seed=7), np.random.default_rng(0))
+    assert isinstance(found, Refusal)
+    assert "2 straight edges" in found.reason
+
+
+@given(st.lists(st.floats(-2, 4), min_size=3, max_size=20), st.floats(-3, 3))
+def test_the_sharpest_moves_with_all_edges(values: list[float], shift: float) -> None:
+    errors = np.full(len(values), 0.2)
+    assert sharpest(np.array(values) + shift, errors) == pytest.approx(
+        sharpest(np.array(values), errors) + shift, abs=0.02
+    )
+
+
+def test_noise_alone_holds_no_edge() -> None:
+    pixels = np.random.default_rng(0).normal(1000, NOISE_DN, (64, 70))
+    assert find_edges(pixels, noise, 4095, "plain") == []
+    assert isinstance(edge_in(pixels[:20, :20], noise, "plain"), Refusal)
+
+
+@given(st.floats(1, 6), st.floats(1, 6), st.floats(0, 0.25), st.floats(0, 0.25))
+def test_axes_are_told_apart_by_how_the_edges_lean(x: float, y: float, lean_x: float, lean_y: float) -> None:
+    """Edges that lean see both losses, added in squares; undone, each axis has its own."""
+    detector = np.sinc(FREQUENCIES)
+
+    def seen(own: float, other: float, lean: float) -> MtfCurve:
+        loss = np.sqrt((1 - lean) * own**2 + lean * other**2) * FREQUENCIES
+        contrast = detector * np.exp(-loss)
+        return MtfCurve(contrast, contrast, contrast, 5, (), lean)
+
+    found = apart(seen(x, y, lean_x), seen(y, x, lean_y))
+    assert found.contrast == pytest.approx(detector * np.exp(-x * FREQUENCIES), abs=1e-6)

@@ -1,0 +1,91 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beers_deploy.model.metrics.edge_fit import edge_response
+from beers_deploy.model.metrics.mtf_basis import (
+    BEND,
+    BENDS,
+    CORNERS,
+    PARTS,
+    at_distances,
+    mtf_at,
+    responses,
+    softened,
+    solve,
+    weights_of,
+)
+
+LOSSES = st.lists(st.floats(0, 2), min_size=PARTS - 1, max_size=PARTS - 1)
+
+
+def falling(losses: list[float]) -> np.ndarray:
+    """The weights of a curve whose logarithm falls by these numbers from corner to corner."""
+    return weights_of(np.exp(-np.cumsum([0.0, *losses])))
+
+
+@given(LOSSES)
+def test_weights_give_the_curve_at_the_corners_and_fall_between(losses: list[float]) -> None:
+    weights = falling(losses)
+    assert weights.min() >= 0
+    assert weights.sum() == pytest.approx(1)
+    optics = np.exp(-np.cumsum([0.0, *losses]))
+    assert mtf_at(CORNERS, weights) == pytest.approx(optics * np.sinc(CORNERS), abs=1e-12)
+    fine = np.linspace(0, 1, 401)
+    assert (np.diff(mtf_at(fine, weights)) <= 1e-12).all()
+    assert (mtf_at(fine, weights) <= np.sinc(fine) + 1e-12).all()
+
+
+@given(LOSSES, st.floats(-0.5, 4))
+def test_softening_multiplies_by_an_exponential(losses: list[float], softness_px: float) -> None:
+    optics = mtf_at(CORNERS[:-1], falling(losses))
+    softer = mtf_at(CORNERS[:-1], softened(falling(losses), softness_px))
+    assert softer == pytest.approx(optics * np.exp(-softness_px * CORNERS[:-1]), abs=1e-12)
+
+
+@pytest.mark.parametrize("gamma", [2.0, 4.4, 7.0])
+def test_the_edge_is_that_of_the_profiles_formula(gamma: float) -> None:
+    """But for what corners 0.05 cycles per pixel apart leave of it, and what lies beyond 1."""
+    distance = np.linspace(-9, 9, 73)
+    weights = weights_of(np.exp(-gamma * CORNERS))
+    edges, lines = responses()
+    assert at_distances(edges @ weights, distance) == pytest.approx(edge_response(distance, gamma), abs=0.006)
+    rise = at_distances(edges @ weights, distance + 0.05) - at_distances(edges @ weights, distance - 0.05)
+    assert rise / 0.1 == pytest.approx(at_distances(lines @ weights, distance), abs=0.01)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_solving_finds_a_smooth_curve_and_stays_within_what_any_curve_is(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    gamma = generator.uniform(1, 8)
+    truth = weights_of(np.exp(-gamma * CORNERS))
+    looks = generator.normal(size=(60, PARTS))
+    gram = looks.T @ looks * 1e8
+    found = solve(gram, gram @ truth)
+    assert found == pytest.approx(truth, abs=1e-3)
+    nothing = solve(np.zeros((PARTS, PARTS)) + 1e-6 * np.eye(PARTS), np.zeros(PARTS))
+    assert nothing.min() >= 0
+    assert nothing.sum() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("shape", ["exponential", "gaussian", "diffraction"])
+@pytest.mark.parametrize("at_nyquist", [0.02, 0.1, 0.3])
+def test_real_optics_bend_no_more_than_expected(shape: str, at_nyquist: float) -> None:
+    optics = at_nyquist * np.pi / 2
+    frequency = CORNERS / 0.5
+    if shape == "exponential":
+        contrast = optics**frequency
+    elif shape == "gaussian":
+        contrast = optics ** (frequency**2)
+    else:
+        cut_off = np.interp(-optics, -chat(np.linspace(0, 1, 999)), np.linspace(0, 1, 999))
+        contrast = chat(np.minimum(frequency * cut_off, 1))
+    bends = BENDS @ weights_of(contrast)
+    assert np.abs(bends[1:]).max() * BEND < 0.05
+    assert np.sqrt(np.mean(bends**2)) < 2
+
+
+def chat(share: np.ndarray) -> np.ndarray:
+    """MTF of a perfect round lens at these shares of its cut-off frequency."""
+    return np.asarray(2 / np.pi * (np.arccos(share) - share * np.sqrt(1 - share**2)))
