@@ -37,7 +37,7 @@ START = weights_of(np.exp(-4.0 * CORNERS))
 """The curve to begin with: 8.6 % at Nyquist."""
 FIRST_PASSES, PASSES, ROUNDS = 6, 2, 5
 
-TIERS = ((0.012, 3, 0.02), (0.03, 8, 0.08), (0.06, 12, 0.08))
+TIERS = ((0.012, 3, 0.02), (0.03, 8, 0.08), (0.06, 10, 0.08))
 """Of edges found by search: largest texture over step, how many such edges are needed, and the least relative
 standard error of their curve. Among 1200 steep places of photographs, those of the first kind were all within 0.5 px
 of a step's softness; of the second, one in three was not (measured)."""
@@ -66,7 +66,9 @@ aliasing."""
 WIDEST = 1.5
 """Factor by which either end of the interval at Nyquist may differ from the figure."""
 MOST_MISSING = 100
-"""More edges than that nobody has: the contrast at Nyquist cannot be told from 0."""
+"""More edges than that nobody has."""
+LEAST_AT_NYQUIST = 1e-3
+"""A lower end of the interval below it cannot be told from 0: edges that are no steps, such as lawn, end there."""
 LEAST_CONTRAST = 1e-4
 
 
@@ -135,6 +137,7 @@ class MtfCurve:
         edges: how many it rests on.
         contradicting: labels of edges that differ from the others.
         lean: mean squared sine of the edges' angle to the axis: how much of the other axis is in it.
+        missing_edges: how many more such edges would narrow the interval at Nyquist to WIDEST.
     """
 
     contrast: np.ndarray
@@ -143,18 +146,12 @@ class MtfCurve:
     edges: int
     contradicting: tuple[str, ...]
     lean: float
+    missing_edges: int = 0
 
     def at(self, frequency: float) -> tuple[float, tuple[float, float]]:
         """Contrast at one of FREQUENCIES, and its interval."""
         place = int(np.argmin(np.abs(FREQUENCIES - frequency)))
         return float(self.contrast[place]), (float(self.low[place]), float(self.high[place]))
-
-    @property
-    def missing_edges(self) -> int:
-        """How many more such edges would narrow the interval at Nyquist to WIDEST; 0 where it is narrow enough."""
-        value, (low, high) = self.at(NYQUIST)
-        excess = (math.log(max(high / value, value / low)) / math.log(WIDEST)) ** 2
-        return min(max(math.ceil(self.edges * (excess - 1)), 0), MOST_MISSING)
 
 
 def measure_curve(edges: Sequence[Edge], generator: np.random.Generator) -> MtfCurve | Refusal:
@@ -169,7 +166,7 @@ def measure_curve(edges: Sequence[Edge], generator: np.random.Generator) -> MtfC
     for _ in range(ROUNDS):
         if not fitted:
             return Refusal("no straight edge")
-        weights = solve(*_summed(fitted, weights))
+        weights = solve(*_summed(fitted, weights), weights)
         fitted = _fitted_again(fitted, weights)
     values, errors = _softness(fitted, weights)
     draws = _drawn(fitted, weights, generator)
@@ -207,7 +204,7 @@ def _curve_of_sharpest(
     for _ in range(ROUNDS):
         if len(kept) < least:
             break
-        weights = solve(*_summed(kept, weights))
+        weights = solve(*_summed(kept, weights), weights)
         fitted = _fitted_again(fitted, weights)
         values, errors = _softness(fitted, weights)
         sure = errors <= MAX_ERROR_PX
@@ -288,7 +285,7 @@ def _drawn(edges: Sequence[FittedEdge], weights: np.ndarray, generator: np.rando
         gram = np.sum([each[0] for each in drawn], axis=0)
         moment = np.sum([each[1] for each in drawn], axis=0)
         # Where pixels say little, the expected smoothness decides: it is drawn too, so that the interval says so.
-        draws.append(solve(gram, moment, generator.standard_normal(PARTS - 3)))
+        draws.append(solve(gram, moment, weights, generator.standard_normal(PARTS - 3)))
     return draws
 
 
@@ -329,10 +326,21 @@ def _with_interval(
     unknown = NORMAL_QUANTILE * floor * contrast
     low = np.maximum(contrast - np.hypot(wider * np.maximum(contrast - lowest, 0.0), unknown), LEAST_CONTRAST)
     high = contrast + np.hypot(wider * np.maximum(highest - contrast, 0.0), unknown)
-    low[0] = high[0] = 1.0
+    contrast[0] = low[0] = high[0] = 1.0
     slope = np.array([edge.line.slope for edge in edges])
     lean = float(np.mean(slope**2 / (1 + slope**2)))
-    return MtfCurve(contrast, low, np.minimum(high, detector), len(edges), contradicting, lean)
+    missing = _missing(contrast, low, high, len(edges))
+    return MtfCurve(contrast, low, np.minimum(high, detector), len(edges), contradicting, lean, missing)
+
+
+def _missing(contrast: np.ndarray, low: np.ndarray, high: np.ndarray, edges: int) -> int:
+    """Return how many more edges would narrow the interval at Nyquist to WIDEST; 0 where it is narrow enough."""
+    place = int(np.argmin(np.abs(FREQUENCIES - NYQUIST)))
+    if low[place] < LEAST_AT_NYQUIST:
+        return MOST_MISSING
+    factor = max(high[place] / contrast[place], contrast[place] / low[place])
+    excess = (math.log(factor) / math.log(WIDEST)) ** 2
+    return min(max(math.ceil(edges * (excess - 1)), 0), MOST_MISSING)
 
 
 def apart(own: MtfCurve, other: MtfCurve) -> MtfCurve:

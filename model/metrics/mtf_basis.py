@@ -24,13 +24,17 @@ SAMPLES_PER_PX, REACH_PX = 16, 24
 HIGHEST_CPX, WAVES = 2.5, 1250
 """Waves that make the tabulated edge: it repeats after 500 pixels."""
 
-BEND = 0.04
-"""Standard deviation of the second differences of the weights, before any edge is seen.
+BEND = 0.8
+"""Standard deviation of the second differences of the weights over the weights there, before any edge is seen.
 
-exp(-gamma f), a Gaussian and diffraction with 2 to 30 % at Nyquist have at most 0.01 to 0.03 (computed); where a pupil
-cuts off, 0.06."""
+exp(-gamma f), a Gaussian and diffraction with 2 to 30 % at Nyquist have 0.05 to 0.3 (computed); where a pupil cuts
+off, 1."""
 FIRST_BEND = 0.1
-"""That of the first of them: a curve may begin with a sudden loss (a veil of stray light, far tails)."""
+"""Standard deviation of the first of them: a curve may begin with a sudden loss (stray light, far tails)."""
+LEAST_WEIGHT = 0.002
+"""Below it bends are as those of this weight."""
+SMOOTHING = np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / 9
+"""Over which the weights are averaged before their bends are expected."""
 
 
 def parts_at(frequencies: ArrayLike) -> np.ndarray:
@@ -84,24 +88,32 @@ def at_distances(table: np.ndarray, distance_px: np.ndarray) -> np.ndarray:
     return np.asarray(table[row] * (1 - share) + table[row + 1] * share)
 
 
-BENDS = np.pad(np.diff(np.eye(PARTS - 1), 2, axis=0), ((0, 0), (0, 1)))
-BENDS /= np.append(FIRST_BEND, np.full(PARTS - 4, BEND))[:, None]
-"""(PARTS - 3, PARTS): second differences of the weights over what is expected of them."""
+SECOND_DIFFERENCES = np.pad(np.diff(np.eye(PARTS - 1), 2, axis=0), ((0, 0), (0, 1)))
 
 
-def solve(gram: np.ndarray, moment: np.ndarray, bends: np.ndarray | None = None) -> np.ndarray:
+def expected_bends(weights: np.ndarray) -> np.ndarray:
+    """(PARTS - 3, PARTS): second differences of weights over what is expected of them around `weights` (PARTS,)."""
+    padded = np.pad(weights[:-1], 2, mode="edge")
+    size = np.maximum(np.convolve(padded, SMOOTHING, mode="valid"), LEAST_WEIGHT)[1:-1] * BEND
+    size[0] = max(size[0], FIRST_BEND)
+    return np.asarray(SECOND_DIFFERENCES / size[:, None])
+
+
+def solve(gram: np.ndarray, moment: np.ndarray, near: np.ndarray, bends: np.ndarray | None = None) -> np.ndarray:
     """The weights that fit best, none negative and of sum 1.
 
     Args:
         gram: (PARTS, PARTS) of the least-squares problem, in units of the noise.
         moment: (PARTS,) its right side.
+        near: (PARTS,) weights near the solution: larger ones may bend more.
         bends: (PARTS - 3,) what the second differences are expected to be, over their deviations; 0 without.
     """
     from scipy.optimize import nnls  # here: who tells no sensor need not wait for SciPy
 
-    gram = gram + BENDS.T @ BENDS
+    expected = expected_bends(near)
+    gram = gram + expected.T @ expected
     if bends is not None:
-        moment = moment + BENDS.T @ bends
+        moment = moment + expected.T @ bends
     # A sum of 1 is held by a weight far above all others', and exactly by the division below.
     hold = 100.0 * np.trace(gram)
     root = np.linalg.cholesky(gram + hold + 1e-9 * np.trace(gram) * np.eye(PARTS))

@@ -1,6 +1,7 @@
 """Every command of docs/tutorials, as a reader would type it, and what it shows; each tutorial in an empty folder."""
 
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,16 @@ def test_your_sensor(tmp_path: Path) -> None:
     walked("your-sensor", tmp_path)
     assert (tmp_path / "report" / "report.html").is_file()
     assert tifffile.imread(tmp_path / "network.tif").shape == (256, 256)
+
+
+def test_real_camera(tmp_path: Path, shared_data: Path) -> None:
+    """On the frames that the page names; skipped where they are not at hand."""
+    for folder in ("frames", "restored/network", "restored/traditional"):
+        (tmp_path / folder).mkdir(parents=True)
+    for path in sorted((shared_data / "mono16").glob("*.tif")):
+        shutil.copy(path, tmp_path / "frames" / path.name.replace("garfield", "IMG"))
+    walked("real-camera", tmp_path)
+    assert tifffile.imread(tmp_path / "restored/network/IMG_161122_164605_0126_GRE.tif").dtype == "uint16"
 
 
 def test_your_network(tmp_path: Path) -> None:

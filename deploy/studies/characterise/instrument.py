@@ -27,6 +27,8 @@ from beers_deploy.studies.characterise.frames import Frames
 
 SEED = 0
 AXES = ("across", "along")
+OWN_LEAK = 0.1
+"""Of the finest detail of one frame, what may be texture where its noise is held against the others'."""
 STILL_STRUCTURE, STILL_DRIFT = 2.0, 0.02
 """Of the difference of two frames of a still scene: structure over noise, and the largest change of level."""
 
@@ -85,7 +87,7 @@ def _require_one_sensor(frames: Frames, each: Sequence[Blocks], dn: float) -> No
     seen = {}
     for path, blocks in zip(frames.paths, each, strict=True):
         line = fit_noise_model(blocks, np.random.default_rng(SEED), coloured=True)
-        if isinstance(line, NoiseModel):
+        if isinstance(line, NoiseModel) and line.leak <= OWN_LEAK:
             seen[path.name] = line.at(dn)
     if not seen:
         return
