@@ -11,6 +11,7 @@ import argparse
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ from beers_deploy.restoration.source import ArraySource, Raster
 
 LIKE = load_sensor("pleiades-degraded").nominal()
 LEAST_SIDE_PX, SIDE_PX, RATIOS = 140, 2048, (4, 2)
+STACKED = 4
 LIGHTS, NOISES = (1.0, 1.0, 0.25, 0.05, 2.0), (1.0, 1.0, 0.2)
 Image = np.ndarray
 
@@ -60,22 +62,32 @@ def main() -> None:
 
 
 def detections(scenes: Sequence[Scene], count: int, seed: int) -> None:
-    """Print how many of the faults in photographs are detected."""
+    """Print how many of the faults in photographs are detected: in single ones, and in strips of several."""
     generator = np.random.default_rng(seed)
-    seen, total = Counter[str](), Counter[str]()
-    for number in range(count):
+    kinds = {"one photograph": 1, f"{STACKED} below one another": STACKED}
+    seen, total, rows_px = Counter[tuple[str, str]](), Counter[tuple[str, str]](), dict[str, list[int]]()
+    for number, kind in product(range(count), kinds):
         sensor = SensorFamily(LIKE).draw(generator)
-        scene = scenes[int(generator.integers(len(scenes)))]
-        image = acquired(scene.radiance, sensor, number, RATIOS[1])
+        image = acquired(stacked(scenes, kinds[kind], generator), sensor, number, RATIOS[1])
+        rows_px.setdefault(kind, []).append(len(image))
         for name, put in FAULTS.items():
             faulty, detected = put(image.astype(np.float64), sensor, generator)
             stored = np.clip(np.rint(faulty), 0, sensor.max_dn).astype(np.uint16)
             hits, of = detected(look(stored, sensor))
-            seen[name] += hits
-            total[name] += of
-    print("| fault | put in | detected |\n|---|---|---|")
+            seen[name, kind] += hits
+            total[name, kind] += of
+    heads = [f"{kind}, {np.median(rows_px[kind]):.0f} rows" for kind in kinds]
+    print(f"| fault | put in, of each | {' | '.join(heads)} |\n|---|---|---|---|")
     for name in FAULTS:
-        print(f"| {name} | {total[name]} | {seen[name] / total[name]:.0%} |")
+        shares = [f"{seen[name, kind] / total[name, kind]:.0%}" for kind in kinds]
+        print(f"| {name} | {total[name, next(iter(kinds))]} | {' | '.join(shares)} |")
+
+
+def stacked(scenes: Sequence[Scene], count: int, generator: np.random.Generator) -> np.ndarray:
+    """Return the radiance of photographs below one another, as wide as the narrowest of them."""
+    chosen = [scenes[int(number)].radiance for number in generator.integers(len(scenes), size=count)]
+    width_px = min(each.shape[1] for each in chosen)
+    return np.concatenate([each[:, :width_px] for each in chosen])
 
 
 Detected = Callable[[BandFaults], tuple[int, int]]

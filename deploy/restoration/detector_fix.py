@@ -11,6 +11,7 @@ import numpy as np
 
 from beers_deploy.model.metrics.detector_lines import Stripes, constant_columns
 from beers_deploy.model.metrics.detector_pixels import PATCH_PX, wrong_pixels
+from beers_deploy.model.progress import Log
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.restoration.detector_list import FOUND, Fault, FaultList, read_list
 from beers_deploy.restoration.detector_look import as_floats, look_at_detectors, value_steps
@@ -26,19 +27,36 @@ MANY = 0.01
 """Share of the pixels from which they are no single faults."""
 ONE_SIDED = 1e-3
 """Weight of a direction with a sound neighbour on one side only, over one with two."""
-SIDES = ((0, -1), (0, 1), (-1, 0), (1, 0))
-"""Rows and columns of a step to the left, right, up and down."""
+ASLANT = 1e-6
+"""Weight of the diagonals: they count where a faulty column crosses a faulty row."""
+WAYS = (
+    ((0, -1), (0, 1), 1.0),
+    ((-1, 0), (1, 0), 1.0),
+    ((-1, -1), (1, 1), ASLANT),
+    ((-1, 1), (1, -1), ASLANT),
+)
+"""Rows and columns of a step to either side, and the weight: along a row, along a column, aslant."""
 
 
-def faults_of(source: Source, wanted: str, name: str) -> FaultList:
+def faults_of(source: Source, wanted: str, name: str, log: Log) -> FaultList:
     """Return the faults that `restore --fix-detectors` names.
 
     Args:
         source: the image.
-        wanted: 'found', or the file of a list.
+        wanted: 'found', or the file of a list; empty for none.
         name: of the image, for messages.
+        log: is told how many will be replaced.
     """
-    return find_faults(source, name) if wanted == FOUND else read_list(Path(wanted), source.raster)
+    if not wanted:
+        return FaultList(())
+    found = find_faults(source, name) if wanted == FOUND else read_list(Path(wanted), source.raster)
+    log(f"faulty detectors: {found.words} {'found' if wanted == FOUND else 'listed'}, to be interpolated")
+    return found
+
+
+def fixed(source: Source, faults: FaultList) -> Source:
+    """Return an image without its faults; the image itself if there are none."""
+    return FixedSource(source, faults) if faults.faults else source
 
 
 def find_faults(source: Source, name: str) -> FaultList:
@@ -95,7 +113,8 @@ class FixedSource:
     """An image whose faulty pixels are replaced by interpolation between sound neighbours.
 
     A pixel is interpolated along its row and along its column, between the nearest sound pixels within `REACH_PX`;
-    the shorter way counts more. Where no sound pixel is in reach it stays, and so does a missing one.
+    the shorter way counts more. Where neither has any, the diagonals count. Where no sound pixel is in reach it
+    stays, and so does a missing one.
     """
 
     def __init__(self, source: Source, faults: FaultList) -> None:
@@ -139,24 +158,24 @@ def replace_pixels(plane: np.ndarray, bad: np.ndarray, sound: np.ndarray, nodata
         nodata: a value that no replaced pixel may take; None for none.
     """
     places = np.argwhere(bad)
-    found = [_nearest(plane, sound, places, np.array(side)) for side in SIDES]
-    values, distances = (np.array(each) for each in zip(*found, strict=True))
     total, weights = np.zeros(len(places)), np.zeros(len(places))
-    for one, other in ((0, 1), (2, 3)):
-        near, far = distances[one], distances[other]
+    closest, distance = np.zeros(len(places)), np.full(len(places), np.inf)
+    for one, other, weight in WAYS:
+        (left, near), (right, far) = (_nearest(plane, sound, places, np.array(side)) for side in (one, other))
         both, either = np.isfinite(near) & np.isfinite(far), np.isfinite(near) | np.isfinite(far)
-        single = np.where(np.isfinite(near), values[one], values[other])
+        single = np.where(near <= far, left, right)
         with np.errstate(invalid="ignore"):
-            between = (values[one] * far + values[other] * near) / (near + far)
-        weight = np.where(both, 1 / (near + far), np.where(either, ONE_SIDED / np.minimum(near, far), 0))
-        total += weight * np.where(both, between, np.where(either, single, 0))
-        weights += weight
+            between = (left * far + right * near) / (near + far)
+        share = np.where(both, 1 / (near + far), np.where(either, ONE_SIDED / np.minimum(near, far), 0)) * weight
+        total += share * np.where(both, between, single)
+        weights += share
+        closest = np.where(np.minimum(near, far) < distance, single, closest)
+        distance = np.minimum(distance, np.minimum(near, far))
     reached = weights > 0
     result = total[reached] / weights[reached]
     result = (np.rint(result) if plane.dtype.kind in "ui" else result).astype(plane.dtype)
     if nodata is not None:
-        nearest = values[np.argmin(distances, axis=0), np.arange(len(places))][reached].astype(plane.dtype)
-        result = np.where(result == plane.dtype.type(nodata), nearest, result)
+        result = np.where(result == plane.dtype.type(nodata), closest[reached].astype(plane.dtype), result)
     rows, columns = places[reached].T
     plane[rows, columns] = result
 

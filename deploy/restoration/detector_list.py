@@ -12,11 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
+from beers_deploy.model.io.files import write_text
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.restoration.source import Raster
 
 OPTION, FOUND = "--fix-detectors", "found"
 HEADER, ALL = ("column", "row", "band"), "*"
+DIGITS = 9
+"""Of a number: no image is larger."""
 
 
 @dataclass(frozen=True, order=True)
@@ -66,6 +69,11 @@ class FaultList:
         words = [f"{count} {name}{'s' if count > 1 else ''}" for name, count in counts.items() if count]
         return ", ".join(words) or "none"
 
+    @property
+    def text_of_row(self) -> dict[str, str]:
+        """For a row of results: what was replaced."""
+        return {"detectors replaced": self.words} if self.faults else {}
+
     def mask(self, raster: Raster, start: int, stop: int) -> np.ndarray:
         """Return where pixels of rows `start` to `stop` (excluded) are faulty, bool (bands, rows, width)."""
         flags = np.zeros((raster.bands, stop - start, raster.width_px), bool)
@@ -83,6 +91,17 @@ class FaultList:
         """Column, row and band of each, (n, 3)."""
         places = [(fault.column, fault.row, fault.band) for fault in self.faults]
         return np.array(places, np.int64).reshape(-1, 3)
+
+
+def list_beside(out: Path, wanted: str) -> Path | None:
+    """Return where the list of found faults is written, beside the restored image; None if none are searched for."""
+    return out.with_name(f"{out.stem}.detectors.csv") if wanted == FOUND else None
+
+
+def write_list(faults: FaultList, path: Path | None) -> None:
+    """Write the faults that were found, if any; None asks for no file."""
+    if path is not None and faults.faults:
+        write_text(path, faults.text)
 
 
 def read_list(path: Path, raster: Raster) -> FaultList:
@@ -116,7 +135,7 @@ def _fault(where: str, line: str, cells: tuple[str, ...], raster: Raster) -> Fau
     """Return the fault of one line."""
     sizes = raster.width_px, raster.height_px, raster.bands + 1
     expected = "column,row or column,row,band"
-    numbers = [-1 if cell == ALL else int(cell) if cell.isascii() and cell.isdecimal() else None for cell in cells]
+    numbers = [_number(cell) for cell in cells]
     if len(numbers) not in (2, 3) or None in numbers or numbers[:2] == [-1, -1] or numbers[2:] in ([-1], [0]):
         got = repr(line[:40])
         raise OptionError(OPTION, expected=expected, got=f"{where}: {got}", remedy="correct or delete the line")
@@ -126,3 +145,10 @@ def _fault(where: str, line: str, cells: tuple[str, ...], raster: Raster) -> Fau
         got = f"{where}: {line.strip()}"
         raise OptionError(OPTION, expected=f"pixels of an image of {image}", got=got, remedy="count from 0")
     return Fault(*placed)
+
+
+def _number(cell: str) -> int | None:
+    """Return the number in a cell, -1 for all; None for anything else."""
+    if cell == ALL:
+        return -1
+    return int(cell) if cell.isascii() and cell.isdecimal() and len(cell) <= DIGITS else None

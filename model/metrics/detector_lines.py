@@ -22,11 +22,11 @@ LEVEL_LINES = 9
 """Lines over whose median a line's level is taken, so that its own fault does not matter."""
 PARITY_LINES = 63
 """Lines over which alternate lines are averaged; their pattern is `Phases`, and no gain of single lines."""
-SIGNIFICANT = 5.5
-"""Standard errors. Of 40 000 lines of Gaussian noise 0.002 reach it."""
+SIGNIFICANT = 6.0
+"""Standard errors. Noise of 40 000 lines reaches it once in 10 000 images."""
 CLEAR = 12.0
 """Standard errors within one block from which a part of a line is judged alone."""
-SURE = 3.0
+SURE = 1.0
 """Standard errors by which a part of a line is alone."""
 REACH = 3
 """Lines to either side of which a single line is the largest, and what is not judged along a border."""
@@ -34,13 +34,15 @@ ASKEW = 0.3
 """Of a line's deviation, by how much the lines around may depart from what a single one leaves there."""
 PART = 0.02
 """Least gain of a part of a line."""
-AGREE = 0.8
+AGREE = 0.75
 """Share of the blocks in which a line must be off to the same side."""
-ISOLATED = 0.7
-"""Least isolation of a line: 1 for a detector; of light it is 0.42 where the MTF at Nyquist is 30 %, and 0.03 at 15 %
-(Gaussian, centred on the line)."""
+ISOLATED, LEAST_ISOLATED = 0.75, 0.55
+"""Least isolation of a line that is measured well, and of any: 1 for a detector. Of a thin bright line it is 0.70,
+0.46, 0.27 and 0.02 where the MTF at Nyquist is 30, 20, 15 and 10 % (a Gaussian centred on a pixel)."""
 SPREAD_SIGNIFICANT = 4.0
 """Standard errors of the covariance from which the spread of all lines is significant."""
+LINES = 16
+"""Lines from which their spread can be told."""
 WHITE = -0.35
 """Correlation of neighbouring second differences: -2/3 for independent detectors; it was above -0.1 for scenes."""
 MAD = 1.4826
@@ -162,8 +164,9 @@ def constant_columns(pixels: np.ndarray) -> np.ndarray:
 
     NaN is a missing pixel, which says nothing.
     """
-    still = np.fmax.reduce(pixels, axis=0) == np.fmin.reduce(pixels, axis=0)
-    moving = ~still & np.isfinite(pixels).any(0)
+    same = np.fmax.reduce(pixels, axis=0) == np.fmin.reduce(pixels, axis=0)
+    known = np.isfinite(pixels).sum(0)
+    still, moving = same & (known >= FEW), ~same & (known > 0)
     left, right = np.roll(moving, 1), np.roll(moving, -1)
     left[0] = right[-1] = False
     pair = still & np.roll(still, -1) & left & np.roll(right, -1)
@@ -190,21 +193,25 @@ def judge_lines(blocks: Blocks, least: float) -> Stripes:
         blocks: of all lines.
         least: the gain that matters, over the level.
     """
-    with np.errstate(invalid="ignore", divide="ignore"):
-        gains, errors = blocks.second / blocks.level, blocks.error / blocks.level
+    measured = np.isfinite(blocks.second) & np.isfinite(blocks.level)
+    dead = np.flatnonzero(_always(blocks.constant, measured | blocks.constant))
+    seen_at_all = measured.any(1)
+    if not seen_at_all.any():
+        return Stripes(dead=tuple(dead.tolist()))
+    level = blocks.level[seen_at_all]
+    gains, errors = blocks.second[seen_at_all] / level, blocks.error[seen_at_all] / level
     errors = np.maximum(errors, 1e-6)
     gains = _without_parity(gains)
     mean, error = _combined(gains, errors)
-    dead = np.flatnonzero(_always(blocks.constant, np.isfinite(blocks.second) | blocks.constant))
     spread, spread_error, seen = _spread(gains, errors)
     off = _single(mean, error, gains, errors, least)
     return Stripes(
         spread=spread,
         spread_error=spread_error,
-        seen=seen and spread is not None and spread > least,
+        seen=seen and spread is not None and spread - spread_error > least,
         off=tuple(line for line in off if line.index not in set(dead.tolist())),
         dead=tuple(dead.tolist()),
-        grows_with_level=_grows(gains, errors, blocks.level),
+        grows_with_level=_grows(gains, errors, level),
     )
 
 
@@ -217,7 +224,7 @@ def _without_parity(gains: np.ndarray) -> np.ndarray:
     """Return (blocks, lines) without what alternate lines have in common nearby."""
     sign = 1 - 2.0 * (np.arange(gains.shape[1]) % 2)
     size = min(PARITY_LINES, gains.shape[1])
-    bound = 3 * np.nanmedian(np.abs(gains), axis=1, keepdims=True) if np.isfinite(gains).any() else 0
+    bound = 3 * np.nanmedian(np.abs(gains), axis=1, keepdims=True)
     shared = uniform_filter1d(np.clip(np.nan_to_num(gains) * sign, -bound, bound), size, axis=1, mode="nearest")
     return np.asarray(gains - shared * sign)
 
@@ -244,18 +251,15 @@ def _spread(gains: np.ndarray, errors: np.ndarray) -> tuple[float | None, float,
     first, _ = _combined(gains[::2], errors[::2])
     other, _ = _combined(gains[1::2], errors[1::2])
     both = np.isfinite(first) & np.isfinite(other)
-    count = int(both.sum())
-    if count < 16:
+    if both.sum() < LINES:
         return None, 0.0, False
     covariance, error = _covariance(first[both], other[both])
-    beside = both[:-1] & both[1:]
-    next_one = np.mean(
-        [
-            _covariance(first[:-1][beside], other[1:][beside])[0],
-            _covariance(other[:-1][beside], first[1:][beside])[0],
-        ]
-    )
     spread = float(np.sqrt(max(covariance, 0) / SECOND))
+    if error == 0:  # constant lines
+        return spread, 0.0, False
+    pairs = both[:-1] & both[1:]
+    crossed = ((first[:-1], other[1:]), (other[:-1], first[1:]))
+    next_one = np.mean([_covariance(left[pairs], right[pairs])[0] for left, right in crossed])
     spread_error = float(error / (2 * SECOND * max(spread, np.sqrt(error / SECOND))))
     seen = covariance > SPREAD_SIGNIFICANT * error and next_one < WHITE * covariance
     return spread, spread_error, bool(seen)
@@ -271,7 +275,7 @@ def _covariance(first: np.ndarray, other: np.ndarray) -> tuple[float, float]:
 
 def _single(mean: np.ndarray, error: np.ndarray, gains: np.ndarray, errors: np.ndarray, least: float) -> list[Line]:
     """Return the lines that are off alone, the largest deviation first."""
-    alone = _alone(mean, error, 0.0)
+    alone = _alone(mean, error, -1.0)
     with np.errstate(invalid="ignore"):
         known = np.isfinite(gains).sum(0)
         like = np.abs(gains - mean) < np.maximum(3 * errors, np.abs(mean) / 2)
@@ -294,7 +298,7 @@ def _single(mean: np.ndarray, error: np.ndarray, gains: np.ndarray, errors: np.n
 
 
 def _alone(second: np.ndarray, error: np.ndarray, sure: float) -> np.ndarray:
-    """Return which lines are alone with their deviation, by so many standard errors.
+    """Return which lines are alone with their deviation, by so many standard errors more than `ISOLATED`.
 
     The second differences around a single line of gain g are (0, -g/2, g, -g/2, 0), and those of a blurred bright
     line fall off over five lines: with r and q, the sums over the next lines and the ones after them over -g, the
@@ -311,7 +315,8 @@ def _alone(second: np.ndarray, error: np.ndarray, sure: float) -> np.ndarray:
         slack = np.maximum(ASKEW * np.abs(second), 3 * error)
         like = np.all(np.abs(beside - expected[:, None] * second) < slack, axis=0)
         largest = np.all(np.abs(second) > np.abs(beside), axis=0)
-        return np.asarray(like & largest & (isolation - sure * unsure > ISOLATED))
+        needed = np.maximum(ISOLATED + sure * unsure, LEAST_ISOLATED)
+        return np.asarray(like & largest & (isolation > needed))
 
 
 def _grows(gains: np.ndarray, errors: np.ndarray, level: np.ndarray) -> bool | None:
@@ -322,7 +327,7 @@ def _grows(gains: np.ndarray, errors: np.ndarray, level: np.ndarray) -> bool | N
     if len(gains) < 3:
         return None
     values = np.where(np.isfinite(gains), gains, 0)
-    levels = np.nanmean(level, axis=1, where=np.isfinite(level)) if np.isfinite(level).any() else np.ones(len(gains))
+    levels = np.nanmean(level, axis=1)
     fits, weights = [], []
     for number in range(len(values)):
         others, _ = _combined(np.delete(gains, number, 0), np.delete(errors, number, 0))

@@ -23,7 +23,7 @@ SIGNIFICANT = 4.0
 """Standard errors from which a section counts."""
 MANY = 0.2
 """Share of the sections that must show the pattern significantly."""
-PATTERNS = ("alternate columns", "alternate rows", "a checkerboard")
+PATTERNS = ("alternate columns", "alternate rows", "checkerboard")
 COLOUR = 0.05
 """Difference over the level from which the pattern is rather a mosaic of colour filters."""
 

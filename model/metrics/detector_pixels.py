@@ -11,9 +11,9 @@ PATCH_PX = 4
 """Pixels around one that are compared with it."""
 LEAST = 9.0
 """Standard deviations of the texture and noise around by which a wrong pixel is off at least."""
-ISOLATED = 0.5
-"""Least isolation of a wrong pixel, two standard errors taken off: 1 for a detector. Of light it is 0.42 where the
-MTF at Nyquist is 30 %, and 0.03 at 15 % (Gaussian, centred on the pixel)."""
+ISOLATED, SURE = 0.75, 1.5
+"""Least isolation of a wrong pixel, so many standard errors taken off: 1 for a detector. Of a point of light it is
+0.70, 0.46, 0.27 and 0.02 where the MTF at Nyquist is 30, 20, 15 and 10 % (a Gaussian centred on a pixel)."""
 DEAD, BRIGHT, DARK = 0.3, 0.6, 10.0
 """A pixel below the first share of its ground, whose neighbours are all above the second: no shadow is that narrow.
 Ground below so many standard deviations is too dark to tell."""
@@ -43,6 +43,8 @@ def wrong_pixels(pixels: np.ndarray, step: float = 0.0) -> np.ndarray:
     places = _candidates(pixels)
     windows = np.lib.stride_tricks.sliding_window_view(pixels, (size, size))
     patches = windows[places[:, 0] - PATCH_PX, places[:, 1] - PATCH_PX].astype(np.float64)
+    known = np.isfinite(patches).sum((1, 2)) > KNOWN
+    places, patches = places[known], patches[known]
     return places[_wrong(patches, step)] if len(places) else places
 
 
@@ -69,7 +71,6 @@ def _wrong(patches: np.ndarray, step: float) -> np.ndarray:
     single pixel of excess e leaves e there, -e/2 beside it and 0 two pixels on; a point of light leaves less beside
     it and more two pixels on.
     """
-    known = np.isfinite(patches).reshape(len(patches), -1).sum(1) > KNOWN
     along = patches[:, 1:-1] - (patches[:, :-2] + patches[:, 2:]) / 2
     both = along[:, :, 1:-1] - (along[:, :, :-2] + along[:, :, 2:]) / 2
     centre = both[:, 3, 3]
@@ -86,8 +87,8 @@ def _wrong(patches: np.ndarray, step: float) -> np.ndarray:
     with np.errstate(invalid="ignore", divide="ignore"):
         isolation = 2 * (far - near) / centre
         unsure = 1.5 * scatter / np.abs(centre)
-        alone = (np.abs(centre) > LEAST * scatter) & (isolation - 2 * unsure > ISOLATED)
+        alone = (np.abs(centre) > LEAST * scatter) & (isolation - SURE * unsure > ISOLATED)
     middle = patches[:, 3:6, 3:6].reshape(len(patches), 9)
     around = np.delete(middle, 4, axis=1)
     dead = (middle[:, 4] < DEAD * ground) & (around.min(1) > BRIGHT * ground) & (ground > DARK * scatter)
-    return np.asarray(known & np.isfinite(isolation) & (alone | dead))
+    return np.asarray(np.isfinite(isolation) & (alone | dead))
