@@ -25,7 +25,7 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene, crop_divisible, read_scene
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.restoration.detector_look import BandFaults, look_at_detectors
+from beers_deploy.restoration.detectors.look import BandFaults, look_at_detectors
 from beers_deploy.restoration.source import ArraySource, Raster
 
 LIKE = load_sensor("pleiades-degraded").nominal()

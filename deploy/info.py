@@ -20,7 +20,7 @@ from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.restoration.detector_words import warn_of_detectors
+from beers_deploy.restoration.detectors.words import warn_of_detectors
 from beers_deploy.restoration.georeference import KEYS, PIXEL_SCALE, POLYNOMIALS, TIE_POINTS, TRANSFORMATION, geo_keys
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.plan import Plan, plan_for

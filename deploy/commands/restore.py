@@ -127,7 +127,7 @@ def restore(
     from beers_deploy.network_files import brighter_files, conditioned, network_file
     from beers_deploy.restoration.bands import parse_sensors
     from beers_deploy.restoration.cog import write_item
-    from beers_deploy.restoration.detector_list import FOUND, list_beside
+    from beers_deploy.restoration.detectors.fault_list import FOUND, list_beside
     from beers_deploy.restoration.run import restore_file
     from beers_deploy.results import Input, Table, print_rows
 

@@ -34,9 +34,9 @@ from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.reading.external import network_sha256, unchanged
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.cog import disk_bytes, what_was_done, write_cog
-from beers_deploy.restoration.detector_fix import faults_of, fixed
-from beers_deploy.restoration.detector_list import list_beside, write_list
-from beers_deploy.restoration.detector_words import warn_of_detectors
+from beers_deploy.restoration.detectors.fault_list import list_beside, write_list
+from beers_deploy.restoration.detectors.fix import faults_of, fixed
+from beers_deploy.restoration.detectors.words import warn_of_detectors
 from beers_deploy.restoration.georeference import unread_places
 from beers_deploy.restoration.options import Compression, Options
 from beers_deploy.restoration.output import Checkpoint, require_codec, require_tiff_name, write_output

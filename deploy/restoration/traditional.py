@@ -19,8 +19,8 @@ from beers_deploy.model.progress import Log, Steps, no_log, steps
 from beers_deploy.model.traditional.pipeline import Chain, restore_strips
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Row, measured
-from beers_deploy.restoration.detector_fix import faults_of, fixed
-from beers_deploy.restoration.detector_list import list_beside, write_list
+from beers_deploy.restoration.detectors.fault_list import list_beside, write_list
+from beers_deploy.restoration.detectors.fix import faults_of, fixed
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.output import Checkpoint, write_output

@@ -10,6 +10,7 @@ A line is measured in several blocks along it. Detectors repeat themselves in al
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
@@ -41,6 +42,8 @@ ISOLATED, LEAST_ISOLATED = 0.75, 0.55
 0.46, 0.27 and 0.02 where the MTF at Nyquist is 30, 20, 15 and 10 % (a Gaussian centred on a pixel)."""
 SPREAD_SIGNIFICANT = 4.0
 """Standard errors of the covariance from which the spread of all lines is significant."""
+LEVELS = 1.3
+"""Ratio of the levels of blocks from which gains are told from offsets."""
 LINES = 16
 """Lines from which their spread can be told."""
 WHITE = -0.35
@@ -130,12 +133,12 @@ def measure_lines(pixels: np.ndarray, valid: np.ndarray) -> Blocks:
         return Blocks(nothing, nothing, nothing, constant[None])
     second = pixels[:, 1:-1] - (pixels[:, :-2] + pixels[:, 2:]) / 2
     known = valid[:, 1:-1] & valid[:, :-2] & valid[:, 2:]
-    measured = (np.pad(each, 1, constant_values=np.nan)[None] for each in _location(second, known))
+    located, error = (np.pad(each, 1, constant_values=np.nan)[None] for each in _location(second, known))
     count = valid.sum(0)
     with np.errstate(invalid="ignore", divide="ignore"):
         level = np.where(4 * count >= rows, pixels.sum(0, dtype=np.float64, where=valid) / count, 0)
         around = median_filter(level, LEVEL_LINES, mode="nearest")
-        return Blocks(*measured, np.where(around > 0, around, np.nan)[None], constant[None])
+        return Blocks(located, error, np.where(around > 0, around, np.nan)[None], constant[None])
 
 
 def _location(values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -322,32 +325,31 @@ def _alone(second: np.ndarray, error: np.ndarray, sure: float) -> np.ndarray:
 def _grows(gains: np.ndarray, errors: np.ndarray, level: np.ndarray) -> bool | None:
     """Say whether the pattern of lines grows with the level; None where blocks of other levels do not tell.
 
-    The pattern of the other blocks is fitted to each block; of gains it fits all blocks alike.
+    The pattern of the other blocks is fitted to each block. Over the level, gains fit all blocks alike, and offsets
+    fall as 1 / level: the slope of the logarithms is 0 or -1.
     """
-    if len(gains) < 3:
-        return None
-    values = np.where(np.isfinite(gains), gains, 0)
+    fits, unsure = (
+        np.array(each) for each in zip(*map(partial(_fit, gains, errors), range(len(gains))), strict=True)
+    )
     levels = np.nanmean(level, axis=1)
-    fits, weights = [], []
-    for number in range(len(values)):
-        others, _ = _combined(np.delete(gains, number, 0), np.delete(errors, number, 0))
-        pattern = np.nan_to_num(others)
-        power = float(np.square(pattern).sum())
-        fits.append(float((pattern * values[number]).sum()) / power if power else 0.0)
-        noise = float(np.sqrt((np.square(pattern) * np.square(np.nan_to_num(errors[number]))).sum()))
-        weights.append(power / noise if noise else 0.0)
-    fits_, weights_ = np.array(fits), np.array(weights)
-    use = (fits_ > 0) & (weights_ > 0) & np.isfinite(levels) & (levels > 0)
-    if use.sum() < 3:
+    use = (fits > 0) & np.isfinite(unsure)
+    if use.sum() < 3 or np.ptp(np.log(levels[use])) < np.log(LEVELS):
         return None
-    x, y, w = np.log(levels[use]), np.log(fits_[use]), np.square(weights_[use] * fits_[use])
-    x, y = x - np.average(x, weights=w), y - np.average(y, weights=w)
-    power = float((w * x * x).sum())
-    if power == 0:
-        return None
-    slope = float((w * x * y).sum()) / power
-    rest = float((w * np.square(y - slope * x)).sum()) / max(int(use.sum()) - 2, 1)
+    x, y, weights = np.log(levels[use]), np.log(fits[use]), np.square(fits[use] / unsure[use])
+    x, y = (each - np.average(each, weights=weights) for each in (x, y))
+    power = float((weights * x * x).sum())
+    slope = float((weights * x * y).sum()) / power
+    rest = float((weights * np.square(y - slope * x)).sum()) / (len(x) - 2)
     error = float(np.sqrt(max(rest, 1) / power))
-    if abs(slope + 0.5) < 2 * error:
-        return None
-    return slope > -0.5
+    return None if abs(slope + 1 / 2) < 3 * error else slope > -1 / 2
+
+
+def _fit(gains: np.ndarray, errors: np.ndarray, number: int) -> tuple[float, float]:
+    """Return by what factor the pattern of the other blocks fits one block, and the standard error of that."""
+    others, _ = _combined(np.delete(gains, number, 0), np.delete(errors, number, 0))
+    pattern = np.nan_to_num(others)
+    power = float(np.square(pattern).sum())
+    if power == 0:
+        return 0.0, np.inf
+    noise = float(np.sqrt(np.square(pattern * np.nan_to_num(errors[number])).sum()))
+    return float((pattern * np.nan_to_num(gains[number])).sum()) / power, noise / power if noise else np.inf

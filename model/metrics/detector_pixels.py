@@ -45,7 +45,7 @@ def wrong_pixels(pixels: np.ndarray, step: float = 0.0) -> np.ndarray:
     patches = windows[places[:, 0] - PATCH_PX, places[:, 1] - PATCH_PX].astype(np.float64)
     known = np.isfinite(patches).sum((1, 2)) > KNOWN
     places, patches = places[known], patches[known]
-    return places[_wrong(patches, step)] if len(places) else places
+    return np.asarray(places[_wrong(patches, step)]) if len(places) else places
 
 
 def _candidates(pixels: np.ndarray) -> np.ndarray:

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.restoration.detector_fix import REACH_PX, FixedSource, find_faults
-from beers_deploy.restoration.detector_list import Fault, FaultList, read_list
-from beers_deploy.restoration.detector_look import LOOKED_PX, look_at_detectors
-from beers_deploy.restoration.detector_words import sentences
+from beers_deploy.restoration.detectors.fault_list import Fault, FaultList, read_list
+from beers_deploy.restoration.detectors.fix import REACH_PX, FixedSource, find_faults
+from beers_deploy.restoration.detectors.look import LOOKED_PX, look_at_detectors
+from beers_deploy.restoration.detectors.words import sentences
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
 from beers_deploy.restoration.source import ArraySource, Raster, VeiledSource

@@ -13,8 +13,8 @@ from beers_deploy.model.metrics.detector_lines import Stripes, constant_columns
 from beers_deploy.model.metrics.detector_pixels import PATCH_PX, wrong_pixels
 from beers_deploy.model.progress import Log
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.restoration.detector_list import FOUND, Fault, FaultList, read_list
-from beers_deploy.restoration.detector_look import as_floats, look_at_detectors, value_steps
+from beers_deploy.restoration.detectors.fault_list import FOUND, Fault, FaultList, read_list
+from beers_deploy.restoration.detectors.look import as_floats, look_at_detectors, value_steps
 from beers_deploy.restoration.source import Plane, Raster, Source, strips
 
 REACH_PX = 16
