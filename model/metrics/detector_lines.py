@@ -278,26 +278,31 @@ def _covariance(first: np.ndarray, other: np.ndarray) -> tuple[float, float]:
 
 def _single(mean: np.ndarray, error: np.ndarray, gains: np.ndarray, errors: np.ndarray, least: float) -> list[Line]:
     """Return the lines that are off alone, the largest deviation first."""
-    alone = _alone(mean, error, -1.0)
     with np.errstate(invalid="ignore"):
         known = np.isfinite(gains).sum(0)
         like = np.abs(gains - mean) < np.maximum(3 * errors, np.abs(mean) / 2)
         agree = (like & (np.sign(gains) == np.sign(mean))).sum(0) >= AGREE * np.maximum(known, 2)
-        off = (np.abs(mean) > np.maximum(least, SIGNIFICANT * error)) & agree & alone
-        # A part of a line, such as a hot column below its hot pixel: there light would have to be excluded surely.
-        clear = np.abs(gains) > np.maximum(CLEAR * errors, PART)
-        sure = clear & np.array([_alone(each, its, SURE) for each, its in zip(gains, errors, strict=True)])
-        partly = (sure.sum(0) >= 2) & (4 * sure.sum(0) >= 3 * clear.sum(0))
+        off = (np.abs(mean) > np.maximum(least, SIGNIFICANT * error)) & agree & _alone(mean, error, -1.0)
     farthest = np.argmax(np.abs(np.nan_to_num(gains)), axis=0)
     largest = np.where(off, mean, np.take_along_axis(gains, farthest[None], axis=0)[0])
-    chosen = sorted(np.flatnonzero(off | partly), key=lambda index: -abs(largest[index]))
     taken = set[int]()
     lines = []
-    for index in chosen:
+    for index in sorted(np.flatnonzero(off | _partly(gains, errors)), key=lambda index: -abs(largest[index])):
         if not taken & {index - 1, index + 1}:  # neighbours are off by half of it, to the other side
             taken.add(int(index))
             lines.append(Line(int(index), float(largest[index]), float(error[index])))
     return lines
+
+
+def _partly(gains: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Return which lines are off in some of the blocks, such as a hot column below its hot pixel.
+
+    Most blocks say nothing of such a line, so that light must be excluded in each of the others.
+    """
+    with np.errstate(invalid="ignore"):
+        clear = np.abs(gains) > np.maximum(CLEAR * errors, PART)
+    sure = clear & np.array([_alone(each, its, SURE) for each, its in zip(gains, errors, strict=True)])
+    return np.asarray((sure.sum(0) >= 2) & (4 * sure.sum(0) >= 3 * clear.sum(0)))
 
 
 def _alone(second: np.ndarray, error: np.ndarray, sure: float) -> np.ndarray:

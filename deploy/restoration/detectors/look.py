@@ -24,7 +24,7 @@ from beers_deploy.model.metrics.detector_pixels import wrong_pixels
 from beers_deploy.restoration.source import Raster, Source
 
 LOOKED_PX = 1 << 23
-"""Pixels of all bands that are looked at: a second on one core (measured)."""
+"""Pixels of all bands that are looked at: one to two seconds on one core (measured)."""
 STRIP_PX, LEAST_STRIP_PX, LEAST_ROWS_PX = 128, 16, 64
 """Rows of a strip, the least of them, and the least of all strips together."""
 MARGIN_PX = 4

@@ -116,7 +116,7 @@ def _figures(band: BandFaults) -> dict[str, Figure]:
     pattern = max((pattern.difference for pattern in band.patterns), default=math.nan)
     return {
         **{f"{name} differ by": _spread(found, rms) for name, found in lines.items()},
-        "pattern of two pixels": measured(100 * pattern, "%", f"the strongest of three, {rms}"),
+        "2 x 2 pattern": measured(100 * pattern, "%", f"the strongest of three, {rms}"),
         "lines off": measured(sum(len(each.off) for each in lines.values()), "1", f"single columns and rows, {how}"),
         "dead lines": measured(sum(len(each.dead) for each in lines.values()), "1", f"columns and rows, {how}"),
         "wrong pixels": measured(len(band.pixels), "1", f"single ones, {how}"),
