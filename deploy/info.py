@@ -1,7 +1,7 @@
 """What the tool makes of an image file, before anyone waits for it.
 
-No pixel of a TIFF is read unless a sensor is told: then windows of the image are held against it. Time here is
-predicted only from tiles that were timed; time on the board is the cost model's.
+Of a TIFF only strips are read, which are searched for faults of detectors, and windows where a sensor is told, which
+are held against it. Time here is predicted only from tiles that were timed; time on the board is the cost model's.
 """
 
 import math
@@ -20,6 +20,7 @@ from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.restoration.detectors.words import warn_of_detectors
 from beers_deploy.restoration.georeference import KEYS, PIXEL_SCALE, POLYNOMIALS, TIE_POINTS, TRANSFORMATION, geo_keys
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.plan import Plan, plan_for
@@ -45,13 +46,14 @@ def info_row(image: Path, options: Options, target: TargetProfile, measure: bool
         options: as a restoration would be given them.
         target: the board whose time is predicted.
         measure: whether tiles are timed here.
-        log: is told where the image contradicts its sensor.
+        log: is told of faults of detectors, and where the image contradicts its sensor.
     """
     network = load_onnx(options.model)
     with open_source(image, options.trust_index) as source:
         raster = source.raster
         scale = known_scale(image.name, raster, options)
         check = SensorCheck()
+        detectors = warn_of_detectors(source, scale.value if isinstance(scale, FullScale) else math.inf, log)
         if isinstance(scale, FullScale):
             check = told_sensor(source, options.sensors, scale.value, str(image), options.strict, log)
     plan = plan_for(network, raster.shape, options)
@@ -63,6 +65,7 @@ def info_row(image: Path, options: Options, target: TargetProfile, measure: bool
         "time here": time_here(network, plan, options) if measure else unavailable("s", UNTIMED),
         f"time on {target.name}": time_on_board(options.model, plan, target),
         **check.figures,
+        **detectors,
     }
     open_scale = {"full scale": "open", "full scale from": str(scale)}
     text = {"pixels": str(raster.dtype), **(scale.text if isinstance(scale, FullScale) else open_scale)}

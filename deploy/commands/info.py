@@ -36,8 +36,9 @@ def info(
     """Say what an image is, how it would be cut and how long that would take.
 
     Shows size, type, full scale and who states it, place on Earth, missing pixels, and the plan of `restore`.
-    --sensor reads windows of FILE and holds their noise and edges against what the sensor states. No other pixel is
-    read, but of PNG, JPEG and TIFFs of several pages.
+    Strips of FILE are searched for stripes, dead and hot columns and pixels. --sensor reads windows of FILE and holds
+    their noise and edges against what the sensor states. No other pixel is read, but of PNG, JPEG and TIFFs of
+    several pages.
     """
     from beers_deploy.info import info_row
     from beers_deploy.model.io.files import require_writable

@@ -1,6 +1,6 @@
 """`beers-deploy restore`: a raw image in, the restored one out, of any size."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from enum import StrEnum
 from functools import partial
@@ -100,6 +100,13 @@ def restore(
         bool,
         typer.Option("--exposure/--no-exposure", help="Restore dark parts at a higher exposure (shipped networks)."),
     ] = True,
+    fix_detectors: Annotated[
+        str | None,
+        typer.Option(
+            help="Interpolate faulty pixels before restoration: 'found', which writes their list beside OUT as "
+            "NAME.detectors.csv, or such a list: lines column,row, with * as the row for a whole column."
+        ),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped or killed.")] = False,
     json: Json = None,
 ) -> None:
@@ -108,7 +115,8 @@ def restore(
     The image is read and written by rows, so memory does not grow with its height. OUT has the scale of IN. Bands are
     restored one by one. Georeference, RPCs, missing pixels (NaN, the nodata value, or a mask) and alpha are kept.
     A shipped network, in float32 (NAME) or INT8 (NAME-int8), is conditioned on --sensor, and without it on the middle
-    of its range. IN's own noise and edges are compared with --sensor. The consistency step keeps the mean and the
+    of its range. IN's own noise and edges are compared with --sensor, and
+    stripes, dead and hot columns and pixels are warned of. The consistency step keeps the mean and the
     flux of points; exposure lets INT8 restore dark parts as well as bright ones.
     --method traditional restores one band, about a minute a megapixel on two cores, and is not resumable.
     JPEG 2000, NITF, HFA, VRT and DIMAP need the extra 'gdal'. Until OUT is finished its rows lie in .OUT.part.
@@ -119,13 +127,17 @@ def restore(
     from beers_deploy.network_files import brighter_files, conditioned, network_file
     from beers_deploy.restoration.bands import parse_sensors
     from beers_deploy.restoration.cog import write_item
+    from beers_deploy.restoration.detectors.fault_list import FOUND, list_beside
     from beers_deploy.restoration.run import restore_file
     from beers_deploy.results import Input, Table, print_rows
 
     budget_bytes = None if memory is None else max(int(memory * 1e9), 1)
     sensors = parse_sensors(sensor or BLIND)
     profiles = (Path(each) for each in sensors.values()) if sensor else ()
-    require_writable(out, json, stac, inputs=(image, network, *profiles))
+    listed = Path(fix_detectors) if fix_detectors and fix_detectors != FOUND else None
+    lists = [] if listed is None else [listed]
+    found_list = list_beside(out, fix_detectors or "")
+    require_writable(out, json, stac, found_list, inputs=(image, network, listed, *profiles))
     how = Options(
         tile_px=tile,
         halo=halo,
@@ -142,12 +154,13 @@ def restore(
         again=again,
         any_result=any_result,
         consistency=consistency,
+        fix_detectors=fix_detectors or "",
     )
     if method is Method.traditional:
         refuse(context, NETWORK_ONLY, expected="none with --method traditional", got="one")
-        row = _by_the_chain(image, out, sensor, how, json)
+        row = _by_the_chain(image, out, sensor, how, (json, found_list))
         print_rows(f"wrote {out}", [row])
-        save(Table("restore", arguments(), (image,), (row,)), json)
+        save(Table("restore", arguments(), (image, *lists), (row,)), json)
         return
     _require_item(stac, cog)
     known = {band: load_sensor(each) for band, each in sensors.items()}
@@ -173,11 +186,11 @@ def restore(
     )
     # Before the run, which may take hours: it refuses a file that is replaced while it is read.
     networks = [Input(f"{path.name}, {band}" if band else path.name, sha256(path)) for band, path in paths.items()]
-    row = restore_file(image, out, how, say, (json, stac))
+    row = restore_file(image, out, how, say, (json, stac, found_list))
     if stac is not None:
         write_item(out, stac)
     print_rows(f"wrote {out}", [row])
-    save(Table("restore", arguments(sensor=sensor or BLIND), (*networks, image), (row,)), json)
+    save(Table("restore", arguments(sensor=sensor or BLIND), (*networks, image, *lists), (row,)), json)
 
 
 def _require_item(stac: Path | None, cog: bool) -> None:
@@ -201,10 +214,10 @@ def _look_at_network(network: Path | None, paths: Mapping[str, Path], known: Map
         say(doubt, err=True)
 
 
-def _by_the_chain(image: Path, out: Path, sensor: str | None, how: Options, json: Path | None) -> Row:
+def _by_the_chain(image: Path, out: Path, sensor: str | None, how: Options, beside: Sequence[Path | None]) -> Row:
     from beers_deploy.restoration.traditional import restore_file_traditionally
 
     if sensor is None:
         remedy = "name a profile ('beers-deploy profiles' lists them) or give your .toml file"
         raise OptionError("--sensor", expected="the sensor that acquired IN", got="none", remedy=remedy)
-    return restore_file_traditionally(image, out, replace(how, sensors={"": load_sensor(sensor)}), say, (json,))
+    return restore_file_traditionally(image, out, replace(how, sensors={"": load_sensor(sensor)}), say, beside)

@@ -14,6 +14,7 @@ An image passes, in this order:
     tiles        the one tile loop, for files, arrays and Dask
     method       a network as a method that studies compare
     sensor_check what the image shows of its sensor, and whether it is raw at all
+    detectors    what it shows of faulty detectors; a list of them, whose pixels are replaced
     journal      which rows are finished, and their digests
     output       finished rows in a checkpoint, the lock, the TIFF
     cog          the finished TIFF cloud-optimised, by GDAL; its STAC item for a catalogue

@@ -46,6 +46,7 @@ class Options:
         bands: networks of single bands by their names, each for its own sensor; empty where `model` is for all.
         brighter: the network for sensors of so many times the gain, by band and factor; empty where none is.
         consistency: whether the consistency step is taken where the sensor is known.
+        fix_detectors: the list of faulty detectors to replace, or 'found'; empty to replace none.
         cog: whether the output is a Cloud-Optimised GeoTIFF.
         sensors: that the user named, by band; under no name where one is for all, empty where none was named.
         strict: whether an image is refused that contradicts its sensor.
@@ -71,6 +72,7 @@ class Options:
     bands: Mapping[str, Path] = field(default_factory=dict)
     brighter: Mapping[str, Mapping[int, Path]] = field(default_factory=dict)
     consistency: bool = True
+    fix_detectors: str = ""
 
     @property
     def sensor_bits(self) -> int | None:

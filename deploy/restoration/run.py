@@ -34,6 +34,9 @@ from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.reading.external import network_sha256, unchanged
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.cog import disk_bytes, what_was_done, write_cog
+from beers_deploy.restoration.detectors.fault_list import list_beside, write_list
+from beers_deploy.restoration.detectors.fix import faults_of, fixed
+from beers_deploy.restoration.detectors.words import warn_of_detectors
 from beers_deploy.restoration.georeference import unread_places
 from beers_deploy.restoration.options import Compression, Options
 from beers_deploy.restoration.output import Checkpoint, require_codec, require_tiff_name, write_output
@@ -49,7 +52,10 @@ from beers_deploy.restoration.tiles.rows import RestoredRow, restore_rows, rows_
 
 RUNS_UNTIL_STEADY = 2
 """Of each tile in work at a time: then a runtime takes no more memory."""
-CHECKED = "the comparison of the image's own noise and edges with its sensor: no part of time and throughput"
+CHECKED = (
+    "the comparison of the image's own noise and edges with its sensor, and the look for faults of detectors: "
+    "no part of time and throughput"
+)
 MANY = 0.05
 """Share of an image above its full scale that no scene has, but a wrong full scale."""
 
@@ -70,8 +76,8 @@ def restore_file(
     started = time.perf_counter()
     if options.scheduler is None:
         require_cores("threads", options.threads)
-    with begun(image, out, options, beside) as source, open_cluster(options.scheduler) as cluster:
-        raster, begun_with = source.raster, stamps(source.files)
+    with begun(image, out, options, beside) as stored, open_cluster(options.scheduler) as cluster:
+        raster, begun_with = stored.raster, stamps(stored.files)
         paths = in_order(options.bands, raster) if options.bands else [options.model]
         read = [read_network(path) for path in paths]
         networks, digests = [network for network, _ in read], ", ".join(digest for _, digest in read)
@@ -80,6 +86,8 @@ def restore_file(
         log(plan.sentence)
         for sentence in unread_places(image, raster):
             log(sentence)
+        faults = faults_of(stored, options.fix_detectors, str(image), log)
+        source = fixed(stored, faults)
         check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
         scale = scale_of(source, plan, options, str(image))
         check, check_s = timed(
@@ -91,6 +99,7 @@ def restore_file(
         restorer = Restorer(raster, exposed, scale.value, plan.tiling, str(image), clips, steps_taken)
         figures = seam_figures(source, plan, restorer)
         job = job_of(source, digests, plan, runtime, scale.value, options, bool(steps_taken))
+        job["detectors"] = faults.sha256
         cog_bytes = disk_bytes(plan.out_shape, raster.out_dtype.itemsize) if options.cog else 0
         ends = [row.keep_stop * plan.scale for row in plan.rows]
         checkpoint = Checkpoint(out, plan.out_shape, raster.out_dtype, job, options.resume, cog_bytes, ends)
@@ -104,13 +113,14 @@ def restore_file(
             about = what_was_done(networks, digests, scale)
             to_cog = partial(write_cog, compression=options.compression, about=about) if options.cog else None
             write_output(checkpoint, source, Compression.none if to_cog else options.compression, to_cog)
+            write_list(faults, list_beside(out, options.fix_detectors))
     time_s, tally = time.perf_counter() - started - check_s, checkpoint.tally
     if tally.clipped:
         share = tally.clipped / prod(raster.shape)
         doubt = f": {share:.0%} of the image; is that its full scale?" if share > MANY else ""
         log(f"{tally.clipped} pixels above full scale, {scale.words}, were clipped to it{doubt}")
     figures |= {"sensor check": measured(check_s, "s", CHECKED), **check.figures, **tally.figures}
-    text = {**scale.text, **check.text, "consistency": words}
+    text = {**scale.text, **check.text, "consistency": words, **faults.text_of_row}
     if options.brighter:
         figures |= tally.exposure_figures
         text["exposures"] = factor_words(options.brighter)
@@ -122,7 +132,9 @@ def restore_file(
 def check_sensor(
     source: Source, networks: Sequence[onnx.ModelProto], options: Options, full_scale: float, name: str, log: Log
 ) -> SensorCheck:
-    """Compare an image with the sensor that the user named; without one, log a sentence if it looks restored already.
+    """Look for faults of detectors, and compare an image with the sensor that the user named.
+
+    Without a named sensor, log a sentence if the image looks restored already.
 
     Args:
         source: the image.
@@ -132,6 +144,8 @@ def check_sensor(
         name: of the image, for messages.
         log: is told what is seen.
     """
+    if not options.again:
+        warn_of_detectors(source, full_scale, log)
     if any(sensor.name != BLIND for sensor in options.sensors.values()):
         return told_sensor(source, options.sensors, full_scale, name, options.strict, log)
     sentence = "" if options.again else restored_already(source, networks, full_scale)

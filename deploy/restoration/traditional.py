@@ -19,13 +19,14 @@ from beers_deploy.model.progress import Log, Steps, no_log, steps
 from beers_deploy.model.traditional.pipeline import Chain, restore_strips
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Row, measured
+from beers_deploy.restoration.detectors.fault_list import list_beside, write_list
+from beers_deploy.restoration.detectors.fix import faults_of, fixed
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.output import Checkpoint, write_output
 from beers_deploy.restoration.plan import Span, check_memory
 from beers_deploy.restoration.radiometry import full_scale_of
-from beers_deploy.restoration.run import CHECKED, begun, require_unchanged, timed
-from beers_deploy.restoration.sensor_check import told_sensor
+from beers_deploy.restoration.run import CHECKED, begun, check_sensor, require_unchanged, timed
 from beers_deploy.restoration.source import Source, fingerprint, stamps, strips
 from beers_deploy.restoration.tiles.engine import as_stored, checked_strip
 from beers_deploy.restoration.tiles.rows import RestoredRow
@@ -44,18 +45,18 @@ def restore_file_traditionally(
     """As `deploy.restoration.run.restore_file`, of a mono image, by the traditional pipeline of its one sensor."""
     started, sensor = time.perf_counter(), options.sensors[""]
     chain = Chain(sensor.nominal(), sensor.reference.nominal())
-    with begun(image, out, options, beside) as source:
-        raster = source.raster
+    with begun(image, out, options, beside) as stored:
+        raster = stored.raster
         if raster.bands > 1:
             remedy = "extract the band that the profile describes"
             raise ImageError(str(image), expected="one band", got=f"{raster.bands} bands", remedy=remedy)
+        faults = faults_of(stored, options.fix_detectors, str(image), log)
+        source = fixed(stored, faults)
         needed = FIXED_BYTES + BYTES_PER_COLUMN * raster.width_px + source.held_bytes(STRIP_PX)
         check_memory(needed, options.memory_bytes, bulky=False)
         extents = (raster.extent(source.read(*rows)) for rows in strips(raster.height_px, STRIP_PX))
         scale = full_scale_of(str(image), raster, extents, options.full_scale, options.sensor_bits)
-        check, check_s = timed(
-            partial(told_sensor, source, options.sensors, scale.value, str(image), options.strict, log)
-        )
+        check, check_s = timed(partial(check_sensor, source, (), options, scale.value, name=str(image), log=log))
         begun_with, digest = stamps(source.files), fingerprint(source.files)
         job = {"image": digest, "method": "traditional"}
         checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, resume=False)
@@ -64,6 +65,7 @@ def restore_file_traditionally(
             _fill(checkpoint, source, fitted, scale.value, str(image))
             require_unchanged(source, str(image), begun_with, digest)
             write_output(checkpoint, source, options.compression)
+            write_list(faults, list_beside(out, options.fix_detectors))
         except BaseException:  # a strip is no place to go on from: the pipeline looks hundreds of rows back
             checkpoint.remove()
             raise
@@ -76,7 +78,7 @@ def restore_file_traditionally(
         "sensor check": measured(check_s, "s", CHECKED),
         **check.figures,
     }
-    text = {"method": "traditional", "sensor": sensor.name, **scale.text, **check.text}
+    text = {"method": "traditional", "sensor": sensor.name, **scale.text, **check.text, **faults.text_of_row}
     return Row("restore", image.name, figures, text)
 
 

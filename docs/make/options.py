@@ -53,7 +53,7 @@ PATHS = {
     "golden": Paths({"out": FOLDER, "json": FILE}, ("given", "compare"), ("target",)),
     "bench": Paths({"json": FILE}, ("model", "image", "measured"), ("sensor", "target")),
     "info": Paths({"json": FILE}, ("image", "network"), ("sensor", "target")),
-    "restore": Paths({"out": FILE, "json": FILE, "stac": FILE}, ("image", "network"), ("sensor",)),
+    "restore": Paths({"out": FILE, "json": FILE, "stac": FILE}, ("image", "network"), ("sensor", "fix_detectors")),
     "evaluate": Paths(
         {"out": FOLDER, "json": FILE}, ("images", "pairs", "lpips"), ("sensor", "reference", "methods")
     ),
@@ -112,6 +112,7 @@ WORDS = {
     "edge": "box",
     "fail_on": "change",
     "finetune": "auto, or steps",
+    "fix_detectors": "found",
     "forbid": "effect",
     "halo": "px",
     "methods": "names",

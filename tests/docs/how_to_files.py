@@ -36,6 +36,7 @@ def prepare(folder: Path) -> None:
     """Put them into a folder."""
     copied_files(folder)
     scenes(folder)
+    faulty_frames(folder)
     networks(folder)
     labelled_pictures(folder)
     if find_spec("rasterio"):
@@ -79,6 +80,15 @@ def scenes(folder: Path) -> None:
     shutil.copy(folder / "aerial" / "site0.png", folder / "scene.png")
     for number in (1, 2):
         tifffile.imwrite(folder / f"raw{number}.tif", acquisition(number - 1, board=number == 1))
+
+
+def faulty_frames(folder: Path) -> None:
+    """Two frames of a camera with a dead column and a hot pixel."""
+    for seed, name in enumerate(("frame.tif", "next.tif")):
+        frame = np.rint(np.random.default_rng(seed).normal(600, 5, (90, 110)))
+        frame[:, 40] = 0
+        frame[20, 80] = 4095
+        tifffile.imwrite(folder / name, frame.astype(np.uint16))
 
 
 def networks(folder: Path) -> None:

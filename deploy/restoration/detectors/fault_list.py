@@ -1,0 +1,154 @@
+"""A list of faulty detectors, as a file.
+
+The list is a CSV file, `column,row` or `column,row,band`, as `restore --fix-detectors` writes and reads it. Columns
+and rows count from 0, bands from 1; without a band a line holds for all. A row of `*` stands for the whole column,
+and a column of `*` for the whole row.
+"""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from beers_deploy.model.io.files import write_text
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.restoration.source import Raster
+
+OPTION, FOUND = "--fix-detectors", "found"
+HEADER, ALL = ("column", "row", "band"), "*"
+DIGITS = 9
+"""Of a number: no image is larger."""
+
+
+@dataclass(frozen=True, order=True)
+class Fault:
+    """A faulty pixel, column or row.
+
+    Attributes:
+        column: of the image, from 0; -1 for all of a row.
+        row: of the image, from 0; -1 for all of a column.
+        band: from 1; 0 for all bands.
+    """
+
+    column: int
+    row: int
+    band: int = 0
+
+    @property
+    def line(self) -> str:
+        """The line of a file."""
+        numbers = [ALL if place < 0 else str(place) for place in (self.column, self.row)]
+        return ",".join([*numbers, *([str(self.band)] if self.band else [])])
+
+
+@dataclass(frozen=True)
+class FaultList:
+    """The faults of an image's detectors, in order and each once."""
+
+    faults: tuple[Fault, ...]
+
+    @property
+    def text(self) -> str:
+        """The content of a file."""
+        header = HEADER if any(fault.band for fault in self.faults) else HEADER[:2]
+        return "\n".join([",".join(header), *(fault.line for fault in self.faults), ""])
+
+    @property
+    def sha256(self) -> str:
+        """The hex digest of the content."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+    @property
+    def words(self) -> str:
+        """How many pixels, columns and rows these are."""
+        columns = sum(fault.row < 0 for fault in self.faults)
+        rows = sum(fault.column < 0 for fault in self.faults)
+        counts = {"pixel": len(self.faults) - columns - rows, "column": columns, "row": rows}
+        words = [f"{count} {name}{'s' if count > 1 else ''}" for name, count in counts.items() if count]
+        return ", ".join(words) or "none"
+
+    @property
+    def text_of_row(self) -> dict[str, str]:
+        """For a row of results: what was replaced."""
+        return {"detectors replaced": self.words} if self.faults else {}
+
+    def mask(self, raster: Raster, start: int, stop: int) -> np.ndarray:
+        """Return where pixels of rows `start` to `stop` (excluded) are faulty, bool (bands, rows, width)."""
+        flags = np.zeros((raster.bands, stop - start, raster.width_px), bool)
+        columns, rows, bands = self._numbers.T
+        single = (columns >= 0) & (start <= rows) & (rows < stop)
+        for band, plane in enumerate(flags, 1):
+            here = (bands == 0) | (bands == band)
+            plane[:, columns[here & (rows < 0)]] = True
+            plane[rows[here & (columns < 0) & (start <= rows) & (rows < stop)] - start] = True
+            plane[rows[here & single] - start, columns[here & single]] = True
+        return flags
+
+    @cached_property
+    def _numbers(self) -> np.ndarray:
+        """Column, row and band of each, (n, 3)."""
+        places = [(fault.column, fault.row, fault.band) for fault in self.faults]
+        return np.array(places, np.int64).reshape(-1, 3)
+
+
+def list_beside(out: Path, wanted: str) -> Path | None:
+    """Return where the list of found faults is written, beside the restored image; None if none are searched for."""
+    return out.with_name(f"{out.stem}.detectors.csv") if wanted == FOUND else None
+
+
+def write_list(faults: FaultList, path: Path | None) -> None:
+    """Write the faults that were found, if any; None asks for no file."""
+    if path is not None and faults.faults:
+        write_text(path, faults.text)
+
+
+def read_list(path: Path, raster: Raster) -> FaultList:
+    """Read a list of faults, and refuse what does not fit the image.
+
+    Args:
+        path: of the file.
+        raster: of the image.
+    """
+    remedy = "write lines `column,row`, counted from 0, with `*` as the row for a whole column"
+    expected = f"'{FOUND}' or a list of faulty detectors"
+    try:
+        lines = path.read_text("utf-8-sig").splitlines()
+    except OSError as error:
+        got = f"{path}: {error.strerror or error}"
+        raise OptionError(OPTION, expected=expected, got=got, remedy=remedy) from error
+    except UnicodeDecodeError as error:
+        raise OptionError(OPTION, expected=expected, got=f"{path}, which is no text", remedy=remedy) from error
+    faults = []
+    for number, line in enumerate(lines, 1):
+        cells = tuple(cell.strip() for cell in line.split(","))
+        if not any(cells) or line.startswith("#") or cells in (HEADER, HEADER[:2]):
+            continue
+        faults.append(_fault(f"{path}, line {number}", line, cells, raster))
+    if not faults:
+        raise OptionError(OPTION, expected=expected, got=f"{path} without any", remedy=remedy)
+    return FaultList(tuple(sorted(set(faults))))
+
+
+def _fault(where: str, line: str, cells: tuple[str, ...], raster: Raster) -> Fault:
+    """Return the fault of one line."""
+    sizes = raster.width_px, raster.height_px, raster.bands + 1
+    expected = "column,row or column,row,band"
+    numbers = [_number(cell) for cell in cells]
+    if len(numbers) not in (2, 3) or None in numbers or numbers[:2] == [-1, -1] or numbers[2:] in ([-1], [0]):
+        got = repr(line[:40])
+        raise OptionError(OPTION, expected=expected, got=f"{where}: {got}", remedy="correct or delete the line")
+    placed = [number for number in numbers if number is not None]
+    if any(number >= size for number, size in zip(placed, sizes, strict=False)):
+        image = f"{raster.width_px} columns, {raster.height_px} rows and {raster.bands} bands"
+        got = f"{where}: {line.strip()}"
+        raise OptionError(OPTION, expected=f"pixels of an image of {image}", got=got, remedy="count from 0")
+    return Fault(*placed)
+
+
+def _number(cell: str) -> int | None:
+    """Return the number in a cell, -1 for all; None for anything else."""
+    if cell == ALL:
+        return -1
+    return int(cell) if cell.isascii() and cell.isdecimal() and len(cell) <= DIGITS else None

@@ -1,0 +1,195 @@
+"""Replace faulty detectors' pixels while an image's rows are read, before anything else sees them.
+
+The faults are those of a list, or found in a pass over the whole image before the first row is restored: so the same
+command, resumed or not, replaces the same pixels.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from beers_deploy.model.metrics.detector_lines import Stripes, constant_columns
+from beers_deploy.model.metrics.detector_pixels import PATCH_PX, wrong_pixels
+from beers_deploy.model.progress import Log
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.restoration.detectors.fault_list import FOUND, Fault, FaultList, read_list
+from beers_deploy.restoration.detectors.look import as_floats, look_at_detectors, value_steps
+from beers_deploy.restoration.source import Plane, Raster, Source, strips
+
+REACH_PX = 16
+"""How far away a sound neighbour may lie."""
+STRIP_PX = 256
+"""Rows that are searched at a time."""
+WRONG_GAIN = 0.05
+"""Gain from which a single column or row is replaced: a smaller one is for an equalisation to correct."""
+MANY = 0.01
+"""Share of the pixels from which they are no single faults."""
+ONE_SIDED = 1e-3
+"""Weight of a direction with a sound neighbour on one side only, over one with two."""
+ASLANT = 1e-6
+"""Weight of the diagonals: they count where a faulty column crosses a faulty row."""
+WAYS = (
+    ((0, -1), (0, 1), 1.0),
+    ((-1, 0), (1, 0), 1.0),
+    ((-1, -1), (1, 1), ASLANT),
+    ((-1, 1), (1, -1), ASLANT),
+)
+"""Rows and columns of a step to either side, and the weight: along a row, along a column, aslant."""
+
+
+def faults_of(source: Source, wanted: str, name: str, log: Log) -> FaultList:
+    """Return the faults that `restore --fix-detectors` names.
+
+    Args:
+        source: the image.
+        wanted: 'found', or the file of a list; empty for none.
+        name: of the image, for messages.
+        log: is told how many will be replaced.
+    """
+    if not wanted:
+        return FaultList(())
+    found = find_faults(source, name) if wanted == FOUND else read_list(Path(wanted), source.raster)
+    log(f"faulty detectors: {found.words} {'found' if wanted == FOUND else 'listed'}, to be interpolated")
+    return found
+
+
+def fixed(source: Source, faults: FaultList) -> Source:
+    """Return an image without its faults; the image itself if there are none."""
+    return FixedSource(source, faults) if faults.faults else source
+
+
+def find_faults(source: Source, name: str) -> FaultList:
+    """Find dead and wrong pixels, columns and rows in all rows of an image.
+
+    Columns, and rows that are off but not dead, are judged in the strips that `look_at_detectors` reads.
+
+    Args:
+        source: the image.
+        name: of it, for messages.
+    """
+    raster = source.raster
+    lines = set[Fault]()
+    for band, found in enumerate(look_at_detectors(source)):
+        number = band_number(band, raster)
+        lines |= {Fault(column, -1, number) for column in _replaced(found.columns)}
+        lines |= {Fault(-1, row, number) for row in _replaced(found.rows)}
+    pixels = set[Fault]()
+    for fault in _found_in_strips(source):
+        (lines if fault.column < 0 else pixels).add(fault)
+        if len(pixels) > MANY * raster.height_px * raster.width_px * raster.bands:
+            got, remedy = f"more than {MANY:.0%} of the pixels alone", "list the faulty ones in a file"
+            raise ImageError(name, expected="few faulty pixels", got=got, remedy=remedy)
+    columns = {(fault.column, fault.band) for fault in lines if fault.row < 0}
+    rows = {(fault.row, fault.band) for fault in lines if fault.column < 0}
+    alone = {each for each in pixels if (each.column, each.band) not in columns and (each.row, each.band) not in rows}
+    return FaultList(tuple(sorted(lines | alone)))
+
+
+def band_number(band: int, raster: Raster) -> int:
+    """Return the number of a band in a list: 0 of an image's only one."""
+    return band + 1 if raster.bands > 1 else 0
+
+
+def _replaced(stripes: Stripes) -> list[int]:
+    """Return the lines that an interpolation gives better than they are."""
+    return [*stripes.dead, *(line.index for line in stripes.off if abs(line.gain) > WRONG_GAIN)]
+
+
+def _found_in_strips(source: Source) -> Iterator[Fault]:
+    """Find dead rows and wrong pixels, strip by strip."""
+    raster, steps = source.raster, value_steps(source)
+    for top, stop in strips(raster.height_px, STRIP_PX):
+        start, end = max(top - PATCH_PX, 0), min(stop + PATCH_PX, raster.height_px)
+        for band, pixels in enumerate(as_floats(raster, source.read(start, end))):
+            number = band_number(band, raster)
+            dead = np.flatnonzero(constant_columns(pixels.T)) + start
+            places = wrong_pixels(pixels, steps[band]) + np.array([start, 0])
+            yield from (Fault(-1, int(row), number) for row in dead if top <= row < stop)
+            yield from (Fault(int(column), int(row), number) for row, column in places if top <= row < stop)
+
+
+class FixedSource:
+    """An image whose faulty pixels are replaced by interpolation between sound neighbours.
+
+    A pixel is interpolated along its row and along its column, between the nearest sound pixels within `REACH_PX`;
+    the shorter way counts more. Where neither has any, the diagonals count. Where no sound pixel is in reach it
+    stays, and so does a missing one.
+    """
+
+    def __init__(self, source: Source, faults: FaultList) -> None:
+        self._source, self.faults = source, faults
+        self.raster, self.files = source.raster, source.files
+        self.veil: Plane | None = source.veil
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), masked where the image is."""
+        raster = self.raster
+        if not self.faults.mask(raster, start, stop).any():
+            return self._source.read(start, stop)
+        top, end = max(start - REACH_PX, 0), min(stop + REACH_PX, raster.height_px)
+        stored = self._source.read(top, end)
+        missing = raster.missing(stored) if raster.may_miss else np.zeros(stored.shape, bool)
+        faulty = self.faults.mask(raster, top, end)
+        pixels = np.ma.getdata(stored).copy()
+        wanted = faulty & ~missing
+        wanted[:, : start - top] = wanted[:, stop - top :] = False
+        for plane, bad, sound in zip(pixels, wanted, ~faulty & ~missing, strict=True):
+            replace_pixels(plane, bad, sound, raster.nodata)
+        within = slice(start - top, stop - top)
+        if isinstance(stored, np.ma.MaskedArray):
+            return np.ma.MaskedArray(pixels[:, within], mask=np.ma.getmaskarray(stored)[:, within])
+        return pixels[:, within]
+
+    def held_bytes(self, rows_px: int) -> int:
+        """As the image's own, and the rows around with their flags."""
+        raster = self.raster
+        row_bytes = raster.bands * raster.width_px * (raster.dtype.itemsize + 4)
+        return self._source.held_bytes(rows_px + 2 * REACH_PX) + (rows_px + 2 * REACH_PX) * row_bytes
+
+
+def replace_pixels(plane: np.ndarray, bad: np.ndarray, sound: np.ndarray, nodata: float | None = None) -> None:
+    """Replace pixels of a plane in place.
+
+    Args:
+        plane: (h, w).
+        bad: which to replace, bool.
+        sound: from which, bool.
+        nodata: a value that no replaced pixel may take; None for none.
+    """
+    places = np.argwhere(bad)
+    total, weights = np.zeros(len(places)), np.zeros(len(places))
+    closest, distance = np.zeros(len(places)), np.full(len(places), np.inf)
+    for one, other, weight in WAYS:
+        (left, near), (right, far) = (_nearest(plane, sound, places, np.array(side)) for side in (one, other))
+        both, either = np.isfinite(near) & np.isfinite(far), np.isfinite(near) | np.isfinite(far)
+        single = np.where(near <= far, left, right)
+        with np.errstate(invalid="ignore"):
+            between = (left * far + right * near) / (near + far)
+        share = np.where(both, 1 / (near + far), np.where(either, ONE_SIDED / np.minimum(near, far), 0)) * weight
+        total += share * np.where(both, between, single)
+        weights += share
+        closest = np.where(np.minimum(near, far) < distance, single, closest)
+        distance = np.minimum(distance, np.minimum(near, far))
+    reached = weights > 0
+    result = total[reached] / weights[reached]
+    result = (np.rint(result) if plane.dtype.kind in "ui" else result).astype(plane.dtype)
+    if nodata is not None:
+        result = np.where(result == plane.dtype.type(nodata), closest[reached].astype(plane.dtype), result)
+    rows, columns = places[reached].T
+    plane[rows, columns] = result
+
+
+def _nearest(
+    plane: np.ndarray, sound: np.ndarray, places: np.ndarray, side: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the value of the nearest sound pixel to one side of each place, and how far it is; inf without one."""
+    values, distances = np.zeros(len(places)), np.full(len(places), np.inf)
+    for steps in range(1, REACH_PX + 1):
+        rows, columns = (places + steps * side).T
+        inside = (rows >= 0) & (rows < plane.shape[0]) & (columns >= 0) & (columns < plane.shape[1])
+        inside[inside] = sound[rows[inside], columns[inside]]
+        here = inside & np.isinf(distances)
+        values[here] = plane[rows[here], columns[here]]
+        distances[here] = steps
+    return values, distances

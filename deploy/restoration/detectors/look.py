@@ -1,0 +1,156 @@
+"""A look for faults of detectors in strips of an image: gains of columns and rows, dead ones, wrong single pixels.
+
+Restoration sharpens what stands alone: a column whose gain is off by 1 % comes out off by near 2 %. So `restore`
+warns of it, and `info` shows what was found. Strips over the whole width, spread evenly from top to bottom, are read:
+of a large image `LOOKED_PX` pixels of all bands together.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from beers_deploy.model.metrics.detector_lines import (
+    Blocks,
+    Stripes,
+    join_blocks,
+    judge_lines,
+    line_up,
+    measure_lines,
+)
+from beers_deploy.model.metrics.detector_phases import Pattern, judge_phases, measure_phases
+from beers_deploy.model.metrics.detector_pixels import wrong_pixels
+from beers_deploy.restoration.source import Raster, Source
+
+LOOKED_PX = 1 << 23
+"""Pixels of all bands that are looked at: one to two seconds on one core (measured)."""
+STRIP_PX, LEAST_STRIP_PX, LEAST_ROWS_PX = 128, 16, 64
+"""Rows of a strip, the least of them, and the least of all strips together."""
+MARGIN_PX = 4
+"""Rows around a strip that its rows and pixels are compared with."""
+BLOCKS, SECTION_PX = 8, 32
+"""Blocks along a line, and the least width of a section of a strip."""
+LEAST = 0.003
+"""Gain of a column that matters, over the level; the patterns of two pixels likewise."""
+
+
+@dataclass(frozen=True)
+class BandFaults:
+    """What one band shows of its detectors.
+
+    Attributes:
+        columns: of the image, whose lines have the image's numbers.
+        rows: likewise, of the rows that were looked at.
+        patterns: of period 2.
+        pixels: row and column (n, 2) of single wrong pixels in what was looked at.
+        looked_px: pixels that were looked at.
+    """
+
+    columns: Stripes
+    rows: Stripes
+    patterns: tuple[Pattern, ...]
+    pixels: np.ndarray
+    looked_px: int
+
+
+def look_at_detectors(source: Source, full_scale: float = np.inf) -> tuple[BandFaults, ...]:
+    """Look for faults of detectors in strips of each band.
+
+    Args:
+        source: the image.
+        full_scale: the pixel value from which on a pixel is no measurement.
+    """
+    raster = source.raster
+    found = [_Found(step) for step in value_steps(source)]
+    for top, stop in _strips(raster.height_px, raster.width_px, raster.bands):
+        start, end = max(top - MARGIN_PX, 0), min(stop + MARGIN_PX, raster.height_px)
+        within = slice(top - start, stop - start)
+        for band, pixels in enumerate(as_floats(raster, source.read(start, end))):
+            found[band].add(start, within, pixels, full_scale)
+    return tuple(each.judged() for each in found)
+
+
+def as_floats(raster: Raster, stored: np.ndarray) -> np.ndarray:
+    """Return stored pixels as float32, NaN where they are missing or no finite numbers."""
+    with np.errstate(over="ignore"):
+        pixels = np.ma.getdata(stored).astype(np.float32)
+    if raster.dtype.kind == "f":
+        pixels[~np.isfinite(pixels)] = np.nan
+    if raster.may_miss:
+        pixels[raster.missing(stored)] = np.nan
+    return pixels
+
+
+def value_steps(source: Source) -> list[float]:
+    """Return the step between the values of each band, 0 of floats: 64 of a 10-bit image stored in 16 bits."""
+    raster = source.raster
+    if raster.dtype.kind == "f":
+        return [0.0] * raster.bands
+    top = raster.height_px // 2
+    rows = np.ma.getdata(source.read(top, min(top + LEAST_STRIP_PX, raster.height_px)))
+    return [float(max(int(np.gcd.reduce(band.astype(np.int64), axis=None)), 1)) for band in rows]
+
+
+def _strips(height_px: int, width_px: int, bands: int) -> Iterator[tuple[int, int]]:
+    """First row and the one behind the last of each strip; first rows are even."""
+    rows_px = min(height_px, max(LOOKED_PX // (width_px * bands), LEAST_ROWS_PX))
+    side_px = min(STRIP_PX, max(LEAST_STRIP_PX, rows_px // BLOCKS))
+    side_px = min(side_px, height_px)
+    for top in np.linspace(0, height_px - side_px, max(rows_px // side_px, 1)):
+        even = int(top) // 2 * 2
+        yield even, even + side_px
+
+
+class _Found:
+    """What was measured in the strips of one band."""
+
+    def __init__(self, step: float) -> None:
+        self._step = step
+        self._columns = list[Blocks]()
+        self._rows = list[Blocks]()
+        self._row_numbers = list[int]()
+        self._phases = list[tuple[np.ndarray, np.ndarray]]()
+        self._pixels = list[np.ndarray]()
+        self._looked_px = 0
+
+    def add(self, top: int, within: slice, pixels: np.ndarray, full_scale: float) -> None:
+        """Measure a strip.
+
+        Args:
+            top: its first row.
+            within: rows of it to be judged; those around are there for comparison.
+            pixels: (h, w), NaN where they are missing.
+            full_scale: the value from which on a pixel is no measurement.
+        """
+        valid = (pixels > 0) & (pixels < full_scale)
+        inner = valid[within]
+        self._columns.append(measure_lines(pixels[within], inner))
+        rows = []
+        for section in _sections(pixels.shape[1]):
+            rows.append(measure_lines(pixels[:, section].T.copy(), valid[:, section].T.copy()).of(within))
+            self._phases.append(measure_phases(pixels[within, section], inner[:, section]))
+        self._rows.append(join_blocks(rows))
+        self._row_numbers += range(top + within.start, top + within.stop)
+        places = wrong_pixels(pixels, self._step)
+        judged = (places[:, 0] >= within.start) & (places[:, 0] < within.stop)
+        self._pixels.append(places[judged] + np.array([top, 0]))
+        self._looked_px += int(np.isfinite(pixels[within]).sum())
+
+    def judged(self) -> BandFaults:
+        """Judge all strips together."""
+        rows = judge_lines(line_up(self._rows), LEAST)
+        return BandFaults(
+            columns=judge_lines(join_blocks(self._columns), LEAST),
+            rows=rows.renumbered(self._row_numbers),
+            patterns=judge_phases(self._phases, LEAST),
+            pixels=np.concatenate(self._pixels),
+            looked_px=self._looked_px,
+        )
+
+
+def _sections(width_px: int) -> list[slice]:
+    """Sections of a strip, side by side, of even first columns."""
+    count = min(max(width_px // SECTION_PX, 1), BLOCKS)
+    ends = [width_px * number // count // 2 * 2 for number in range(count)] + [width_px]
+    return [slice(left, right) for left, right in pairwise(ends)]

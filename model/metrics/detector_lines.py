@@ -1,0 +1,360 @@
+"""Find faults of single detectors in the pixels of one band: lines of another gain, dead lines, wrong single pixels.
+
+A detector gives its fault to one column (pushbroom), one row or one pixel, and leaves its neighbours alone. A scene
+cannot do that: the optics spread a line or a point over several pixels. Every test here compares a line or a pixel
+with its neighbours, asks for the share that blurred light would have given them (`SHARED`), and weighs the difference
+with the noise and texture around.
+
+A line is measured in several blocks along it. Detectors repeat themselves in all blocks, and scenes do not.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from scipy.ndimage import median_filter, uniform_filter1d
+
+ROUNDS = 4
+"""Of the estimate of location: it moves by at most three times its clipping range a round."""
+FEW = 8
+"""Pixels of a line that tell nothing."""
+LEVEL_LINES = 9
+"""Lines over whose median a line's level is taken, so that its own fault does not matter."""
+PARITY_LINES = 63
+"""Lines over which alternate lines are averaged; their pattern is `Phases`, and no gain of single lines."""
+SIGNIFICANT = 6.0
+"""Standard errors. Noise of 40 000 lines reaches it once in 10 000 images."""
+CLEAR = 12.0
+"""Standard errors within one block from which a part of a line is judged alone."""
+SURE = 1.0
+"""Standard errors by which a part of a line is alone."""
+REACH = 3
+"""Lines to either side of which a single line is the largest, and what is not judged along a border."""
+ASKEW = 0.3
+"""Of a line's deviation, by how much the lines around may depart from what a single one leaves there."""
+PART = 0.02
+"""Least gain of a part of a line."""
+AGREE = 0.75
+"""Share of the blocks in which a line must be off to the same side."""
+ISOLATED, LEAST_ISOLATED = 0.75, 0.55
+"""Least isolation of a line that is measured well, and of any: 1 for a detector. Of a thin bright line it is 0.70,
+0.46, 0.27 and 0.02 where the MTF at Nyquist is 30, 20, 15 and 10 % (a Gaussian centred on a pixel)."""
+SPREAD_SIGNIFICANT = 4.0
+"""Standard errors of the covariance from which the spread of all lines is significant."""
+LEVELS = 1.3
+"""Ratio of the levels of blocks from which gains are told from offsets."""
+LINES = 16
+"""Lines from which their spread can be told."""
+WHITE = -0.35
+"""Correlation of neighbouring second differences: -2/3 for independent detectors; it was above -0.1 for scenes."""
+MAD = 1.4826
+"""Standard deviation of Gaussian numbers over their median absolute deviation."""
+MAD_ERROR = 2.33
+"""Relative standard error of a variance by the median absolute deviation of N numbers, times sqrt(N)."""
+SECOND = 1.5
+"""Variance of second differences x - (left + right) / 2 of independent numbers of variance 1."""
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Lines measured in blocks along them; every array is (blocks, lines), NaN where nothing could be measured.
+
+    Attributes:
+        second: each line less the mean of its two neighbours, in pixel values.
+        error: its standard error by the scatter within the block.
+        level: pixel value around the line.
+        constant: True where all pixels of a line in the block have one value, and those around it do not.
+    """
+
+    second: np.ndarray
+    error: np.ndarray
+    level: np.ndarray
+    constant: np.ndarray
+
+    def of(self, lines: slice) -> "Blocks":
+        """Return some of the lines."""
+        arrays = self.second, self.error, self.level, self.constant
+        return Blocks(*(each[:, lines] for each in arrays))
+
+
+@dataclass(frozen=True)
+class Line:
+    """A single line that is off.
+
+    Attributes:
+        index: of the line.
+        gain: its deviation from its neighbours over the level around.
+        error: standard error of that.
+    """
+
+    index: int
+    gain: float
+    error: float
+
+
+@dataclass(frozen=True)
+class Stripes:
+    """What the lines of one direction show.
+
+    Attributes:
+        spread: standard deviation of the lines' gains without noise, over the level; None if it cannot be seen.
+        spread_error: its standard error.
+        seen: whether the spread is significant, and of independent lines.
+        off: single lines that are off, the largest deviation first.
+        dead: lines that are constant where their neighbours are not.
+        grows_with_level: True for gains, False for offsets; None where the levels do not tell.
+    """
+
+    spread: float | None = None
+    spread_error: float = 0.0
+    seen: bool = False
+    off: tuple[Line, ...] = ()
+    dead: tuple[int, ...] = ()
+    grows_with_level: bool | None = None
+
+    def renumbered(self, numbers: Sequence[int]) -> "Stripes":
+        """Return the same with the line of index i called `numbers[i]`."""
+        off = tuple(replace(line, index=numbers[line.index]) for line in self.off)
+        return replace(self, off=off, dead=tuple(sorted({numbers[index] for index in self.dead})))
+
+
+def measure_lines(pixels: np.ndarray, valid: np.ndarray) -> Blocks:
+    """Measure the columns of one block of an image.
+
+    Args:
+        pixels: (h, w) float32, NaN where they are missing.
+        valid: where they are measurements, neither missing nor at an end of full scale.
+    """
+    rows, columns = pixels.shape
+    constant = constant_columns(pixels)
+    nothing = np.full((1, columns), np.nan)
+    if columns < 2 * REACH + 1:
+        return Blocks(nothing, nothing, nothing, constant[None])
+    second = pixels[:, 1:-1] - (pixels[:, :-2] + pixels[:, 2:]) / 2
+    known = valid[:, 1:-1] & valid[:, :-2] & valid[:, 2:]
+    located, error = (np.pad(each, 1, constant_values=np.nan)[None] for each in _location(second, known))
+    count = valid.sum(0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        level = np.where(4 * count >= rows, pixels.sum(0, dtype=np.float64, where=valid) / count, 0)
+        around = median_filter(level, LEVEL_LINES, mode="nearest")
+        return Blocks(located, error, np.where(around > 0, around, np.nan)[None], constant[None])
+
+
+def _location(values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the robust location of the columns of (h, w) values by Huber's estimator, and its standard error.
+
+    A median would be one of the few values that integers leave; a mean follows the edges of the scene.
+    """
+    count = known.sum(0, dtype=np.float32)
+    values = values if known.all() else np.where(known, values, 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        reach = 2 * np.abs(values).sum(0) / count
+        centre = np.zeros(values.shape[1], np.float32)
+        for _ in range(ROUNDS):
+            rest = values - centre
+            inside = np.maximum((known & (np.abs(rest) <= reach)).sum(0, dtype=np.float32), count / 3)
+            clipped = np.clip(rest, -reach, reach) * known
+            centre = centre + clipped.sum(0) / inside
+            reach = 2 * np.abs(clipped).sum(0) / count
+        error = np.sqrt(np.square(clipped).sum(0)) / inside
+    few = count < max(len(values) / 4, FEW)
+    return np.where(few, np.nan, centre), np.where(few, np.nan, error)
+
+
+def constant_columns(pixels: np.ndarray) -> np.ndarray:
+    """Return which columns of (h, w) pixels have one value, alone or in pairs, between columns that vary.
+
+    NaN is a missing pixel, which says nothing.
+    """
+    same = np.fmax.reduce(pixels, axis=0) == np.fmin.reduce(pixels, axis=0)
+    known = np.isfinite(pixels).sum(0)
+    still, moving = same & (known >= FEW), ~same & (known > 0)
+    left, right = np.roll(moving, 1), np.roll(moving, -1)
+    left[0] = right[-1] = False
+    pair = still & np.roll(still, -1) & left & np.roll(right, -1)
+    pair[-1] = False
+    return np.asarray((still & left & right) | pair | np.roll(pair, 1))
+
+
+def join_blocks(blocks: Sequence[Blocks]) -> Blocks:
+    """Return blocks of the same lines as one."""
+    parts = [[each.second, each.error, each.level, each.constant] for each in blocks]
+    return Blocks(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def line_up(blocks: Sequence[Blocks]) -> Blocks:
+    """Return blocks of other lines, all of the same count, as one: line behind line."""
+    parts = [[each.second, each.error, each.level, each.constant] for each in blocks]
+    return Blocks(*(np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True)))
+
+
+def judge_lines(blocks: Blocks, least: float) -> Stripes:
+    """Say what lines show that were measured in blocks.
+
+    Args:
+        blocks: of all lines.
+        least: the gain that matters, over the level.
+    """
+    measured = np.isfinite(blocks.second) & np.isfinite(blocks.level)
+    dead = np.flatnonzero(_always(blocks.constant, measured | blocks.constant))
+    seen_at_all = measured.any(1)
+    if not seen_at_all.any():
+        return Stripes(dead=tuple(dead.tolist()))
+    level = blocks.level[seen_at_all]
+    gains, errors = blocks.second[seen_at_all] / level, blocks.error[seen_at_all] / level
+    errors = np.maximum(errors, 1e-6)
+    gains = _without_parity(gains)
+    mean, error = _combined(gains, errors)
+    spread, spread_error, seen = _spread(gains, errors)
+    off = _single(mean, error, gains, errors, least)
+    return Stripes(
+        spread=spread,
+        spread_error=spread_error,
+        seen=seen and spread is not None and spread - spread_error > least,
+        off=tuple(line for line in off if line.index not in set(dead.tolist())),
+        dead=tuple(dead.tolist()),
+        grows_with_level=_grows(gains, errors, level),
+    )
+
+
+def _always(flags: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return which lines are flagged in all blocks where anything is known of them."""
+    return np.asarray((flags | ~known).all(0) & flags.any(0))
+
+
+def _without_parity(gains: np.ndarray) -> np.ndarray:
+    """Return (blocks, lines) without what alternate lines have in common nearby."""
+    sign = 1 - 2.0 * (np.arange(gains.shape[1]) % 2)
+    size = min(PARITY_LINES, gains.shape[1])
+    bound = 3 * np.nanmedian(np.abs(gains), axis=1, keepdims=True)
+    shared = uniform_filter1d(np.clip(np.nan_to_num(gains) * sign, -bound, bound), size, axis=1, mode="nearest")
+    return np.asarray(gains - shared * sign)
+
+
+def _combined(gains: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean over blocks and its standard error, widened where the blocks contradict each other."""
+    weights = np.where(np.isfinite(gains), 1 / np.square(errors), 0)
+    total = weights.sum(0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.nansum(weights * gains, axis=0) / total
+        free = np.maximum((weights > 0).sum(0) - 1, 1)
+        scatter = np.nansum(weights * np.square(gains - mean), axis=0) / free
+        return mean, np.sqrt(np.maximum(scatter, 1) / total)
+
+
+def _spread(gains: np.ndarray, errors: np.ndarray) -> tuple[float | None, float, bool]:
+    """Return the standard deviation of independent lines' gains, its error, and whether it is significant.
+
+    Two halves of the blocks share the detectors, but neither noise nor scene. Their covariance is robust: a quarter
+    of the difference between the variances of sum and difference, by median absolute deviations.
+    """
+    if len(gains) < 2:
+        return None, 0.0, False
+    first, _ = _combined(gains[::2], errors[::2])
+    other, _ = _combined(gains[1::2], errors[1::2])
+    both = np.isfinite(first) & np.isfinite(other)
+    if both.sum() < LINES:
+        return None, 0.0, False
+    covariance, error = _covariance(first[both], other[both])
+    spread = float(np.sqrt(max(covariance, 0) / SECOND))
+    if error == 0:  # constant lines
+        return spread, 0.0, False
+    pairs = both[:-1] & both[1:]
+    crossed = ((first[:-1], other[1:]), (other[:-1], first[1:]))
+    next_one = np.mean([_covariance(left[pairs], right[pairs])[0] for left, right in crossed])
+    spread_error = float(error / (2 * SECOND * max(spread, np.sqrt(error / SECOND))))
+    seen = covariance > SPREAD_SIGNIFICANT * error and next_one < WHITE * covariance
+    return spread, spread_error, bool(seen)
+
+
+def _covariance(first: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+    """Return a robust covariance (Gnanadesikan and Kettenring 1972) and its standard error."""
+    together, apart = (np.square(MAD * np.median(np.abs(each))) for each in (first + other, first - other))
+    # Second differences of neighbouring lines are no independent numbers: half as many count.
+    error = MAD_ERROR * np.hypot(together, apart) / 4 / np.sqrt(max(len(first) / 2, 1))
+    return float(together - apart) / 4, float(error)
+
+
+def _single(mean: np.ndarray, error: np.ndarray, gains: np.ndarray, errors: np.ndarray, least: float) -> list[Line]:
+    """Return the lines that are off alone, the largest deviation first."""
+    with np.errstate(invalid="ignore"):
+        known = np.isfinite(gains).sum(0)
+        like = np.abs(gains - mean) < np.maximum(3 * errors, np.abs(mean) / 2)
+        agree = (like & (np.sign(gains) == np.sign(mean))).sum(0) >= AGREE * np.maximum(known, 2)
+        off = (np.abs(mean) > np.maximum(least, SIGNIFICANT * error)) & agree & _alone(mean, error, -1.0)
+    farthest = np.argmax(np.abs(np.nan_to_num(gains)), axis=0)
+    largest = np.where(off, mean, np.take_along_axis(gains, farthest[None], axis=0)[0])
+    taken = set[int]()
+    lines = []
+    for index in sorted(np.flatnonzero(off | _partly(gains, errors)), key=lambda index: -abs(largest[index])):
+        if not taken & {index - 1, index + 1}:  # neighbours are off by half of it, to the other side
+            taken.add(int(index))
+            lines.append(Line(int(index), float(largest[index]), float(error[index])))
+    return lines
+
+
+def _partly(gains: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Return which lines are off in some of the blocks, such as a hot column below its hot pixel.
+
+    Most blocks say nothing of such a line, so that light must be excluded in each of the others.
+    """
+    with np.errstate(invalid="ignore"):
+        clear = np.abs(gains) > np.maximum(CLEAR * errors, PART)
+    sure = clear & np.array([_alone(each, its, SURE) for each, its in zip(gains, errors, strict=True)])
+    return np.asarray((sure.sum(0) >= 2) & (4 * sure.sum(0) >= 3 * clear.sum(0)))
+
+
+def _alone(second: np.ndarray, error: np.ndarray, sure: float) -> np.ndarray:
+    """Return which lines are alone with their deviation, by so many standard errors more than `ISOLATED`.
+
+    The second differences around a single line of gain g are (0, -g/2, g, -g/2, 0), and those of a blurred bright
+    line fall off over five lines: with r and q, the sums over the next lines and the ones after them over -g, the
+    isolation r - q is 1 for a detector.
+    """
+    padded = np.pad(second, REACH, constant_values=np.nan)
+    count = len(second)
+    around = [padded[REACH + step : REACH + step + count] for step in range(-REACH, REACH + 1) if step]
+    expected = np.array([-1 / 2 if abs(step) == 1 else 0.0 for step in range(-REACH, REACH + 1) if step])
+    beside = np.array(around)
+    near, far = beside[2] + beside[3], beside[1] + beside[4]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        isolation, unsure = (far - near) / second, 2 * error / np.abs(second)
+        slack = np.maximum(ASKEW * np.abs(second), 3 * error)
+        like = np.all(np.abs(beside - expected[:, None] * second) < slack, axis=0)
+        largest = np.all(np.abs(second) > np.abs(beside), axis=0)
+        needed = np.maximum(ISOLATED + sure * unsure, LEAST_ISOLATED)
+        return np.asarray(like & largest & (isolation > needed))
+
+
+def _grows(gains: np.ndarray, errors: np.ndarray, level: np.ndarray) -> bool | None:
+    """Say whether the pattern of lines grows with the level; None where blocks of other levels do not tell.
+
+    The pattern of the other blocks is fitted to each block. Over the level, gains fit all blocks alike, and offsets
+    fall as 1 / level: the slope of the logarithms is 0 or -1.
+    """
+    fits, unsure = (
+        np.array(each) for each in zip(*map(partial(_fit, gains, errors), range(len(gains))), strict=True)
+    )
+    levels = np.nanmean(level, axis=1)
+    use = (fits > 0) & np.isfinite(unsure)
+    if use.sum() < 3 or np.ptp(np.log(levels[use])) < np.log(LEVELS):
+        return None
+    x, y, weights = np.log(levels[use]), np.log(fits[use]), np.square(fits[use] / unsure[use])
+    x, y = (each - np.average(each, weights=weights) for each in (x, y))
+    power = float((weights * x * x).sum())
+    slope = float((weights * x * y).sum()) / power
+    rest = float((weights * np.square(y - slope * x)).sum()) / (len(x) - 2)
+    error = float(np.sqrt(max(rest, 1) / power))
+    return None if abs(slope + 1 / 2) < 3 * error else slope > -1 / 2
+
+
+def _fit(gains: np.ndarray, errors: np.ndarray, number: int) -> tuple[float, float]:
+    """Return by what factor the pattern of the other blocks fits one block, and the standard error of that."""
+    others, _ = _combined(np.delete(gains, number, 0), np.delete(errors, number, 0))
+    pattern = np.nan_to_num(others)
+    power = float(np.square(pattern).sum())
+    if power == 0:
+        return 0.0, np.inf
+    noise = float(np.sqrt(np.square(pattern * np.nan_to_num(errors[number])).sum()))
+    return float((pattern * np.nan_to_num(gains[number])).sum()) / power, noise / power if noise else np.inf

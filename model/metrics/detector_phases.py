@@ -1,0 +1,106 @@
+"""Find a fixed pattern of 2 x 2 pixels: alternate rows, alternate columns, or a checkerboard.
+
+Two or four read-out channels, or pixels that share their electronics, differ in gain or offset. The pattern has the
+period of two pixels, where optics leave little contrast and no scene keeps its phase. It may change slowly over the
+image, and even its sign: so it is measured in sections.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import convolve1d, maximum_filter
+
+SMOOTH = np.array([1, 4, 6, 4, 1], np.float32) / 16
+"""Removes a pattern of period 2 and keeps what is smooth."""
+EDGE_PX = 2
+"""Pixels along a border that the filter cannot judge."""
+CLIP = 2.0
+"""Multiple of the mean absolute deviation at which texture is clipped."""
+TEXTURE = 2.0
+"""Factor on the standard error: neighbouring deviations of texture are no independent numbers."""
+SIGNIFICANT = 4.0
+"""Standard errors from which a section counts."""
+MANY = 0.2
+"""Share of the sections that must show the pattern significantly."""
+PATTERNS = ("alternate columns", "alternate rows", "checkerboard")
+COLOUR = 0.05
+"""Difference over the level from which the pattern is rather a mosaic of colour filters."""
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """One pattern of period 2.
+
+    Attributes:
+        name: one of `PATTERNS`.
+        difference: between its two kinds of pixels over the level, root mean square of the sections without noise.
+        largest: of the sections, the largest significant one.
+        seen: whether enough sections show it significantly.
+    """
+
+    name: str
+    difference: float
+    largest: float
+    seen: bool
+
+
+def measure_phases(pixels: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Measure the patterns of one section.
+
+    Args:
+        pixels: (h, w) float32, whose first row and column are even ones of the image.
+        valid: where they are measurements.
+
+    Returns:
+        The differences over the level, (3,), in the order of `PATTERNS`, and their standard errors; NaN where the
+        section is too small or dark.
+    """
+    nothing = np.full(3, np.nan), np.full(3, np.nan)
+    if min(pixels.shape) < 8 * EDGE_PX:
+        return nothing
+    smooth = convolve1d(convolve1d(pixels, SMOOTH, axis=0), SMOOTH, axis=1)
+    inner = (slice(EDGE_PX, -EDGE_PX),) * 2
+    rest = (pixels - smooth)[inner]
+    # The filter spreads what is no measurement over its reach.
+    known = np.ones(rest.shape, bool)
+    if not valid.all():
+        known = ~maximum_filter(~valid, 2 * EDGE_PX + 1)[inner]
+    if known.mean() < 1 / 4:
+        return nothing
+    level = float(np.mean(smooth[inner][known], dtype=np.float64))
+    if level <= 0:
+        return nothing
+    reach = CLIP * float(np.mean(np.abs(rest[known])))
+    clipped = np.where(known, np.clip(rest, -reach, reach), 0)
+    inside = max(int((known & (np.abs(rest) <= reach)).sum()), 1)
+    down, across = (1 - 2.0 * (np.arange(side) % 2) for side in rest.shape)
+    signs = ((np.ones_like(down), across), (down, np.ones_like(across)), (down, across))
+    sums = np.array([float(rows @ clipped @ columns) for rows, columns in signs])
+    error = TEXTURE * float(np.sqrt(np.square(clipped).sum(dtype=np.float64))) / inside
+    # Twice the amplitude: the difference between the two kinds of pixels.
+    return 2 * sums / inside / level, np.full(3, 2 * error / level)
+
+
+def judge_phases(measured: Sequence[tuple[np.ndarray, np.ndarray]], least: float) -> tuple[Pattern, ...]:
+    """Say what the sections of an image show of each pattern.
+
+    Args:
+        measured: of each section, as `measure_phases` returns it.
+        least: the difference that matters, over the level.
+    """
+    if not measured:
+        return ()
+    differences, errors = (np.array(each) for each in zip(*measured, strict=True))
+    found = []
+    for number, name in enumerate(PATTERNS):
+        known = np.isfinite(differences[:, number])
+        if not known.any():
+            continue
+        difference, error = differences[known, number], errors[known, number]
+        power = float(np.mean(np.square(difference) - np.square(error / TEXTURE)))
+        strong = np.abs(difference) > SIGNIFICANT * error
+        rms = float(np.sqrt(max(power, 0)))
+        largest = float(np.max(np.abs(difference[strong]), initial=0))
+        found.append(Pattern(name, rms, largest, bool(rms > least and strong.mean() >= MANY)))
+    return tuple(found)

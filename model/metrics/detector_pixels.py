@@ -1,0 +1,94 @@
+"""Find single pixels that no blurred image can have: dead ones, hot ones, hits of particles.
+
+The optics spread a point over its neighbours. Where the MTF at Nyquist is 30 % (a Gaussian), the four pixels beside
+the brightest one of a point source hold 0.22 of its excess in the mean, wherever it lies in that pixel; where it is
+lower, they hold more. A faulty pixel leaves its neighbours alone.
+"""
+
+import numpy as np
+
+PATCH_PX = 4
+"""Pixels around one that are compared with it."""
+LEAST = 9.0
+"""Standard deviations of the texture and noise around by which a wrong pixel is off at least."""
+ISOLATED, SURE = 0.75, 1.5
+"""Least isolation of a wrong pixel, so many standard errors taken off: 1 for a detector. Of a point of light it is
+0.70, 0.46, 0.27 and 0.02 where the MTF at Nyquist is 30, 20, 15 and 10 % (a Gaussian centred on a pixel)."""
+DEAD, BRIGHT, DARK = 0.3, 0.6, 10.0
+"""A pixel below the first share of its ground, whose neighbours are all above the second: no shadow is that narrow.
+Ground below so many standard deviations is too dark to tell."""
+CANDIDATE = 2.0
+"""Multiple of the mean step between neighbours by which a candidate lies outside of all its neighbours."""
+CUT, CUT_NOISE, CUT_STEPS = 0.3, 0.03, 3.0
+"""Share of equal pixels from which the ground is taken to be cut off, and the noise, over the ground and in steps,
+that is then assumed."""
+QUIET = 0.001
+"""Noise over the ground that is assumed at least."""
+KNOWN = 60
+"""Of the 81 pixels around, those that must be known."""
+
+
+def wrong_pixels(pixels: np.ndarray, step: float = 0.0) -> np.ndarray:
+    """Return the rows and columns (n, 2) of single wrong pixels, in the order of rows.
+
+    Pixels within `PATCH_PX` of a border are not judged.
+
+    Args:
+        pixels: (h, w) float32, NaN where they are unknown.
+        step: between the values that pixels can have; 0 where it is not known.
+    """
+    size = 2 * PATCH_PX + 1
+    if min(pixels.shape) < size:
+        return np.empty((0, 2), np.int64)
+    places = _candidates(pixels)
+    windows = np.lib.stride_tricks.sliding_window_view(pixels, (size, size))
+    patches = windows[places[:, 0] - PATCH_PX, places[:, 1] - PATCH_PX].astype(np.float64)
+    known = np.isfinite(patches).sum((1, 2)) > KNOWN
+    places, patches = places[known], patches[known]
+    return np.asarray(places[_wrong(patches, step)]) if len(places) else places
+
+
+def _candidates(pixels: np.ndarray) -> np.ndarray:
+    """Return the places (n, 2) of pixels that lie clearly above, or below, all of their eight neighbours."""
+    height, width = pixels.shape
+    inner = pixels[PATCH_PX : height - PATCH_PX, PATCH_PX : width - PATCH_PX]
+    above = below = None
+    for down, across in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
+        rows = slice(PATCH_PX + down, height - PATCH_PX + down)
+        each = pixels[rows, PATCH_PX + across : width - PATCH_PX + across]
+        above = each if above is None else np.maximum(above, each)
+        below = each if below is None else np.minimum(below, each)
+    step = np.abs(np.diff(inner, axis=1))
+    least = CANDIDATE * float(np.nanmean(step)) if np.isfinite(step).any() else 0.0
+    out = np.maximum(inner - above, below - inner)
+    return np.asarray(np.argwhere((out > 0) & (out >= least)) + PATCH_PX)
+
+
+def _wrong(patches: np.ndarray, step: float) -> np.ndarray:
+    """Return which patches (n, 9, 9) have a centre that is no light; NaN is unknown.
+
+    The second difference along both axes, x - (its 4 sides) / 2 + (its 4 diagonals) / 4, removes planes and edges. A
+    single pixel of excess e leaves e there, -e/2 beside it and 0 two pixels on; a point of light leaves less beside
+    it and more two pixels on.
+    """
+    along = patches[:, 1:-1] - (patches[:, :-2] + patches[:, 2:]) / 2
+    both = along[:, :, 1:-1] - (along[:, :, :-2] + along[:, :, 2:]) / 2
+    centre = both[:, 3, 3]
+    near = both[:, [2, 4, 3, 3], [3, 3, 2, 4]].mean(1)
+    far = both[:, [1, 5, 3, 3], [3, 3, 1, 5]].mean(1)
+    ring = np.ones((7, 7), bool)
+    ring[2:5, 2:5] = False
+    scatter = np.sqrt(np.nanmean(np.square(both[:, ring]), axis=1))
+    ground = np.nanmedian(patches[:, 2:7, 2:7].reshape(len(patches), 25), axis=1)
+    # Rounding hides the noise of a quiet image, and an end of the range cuts it off: neither may pass for no noise.
+    cut = (patches == ground[:, None, None]).mean((1, 2)) > CUT
+    floor = np.where(cut, CUT_NOISE * np.abs(ground) + CUT_STEPS * step, np.maximum(step, QUIET * np.abs(ground)))
+    scatter = np.maximum(scatter, floor)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        isolation = 2 * (far - near) / centre
+        unsure = 1.5 * scatter / np.abs(centre)
+        alone = (np.abs(centre) > LEAST * scatter) & (isolation - SURE * unsure > ISOLATED)
+    middle = patches[:, 3:6, 3:6].reshape(len(patches), 9)
+    around = np.delete(middle, 4, axis=1)
+    dead = (middle[:, 4] < DEAD * ground) & (around.min(1) > BRIGHT * ground) & (ground > DARK * scatter)
+    return np.asarray(np.isfinite(isolation) & (alone | dead))

@@ -1,0 +1,260 @@
+"""Faulty detectors are told, listed, replaced before restoration and written; what does not fit is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.restoration.detectors.fault_list import Fault, FaultList, read_list
+from beers_deploy.restoration.detectors.fix import REACH_PX, FixedSource, find_faults
+from beers_deploy.restoration.detectors.look import LOOKED_PX, look_at_detectors
+from beers_deploy.restoration.detectors.words import sentences
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.run import restore_file
+from beers_deploy.restoration.source import ArraySource, Raster, VeiledSource
+from tests.deploy.command_line import done, refused
+from tests.deploy.restoration.runs import stopped_after
+
+HEIGHT, WIDTH, LEVEL, NOISE = 140, 120, 600.0, 5.0
+
+
+def ground(*shape: int, seed: int = 0) -> np.ndarray:
+    """An even raw image, uint16."""
+    return np.rint(np.random.default_rng(seed).normal(LEVEL, NOISE, shape)).astype(np.uint16)
+
+
+def faulty() -> np.ndarray:
+    """Dead and hot pixels, a dead column and a dead row, far apart."""
+    pixels = ground(HEIGHT, WIDTH)
+    pixels[:, 40] = 0
+    pixels[100] = 4095
+    pixels[20, 80] = 4095
+    pixels[70, 90] = 0
+    return pixels
+
+
+FAULTS = [Fault(-1, 100), Fault(40, -1), Fault(80, 20), Fault(90, 70)]
+
+
+def source_of(pixels: np.ndarray, nodata: float | None = None) -> ArraySource:
+    planes = pixels if pixels.ndim == 3 else pixels[None]
+    return ArraySource(planes, Raster(*planes.shape, planes.dtype, nodata))
+
+
+def read(source: FixedSource, step_px: int = 7) -> np.ndarray:
+    """Read all rows, some at a time."""
+    height = source.raster.height_px
+    return np.concatenate([source.read(top, min(top + step_px, height)) for top in range(0, height, step_px)], axis=1)
+
+
+def test_all_kinds_are_found_in_each_band() -> None:
+    assert list(find_faults(source_of(faulty()), "image").faults) == FAULTS
+    bands = np.stack([ground(HEIGHT, WIDTH, seed=3), faulty()])
+    assert set(find_faults(source_of(bands), "image").faults) == {Fault(f.column, f.row, 2) for f in FAULTS}
+
+
+def test_the_same_is_found_in_floats_with_missing_pixels() -> None:
+    pixels = faulty().astype(np.float32) * np.float32(0.37)
+    pixels[:10, :30] = np.nan
+    assert list(find_faults(source_of(pixels), "image").faults) == FAULTS
+    hidden = faulty()
+    hidden[:10, :30] = 0
+    assert list(find_faults(source_of(hidden, nodata=0.0), "image").faults) == [Fault(-1, 100), Fault(80, 20)]
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(1, 300), st.integers(0, 2**20))
+def test_however_rows_are_read_the_same_pixels_come(step_px: int, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    pixels = ground(2, HEIGHT, WIDTH, seed=seed)
+    places = generator.integers((0, 0, 0), (WIDTH, HEIGHT, 3), (30, 3))
+    faults = FaultList(tuple(Fault(*map(int, place)) for place in places))
+    source = FixedSource(source_of(pixels), faults)
+    whole = source.read(0, HEIGHT)
+    np.testing.assert_array_equal(read(source, step_px), whole)
+    mask = faults.mask(source.raster, 0, HEIGHT)
+    np.testing.assert_array_equal(whole[~mask], pixels[~mask])
+    assert (np.abs(whole[mask] - LEVEL) < 6 * NOISE).all()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int16, np.float32, np.float64])
+def test_a_plane_is_interpolated_exactly(dtype: type) -> None:
+    rows, columns = np.indices((HEIGHT, WIDTH))
+    plane = (rows // 2 + columns // 2 * 0 + 20).astype(dtype)  # constant along each row
+    spoilt = plane.copy()
+    spoilt[:, 50:52] = 0
+    spoilt[30, 20] = 99
+    faults = FaultList((Fault(50, -1), Fault(51, -1), Fault(20, 30)))
+    fixed = FixedSource(source_of(spoilt), faults).read(0, HEIGHT)[0]
+    assert fixed.dtype == dtype
+    np.testing.assert_allclose(fixed, plane, atol=0.5)
+    np.testing.assert_allclose(fixed[:, 50:52], plane[:, 50:52], rtol=1e-6)
+
+
+def test_missing_pixels_stay_missing_and_are_no_neighbours() -> None:
+    pixels = ground(HEIGHT, WIDTH)
+    pixels[:, 61:] = 7
+    faults = FaultList((Fault(60, -1), Fault(90, 5)))
+    fixed = FixedSource(source_of(pixels, nodata=7.0), faults).read(0, HEIGHT)[0]
+    np.testing.assert_array_equal(fixed[:, 61:], pixels[:, 61:])
+    np.testing.assert_array_equal(fixed[:, 60], pixels[:, 59])
+    planes = np.stack([pixels, (pixels != 7).astype(np.uint16)])
+    veiled = FixedSource(VeiledSource(source_of(planes), "unassalpha"), faults)
+    got = veiled.read(3, 9)
+    np.testing.assert_array_equal(np.ma.getmaskarray(got)[0], pixels[3:9] == 7)
+    np.testing.assert_array_equal(np.ma.getdata(got)[0], fixed[3:9])
+
+
+def test_a_replaced_pixel_never_falls_on_the_nodata_value() -> None:
+    pixels = np.full((9, 9), 10, np.uint16)
+    pixels[4, :4], pixels[4, 5:], pixels[:4, 4], pixels[5:, 4] = 9, 11, 9, 11
+    pixels[4, 4] = 99
+    faults = FaultList((Fault(4, 4),))
+    assert FixedSource(source_of(pixels), faults).read(0, 9)[0, 4, 4] == 10
+    assert FixedSource(source_of(pixels, nodata=10.0), faults).read(0, 9)[0, 4, 4] in (9, 11)
+
+
+def test_what_no_sound_pixel_is_near_stays() -> None:
+    pixels = ground(5, 80)
+    faults = FaultList(tuple(Fault(column, -1) for column in range(80)))
+    np.testing.assert_array_equal(FixedSource(source_of(pixels), faults).read(0, 5)[0], pixels)
+    faults = FaultList(tuple(Fault(column, -1) for column in range(REACH_PX + 1)))
+    fixed = FixedSource(source_of(pixels), faults).read(0, 5)[0]
+    np.testing.assert_array_equal(fixed[:, 0], pixels[:, 0])
+    np.testing.assert_array_equal(fixed[:, 1], pixels[:, REACH_PX + 1])
+
+
+lists = st.lists(
+    st.builds(Fault, st.integers(-1, 9), st.integers(0, 7), st.integers(0, 3)) | st.just(Fault(3, -1)), min_size=1
+)
+
+
+@given(lists)
+def test_a_list_is_read_as_it_was_written(tmp_path_factory: pytest.TempPathFactory, faults: list[Fault]) -> None:
+    path = tmp_path_factory.getbasetemp() / "list.csv"
+    written = FaultList(tuple(sorted(set(faults))))
+    path.write_text(written.text)
+    assert read_list(path, Raster(3, 8, 10, np.dtype(np.uint16))).faults == written.faults
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "without any"),
+        ("column,row\n", "without any"),
+        ("12,3", "line 1: 12,3"),
+        ("column,row\n1,8", "line 2: 1,8"),
+        ("1,2,4", "3 bands"),
+        ("1,2,0", "column,row"),
+        ("*,*", "column,row"),
+        ("1", "column,row"),
+        ("1,2,3,4", "column,row"),
+        ("-1,2", "column,row"),
+        ("1.5,2", "column,row"),
+        ("a,b", "'a,b'"),
+        ("1,²", "column,row"),
+        ("1," + "9" * 5000, "column,row"),
+    ],
+)
+def test_a_list_that_does_not_fit_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "list.csv").write_text(text, encoding="utf-8")
+    with pytest.raises(OptionError) as error:
+        read_list(tmp_path / "list.csv", Raster(3, 8, 10, np.dtype(np.uint16)))
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe\x00", None])
+def test_what_is_no_text_file_is_refused(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "list.csv"
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_bytes(content)
+    with pytest.raises(OptionError, match="list of faulty detectors"):
+        read_list(path, Raster(3, 8, 10, np.dtype(np.uint16)))
+
+
+def test_an_image_full_of_single_pixels_has_no_single_faults() -> None:
+    pixels = ground(HEIGHT, WIDTH)
+    pixels[5::7, 5::7] = 4095
+    with pytest.raises(ImageError, match="few faulty pixels"):
+        find_faults(source_of(pixels), "image")
+
+
+def test_sentences_name_kind_place_and_remedy() -> None:
+    pixels = faulty().astype(np.float64)
+    pixels[:, ::2] *= 1.04
+    said = sentences(look_at_detectors(source_of(np.rint(np.minimum(pixels, 4095)).astype(np.uint16)), 5000))
+    assert all("look at the detectors: " in sentence for sentence in said)
+    for words in ("1 dead column", "column 40", "1 dead row", "row 100", "column 80, row 20", "alternate columns"):
+        assert any(words in sentence for sentence in said), words
+    assert not sentences(look_at_detectors(source_of(ground(HEIGHT, WIDTH)), 4095))
+
+
+def test_of_a_large_image_few_rows_are_read() -> None:
+    class Counting(ArraySource):
+        rows = 0
+
+        def read(self, start: int, stop: int) -> np.ndarray:
+            self.rows += stop - start
+            return np.broadcast_to(ground(1, 1, 5000), (1, stop - start, 5000))
+
+    source = Counting(np.empty((1, 0, 0), np.uint16), Raster(1, 10**6, 5000, np.dtype(np.uint16)))
+    look_at_detectors(source)
+    assert source.rows * 5000 < 1.2 * LOOKED_PX
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    tifffile.imwrite(tmp_path / "in.tif", faulty())
+    return tmp_path / "in.tif"
+
+
+def test_a_restoration_sees_the_replaced_pixels(image: Path, model: Path, tmp_path: Path) -> None:
+    fixed = FixedSource(source_of(faulty()), FaultList(tuple(FAULTS))).read(0, HEIGHT)[0]
+    tifffile.imwrite(tmp_path / "fixed.tif", fixed)
+    restore_file(tmp_path / "fixed.tif", tmp_path / "expected.tif", Options(model, 64))
+    row = restore_file(image, tmp_path / "out.tif", Options(model, 64, fix_detectors="found"))
+    assert row.text["detectors replaced"] == "2 pixels, 1 column, 1 row"
+    expected = tifffile.imread(tmp_path / "expected.tif")
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "out.tif"), expected)
+    listed = tmp_path / "out.detectors.csv"
+    assert listed.read_text() == "column,row\n*,100\n40,*\n80,20\n90,70\n"
+    restore_file(image, tmp_path / "again.tif", Options(model, 64, fix_detectors=str(listed)))
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "again.tif"), expected)
+    assert not (tmp_path / "again.detectors.csv").exists()
+
+
+def test_a_stopped_run_goes_on_with_the_same_faults_and_no_others(image: Path, model: Path, tmp_path: Path) -> None:
+    (tmp_path / "list.csv").write_text("7,8\n")
+    out, options = tmp_path / "out.tif", Options(model, 64, fix_detectors="found")
+    restore_file(image, tmp_path / "expected.tif", options)
+    with stopped_after(4):
+        restore_file(image, out, options)
+    assert not (tmp_path / "out.detectors.csv").exists()
+    for other in ("", str(tmp_path / "list.csv")):
+        with pytest.raises(OptionError, match="resume"):
+            restore_file(image, out, Options(model, 64, fix_detectors=other, resume=True))
+    restore_file(image, out, Options(model, 64, fix_detectors="found", resume=True))
+    assert out.read_bytes() == (tmp_path / "expected.tif").read_bytes()
+    assert (tmp_path / "out.detectors.csv").exists()
+
+
+def test_commands_say_it(image: Path, model: Path, tmp_path: Path) -> None:
+    network = ("--network", model)
+    said = done("info", image, *network)
+    assert "look at the detectors: 1 dead column" in said
+    assert "dead lines" in said
+    out = tmp_path / "out.tif"
+    assert "look at the detectors: 1 dead column" in done("restore", image, out, *network)
+    said = done("restore", image, out, *network, "--fix-detectors", "found")
+    assert "2 pixels, 1 column, 1 row found" in said
+    assert "look at the detectors" not in said
+    before = out.read_bytes()
+    assert "--fix-detectors" in refused("restore", image, out, *network, "--fix-detectors", tmp_path / "none.csv")
+    assert "input" in refused("restore", image, out, *network, "--fix-detectors", out)
+    assert out.read_bytes() == before

@@ -1,0 +1,108 @@
+"""Lines of another gain are found with their gain; what a scene has is not."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter
+
+from beers_deploy.model.metrics.detector_lines import (
+    Stripes,
+    constant_columns,
+    join_blocks,
+    judge_lines,
+    measure_lines,
+)
+
+LEAST = 0.003
+SIGMA_PX = {"25 %": 0.53, "15 %": 0.62, "5 %": 0.78}
+"""Gaussian blur by its MTF at Nyquist."""
+seeds = st.integers(0, 2**20)
+
+
+def judged(image: np.ndarray, rows_px: int = 64) -> Stripes:
+    """Judge the columns of an image in blocks of rows."""
+    blocks = [image[top : top + rows_px].astype(np.float32) for top in range(0, len(image), rows_px)]
+    return judge_lines(join_blocks([measure_lines(block, np.isfinite(block)) for block in blocks]), LEAST)
+
+
+def noisy(image: np.ndarray, generator: np.random.Generator, noise: float = 4.0) -> np.ndarray:
+    return np.asarray(np.rint(image + generator.normal(0, noise, image.shape)), np.float32)
+
+
+@settings(deadline=None, max_examples=15)
+@given(seeds, st.integers(16, 180), st.floats(50, 3000), st.sampled_from([2.0, 4.0, 40.0]))
+def test_even_ground_has_no_lines(seed: int, width: int, level: float, noise: float) -> None:
+    found = judged(noisy(np.full((512, width), level), np.random.default_rng(seed), noise))
+    assert not found.seen
+    assert not found.off
+    assert not found.dead
+
+
+@settings(deadline=None, max_examples=15)
+@given(seeds, st.integers(250, 500), st.floats(0.006, 0.03))
+def test_the_spread_of_the_gains_is_measured(seed: int, width: int, rms: float) -> None:
+    generator = np.random.default_rng(seed)
+    gains = 1 + rms * generator.standard_normal(width)
+    found = judged(noisy(600 * gains * np.ones((512, 1)), generator))
+    assert found.seen
+    assert found.spread == pytest.approx(rms, rel=0.5)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seeds, st.integers(4, 95), st.sampled_from([-0.2, -0.02, 0.01, 0.3]))
+def test_a_single_column_is_found_with_its_gain(seed: int, column: int, gain: float) -> None:
+    image = np.full((512, 100), 600.0)
+    image[:, column] *= 1 + gain
+    (line,) = judged(noisy(image, np.random.default_rng(seed))).off
+    assert line.index == column
+    assert line.gain == pytest.approx(gain, abs=0.004)
+
+
+@pytest.mark.parametrize("sigma_px", SIGMA_PX.values(), ids=list(SIGMA_PX))
+@pytest.mark.parametrize("width_px", [1, 2, 5, 40])
+@pytest.mark.parametrize("shift_px", [0, 1, 2])
+def test_a_blurred_road_along_the_columns_is_a_scene(sigma_px: float, width_px: int, shift_px: int) -> None:
+    fine = np.full((512, 300), 600.0)  # thirds of a pixel
+    fine[:, 150 + shift_px : 150 + shift_px + 3 * width_px] = 900
+    blurred = gaussian_filter(fine, (0, 3 * sigma_px), mode="nearest")
+    image = blurred[:, 1::3]
+    assert not judged(noisy(image, np.random.default_rng(shift_px))).off
+
+
+@settings(deadline=None, max_examples=10)
+@given(seeds, st.sampled_from([0.0, 7.0, 4095.0]), st.integers(1, 98))
+def test_a_dead_column_is_found_and_its_neighbours_are_not(seed: int, value: float, column: int) -> None:
+    image = noisy(np.full((512, 100), 600.0), np.random.default_rng(seed))
+    image[:, column] = value
+    found = judged(image)
+    assert found.dead == (column,)
+    assert not {line.index for line in found.off} & {column - 1, column, column + 1}
+
+
+def test_a_margin_and_a_constant_image_are_no_dead_columns() -> None:
+    image = noisy(np.full((64, 50), 600.0), np.random.default_rng(0))
+    image[:, :5] = 0
+    image[:, -1] = 0
+    assert not constant_columns(image).any()
+    assert not constant_columns(np.full((64, 50), 7.0)).any()
+    image[:, 20:22] = 3
+    assert np.flatnonzero(constant_columns(image)).tolist() == [20, 21]
+    image[:, 30] = np.nan
+    assert np.flatnonzero(constant_columns(image)).tolist() == [20, 21]
+
+
+@pytest.mark.parametrize("gains", [True, False])
+def test_gains_grow_with_the_level_and_offsets_do_not(gains: bool) -> None:
+    generator = np.random.default_rng(5)
+    level = np.repeat([200.0, 400, 800, 1600, 300, 1000, 600, 1400], 64)[:, None]
+    pattern = generator.standard_normal(200)
+    image = level * (1 + 0.02 * pattern) if gains else level + 12 * pattern
+    assert judged(noisy(image, generator)).grows_with_level is gains
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (5, 5), (3, 200), (200, 3), (64, 7)])
+@pytest.mark.parametrize("value", [0.0, 5.0, np.nan])
+def test_what_is_too_small_or_empty_says_nothing(shape: tuple[int, int], value: float) -> None:
+    found = judged(np.full(shape, value))
+    assert (found.seen, found.off, found.dead) == (False, (), ())
