@@ -38,7 +38,7 @@ class Box(NamedTuple):
 
 
 class Place(NamedTuple):
-    """A crop to show of a frame, flat ground in it, and a box that an edge crosses from top to bottom, if any does."""
+    """A crop to show of a frame, flat ground in it, and a box that an edge crosses from top to bottom, if any."""
 
     frame: str
     crop: Box

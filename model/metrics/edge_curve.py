@@ -49,6 +49,10 @@ MOST_EDGES = 60
 """The least uneven count; more take time and add little."""
 FEW_EDGES = 7
 """Of so many or fewer, strips along the edges are drawn; of more, whole edges."""
+EVEN = 0.012
+"""Texture over step up to which noise alone is drawn along an edge: it has no texture to draw strips of."""
+UNEVEN_PX = 20.0
+"""By how much texture scatters the softness of edges found by search, for a texture as large as the step (measured)."""
 
 SCATTER_PX, SOFT_PX, OUTLIERS, OUTLIER_RANGE_PX = 0.15, 0.3, 0.05, 8.0
 """Of softness: scatter of steps beyond their errors, and mean excess of others, both before any edge is seen; share
@@ -208,15 +212,23 @@ def _curve_of_sharpest(
         fitted = _fitted_again(fitted, weights)
         values, errors = _softness(fitted, weights)
         sure = errors <= MAX_ERROR_PX
+        errors = np.hypot(errors, [UNEVEN_PX * edge.unevenness for edge in fitted])
         step = sharpest(values[sure], errors[sure]) if sure.any() else 0.0
         alike = sure & (np.abs(values - step) <= KEPT_DEVIATIONS * np.hypot(errors, SCATTER_PX))
         kept = [edge for edge, each in zip(fitted, alike, strict=True) if each]
     if len(kept) < least:
         return Refusal(f"{len(kept)} straight edges of one sharpness, {least} are needed")
-    draws = [softened(draw, step) for draw in _drawn(kept, weights, generator)]
+    steps = _drawn_steps(values[sure], errors[sure], generator)
+    draws = [softened(*pair) for pair in zip(_drawn(kept, weights, generator), steps, strict=True)]
     curve = _with_interval(softened(weights, step), draws, kept, (), floor)
     high = np.minimum(curve.high * np.exp(NATURAL_PX * FREQUENCIES), np.sinc(FREQUENCIES))
     return replace(curve, high=high)
+
+
+def _drawn_steps(values: np.ndarray, errors: np.ndarray, generator: np.random.Generator) -> list[float]:
+    """Return the softness of the steps in each draw of edges."""
+    draws = (generator.integers(values.size, size=values.size) for _ in range(DRAWS))
+    return [sharpest(values[chosen], errors[chosen]) for chosen in draws]
 
 
 def _first_fits(edges: Sequence[Edge]) -> list[FittedEdge]:
@@ -292,7 +304,12 @@ def _drawn(edges: Sequence[FittedEdge], weights: np.ndarray, generator: np.rando
 def _drawn_along(
     edge: FittedEdge, weights: np.ndarray, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return an edge's normal equations with its strips drawn with replacement."""
+    """Return an edge's normal equations with its noise drawn again, or its strips drawn with replacement."""
+    if edge.unevenness <= EVEN:
+        gram, moment = normal_equations(edge, weights)
+        sizes, axes = np.linalg.eigh(gram)
+        noise = axes @ (np.sqrt(np.maximum(sizes, 0.0)) * generator.standard_normal(PARTS))
+        return gram, moment + noise
     strips = strips_of(edge)
     counts = np.bincount(generator.integers(strips, size=strips), minlength=strips)
     return normal_equations(edge, weights, counts)
@@ -320,7 +337,9 @@ def _with_interval(
     detector = np.sinc(FREQUENCIES)
     contrast = np.clip(mtf_at(FREQUENCIES, weights), LEAST_CONTRAST, detector)
     drawn = np.maximum([mtf_at(FREQUENCIES, draw) for draw in draws], LEAST_CONTRAST)
-    looks = sum(map(strips_of, edges)) if len(edges) <= FEW_EDGES else len(edges)
+    looks = len(edges)
+    if looks <= FEW_EDGES:
+        looks = sum(len(edge.weights) if edge.unevenness <= EVEN else strips_of(edge) for edge in edges)
     wider = float(stdtrit(looks - 1, HIGH_PERCENT / 100)) / NORMAL_QUANTILE * math.sqrt(looks / (looks - 1))
     lowest, highest = np.percentile(drawn, [LOW_PERCENT, HIGH_PERCENT], axis=0)
     unknown = NORMAL_QUANTILE * floor * contrast
