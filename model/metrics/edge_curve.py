@@ -17,7 +17,16 @@ import numpy as np
 
 from beers_deploy.model.metrics.edge_blur import THOROUGH, plain_squares
 from beers_deploy.model.metrics.edge_fit import ANY, MAX_SLOPE, EdgeBlur, Limits, Noise, centroids, fit_shape
-from beers_deploy.model.metrics.mtf_basis import CORNERS, PARTS, mtf_at, softened, solve, weights_of
+from beers_deploy.model.metrics.mtf_basis import (
+    BENDS,
+    CORNERS,
+    PARTS,
+    likeliest_bend,
+    mtf_at,
+    softened,
+    solve,
+    weights_of,
+)
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.metrics.uneven_edge import (
     MAD,
@@ -44,7 +53,8 @@ of a step's softness; of the second, one in three was not (measured)."""
 MAX_ERROR_PX = 0.6
 """Standard error of softness of an edge found by search."""
 NATURAL_PX = 0.3
-"""How much softer than a step the sharpest edges of a scene may be: it raises the interval's upper end."""
+"""How much softer than a step the sharpest edges of a scene may be, and how much sharper thin things beside them make
+them look: it widens the interval."""
 MOST_EDGES = 60
 """The least uneven count; more take time and add little."""
 FEW_EDGES = 7
@@ -52,7 +62,7 @@ FEW_EDGES = 7
 EVEN = 0.012
 """Texture over step up to which noise alone is drawn along an edge: it has no texture to draw strips of."""
 UNEVEN_PX = 20.0
-"""By how much texture scatters the softness of edges found by search, for a texture as large as the step (measured)."""
+"""By how much texture as large as the step scatters the softness of edges found by search (measured)."""
 
 SCATTER_PX, SOFT_PX, OUTLIERS, OUTLIER_RANGE_PX = 0.15, 0.3, 0.05, 8.0
 """Of softness: scatter of steps beyond their errors, and mean excess of others, both before any edge is seen; share
@@ -60,6 +70,9 @@ of edges that are neither, and where these lie."""
 KEPT_DEVIATIONS = 2.5
 CONTRADICTION_DEVIATIONS, CONTRADICTION_PX = 3.0, 0.4
 """0.4 px is 18 % of the contrast at Nyquist."""
+
+SHARP_CPX, SHARPEST = 0.25, 0.96
+"""Contrast there over that of a perfect lens, above which no blurred edge lies."""
 
 DRAWS = 200
 LOW_PERCENT, HIGH_PERCENT = 5.0, 95.0
@@ -167,13 +180,16 @@ def measure_curve(edges: Sequence[Edge], generator: np.random.Generator) -> MtfC
     """
     fitted = _first_fits(edges)
     weights = START
+    bend = BENDS[0]
     for _ in range(ROUNDS):
         if not fitted:
             return Refusal("no straight edge")
-        weights = solve(*_summed(fitted, weights), weights)
+        weights, bend = _solved(fitted, weights)
         fitted = _fitted_again(fitted, weights)
+    if mtf_at(SHARP_CPX, weights) > SHARPEST * np.sinc(SHARP_CPX):
+        return Refusal("sharper than a detector's pixel: sharpened, or more than one edge in a box")
     values, errors = _softness(fitted, weights)
-    draws = _drawn(fitted, weights, generator)
+    draws = _drawn(fitted, weights, bend, generator)
     return _with_interval(weights, draws, fitted, _contradicting(fitted, values, errors), FLOOR)
 
 
@@ -204,11 +220,12 @@ def _curve_of_sharpest(
     """Return the curve of the edges that are as sharp as the sharpest, but for chance."""
     kept = fitted
     weights = START
+    bend = BENDS[0]
     step = 0.0
     for _ in range(ROUNDS):
         if len(kept) < least:
             break
-        weights = solve(*_summed(kept, weights), weights)
+        weights, bend = _solved(kept, weights)
         fitted = _fitted_again(fitted, weights)
         values, errors = _softness(fitted, weights)
         sure = errors <= MAX_ERROR_PX
@@ -219,10 +236,10 @@ def _curve_of_sharpest(
     if len(kept) < least:
         return Refusal(f"{len(kept)} straight edges of one sharpness, {least} are needed")
     steps = _drawn_steps(values[sure], errors[sure], generator)
-    draws = [softened(*pair) for pair in zip(_drawn(kept, weights, generator), steps, strict=True)]
+    draws = [softened(*pair) for pair in zip(_drawn(kept, weights, bend, generator), steps, strict=True)]
     curve = _with_interval(softened(weights, step), draws, kept, (), floor)
-    high = np.minimum(curve.high * np.exp(NATURAL_PX * FREQUENCIES), np.sinc(FREQUENCIES))
-    return replace(curve, high=high)
+    unknown = np.exp(NATURAL_PX * FREQUENCIES)
+    return replace(curve, low=curve.low / unknown, high=np.minimum(curve.high * unknown, np.sinc(FREQUENCIES)))
 
 
 def _drawn_steps(values: np.ndarray, errors: np.ndarray, generator: np.random.Generator) -> list[float]:
@@ -243,10 +260,13 @@ def _fitted_again(edges: Sequence[FittedEdge], weights: np.ndarray) -> list[Fitt
     return [edge for edge in again if edge is not None]
 
 
-def _summed(edges: Sequence[FittedEdge], weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sum of the edges' normal equations."""
+def _solved(edges: Sequence[FittedEdge], weights: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the curve that fits all edges best, and by how much it bends."""
     grams, moments = zip(*(normal_equations(edge, weights) for edge in edges), strict=True)
-    return np.sum(grams, axis=0), np.sum(moments, axis=0)
+    gram = np.sum(grams, axis=0)
+    moment = np.sum(moments, axis=0)
+    bend = likeliest_bend(gram, moment, weights)
+    return solve(gram, moment, weights, bend), bend
 
 
 def _softness(edges: Sequence[FittedEdge], weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -284,7 +304,9 @@ def sharpest(values: np.ndarray, errors: np.ndarray) -> float:
     return float(minimize(unlikeliness, start, method="Nelder-Mead", options=options).x[0])
 
 
-def _drawn(edges: Sequence[FittedEdge], weights: np.ndarray, generator: np.random.Generator) -> list[np.ndarray]:
+def _drawn(
+    edges: Sequence[FittedEdge], weights: np.ndarray, bend: float, generator: np.random.Generator
+) -> list[np.ndarray]:
     """Return the curve of each draw of edges, strips and expected bends."""
     count = len(edges)
     whole = [normal_equations(edge, weights) for edge in edges]
@@ -297,7 +319,7 @@ def _drawn(edges: Sequence[FittedEdge], weights: np.ndarray, generator: np.rando
         gram = np.sum([each[0] for each in drawn], axis=0)
         moment = np.sum([each[1] for each in drawn], axis=0)
         # Where pixels say little, the expected smoothness decides: it is drawn too, so that the interval says so.
-        draws.append(solve(gram, moment, weights, generator.standard_normal(PARTS - 3)))
+        draws.append(solve(gram, moment, weights, bend, generator.standard_normal(PARTS - 3)))
     return draws
 
 

@@ -24,8 +24,8 @@ SAMPLES_PER_PX, REACH_PX = 16, 24
 HIGHEST_CPX, WAVES = 2.5, 1250
 """Waves that make the tabulated edge: it repeats after 500 pixels."""
 
-BEND = 0.8
-"""Standard deviation of the second differences of the weights over the weights there, before any edge is seen.
+BENDS = (0.2, 0.4, 0.8)
+"""Standard deviations of the second differences of the weights over the weights there, of which edges choose one.
 
 exp(-gamma f), a Gaussian and diffraction with 2 to 30 % at Nyquist have 0.05 to 0.3 (computed); where a pupil cuts
 off, 1."""
@@ -91,26 +91,29 @@ def at_distances(table: np.ndarray, distance_px: np.ndarray) -> np.ndarray:
 SECOND_DIFFERENCES = np.pad(np.diff(np.eye(PARTS - 1), 2, axis=0), ((0, 0), (0, 1)))
 
 
-def expected_bends(weights: np.ndarray) -> np.ndarray:
+def expected_bends(weights: np.ndarray, bend: float) -> np.ndarray:
     """(PARTS - 3, PARTS): second differences of weights over what is expected of them around `weights` (PARTS,)."""
     padded = np.pad(weights[:-1], 2, mode="edge")
-    size = np.maximum(np.convolve(padded, SMOOTHING, mode="valid"), LEAST_WEIGHT)[1:-1] * BEND
+    size = np.maximum(np.convolve(padded, SMOOTHING, mode="valid"), LEAST_WEIGHT)[1:-1] * bend
     size[0] = max(size[0], FIRST_BEND)
     return np.asarray(SECOND_DIFFERENCES / size[:, None])
 
 
-def solve(gram: np.ndarray, moment: np.ndarray, near: np.ndarray, bends: np.ndarray | None = None) -> np.ndarray:
+def solve(
+    gram: np.ndarray, moment: np.ndarray, near: np.ndarray, bend: float, bends: np.ndarray | None = None
+) -> np.ndarray:
     """The weights that fit best, none negative and of sum 1.
 
     Args:
         gram: (PARTS, PARTS) of the least-squares problem, in units of the noise.
         moment: (PARTS,) its right side.
         near: (PARTS,) weights near the solution: larger ones may bend more.
+        bend: by how much, of them.
         bends: (PARTS - 3,) what the second differences are expected to be, over their deviations; 0 without.
     """
     from scipy.optimize import nnls  # here: who tells no sensor need not wait for SciPy
 
-    expected = expected_bends(near)
+    expected = expected_bends(near, bend)
     gram = gram + expected.T @ expected
     if bends is not None:
         moment = moment + expected.T @ bends
@@ -119,3 +122,23 @@ def solve(gram: np.ndarray, moment: np.ndarray, near: np.ndarray, bends: np.ndar
     root = np.linalg.cholesky(gram + hold + 1e-9 * np.trace(gram) * np.eye(PARTS))
     weights, _ = nnls(root.T, np.linalg.solve(root, moment + hold))
     return np.asarray(weights / weights.sum())
+
+
+def likeliest_bend(gram: np.ndarray, moment: np.ndarray, near: np.ndarray) -> float:
+    """Which of BENDS explains the edges best: the largest marginal likelihood of normal weights.
+
+    Args:
+        gram: (PARTS, PARTS) of the least-squares problem, in units of the noise.
+        moment: (PARTS,) its right side.
+        near: (PARTS,) weights near the solution.
+    """
+
+    def evidence(bend: float) -> float:
+        expected = expected_bends(near, bend)
+        weights = solve(gram, moment, near, bend)
+        whole = gram + expected.T @ expected
+        left = float(weights @ whole @ weights - 2 * moment @ weights)
+        _, log_volume = np.linalg.slogdet(whole + np.trace(whole) * 1e-12 * np.eye(PARTS))
+        return -0.5 * left - 0.5 * float(log_volume) - len(expected) * math.log(bend)
+
+    return max(BENDS, key=evidence)

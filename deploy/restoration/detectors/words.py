@@ -54,7 +54,7 @@ def _of_band(band: BandFaults) -> Iterator[str]:
     if len(band.pixels):
         places = [f"column {column}, row {row}" for row, column in band.pixels[:NAMED].tolist()]
         yield (
-            f"{_count(len(band.pixels), 'pixel')} of {band.looked_px} stand alone as no light does: hot, dead or "
+            f"{_count(len(band.pixels), 'pixel')} of {band.looked_px}, alone as no light is: hot, dead or "
             f"hit by a particle ({_some(places, len(band.pixels))}); restoration sharpens that; {FIX} such pixels"
         )
 

@@ -61,9 +61,9 @@ def test_solving_finds_a_smooth_curve_and_stays_within_what_any_curve_is(seed: i
     truth = weights_of(np.exp(-gamma * CORNERS))
     looks = generator.normal(size=(60, PARTS))
     gram = looks.T @ looks * 1e8
-    found = solve(gram, gram @ truth, truth)
+    found = solve(gram, gram @ truth, truth, 0.8)
     assert found == pytest.approx(truth, abs=1e-3)
-    nothing = solve(np.zeros((PARTS, PARTS)) + 1e-6 * np.eye(PARTS), np.zeros(PARTS), truth)
+    nothing = solve(np.zeros((PARTS, PARTS)) + 1e-6 * np.eye(PARTS), np.zeros(PARTS), truth, 0.8)
     assert nothing.min() >= 0
     assert nothing.sum() == pytest.approx(1)
 
@@ -81,7 +81,7 @@ def test_real_optics_bend_no_more_than_expected(shape: str, at_nyquist: float) -
         cut_off = np.interp(-optics, -chat(np.linspace(0, 1, 999)), np.linspace(0, 1, 999))
         contrast = chat(np.minimum(frequency * cut_off, 1))
     weights = weights_of(contrast)
-    bends = expected_bends(weights) @ weights
+    bends = expected_bends(weights, 0.8) @ weights
     assert np.abs(bends).max() < 3
     assert np.sqrt(np.mean(bends**2)) < 1
 
