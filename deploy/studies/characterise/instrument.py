@@ -20,6 +20,7 @@ from beers_deploy.model.metrics.edge_curve import (
 )
 from beers_deploy.model.metrics.noise_line import Blocks, NoiseModel, cut_blocks, cut_pair, fit_noise_model, join
 from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.model.progress import steps
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.response import NYQUIST
 from beers_deploy.restoration.sensor_check import NOISE_KEPT
@@ -160,10 +161,12 @@ def _pointed_at(frames: Frames, boxes: Mapping[str, np.ndarray], variance: Varia
 def _found(frames: Frames, variance: Variance) -> dict[str, list[Edge]]:
     """The edges of all frames, those near the horizontal turned upright."""
     edges: dict[str, list[Edge]] = {axis: [] for axis in AXES}
-    for path in frames.paths:
-        for tile in frames.tiles(path):
-            edges["across"] += find_edges(tile, variance, frames.full_scale_dn, path.name)
-            edges["along"] += find_edges(tile.T, variance, frames.full_scale_dn, path.name)
+    with steps("looking for edges", len(frames.paths)) as done:
+        for path in frames.paths:
+            for tile in frames.tiles(path):
+                edges["across"] += find_edges(tile, variance, frames.full_scale_dn, path.name)
+                edges["along"] += find_edges(tile.T, variance, frames.full_scale_dn, path.name)
+            done.advance()
     return edges
 
 

@@ -42,7 +42,8 @@ FAULTS = [Fault(-1, 100), Fault(40, -1), Fault(80, 20), Fault(90, 70)]
 
 def source_of(pixels: np.ndarray, nodata: float | None = None) -> ArraySource:
     planes = pixels if pixels.ndim == 3 else pixels[None]
-    return ArraySource(planes, Raster(*planes.shape, planes.dtype, nodata))
+    bands, height_px, width_px = planes.shape
+    return ArraySource(planes, Raster(bands, height_px, width_px, planes.dtype, nodata))
 
 
 def read(source: FixedSource, step_px: int = 7) -> np.ndarray:
@@ -84,7 +85,7 @@ def test_however_rows_are_read_the_same_pixels_come(step_px: int, seed: int) -> 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int16, np.float32, np.float64])
 def test_a_plane_is_interpolated_exactly(dtype: type) -> None:
     rows, columns = np.indices((HEIGHT, WIDTH))
-    plane = (rows // 2 + columns // 2 * 0 + 20).astype(dtype)  # constant along each row
+    plane: np.ndarray = (rows // 2 + columns // 2 * 0 + 20).astype(dtype)  # constant along each row
     spoilt = plane.copy()
     spoilt[:, 50:52] = 0
     spoilt[30, 20] = 99
