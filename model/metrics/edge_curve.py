@@ -240,7 +240,8 @@ def _curve_of_sharpest(
         alike = sure & (np.abs(values - step) <= KEPT_DEVIATIONS * np.hypot(errors, SCATTER_PX))
         kept = [edge for edge, each in zip(fitted, alike, strict=True) if each]
     if len(kept) < least:
-        return Refusal(f"{len(kept)} straight edges of one sharpness, {least} are needed")
+        count = f"{len(kept)} straight edge{'' if len(kept) == 1 else 's'}"
+        return Refusal(f"{count} of one sharpness, {least} are needed")
     steps = _drawn_steps(values[sure], errors[sure], generator)
     draws = [softened(*pair) for pair in zip(_drawn(kept, weights, generator), steps, strict=True)]
     curve = _with_interval(softened(weights, step), draws, kept, (), floor)

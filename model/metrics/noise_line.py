@@ -33,6 +33,8 @@ MAX_LEAK = 0.5
 """Of the energy of the corners, what may come from texture."""
 MAX_COLOUR, COLOUR_SCATTER = 0.15, 3.0
 """What the noise at middle frequencies may differ from that of the corners by: white noise does not."""
+MOSAIC = 0.2
+"""Of the noise at the finest detail, what a mosaic of colour filters leaves at middle frequencies, at most."""
 MIN_RANGE = 0.25
 """Least spread of the blocks' means, of the brightest: less gives no line."""
 ROUNDING = 1 / 12
@@ -168,6 +170,7 @@ class NoiseModel:
         colour: noise at middle frequencies over that at the finest; 1 for white noise. The line is that of the
             stronger of the two.
         white: whether the two are equal, but for chance.
+        one_level: whether it was seen at one level of light alone, so that how it grows with light is assumed.
         spectrum: noise in the bands of SPECTRUM over that beyond FINE.
     """
 
@@ -179,6 +182,7 @@ class NoiseModel:
     leak: float
     colour: float = 1.0
     white: bool = True
+    one_level: bool = False
     spectrum: tuple[float, ...] = ()
 
     def total(self, dn: np.ndarray) -> np.ndarray:
@@ -197,13 +201,13 @@ class NoiseModel:
         return Variance(value, (max(low - model * value, 0.0), high + model * value), beyond > 0)
 
 
-def fit_noise_model(blocks: Blocks, generator: np.random.Generator, coloured: bool = False) -> NoiseModel | Refusal:
+def fit_noise_model(blocks: Blocks, generator: np.random.Generator, incomplete: bool = False) -> NoiseModel | Refusal:
     """Fit the line to blocks of any number of images of one instrument; or say why there is none.
 
     Args:
         blocks: of all images.
         generator: for the draws of the interval.
-        coloured: whether noise that is not white is taken as well.
+        incomplete: whether noise that is not white is taken as well, and noise of one level of light alone.
     """
     if blocks.mean.size < LEAST:
         return Refusal(f"{blocks.mean.size} blocks of 16 x 16 unclipped pixels, {LEAST} are needed")
@@ -216,19 +220,45 @@ def fit_noise_model(blocks: Blocks, generator: np.random.Generator, coloured: bo
     if used.mean.size < LEAST or parts.size < LEAST_PARTS:
         return Refusal(f"{used.mean.size} blocks without much texture, {LEAST} are needed")
     dark, bright = (float(v) for v in np.percentile(used.mean, [EDGE_PERCENT, 100 - EDGE_PERCENT]))
-    if bright - dark < MIN_RANGE * bright:
+    one_level = bright - dark < MIN_RANGE * bright
+    if one_level and not incomplete:
         return Refusal(f"even areas from {dark:.4g} to {bright:.4g} DN only, too narrow for a line")
     draws = np.array([_fitted(used, _weights(used.part, parts, generator)) for _ in range(DRAWS)])
+    if one_level:
+        fit, draws = _of_one_level(used, fit, draws, generator)
     leak = float(fit[2] * np.maximum(used.structure - used.noise(fit), 0).mean() / used.fine.mean())
     alpha, beta = _unrounded(fit)
     shown = np.array([_unrounded(draw) for draw in draws])
-    model = NoiseModel(alpha, beta, shown, used.mean.size, (dark, bright), leak)
-    if leak > MAX_LEAK:
-        return Refusal(f"{leak:.0%} of the finest detail is texture, {MAX_LEAK:.0%} at most")
-    model = _with_colour(used, model)
-    if not model.white and not coloured:
-        return Refusal(f"noise {model.colour:.2f} times as strong at middle frequencies: not white")
-    return model
+    model = NoiseModel(alpha, beta, shown, used.mean.size, (dark, bright), leak, one_level=one_level)
+    return _judged(_with_colour(used, model), incomplete)
+
+
+def _judged(model: NoiseModel, incomplete: bool) -> NoiseModel | Refusal:
+    """Return the line, or why it is not the noise of one detector."""
+    if model.leak > MAX_LEAK:
+        return Refusal(f"{model.leak:.0%} of the finest detail is texture, {MAX_LEAK:.0%} at most")
+    if model.white or (incomplete and model.colour >= MOSAIC):
+        return model
+    mosaic = "not white" if model.colour >= MOSAIC else "a mosaic of unequal channels"
+    return Refusal(f"noise {model.colour:.2f} times as strong at middle frequencies: {mosaic}")
+
+
+def _of_one_level(
+    used: Blocks, fit: np.ndarray, draws: np.ndarray, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return fit and draws of noise whose growth with light is not seen: any part of it may be that of photons.
+
+    The fit takes all: told too much noise in bright light, a restoration smooths, told too little it makes grain. The
+    draws take from none to all.
+    """
+    level = float(np.median(used.mean))
+
+    def split(numbers: np.ndarray, share: float) -> list[float]:
+        noise = float(numbers[0]) * level + float(numbers[1])
+        return [share * noise / max(level, ROUNDING), (1 - share) * noise, float(numbers[2])]
+
+    drawn = [split(draw, share) for draw, share in zip(draws, generator.uniform(size=len(draws)), strict=True)]
+    return np.array(split(fit, 1.0)), np.array(drawn)
 
 
 def _choose(blocks: Blocks) -> tuple[Blocks, np.ndarray]:

@@ -46,7 +46,7 @@ def measure_noise(frames: Frames) -> Noise:
     """Fit the noise line to all frames, or to the differences of those that show one still scene."""
     each = [_above_dark(join([_cut(tile, frames) for tile in frames.tiles(path)]), frames) for path in frames.paths]
     still = [_above_dark(blocks, frames) for blocks in _still_pairs(frames)]
-    model = fit_noise_model(join(still or each), np.random.default_rng(SEED), coloured=True)
+    model = fit_noise_model(join(still or each), np.random.default_rng(SEED), incomplete=True)
     if isinstance(model, Refusal):
         expected = "blurred, raw ground, from dark to bright"
         remedy = "give more raw images of plain ground, dark and bright, neither restored nor resampled"
@@ -87,7 +87,7 @@ def _require_one_sensor(frames: Frames, each: Sequence[Blocks], dn: float) -> No
         return
     seen = {}
     for path, blocks in zip(frames.paths, each, strict=True):
-        line = fit_noise_model(blocks, np.random.default_rng(SEED), coloured=True)
+        line = fit_noise_model(blocks, np.random.default_rng(SEED), incomplete=True)
         if isinstance(line, NoiseModel) and line.leak <= OWN_LEAK:
             seen[path.name] = line.at(dn)
     if not seen:

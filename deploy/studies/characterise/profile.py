@@ -86,6 +86,11 @@ class Characterised:
                 f"the noise is not white: at middle frequencies it is {model.colour:.2f} times as strong as at the "
                 f"finest. {_colour_consequence(model.colour)}"
             )
+        if model.one_level:
+            yield (
+                f"the frames show one level of light, near {model.measured_dn[1]:.4g} DN above the dark: all noise "
+                "there is taken for that of photons; give frames of other brightness as well"
+            )
         yield from self._notes_on_edges()
 
     def _notes_on_edges(self) -> Iterator[str]:
@@ -193,6 +198,8 @@ def _noise_table(found: Characterised, images: str) -> dict[str, object]:
             source += f"; extrapolated from {dark:.3g} to {bright:.3g} W/m2/sr/um"
         if not model.white:
             source += f"; not white, {model.colour:.2f} times as strong at middle frequencies as at the finest"
+        if model.one_level:
+            source += "; seen at one level of light, and how the noise grows with light is assumed"
         table[f"radiance_{number}"] = _constant(float(f"{snr.radiance:.10g}"), "inferred", f"1/{part} of full scale")
         table[f"snr_{number}"] = _constant(float(f"{value:.8g}"), "measured", source)
     return table

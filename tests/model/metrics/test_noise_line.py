@@ -117,3 +117,45 @@ def test_texture_as_sharp_as_a_pixel_is_refused() -> None:
     radius = np.hypot(np.fft.fftfreq(512)[:, None], np.fft.rfftfreq(512)[None, :])
     waves = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((512, 512))) / np.maximum(radius, 1 / 100), s=(512, 512))
     assert "texture" in refused(np.rint(plain((512, 512)) * np.exp(0.2 * waves / waves.std())))
+
+
+def test_noise_of_one_level_is_that_of_photons_with_an_interval_that_holds_a_constant() -> None:
+    """Sky behind stars, a flat field: how the noise grows with light is not seen."""
+    generator = np.random.default_rng(5)
+    flat = generator.normal(800, 20, (320, 320))
+    assert isinstance(fitted(cut_blocks(flat, MAX_DN)), Refusal)
+    line = fit_noise_model(cut_blocks(flat, MAX_DN), np.random.default_rng(0), incomplete=True)
+    assert isinstance(line, NoiseModel)
+    assert line.one_level
+    assert line.at(800).value == pytest.approx(400, rel=0.05)
+    bright = line.at(3200)
+    assert bright.value == pytest.approx(1600, rel=0.05)
+    assert bright.interval[0] <= 400 * 1.05
+
+
+@pytest.mark.parametrize(("kernel", "stronger"), [((0.2, 0.6, 0.2), "middle"), ((-0.25, 1.0, -0.25), "finest")])
+def test_noise_that_is_not_white_is_told_by_its_stronger_part(
+    kernel: tuple[float, float, float], stronger: str
+) -> None:
+    generator = np.random.default_rng(6)
+    level = np.linspace(300, 3000, 320)[:, None] * np.ones(320)
+    white = generator.normal(0, 1, (322, 322)) * 30
+    rows = sum(weight * white[i : i + 320] for i, weight in enumerate(kernel))
+    coloured = sum(weight * rows[:, i : i + 320] for i, weight in enumerate(kernel))
+    image = level + coloured
+    assert isinstance(fitted(cut_blocks(image, MAX_DN)), Refusal)
+    line = fit_noise_model(cut_blocks(image, MAX_DN), np.random.default_rng(0), incomplete=True)
+    assert isinstance(line, NoiseModel)
+    assert not line.white
+    assert (line.colour > 1) == (stronger == "middle")
+    assert (np.diff(line.spectrum) < 0).all() == (stronger == "middle")
+
+
+def test_a_mosaic_of_unequal_channels_is_refused() -> None:
+    generator = np.random.default_rng(7)
+    channels = np.kron(np.ones((160, 160)), [[1.0, 0.6], [0.6, 0.4]]) * np.linspace(300, 3000, 320)[:, None]
+    found = fit_noise_model(
+        cut_blocks(generator.poisson(channels), MAX_DN), np.random.default_rng(0), incomplete=True
+    )
+    assert isinstance(found, Refusal)
+    assert "mosaic" in found.reason
