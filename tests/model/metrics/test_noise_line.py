@@ -140,8 +140,8 @@ def test_noise_that_is_not_white_is_told_by_its_stronger_part(
     generator = np.random.default_rng(6)
     level = np.linspace(300, 3000, 320)[:, None] * np.ones(320)
     white = generator.normal(0, 1, (322, 322)) * 30
-    rows = sum(weight * white[i : i + 320] for i, weight in enumerate(kernel))
-    coloured = sum(weight * rows[:, i : i + 320] for i, weight in enumerate(kernel))
+    rows = np.sum([weight * white[i : i + 320] for i, weight in enumerate(kernel)], axis=0)
+    coloured = np.sum([weight * rows[:, i : i + 320] for i, weight in enumerate(kernel)], axis=0)
     image = level + coloured
     assert isinstance(fitted(cut_blocks(image, MAX_DN)), Refusal)
     line = fit_noise_model(cut_blocks(image, MAX_DN), np.random.default_rng(0), incomplete=True)
