@@ -1,0 +1,50 @@
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks import counts
+
+CODE = '''"""A module's text."""
+
+FIRST, SECOND = 1, 2  # why
+
+
+def _lone() -> int:
+    """A function's text."""
+    return [x + y for x in range(3) for y in range(x)][0]
+
+
+def main() -> int:
+    one, other = divmod(7, 2)
+    return one if other else (FIRST if one else _lone())
+'''
+
+
+def test_what_is_counted() -> None:
+    tree = ast.parse(CODE)
+    nodes = list(ast.walk(tree))
+    tokens, lines, comments = counts.measured(CODE, tree)
+    assert (lines, comments) == (13, 1)
+    assert tokens == 7 + 7 + 23 + 7 + 10 + 14  # a line each
+    assert sum(map(counts.is_paired, nodes)) == 1
+    assert sum(map(counts.is_nested_conditional, nodes)) == 1
+    assert counts.lone_helpers(nodes) == 1
+
+
+def test_the_project_keeps_its_limits() -> None:
+    script = Path(counts.__file__)
+    done = subprocess.run([sys.executable, str(script), "--check"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "| tokens a line |" in done.stdout
+
+
+@pytest.mark.parametrize("limit", [0.0, 1.0])
+def test_a_limit_that_is_passed_is_told(monkeypatch: pytest.MonkeyPatch, limit: float) -> None:
+    found = {name: counts.counted(("benchmarks",)) for name in counts.PARTS}
+    monkeypatch.setitem(counts.LIMITS, "tokens a line", {"source": limit})
+    monkeypatch.setitem(counts.LIMITS, "paired assignments", {})
+    (sentence,) = counts.over(found)
+    assert f"{limit:.2f} at most" in sentence
