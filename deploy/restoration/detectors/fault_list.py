@@ -114,7 +114,7 @@ def read_list(path: Path, raster: Raster) -> FaultList:
     remedy = "write lines `column,row`, counted from 0, with `*` as the row for a whole column"
     expected = f"'{FOUND}' or a list of faulty detectors"
     try:
-        lines = path.read_text("utf-8-sig").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except OSError as error:
         got = f"{path}: {error.strerror or error}"
         raise OptionError(OPTION, expected=expected, got=got, remedy=remedy) from error
