@@ -3,8 +3,8 @@
     python benchmarks/counts.py [--check]
 
 Tokens are Python's own: names, operators, numbers and strings, without docstrings, comments and line breaks; lines
-are all of a file's. `--check`
-ends with 1 where density or paired assignments have risen above the limits below; whoever lowers them lowers the limits as well.
+are all of a file's. `--check` ends with 1 where density or paired assignments have risen above the limits below;
+whoever lowers them lowers the limits as well.
 """
 
 import argparse
