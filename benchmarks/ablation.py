@@ -57,7 +57,8 @@ def main() -> None:
     given = parser.parse_args()
     model = float_model(float_file(given.network, load_sensor(given.sensor)))
     calibration = Calibration(load_sensor(given.sensor), given.images, given.patches, given.patch, given.seed)
-    session, unseen = open_any_size(model), calibration.unseen.pairs
+    session = open_any_size(model)
+    unseen = calibration.unseen.pairs
     print("| passes | MAE | PSNR drop, dB |\n|---|---|---|")
     for name, left_out in ablations():
         with left_out:

@@ -87,9 +87,11 @@ def restored(networks: list[Path], out: Path) -> None:
 def compare(root: Path, processors: tuple[str, ...]) -> dict[str, dict[str, float]]:
     """The largest difference in DN from this processor's pixels, by emulated processor and network."""
     with tempfile.TemporaryDirectory() as folder:
-        files, here = [file for name in NETWORKS for file in shipped_pair(name)], Path(folder) / "here.npz"
+        files = [file for name in NETWORKS for file in shipped_pair(name)]
+        here = Path(folder) / "here.npz"
         restored(files, here)
-        expected, found = dict(np.load(here)), {}
+        expected = dict(np.load(here))
+        found = {}
         for processor in processors:
             out = Path(folder) / f"{processor}.npz"
             on_arm(root, processor, __file__, "--restore", str(out), *map(str, files))

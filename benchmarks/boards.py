@@ -26,10 +26,12 @@ from beers_deploy.quantise import family_model
 def files(images: Path | None, variants: list[str]) -> None:
     """A line a network and board."""
     for variant in variants:
-        network, first = Conditioned(variant, shipped_weights(variant)), ""
+        network = Conditioned(variant, shipped_weights(variant))
+        first = ""
         shipped = integers(load_onnx(SHIPPED / f"{variant}{INT8}.onnx"))
         for name in board_names():
-            start, target = time.perf_counter(), load_target(name)
+            start = time.perf_counter()
+            target = load_target(name)
             made = family_model(network, [images] if images else [], shifts=target_shifts(target))
             found = integers(made)
             first = first or found

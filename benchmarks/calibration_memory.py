@@ -41,7 +41,8 @@ def main() -> None:
     scenes = ["--images", str(arguments.images)] if arguments.images else []
     print(f"{'imports alone':24s} {measure(IMPORTS)[0]:7.0f} MB")
     with tempfile.TemporaryDirectory() as folder:
-        network, int8 = str(arguments.float), str(Path(folder) / "int8.onnx")
+        network = str(arguments.float)
+        int8 = str(Path(folder) / "int8.onnx")
         for patches, side in CASES:
             drawn = ["--sensor", "pleiades-variable", "--patches", str(patches), "--patch", str(side), *scenes]
             peak, seconds, computing = measure([*COMMAND, "quantize", network, "--out", int8, *drawn])

@@ -136,7 +136,8 @@ def written(
     for index, scene in enumerate(scenes):
         radiance = crop_divisible(scene.radiance, RATIO)
         radiance = with_target(radiance) if index == target else radiance
-        spectrum, seed = scene_spectrum(radiance), 100 * number + index
+        spectrum = scene_spectrum(radiance)
+        seed = 100 * number + index
         dn = acquire(spectrum, radiance.shape[-1], sensor, RATIO, Draw(seed), "degraded")
         paths.append(folder / f"{index}.tif")
         tifffile.imwrite(paths[-1], to_uint16(dn))

@@ -100,7 +100,8 @@ def integers(chain: Chain) -> None:
         }
         chain.constants.extend(numpy_helper.from_array(value, name) for name, value in values.items())
         chain.then("QuantizeLinear", "image", "scale", "zero")
-    before, read = chain.last, ("scale", "zero")
+    before = chain.last
+    read = ("scale", "zero")
     weights = ("weight", "scale", "weight_zero", *read, "bias")
     chain.then("QLinearConv", before, *read, *weights, pads=[1] * 4)
     chain.then("Max", chain.last, "zero")

@@ -3,8 +3,8 @@
     python benchmarks/counts.py [--check]
 
 Tokens are Python's own: names, operators, numbers and strings, without docstrings, comments and line breaks; lines
-are all of a file's. `--check`
-ends with 1 where density or paired assignments have risen above LIMITS; whoever lowers them lowers LIMITS as well.
+are all of a file's. `--check` ends with 1 where density or paired assignments have risen above the limits below;
+whoever lowers them lowers the limits as well.
 """
 
 import argparse
@@ -18,7 +18,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-PARTS = {"source": ("profiles", "model", "quant", "deploy"), "tests": ("tests",), "benchmarks": ("benchmarks", "docs")}
+PARTS = {
+    "source": ("profiles", "model", "quant", "deploy"),
+    "tests": ("tests",),
+    "benchmarks": ("benchmarks", "docs"),
+}
 LAYOUT = {
     tokenize.COMMENT,
     tokenize.NL,
@@ -28,8 +32,10 @@ LAYOUT = {
     tokenize.ENCODING,
     tokenize.ENDMARKER,
 }
-LIMITS = {"tokens a line": {"source": 7.49, "tests": 9.91}, "paired assignments": {"source": 851, "tests": 442}}
-"""Largest values that may land."""
+DENSITY_LIMITS = {"source": 7.37, "tests": 9.77}
+"""Tokens a line that may land."""
+PAIRED_LIMITS = {"source": 194, "tests": 64}
+"""Paired assignments that may land."""
 
 
 class Counts(NamedTuple):
@@ -82,10 +88,10 @@ def table(counts: dict[str, Counts]) -> dict[str, list[str]]:
 
 def over(counts: dict[str, Counts]) -> Iterator[str]:
     """Return a sentence for each limit that is passed."""
-    for name, limit in LIMITS["tokens a line"].items():
+    for name, limit in DENSITY_LIMITS.items():
         if round(counts[name].density, 2) > limit:
             yield f"{name}: {counts[name].density:.2f} tokens a line, {limit:.2f} at most: write statements out"
-    for name, limit in LIMITS["paired assignments"].items():
+    for name, limit in PAIRED_LIMITS.items():
         if counts[name].paired_assignments > limit:
             yield f"{name}: {counts[name].paired_assignments} paired assignments, {limit} at most: one a line"
 
@@ -94,7 +100,9 @@ def counted(folders: tuple[str, ...]) -> Counts:
     """Count all Python files below some folders of the project."""
     texts = [path.read_text(encoding="utf-8") for folder in folders for path in sorted((ROOT / folder).rglob("*.py"))]
     trees = [ast.parse(text) for text in texts]
-    tokens, lines, comments = map(sum, zip(*(measured(*pair) for pair in zip(texts, trees, strict=True)), strict=True))
+    tokens, lines, comments = map(
+        sum, zip(*(measured(*pair) for pair in zip(texts, trees, strict=True)), strict=True)
+    )
     nodes = [node for tree in trees for node in ast.walk(tree)]
     return Counts(
         tokens=tokens,

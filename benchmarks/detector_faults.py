@@ -45,7 +45,9 @@ def main() -> None:
     arguments = parser.parse_args()
     scenes = [read_scene(path, LIKE) for folder in arguments.images for path in list_images(folder)]
     scenes = [scene for scene in scenes if fitting_oversampling(scene.radiance, RATIOS, LEAST_SIDE_PX)]
-    clean, alarms, worst = Counter[str](), Counter[tuple[str, str]](), Counter[str]()
+    clean = Counter[str]()
+    alarms = Counter[tuple[str, str]]()
+    worst = Counter[str]()
     for kind, image, sensor, words in acquisitions(scenes, arguments.count, arguments.seed):
         found = kinds_of(look(image, sensor))
         clean[kind] += 1
@@ -65,7 +67,9 @@ def detections(scenes: Sequence[Scene], count: int, seed: int) -> None:
     """Print how many of the faults in photographs are detected: in single ones, and in strips of several."""
     generator = np.random.default_rng(seed)
     kinds = {"one photograph": 1, f"{STACKED} below one another": STACKED}
-    seen, total, rows_px = Counter[tuple[str, str]](), Counter[tuple[str, str]](), dict[str, list[int]]()
+    seen = Counter[tuple[str, str]]()
+    total = Counter[tuple[str, str]]()
+    rows_px = dict[str, list[int]]()
     for number, kind in product(range(count), kinds):
         sensor = SensorFamily(LIKE).draw(generator)
         image = acquired(stacked(scenes, kinds[kind], generator), sensor, number, RATIOS[1])
@@ -169,10 +173,12 @@ def acquisitions(scenes: Sequence[Scene], count: int, seed: int) -> Iterator[tup
         ratio = RATIOS[int(generator.integers(len(RATIOS)))]
         if kind == "photograph":
             scene = scenes[int(generator.integers(len(scenes)))]
-            radiance, name = scene.radiance, scene.name
+            radiance = scene.radiance
+            name = scene.name
             ratio = ratio if fitting_oversampling(radiance, [ratio], LEAST_SIDE_PX) else RATIOS[1]
         else:
-            radiance, name = DRAWN[kind](generator), "drawn"
+            radiance = DRAWN[kind](generator)
+            name = "drawn"
         sensor = SensorFamily(LIKE, other_curves=0.3).draw(generator)
         light, noise = (float(generator.choice(each)) for each in (LIGHTS, NOISES))
         quiet = replace(sensor, alpha=sensor.alpha * noise**2, beta=sensor.beta * noise**2)
@@ -190,7 +196,8 @@ def along_the_axes(generator: np.random.Generator) -> np.ndarray:
     """Radiance of fields, crops, roofs and streets whose edges lie along columns and rows."""
     canvas = np.full((SIDE_PX, SIDE_PX), 80, np.float32)
     for _ in range(int(generator.integers(2, 7))):  # edges and streets from side to side
-        start, width = int(generator.integers(SIDE_PX)), int(generator.integers(1, 400))
+        start = int(generator.integers(SIDE_PX))
+        width = int(generator.integers(1, 400))
         strip = (slice(None), slice(start, start + width))
         canvas[strip if generator.random() < 0.5 else strip[::-1]] = generator.uniform(10, 250)
     for _ in range(int(generator.integers(10, 60))):
@@ -198,7 +205,8 @@ def along_the_axes(generator: np.random.Generator) -> np.ndarray:
         height, width = (int(generator.integers(20, 900)) for _ in range(2))
         part = canvas[top : top + height, left : left + width]
         part[:] = generator.uniform(10, 250)
-        period, share = int(generator.integers(5, 60)), generator.uniform(0.2, 0.8)
+        period = int(generator.integers(5, 60))
+        share = generator.uniform(0.2, 0.8)
         lines = (np.arange(max(part.shape)) % period < share * period) * generator.uniform(-0.5, 1.0)
         if generator.random() < 0.6:  # crops or the sheets of a roof
             across = generator.random() < 0.5

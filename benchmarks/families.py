@@ -67,8 +67,10 @@ class Restoring(nn.Module):
 
     def __init__(self, features: int, scale: int, body: nn.Module) -> None:
         super().__init__()
-        self.scale, self.body = scale, body
-        self.head, self.tail = conv(scale**2, features), conv(features, scale**2)
+        self.scale = scale
+        self.body = body
+        self.head = conv(scale**2, features)
+        self.tail = conv(features, scale**2)
 
     def forward(self, image: Tensor) -> Tensor:
         """Restore images."""
@@ -89,7 +91,8 @@ class Depthwise(nn.Module):
 
     def __init__(self, features: int) -> None:
         super().__init__()
-        self.expand, self.project = conv(features, 2 * features, 1), conv(2 * features, features, 1)
+        self.expand = conv(features, 2 * features, 1)
+        self.project = conv(2 * features, features, 1)
         self.depthwise = nn.Conv2d(2 * features, 2 * features, 5, padding=2, groups=2 * features)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -111,7 +114,8 @@ def dilated_blocks(blocks: int, features: int) -> Iterable[nn.Module]:
 def widening_block(features: int) -> ResidualBlock:
     """A residual block four times as wide inside (WDSR, Yu et al. 2018)."""
     block = ResidualBlock(features)
-    block.first, block.second = conv(features, 4 * features), conv(4 * features, features)
+    block.first = conv(features, 4 * features)
+    block.second = conv(4 * features, features)
     return block
 
 
@@ -137,10 +141,12 @@ class Levels(nn.Module):
 
     def __init__(self, features: int) -> None:
         super().__init__()
-        self.before, self.after = ResidualBlock(features), ResidualBlock(features)
+        self.before = ResidualBlock(features)
+        self.after = ResidualBlock(features)
         self.down = nn.Conv2d(features, 2 * features, 3, stride=2, padding=1)
         self.deep = nn.Sequential(*(ResidualBlock(2 * features) for _ in range(2)))
-        self.up, self.end = nn.ConvTranspose2d(2 * features, features, 2, stride=2), conv(features, features)
+        self.up = nn.ConvTranspose2d(2 * features, features, 2, stride=2)
+        self.end = conv(features, features)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, F, H, W) of even sides to the same."""

@@ -59,8 +59,10 @@ NETWORKS: dict[str, Callable[[], nn.Module]] = {"depthwise": depthwise, "unet": 
 
 def float_step(network: nn.Module, layout: torch.memory_format) -> Callable[[], None]:
     """What anybody would write."""
-    network, images = network.to(memory_format=layout), torch.rand(PATCHES, 1, SIDE_PX, SIDE_PX)  # type: ignore[call-overload]
-    optimiser, images = torch.optim.Adam(network.parameters(), lr=1e-4), images.to(memory_format=layout)
+    network = network.to(memory_format=layout)  # type: ignore[call-overload]
+    images = torch.rand(PATCHES, 1, SIDE_PX, SIDE_PX)
+    optimiser = torch.optim.Adam(network.parameters(), lr=1e-4)
+    images = images.to(memory_format=layout)
 
     def step() -> None:
         optimiser.zero_grad()
@@ -72,7 +74,8 @@ def float_step(network: nn.Module, layout: torch.memory_format) -> Callable[[], 
 
 def tuning_step(core: IntCore) -> Callable[[], None]:
     """A step of `quantize --finetune`."""
-    generator, samples = np.random.default_rng(0), []
+    generator = np.random.default_rng(0)
+    samples = []
     for _ in range(PATCHES):
         image = generator.random((1, 1, SIDE_PX, SIDE_PX)).astype(np.float32)
         planes = torch.from_numpy(core.ends.split(image).astype(np.float32)).to(memory_format=torch.channels_last)

@@ -44,7 +44,8 @@ finally:
 def scene(width: int, height: int) -> np.ndarray:
     """(height, width) uint16 of 12 bits: a smooth picture with the noise of a sensor."""
     generator = np.random.default_rng(0)
-    down, across = np.arange(height)[:, None] / 97, np.arange(width)[None] / 131
+    down = np.arange(height)[:, None] / 97
+    across = np.arange(width)[None] / 131
     smooth = 1500 + 900 * np.sin(down) * np.cos(across)
     return np.clip(smooth + generator.normal(0, 20, (height, width)), 0, 4095).astype(np.uint16)
 
@@ -107,7 +108,8 @@ FORMATS: dict[str, tuple[str, Callable[[Path, np.ndarray], Path]]] = {
 
 def restored(image: Path, model: str, *more: str) -> tuple[float, float, str]:
     """Processor time in s, peak memory in GB, and a digest of the pixels."""
-    out, figures = image.with_name("out.tif"), image.with_name("out.json")
+    out = image.with_name("out.tif")
+    figures = image.with_name("out.json")
     words = ["restore", str(image), str(out), "--network", model, "--threads", "1", "--json", str(figures), *more]
     done = subprocess.run([sys.executable, "-c", COUNTED, *words], capture_output=True, text=True, check=True)  # noqa: S603
     row = json.loads(figures.read_text())["rows"][0]["figures"]
@@ -119,7 +121,8 @@ def restored(image: Path, model: str, *more: str) -> tuple[float, float, str]:
 def decoding_s(image: Path) -> float:
     """Processor time of reading every row once, threads that decode included."""
     with open_source(image) as source:
-        height_px, started = source.raster.height_px, time.process_time()
+        height_px = source.raster.height_px
+        started = time.process_time()
         for top in range(0, height_px, STRIP_PX):
             source.read(top, min(top + STRIP_PX, height_px))
         return time.process_time() - started
@@ -134,7 +137,8 @@ def main() -> None:
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")  # that tiles lie nowhere on Earth
     with tempfile.TemporaryDirectory() as name:
-        pixels, first = scene(*parse_size(arguments.size)), 0.0
+        pixels = scene(*parse_size(arguments.size))
+        first = 0.0
         for label, (file, make) in FORMATS.items():
             image = make(Path(name) / file, pixels)
             runs = [restored(image, arguments.model) for _ in range(arguments.repeats)]

@@ -100,13 +100,15 @@ class Peered:
 
 def scores(in_float: Restore, in_int8: Restore, pairs: list[Pair]) -> list[str]:
     """The table's columns of accuracy; PSNR and SSIM are means over patches, of images with references alone."""
-    differences, rows = [], []
+    differences = []
+    rows = []
     for image, reference in pairs:
         both = [_as_in_a_file(run(image), image) for run in (in_float, in_int8)]
         differences.append((both[1] - both[0]).ravel())
         rows.append([*_against(reference, both), *_alike(image, both)])
     difference = np.concatenate(differences).astype(np.float64)
-    mae, std = float(np.abs(difference).mean()), float(difference.std())
+    mae = float(np.abs(difference).mean())
+    std = float(difference.std())
     db_float, db_int8, similarity, same = np.mean(rows, axis=0)
     sizes = [f"{mae:.6f}", f"{std:.6f}", f"{np.abs(difference).max():.4f}", f"{std / mae:.2f}"]
     found = f"{db_float:.2f}", f"{db_int8:.2f}", f"{db_float - db_int8:.3f}", f"{similarity:.4f}", f"{100 * same:.2f}"
@@ -160,7 +162,8 @@ def vint8_words(host: Path, theirs: Path, tile_px: int, python: str) -> str:
     """What Quark's adjuster makes of our VINT8 file, and where the layout is not that of Quark's own."""
     ours = Network.load(host).core("vek385", tile_px).save(host.with_name("vint8.onnx"))
     done = subprocess.run([python, str(QUARK), "adjust", str(ours)], check=True, capture_output=True, text=True)  # noqa: S603
-    one, other = layout(ours), layout(theirs)
+    one = layout(ours)
+    other = layout(theirs)
     return f"VINT8: {done.stdout.strip().splitlines()[-1]}; ours alone {[*(one - other)]}, Quark's {[*(other - one)]}"
 
 
@@ -220,7 +223,8 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
         cells = [*scores(in_float, network.runner(out), held_out), f"{seconds:.0f}", f"{peak_mb:.0f}"]
         yield f"| {way.name} | {graph} | {' | '.join(cells)} |"
         made[f"{way.name}, {graph}"] = out
-    host, theirs = made.get("beers-deploy, rewritten"), made.get("Quark VINT8, rewritten")
+    host = made.get("beers-deploy, rewritten")
+    theirs = made.get("Quark VINT8, rewritten")
     if host and theirs:
         yield vint8_words(host, theirs, images.shape[2], arguments.quark_python)
 

@@ -33,7 +33,9 @@ FULL_SCALE = np.float32(4095)
 def main() -> None:
     """Wait for turns until the input ends."""
     model, source, out = sys.argv[1:4]
-    tile_px, overlap, threads = int(sys.argv[4]), float(sys.argv[5]), int(sys.argv[6])
+    tile_px = int(sys.argv[4])
+    overlap = float(sys.argv[5])
+    threads = int(sys.argv[6])
     torch.set_num_threads(threads)
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads

@@ -58,13 +58,15 @@ def main() -> None:
 def cell(name: str, clean: np.ndarray, sigma: int, quality: str, repeats: int) -> tuple[float, float]:
     """PSNR above the C++ program's, and the ratio of times (the fastest of some runs)."""
     noise = np.random.default_rng(0).normal(0, sigma, clean.shape)
-    noisy, times_s = torch.from_numpy((clean + noise).astype(np.float32)), []
+    noisy = torch.from_numpy((clean + noise).astype(np.float32))
+    times_s = []
     for _ in range(repeats):
         started = time.perf_counter()
         denoised = torch.cat(list(nl_bayes_strips([noisy], len(noisy), Noise(sigma), QUALITIES[quality])))
         times_s.append(time.perf_counter() - started)
     level_db, time_s, (cpp_db, cpp_s) = psnr_db(denoised.numpy(), clean, 255), min(times_s), CPP[name, sigma]
-    gain, ratio = level_db - cpp_db, time_s / cpp_s
+    gain = level_db - cpp_db
+    ratio = time_s / cpp_s
     print(f"{name:10} sigma {sigma}: {level_db:.2f} dB ({gain:+.2f}), {time_s:.2f} s ({ratio:.2f} x)", flush=True)
     return gain, ratio
 

@@ -27,7 +27,8 @@ class Reader(CalibrationDataReader):
     """One patch after the other, and again from the first once rewound."""
 
     def __init__(self, name: str, patches: np.ndarray) -> None:
-        self.name, self.patches = name, patches
+        self.name = name
+        self.patches = patches
         self.rewind()
 
     def get_next(self) -> dict[str, np.ndarray] | None:
@@ -65,7 +66,8 @@ def config_of(how: str) -> QConfig | Config:
 
 def adjusted(model: onnx.ModelProto) -> dict[str, int]:
     """Scales that the adjuster moves, and convolutions whose scales it does not find, by their counts."""
-    positions, constants = QuantPosManager(ONNXModel(model)), model.graph.initializer
+    positions = QuantPosManager(ONNXModel(model))
+    constants = model.graph.initializer
     before = {tensor.name: tensor.SerializeToString() for tensor in constants}
     finders = positions.get_ipos_name, positions.get_wpos_name, positions.get_opos_name
     convolutions = [node for node in model.graph.node if node.op_type in ("Conv", "ConvTranspose")]

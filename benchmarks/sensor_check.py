@@ -122,7 +122,8 @@ def acquisitions(folder: Path, count: int, seed: int) -> Iterator[tuple[Instrume
     scenes = [read_scene(path, LIKE) for path in list_images(folder)]
     scenes = [scene for scene in scenes if fitting_oversampling(scene.radiance, [RATIO], LEAST_SIDE_PX)]
     for number in range(count):
-        sensor, scene = draw(generator), scenes[int(generator.integers(len(scenes)))]
+        sensor = draw(generator)
+        scene = scenes[int(generator.integers(len(scenes)))]
         radiance = crop_divisible(scene.radiance, RATIO)
         yield sensor, seen(radiance, sensor, number), "photograph"
         yield sensor, seen(texture(generator), sensor, number), "texture"

@@ -97,9 +97,11 @@ class MobileUNet(nn.Module):
     def __init__(self, features: int = 8) -> None:
         super().__init__()
         self.head = conv(1, features, nn.ReLU6())
-        self.fine, self.down = inverted(features, features), inverted(features, 2 * features)
+        self.fine = inverted(features, features)
+        self.down = inverted(features, 2 * features)
         self.deep = nn.Sequential(*(inverted(2 * features, 2 * features) for _ in range(2)))
-        self.join, self.tail = inverted(3 * features, features), nn.Conv2d(features, 1, 3, padding=1)
+        self.join = inverted(3 * features, features)
+        self.tail = nn.Conv2d(features, 1, 3, padding=1)
 
     def forward(self, image: Tensor) -> Tensor:
         """Images (N, 1, H, W) of even sides to the same."""
@@ -212,7 +214,8 @@ def cells(name: str, way: Way, python: str, folder: Path, drawn: dict[bool, Draw
     path = folder / f"{slug(name)}.onnx"
     model = load_onnx(path)
     network = Peered(model, ends_of(read_network(model)))
-    patches, out = path.with_suffix(".npy"), path.with_suffix(f".{slug(way.name)}.onnx")
+    patches = path.with_suffix(".npy")
+    out = path.with_suffix(f".{slug(way.name)}.onnx")
     if way is TUNED:
         seconds = fine_tune(path, drawn[True], out)
     else:
@@ -238,7 +241,8 @@ def slug(name: str) -> str:
 
 def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
     """Line by line, as each network is judged."""
-    ours, quark = [Way("beers-deploy", False, OURS, ("ours",))], [Way("Quark XINT8", False, QUARK, (), ("0",))]
+    ours = [Way("beers-deploy", False, OURS, ("ours",))]
+    quark = [Way("Quark XINT8", False, QUARK, (), ("0",))]
     if arguments.tuned:
         ours.append(TUNED)
         quark.append(Way("Quark XINT8, AdaRound", False, QUARK, (), (ADAROUND_STEPS,)))

@@ -66,7 +66,8 @@ def measure(scenes: Sequence[Scene], networks: Sequence[str], out: Path, part: s
         for around, steps in AROUND.items()
     }
     scores: Scores = {}
-    nominal, aim = DEGRADED.nominal(), REFERENCE.nominal()
+    nominal = DEGRADED.nominal()
+    aim = REFERENCE.nominal()
     for name, sensor in list(conditions(nominal, DEGRADED).items())[part]:
         if name == NOMINAL:  # it is also MTF 7 %
             continue

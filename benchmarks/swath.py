@@ -63,7 +63,8 @@ def main() -> None:
         for path in networks + ([arguments.int8] if arguments.int8 else []):
             for runtime in arguments.runtimes.split(","):
                 options = Options(path, TILE_PX, runtime=Runtime(runtime), threads=arguments.threads)
-                size, repeats = parse_size(arguments.size), arguments.repeats
+                size = parse_size(arguments.size)
+                repeats = arguments.repeats
                 if arguments.peers or arguments.monai_python:
                     beside_peers(folder, options, size, repeats, arguments.monai_python)
                 else:
@@ -161,8 +162,10 @@ def ways(task: Task, monai_python: str | None) -> Iterator[dict[str, Run]]:
 
 def overlapped(task: Task, way: str, chunks_at_once: int) -> Run:
     """dask.array.map_overlap over chunks that are a tile with their overlap, the cores shared among those at work."""
-    core_px, halo_px = TILE_PX - 2 * task.halo_px, task.halo_px
-    out, threads = task.out(way), max(task.cores // chunks_at_once, 1)
+    core_px = TILE_PX - 2 * task.halo_px
+    halo_px = task.halo_px
+    out = task.out(way)
+    threads = max(task.cores // chunks_at_once, 1)
 
     def run() -> None:
         import dask.array as da
@@ -232,12 +235,14 @@ def fastest(works: Sequence[Callable[[], float | None]], repeats: int) -> np.nda
 def memory(folder: Path, model: Path, size: tuple[int, int], known_rows: int | None) -> None:
     """Peak memory of the command on a drawn swath, compressed in tiles, never whole in memory."""
     width, height = size
-    image, figures = folder / "swath.tif", folder / "swath.json"
+    image = folder / "swath.tif"
+    figures = folder / "swath.json"
     write_swath(image, height, width, known_rows or height)
     arguments = ["restore", image, folder / "swath-out.tif", "--network", model, "--json", figures]
     subprocess.run([sys.executable, "-c", ENTRY, *map(str, arguments)], check=True)  # noqa: S603
     row = json.loads(figures.read_text(encoding="utf-8"))["rows"][0]["figures"]
-    time_s, peak_gb = row["time"]["value"], row["peak memory"]["value"]
+    time_s = row["time"]["value"]
+    peak_gb = row["peak memory"]["value"]
     print(f"{width} x {height}: {time_s:.0f} s, peak memory {peak_gb:.3f} GB", flush=True)
 
 
@@ -245,7 +250,8 @@ def write_swath(path: Path, height: int, width: int, known_rows: int) -> None:
     """A ramp of uint16 over the known rows, tile by tile; tiles below them are left out of the file, as nodata."""
     ramp = np.arange(1, 257, dtype=np.uint16) * np.ones((256, 1), np.uint16)
     across = -(-width // 256)
-    known, count = -(-known_rows // 256) * across, -(-height // 256) * across
+    known = -(-known_rows // 256) * across
+    count = -(-height // 256) * across
     tifffile.imwrite(
         path,
         (ramp + np.uint16(k % 3000) if k < known else None for k in range(count)),

@@ -47,7 +47,8 @@ def main() -> None:
     scenes = [procedural_scene(1200, 1600, np.random.default_rng(seed)) for seed in range(4)]
     source = PatchSource(scenes, PatchRecipe(*profiles, patch_px=PATCH_PX), BATCH, 0)
     recipe = TrainingRecipe(steps=(TURNS + 1) * arguments.steps, batch=BATCH, loss=LOSS)
-    variant, steps = VARIANTS[arguments.variant], arguments.steps
+    variant = VARIANTS[arguments.variant]
+    steps = arguments.steps
     trainers = {name: Trainer(variant, recipe, precision=name) for name in get_args(Precision)}
     made = list(islice(source.batches(), steps))
     batches = source.batches()
@@ -70,7 +71,8 @@ def main() -> None:
 
 def kinds_of_patches() -> dict[str, PatchRecipe]:
     """Recipes of patches for any sensor, by name."""
-    degraded, reference = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+    degraded = load_sensor("pleiades-degraded")
+    reference = load_sensor("pleiades-reference")
     plain = PatchRecipe(degraded, reference, PATCH_PX, family=SensorFamily(degraded.nominal()))
     family = SensorFamily(degraded.nominal(), other_curves=0.4)
     return {"ordinary": plain, "varied": replace(plain, family=family, looks=VARIED, noisy_reference=False)}

@@ -68,7 +68,8 @@ def main() -> None:
 
 def build_handler(folder: Path) -> Path:
     """Compile the handler of the signal."""
-    source, library = folder / "handler.c", folder / "handler.so"
+    source = folder / "handler.c"
+    library = folder / "handler.so"
     source.write_text(HANDLER, encoding="utf-8")
     subprocess.run(["gcc", "-O1", "-shared", "-fPIC", "-o", library, source], check=True)  # noqa: S603, S607
     return library

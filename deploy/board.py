@@ -73,12 +73,14 @@ class Board(TargetProfile):
             ProfileError: no such sensor.
         """
         known = None if sensor is None else Sensor.load(sensor)
-        network, folder = Network.load(int8, sensor=BLIND if known is None else known), Path(out)
+        network = Network.load(int8, sensor=BLIND if known is None else known)
+        folder = Path(out)
         if known is not None and known.name != BLIND and (doubt := other_sensor(network.model, known)):
             warnings.warn(doubt, stacklevel=2)
         if record:
             require_library()  # refused before anything is written
-        core, brighter = network.core(self, tile), _brighter(int8, known)
+        core = network.core(self, tile)
+        brighter = _brighter(int8, known)
         facts = host_facts(network, tile, known, brighter)
         core.save(folder / "core.onnx")
         for factor, each in brighter.items():

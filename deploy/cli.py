@@ -71,7 +71,8 @@ class Stream:
     """
 
     def __init__(self, stream: Any) -> None:
-        self.stream, self.lost = stream or open(os.devnull, "w"), ""  # noqa: PTH123, SIM115 - as long as the process
+        self.stream = stream or open(os.devnull, "w")  # noqa: PTH123, SIM115 - as long as the process
+        self.lost = ""
         if isinstance(self.stream, io.TextIOWrapper):
             self.stream.reconfigure(errors="backslashreplace")  # a name that a terminal lacks must end no run either
 
@@ -105,8 +106,10 @@ class Group(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command; what was lost on standard output ends it with 70 when all is done."""
-        closed, out = sys.stdout is None, cast(Any, Stream(sys.stdout))
-        sys.stdout, sys.stderr = out, cast(TextIO, Stream(sys.stderr))
+        closed = sys.stdout is None
+        out = cast(Any, Stream(sys.stdout))
+        sys.stdout = out
+        sys.stderr = cast(TextIO, Stream(sys.stderr))
         found = self._invoke(ctx)
         if out.lost or (closed and ctx.meta[PIPES_RESULTS]):
             typer.echo(f"beers-deploy: standard output: {out.lost or 'closed'}; all else is done", err=True)
@@ -141,7 +144,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             typer.echo(f"beers-deploy: {visible(message)}", err=True)
             raise typer.Exit(code) from None
 
-    signature, more = inspect.signature(function), {"quiet": Quiet, "verbose": Verbose}
+    signature = inspect.signature(function)
+    more = {"quiet": Quiet, "verbose": Verbose}
     kind = inspect.Parameter.KEYWORD_ONLY
     extra = [inspect.Parameter(name, kind, default=False, annotation=hint) for name, hint in more.items()]
     own = [*signature.parameters.values(), *extra]

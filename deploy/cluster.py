@@ -86,7 +86,8 @@ def _connect(distributed: Any, address: str) -> Any:
     try:
         client = distributed.Client(address, timeout=ANSWER_S, set_as_default=False)
     except (OSError, ValueError) as error:
-        got, remedy = " ".join(str(error).split())[:120], "give its address, such as tcp://host:8786"
+        got = " ".join(str(error).split())[:120]
+        remedy = "give its address, such as tcp://host:8786"
         raise MachineError(f"scheduler {address}", expected="an answer", got=got, remedy=remedy) from error
     try:
         client.wait_for_workers(1, timeout=JOIN_S)
@@ -102,7 +103,8 @@ def _require_same_versions(client: Any) -> None:
         here = version(package)
         for worker, got in client.run(version, package, on_error="return").items():
             if got != here:
-                expected, remedy = f"{package} {here}", "install the same versions on every machine"
+                expected = f"{package} {here}"
+                remedy = "install the same versions on every machine"
                 raise MachineError(f"worker {worker}", expected=expected, got=str(got), remedy=remedy)
 
 

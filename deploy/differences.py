@@ -117,7 +117,8 @@ def read_document(path: Path) -> dict[str, object]:
 
 def changes(before: Mapping[str, object], after: Mapping[str, object]) -> Changes:
     """Match the figures of two documents."""
-    old, new = figures_of(before), figures_of(after)
+    old = figures_of(before)
+    new = figures_of(after)
     both = tuple(Change(place, figure, new[place]) for place, figure in old.items() if place in new)
     return Changes(both, tuple(p for p in old if p not in new), tuple(p for p in new if p not in old))
 

@@ -61,8 +61,10 @@ def banked_to_onnx(
         about: metadata.
         tile_px: side of a fixed square image, or None for any number and size.
     """
-    variant, bank = weights.variant, network_bank(sensor, weights.kernels)
-    scale, pixels = variant.scale, variant.pixels
+    variant = weights.variant
+    bank = network_bank(sensor, weights.kernels)
+    scale = variant.scale
+    pixels = variant.pixels
     require_tile(tile_px, scale)
     vector = np.array(sensor_vector(sensor).values, np.float32)
     tensors = dict(weights.tensors)

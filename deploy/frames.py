@@ -91,7 +91,8 @@ def bars(rows: Sequence[Row], figure: str | None, ax: "Axes | None") -> "Axes":
 
 def html_table(title: str, rows: Sequence[Row]) -> str:
     """One line a row; the mode behind a figure, its source (or why there is none) as its tooltip."""
-    keys, words = figures_of(rows), words_of(rows)
+    keys = figures_of(rows)
+    words = words_of(rows)
     units = {key: figure.unit for row in rows for key, figure in row.figures.items()}
     head = "".join(_cell("th", f"{key} ({units[key]})" if units[key] else key) for key in keys)
     head = _cell("th", title) + head + "".join(_cell("th", word) for word in words)

@@ -153,7 +153,8 @@ def restore(
             path = Path(image if isinstance(image, str | os.PathLike) else image.name)
             return _restore_path(path, replace(job.options, resume=resume, cog=cog), job, out)
         if out is not None or resume or cog:
-            name, remedy = "out" if out is not None else "cog" if cog else "resume", "save the result yourself"
+            name = "out" if out is not None else "cog" if cog else "resume"
+            remedy = "save the result yourself"
             raise OptionError(name, expected="none beside an array", got="one", remedy=remedy)
         return _restore_any(image, job)
 
@@ -231,11 +232,13 @@ def _restore_labelled(image: Any, job: Job) -> Any:
         names = ", ".join(map(str, image.data_vars)) or "none"
         remedy = "choose one of its variables"
         raise ImageError(NAME, expected="an xarray.DataArray", got=f"a Dataset of {names}", remedy=remedy)
-    own, options = image.attrs, job.options
+    own = image.attrs
+    options = job.options
     require_raw(NAME, is_restored(str(own.get("TIFFTAG_SOFTWARE", "")), own), options.again)
     full_scale = own.get("full_scale") if options.full_scale is None else options.full_scale
     missing = own.get("_FillValue") if job.nodata is None else job.nodata
-    dims, bands = image.dims, next((dim for dim in image.dims if dim in BAND_DIMS), None)
+    dims = image.dims
+    bands = next((dim for dim in image.dims if dim in BAND_DIMS), None)
     ordered = image if bands is None or image.ndim != 3 else image.transpose(bands, ...)
     if image.ndim == 3 and bands is None and ordered.shape[-1] <= FEW < min(ordered.shape[:-1]):
         raise _bands_last(ordered.shape, "name the dimension of the bands 'band'")
@@ -246,7 +249,8 @@ def _restore_labelled(image: Any, job: Job) -> Any:
 
 def _restore_masked(image: Any, job: Job) -> Any:
     """A masked array, whose masked pixels are missing and stay masked, enlarged with the image."""
-    restored, mask = _restore(image, job), np.ma.getmaskarray(image)
+    restored = _restore(image, job)
+    mask = np.ma.getmaskarray(image)
     scale = restored.shape[-1] // mask.shape[-1]
     mask = mask.repeat(scale, axis=-2).repeat(scale, axis=-1)
     if mask.shape != restored.shape:  # other bands are made of all that the image has
@@ -280,7 +284,8 @@ def _restore_traditionally(bands: np.ndarray, raster: Raster, job: Job) -> np.nd
     bits = int(chain.degraded.max_dn).bit_length()
     extents = (raster.extent(band) for band in bands)
     full_scale = full_scale_of(NAME, raster, extents, job.options.full_scale, bits).value
-    to_dn, restored = np.float32(chain.degraded.max_dn / full_scale), []
+    to_dn = np.float32(chain.degraded.max_dn / full_scale)
+    restored = []
     told_sensor(ArraySource(bands, raster), job.options.sensors, full_scale, NAME, job.options.strict, warnings.warn)
     for band in bands:
         strip = checked_strip(raster, 0, band[None], full_scale, NAME)
@@ -319,7 +324,8 @@ def _between(places: np.ndarray, count: int) -> np.ndarray | None:
 
 
 def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndarray:
-    network, source = load_onnx(options.model), ArraySource(bands, raster)
+    network = load_onnx(options.model)
+    source = ArraySource(bands, raster)
     plan = plan_for(network, raster.shape, options)
     at_once = tiles_at_once(options.threads, plan.tiles)
     infer, _ = open_runtime(options.runtime, network, options.threads, at_once)

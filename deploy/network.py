@@ -116,7 +116,8 @@ class Network:
             ModelError: a float network, or an INT8 one that was not quantised under the DPU's rules here.
             OptionError: an NPU and no tile, or one that the network cannot rearrange.
         """
-        core, side_px = read_core(self.model), tile or fixed_tile_px(self.model)
+        core = read_core(self.model)
+        side_px = tile or fixed_tile_px(self.model)
         require_tile(side_px, core.ends.place_px)
         write = vint8_model if TargetProfile.load(board).npu else board_model
         return Network(write(core, metadata(self.model), side_px), f"{self.name}-core")
@@ -193,7 +194,8 @@ def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
         raise ModelError("network", expected=expected, got=type(module).__name__, remedy=remedy)
     torch = optional("torch", "network")
     free = {name: {0: "N", 2: "H", 3: "W"} for name in ("image", "restored")}
-    stream, training = io.BytesIO(), module.training
+    stream = io.BytesIO()
+    training = module.training
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter's own: what it writes is checked below
         try:

@@ -145,7 +145,8 @@ def int8_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
 
 def shipped_pair(name: str = VARIANT, sensor: str = SENSOR) -> tuple[Path, Path]:
     """A shipped network in float32 and in INT8, told a sensor."""
-    known, given = load_sensor(sensor), Path(shipped_weights(name).stem)
+    known = load_sensor(sensor)
+    given = Path(shipped_weights(name).stem)
     return float_file(given, known), int8_file(given, known)
 
 
@@ -197,7 +198,8 @@ def _written(network: Conditioned, sensor: Sensor, int8: bool, log: Log) -> Path
 
 def process_file(name: str, digest: str) -> Path:
     """Of a file of this process, named for the tables that show it."""
-    folder, stem = _folder() / digest[:12], re.sub(r"[^\w.-]+", "-", name)[:40]
+    folder = _folder() / digest[:12]
+    stem = re.sub(r"[^\w.-]+", "-", name)[:40]
     folder.mkdir(exist_ok=True)
     return folder / f"{stem}.onnx"
 
@@ -225,7 +227,8 @@ def told_by_delta(model: onnx.ModelProto, delta: Path) -> onnx.ModelProto:
     try:
         packed = delta.read_bytes()
     except OSError as error:
-        got, remedy = unreadable(delta) or str(error), "give a file that 'export --delta' wrote"
+        got = unreadable(delta) or str(error)
+        remedy = "give a file that 'export --delta' wrote"
         raise ModelError(str(delta), expected="a delta", got=got, remedy=remedy) from error
     core, name = with_delta(required_family(model).core, packed, str(delta))
     return host_model(core, {**metadata(model), "sensor": name}, fixed_tile_px(model))

@@ -143,7 +143,8 @@ def simulate(
     degraded = calling_for(Sensor.load(sensor), call, effects)
     aim = degraded.reference if reference is None else Sensor.load(reference).in_units_of(degraded)
     require_same_units(degraded, aim)
-    draw, ratio = Draw(seed), int(degraded.oversampling.low)
+    draw = Draw(seed)
+    ratio = int(degraded.oversampling.low)
     radiance = _scene(scene, aim.nominal(), size, ratio, seed).radiance * (call.radiance_scale.low if call else 1.0)
     seen_by, meant_by = (
         profile.draw(draw.generator(f"sensor-{role}"))

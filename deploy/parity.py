@@ -44,7 +44,8 @@ def require_parity(network: ConvBEERS | OfOneSensor, model: Path | onnx.ModelPro
     with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused
         difference = float(np.abs(run(open_session(model), image) - expected).max())
     if not np.isfinite(difference):
-        expected_text, remedy = "finite pixels on a random image", "train it again with a lower learning rate"
+        expected_text = "finite pixels on a random image"
+        remedy = "train it again with a lower learning rate"
         raise ModelError("network", expected=expected_text, got="NaN or infinity", remedy=remedy)
     if difference > MAX_DIFFERENCE:
         expected = f"at most {MAX_DIFFERENCE:g} of full scale from torch"

@@ -91,7 +91,8 @@ def quantize(
         >>> bd.quantize(bd.Network.load(network, example=(1, 1, 32, 32)), samples, board="zcu102").precision
         'int8'
     """
-    target, known = TargetProfile.load(board), Sensor.load(sensor)
+    target = TargetProfile.load(board)
+    known = Sensor.load(sensor)
     banked = conditioned(Path(network)) if isinstance(network, str | os.PathLike) else None
     steps = steps_of(finetune)
     if banked and (steps != 0 or samples is not None):
@@ -116,7 +117,8 @@ def steps_of(finetune: int | str) -> int | None:
     if finetune == "auto":
         return None
     if not str(finetune).isdecimal():
-        expected, remedy = "auto, or whole steps from 0", "choose auto"
+        expected = "auto, or whole steps from 0"
+        remedy = "choose auto"
         raise OptionError("finetune", expected=expected, got=repr(finetune), remedy=remedy)
     return int(finetune)
 
@@ -128,7 +130,8 @@ def _simulated(sensor: Sensor, images: Path | None, patches: int, patch_px: int,
 
 
 def _by_itself(origin: Network, calibration: Source, target: TargetProfile, steps: int | None) -> Network:
-    shifts, tuning = _shifts_of(target), None
+    shifts = _shifts_of(target)
+    tuning = None
     if steps != 0:
         optional("torch", "finetune")
         from beers_deploy.quant.passes.tune import Tuning
@@ -160,7 +163,8 @@ def _shifts_of(target: TargetProfile) -> Shifts:
 def losses_of(network: Network, samples: object = None, **drawn: Any) -> str:
     """What INT8 costs on what calibration did not see, in one sentence; all as in `sensitivity_report`."""
     assert network.origin is not None and network.quantised is not None  # noqa: S101, PT018
-    model, result = network.origin.model, network.quantised
+    model = network.origin.model
+    result = network.quantised
     held_out = (samples_of(model, samples) or _simulated(**drawn)).unseen
     found = compare(open_any_size(model), open_any_size(result.host), held_out.pairs, samples is None)
     return losses(result, found, held_out)
@@ -178,10 +182,12 @@ def sensitivity_report(
         drawn: sensor, images, patches, patch_px and seed as given there.
     """
     assert network.origin is not None and network.quantised is not None  # noqa: S101, PT018
-    model, result = network.origin.model, network.quantised
+    model = network.origin.model
+    result = network.quantised
     held_out = (samples_of(model, samples) or _simulated(**drawn)).unseen
     sessions = open_any_size(model), open_any_size(result.host)
-    found, spread = compare(*sessions, held_out.pairs, samples is None), spread_of(*sessions, held_out.degraded)
+    found = compare(*sessions, held_out.pairs, samples is None)
+    spread = spread_of(*sessions, held_out.degraded)
     worst = spread.worst(WORST)
     layers = layer_error_rows(result, held_out)
     rows = [gate_row(found), *layers, *(worst_row(k, held_out, spread) for k in worst), sizes_row(spread)]
@@ -195,9 +201,11 @@ def rounding_of(int8: Path, weights: Path) -> "Rounding":
     from beers_deploy.model.convbeers import Rounding
     from beers_deploy.quant.banked.calibrate import map_steps
 
-    model, given = load_onnx(int8), read_conditioned(weights)
+    model = load_onnx(int8)
+    given = read_conditioned(weights)
     if metadata(model).get(WEIGHTS) != sha256(weights):
-        expected, remedy = f"the INT8 file of {weights}", "make it with 'beers-deploy quantize'"
+        expected = f"the INT8 file of {weights}"
+        remedy = "make it with 'beers-deploy quantize'"
         raise ModelError(str(int8), expected=expected, got="another network's", remedy=remedy)
     with contradictions(str(int8)):
         found = map_steps(required_family(model), given)
@@ -224,7 +232,8 @@ def family_model(
     from beers_deploy.quant.banked.calibrate import family_images, quantise_family
 
     weights = read_conditioned(network.weights)
-    aim, scale = load_sensor(REFERENCE).nominal(), weights.variant.scale
+    aim = load_sensor(REFERENCE).nominal()
+    scale = weights.variant.scale
     scenes = load_scenes(None, aim, seed)
     if images:  # drawn scenes have stronger edges, photographs finer ground
         photographs = [scene for folder in images for scene in load_scenes(folder, aim, seed)]

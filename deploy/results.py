@@ -217,7 +217,8 @@ def print_rows(title: str, rows: Iterable[Row], console: Console | None = None) 
     # Measured on a wide console: on its own a table's least width never exceeds the console's.
     if Measurement.get(console, console.options.update(width=PIPE_WIDTH), table).minimum > console.width:
         table = one_by_one(rows)
-    table.title, table.title_justify = plain(title), "left"
+    table.title = plain(title)
+    table.title_justify = "left"
     console.print(table)
     if keys:
         console.print(LEGEND, style="dim", highlight=False, markup=False)

@@ -106,7 +106,8 @@ class Verdict(Table):
         return f"Verdict({self})"
 
     def __str__(self) -> str:
-        mae, drop_db = self.comparison.result.mae, self.comparison.result.drop_db
+        mae = self.comparison.result.mae
+        drop_db = self.comparison.result.drop_db
         drop = "" if math.isnan(drop_db) else f", PSNR drop {drop_db:.2f} dB"
         return f"gate {sentence(self.checks, f'MAE {mae:.3g} of full scale{drop}')}"
 
@@ -252,7 +253,9 @@ def gate(
         True
     """
     _require_metric(metric)
-    allowed, target, known = limits_of(limits), TargetProfile.load(board), Sensor.load(sensor)
+    allowed = limits_of(limits)
+    target = TargetProfile.load(board)
+    known = Sensor.load(sensor)
     ours, theirs = _pair(int8, against, known)
     config = limits if isinstance(limits, str | os.PathLike) else None
     told = sensor if isinstance(sensor, str) else known.name
@@ -347,7 +350,8 @@ def _require_metric(metric: str | None) -> None:
 
 def _require_references(own: OwnSamples | None, wanted: str) -> None:
     if own is not None and not any(reference.size for _, reference in own.all.pairs):
-        expected, remedy = f"references for {wanted}", "give images and references, or leave it out"
+        expected = f"references for {wanted}"
+        remedy = "give images and references, or leave it out"
         raise OptionError("samples", expected=expected, got="images alone", remedy=remedy)
 
 

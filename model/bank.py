@@ -138,7 +138,8 @@ def _reference() -> Instrument:
 
 
 def _bank(sensor: Instrument, sigma: float, kernels: Kernels) -> Bank:
-    fy, fx = np.fft.fftfreq(GRID)[:, None], np.fft.fftfreq(GRID)[None, :]
+    fy = np.fft.fftfreq(GRID)[:, None]
+    fx = np.fft.fftfreq(GRID)[None, :]
     blur, target = (sensor_mtf(fx, fy, each) for each in (sensor, _reference()))
     r_squared = (fx**2 + fy**2) / NYQUIST**2
     epsilons = [EPSILON_PER_SIGMA * sigma * STEP ** (k - 1) for k in range(FILTERS)]
@@ -196,7 +197,8 @@ def in_places(kernels: NDArray[np.float64], scale: int) -> NDArray[np.float64]:
         of the planes, and of the image, orders them.
     """
     side_px = kernels.shape[-1]
-    reach, middle = -(-(side_px // 2) // scale), side_px // 2
+    reach = -(-(side_px // 2) // scale)
+    middle = side_px // 2
     found = np.zeros((len(kernels), scale, scale, scale, scale, 2 * reach + 1, 2 * reach + 1))
     for row, column, down, right in product(range(scale), range(scale), range(side_px), range(side_px)):
         (place_y, y), (place_x, x) = divmod(row + down - middle, scale), divmod(column + right - middle, scale)

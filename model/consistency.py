@@ -102,7 +102,8 @@ class Placed:
         half = BLOCK_PX // 2
         count = -(-self.size_px // BLOCK_PX)
         left_out = BORDER_BLOCKS if count > 2 * BORDER_BLOCKS else 0
-        low, high = left_out, count - 1 - left_out
+        low = left_out
+        high = count - 1 - left_out
         first = (self.keep_start - half) // BLOCK_PX
         last = (self.keep_stop - 1 - half) // BLOCK_PX + 1
         return min(max(first, low), high), max(min(last, high), low)
@@ -146,7 +147,9 @@ class Consistency:
         kernel = _blur_between(sensor, reference)
         near = _centre(kernel, NEAR_PX)
         left, values, right = np.linalg.svd(near)
-        left, values, right = left[:, :RANK], values[:RANK], right[:RANK]
+        left = left[:, :RANK]
+        values = values[:RANK]
+        right = right[:RANK]
         near = (left * values) @ right
         box = np.full(BLOCK_PX, 1 / BLOCK_PX)
         # Convolution turns a filter around; the sums below go forwards.
@@ -214,7 +217,8 @@ class Consistency:
     def _around(self, means: Image) -> Image:
         """The sum of block means around each block, weighted by `far`."""
         side = len(self.far)
-        height, width = means.shape[0] - side + 1, means.shape[1] - side + 1
+        height = means.shape[0] - side + 1
+        width = means.shape[1] - side + 1
         total = np.zeros((height, width), np.float32)
         for row in range(side):
             for column in range(side):
@@ -224,7 +228,8 @@ class Consistency:
 
 def _blur_between(sensor: Instrument, reference: Instrument) -> NDArray[np.float64]:
     """The filter H around its first pixel, (GRID, GRID) float64 of sum 1."""
-    fy, fx = np.fft.fftfreq(GRID)[:, None], np.fft.fftfreq(GRID)[None, :]
+    fy = np.fft.fftfreq(GRID)[:, None]
+    fx = np.fft.fftfreq(GRID)[None, :]
     ratio = sensor_mtf(fx, fy, sensor) / sensor_mtf(fx, fy, reference)
     return np.asarray(np.fft.ifft2(ratio / ratio[0, 0]).real)
 
@@ -257,7 +262,8 @@ def _clipped_noise(sensor: Instrument, full_scale: float) -> tuple[Image, Image]
     A signal s with Gaussian noise sigma, clipped at 0, has the mean s + e with
     e = sigma phi(s / sigma) - s Phi(-s / sigma), phi and Phi being the normal density and distribution.
     """
-    gain, unit = sensor.gain_dn_per_radiance, full_scale / sensor.max_dn
+    gain = sensor.gain_dn_per_radiance
+    unit = full_scale / sensor.max_dn
     variance_dark_dn = sensor.beta * gain**2 + 1 / 12
     # alpha L grows with the signal: the range ends where the signal is EXCESS_SIGMAS times its own noise.
     slope_dn = sensor.alpha * gain
@@ -283,10 +289,12 @@ def _extended(
     image: Image, sides: tuple[Placed, Placed], origin: tuple[int, int], around_px: int
 ) -> NDArray[np.float32]:
     """The pixels of the blocks of a window and `around_px` more, mirrored beyond the image's borders (edge twice)."""
-    slices, pads = [], []
+    slices = []
+    pads = []
     for placed, first in zip(sides, origin, strict=True):
         start, stop = placed.span(around_px)
-        low, high = max(start, 0), min(stop, placed.size_px)
+        low = max(start, 0)
+        high = min(stop, placed.size_px)
         slices.append(slice(low - first, high - first))
         pads.append((low - start, stop - high))
     inside = image[slices[0], slices[1]]

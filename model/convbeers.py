@@ -194,7 +194,8 @@ class BankedConvBEERS(Layers):
 
     def _held(self, filtered: Tensor, gains: Tensor) -> tuple[Tensor, Tensor]:
         """Planes and analytic restoration, (N, 5, H, W) in units, held as `Bank.reach` says."""
-        planes, analytic = filtered[:, :FILTERS], filtered[:, FILTERS:]
+        planes = filtered[:, :FILTERS]
+        analytic = filtered[:, FILTERS:]
         if self.kernels == "cut":
             return planes.clamp(-LARGEST, LARGEST), analytic.clamp(-LARGEST, LARGEST)
         reach = LARGEST / gains[:, None, None, None]
@@ -209,7 +210,10 @@ class OfOneSensor(nn.Module):
 
     def __init__(self, network: BankedConvBEERS, vector: Tensor, bank: Bank | None = None) -> None:
         super().__init__()
-        self.network, self.vector, self.bank, self.variant = network, vector, bank, network.variant
+        self.network = network
+        self.vector = vector
+        self.bank = bank
+        self.variant = network.variant
 
     def forward(self, image: Tensor) -> Tensor:
         """Restore (N, 1, H, W)."""
@@ -230,7 +234,8 @@ def told(network: Network, vector: Tensor, bank: Bank | None = None) -> ConvBEER
 
 def each_by_its_own(image: Tensor, kernels: Tensor) -> Tensor:
     """Image n of (N, 1, H, W), mirrored at its borders, by kernels n of (N, K, 7, 7): (N, K, H, W)."""
-    count, radius = len(image), SIDE_PX // 2
+    count = len(image)
+    radius = SIDE_PX // 2
     wide = pad(image, [radius] * 4, mode="reflect")
     made = conv2d(wide.transpose(0, 1), kernels.flatten(0, 1)[:, None], groups=count)
     return made.view(count, -1, *image.shape[-2:])
@@ -266,9 +271,12 @@ def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
     sources = _sources(network.variant, variant)
     large = type(network)(variant)
     initialise(large, generator)
-    weights, small, factor = large.state_dict(), network.state_dict(), variant.scale // network.variant.scale
+    weights = large.state_dict()
+    small = network.state_dict()
+    factor = variant.scale // network.variant.scale
     for name, source in sources.items():
-        weight, bias = weights[f"{name}.weight"], weights[f"{name}.bias"]
+        weight = weights[f"{name}.weight"]
+        bias = weights[f"{name}.bias"]
         if source is not None:
             weight.copy_(_widened(_coarser(small[f"{source}.weight"], factor), weight.shape, generator))
             bias.copy_(_repeated(small[f"{source}.bias"], bias.shape, factor))
@@ -313,7 +321,8 @@ def _coarser(weight: Tensor, factor: int) -> Tensor:
 
 def _widened(weight: Tensor, channels: Sequence[int], generator: torch.Generator) -> Tensor:
     """(O, I, kh, kw) to as many `channels`: copies along both, divided among the copies of an input."""
-    copies_out, copies_in = channels[0] // weight.shape[0], channels[1] // weight.shape[1]
+    copies_out = channels[0] // weight.shape[0]
+    copies_in = channels[1] // weight.shape[1]
     shares = torch.rand(channels[0], copies_in, weight.shape[1], 1, 1, generator=generator) + 0.5
     shares = shares / shares.sum(1, keepdim=True)
     spread = weight.repeat(copies_out, 1, 1, 1).unsqueeze(1) * shares

@@ -60,7 +60,8 @@ def _drawn_optics(generator: np.random.Generator) -> Callable[[float], Curve]:
         obscuration = float(generator.choice(OBSCURATIONS))
         return lambda contrast: pupil_contrast(contrast, obscuration)
     depth = float(generator.uniform(-DEEPEST_BEND, DEEPEST_BEND))
-    middle, width = float(generator.uniform(0.3, 0.6)), float(generator.uniform(0.15, 0.35))
+    middle = float(generator.uniform(0.3, 0.6))
+    width = float(generator.uniform(0.15, 0.35))
     hill = np.exp(-(((share - middle) / width) ** 2)) * np.sin(math.pi * share)
     return lambda contrast: np.asarray(np.minimum(contrast**share * (1 + depth * hill), 1.0))
 

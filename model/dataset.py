@@ -90,14 +90,16 @@ def plan_windows(recipe: DatasetRecipe) -> list[Window]:
 
 
 def _scene_windows(recipe: DatasetRecipe, index: int, first: int) -> Iterator[Window]:
-    path, ratio = recipe.scenes[index], recipe.oversampling
+    path = recipe.scenes[index]
+    ratio = recipe.oversampling
     height, width = load(recipe, index).radiance.shape
     stem = f"{index:04d}-{path.stem if path else 'drawn'}"
     if recipe.patch_px is None:
         if min(height, width) // ratio > 2 * MARGIN_PX:
             yield Window(first, index, stem, 0, 0, height, width)
         return
-    side, step = (recipe.patch_px + 2 * MARGIN_PX) * ratio, recipe.patch_px * ratio
+    side = (recipe.patch_px + 2 * MARGIN_PX) * ratio
+    step = recipe.patch_px * ratio
     corners = [(y, x) for y in range(0, height - side + 1, step) for x in range(0, width - side + 1, step)]
     for k, (top, left) in enumerate(corners):
         yield Window(first + k, index, f"{stem}-{k:05d}", top, left, side, side)
@@ -133,7 +135,8 @@ def make_patches(recipe: DatasetRecipe, windows: list[Window]) -> list[Patch]:
 
 
 def _make_patch(recipe: DatasetRecipe, window: Window, radiance: np.ndarray) -> Patch:
-    bottom, right = window.top + window.height, window.left + window.width
+    bottom = window.top + window.height
+    right = window.left + window.width
     part = prepare_scene(radiance[window.top : bottom, window.left : right], recipe.oversampling)
     draw = Draw(recipe.seed, window.number)
     line, sensors = _drawn(recipe, window)
@@ -205,7 +208,8 @@ def write_dataset(
     """
     _check_folder(recipe, out, resume)
     _remove_left_overs(out)
-    windows, manifest = plan_windows(recipe), out / "manifest.jsonl"
+    windows = plan_windows(recipe)
+    manifest = out / "manifest.jsonl"
     scenes = [list(group) for _, group in groupby(windows, key=lambda w: w.scene)]
     chunks = [scene[first : first + CHUNK] for scene in scenes for first in range(0, len(scene), CHUNK)]
     parts = {out / "parts" / f"{chunk[0].number:08d}.jsonl": chunk for chunk in chunks}
@@ -277,7 +281,8 @@ def _made(
 
 
 def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
-    path, wanted = out / "recipe.json", json.dumps(recipe.to_json(), indent=1, sort_keys=True) + "\n"
+    path = out / "recipe.json"
+    wanted = json.dumps(recipe.to_json(), indent=1, sort_keys=True) + "\n"
     if not path.exists():
         write_text(path, wanted)
         return
@@ -300,7 +305,8 @@ def _read_summary(path: Path) -> dict[str, float]:
         rejected = sum(int(line[role]["rejected_snr_pairs"]) for line in lines for role in ("degraded", "reference"))
         return {"patches": len(lines), "rejected_share": rejected / (rejected + 2 * len(lines))}
     except (ArithmeticError, LookupError, OSError, TypeError, ValueError) as error:
-        got, remedy = " ".join(str(error).split())[:120], "choose another folder"
+        got = " ".join(str(error).split())[:120]
+        remedy = "choose another folder"
         raise OptionError(str(path), expected="a dataset's manifest", got=got, remedy=remedy) from error
 
 

@@ -30,7 +30,8 @@ def departure(sensor: Instrument, kernels: Kernels) -> str:
         smeared = axis == "along" and bool(sensor.smear_px)
         at_nyquist = float(curve[-1]) if smeared else contrast
         known = np.stack(_known_curves(at_nyquist, kernels))
-        low, high = known.min(0) * (1 - MARGIN), known.max(0) * (1 + MARGIN)
+        low = known.min(0) * (1 - MARGIN)
+        high = known.max(0) * (1 + MARGIN)
         outside = np.maximum(low / np.maximum(curve, 1e-9), curve / high)
         worst = int(outside[:-1].argmax())
         if outside[worst] > 1:

@@ -69,7 +69,9 @@ def noise_over_full_scale(sensor: Instrument, part: int = 4) -> float:
 
 def sensor_vector(sensor: Instrument) -> SensorVector:
     """The sensor vector, clamped to the ranges."""
-    values, entries, outside = sensor_values(sensor), list[float](), list[str]()
+    values = sensor_values(sensor)
+    entries = list[float]()
+    outside = list[str]()
     for (name, value), (low, high) in zip(values.items(), RANGES.values(), strict=True):
         inside = min(max(value, low), high)
         if inside != value:
@@ -111,7 +113,8 @@ class SensorFamily:
         dark = sigma * _log_uniform(generator, 0.5, 1.0)
         alpha = max(sigma**2 - dark**2, 0.0) / (full_scale * 3 / 16)
         beta = max(dark**2 - alpha * full_scale / 16, 0.0)
-        gain, bits = self.like.gain_dn_per_radiance, self.like.bits
+        gain = self.like.gain_dn_per_radiance
+        bits = self.like.bits
         made = Instrument(mtf, alpha, beta, gain, bits, {}, along, full_scale / 4)
         if self.other_curves and generator.random() < self.other_curves:
             return replace(made, response=draw_table(mtf, along, generator))

@@ -77,14 +77,18 @@ class Steps:
     """Counts steps of one piece of work."""
 
     def __init__(self, label: str, total: int, bar: rich_progress.Progress | None) -> None:
-        self.label, self.total, self.done, self._bar = label, total, 0, bar
+        self.label = label
+        self.total = total
+        self.done = 0
+        self._bar = bar
         self._task = bar.add_task(label, total=total) if bar else None
         self._printed = time.monotonic()
 
     def advance(self, steps: int = 1, note: str = "") -> None:
         """Report that so many further steps are done."""
         self.done += steps
-        sink, shown = _sink.get(), f"{self.label} {note}".strip()
+        sink = _sink.get()
+        shown = f"{self.label} {note}".strip()
         if callable(sink):
             sink(Step(shown, self.done, self.total))
         elif self._bar is not None and self._task is not None:

@@ -77,7 +77,9 @@ def read_stated(where: str, raw: object) -> tuple[object, Status, str]:
     if not isinstance(raw, Mapping):
         return raw, "stated", "stated by the profile without a source"
     check_keys(where, raw, required={"value", "status", "source"})
-    status, source, remedy = raw["status"], raw["source"], "say where the number comes from"
+    status = raw["status"]
+    source = raw["source"]
+    remedy = "say where the number comes from"
     if status not in get_args(Status):
         expected = "one of " + ", ".join(get_args(Status))
         raise ProfileError(f"{where}.status", expected=expected, got=repr(status), remedy=remedy)

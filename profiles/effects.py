@@ -199,7 +199,8 @@ class Defects(PixelEffect):
 
     def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
         draw = generator().random(image.shape, dtype=np.float32)
-        dead, hot = self.dead_per_million / 1e6, self.hot_per_million / 1e6
+        dead = self.dead_per_million / 1e6
+        hot = self.hot_per_million / 1e6
         image = np.where(draw < dead, np.float32(0), image)
         # One draw decides both, so a pixel is never dead and hot.
         return np.where(draw >= 1 - hot, np.float32(sensor.max_dn), image) if hot > 0 else image

@@ -46,7 +46,10 @@ class BeersError(Exception):
         super().__init__(
             f"{printable(where)}: expected {printable(expected, 4 * LONGEST)}, got {printable(got)}; {remedy}."
         )
-        self.where, self.expected, self.got, self.remedy = where, expected, got, remedy
+        self.where = where
+        self.expected = expected
+        self.got = got
+        self.remedy = remedy
 
     def __reduce__(self) -> tuple[object, ...]:
         """How it comes back from a worker process: an exception's own way knows no keywords."""

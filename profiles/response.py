@@ -152,7 +152,8 @@ def _grid(point: PointSpread) -> tuple[NDArray[np.float64], ...]:
 
 @lru_cache(maxsize=64)
 def _contrast_at_nyquist(response: Response) -> tuple[float, float]:
-    none, nyquist = np.zeros((1, 1)), np.full((1, 1), NYQUIST)
+    none = np.zeros((1, 1))
+    nyquist = np.full((1, 1), NYQUIST)
     across, along = (float(np.abs(response.at(*f)[0, 0])) for f in ((nyquist, none), (none, nyquist)))
     return across, along
 
@@ -218,7 +219,8 @@ def _stored_point_spread(label: str, raw: Mapping[str, Any]) -> PointSpread:
         if not (np.isfinite(samples).all() and samples.sum() > 0):
             raise ValueError("samples that are not finite or have no sum above 0")
     except (TypeError, ValueError) as error:
-        expected, remedy = "the samples of a point-spread function, as they were stored", "make the file again"
+        expected = "the samples of a point-spread function, as they were stored"
+        remedy = "make the file again"
         raise ProfileError(label, expected=expected, got=str(error), remedy=remedy) from error
     return point
 
@@ -353,5 +355,6 @@ def _read_samples(where: str, path: Path) -> NDArray[np.float64]:
         return np.asarray(found, np.float64)
     except Exception as error:  # whatever the bytes of a damaged file lead to
         expected = f"one array of real numbers, (rows, columns), of at most {FILE_SIDE} a side"
-        got, remedy = str(error) or type(error).__name__, "crop it, leave one plane, and save it by numpy.save"
+        got = str(error) or type(error).__name__
+        remedy = "crop it, leave one plane, and save it by numpy.save"
         raise ProfileError(where, expected=expected, got=got, remedy=remedy) from error

@@ -200,7 +200,8 @@ class Sensor:
         return np.sqrt(np.maximum(alpha * np.asarray(radiance, np.float64) + beta, 0.0))
 
     def __repr__(self) -> str:
-        across, bits = self.mtf_nyquist, self.bits
+        across = self.mtf_nyquist
+        bits = self.bits
         noise = f"SNR {self.snr_1} at {self.radiance_1} W/m2/sr/um" if self.snr_1 else "noise by alpha and beta"
         more = f", {', '.join(self.effects)}" if self.effects else ""
         return f"Sensor({self.name!r}: {bits} bits, MTF {across} at Nyquist, {noise}{more})"
@@ -275,7 +276,9 @@ class Sensor:
     def _sensor(
         self, mtf: float, alpha: float, beta: float, effects: Mapping[str, Effect], mtf_along: float | None
     ) -> Instrument:
-        gain, bits, bright = self.gain_dn_per_radiance.low, int(self.bits.low), self.radiance_1.low
+        gain = self.gain_dn_per_radiance.low
+        bits = int(self.bits.low)
+        bright = self.radiance_1.low
         return Instrument(mtf, alpha, beta, gain, bits, effects, mtf_along, bright, self.response)
 
     def impossible_snr(self) -> ProfileError:
@@ -332,7 +335,8 @@ def noise_from_snr(radiance_0: float, snr_0: float, radiance_1: float, snr_1: fl
 
     Either may come out negative: see `snr_0_bounds`. On a bound it is 0, whatever rounding left of it.
     """
-    variance_0, variance_1 = (radiance_0 / snr_0) ** 2, (radiance_1 / snr_1) ** 2
+    variance_0 = (radiance_0 / snr_0) ** 2
+    variance_1 = (radiance_1 / snr_1) ** 2
     rounding = ROUNDING * max(variance_0, variance_1)
     slope = _rounded_off(variance_1 - variance_0, rounding)
     alpha = slope / (radiance_1 - radiance_0)

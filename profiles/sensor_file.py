@@ -56,10 +56,12 @@ def load_sensor(name: str) -> Sensor:
 
 def with_numbers(sensor: Sensor, numbers: Mapping[str, Number]) -> Sensor:
     """A sensor with other numbers; see `Sensor.replace`."""
-    where, tables = f"sensor {sensor.name}", tables_of(sensor)
+    where = f"sensor {sensor.name}"
+    tables = tables_of(sensor)
     for key, value in numbers.items():
         if key not in TABLE_OF:
-            expected, remedy = f"one of {', '.join(TABLE_OF)}", "correct the name"
+            expected = f"one of {', '.join(TABLE_OF)}"
+            remedy = "correct the name"
             raise ProfileError(where, expected=expected, got=repr(key), remedy=remedy)
         tables[TABLE_OF[key]][key] = list(value) if isinstance(value, tuple) else value
     for one, other in (({"alpha", "beta"}, {"snr_0", "snr_1"}), ({"snr_0", "snr_1"}, {"alpha", "beta"})):
@@ -90,7 +92,8 @@ def _plain(constant: Constant) -> dict[str, object]:
 
 def save_sensor(sensor: Sensor, path: Path) -> Path:
     """Write a sensor as the TOML file that `load_sensor` reads, and a point-spread function beside it as .npy."""
-    tables, response = tables_of(sensor), sensor.response
+    tables = tables_of(sensor)
+    response = sensor.response
     about = {"status": sensor.mtf_nyquist.status, "source": sensor.mtf_nyquist.source}
     if isinstance(response, MtfTable):
         axes = {axis: {"value": list(getattr(response, axis)), **about} for axis in ("across", "along")}
@@ -128,7 +131,8 @@ def sensor_from_json(label: str, raw: Mapping[str, Any]) -> Sensor:
         raise ProfileError(label, expected="a table of effects", got=repr(effects), remedy="make it anew")
     found = read_sensor(label, {"description": raw["description"], **tables, **effects})
     if raw.get("response") is not None:
-        response, mtf = response_from_json(f"{label} response", raw["response"]), found.mtf_nyquist
+        response = response_from_json(f"{label} response", raw["response"])
+        mtf = found.mtf_nyquist
         found = replace(found, response=response, **axes_of(response, mtf.status, mtf.source))
         _check_budget(label, found)
     return replace(found, name=str(raw["name"]))
@@ -160,7 +164,8 @@ def read_sensor(label: str, raw: Mapping[str, Any], folder: Path = Path()) -> Se
     if "mtf_nyquist" not in constants:
         response, status, source = read_response(f"{label} [mtf]", stated["mtf"], folder)
         blur = {"response": response, **axes_of(response, status, source)}
-    name, description = label.removesuffix(".toml"), str(raw["description"])
+    name = label.removesuffix(".toml")
+    description = str(raw["description"])
     profile = Sensor(name=name, description=description, effects=effects, **{**constants, **blur})
     _check_budget(label, profile)
     _check_snr(profile)
@@ -171,7 +176,8 @@ def _read_table(label: str, table: str, content: object) -> Mapping[str, object]
     """The content of a table that is filled in one of its ways, and in no other."""
     if not isinstance(content, Mapping):
         raise ProfileError(label, expected=f"a table [{table}]", got=repr(content), remedy="write it as one")
-    where, ways = f"{label} [{table}]", TABLES[table]
+    where = f"{label} [{table}]"
+    ways = TABLES[table]
     check_keys(where, content, required=set(), optional=set(table_keys(table)))
     # The two radiances belong to both ways of stating noise, and say of neither that it is meant.
     telling = set(content) - {"radiance_0", "radiance_1"}
@@ -290,7 +296,8 @@ def _check_snr(profile: Sensor) -> None:
     if profile.snr_0 is None or profile.snr_1 is None:
         return
     radiances = profile.radiance_0.low, profile.radiance_1.low
-    lowest, highest = snr_0_bounds(*radiances, profile.snr_1.low)[0], snr_0_bounds(*radiances, profile.snr_1.high)[1]
+    lowest = snr_0_bounds(*radiances, profile.snr_1.low)[0]
+    highest = snr_0_bounds(*radiances, profile.snr_1.high)[1]
     if profile.snr_0.high < lowest or profile.snr_0.low > highest:
         raise profile.impossible_snr()
 

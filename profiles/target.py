@@ -75,9 +75,11 @@ class TargetProfile:
         try:
             return self.tables[table][key]
         except KeyError:
-            got, remedy = "none", "add it to the file"
+            got = "none"
+            remedy = "add it to the file"
             if table == "cost" and table not in self.tables:
-                got, remedy = "no cost constants yet", "take those of a board with the same DPU: base = its name"
+                got = "no cost constants yet"
+                remedy = "take those of a board with the same DPU: base = its name"
             raise ProfileError(
                 f"target profile {self.name}", expected=f"[{table}] {key}", got=got, remedy=remedy
             ) from None

@@ -50,14 +50,16 @@ def layer_bounds(core: IntCore) -> list[LayerBound]:
     for op in core.ops:
         low, high, shift = _accumulated(core, op, [ranges[name] for name in op.inputs])
         bits = float(np.log2(max(int(np.abs(low).max()), int(np.abs(high).max()), 1)))
-        low, high = _shifted(low, shift), _shifted(high, shift)
+        low = _shifted(low, shift)
+        high = _shifted(high, shift)
         ranges[op.output] = np.clip(low, INT8_MIN, INT8_MAX), np.clip(high, INT8_MIN, INT8_MAX)
         bounds.append(LayerBound(op.name, bits, int(low.min()), int(high.max())))
     return bounds
 
 
 def _planes(core: IntCore) -> Range:
-    count, channels = core.ends.planes, core.ends.channels
+    count = core.ends.planes
+    channels = core.ends.channels
     if core.ends.banked:
         low, high = (np.array(ends) for ends in PLANE_ENDS)
         return low.repeat(channels), high.repeat(channels)
@@ -109,14 +111,18 @@ def _padded(ends: Range) -> Range:
 def _conv(core: IntCore, op: IntConv, read: Range) -> Accumulated:
     low, high = _padded(read)
     weight = op.weight.astype(np.int64)
-    up, down = np.maximum(weight, 0).sum((2, 3)), np.minimum(weight, 0).sum((2, 3))
+    up = np.maximum(weight, 0).sum((2, 3))
+    down = np.minimum(weight, 0).sum((2, 3))
     product = op.weight_frac_bits + core.frac_bits[op.input]
     bias = op.bias.astype(np.int64) << (product - op.bias_frac_bits)
     if op.groups == 1:
-        least, most = up @ low + down @ high + bias, up @ high + down @ low + bias
+        least = up @ low + down @ high + bias
+        most = up @ high + down @ low + bias
     else:  # depthwise: each channel its own
-        up, down = up[:, 0], down[:, 0]
-        least, most = up * low + down * high + bias, up * high + down * low + bias
+        up = up[:, 0]
+        down = down[:, 0]
+        least = up * low + down * high + bias
+        most = up * high + down * low + bias
     (least, finer), (most, _) = (activated(end, op.activation, product) for end in (least, most))
     return least, most, product - core.frac_bits[op.output] + finer
 

@@ -115,7 +115,8 @@ def draw_views(
 
 
 def _blurred_as(sensor: Instrument, other: Instrument) -> Instrument:
-    across, along = other.mtf_nyquist, other.mtf_nyquist_along
+    across = other.mtf_nyquist
+    along = other.mtf_nyquist_along
     return replace(sensor, mtf_nyquist=across, mtf_nyquist_along=along, response=other.response)
 
 
@@ -123,7 +124,8 @@ def stratified(
     candidates: Sequence[Candidate], key: Callable[[Candidate], float], count: int, generator: np.random.Generator
 ) -> list[Candidate]:
     """One of each of `count` equal groups of the candidates ordered by `key`, in random order."""
-    ranked, size = sorted(candidates, key=key), len(candidates) // count
+    ranked = sorted(candidates, key=key)
+    size = len(candidates) // count
     chosen = [ranked[group * size + int(generator.integers(size))] for group in range(count)]
     return [chosen[k] for k in generator.permutation(count)]
 
@@ -209,7 +211,8 @@ def relit(views: Sequence[View], lightings: Sequence[Lighting], generator: np.ra
 def _simulate(ground: Ground, sensors: Sequence[Instrument], draw: Draw) -> list[np.ndarray]:
     """What the degraded sensor, and the reference if given, make of the same ground: patches (1, 1, P, P)."""
     radiance = ground.radiance
-    spectrum, width = scene_spectrum(radiance), radiance.shape[-1]
+    spectrum = scene_spectrum(radiance)
+    width = radiance.shape[-1]
     images = [
         acquire(spectrum, width, sensor, ground.oversampling, draw, role) / sensor.max_dn
         for role, sensor in zip(ROLES, sensors, strict=False)
@@ -273,6 +276,7 @@ def unseen_patches(degraded: Sensor, images: Path | None, patches: int, seed: in
         patches: how many.
         seed: of the calibration.
     """
-    reference, other = reference_for(degraded), seed + HELD_OUT_SEED
+    reference = reference_for(degraded)
+    other = seed + HELD_OUT_SEED
     scenes = load_scenes(images, reference.nominal(), other, patches)
     return draw_patches(scenes, degraded, reference, patches, other, lightings=JUDGING)

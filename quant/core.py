@@ -166,7 +166,8 @@ def build_core(
 
 def _with_biases_left(core: IntCore, graph: Graph) -> IntCore:
     """What rounding the last bias leaves is known, and where a result comes in windows the host adds it."""
-    last, whole = graph[-1], core.ops[-1]
+    last = graph[-1]
+    whole = core.ops[-1]
     if not (core.ends.offsets and isinstance(last, Conv) and isinstance(whole, IntConv)):
         return core
     wanted = nearest_bias(last, whole.weight, whole.weight_frac_bits, graph)
@@ -259,9 +260,11 @@ def op_shifts(
     op: IntConv | Op, frac_bits: Mapping[str, int], shifts: Shifts
 ) -> list[tuple[str, int, tuple[int, int]]]:
     """(name, value, window) of the shifts that one operation needs."""
-    inputs, output = [frac_bits[i] for i in op.inputs], frac_bits[op.output]
+    inputs = [frac_bits[i] for i in op.inputs]
+    output = frac_bits[op.output]
     if isinstance(op, Add):
-        read, write = max(inputs) - min(inputs), min(inputs) - output
+        read = max(inputs) - min(inputs)
+        write = min(inputs) - output
         return [("shift_read", read, shifts.read), ("shift_write", write, shifts.write)]
     if isinstance(op, Mul):
         return [("shift_cut", sum(inputs) - output, shifts.cut)]

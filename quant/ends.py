@@ -227,13 +227,15 @@ def write_front(w: HostWriter, ends: Ends) -> None:
         w.node("Round", "host_front.planes", ["host_front.scale"])
         _write_uint8(w)
         return
-    image, channels = IMAGE, ends.image_channels
+    image = IMAGE
+    channels = ends.image_channels
     if ends.border_px:
         around = w.constant("border_px", np.array([0, 0, ends.border_px, ends.border_px] * 2))
         image = w.node("Pad", "host_front.widened", [image, around], mode="reflect")
     for k, shuffle in enumerate(ends.front):
         write_shuffle(w, shuffle, image, f"host_front.shuffled_{k}", channels)
-        image, channels = f"host_front.shuffled_{k}", channels * shuffle.block**2
+        image = f"host_front.shuffled_{k}"
+        channels = channels * shuffle.block**2
     step, part = (STEP_DN, PART) if ends.banked else (STEP, QUARTER)
     w.node("Mul", "host_front.scale", [image, w.scalar("max_dn", MAX_DN)])
     w.node("Round", "host_front.round", ["host_front.scale"])
@@ -281,7 +283,8 @@ def write_back(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> Non
         name = "host_back.clipped" if ends.last else "restored"
         w.node("Clip", name, ["host_back.add", *limits], name="host_back.clip")
         for k, shuffle in enumerate(ends.last):
-            result, name = name, "restored" if k + 1 == len(ends.last) else f"host_back.last_{k}"
+            result = name
+            name = "restored" if k + 1 == len(ends.last) else f"host_back.last_{k}"
             write_shuffle(w, shuffle, result, name)
     elif ends.tail:
         ends.tail.write(w, result)

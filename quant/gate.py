@@ -77,7 +77,8 @@ def parts_of(name: str, result: np.ndarray, reference: np.ndarray) -> Parts:
     wanted = (len(result), *result.shape[2:]) if metric.of_classes else result.shape
     if reference.size != math.prod(wanted) or (metric.of_classes and result.shape[1] < 2):
         kind = "numbers of classes" if metric.of_classes else "references"
-        expected, got = f"{kind} of {times(wanted)}", f"{times(reference.shape)} for results of {times(result.shape)}"
+        expected = f"{kind} of {times(wanted)}"
+        got = f"{times(reference.shape)} for results of {times(result.shape)}"
         raise OptionError("metric", expected=expected, got=got, remedy="give these, or another metric")
     return metric.parts(result, reference)
 
@@ -239,9 +240,11 @@ def compare(
 
 
 def _require_full_scale(name: str, reference: np.ndarray) -> None:
-    low, high = float(reference.min()), float(reference.max())
+    low = float(reference.min())
+    high = float(reference.max())
     if not (low >= 0 and high <= LARGEST):
-        got, remedy = f"{low:.4g} to {high:.4g}", "divide it by full scale"
+        got = f"{low:.4g} to {high:.4g}"
+        remedy = "divide it by full scale"
         raise ImageError(name, expected="a reference with values in [0, 1]", got=got, remedy=remedy)
 
 
@@ -287,7 +290,8 @@ def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None)
         checks.append([Check("PSNR float-INT8", result.psnr_between_db, least, "dB", "at least")])
     if baseline_mae is not None:
         growth = MAE_GROWTH if limits.mae_growth is None else limits.mae_growth
-        allowed, detail = growth * baseline_mae, f"the baseline has {baseline_mae:.4g}"
+        allowed = growth * baseline_mae
+        detail = f"the baseline has {baseline_mae:.4g}"
         checks.append(_at_most("MAE against the baseline", result.mae, allowed, scale, detail))
     return [check for found in checks for check in found]
 
@@ -327,7 +331,8 @@ def gate_row(result: GateResult) -> Row:
 
 def verdict_row(result: GateResult, shares: Mapping[str, float]) -> Row:
     """The figures of a gate: those of `gate_row`, the PSNR lost to the reference, the worst layer's saturation."""
-    row, drop = gate_row(result), _figure(result.drop_db, "dB", result)
+    row = gate_row(result)
+    drop = _figure(result.drop_db, "dB", result)
     worst = saturation_figure(shares, result.source)
     return replace(row, figures={**row.figures, "PSNR drop": drop, "saturated results": worst})
 

@@ -86,7 +86,8 @@ def cannot_saturate(kind: str, weight: np.ndarray, largest: int) -> bool:
     rows = _rows(kind, weight)
     # Pairs begin at even places. Where an odd number of channels lets them straddle taps, all neighbours count.
     step = 2 if kind == "QLinearConv" and weight.shape[1] % 2 == 0 else 1
-    first, second = rows[:, :-1:step], rows[:, 1::step]
+    first = rows[:, :-1:step]
+    second = rows[:, 1::step]
     highest = np.maximum(first, 0) + np.maximum(second, 0)
     lowest = np.minimum(first, 0) + np.minimum(second, 0)
     return bool((largest * highest <= INT16_MAX).all() and (largest * lowest >= INT16_MIN).all())
@@ -106,7 +107,8 @@ class _Rewriting:
 
     def __init__(self, model: onnx.ModelProto) -> None:
         self.model = deepcopy(model)
-        self.arrays, self.ways = constants(model), dict[str, Way]()
+        self.arrays = constants(model)
+        self.ways = dict[str, Way]()
         self.writers = {name: node for node in self.model.graph.node for name in node.output}
         self.readers: dict[str, list[onnx.NodeProto]] = defaultdict(list)
         for node in self.model.graph.node:
@@ -121,7 +123,8 @@ class _Rewriting:
 
         Left as it is where anything but the operators above would notice.
         """
-        source, result = relu.input[0], relu.output[0]
+        source = relu.input[0]
+        result = relu.output[0]
         middle = self.arrays.get(relu.input[1]) if len(relu.input) == 2 else None
         writer = self.writers.get(source)
         if middle is None or middle.dtype != np.uint8 or middle.size != 1 or writer is None:
@@ -209,7 +212,8 @@ class _Rewriting:
         result = result or f"{source}.unsigned"
         if result in self.moved:
             return [], result
-        wide, moved = f"{result}.wide", f"{result}.moved"
+        wide = f"{result}.wide"
+        moved = f"{result}.moved"
         nodes = [
             helper.make_node("Cast", [source], [wide], name=wide, to=TensorProto.INT32),
             helper.make_node("Add", [wide, self._constant(np.int32(by))], [moved], name=moved),
@@ -251,7 +255,8 @@ class _ChannelPadding:
     """What is filled already: convolutions may share an input."""
 
     def __init__(self, graph: onnx.GraphProto, arrays: dict[str, np.ndarray]) -> None:
-        self.graph, self.arrays = graph, arrays
+        self.graph = graph
+        self.arrays = arrays
         self.wide_inputs = set[str]()
 
     def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
@@ -276,7 +281,8 @@ class _ChannelPadding:
 
     def _widen(self, node: onnx.NodeProto, outputs: int, inputs: int) -> None:
         """Weights of zero; scales and zero points that are a channel's own get more, which matter to nobody."""
-        name, narrow = node.output[0], self.arrays[node.input[3]]
+        name = node.output[0]
+        narrow = self.arrays[node.input[3]]
         wide = np.pad(narrow, [(0, outputs), (0, inputs), (0, 0), (0, 0)])
         for place in (4, 5, 8):  # scale and zero point of the weights, bias
             value = self.arrays.get(node.input[place]) if place < len(node.input) else None

@@ -85,9 +85,11 @@ def parse_onnx(content: bytes, where: str, to_run: bool = True, path: Path | Non
     except (DecodeError, onnx.checker.ValidationError, ValueError) as error:
         got = " ".join(str(error).split())[:120] or "other bytes"
         raise ModelError(where, expected="an ONNX file", got=got, remedy=REMEDY) from error
-    opset, known = opset_of(model), onnx.defs.onnx_opset_version()
+    opset = opset_of(model)
+    known = onnx.defs.onnx_opset_version()
     if opset > known:
-        expected, remedy = f"an ONNX opset of at most {known}", "export it for an older one"
+        expected = f"an ONNX opset of at most {known}"
+        remedy = "export it for an older one"
         raise ModelError(where, expected=expected, got=f"{opset}", remedy=remedy)
     if to_run:
         check_runnable(model, where)

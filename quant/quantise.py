@@ -125,9 +125,11 @@ class Plan:
         alone = self.ends.gains == 1 and not self.ends.adds_image
         if not (alone and takes_gains(self.graph) and self.ends.outputs <= MAX_CHANNELS // 2):
             return self
-        low, high = np.array(np.inf), np.array(-np.inf)
+        low = np.array(np.inf)
+        high = np.array(-np.inf)
         for (result,) in values_of(self.graph, [CORRECTION], images, self.ends):
-            low, high = np.minimum(low, result[0].min((1, 2))), np.maximum(high, result[0].max((1, 2)))
+            low = np.minimum(low, result[0].min((1, 2)))
+            high = np.maximum(high, result[0].max((1, 2)))
         offsets = window_offsets(low, high, 2.0 ** -(frac_bits + FINER))
         found = tuple(tuple(float(each) for each in window) for window in offsets)
         return replace(self, ends=replace(self.ends, offsets=found))
@@ -196,7 +198,8 @@ def quantise_model(
     """
     network = read_network(model)
     graph = read_planes(network.graph)
-    ends, found = ends_of(network, 2 if network.adds_image and takes_gains(graph) else 1), streams(graph)
+    ends = ends_of(network, 2 if network.adds_image and takes_gains(graph) else 1)
+    found = streams(graph)
     plan = Plan(graph, ends, found, _chain(graph, ends, found), shifts, pairs)
     core, final, last_sum = rounded(plan, patches.degraded, log)
     core = replace(core, ends=replace(core.ends, tail=network.tail))
@@ -227,7 +230,8 @@ def choose_frac_bits(graph: Graph, images: Iterable[np.ndarray], ends: Ends = ON
     Two passes, so images that can be passed over twice: the largest values, then the squared errors of the scales
     around them.
     """
-    names, shared = tensors(graph), tied(graph)
+    names = tensors(graph)
+    shared = tied(graph)
     groups = np.array([names.index(shared[name]) if shared[name] in names else -1 for name in names])
 
     def together(of_each: np.ndarray, join: Callable[..., np.ndarray]) -> np.ndarray:
@@ -257,7 +261,8 @@ def rounded(plan: Plan, images: Remade[np.ndarray], log: Log = no_log) -> tuple[
     frac_bits = choose_frac_bits(plan.graph, images, plan.ends)
     plan = plan.without_large_sums(frac_bits).with_windows(frac_bits[CORRECTION], images)
     graph = _balanced(plan, frac_bits, images, log)
-    paired, last_sum = plan.paired(graph), frozenset[str]()
+    paired = plan.paired(graph)
+    last_sum = frozenset[str]()
     if paired is not graph:
         paired = with_room(paired, STREAM_STEP, images, plan.ends)
         last_sum = frozenset(paired[-2].inputs)

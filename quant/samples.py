@@ -129,7 +129,9 @@ def samples_in(given: object) -> list[Pair]:
     if hasattr(given, "ndim"):
         return [(image, NO_REFERENCE) for image in _batch(given)]
     if isinstance(given, tuple) and len(given) == 2 and all(hasattr(each, "ndim") for each in given):
-        seen, meant = _batch(given[0]), _plain(given[1])  # a reference may be a class, or a class for each pixel
+        # a reference may be a class, or a class for each pixel
+        seen = _batch(given[0])
+        meant = _plain(given[1])
         meant = meant[None] if np.ndim(given[0]) == 3 else meant
         if meant.ndim == 0 or len(seen) != len(meant):
             got = f"images of {times(seen.shape)} and references of {_shape(meant)}"
@@ -292,7 +294,8 @@ def _cut(
         got = times((height, width))
         raise ImageError(name, expected=f"images of {fixed_px} x {fixed_px} pixels", got=got, remedy=REMEDY)
     if reference.size and (height % multiple_px or width % multiple_px):
-        expected, got = f"images of multiples of {multiple_px} pixels beside a reference", times((height, width))
+        expected = f"images of multiples of {multiple_px} pixels beside a reference"
+        got = times((height, width))
         raise ImageError(name, expected=expected, got=got, remedy="cut both")
     if reference.size:
         yield image[None], reference[None]
@@ -351,7 +354,8 @@ class OwnSamples:
 def samples_of(model: onnx.ModelProto, given: object) -> OwnSamples | None:
     """A user's samples for a network, None where none are given and it takes simulated ones."""
     channels = int(model.graph.input[0].type.tensor_type.shape.dim[1].dim_value) or 1
-    fixed_px, multiple_px = fixed_tile_px(model), _multiple_px(model)
+    fixed_px = fixed_tile_px(model)
+    multiple_px = _multiple_px(model)
     if given is not None:
         found = Path(given) if isinstance(given, str | os.PathLike) else samples_in(given)
         return OwnSamples(found, channels, fixed_px, multiple_px or 1)

@@ -105,11 +105,14 @@ def layer_errors(graph: Graph, core: IntCore, crops: Iterable[np.ndarray]) -> tu
         for op, whole in zip(graph, core.ops, strict=True)
         if isinstance(op, Conv) and isinstance(whole, IntConv)
     )
-    names, width = tensors((*graph, *twins)), core.ends.planes * core.ends.channels
+    names = tensors((*graph, *twins))
+    width = core.ends.planes * core.ends.channels
     halo_px = None if halo_of(graph) is None else 0
-    exact, int8 = open_session(graph_to_onnx((*graph, *twins), names, width)), open_session(host_model(core, {}))
+    exact = open_session(graph_to_onnx((*graph, *twins), names, width))
+    int8 = open_session(host_model(core, {}))
     rests = {name: open_session(_rest(graph, name, width)) for name in tensors(graph) if name != CORRECTION}
-    layers, together = [LayerError(op.name, Loss(), Loss()) for op in graph], Loss()
+    layers = [LayerError(op.name, Loss(), Loss()) for op in graph]
+    together = Loss()
     scale = core.scale(CORRECTION)
     for crop in crops:
         (values,) = tensor_values(exact, names, crop, halo_px, core.ends)
@@ -117,7 +120,8 @@ def layer_errors(graph: Graph, core: IntCore, crops: Iterable[np.ndarray]) -> tu
         restored = core.ends.restored(crop, wanted[CORRECTION], scale)
         offset = crop if core.ends.adds_image else 0.0
         for op, layer in zip(graph, layers, strict=True):
-            result, meant = _in_int8(op, core, wanted), wanted[op.output]
+            result = _in_int8(op, core, wanted)
+            meant = wanted[op.output]
             if op.output == CORRECTION:  # of two gains one is coarse and the other clipped: together they count
                 result = core.ends.merge(result, scale)
                 meant = core.ends.whole(meant)
@@ -186,7 +190,9 @@ def spread_of(
     float_session: ort.InferenceSession, int8_session: ort.InferenceSession, images: Iterable[np.ndarray]
 ) -> Spread:
     """Run both networks on images (1, 1, H, W) in [0, 1], one at a time."""
-    counts, mae, largest = np.zeros(2 * MAX_DN + 1, np.int64), [], []
+    counts = np.zeros(2 * MAX_DN + 1, np.int64)
+    mae = []
+    largest = []
     for image in images:
         in_float, in_int8 = (np.clip(run(session, image), 0, 1) for session in (float_session, int8_session))
         difference = (in_int8 - in_float).ravel()
@@ -258,11 +264,14 @@ def losses(result: Quantised, gate: GateResult, patches: Patches) -> str:
     """What INT8 costs, on the worst patch too; where that is much, which tensors cost most and what to try."""
     if not math.isnan(gate.drop_db):
         worst = f"{gate.drop_db:.2f} dB of {gate.psnr_float_db:.2f}, and {gate.worst_drop_db:.2f} dB where most"
-        said, much = f"INT8 loses {worst}", gate.drop_db > MUCH_DB
+        said = f"INT8 loses {worst}"
+        much = gate.drop_db > MUCH_DB
     elif not math.isnan(gate.same_class):
-        said, much = f"INT8 tells {100 * gate.same_class:.2f} % of the classes as float", gate.same_class < SAME_CLASS
+        said = f"INT8 tells {100 * gate.same_class:.2f} % of the classes as float"
+        much = gate.same_class < SAME_CLASS
     else:
-        said, much = f"INT8 differs from float by {gate.mae:.2g} of full scale on average", False
+        said = f"INT8 differs from float by {gate.mae:.2g} of full scale on average"
+        much = False
     if not much:
         return f"{said} ({gate.source})"
     named = ", ".join(f"{name} ({share:.0f} %)" for name, share in _costliest(layer_error_rows(result, patches)))

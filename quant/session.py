@@ -128,7 +128,8 @@ def tensor_values(
     """
     for (top, bottom), (left, right) in _places(image, halo_px):
         around_px = halo_px or 0
-        above, before = min(top, around_px), min(left, around_px)
+        above = min(top, around_px)
+        before = min(left, around_px)
         with_halo = image[..., top - above : bottom + around_px, left - before : right + around_px]
         values = session.run(names, {PLANES: planes_of(with_halo, ends)})
         if halo_px is not None:

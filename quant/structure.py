@@ -70,7 +70,8 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
         return {}
     kinds = {t.name: onnx.helper.np_dtype_to_tensor_dtype(np.dtype(t.scale.integer_type)) for t in looked_at}
     session = open_session(with_outputs(any_size(model), kinds), optimise=False)
-    ends, counts = np.zeros(len(looked_at)), np.zeros(len(looked_at))
+    ends = np.zeros(len(looked_at))
+    counts = np.zeros(len(looked_at))
     for image in images:
         results = tensors_of(session, [tensor.name for tensor in looked_at], image)
         flags = [tensor.at_ends(values) for tensor, values in zip(looked_at, results, strict=True)]
@@ -144,7 +145,8 @@ class Relus:
 def count_relus(model: onnx.ModelProto) -> Relus:
     """The ReLUs of a file."""
     with contradictions("model"):
-        graph, core = OnnxGraph(model), _own_core(model)
+        graph = OnnxGraph(model)
+        core = _own_core(model)
         rounded = {tensor.name: tensor for tensor in _rounded(graph, core)}
         convolved = {name for node in graph.nodes if "Conv" in node.op_type for name in node.outputs}
         explicit = sum(_is_relu(node, graph, rounded) for node in graph.nodes)
@@ -192,8 +194,10 @@ def structure_checks(float_model: onnx.ModelProto, int8: onnx.ModelProto, must_d
     plain, optimised = (result_of(open_any_size(int8, optimise=o), image) for o in (False, True))
     difference = float(np.abs(plain - optimised).max())
     optimisation = Check("optimised against unoptimised", difference, 0, "of full scale")
-    wanted, kept = count_relus(float_model).explicit, count_relus(int8)
-    said, faults = f"{wanted} in float, {kept} in INT8", encoding_faults(int8)
+    wanted = count_relus(float_model).explicit
+    kept = count_relus(int8)
+    said = f"{wanted} in float, {kept} in INT8"
+    faults = encoding_faults(int8)
     checks = [Check("ReLUs lost or added", kept.off_by(wanted), 0, "ReLU", detail=said)]
     if faults is None and must_describe:
         faults = ["the file does not describe its integers, as that of the baseline did"]

@@ -248,7 +248,8 @@ def named(node: NodeProto) -> str:
 
 def _check_operator(node: NodeProto, where: str) -> None:
     if node.domain not in STANDARD and (node.domain, node.op_type) not in ONNXRUNTIMES:
-        got, remedy = f"{named(node)} of {node.domain!r}", foreign_remedy(node.domain, node.op_type)
+        got = f"{named(node)} of {node.domain!r}"
+        remedy = foreign_remedy(node.domain, node.op_type)
         raise refused(where, "operators of ONNX itself", got, remedy)
     if any(a.HasField("g") or a.graphs or a.HasField("sparse_tensor") for a in node.attribute):
         raise refused(where, "nodes that run once", f"{named(node)} with a graph within", "unroll it")
@@ -278,5 +279,6 @@ def _check_growth(node: NodeProto, constants: dict[str, TensorProto], of_image: 
             if absolute:
                 check_size(named(node), values, where)
             elif not max(map(abs, values), default=0) <= WINDOW_PX:
-                got, remedy = f"{named(node)} by {times(values)}", "export the network again"
+                got = f"{named(node)} by {times(values)}"
+                remedy = "export the network again"
                 raise refused(where, f"enlargements of at most {WINDOW_PX}", got, remedy)

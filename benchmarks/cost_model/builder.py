@@ -85,7 +85,8 @@ class Builder:
         self, x: Tensor, kernel: Size, stride: Size, *, valid: int = 0, ceil: int = 0, op_type: str = "MaxPool"
     ) -> Tensor:
         """The largest value of a window, or its mean; `ceil` counts windows that only begin inside a bare image."""
-        window, seen = _window(kernel, stride, valid or ceil, 1), x.shape
+        window = _window(kernel, stride, valid or ceil, 1)
+        seen = x.shape
         if ceil:  # as much padding behind the image as may be lost to a stride
             behind = window.stride[0] - 1, window.stride[1] - 1
             window = replace(window, pads=(0, 0, *behind))

@@ -265,7 +265,8 @@ def measured_here() -> tuple[float, Mapping[str, float], Rates]:
     chain = Chain(sensors[0].nominal(), sensors[1].nominal())
     with one_thread_per_operation():
         cpu_s = statistics.median(_cpu_s(crop, chain) for crop in crops)
-    rates, quality = measured_rates(), quality_named(QUALITY)
+    rates = measured_rates()
+    quality = quality_named(QUALITY)
     explained = math.fsum(rates.times_s(chain_work(CROP_PX, CROP_PX, quality)).values()) / cpu_s
     times_s = rates.times_s(chain_work(HEIGHT_PX, WIDTH_PX, quality))
     scale = min(explained, 1.0) / math.fsum(times_s.values())
@@ -280,8 +281,10 @@ def _cpu_s(dn: np.ndarray, chain: Chain) -> float:
 
 def s_per_mpx(cpu_s: float, shares: Mapping[str, float], rates: Rates, board: TargetProfile) -> Interval:
     """Time of 10^6 pixels on all the board's cores, least and most: one core's shared by Amdahl's law."""
-    by_kind, cores = slowdowns(board, rates), board.value("cpu", "cores")
-    unknown, rest = _hull(list(by_kind.values())), 1 - math.fsum(shares.values())
+    by_kind = slowdowns(board, rates)
+    cores = board.value("cpu", "cores")
+    unknown = _hull(list(by_kind.values()))
+    rest = 1 - math.fsum(shares.values())
     low, high = (
         cpu_s
         * (math.fsum(share * by_kind[kind][end] for kind, share in shares.items()) + rest * unknown[end])

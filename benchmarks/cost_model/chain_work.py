@@ -96,7 +96,8 @@ def _search(tile: Tile, settings: PassSettings) -> Work:
     window = settings.window_px
     height, width = tile.covered_px(settings.side_px)
     sums = tile.rows * height * window * width + tile.rows * window * width * tile.columns
-    squares, distances = height * window * width, tile.groups * window
+    squares = height * window * width
+    distances = tile.groups * window
     return Work(
         {
             "box sums": 2 * window * sums,
@@ -110,7 +111,8 @@ def _search(tile: Tile, settings: PassSettings) -> Work:
 
 def _estimates(tile: Tile, settings: PassSettings) -> Work:
     """`estimate_groups`: of the group, and in pass 2 also of the guide's."""
-    n, images = settings.side_px**2, 2 if settings.clean_guide else 1
+    n = settings.side_px**2
+    images = 2 if settings.clean_guide else 1
     members = tile.groups * settings.similar
     return Work(
         {

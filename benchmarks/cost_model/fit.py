@@ -123,7 +123,9 @@ class Cases:
 
     def predicted(self, times: Times) -> Array:
         """ln(FPS) with several threads, (n,)."""
-        dpu, host, q = np.log(times.dpu_s), np.log(times.host_s / self.host_cores), self.structure.crowding
+        dpu = np.log(times.dpu_s)
+        host = np.log(times.host_s / self.host_cores)
+        q = self.structure.crowding
         return -np.logaddexp(q * dpu, q * host) / q
 
     def residuals(self, constants: Constants) -> Array:
@@ -155,7 +157,8 @@ def fit(cases: Cases, near: Constants | None = None) -> Constants:
 
 def _descend(cases: Cases, logs: Array) -> tuple[Array, float]:
     """Where damped steps end, and its cost."""
-    damping, cost = 1e-3, _cost(cases, logs)
+    damping = 1e-3
+    cost = _cost(cases, logs)
     normal, downhill = _slope(cases, logs)
     for _ in range(MOST):
         there = logs + np.linalg.solve(normal + damping * np.diag(np.diag(normal)), downhill)
@@ -167,7 +170,9 @@ def _descend(cases: Cases, logs: Array) -> tuple[Array, float]:
                 break
             continue
         done = cost - new < ENOUGH * cost and damping < 1
-        logs, cost, damping = there, new, max(damping / 4, 1e-9)
+        logs = there
+        cost = new
+        damping = max(damping / 4, 1e-9)
         if done:
             break
         normal, downhill = _slope(cases, logs)

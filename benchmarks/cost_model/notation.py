@@ -180,7 +180,8 @@ class _Scope:
     """A network or a block while its lines are read."""
 
     def __init__(self, blocks: Mapping[str, Block], builder: Builder, names: Mapping[str, Value]) -> None:
-        self.blocks, self.builder = blocks, builder
+        self.blocks = blocks
+        self.builder = builder
         self.names: dict[str, Value] = {"x": builder.image, **names}
 
     @property
@@ -233,7 +234,8 @@ class _Scope:
     def _evaluate(self, node: ast.expr) -> int:
         """A whole number, a name of one, or a sum, difference, product or exact quotient of such."""
         if isinstance(node, ast.BinOp):
-            left, right = self._evaluate(node.left), self._evaluate(node.right)
+            left = self._evaluate(node.left)
+            right = self._evaluate(node.right)
             if isinstance(node.op, ast.Div) and left % right:
                 raise ValueError(f"{left} / {right} is not exact")
             return SIGNS[type(node.op)](left, right)

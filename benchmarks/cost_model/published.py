@@ -114,12 +114,14 @@ def published_cases(board: str, *, slower: bool = False) -> tuple[Case, ...]:
 
 def network_case(name: str, dpu: Dpu, fps: tuple[float, ...], fps_single: tuple[float, ...] = ()) -> Case:
     """One of NETWORKS on a configuration, with its rates."""
-    net, entry = written(name).network, NETWORKS[name]
+    net = written(name).network
+    entry = NETWORKS[name]
     sizes = {op.output: op.out_bytes for op in net.operations}
     taken = sum(math.prod(shape) for shape in net.inputs.values())
     read = sum(written(name).read_bytes.values())
     given = sum(sizes[result] for result in net.outputs)
     host = host_work(taken, given, read, entry.host) if entry.host else host_work(0, 0, 0, "copy")
     layers = Layers.of(count_work(net.operations, dpu), dpu)
-    cores, largest = dpu.whole("cpu", "cores"), largest_map_bytes(net.operations)
+    cores = dpu.whole("cpu", "cores")
+    largest = largest_map_bytes(net.operations)
     return Case(name, entry.family, dpu.name, layers, host, cores, fps, fps_single, largest)

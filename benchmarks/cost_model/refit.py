@@ -102,7 +102,8 @@ def by_kind() -> Iterator[tuple[object, ...]]:
             if not rows:
                 continue
             errors = [row.network for row in rows], [row.rates for row in rows]
-            off, bias = by_network(*errors), by_network(*errors, signed=True).mean()
+            off = by_network(*errors)
+            bias = by_network(*errors, signed=True).mean()
             counts, (median, mean, largest) = (len(off), sum(len(row.rates) for row in rows)), _spread(off)
             yield board, kind, *counts, median, mean, f"{100 * bias:+.1f} %", largest, *map(_percent, coverage(rows))
 
@@ -145,7 +146,8 @@ def main() -> int:
     """Write or check [cost] of all boards; 1 where `--check` finds another."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--check", action="store_true", help="write nothing, and say which profile differs")
-    check, stale = parser.parse_args().check, []
+    check = parser.parse_args().check
+    stale = []
     for board in boards():
         path = TARGETS / f"{board}.toml"
         text = path.read_text(encoding="utf-8")

@@ -82,7 +82,8 @@ def nested(board: str) -> Nested:
     """Leave each family out; choose and make widths from the others alone; predict what was left out."""
     names = _trial(board, chosen(board)).names
     found = [row for name in names for row in _trial(board, chosen(board, name)).left_out(name)]
-    cases, by_case = _trial(board, chosen(board)).cases, {(row.network, row.configuration): row for row in found}
+    cases = _trial(board, chosen(board)).cases
+    by_case = {(row.network, row.configuration): row for row in found}
     rows = [by_case[row.network, row.configuration] for row in cases.rows]
     errors = np.array([row.error for row in rows])
     return Nested(rows, cases, widths_of(errors, cases, [row.regime for row in rows]))
@@ -128,8 +129,10 @@ class Trial:
     def left_out(self, name: str) -> list[LeftOut]:
         """A family, predicted without it, in intervals whose widths were made without it."""
         widths = widths_of(*self.inner(name))
-        tested, constants = self.cases.only(self.cases.families == name), self.fit_without({name})
-        errors, regimes = tested.errors(constants), regimes_of(tested, constants)
+        tested = self.cases.only(self.cases.families == name)
+        constants = self.fit_without({name})
+        errors = tested.errors(constants)
+        regimes = regimes_of(tested, constants)
         return [
             LeftOut(row.network, row.family, row.configuration, kind, float(error), rates, widths[kind])
             for row, kind, error, rates in zip(tested.rows, regimes, errors, tested.rate_errors(errors), strict=True)
@@ -138,10 +141,12 @@ class Trial:
     def inner(self, left_out: str) -> tuple[Array, Cases, list[Regime]]:
         """Errors and regimes of all families but one, which no fit sees, by folds of the others."""
         kept = self.cases.only(self.cases.families != left_out)
-        errors, regimes = np.zeros(len(kept.rows)), np.zeros(len(kept.rows), dtype=object)
+        errors = np.zeros(len(kept.rows))
+        regimes = np.zeros(len(kept.rows), dtype=object)
         for fold in range(FOLDS):
             tested = self.names[fold::FOLDS]
-            mine, constants = np.isin(kept.families, tested), self.fit_without({*tested, left_out})
+            mine = np.isin(kept.families, tested)
+            constants = self.fit_without({*tested, left_out})
             errors[mine] = kept.only(mine).errors(constants)
             regimes[mine] = regimes_of(kept.only(mine), constants)
         return errors, kept, list(regimes)
@@ -159,9 +164,11 @@ def widths_of(errors: Array, cases: Cases, regimes: Sequence[Regime]) -> Widths:
     (drawn to that of all regimes); a family's score is its largest error over scale; the widths are the scales times
     the score that SHARE of all families keep to.
     """
-    families, kinds = cases.families, np.array(regimes)
+    families = cases.families
+    kinds = np.array(regimes)
     sizes = np.array([np.abs(rates).max() for rates in cases.rate_errors(errors)])
-    overall, scales = family_mean(sizes, families), dict[Regime, float]()
+    overall = family_mean(sizes, families)
+    scales = dict[Regime, float]()
     for kind in get_args(Regime):
         mine = kinds == kind
         count = len(set(families[mine]))
@@ -204,7 +211,8 @@ def pair_width(board: str) -> float:
     Each network predicted without itself; only rates that the DPU bounds.
     """
     trial = _trial(board, chosen(board))
-    cases, names = trial.cases, np.array([row.network for row in trial.cases.rows])
+    cases = trial.cases
+    names = np.array([row.network for row in trial.cases.rows])
     errors = np.zeros(len(names))
     for name in dict.fromkeys(names):
         errors[names == name] = cases.only(names == name).errors(fit(cases.only(names != name), near=trial.near))
@@ -254,7 +262,8 @@ def rank_correlation(found: Nested) -> float:
 def one_thread(board: str) -> tuple[list[str], list[Array]]:
     """Names and ln(predicted / published) of rates with one thread, each family left out."""
     trial = _trial(board, chosen(board))
-    names, errors = [], []
+    names = []
+    errors = []
     for family in trial.names:
         tested = trial.cases.only(trial.cases.families == family)
         single = tested.residuals(trial.fit_without({family}))[len(tested.rows) :]
@@ -273,9 +282,11 @@ def owner_errors(board: str, *, slower: bool = False) -> list[float]:
     """
     trial = _trial(board, chosen(board))
     cases = Cases(published_cases(board, slower=slower), trial.cases.structure)
-    errors, on_host = np.zeros(len(cases.rows)), np.zeros(len(cases.rows), dtype=bool)
+    errors = np.zeros(len(cases.rows))
+    on_host = np.zeros(len(cases.rows), dtype=bool)
     for name in dict.fromkeys(cases.families):
-        mine, constants = cases.families == name, trial.fit_without({name})
+        mine = cases.families == name
+        constants = trial.fit_without({name})
         errors[mine] = cases.only(mine).errors(constants)
         on_host[mine] = [kind == "host" for kind in regimes_of(cases.only(mine), constants)]
     owners = errors[:, None] * (on_host[:, None] == on_host)
@@ -286,7 +297,8 @@ def owner_errors(board: str, *, slower: bool = False) -> list[float]:
 def transferred(source: str, target: str) -> tuple[list[str], list[Array]]:
     """Names and errors of a board's cases with constants fitted to another's rates, without the family of each."""
     crowding = chosen(target, seen=False)
-    wanted, trial = _trial(target, crowding).cases, _trial(source, crowding)
+    wanted = _trial(target, crowding).cases
+    trial = _trial(source, crowding)
     errors = np.zeros(len(wanted.rows))
     for name in dict.fromkeys(wanted.families):
         mine = wanted.families == name

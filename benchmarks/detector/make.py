@@ -41,10 +41,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=RECIPE.steps)
     given = parser.parse_args()
     torch.set_num_threads(1)
-    files, recipe = (
-        [given.folder / path.name for path in (DETECTOR, DETECTOR_INT8)],
-        replace(RECIPE, steps=given.steps),
-    )
+    files = [given.folder / path.name for path in (DETECTOR, DETECTOR_INT8)]
+    recipe = replace(RECIPE, steps=given.steps)
     pictures = drawn(0, given.pictures)
     with steps("training", recipe.steps) as bar:
         network = train_detector(pictures, len(CLASSES), recipe, lambda loss: bar.advance(note=f"loss {loss:.2f}"))
@@ -75,7 +73,8 @@ def quantise(pictures: Sequence[Picture], file: Path, int8: Path) -> None:
 
 def judge(pictures: Sequence[Picture], files: Sequence[Path]) -> None:
     """Print average precisions with intervals, over pictures that nothing was trained on."""
-    truths, hits = [Boxes.of(picture.corners, picture.classes) for picture in pictures], {}
+    truths = [Boxes.of(picture.corners, picture.classes) for picture in pictures]
+    hits = {}
     for file in files:
         detector = open_detector(file, 1)
         found = [detector.detect((each.image.astype(np.float32) / 255).transpose(1, 2, 0)) for each in pictures]

@@ -49,7 +49,8 @@ def decoded(boxes: Tensor) -> Tensor:
     The centre is told from the middle of the cell, in cells; the size as the logarithm of cells.
     """
     rows, columns = (torch.arange(side, dtype=boxes.dtype) + 0.5 for side in boxes.shape[2:])
-    x, y = boxes[:, :1] + columns, boxes[:, 1:2] + rows[:, None]
+    x = boxes[:, :1] + columns
+    y = boxes[:, 1:2] + rows[:, None]
     return STRIDE_PX * torch.cat([x, y, torch.exp(boxes[:, 2:4])], dim=1)
 
 
@@ -99,7 +100,8 @@ def detector_to_onnx(
         side_px: S, a multiple of 8.
         about: further metadata.
     """
-    buffer, image = io.BytesIO(), torch.zeros(1, 3, side_px, side_px)
+    buffer = io.BytesIO()
+    image = torch.zeros(1, 3, side_px, side_px)
     with warnings.catch_warnings():
         # The newer exporter wants onnxscript, a package more.
         warnings.simplefilter("ignore", DeprecationWarning)

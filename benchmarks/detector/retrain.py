@@ -150,7 +150,8 @@ def training_pictures(rows: Sequence[Condition], scenes: int, seed: int) -> dict
 
 def picture_from(seen: AcquiredScene, method: Method | None) -> Picture:
     """What a detector is trained on: an image as it would be shown, in its square input, and the boxes on it."""
-    rgb, truth = seen.shown(method), seen.scene.truth
+    rgb = seen.shown(method)
+    truth = seen.scene.truth
     height, width, _ = rgb.shape
     box = Letterbox(height, width, SIDE_PX)
     return picture_of(box.image(rgb), box.to_input(truth.corners / seen.sensors.oversampling), truth.classes)
@@ -163,7 +164,8 @@ def retrained_rows(scored: Mapping[str, Sequence[Mapping[str, float]]]) -> list[
         scored: by row, reference first, then a degraded and a restored one for each sensor; figures of each seed.
     """
     ap50 = {name: np.array([one["mAP50"] for one in each]) for name, each in scored.items()}
-    names, made = list(scored), list[Row]()
+    names = list(scored)
+    made = list[Row]()
     for number, name in enumerate(names):
         figures = {shown: _figure([each[shown] for each in scored[name]]) for shown in KEYS}
         if number and number % 2 == 0:

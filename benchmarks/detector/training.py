@@ -51,7 +51,8 @@ def picture_of(rgb: np.ndarray, corners: np.ndarray, classes: np.ndarray) -> Pic
 
 def drawn_picture(side_px: int, seed: int, number: int) -> Picture:
     """The synthetic scene of a number as the reference sensor sees it, stretched by itself, `side_px` a side."""
-    side, sensor = side_px * OVERSAMPLING, load_sensor(REFERENCE).nominal()
+    side = side_px * OVERSAMPLING
+    sensor = load_sensor(REFERENCE).nominal()
     radiance, truth = synthetic_scene(np.random.default_rng([STREAM, seed, number]), side, side)
     dn = acquire_padded(radiance, sensor, OVERSAMPLING, Draw(seed, number), "reference")
     rgb = stretch_of(dn).to_srgb(dn).transpose(2, 0, 1)
@@ -80,7 +81,8 @@ def targets_of(corners: np.ndarray, classes: np.ndarray, count: int, height: int
 
     Where two objects claim a cell, the smaller one has its box.
     """
-    bumps, weights = np.zeros((count, height, width), np.float32), np.zeros((1, height, width), np.float32)
+    bumps = np.zeros((count, height, width), np.float32)
+    weights = np.zeros((1, height, width), np.float32)
     boxes = np.zeros((4, height, width), np.float32)
     sizes = (corners[:, 2:] - corners[:, :2]).prod(1)
     for k in np.argsort(-sizes):
@@ -97,7 +99,8 @@ def targets_of(corners: np.ndarray, classes: np.ndarray, count: int, height: int
 
 def _bump(corners: np.ndarray, height: int, width: int) -> tuple[tuple[slice, slice], np.ndarray]:
     """The cells around the centre of a box in cells, and the Gaussian there: 1 in the cell that holds the centre."""
-    middle, half = (corners[:2] + corners[2:]) / 2, SPREAD * (corners[2:] - corners[:2]) / 2
+    middle = (corners[:2] + corners[2:]) / 2
+    half = SPREAD * (corners[2:] - corners[:2]) / 2
     column, row = (int(v) for v in np.clip(np.floor(middle), 0, (width - 1, height - 1)))
     reach_x, reach_y = (int(v) for v in np.floor(half))
     rows = slice(max(row - reach_y, 0), min(row + reach_y + 1, height))
@@ -115,7 +118,8 @@ def loss_of(found: Tensor, targets: Targets) -> tuple[Tensor, Tensor]:
 
 def focal_loss(logits: Tensor, bumps: Tensor) -> Tensor:
     """CenterNet's penalty-reduced focal loss, over the number of objects."""
-    score, centre = torch.sigmoid(logits), bumps.eq(1)
+    score = torch.sigmoid(logits)
+    centre = bumps.eq(1)
     at_centre = (1 - score) ** 2 * functional.logsigmoid(logits) * centre
     elsewhere = score**2 * functional.logsigmoid(-logits) * (1 - bumps) ** 4 * ~centre
     return -(at_centre + elsewhere).sum() / centre.sum().clamp(min=1)
@@ -131,7 +135,8 @@ def box_loss(boxes: Tensor, targets: Targets) -> Tensor:
 
 def generalised_iou(one: Tensor, other: Tensor) -> Tensor:
     """GIoU (N, 1, h, w) of boxes x1, y1, x2, y2 along dimension 1."""
-    low, high = torch.maximum(one[:, :2], other[:, :2]), torch.minimum(one[:, 2:], other[:, 2:])
+    low = torch.maximum(one[:, :2], other[:, :2])
+    high = torch.minimum(one[:, 2:], other[:, 2:])
     shared = (high - low).clamp(min=0).prod(1, keepdim=True)
     areas = sum((each[:, 2:] - each[:, :2]).prod(1, keepdim=True) for each in (one, other))
     hull = (torch.maximum(one[:, 2:], other[:, 2:]) - torch.minimum(one[:, :2], other[:, :2])).prod(1, keepdim=True)
@@ -249,7 +254,8 @@ def _lit(image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
 
 def turned(picture: Picture, generator: np.random.Generator) -> Picture:
     """A picture of equal sides in one of the square's eight symmetries, its boxes with it."""
-    image, corners = picture.image, picture.corners
+    image = picture.image
+    corners = picture.corners
     height, width = image.shape[1:]
     if generator.random() < 0.5:
         image = image[..., ::-1]
@@ -258,5 +264,6 @@ def turned(picture: Picture, generator: np.random.Generator) -> Picture:
         image = image[:, ::-1]
         corners = np.stack([corners[:, 0], height - corners[:, 3], corners[:, 2], height - corners[:, 1]], axis=1)
     if generator.random() < 0.5 and height == width:
-        image, corners = image.transpose(0, 2, 1), corners[:, [1, 0, 3, 2]]
+        image = image.transpose(0, 2, 1)
+        corners = corners[:, [1, 0, 3, 2]]
     return Picture(image, corners, picture.classes)

@@ -112,7 +112,8 @@ def predict(
         predictions, notes = _predictions(found.file, found.model, boards, tile, host_task)
         rows = list(map(frame_row, predictions))
     else:
-        halo_px, takes_step = parse_halo(str(halo), tiling.halo_px), consistency and keeps_pixels(tiling)
+        halo_px = parse_halo(str(halo), tiling.halo_px)
+        takes_step = consistency and keeps_pixels(tiling)
         swath = Swath(width_px, height_px, tile, halo_px, consistency=takes_step)
         predictions, notes = _predictions(found.file, found.model, boards, tile, host_task, swath.step_px)
         rows = [swath_row(prediction, swath) for prediction in predictions]
@@ -214,7 +215,8 @@ def bench_board(
         return _frames(model, network, boards, corrected, error, host_task)
     dn = read_acquisition(image, full_scale, None) if image else None
     width_px, height_px = (dn.shape[1], dn.shape[0]) if dn is not None else parse_size(size or PAPER_SIZE)
-    halo_px, takes_step = parse_halo(halo, tiling.halo_px), consistency and keeps_pixels(tiling)
+    halo_px = parse_halo(halo, tiling.halo_px)
+    takes_step = consistency and keeps_pixels(tiling)
     swath = Swath(width_px, height_px, tiles_px[0], halo_px, consistency=takes_step)
     counts = dict[int, int]()
     if dn is not None and sensor is not None:
@@ -230,7 +232,8 @@ def bench_board(
         prediction = predict_file(model, boards[0], swath.tile_px, host_task, swath.step_px)
         rows = [*predicted_rows(model.stem, prediction, swath), *beside]
         shown = [*corrected, (f"{title} in tiles of {swath.tile_px}", rows)]
-        notes, layers = [*host_words(prediction), *exposure_words(counts)], [_layers(model, prediction)]
+        notes = [*host_words(prediction), *exposure_words(counts)]
+        layers = [_layers(model, prediction)]
         return BoardBench(shown, notes, layers, swath, dn)
     swept = sweep_rows(model, swath, boards, tiles_px, host_task)
     whole = (f"{model.name}, {title} in whole tiles, halo {swath.halo_px} px", swept)
@@ -278,10 +281,12 @@ def _boards(
 ) -> tuple[list[Dpu], Tables]:
     """The configurations asked for; corrected by runs where they are given, and the tables that say so."""
     if target == ALL and config not in (None, ALL):
-        expected, remedy = "'all' or none beside all boards", "leave it out, or name the board"
+        expected = "'all' or none beside all boards"
+        remedy = "leave it out, or name the board"
         raise OptionError("dpu", expected=expected, got=repr(config), remedy=remedy)
     if target == ALL and measured is not None:
-        expected, remedy = "one board beside `measured`", "name the board that the runs are of"
+        expected = "one board beside `measured`"
+        remedy = "name the board that the runs are of"
         raise OptionError("target", expected=expected, got=repr(target), remedy=remedy)
     targets = boards_of(target)
     boards = [dpu_of(each, name) for each in targets for name in (each.configurations if config == ALL else [config])]

@@ -56,7 +56,8 @@ def time_networks(runs: Sequence[Timed], tile_px: int, threads: int, min_time_s:
 
 
 def _row(run: Timed, tile_px: int, conditions: Mapping[str, Figure]) -> Row:
-    times_ms, total_s = 1e3 * np.array(run.times_s), sum(run.times_s)
+    times_ms = 1e3 * np.array(run.times_s)
+    total_s = sum(run.times_s)
     source = f"{len(run.times_s)} runs in {total_s:.1f} s after one for warm-up, loading left out"
     memory = "rise of resident memory once the file was opened and had run once"
     figures = {
@@ -101,7 +102,8 @@ def host_rows(
     runs = [Timed(model.stem, given)]
     if other is not None:
         runs.append(Timed(f"{'INT8' if is_quantised(other) else 'float32'} of the same shape", other))
-    min_time_s, min_runs = target.value("measurement", "min_time_s"), int(target.value("measurement", "min_runs"))
+    min_time_s = target.value("measurement", "min_time_s")
+    min_runs = int(target.value("measurement", "min_runs"))
     cpu_load()
     time_networks(runs, tile_px, threads, min_time_s, min_runs)
     conditions = conditions_of(threads or psutil.cpu_count(logical=False) or 1)

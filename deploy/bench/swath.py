@@ -79,7 +79,8 @@ def predict_file(
 
 def swath_figures(prediction: Prediction, swath: Swath, frames: float, batches: float) -> dict[str, Figure]:
     """Return the figures of a swath that takes `frames` tiles in `batches` batches."""
-    power, latency = dpu_power(prediction.dpu), swath_latency(prediction, batches)
+    power = dpu_power(prediction.dpu)
+    latency = swath_latency(prediction, batches)
     step = {"consistency step": step_time(prediction, swath)} if swath.consistency else {}
     return {
         "tiles": exact(frames, "tile", ARITHMETIC),
@@ -178,6 +179,7 @@ def parse_size(text: str) -> tuple[int, int]:
     """WIDTHxHEIGHT in pixels as (width, height)."""
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(part.isdecimal() and 0 < int(part[:9]) <= SIDE_PX for part in parts):
-        expected, remedy = f"WIDTHxHEIGHT of 1 to {SIDE_PX} pixels", f"write it as {PAPER_SIZE}"
+        expected = f"WIDTHxHEIGHT of 1 to {SIDE_PX} pixels"
+        remedy = f"write it as {PAPER_SIZE}"
         raise OptionError("size", expected=expected, got=repr(text), remedy=remedy)
     return int(parts[0]), int(parts[1])

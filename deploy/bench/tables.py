@@ -61,7 +61,8 @@ def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]
         "host beside the DPU": host_time(prediction, "ms/tile"),
         "power of products and traffic": counted_power(prediction),
     }
-    words, name = {"fitted range": fitted_range(prediction)}, f"{name}, INT8 on the DPU ({prediction.dpu.name})"
+    words = {"fitted range": fitted_range(prediction)}
+    name = f"{name}, INT8 on the DPU ({prediction.dpu.name})"
     return [
         Row(TABLE, f"{name}, {how}", swath_figures(prediction, swath, *count) | besides, words)
         for how, count in counts.items()
@@ -99,16 +100,20 @@ def published_rows() -> list[Row]:
 
 def processor_row(swath: Swath, board: TargetProfile) -> Row:
     """The traditional pipeline on the board's own processor, from the time of 10^6 pixels that its file states."""
-    cpu, mpx, watts = board.tables.get("cpu", {}), swath.pixels / 1e6, board.tables.get("power", {}).get("cpu_run_w")
+    cpu = board.tables.get("cpu", {})
+    mpx = swath.pixels / 1e6
+    watts = board.tables.get("power", {}).get("cpu_run_w")
     power = unavailable("W", "no power of a run on this board's processor is published")
     if watts is not None:
         power = published(watts.low, "W", watts.source)
-    constant, cores = cpu.get(CHAIN), f", {cpu['cores']} cores" if "cores" in cpu else ""
+    constant = cpu.get(CHAIN)
+    cores = f", {cpu['cores']} cores" if "cores" in cpu else ""
     name = f"traditional pipeline on the processor of {board.name}{cores}"
     if constant is None:
         missing = f"the target states no [cpu] {CHAIN}"
         return Row(TABLE, name, {"latency": unavailable("s", missing), "power": power})
-    low_s, high_s = mpx * constant.low, mpx * constant.high
+    low_s = mpx * constant.low
+    high_s = mpx * constant.high
     latency = predicted(between((low_s, high_s)), "s", (low_s, high_s), constant.source)
     figures = {
         "latency": latency,
@@ -130,7 +135,9 @@ def layer_rows(prediction: Prediction) -> list[Row]:
 
 
 def _layer_row(layer: LayerCost, prediction: Prediction) -> Row:
-    work, batch, dpu = layer.work, prediction.batch, prediction.dpu
+    work = layer.work
+    batch = prediction.batch
+    dpu = prediction.dpu
     low_j, high_j = layer_energy_j(layer, dpu)
     moved = batch * work.map_bytes + work.weight_bytes
     seconds = layer.time_s or math.inf  # a concat takes no time of its own
@@ -192,7 +199,8 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
         boards: as given there.
         within_s: what the swath may take.
     """
-    each, found = len(rows) // len(boards), dict[str, str]()
+    each = len(rows) // len(boards)
+    found = dict[str, str]()
     placed = [(boards[k // each].peak_ops_per_s, row) for k, row in enumerate(rows)]
     ends: dict[str, Callable[[Figure], float | None]] = {
         "by the whole interval": lambda latency: interval_ends(latency)[1],
@@ -210,7 +218,8 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
 
 def frame_row(prediction: Prediction) -> Row:
     """A network that is run on whole images, on one configuration: frames instead of a swath."""
-    power, frame_s = dpu_power(prediction.dpu), swath_latency(prediction, 1 / prediction.batch)
+    power = dpu_power(prediction.dpu)
+    frame_s = swath_latency(prediction, 1 / prediction.batch)
     figures = {
         "work": exact(prediction.operations / 1e9, "GOP"),
         "batch": exact(prediction.batch, "frame", "images in flight"),

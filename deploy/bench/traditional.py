@@ -41,7 +41,8 @@ class ChainTime:
 
     def row(self, swath: Swath) -> Row:
         """The swath by proportion; the interval is that of the fastest and the slowest crop."""
-        median, mpx = statistics.median(self.s_per_mpx), swath.pixels / 1e6
+        median = statistics.median(self.s_per_mpx)
+        mpx = swath.pixels / 1e6
         here = f"{len(self.s_per_mpx)} crops of {self.crop} on this processor, the default quality"
         ends = mpx * min(self.s_per_mpx), mpx * max(self.s_per_mpx)
         latency = predicted(mpx * median, "s", ends, f"by the pixel from {here}")

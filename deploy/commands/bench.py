@@ -115,7 +115,9 @@ def bench(
     from beers_deploy.network_files import conditioned, int8_file
     from beers_deploy.results import Table, inputs_of, print_rows, require_same
 
-    tiles, here, board = parse_tiles(tile), target in HOSTS, target.removesuffix(MODEL_SUFFIX)
+    tiles = parse_tiles(tile)
+    here = target in HOSTS
+    board = target.removesuffix(MODEL_SUFFIX)
     _refuse_unused(context, here)
     require_writable(json, inputs=(model, image, measured, Path(target), Path(sensor)))
     known = load_sensor(sensor)
@@ -182,7 +184,8 @@ def _traditional_row(dn: "np.ndarray | None", swath: "Swath") -> "Row":
 def _refuse_unused(context: typer.Context, here: bool) -> None:
     """Refuse the options of the other target, and a size or a scale that no image asks for."""
     wanted = "the modelled board" if here else "--target host"
-    expected, remedy = f"{wanted} beside it", f"leave it out, or take {wanted}"
+    expected = f"{wanted} beside it"
+    remedy = f"leave it out, or take {wanted}"
     refuse(context, BOARD_ONLY if here else HOST_ONLY, expected=expected, got="the other target", remedy=remedy)
     if context.params["image"] is None:
         refuse(context, ["full_scale"], expected="--image beside it")
@@ -192,6 +195,7 @@ def _refuse_unused(context: typer.Context, here: bool) -> None:
 
 def _single(tiles: list[int]) -> int:
     if len(tiles) > 1:
-        expected, remedy = "one size with --target host", "run it once a size"
+        expected = "one size with --target host"
+        remedy = "run it once a size"
         raise OptionError("--tile", expected=expected, got=str(tiles), remedy=remedy)
     return tiles[0]

@@ -34,7 +34,8 @@ def diff(
     documents = read_document(before), read_document(after)
     found = changes(*documents)
     if not found.both:
-        expected, remedy = "documents that share a figure", "give two results of one command"
+        expected = "documents that share a figure"
+        remedy = "give two results of one command"
         raise OptionError(str(after), expected=expected, got="none in both", remedy=remedy)
     rows = change_rows(found.changed)
     if rows:

@@ -87,5 +87,6 @@ def parse_brightness(text: str | None) -> tuple[float, ...]:
     try:
         return tuple(float(each) for each in (text or "1").split(","))
     except ValueError as error:
-        expected, remedy = "numbers separated by commas", "give factors such as 0.25,0.05"
+        expected = "numbers separated by commas"
+        remedy = "give factors such as 0.25,0.05"
         raise OptionError("brightness", expected=expected, got=repr(text), remedy=remedy) from error

@@ -91,7 +91,8 @@ def export(
         warn_outside(known, read_conditioned(path).kernels, partial(say, err=True))
         model = float_for(path, path.stem, known, tile)
     elif sensor is not None:
-        expected, remedy = "weights of 'train --conditioned'", "leave --sensor out, or give such weights"
+        expected = "weights of 'train --conditioned'"
+        remedy = "leave --sensor out, or give such weights"
         raise ModelError(str(path), expected=expected, got="those of a plain network", remedy=remedy)
     else:
         weights = read_plain(path)
@@ -152,7 +153,9 @@ def _export_int8(
         made = told_by_delta(model, apply)
     else:
         made = told_int8(model, load_sensor(sensor or SENSOR), log=partial(say, err=True))
-    core, about, side_px = read_core(made), metadata(made), tile_px or fixed_tile_px(made)
+    core = read_core(made)
+    about = metadata(made)
+    side_px = tile_px or fixed_tile_px(made)
     require_tile(side_px, core.ends.place_px)
     board_file, profile = board
     for_board = Network(made, out.stem).core(profile, tile_px) if board_file else None

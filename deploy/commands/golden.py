@@ -41,7 +41,8 @@ def golden(
     if compare is None:
         refuse(context, ("json",), expected="--compare beside it", remedy="leave it out, or compare")
     if (out is None) == (compare is None):
-        expected, remedy = "one of --out and --compare", "give the folder to write, or the folder to compare with"
+        expected = "one of --out and --compare"
+        remedy = "give the folder to write, or the folder to compare with"
         raise OptionError("out", expected=expected, got="both" if out else "none", remedy=remedy)
     if compare is None:
         say(f"wrote {write_golden(in_int8(given), cast('Path', out), tile=tile, board=target)}")

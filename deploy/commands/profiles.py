@@ -97,7 +97,8 @@ def _sensor_rows(sensor: Sensor) -> list[Row]:
 
 def _response(sensor: Sensor) -> list[Row]:
     """A table's numbers, or what a point-spread function is made of."""
-    response, said = sensor.response, (sensor.mtf_nyquist.status, sensor.mtf_nyquist.source)
+    response = sensor.response
+    said = (sensor.mtf_nyquist.status, sensor.mtf_nyquist.source)
     if response is None:
         return []
     if not isinstance(response, MtfTable):

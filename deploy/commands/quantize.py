@@ -119,7 +119,8 @@ def _report_files(folder: Path | None, model: Path) -> tuple[Path, Path] | tuple
     if folder is None:
         return None, None
     if conditioned(model):
-        expected, remedy = "a network that is calibrated by itself", "leave it out"
+        expected = "a network that is calibrated by itself"
+        remedy = "leave it out"
         raise OptionError("--report", expected=expected, got="one behind a bank", remedy=remedy)
     optional("matplotlib", "--report")
     return folder / "report.html", folder / "report.json"

@@ -173,7 +173,8 @@ def restore(
     brighter = {band: brighter_files(network, each) for band, each in known.items()} if exposure else {}
     if sensor and not found:
         _look_at_network(network, paths, known)
-    path, bits = next(iter(paths.values())), {int(each.bits.low) for each in known.values()}
+    path = next(iter(paths.values()))
+    bits = {int(each.bits.low) for each in known.values()}
     if len(bits) > 1 and full_scale is None:
         remedy = "give --full-scale, or restore such bands apart"
         raise OptionError("--sensor", expected="sensors of equal bits", got=f"{sorted(bits)}", remedy=remedy)
@@ -208,7 +209,8 @@ def _look_at_network(network: Path | None, paths: Mapping[str, Path], known: Map
     from beers_deploy.quant.onnx_file import load_onnx
 
     if len(known) > 1:
-        expected, remedy = "a shipped network, or weights of 'train --conditioned'", "give one sensor for all bands"
+        expected = "a shipped network, or weights of 'train --conditioned'"
+        remedy = "give one sensor for all bands"
         raise OptionError("--sensor", expected=expected, got=f"{network} with a sensor for each band", remedy=remedy)
     if doubt := other_sensor(load_onnx(paths[""]), known[""]):
         say(doubt, err=True)

@@ -67,7 +67,8 @@ def refuse(
     """
     parameters = {parameter.name: parameter for parameter in context.command.params}
     for name in names:
-        source, parameter = context.get_parameter_source(name), parameters[name]
+        source = context.get_parameter_source(name)
+        parameter = parameters[name]
         spellings = parameter.opts if context.params[name] else parameter.secondary_opts
         if source is not None and source.name == "COMMANDLINE" and spellings:
             raise OptionError(spellings[0], expected=expected, got=got, remedy=remedy)

@@ -80,7 +80,8 @@ def simulate(
     from beers_deploy.model.progress import steps
 
     if out is None:
-        expected, remedy = "--out beside it", "leave it out, or give a folder"
+        expected = "--out beside it"
+        remedy = "leave it out, or give a folder"
         refuse(context, ["workers", "scheduler", "resume"], expected=expected, remedy=remedy)
     if scheduler is not None:
         refuse(context, ["workers"], expected="none beside --scheduler", got="some", remedy="leave one of them out")

@@ -75,7 +75,8 @@ def stress(
     subject = open_subject(float_model, int8_model, sensor, partial(say, err=True))
     inputs = inputs_of(*subject.paths) if json else ()
     if bit_flips:
-        results, shown = [], flip_rows(subject, Calibration(load_sensor(sensor), images, draws, side, seed), target)
+        results = []
+        shown = flip_rows(subject, Calibration(load_sensor(sensor), images, draws, side, seed), target)
     else:
         results = run_battery(subject, [case for case in CASES if case.name in names], wanted, seed, side)
         shown = shown_rows(subject, results)
@@ -112,5 +113,6 @@ def _refuse_unused(context: typer.Context, bit_flips: bool) -> None:
         remedy = "leave one of the two out"
         refuse(context, HARD_CASES_ONLY, expected="hard cases", got="--bit-flips", remedy=remedy)
     else:
-        expected, remedy = "--bit-flips beside it", "add --bit-flips, or leave it out"
+        expected = "--bit-flips beside it"
+        remedy = "add --bit-flips, or leave it out"
         refuse(context, BIT_FLIPS_ONLY, expected=expected, got="hard cases", remedy=remedy)

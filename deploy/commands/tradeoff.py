@@ -82,7 +82,8 @@ def tradeoff(
         remedy = "give labelled pictures, or leave it out"
         refuse(context, ["detector", "classes", *named], expected="--labelled beside it", remedy=remedy)
     names = [name for each in network or [ALL] for name in (shipped_names() if each == ALL else [each])]
-    aim, boards = reference or REFERENCE, parse_targets(target)
+    aim = reference or REFERENCE
+    boards = parse_targets(target)
     tree = labelled.rglob("*") if labelled else ()
     read = (images, calibration, lpips, labelled, detector, *tree, *map(Path, (sensor, aim, *boards, *names)))
     written = (out / "tradeoff.json", *(out / name for name in FILES), out / "measurements.json", json)

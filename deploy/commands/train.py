@@ -96,13 +96,15 @@ def train(
         _make(recipe, folders, out, resume, device)
         return
     if pairs is not None and (images is not None or drawn):
-        expected, remedy = "neither --images nor --drawn beside it", "leave one out"
+        expected = "neither --images nor --drawn beside it"
+        remedy = "leave one out"
         raise OptionError("--pairs", expected=expected, got="both", remedy=remedy)
     if conditioned and pairs is not None:
         remedy = "leave one out: stored pairs do not say what sensor each had"
         raise OptionError("--conditioned", expected="no --pairs beside it", got="both", remedy=remedy)
     if rounding is not None and not (conditioned and start):
-        expected, remedy = "--conditioned and --start beside it", "give both, or leave it out"
+        expected = "--conditioned and --start beside it"
+        remedy = "give both, or leave it out"
         raise OptionError("--rounding", expected=expected, got="not both", remedy=remedy)
     _refuse_unused(context)
     stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else list(folders)
@@ -151,7 +153,8 @@ BESIDE_RECIPE = ("recipe", "images", "out", "resume", "device")
 def _refuse_beside_recipe(context: typer.Context) -> None:
     """Refuse options that the recipe states."""
     stated = [name for name in context.params if name not in BESIDE_RECIPE]
-    expected, remedy = "no --recipe beside it, which states it", "leave it out, or give a recipe of your own"
+    expected = "no --recipe beside it, which states it"
+    remedy = "leave it out, or give a recipe of your own"
     refuse(context, stated, expected=expected, got="both", remedy=remedy)
 
 
@@ -179,5 +182,6 @@ def _refuse_unused(context: typer.Context) -> None:
         expected = "--images, of which whole sites are held out, beside it"
         refuse(context, ["validate_every"], expected=expected, got="no images: nothing to validate on", remedy=remedy)
     if not context.params["lpips_weight"]:
-        expected, got = "a weight of LPIPS in the loss", "--lpips-weight 0"
+        expected = "a weight of LPIPS in the loss"
+        got = "--lpips-weight 0"
         refuse(context, ["lpips"], expected=expected, got=got, remedy="leave one of the two out")

@@ -131,7 +131,8 @@ def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
         where = f"{profile.name} [configurations.{name}] {key}"
         raise ProfileError(where, expected=CONFIGURATION[key].expected, got="none", remedy="add it")
     if not profile.documents:
-        got, remedy = "none", "add it, or begin with base = the name of a board with the same DPU"
+        got = "none"
+        remedy = "add it, or begin with base = the name of a board with the same DPU"
         raise ProfileError(profile.name, expected="a table [documents]", got=got, remedy=remedy)
     return Dpu(profile, name, constants)
 
@@ -141,6 +142,7 @@ def ruled(profile: TargetProfile, configuration: str | None = None) -> Dpu:
     if not profile.npu:
         return dpu_of(profile, configuration)
     if configuration is not None:
-        expected, remedy = f"none beside {profile.name}, which has an NPU", "leave it out"
+        expected = f"none beside {profile.name}, which has an NPU"
+        remedy = "leave it out"
         raise OptionError("dpu", expected=expected, got=repr(configuration), remedy=remedy)
     return Dpu(profile, "NPU", {})

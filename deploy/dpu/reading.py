@@ -81,7 +81,8 @@ class _Reader:
     """Walks the nodes once, in their topological order, carrying shapes and number formats along."""
 
     def __init__(self, graph: OnnxGraph, inputs: dict[str, Shape]) -> None:
-        self.graph, self.inputs = graph, inputs
+        self.graph = graph
+        self.inputs = inputs
         self.shapes: dict[str, Shape | None] = dict(inputs)
         self.kinds: dict[str, Kind] = {}
         self.integers = Integers(graph)
@@ -97,9 +98,11 @@ class _Reader:
             return
         weight = self.integers.weight(node)
         kind = "activation" if self._is_activation(node) else kind_of(node, weight)
-        inputs, formats = self.integers.activations(node), self.integers.formats(node)
+        inputs = self.integers.activations(node)
+        formats = self.integers.formats(node)
         shapes = tuple(map(self.shapes.get, inputs))
-        window, channels = _window(node, weight, shapes), _channels(node, weight, shapes)
+        window = _window(node, weight, shapes)
+        channels = _channels(node, weight, shapes)
         shape = out_shape(node, kind, shapes, window, channels[1], self.graph.constants)
         outputs = tuple(self.integers.resolve(name) for name in node.outputs if name)
         self.shapes |= dict.fromkeys(outputs, shape)
@@ -151,7 +154,8 @@ def _channels(node: Node, weight: np.ndarray | None, shapes: Sequence[Shape | No
     if weight is None:
         channels = shapes[0][0] if shapes and shapes[0] else 0
         return channels, channels
-    first, second = weight.shape[0], weight.shape[1] * int(node.attributes.get("group", 1))
+    first = weight.shape[0]
+    second = weight.shape[1] * int(node.attributes.get("group", 1))
     return (first, second) if node.op_type == "ConvTranspose" else (second, first)
 
 
@@ -166,7 +170,8 @@ def _input_shape(name: str, sizes: Sequence[int], tile_px: int | None, places: t
         where: the file, in messages.
     """
     if len(sizes) != 4 or sizes[1] < 1:
-        got, remedy = f"{name} {sizes}", "export the network as such"
+        got = f"{name} {sizes}"
+        remedy = "export the network as such"
         raise ModelError(where, expected="inputs (N, C, H, W)", got=got, remedy=remedy)
     if sizes[0] > 1:
         remedy = "export it for any number of images, or for one"
@@ -178,7 +183,8 @@ def _input_shape(name: str, sizes: Sequence[int], tile_px: int | None, places: t
     place_px, border_px = places
     side, beyond = divmod(tile_px + 2 * border_px, place_px)
     if beyond:
-        expected, remedy = f"a tile of a multiple of {place_px} px", "choose another `tile`"
+        expected = f"a tile of a multiple of {place_px} px"
+        remedy = "choose another `tile`"
         raise ModelError(where, expected=expected, got=f"{tile_px} px", remedy=remedy)
     fixed = {size for size in sizes[2:] if size} - {side}
     if fixed:

@@ -55,10 +55,13 @@ def write_golden(
         tile: side of a tile in pixels; the network's own if it has one, else 64.
         board: whose way to round ties is taken.
     """
-    network, folder = Network.load(int8), Path(out)
+    network = Network.load(int8)
+    folder = Path(out)
     with faults_named(network.label):
         core = read_core(network.model)
-    half_even, names = bool(TargetProfile.load(board).npu), files_of(core)  # AMD's kernel for its NPU rounds to even
+    # AMD's kernel for its NPU rounds to even
+    half_even = bool(TargetProfile.load(board).npu)
+    names = files_of(core)
     generator = np.random.default_rng(0)
     images = _images(network, core.ends.image_channels, tile, generator)
     planes = {case: core.ends.split(image) for case, image in images.items()}
@@ -255,7 +258,8 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
         results: folders of the cases' names with files of the layers' names, any of them: int8, uint8 around 128,
             or float multiples of the tensor's scale; channels first, or last.
     """
-    golden, given = read_golden(Path(folder)), Path(results)
+    golden = read_golden(Path(folder))
+    given = Path(results)
     seen = _results(golden, given)
     wrong = [name for name, cases in seen.items() if _differing(name, cases)]
     verdict = _verdict(golden.core, seen, wrong[0], golden.half_even) if wrong else ""
@@ -270,11 +274,13 @@ Results = Mapping[str, list[Seen]]
 
 
 def _results(golden: Golden, given: Path) -> Results:
-    files, paths = files_of(golden.core), [path for path in given.glob("*/*.npy") if path.name != PICTURE]
+    files = files_of(golden.core)
+    paths = [path for path in given.glob("*/*.npy") if path.name != PICTURE]
     unknown = [path for path in paths if path.parent.name not in golden.cases or path.name not in files.values()]
     if unknown or not paths:
         got = f"{unknown[0].parent.name}/{unknown[0].name}" if unknown else "none"
-        expected, remedy = "results as CASE/LAYER.npy", f"name them as in {INDEX}"
+        expected = "results as CASE/LAYER.npy"
+        remedy = f"name them as in {INDEX}"
         raise OptionError(str(given), expected=expected, got=got, remedy=remedy)
     found: dict[str, list[Seen]] = {}
     for name, file in files.items():
@@ -295,7 +301,8 @@ def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
     if values.shape != shape and values.ndim == len(shape) and np.moveaxis(values, -1, 1).shape == shape:
         values = np.moveaxis(values, -1, 1)
     if values.shape != shape:
-        got, remedy = f"{values.shape}", "write the tensor whole, of the tile that the vectors have"
+        got = f"{values.shape}"
+        remedy = "write the tensor whole, of the tile that the vectors have"
         raise ImageError(str(path), expected=f"shape {shape}", got=got, remedy=remedy)
     if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
         got = f"{values.dtype} values, or some that are not finite"
@@ -326,7 +333,8 @@ def _layer(core: IntCore, name: str) -> str:
 
 def _unseen_before(core: IntCore, name: str, seen: Collection[str]) -> list[IntConv | Op]:
     """The operations between tensors that a board handed out and the one of that name, which is the last."""
-    wanted, found = {name}, list[IntConv | Op]()
+    wanted = {name}
+    found = list[IntConv | Op]()
     for op in reversed(core.ops):
         if op.output in wanted and (op.output == name or op.output not in seen):
             found.insert(0, op)

@@ -76,7 +76,8 @@ def factors(tile: np.ndarray) -> np.ndarray:
     chosen = np.ones(tile.shape[2:], int)
     if len(UNITS) == 1:
         return chosen
-    dark, brightest = F(S["offset"]), brightest_around(tile[0, 0], S["halo_px"])
+    dark = F(S["offset"])
+    brightest = brightest_around(tile[0, 0], S["halo_px"])
     for factor in sorted(UNITS)[1:]:
         chosen[(brightest - dark) * F(factor) + dark <= F(S["headroom"])] = factor
     return chosen
@@ -86,10 +87,12 @@ def brightest_around(pixels: np.ndarray, radius: int) -> np.ndarray:
     """Compute the maximum of the square of `radius` pixels around each pixel (h, w)."""
     size = 2 * radius + 1
     for _ in range(2):  # down, then across
-        pixels, length = np.pad(pixels, [(radius, radius), (0, 0)], "edge"), 1
+        pixels = np.pad(pixels, [(radius, radius), (0, 0)], "edge")
+        length = 1
         while length < size:  # the maximum of two windows that touch or overlap is that of a window twice as long
             step = min(length, size - length)
-            pixels, length = np.maximum(pixels[:-step], pixels[step:]), length + step
+            pixels = np.maximum(pixels[:-step], pixels[step:])
+            length = length + step
         pixels = pixels.T
     return pixels
 
@@ -163,7 +166,8 @@ def interpolated(blocks: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     for size in shape:
         place = np.arange(size) - BLOCK // 2
         left_out = 2 if len(blocks) > 4 else 0
-        low, high = left_out, len(blocks) - 1 - left_out
+        low = left_out
+        high = len(blocks) - 1 - left_out
         left, right = (np.clip(place // BLOCK + k, low, high) for k in (0, 1))
         share = (((2 * place + 1) % (2 * BLOCK)).astype(F) / F(2 * BLOCK))[:, None]
         blocks = (blocks[left] * (F(1) - share) + blocks[right] * share).T
@@ -178,7 +182,9 @@ def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
 
 def main(source: str, target: str, runs: dict[int, Any]) -> None:
     """Restore an image of at least a tile, tile by tile. `runs` has the core of each factor: planes to result."""
-    image, t, r = np.load(source).astype(F), S["tile_px"], S["scale"]
+    image = np.load(source).astype(F)
+    t = S["tile_px"]
+    r = S["scale"]
     if image.ndim != 3 or min(image.shape[1:]) < t or not np.isfinite(image).all():
         sys.exit(f"{source}: expected finite values (C, H, W) of at least {t} x {t} pixels, got shape {image.shape}")
     wide = np.pad(image, [(0, 0)] + [(0, -n % S["lattice_px"]) for n in image.shape[1:]], "edge")

@@ -33,7 +33,8 @@ def host_facts(
     Raises:
         OptionError: a sensor that would change nothing.
     """
-    facts, others = host_constants(network, tile_px), brighter or {}
+    facts = host_constants(network, tile_px)
+    others = brighter or {}
     step = consistency_facts(network, sensor) if sensor is not None and facts is not None else None
     if sensor is not None and step is None and not others:
         expected = "none where neither the consistency step nor exposures can be used"
@@ -59,7 +60,8 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
     plain = all(each.columns_first or wide == each.block**2 for found, wide in shuffles.values() for each in found)
     if not ends.is_image or ends.direct or not plain or any(len(found) > 1 for found, _ in shuffles.values()):
         return None
-    tiling, scale = network.tiling, core.scale(CORRECTION)
+    tiling = network.tiling
+    scale = core.scale(CORRECTION)
     step, part, middle = (STEP_DN, PART, MIDDLE_DN) if ends.banked else (STEP, QUARTER, 0)
     return {
         **{name: found[0].block if found else 1 for name, (found, _) in shuffles.items()},

@@ -99,7 +99,8 @@ def open_session(model: Path, provider: str, options: dict[str, str]) -> ort.Inf
 
 def make_feed(session: ort.InferenceSession, batch: int, tile_px: int) -> dict[str, np.ndarray]:
     """Noise that survives quantisation unchanged: multiples of 2^-7, or int8 itself; the same at every run."""
-    random, feed = np.random.default_rng(0), {}
+    random = np.random.default_rng(0)
+    feed = {}
     for tensor in session.get_inputs():
         shape = [batch, tensor.shape[1], tile_px, tile_px]
         if any(isinstance(size, int) and size != wanted for size, wanted in zip(tensor.shape, shape)):  # noqa: B905

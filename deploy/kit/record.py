@@ -99,7 +99,8 @@ def _has_family(network: Network) -> bool:
 
 def code_sha256() -> str:
     """Of the sources of this package, whose names and bytes in their order are one text."""
-    root, digest = Path(__file__).parents[1], hashlib.sha256()
+    root = Path(__file__).parents[1]
+    digest = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
         digest.update(f"{path.relative_to(root).as_posix()} {sha256(path)}\n".encode())
     return digest.hexdigest()
@@ -150,7 +151,9 @@ def bill_of(said: dict[str, Any]) -> str:
         # Two files may have one name, and a reference must be unique.
         return Component(type=kind, name=shown, bom_ref=f"{kind.value}:{shown}:{digest}", hashes=hashes, **more)
 
-    network, tool, bom = said["network"], said["tool"], Bom(serial_number=uuid5(NAMESPACE_URL, json.dumps(said)))
+    network = said["network"]
+    tool = said["tool"]
+    bom = Bom(serial_number=uuid5(NAMESPACE_URL, json.dumps(said)))
     facts = said["says"] | {
         key: said[key] for key in ("training", "sensors_in_range", "limitations", "passed", "licence")
     }

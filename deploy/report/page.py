@@ -18,7 +18,8 @@ INTERVAL = re.compile(r"\[[^\[\]]*\]")
 
 
 def _template() -> jinja2.Template:
-    loader, strict = jinja2.FileSystemLoader(Path(__file__).parent), jinja2.StrictUndefined
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    strict = jinja2.StrictUndefined
     # Autoescape deals with markup; `finalize` sees every value that is written, and escapes what is not printable.
     made = jinja2.Environment(
         loader=loader, autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True, finalize=_shown

@@ -207,7 +207,8 @@ def curves_svg(
         An SVG file, light or dark as its reader's screen is.
     """
     rows = math.ceil(len({curve.name for _, curves in panels for curve in curves}) / LEGEND_NAMES)
-    width_px, more_px = CURVES_PX[0], (rows - 1) * LEGEND_ROW_PX
+    width_px = CURVES_PX[0]
+    more_px = (rows - 1) * LEGEND_ROW_PX
     height_px = CURVES_PX[1] + more_px
     frame = CURVES_FRAME | {"top": 1 - ABOVE_PX / height_px, "bottom": (BELOW_PX + more_px) / height_px}
     with look():
@@ -225,7 +226,8 @@ def curves_svg(
         set_ticks(all_axes[0].yaxis, 8)
         figure.supxlabel(x_title, size=FONT_PX, color=LIGHT["soft"], y=(X_TITLE_PX + more_px) / height_px)
         figure.supylabel(y_title, size=FONT_PX, color=LIGHT["soft"])
-        columns, at = math.ceil(len(named) / rows), (0.5, LEGEND_PX / height_px)
+        columns = math.ceil(len(named) / rows)
+        at = (0.5, LEGEND_PX / height_px)
         figure.legend(named.values(), named, ncols=columns, loc="lower center", bbox_to_anchor=at)
         return svg_of(figure, f"{y_title} against {x_title}")
 
@@ -265,7 +267,8 @@ def bins(spread: "Spread") -> tuple[np.ndarray, np.ndarray, int]:
     wide = 1
     while 2 * (reach := -(-max(farthest - wide // 2, 0) // wide)) + 1 > MOST_BARS:
         wide += 2  # odd, so that zero lies in the middle of a bin
-    half, middle = reach * wide + wide // 2, MAX_DN + wide
+    half = reach * wide + wide // 2
+    middle = MAX_DN + wide
     padded = np.pad(spread.counts, wide)
     shares = padded[middle - half : middle + half + 1].reshape(-1, wide).sum(1) / spread.counts.sum()
     return np.arange(-reach, reach + 1) * wide, shares, wide

@@ -51,9 +51,11 @@ def disk_bytes(shape: tuple[int, int, int], itemsize: int) -> int:
     The driver halves the image until it is one block, and writes these overviews into a file of their own first.
     """
     bands, height, width = shape
-    full, overviews = padded_px(shape, BLOCK_PX), 0
+    full = padded_px(shape, BLOCK_PX)
+    overviews = 0
     while max(height, width) > BLOCK_PX:
-        height, width = -(-height // 2), -(-width // 2)
+        height = -(-height // 2)
+        width = -(-width // 2)
         overviews += padded_px((bands, height, width), BLOCK_PX)
     return (full + 2 * overviews) * itemsize
 

@@ -93,7 +93,8 @@ def _damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
         while cause.__cause__ is not None:  # rasterio's own words are "see previous exception"
             cause = cause.__cause__
         name = f"{path}, {where}" if where else str(path)
-        got, remedy = " ".join(str(cause).split())[:160] or type(cause).__name__, "check that it is a whole image"
+        got = " ".join(str(cause).split())[:160] or type(cause).__name__
+        remedy = "check that it is a whole image"
         expected = f"an image that GDAL reads as {GDAL_DRIVERS[path.suffix.lower()]}"
         raise ImageError(name, expected=expected, got=got, remedy=remedy) from error
 
@@ -104,7 +105,10 @@ class GdalSource:
     veil: Plane | None = None
 
     def __init__(self, files: tuple[Path, ...], dataset: Any, block_px: int, environment: dict[str, Any]) -> None:
-        self.files, self._path, self._dataset, self._environment = files, files[0], dataset, environment
+        self.files = files
+        self._path = files[0]
+        self._dataset = dataset
+        self._environment = environment
         with _damage_in_a_sentence(self._path):
             self.raster = _raster(self._path, dataset)
         self._block_px = block_px
@@ -138,7 +142,8 @@ def _raster(path: Path, dataset: Any) -> Raster:
         if len({str(one) for one in each}) > 1:
             got = ", ".join(str(one) for one in each)
             raise ImageError(str(path), expected=f"bands of equal {kind}", got=got, remedy="split the bands")
-    name, dtype = str(path), require_numbers(str(path), np.dtype(dataset.dtypes[0]))
+    name = str(path)
+    dtype = require_numbers(str(path), np.dtype(dataset.dtypes[0]))
     require_size(name, dataset.count, dataset.height, dataset.width)
     colours = [each.name for each in dataset.colorinterp]
     if "palette" in colours:
@@ -177,8 +182,10 @@ def _tags(dataset: Any, nodata: float | None) -> tuple[Tag, ...]:
             small.update_tags(**{key: value for key, value in dataset.tags().items() if key == "AREA_OR_POINT"})
             if dataset.rpcs is not None:
                 small.rpcs = dataset.rpcs
-            small.descriptions, small.units = dataset.descriptions, [unit or "" for unit in dataset.units]
-            small.scales, small.offsets = dataset.scales, dataset.offsets
+            small.descriptions = dataset.descriptions
+            small.units = [unit or "" for unit in dataset.units]
+            small.scales = dataset.scales
+            small.offsets = dataset.offsets
             for band in range(1, dataset.count + 1):
                 small.update_tags(band, **dataset.tags(band))
         content = memory.read()

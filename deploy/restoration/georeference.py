@@ -86,7 +86,8 @@ def of_sidecar(path: Path, raster: Raster) -> Raster:
     if not beside.is_file():
         return raster
     root = read_xml(beside, AUX_BYTES, "metadata as GDAL writes it", "write it again, or remove it")
-    name, bands = str(beside), list(root.iter("PAMRasterBand"))
+    name = str(beside)
+    bands = list(root.iter("PAMRasterBand"))
     for band in bands:
         offset, scale = (number_of(band.findtext(key, ""), usual) for key, usual in (("Offset", 0), ("Scale", 1)))
         require_small_offset(name, offset, scale)

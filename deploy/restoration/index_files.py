@@ -79,7 +79,9 @@ def index_files(path: Path, trusted: bool = False) -> tuple[Path, ...]:
     """
     if not is_index(path):
         return ()
-    home, found, pending = path.resolve().parent, dict[Path, None](), [path.resolve()]
+    home = path.resolve().parent
+    found = dict[Path, None]()
+    pending = [path.resolve()]
     while pending:
         index = pending.pop()
         found[index] = None
@@ -115,7 +117,8 @@ def _require_pixels(index: Path, text: str, file: Path) -> None:
 
 
 def _parsed(path: Path) -> ET.Element:
-    expected, remedy = "a VRT or a DIMAP, plain XML", "write it again"
+    expected = "a VRT or a DIMAP, plain XML"
+    remedy = "write it again"
     root = read_xml(path, INDEX_BYTES, expected, remedy)
     if path.suffix.lower() == ".vrt" and root.tag != VRT:
         raise _refused(path, expected, f"a document that is no {VRT}", remedy)

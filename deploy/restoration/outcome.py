@@ -87,18 +87,23 @@ class Tally:
             known: which results are; None for all.
         """
         alike = len(stored) == len(restored)
-        between, scale = (stored > 0) & (stored < 1), restored.shape[1] // stored.shape[1]
+        between = (stored > 0) & (stored < 1)
+        scale = restored.shape[1] // stored.shape[1]
         within = between.repeat(scale, axis=1).repeat(scale, axis=2) if alike else True
         at_ends = ((restored <= 0) | (restored >= 1)) & within
-        before, after = stored, restored
+        before = stored
+        after = restored
         if seen is not None and known is not None:
-            at_ends, before, after = at_ends & known, stored[seen], restored[known]
+            at_ends = at_ends & known
+            before = stored[seen]
+            after = restored[known]
         ends = int(at_ends.sum())
         counts = cls(after.size, int((before > 1).sum()), ends, network_at_ends=ends)
         if not alike:
             return counts
         before = np.minimum(before, 1)
-        total, squared = float(after.sum()), float((after**2).sum())
+        total = float(after.sum())
+        squared = float((after**2).sum())
         return replace(
             counts,
             compared=before.size,
@@ -175,10 +180,8 @@ class Tally:
     @property
     def figures(self) -> Mapping[str, Figure]:
         """For the results of a run."""
-        ends, mean = (
-            "results at 0 or full scale where the image is not",
-            "mean of the known pixels, after less before",
-        )
+        ends = "results at 0 or full scale where the image is not"
+        mean = "mean of the known pixels, after less before"
         return {
             "clipped pixels": measured(self.clipped, "1", "pixels of the image above its full scale"),
             "results at ends": measured(100 * self.share_at_ends, "%", ends),
@@ -188,7 +191,8 @@ class Tally:
     @property
     def exposure_figures(self) -> Mapping[str, Figure]:
         """What several exposures of the network were used for, for the results of a run."""
-        runs, pixels = "exposures that tiles asked for, mean of the tiles", "restored at an exposure above 1"
+        runs = "exposures that tiles asked for, mean of the tiles"
+        pixels = "restored at an exposure above 1"
         share = 100 * self.brightened / max(self.known, 1)
         return {
             "network runs": measured(self.runs / max(self.tiles, 1), "run/tile", runs),
@@ -205,7 +209,8 @@ class Tally:
     @property
     def doubts(self) -> list[str]:
         """What a user should look at, a clause each; of the network's results, before the consistency step."""
-        found, given = [], self.network
+        found = []
+        given = self.network
         before = "before the consistency step, " if self.change_squared else ""
         if self.clipped > MANY_AT_ENDS * max(self.compared, 1):
             found.append(f"{self.clipped} pixels of the image, nearly all, are above full scale")
@@ -223,7 +228,8 @@ class Tally:
         given = self.network
         impossible = given.share_at_ends > MANY_AT_ENDS or abs(given.moved) > FAR or given.flat
         if self.known >= FEW and (impossible or self.clipped > MANY_AT_ENDS * max(self.compared, 1)):
-            expected, got = "a network that restores this image", "; ".join(self.doubts)
+            expected = "a network that restores this image"
+            got = "; ".join(self.doubts)
             remedy = (
                 "check its scale with 'gate' and the image's `full_scale`, or write it all the same: `any_result`"
             )

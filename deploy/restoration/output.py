@@ -60,7 +60,9 @@ class Checkpoint:
             cog_bytes: of disk that the output takes beside the rows and the plain TIFF.
             row_ends: at which row of pixels each row of tiles ends; a journal of other rows is refused.
         """
-        self.out, self.shape, self.dtype = out, shape, dtype
+        self.out = out
+        self.shape = shape
+        self.dtype = dtype
         self.folder = part_folder(out)
         for name in ROWS_FILES:
             require_regular(self.folder / name)
@@ -94,7 +96,8 @@ class Checkpoint:
                 os.fsync(stream.fileno())
             rows_px = row.pixels.shape[1]
             self._finished.append(FinishedRow(rows_px, row.pixels.nbytes, digest.hexdigest(), row.tally))
-            self.rows, self.tally = self.rows + rows_px, self.tally + row.tally
+            self.rows = self.rows + rows_px
+            self.tally = self.tally + row.tally
             self._write_journal()
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
@@ -106,7 +109,8 @@ class Checkpoint:
     def require_known(self, name: str) -> None:
         """Refuse an image, `name` in messages, that has no pixels with values."""
         if not self.tally.known:
-            got, remedy = "NaN or nodata everywhere", "check that it is the right file"
+            got = "NaN or nodata everywhere"
+            remedy = "check that it is the right file"
             raise ImageError(name, expected="some pixels with values", got=got, remedy=remedy)
 
     def remove(self) -> None:
@@ -142,12 +146,14 @@ class Checkpoint:
             if planned and max(ends, default=0) <= self.shape[1]:
                 return finished
         expected = "the image, the model and the options of the run that was stopped"
-        got, remedy = f"others, or a damaged {path}", "run it as before, or start afresh without `resume`"
+        got = f"others, or a damaged {path}"
+        remedy = "run it as before, or start afresh without `resume`"
         raise OptionError("resume", expected=expected, got=got, remedy=remedy)
 
     def _matching(self, finished: list[FinishedRow]) -> list[FinishedRow]:
         """Return the rows of tiles down to the first one whose pixels are not those that the journal states."""
-        matching, top = list[FinishedRow](), 0
+        matching = list[FinishedRow]()
+        top = 0
         for row in finished:
             if self._stored(top, row.rows_px) != (row.size_bytes, row.sha256):
                 break
@@ -157,7 +163,8 @@ class Checkpoint:
 
     def _stored(self, top: int, rows_px: int) -> tuple[int, str]:
         """Return the size in bytes and the digest of rows of pixels that are stored; fewer bytes where it ends."""
-        size_bytes, digest = 0, hashlib.sha256()
+        size_bytes = 0
+        digest = hashlib.sha256()
         with suppress(OSError), (self.folder / "rows.raw").open("rb") as stream:
             for band in range(self.shape[0]):
                 stream.seek(self._offset(band, top))
@@ -167,7 +174,8 @@ class Checkpoint:
         return size_bytes, digest.hexdigest()
 
     def _write_journal(self) -> None:
-        path, fresh = self.folder / "journal.json", self.folder / "journal.new"
+        path = self.folder / "journal.json"
+        fresh = self.folder / "journal.new"
         with fresh.open("w", encoding="utf-8") as stream:
             stream.write(journal_text(self._job, self._finished))
             stream.flush()
@@ -230,7 +238,8 @@ def require_codec(compression: Compression) -> None:
     except (ValueError, KeyError, ImportError) as error:
         if not isinstance(error, ImportError) and "imagecodecs" not in str(error):
             raise  # a fault of the writer, whatever is installed
-        got, remedy = " ".join(str(error).split()), "pip install 'beers-deploy[codecs]' or use zlib"
+        got = " ".join(str(error).split())
+        remedy = "pip install 'beers-deploy[codecs]' or use zlib"
         raise MissingExtraError("compression", expected="an installed codec", got=got, remedy=remedy) from error
 
 
@@ -253,7 +262,8 @@ def write_output(
         compression: of the TIFF; none where it is on its way to be cloud-optimised.
         to_cog: writes the TIFF again, cloud-optimised; None leaves it as it is.
     """
-    fresh, bands = checkpoint.folder / PLAIN, checkpoint.shape[0]
+    fresh = checkpoint.folder / PLAIN
+    bands = checkpoint.shape[0]
     planes = bands + source.raster.has_alpha
     plain_bytes = padded_px((planes, *checkpoint.shape[1:]), TILE_PX) * checkpoint.dtype.itemsize
     with checkpoint.disk():
@@ -271,7 +281,8 @@ def write_output(
                 mask = _squares_of(_veil(checkpoint, source), np.dtype(bool), compression)
                 file.write(shape=checkpoint.shape[1:], photometric="mask", subfiletype=MASK, **mask)
         if to_cog is not None:
-            plain, fresh = fresh, checkpoint.folder / COG
+            plain = fresh
+            fresh = checkpoint.folder / COG
             to_cog(plain, fresh)
         with fresh.open("r+b") as stream:
             os.fsync(stream.fileno())
@@ -327,7 +338,8 @@ def _strips(checkpoint: Checkpoint, source: Source) -> Iterator[np.ndarray]:
 
 def _veil(checkpoint: Checkpoint, source: Source) -> Iterator[np.ndarray]:
     """Rows of squares of the image's alpha as stored, or of its mask as bool, enlarged with the image."""
-    scale, read = checkpoint.shape[2] // source.raster.width_px, source.veil
+    scale = checkpoint.shape[2] // source.raster.width_px
+    read = source.veil
     if read is None:
         raise ValueError("no veil")
     for top, bottom in strips(checkpoint.shape[1], TILE_PX):

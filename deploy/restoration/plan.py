@@ -44,7 +44,8 @@ def plan_side(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1, lea
     """
     if tile_px < 2 * halo_px + lattice_px or halo_px < 0:
         least = f", {2 * halo_px + lattice_px} px at least" if lattice_px > 1 else ""
-        expected, remedy = f"more than twice the halo of {halo_px} px{least}", "take larger tiles or a smaller halo"
+        expected = f"more than twice the halo of {halo_px} px{least}"
+        remedy = "take larger tiles or a smaller halo"
         raise OptionError("tile", expected=expected, got=f"{tile_px} px", remedy=remedy)
     whole_px = _up(max(size_px, least_px), lattice_px)
     return list(_spans(size_px, whole_px, min(tile_px // lattice_px * lattice_px, whole_px), halo_px))
@@ -168,7 +169,8 @@ def plan_for(network: onnx.ModelProto, shape: tuple[int, int, int], options: Opt
     tiling, (_, height_px, width_px) = tiling_of(network, str(options.model)), shape
     if tiling.fixed_px is not None and (tiling.fixed_px != options.tile_px or min(shape[1:]) < tiling.fixed_px):
         expected = f"{tiling.fixed_px}, the size the model is fixed to, and an image at least as large"
-        got, remedy = f"tile {options.tile_px}, image {width_px} x {height_px}", "take a network of free sizes"
+        got = f"tile {options.tile_px}, image {width_px} x {height_px}"
+        remedy = "take a network of free sizes"
         raise OptionError("tile", expected=expected, got=got, remedy=remedy)
     return make_plan(shape, options.tile_px, parse_halo(options.halo, tiling.halo_px), tiling)
 
@@ -192,7 +194,8 @@ def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling
 def _require_fit(bands: int, halo_px: int, tiling: Tiling) -> None:
     """That a network can restore an image of so many bands, with such a halo."""
     if tiling.scale.denominator != 1:
-        got, remedy = f"one of {tiling.scale} of it", "add what enlarges it to the network"
+        got = f"one of {tiling.scale} of it"
+        remedy = "add what enlarges it to the network"
         raise ModelError("tiled model", expected="a result of the image's size or a multiple", got=got, remedy=remedy)
     if tiling.channels_in not in (1, bands):
         expected = f"an image of {tiling.channels_in} bands, as the network takes them"

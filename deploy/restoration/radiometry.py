@@ -63,5 +63,6 @@ def require_room(raster: Raster, full_scale: float) -> None:
     """That restored pixels up to full scale fit into the output's type."""
     kind = raster.out_dtype
     if kind.kind == "u" and full_scale > np.iinfo(kind).max:
-        expected, remedy = f"at most {np.iinfo(kind).max} for {kind} pixels", "convert the image to uint16"
+        expected = f"at most {np.iinfo(kind).max} for {kind} pixels"
+        remedy = "convert the image to uint16"
         raise OptionError("full_scale", expected=expected, got=f"{full_scale:g}", remedy=remedy)

@@ -77,10 +77,12 @@ def restore_file(
     if options.scheduler is None:
         require_cores("threads", options.threads)
     with begun(image, out, options, beside) as stored, open_cluster(options.scheduler) as cluster:
-        raster, begun_with = stored.raster, stamps(stored.files)
+        raster = stored.raster
+        begun_with = stamps(stored.files)
         paths = in_order(options.bands, raster) if options.bands else [options.model]
         read = [read_network(path) for path in paths]
-        networks, digests = [network for network, _ in read], ", ".join(digest for _, digest in read)
+        networks = [network for network, _ in read]
+        digests = ", ".join(digest for _, digest in read)
         require_alike(networks, paths)
         plan = plan_for(networks[0], raster.shape, options)
         log(plan.sentence)
@@ -114,7 +116,8 @@ def restore_file(
             to_cog = partial(write_cog, compression=options.compression, about=about) if options.cog else None
             write_output(checkpoint, source, Compression.none if to_cog else options.compression, to_cog)
             write_list(faults, list_beside(out, options.fix_detectors))
-    time_s, tally = time.perf_counter() - started - check_s, checkpoint.tally
+    time_s = time.perf_counter() - started - check_s
+    tally = checkpoint.tally
     if tally.clipped:
         share = tally.clipped / prod(raster.shape)
         doubt = f": {share:.0%} of the image; is that its full scale?" if share > MANY else ""
@@ -198,7 +201,8 @@ def _opened(
     threads = 1 if cluster else options.threads
     at_once = tiles_at_once(threads, plan.tiles)
     opened = [open_runtime(options.runtime, network, threads, at_once) for network in networks]
-    infers, runtime = [infer for infer, _ in opened], opened[0][1]
+    infers = [infer for infer, _ in opened]
+    runtime = opened[0][1]
 
     def at_first_call(network: onnx.ModelProto) -> Infer:
         if cluster is None:
@@ -337,7 +341,8 @@ def _write_behind(restored: Iterable[RestoredRow], checkpoint: Checkpoint) -> No
 
 def plan_figures(plan: Plan) -> dict[str, Figure]:
     """How an image is cut: known, but not measured."""
-    numbers, source = {"tiles": plan.tiles, "work factor": plan.work_factor}, "arithmetic on the plan of tiles"
+    numbers = {"tiles": plan.tiles, "work factor": plan.work_factor}
+    source = "arithmetic on the plan of tiles"
     return {key: predicted(number, "1", (number, number), source) for key, number in numbers.items()}
 
 
@@ -352,7 +357,8 @@ def seam_figures(source: Source, plan: Plan, restorer: Restorer) -> dict[str, Fi
     if plan.tiling.fixed_px is not None:
         reason = "the network is fixed to one tile size: no wider window to compare with"
         return dict.fromkeys(keys, unavailable("DN", reason))
-    rows, columns = plan.rows[len(plan.rows) // 2], plan.columns[len(plan.columns) // 2]
+    rows = plan.rows[len(plan.rows) // 2]
+    columns = plan.columns[len(plan.columns) // 2]
     ends_px = plan.rows[-1].stop, plan.columns[-1].stop
     wide = [_widened(span, plan.radius_px, end_px) for span, end_px in zip((rows, columns), ends_px, strict=True)]
     strip = restorer.read(source, min(rows.start, wide[0].start), max(rows.stop, wide[0].stop))
@@ -369,7 +375,8 @@ def _widened(span: Span, radius_px: int, size_px: int) -> Span:
 
     What is kept ends on the network's lattice, or with the image: then what is read ends with the extension too.
     """
-    start, stop = max(span.keep_start - radius_px, 0), min(span.keep_stop + radius_px, size_px)
+    start = max(span.keep_start - radius_px, 0)
+    stop = min(span.keep_stop + radius_px, size_px)
     stop = size_px if span.stop == size_px else stop
     return Span(start, stop, span.keep_start, span.keep_stop)
 

@@ -45,7 +45,8 @@ def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tup
             network.reshape(list(shape))
             return core.compile_model(network, "CPU", options)
         except RuntimeError as error:
-            got, remedy = " ".join(str(error).split())[:160], "take `runtime` onnxruntime"
+            got = " ".join(str(error).split())[:160]
+            remedy = "take `runtime` onnxruntime"
             raise ModelError("ONNX model", expected="one that OpenVINO runs", got=got, remedy=remedy) from error
 
     compiling = Lock()

@@ -153,7 +153,8 @@ def check_source(source: Source, sensors: Sequence[Sensor], full_scale: float) -
         sensors: one of all bands, or one of each.
         full_scale: the pixel value that is the sensors' largest digital number.
     """
-    bands, windows = source.raster.bands, band_windows(source)
+    bands = source.raster.bands
+    windows = band_windows(source)
     found = [held_against(seen, sensors[band % len(sensors)], full_scale) for band, seen in enumerate(windows)]
     if bands == 1:
         return found[0]
@@ -207,7 +208,8 @@ def held_against(windows: Sequence[np.ndarray], sensor: Sensor, full_scale: floa
         reason = "the pixels are not whole numbers: they were scaled, and the noise of rounding is not known"
         blurs = {f"MTF {axis} seen": unavailable("%", reason) for axis in AXES}
         return SensorCheck({"SNR seen": unavailable("ratio", reason), **blurs})
-    pixels, clipped_at = [window / step for window in windows], full_scale / step
+    pixels = [window / step for window in windows]
+    clipped_at = full_scale / step
     told = _told(sensor, clipped_at)
     blocks = join([cut_blocks(window, clipped_at) for window in pixels])
     line = fit_noise_model(blocks, np.random.default_rng(SEED))
@@ -223,7 +225,8 @@ def held_against(windows: Sequence[np.ndarray], sensor: Sensor, full_scale: floa
 
 def _told(sensor: Sensor, clipped_at: float) -> Told:
     generator = np.random.default_rng(SEED)
-    first, drawn = sensor.nominal(), (sensor.draw(generator) for _ in range(DRAWS))
+    first = sensor.nominal()
+    drawn = (sensor.draw(generator) for _ in range(DRAWS))
     return Told([first, *(each for each in drawn if each != first)], clipped_at / first.max_dn)
 
 
@@ -232,7 +235,9 @@ def _noise(line: NoiseModel | Refusal, blocks: Blocks, told: Told) -> tuple[dict
     if isinstance(line, Refusal):
         return {"SNR seen": unavailable("ratio", line.reason)}, _smoothed(blocks, told)
     value = math.sqrt(math.prod(line.measured_dn))
-    seen, expected, first = line.at(value), told.variances(value), told.instruments[0]
+    seen = line.at(value)
+    expected = told.variances(value)
+    first = told.instruments[0]
     signal = max(value - told.unit * first.offset_dn, 0)
     radiance = signal / (told.unit * first.gain_dn_per_radiance)
     variances = seen.interval[1], seen.value, seen.interval[0], expected[0]
@@ -361,5 +366,6 @@ def _least_variance(values: np.ndarray, full_scale: float) -> np.ndarray:
     second on, lie below the noise line of every sensor of the range, also where the dark is above 0.
     """
     light = np.maximum(values / full_scale - OFFSET, 0)
-    dark, bright = RANGES["sigma_dark"][0] ** 2, RANGES["sigma_bright"][0] ** 2
+    dark = RANGES["sigma_dark"][0] ** 2
+    bright = RANGES["sigma_bright"][0] ** 2
     return np.asarray(full_scale**2 * np.minimum(16 * dark * light, bright))

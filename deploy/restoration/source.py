@@ -82,7 +82,8 @@ class Raster:
 
     def missing(self, pixels: np.ndarray) -> np.ndarray:
         """Where stored pixels hold no measurement: NaN, the nodata value, or masked; bool of the same shape."""
-        flags, held = np.ma.getmaskarray(pixels).copy(), np.ma.getdata(pixels)
+        flags = np.ma.getmaskarray(pixels).copy()
+        held = np.ma.getdata(pixels)
         if self.dtype.kind == "f":
             flags |= np.isnan(held)
         if self.nodata is not None:
@@ -248,7 +249,10 @@ class VeiledSource:
             held_bytes: memory that the mask takes beside the image, by rows at a time.
             files: that the mask lies in, where they are others.
         """
-        self._source, self._mask, self._mask_bytes, self.files = source, mask, held_bytes, (*source.files, *files)
+        self._source = source
+        self._mask = mask
+        self._mask_bytes = held_bytes
+        self.files = (*source.files, *files)
         bands = source.raster.bands - (mask is None)
         self.raster = replace(source.raster, bands=bands, veil=kind)
         self.veil: Plane | None = self._rows_of_veil
@@ -333,7 +337,8 @@ def _masked(source: Source, path: Path, stack: ExitStack) -> Source:
 
 
 def _with_mask(source: Source, mask: "PageRows", files: tuple[Path, ...]) -> Source:
-    raster, name = source.raster, str(mask.path)
+    raster = source.raster
+    name = str(mask.path)
     if mask.shape != (1, raster.height_px, raster.width_px) or raster.veil:
         got = "alpha or another mask beside it" if raster.veil else f"one of {times(mask.shape)}"
         raise ImageError(name, expected=f"one mask of {times(raster.shape[1:])}", got=got, remedy="keep one of them")
@@ -342,7 +347,8 @@ def _with_mask(source: Source, mask: "PageRows", files: tuple[Path, ...]) -> Sou
 
 def whole_source(path: Path) -> Source:
     """An image read whole: PNG or JPEG."""
-    pixels, alpha = read_pixels(path), read_alpha(path)
+    pixels = read_pixels(path)
+    alpha = read_alpha(path)
     dtype = require_numbers(str(path), pixels.dtype)
     bands = pixels[None] if pixels.ndim == 2 else np.moveaxis(pixels, 2, 0)
     planes = bands if alpha is None else np.concatenate([bands, alpha[None]])
@@ -359,7 +365,9 @@ class ArraySource:
     veil: Plane | None = None
 
     def __init__(self, pixels: np.ndarray, raster: Raster, files: tuple[Path, ...] = ()) -> None:
-        self._pixels, self.raster, self.files = pixels, raster, files
+        self._pixels = pixels
+        self.raster = raster
+        self.files = files
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), not copied."""
@@ -399,7 +407,8 @@ class PageRows:
     """
 
     def __init__(self, path: Path, page: tifffile.TiffPage) -> None:
-        self.path, self._page = path, page
+        self.path = path
+        self._page = page
         self._planes, _, height_px, width_px, self._samples = page.shaped
         self.shape = self._planes * self._samples, height_px, width_px
         self._dtype = np.dtype(page.dtype)
@@ -436,13 +445,15 @@ class PageRows:
 
     def _read_segments(self, start: int, stop: int) -> np.ndarray:
         size = self._segment_px
-        first, last = start // size, -(-stop // size)
+        first = start // size
+        last = -(-stop // size)
         self._held = {row: pixels for row, pixels in self._held.items() if first <= row < last}
         out = np.empty((self.shape[0], stop - start, self.shape[2]), self._dtype)
         for row in range(first, last):
             pixels = self._held[row] = self._held[row] if row in self._held else self._decode(row)
             top = row * size
-            low, high = max(start, top), min(stop, top + size)
+            low = max(start, top)
+            high = min(stop, top + size)
             out[:, low - start : high - start] = pixels[:, low - top : high - top]
         return out
 
@@ -451,11 +462,13 @@ class PageRows:
         page, (bands, _, width) = self._page, self.shape
         block = np.empty((self._planes, self._samples, self._segment_px, width), self._dtype)
         wanted = [(p * self._down + row) * self._across + c for p in range(self._planes) for c in range(self._across)]
-        offsets, counts = [page.dataoffsets[i] for i in wanted], [page.databytecounts[i] for i in wanted]
+        offsets = [page.dataoffsets[i] for i in wanted]
+        counts = [page.databytecounts[i] for i in wanted]
         jpeg = {"jpegtables": page.jpegtables, "jpegheader": page.jpegheader}
         for data, index in page.parent.filehandle.read_segments(offsets, counts, wanted):
             pixels, (plane, _, _, left, _), (_, rows, columns, _) = page.decode(data, index, **jpeg)
-            rows, columns = min(rows, self._segment_px), min(columns, width - left)
+            rows = min(rows, self._segment_px)
+            columns = min(columns, width - left)
             target = block[plane, :, :rows, left : left + columns]
             target[:] = page.nodata if pixels is None else np.moveaxis(pixels[0, :rows, :columns], 2, 0)
         return block.reshape(bands, self._segment_px, width)

@@ -43,7 +43,8 @@ def restore_file_traditionally(
     image: Path, out: Path, options: Options, log: Log = no_log, beside: Sequence[Path | None] = ()
 ) -> Row:
     """As `deploy.restoration.run.restore_file`, of a mono image, by the traditional pipeline of its one sensor."""
-    started, sensor = time.perf_counter(), options.sensors[""]
+    started = time.perf_counter()
+    sensor = options.sensors[""]
     chain = Chain(sensor.nominal(), sensor.reference.nominal())
     with begun(image, out, options, beside) as stored:
         raster = stored.raster
@@ -57,7 +58,8 @@ def restore_file_traditionally(
         extents = (raster.extent(source.read(*rows)) for rows in strips(raster.height_px, STRIP_PX))
         scale = full_scale_of(str(image), raster, extents, options.full_scale, options.sensor_bits)
         check, check_s = timed(partial(check_sensor, source, (), options, scale.value, name=str(image), log=log))
-        begun_with, digest = stamps(source.files), fingerprint(source.files)
+        begun_with = stamps(source.files)
+        digest = fingerprint(source.files)
         job = {"image": digest, "method": "traditional"}
         checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, resume=False)
         try:
@@ -97,7 +99,9 @@ def _counted(strips_read: Iterator[Tensor], bar: Steps) -> Iterator[Tensor]:
 
 
 def _fill(checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: float, name: str) -> None:
-    raster, to_dn, top = source.raster, chain.degraded.max_dn / full_scale, 0
+    raster = source.raster
+    to_dn = chain.degraded.max_dn / full_scale
+    top = 0
     with steps("restoring rows", raster.height_px) as bar:
         for strip in restore_strips(_read(source, to_dn, full_scale, name), raster.height_px, chain):
             stop = top + strip.shape[0]

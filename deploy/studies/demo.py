@@ -83,7 +83,8 @@ def run_demo(
     floating, int8 = (Network.load(name, sensor=sensors[0]) for name in (VARIANT, f"{VARIANT}-int8"))
     for name, network in (("float", floating), ("int8", int8), ("core", int8.core())):
         network.save(out / f"{name}.onnx")
-    float_file, int8_file = out / "float.onnx", out / "int8.onnx"
+    float_file = out / "float.onnx"
+    int8_file = out / "int8.onnx"
     verdict = gate(int8_file, float_file, sensor=sensors[0], patches=GATE_PATCHES, seed=seed)
     say("checking every operator against the DPU")
     placement = check(int8_file, tile=TILE_PX).placement
@@ -114,7 +115,8 @@ def load_sensors(name: str = SENSOR) -> tuple[Sensor, Sensor]:
     """The sensor that the demo simulates, and the one it imitates."""
     degraded = load_sensor(name)
     if degraded.nominal().bits != BITS:
-        got, remedy = f"{degraded.nominal().bits} bits", "use 'restore', with a full scale or the traditional method"
+        got = f"{degraded.nominal().bits} bits"
+        remedy = "use 'restore', with a full scale or the traditional method"
         raise OptionError("sensor", expected=f"a sensor of {BITS} bits", got=got, remedy=remedy)
     return degraded, reference_for(degraded)
 
@@ -144,7 +146,8 @@ def read_input(
 
 def bench_tables(model: Path, dn: np.ndarray, sensors: tuple[Sensor, Sensor]) -> list[Section]:
     """Speed for this image, for the swath of the paper beside its rows, and for that swath on every board."""
-    dpu, halo_px = load_dpu(DEFAULT_TARGET), tiling_of(load_onnx(model)).halo_px
+    dpu = load_dpu(DEFAULT_TARGET)
+    halo_px = tiling_of(load_onnx(model)).halo_px
     chain = measure_chain(dn, *sensors)
     rows = []
     for width, height in ((dn.shape[1], dn.shape[0]), SWATH_PX):
@@ -166,7 +169,8 @@ def bench_tables(model: Path, dn: np.ndarray, sensors: tuple[Sensor, Sensor]) ->
 
 def pictures_of(images: dict[str, np.ndarray], out: Path) -> list[Picture]:
     """Crops of several (H, W) images side by side, also written as before-after.png, and the INT8 result whole."""
-    side, stretch = min(CROP_PX, *images[INPUT].shape), stretch_of(images[INPUT])
+    side = min(CROP_PX, *images[INPUT].shape)
+    stretch = stretch_of(images[INPUT])
     windows = busiest_windows(images[INPUT], side)
     crops = strip(images, windows, side, ZOOM, stretch)
     with whole_file(out / "before-after.png") as temporary:
@@ -183,11 +187,13 @@ def pictures_of(images: dict[str, np.ndarray], out: Path) -> list[Picture]:
 def headline(bench: Sequence[Row], quality: Sequence[Row], placement: Placement) -> str:
     """One sentence: does it fit, how fast, at what quality."""
     latency = next(row for row in bench if "whole tiles" in row.name).figures["latency"]
-    cpu, board = bench[0].figures["latency"], DEFAULT_TARGET.upper()
+    cpu = bench[0].figures["latency"]
+    board = DEFAULT_TARGET.upper()
     fits = "fits" if placement.dpu_subgraphs == 1 and not placement.failed else "does not fit"
     text = f"{VARIANT} in INT8 {fits} the DPU whole: predicted {latency} s for this image on a {board}"
     text += f", against {cpu} s {cpu.mode} for the traditional pipeline on this CPU"
     if quality:
-        before, after = quality[0].figures["PSNR"], quality[-1].figures["PSNR"]
+        before = quality[0].figures["PSNR"]
+        after = quality[-1].figures["PSNR"]
         text += f"; PSNR rises from {before} to {after} dB (measured)"
     return f"{text}."

@@ -76,13 +76,16 @@ def stage_run(
 ) -> Run:
     """Return the run of a stage; the INT8 file whose roundings it trains with is made where it is not there."""
     folder = out / f"{number}-{stage.name}"
-    rounding, digest = None, ""
+    rounding = None
+    digest = ""
     if stage.rounding and start is not None:
         int8 = folder / "start-int8.onnx"
         if not int8.exists():
             save_onnx(family_model(Conditioned(recipe.variant, start), images), int8)
-        rounding, digest = rounding_of(int8, start), sha256(int8)
-    degraded, reference = load_sensor(SENSOR), load_sensor(REFERENCE)
+        rounding = rounding_of(int8, start)
+        digest = sha256(int8)
+    degraded = load_sensor(SENSOR)
+    reference = load_sensor(REFERENCE)
     family = SensorFamily(degraded.nominal(), other_curves=recipe.other_curves)
     patches = PatchRecipe(
         degraded,

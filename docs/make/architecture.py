@@ -32,7 +32,8 @@ def modules() -> dict[str, Path]:
 
 def imports_of(path: Path, known: dict[str, Path], *, late: bool = True) -> set[str]:
     """The modules of ours that a file imports: anywhere in it, or as it is loaded alone."""
-    found, tree = set[str](), ast.parse(path.read_text(encoding="utf-8"))
+    found = set[str]()
+    tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree) if late else tree.body:
         if isinstance(node, ast.Import):
             found |= {in_folder(alias.name) for alias in node.names}
@@ -49,7 +50,8 @@ def in_folder(module: str) -> str:
 
 def arrows() -> dict[str, set[str]]:
     """From each box to those that it needs."""
-    known, found = modules(), defaultdict[str, set[str]](set)
+    known = modules()
+    found = defaultdict[str, set[str]](set)
     for name, path in known.items():
         found[box_of(name)] |= {box_of(other) for other in imports_of(path, known)} - {box_of(name)}
     return dict(found)
@@ -57,7 +59,8 @@ def arrows() -> dict[str, set[str]]:
 
 def beyond(box: str, edges: dict[str, set[str]]) -> set[str]:
     """All that a box needs by way of others."""
-    seen, waiting = set[str](), list(edges.get(box, ()))
+    seen = set[str]()
+    waiting = list(edges.get(box, ()))
     while waiting:
         for further in edges.get(waiting.pop(), set()) - seen:
             seen.add(further)

@@ -66,7 +66,8 @@ def document() -> str:
     """The page as Markdown."""
     shown = ", ".join(f"{key} {value:g}" for values in SHOWN.values() for key, value in values.items())
     scene = procedural_scene(1500, 1500, np.random.default_rng(0)).radiance
-    order, count = ", ".join(ORDER[ORDER.index("sampling") + 1 :]), len(TABLES)
+    order = ", ".join(ORDER[ORDER.index("sampling") + 1 :])
+    count = len(TABLES)
     head = HEAD.format(count=count, order=order, shown=shown, tolerance=TOLERANCE_DN)
     return head + "\n".join(bounds(scene)) + "\n"
 

@@ -92,7 +92,8 @@ def shown(figure: Figure | None, interval: bool = True, digits: int | None = Non
         return str(figure["source"]) if figure and figure.get("unit") == "" else "-"
     if digits is None:
         digits = 0 if figure["unit"] == "ratio" and figure["value"] > 2 else DIGITS.get(figure["unit"], 2)
-    text, ends = f"{figure['value']:.{digits}f}", figure.get("interval")
+    text = f"{figure['value']:.{digits}f}"
+    ends = figure.get("interval")
     return f"{text} [{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]" if ends and interval else text
 
 

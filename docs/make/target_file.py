@@ -164,7 +164,8 @@ def accepted(limit: target_limits.Limits) -> str:
 
 def line(key: str, unit: str, meaning: str, limit: target_limits.Limits, constants: list[Constant]) -> str:
     """A key: what it is, its unit, the values among the shipped boards, and those that it can have."""
-    low, high = min(c.low for c in constants), max(c.high for c in constants)
+    low = min(c.low for c in constants)
+    high = max(c.high for c in constants)
     among = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
     return f"- `{key}`: {meaning} ({among}{f' {unit}' if unit != '1' else ''}; {accepted(limit)})"
 

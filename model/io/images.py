@@ -80,7 +80,8 @@ def damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
             remedy = "pip install 'beers-deploy[codecs]'"
             expected = "a TIFF compression known here"
             raise MachineError(name, expected=expected, got=str(error), remedy=remedy) from error
-        got, remedy = " ".join(str(error).split()) or type(error).__name__, "check that it is a whole image"
+        got = " ".join(str(error).split()) or type(error).__name__
+        remedy = "check that it is a whole image"
         raise ImageError(name, expected="a readable TIFF, PNG or JPEG", got=got[:120], remedy=remedy) from error
 
 
@@ -107,7 +108,8 @@ def image_size_px(path: Path) -> tuple[int, int]:
     with damage_in_a_sentence(path), warnings.catch_warnings(action="ignore"):
         if path.suffix.lower() in TIFF_SUFFIXES:
             with open_tiff(path) as file:
-                height, width = file.series[0].keyframe.imagelength, file.series[0].keyframe.imagewidth
+                height = file.series[0].keyframe.imagelength
+                width = file.series[0].keyframe.imagewidth
         else:
             with Image.open(path, formats=("PNG", "JPEG")) as image:
                 width, height = image.size
@@ -153,7 +155,9 @@ def _read_tiff(path: Path) -> np.ndarray:
 
 
 def _read_other(path: Path) -> np.ndarray:
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # our own check knows the free memory
+    # our own check knows the free memory
+    limit = Image.MAX_IMAGE_PIXELS
+    Image.MAX_IMAGE_PIXELS = None
     try:
         with (
             damage_in_a_sentence(path),
@@ -190,7 +194,8 @@ def _png_bits(path: Path) -> int | None:
 
 
 def _check_memory(path: Path, samples: int) -> None:
-    needed, free = samples * 4 * WORKING_COPIES, psutil.virtual_memory().available
+    needed = samples * 4 * WORKING_COPIES
+    free = psutil.virtual_memory().available
     if needed > free:
         room, size = sizes(free, needed)
         expected = f"an image that fits in {room} of free memory"
@@ -255,9 +260,11 @@ def settled_scale(
     if brightest == 0:  # black, or missing everywhere
         return usual
     if brightest > UNIT_MAX:
-        got, choices = "no whole numbers, as radiances are", f"{usual:g} for digital numbers, else your own"
+        got = "no whole numbers, as radiances are"
+        choices = f"{usual:g} for digital numbers, else your own"
     else:
-        got, choices = "which may be shares of it", f"1 for 0..1, {usual:g} for digital numbers"
+        got = "which may be shares of it"
+        choices = f"1 for 0..1, {usual:g} for digital numbers"
     raise _open(name, f"floats of at most {brightest:.3g}, {got}", remedy or f"{REMEDY} ({choices})")
 
 
@@ -299,7 +306,8 @@ def read_acquisition(
         raise ImageError(
             str(path), expected="one band", got=f"{pixels.shape[2]} bands", remedy="extract the panchromatic band"
         )
-    low, high = float(pixels.min()), float(pixels.max())
+    low = float(pixels.min())
+    high = float(pixels.max())
     settled = settled_scale(str(path), pixels.dtype, [extent_of(pixels)], full_scale, max_dn, remedy)
     if low < 0 or high > settled:
         expected = (

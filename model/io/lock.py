@@ -50,7 +50,8 @@ def _take(out: Path, folder: Path) -> BaseFileLock:
     """The lock, held; where there are no locks it holds nothing."""
     # A file that only stands for a lock would outlive a killed run: rather none where the system has none.
     if folder.is_symlink():
-        got, remedy = "a symbolic link", "remove it, or choose another output"
+        got = "a symbolic link"
+        remedy = "remove it, or choose another output"
         raise MachineError(str(folder), expected="a folder of this program", got=got, remedy=remedy)
     lock = FileLock(folder / NAME, timeout=GRACE_S, thread_local=False, fallback_to_soft=False)
     until_s = time.monotonic() + GRACE_S
@@ -59,12 +60,14 @@ def _take(out: Path, folder: Path) -> BaseFileLock:
             folder.mkdir(parents=True, exist_ok=True)
             lock.acquire()
         except Timeout as error:
-            got, remedy = "another one at work", "wait for its end or choose another output"
+            got = "another one at work"
+            remedy = "wait for its end or choose another output"
             raise MachineError(str(out), expected="no other run on this output", got=got, remedy=remedy) from error
         except OSError as error:
             if isinstance(error, FileNotFoundError) and time.monotonic() < until_s:
                 continue  # the folder went with a run that ended just now
             if error.errno not in NO_LOCKS:
-                got, remedy = error.strerror or str(error), "choose another path"
+                got = error.strerror or str(error)
+                remedy = "choose another path"
                 raise MachineError(str(folder), expected="a folder to write to", got=got, remedy=remedy) from error
         return lock

@@ -74,9 +74,11 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
             # Copies: the library's own lie in the file, which Windows then does not replace, and others may change.
             return {key: np.array(file.get_tensor(key)) for key in file.keys()}, header  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
-        got, remedy = unreadable(path) or " ".join(str(error).split())[:120], TRAINED
+        got = unreadable(path) or " ".join(str(error).split())[:120]
+        remedy = TRAINED
         if other := _other_format(path):
-            got, remedy = other.name, f"{TRAINED}, or an ONNX file of your own network: {other.remedy}"
+            got = other.name
+            remedy = f"{TRAINED}, or an ONNX file of your own network: {other.remedy}"
         raise ModelError(str(path), expected="safetensors weights", got=got, remedy=remedy) from error
 
 

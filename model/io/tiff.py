@@ -106,12 +106,15 @@ sizes from the packed bytes."""
 def check_page(path: Path, page: tifffile.TiffPage) -> None:
     """Refuse a page that would take more than its pixels do."""
     if page.compression not in KNOWN:
-        got, remedy = str(tifffile.COMPRESSION(page.compression).name), "write it with deflate, LZW or zstd"
+        got = str(tifffile.COMPRESSION(page.compression).name)
+        remedy = "write it with deflate, LZW or zstd"
         raise ImageError(str(path), expected="a TIFF compression known here", got=got, remedy=remedy)
-    needed, free = segment_bytes(page), psutil.virtual_memory().available
+    needed = segment_bytes(page)
+    free = psutil.virtual_memory().available
     if needed > free:
         room, size = sizes(free, needed)
-        expected, got = f"strips or tiles that fit in {room}", f"{size} for one"
+        expected = f"strips or tiles that fit in {room}"
+        got = f"{size} for one"
         raise MachineError(str(path), expected=expected, got=got, remedy="rewrite it in smaller tiles")
     _check_whole(path, page)
 
@@ -127,9 +130,11 @@ def segment_bytes(page: tifffile.TiffPage) -> int:
 def _check_whole(path: Path, page: tifffile.TiffPage) -> None:
     """Reading beyond the end would take the memory first, and find out then."""
     ends = (a + n for a, n in zip(page.dataoffsets, page.databytecounts, strict=True))
-    end, size = max(ends, default=0), path.stat().st_size
+    end = max(ends, default=0)
+    size = path.stat().st_size
     if end > size:
-        got, remedy = f"a file cut short at {size} of {end} bytes", "copy it again"
+        got = f"a file cut short at {size} of {end} bytes"
+        remedy = "copy it again"
         raise ImageError(str(path), expected="a whole TIFF", got=got, remedy=remedy)
 
 

@@ -29,7 +29,8 @@ def site_interval(
     count = len(set(sites))
     if count < LEAST_SITES:
         return None, f"no interval: {count} site{'s' if count > 1 else ''}, fewer than {LEAST_SITES}"
-    numbers, names = np.asarray(values, np.float64), np.asarray(sites)
+    numbers = np.asarray(values, np.float64)
+    names = np.asarray(sites)
     groups = [numbers[names == name] for name in np.unique(names)]
     sums, counts = (np.array([f(group) for group in groups]) for f in (np.sum, np.size))
     drawn = generator.integers(len(groups), size=(DRAWS, len(groups)))

@@ -169,8 +169,10 @@ def constant_columns(pixels: np.ndarray) -> np.ndarray:
     """
     same = np.fmax.reduce(pixels, axis=0) == np.fmin.reduce(pixels, axis=0)
     known = np.isfinite(pixels).sum(0)
-    still, moving = same & (known >= FEW), ~same & (known > 0)
-    left, right = np.roll(moving, 1), np.roll(moving, -1)
+    still = same & (known >= FEW)
+    moving = ~same & (known > 0)
+    left = np.roll(moving, 1)
+    right = np.roll(moving, -1)
     left[0] = right[-1] = False
     pair = still & np.roll(still, -1) & left & np.roll(right, -1)
     pair[-1] = False
@@ -202,7 +204,8 @@ def judge_lines(blocks: Blocks, least: float) -> Stripes:
     if not seen_at_all.any():
         return Stripes(dead=tuple(dead.tolist()))
     level = blocks.level[seen_at_all]
-    gains, errors = blocks.second[seen_at_all] / level, blocks.error[seen_at_all] / level
+    gains = blocks.second[seen_at_all] / level
+    errors = blocks.error[seen_at_all] / level
     errors = np.maximum(errors, 1e-6)
     gains = _without_parity(gains)
     mean, error = _combined(gains, errors)
@@ -317,9 +320,11 @@ def _alone(second: np.ndarray, error: np.ndarray, sure: float) -> np.ndarray:
     around = [padded[REACH + step : REACH + step + count] for step in range(-REACH, REACH + 1) if step]
     expected = np.array([-1 / 2 if abs(step) == 1 else 0.0 for step in range(-REACH, REACH + 1) if step])
     beside = np.array(around)
-    near, far = beside[2] + beside[3], beside[1] + beside[4]
+    near = beside[2] + beside[3]
+    far = beside[1] + beside[4]
     with np.errstate(invalid="ignore", divide="ignore"):
-        isolation, unsure = (far - near) / second, 2 * error / np.abs(second)
+        isolation = (far - near) / second
+        unsure = 2 * error / np.abs(second)
         slack = np.maximum(ASKEW * np.abs(second), 3 * error)
         like = np.all(np.abs(beside - expected[:, None] * second) < slack, axis=0)
         largest = np.all(np.abs(second) > np.abs(beside), axis=0)
@@ -340,7 +345,9 @@ def _grows(gains: np.ndarray, errors: np.ndarray, level: np.ndarray) -> bool | N
     use = (fits > 0) & np.isfinite(unsure)
     if use.sum() < 3 or np.ptp(np.log(levels[use])) < np.log(LEVELS):
         return None
-    x, y, weights = np.log(levels[use]), np.log(fits[use]), np.square(fits[use] / unsure[use])
+    x = np.log(levels[use])
+    y = np.log(fits[use])
+    weights = np.square(fits[use] / unsure[use])
     x, y = (each - np.average(each, weights=weights) for each in (x, y))
     power = float((weights * x * x).sum())
     slope = float((weights * x * y).sum()) / power

@@ -97,7 +97,8 @@ def judge_phases(measured: Sequence[tuple[np.ndarray, np.ndarray]], least: float
         known = np.isfinite(differences[:, number])
         if not known.any():
             continue
-        difference, error = differences[known, number], errors[known, number]
+        difference = differences[known, number]
+        error = errors[known, number]
         power = float(np.mean(np.square(difference) - np.square(error / TEXTURE)))
         strong = np.abs(difference) > SIGNIFICANT * error
         rms = float(np.sqrt(max(power, 0)))

@@ -44,7 +44,8 @@ def wrong_pixels(pixels: np.ndarray, step: float = 0.0) -> np.ndarray:
     windows = np.lib.stride_tricks.sliding_window_view(pixels, (size, size))
     patches = windows[places[:, 0] - PATCH_PX, places[:, 1] - PATCH_PX].astype(np.float64)
     known = np.isfinite(patches).sum((1, 2)) > KNOWN
-    places, patches = places[known], patches[known]
+    places = places[known]
+    patches = patches[known]
     return np.asarray(places[_wrong(patches, step)]) if len(places) else places
 
 

@@ -84,7 +84,8 @@ def plain_squares(
 def _squares(image: np.ndarray, noise: Noise, effort: Effort) -> np.ndarray:
     """Squares (N, S, S) around the steepest places, no centre in another's middle."""
     rows, columns = _steepest(_steepness(image, noise, effort.step_px), effort)
-    taken, chosen = np.zeros(image.shape, bool), list[int]()
+    taken = np.zeros(image.shape, bool)
+    chosen = list[int]()
     for k, (row, column) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
         if not taken[row, column]:
             taken[row - HALF_PX : row + HALF_PX + 1, column - 3 : column + 4] = True
@@ -99,7 +100,8 @@ def _squares(image: np.ndarray, noise: Noise, effort: Effort) -> np.ndarray:
 def _steepest(steep: np.ndarray, effort: Effort) -> tuple[np.ndarray, np.ndarray]:
     """Return rows and columns of the steepest place of each cell that is steep, the steepest of all first."""
     height, width = steep.shape
-    down, across = effort.cell_px[0] // effort.step_px, effort.cell_px[1]
+    down = effort.cell_px[0] // effort.step_px
+    across = effort.cell_px[1]
     padded = np.pad(steep, ((0, -height % down), (0, -width % across)))
     blocks = padded.reshape(padded.shape[0] // down, down, -1, across).swapaxes(1, 2)
     cells = blocks.reshape(*blocks.shape[:2], -1)
@@ -108,7 +110,8 @@ def _steepest(steep: np.ndarray, effort: Effort) -> tuple[np.ndarray, np.ndarray
     order = np.argsort(best, axis=None, kind="stable")[::-1][: int((best > MIN_STEEPNESS).sum())]
     cell_row, cell_column = np.divmod(order, best.shape[1])
     inner_row, inner_column = np.divmod(inner.ravel()[order], across)
-    rows, columns = cell_row * down + inner_row, cell_column * across + inner_column
+    rows = cell_row * down + inner_row
+    columns = cell_column * across + inner_column
     return MARGIN_PX + rows * effort.step_px, MARGIN_PX + columns
 
 
@@ -135,7 +138,8 @@ def _steepness(image: np.ndarray, noise: Noise, step_px: int) -> np.ndarray:
 
 def _flat(squares: np.ndarray, noise: Noise, roughness: float) -> np.ndarray:
     """Whether the three outer columns on either side scatter by noise alone: (N,) of bool."""
-    left, right = squares[:, :, :3], squares[:, :, -3:]
+    left = squares[:, :, :3]
+    right = squares[:, :, -3:]
     step = np.abs(right.mean((1, 2)) - left.mean((1, 2)))
     # The tails of the blur slope: what a column does along itself is what counts.
     scatter = [_scatter(side) - noise(side).mean((1, 2)) for side in (left, right)]
@@ -241,7 +245,8 @@ def _centre(values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
     off = np.abs(values - np.median(values))
     scatter = ROBUST * float(np.median(off))
     kept = off <= 3 * np.maximum(scatter, errors)
-    v, e = values[kept], errors[kept]
+    v = values[kept]
+    e = errors[kept]
     between = max(float(v.var(ddof=1)) - float((e**2).mean()), 0.0) if v.size > 1 else LONE_ERROR**2
     weights = 1 / (e**2 + between)
     return float((weights * v).sum() / weights.sum()), float(weights.sum() ** -0.5)

@@ -191,15 +191,20 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
         return fits
     y, x = (np.arange(size) - (size - 1) / 2 for size in (height, width))
     lines = centroids(pixels, y, x)
-    across, down = np.tile(x, height), np.repeat(y, width)
-    start, seen, left = lines.place, pixels.reshape(count, -1), np.arange(count)
+    across = np.tile(x, height)
+    down = np.repeat(y, width)
+    start = lines.place
+    seen = pixels.reshape(count, -1)
+    left = np.arange(count)
     for _ in range(PASSES):
         near = np.abs(across - lines.place[:, None] - lines.slope[:, None] * down) <= HALF_PX
         sizes = near.sum(1)
         for k in np.flatnonzero(sizes < 10 * HALF_PX):
             fits[left[k]] = Refusal(f"{sizes[k]} pixels near the edge, {10 * HALF_PX} are needed")
         enough = sizes >= 10 * HALF_PX
-        lines, left, near = lines.only(enough), left[enough], near[enough]
+        lines = lines.only(enough)
+        left = left[enough]
+        near = near[enough]
         solved = _solve(lines, across, down, seen[left], near, shape)
         moved, lines = _move(lines, solved.change)
         lost = (np.abs(lines.place - start[left]) > MAX_PLACE_PX) | (np.abs(lines.slope) > MAX_SLOPE)
@@ -207,7 +212,8 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
         for k in np.flatnonzero(done):
             at = left[k]
             fits[at] = _judged(lines, solved, int(k), int(near[k].sum()) - 5, pixels[at], limits, bool(shape))
-        lines, left = lines.only(~lost & ~done), left[~lost & ~done]
+        lines = lines.only(~lost & ~done)
+        left = left[~lost & ~done]
         if not left.size:
             break
     return fits
@@ -244,7 +250,8 @@ def _solve(lines: _Lines, x: np.ndarray, y: np.ndarray, seen: np.ndarray, near: 
     step = levels[:, 1, None] * near
     rise = _at_distances(tables, distance + 0.1) - _at_distances(tables, distance - 0.1)
     rise *= step / 0.2 / lean
-    low, high = np.maximum(lines.gamma - 0.15, 0.0), np.minimum(lines.gamma + 0.15, float(GAMMAS[-1]))
+    low = np.maximum(lines.gamma - 0.15, 0.0)
+    high = np.minimum(lines.gamma + 0.15, float(GAMMAS[-1]))
     softer = (_at_gammas(high, shape) - _at_gammas(low, shape)) / (high - low)[:, None]
     terms = np.stack(
         [plateaus[:, 0], plateaus[:, 1], -rise, -rise * y, _at_distances(softer, distance) * step], axis=1
@@ -267,7 +274,9 @@ def _judged(
     lines: _Lines, solved: _Solved, k: int, count: int, pixels: np.ndarray, limits: Limits, steeper: bool
 ) -> Fit:
     """Return edge `k` if it keeps to the limits."""
-    gamma, chi2, step = float(lines.gamma[k]), float(solved.chi2[k]), float(solved.step[k])
+    gamma = float(lines.gamma[k])
+    chi2 = float(solved.chi2[k])
+    step = float(solved.step[k])
     scatter = chi2 / count
     misfit = math.sqrt(max(scatter - 1, 0.0)) / max(step, 1e-9)
     error = math.sqrt(float(solved.variance[k]) * max(scatter, 1.0))

@@ -43,7 +43,8 @@ def ssim(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
     from skimage.metrics import structural_similarity  # here, for PSNR alone needs none of its half second
 
     if min(image.shape) < MIN_SIDE_PX:
-        expected, got = f"at least {MIN_SIDE_PX} pixels a side", " x ".join(map(str, image.shape[::-1]))
+        expected = f"at least {MIN_SIDE_PX} pixels a side"
+        got = " x ".join(map(str, image.shape[::-1]))
         raise ImageError("SSIM", expected=expected, got=got, remedy="give larger images")
     # float64, or scikit-image would compute float32 images in float32 and be off by some 1e-8.
     pixels = (np.asarray(each, np.float64) for each in (image, reference))

@@ -196,7 +196,8 @@ class NoiseModel:
         dark, bright = self.measured_dn
         beyond = max(math.log(dark / dn), math.log(dn / bright), 0.0)
         # What texture leaked is taken off by a straight line, which may be wrong by a part of it.
-        wider, model = 1 + beyond, 0.04 + 0.2 * self.leak
+        wider = 1 + beyond
+        model = 0.04 + 0.2 * self.leak
         low, high = (value + wider * (end - value) for end in (min(low, value), max(high, value)))
         return Variance(value, (max(low - model * value, 0.0), high + model * value), beyond > 0)
 
@@ -291,7 +292,8 @@ def _fitted(blocks: Blocks, weights: np.ndarray, seen: np.ndarray | None = None)
     from scipy.optimize import nnls
 
     seen = blocks.fine if seen is None else seen
-    size, fit = np.full(seen.size, max(float(weights @ seen / weights.sum()), ROUNDING)), np.zeros(3)
+    size = np.full(seen.size, max(float(weights @ seen / weights.sum()), ROUNDING))
+    fit = np.zeros(3)
     for _ in range(4):
         noise = blocks.noise(fit) if fit.any() else size
         terms = np.stack([blocks.mean, np.ones(seen.size), np.maximum(blocks.structure - noise, 0)], axis=1)

@@ -76,7 +76,8 @@ class Backbone(nn.Module):
 
     def __init__(self, network: str, *, l2_pool: bool = False) -> None:
         super().__init__()
-        self.network, self.spec = network, BACKBONES[network]
+        self.network = network
+        self.spec = BACKBONES[network]
         layers = {"squeeze": _squeezenet, "vgg": _vgg16}[network]()
         if l2_pool:
             layers = [L2Pool() if isinstance(layer, nn.MaxPool2d) else layer for layer in layers]
@@ -90,7 +91,8 @@ class Backbone(nn.Module):
         """
         colour = image.to(next(self.parameters()).dtype).expand(-1, 3, -1, -1)
         mean, std = (colour.new_tensor(x)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
-        x, found = (colour - mean) / std, [colour]
+        x = (colour - mean) / std
+        found = [colour]
         for index, layer in enumerate(self.features):
             x = layer(x)
             if index in self.spec.taps:
@@ -222,7 +224,8 @@ class Lpips(nn.Module):
 
     def __init__(self, backbone: Backbone, heads: Sequence[Tensor]) -> None:
         super().__init__()
-        self.backbone, self.label = backbone, f"LPIPS-{backbone.network}"
+        self.backbone = backbone
+        self.label = f"LPIPS-{backbone.network}"
         self.register_buffer("heads", torch.cat(list(heads)))
         self.requires_grad_(False).eval()
 
@@ -293,8 +296,10 @@ def _texture_and_structure(a: Tensor, b: Tensor, small: float = 1e-6) -> tuple[T
 
     Written as differences, not as 1 - (2 x y + c) / (x^2 + y^2 + c): identical images then give 0 to the last digit.
     """
-    mean_a, mean_b = a.mean(dim=(2, 3), keepdim=True), b.mean(dim=(2, 3), keepdim=True)
-    a, b = a - mean_a, b - mean_b
+    mean_a = a.mean(dim=(2, 3), keepdim=True)
+    mean_b = b.mean(dim=(2, 3), keepdim=True)
+    a = a - mean_a
+    b = b - mean_b
     texture = (mean_a - mean_b).square() / (mean_a.square() + mean_b.square() + small)
     variances = a.square().mean(dim=(2, 3)) + b.square().mean(dim=(2, 3))
     return texture.flatten(1), (a - b).square().mean(dim=(2, 3)) / (variances + small)

@@ -72,7 +72,9 @@ def _distance(image: np.ndarray, angle: float) -> np.ndarray | Refusal:
     """
     rows, columns = (np.arange(side) - (side - 1) / 2 for side in image.shape)
     across = columns[None, :] + rows[:, None] * math.tan(angle)
-    between, rise, shift = (across[:, 1:] + across[:, :-1]) / 2, np.diff(image, axis=1), 0.0
+    between = (across[:, 1:] + across[:, :-1]) / 2
+    rise = np.diff(image, axis=1)
+    shift = 0.0
     for _ in range(PASSES):
         weights = rise * _hamming(between - shift)
         total = float(weights.sum())
@@ -129,7 +131,8 @@ class Plateaus:
 def _fit_plateaus(image: np.ndarray, distance: np.ndarray) -> Plateaus:
     """Least squares over all pixels beyond the window, both sides at once."""
     far = np.abs(distance) > WINDOW_PX
-    d, v = distance[far], image[far]
+    d = distance[far]
+    v = image[far]
     terms = np.stack([d < 0, d > 0, -1 / d], axis=1).astype(np.float64)
     low, high, tail = (float(c) for c in np.linalg.lstsq(terms, v, rcond=None)[0])
     sigma = float(np.sqrt(np.mean((v - terms @ (low, high, tail)) ** 2)))
@@ -144,8 +147,10 @@ def _mtf(image: np.ndarray, distance: np.ndarray, plateaus: Plateaus) -> float:
     have the right tails: what else it gets wrong stands in the bins.
     """
     near = np.abs(np.rint(distance * BINS_PER_PX)) <= HALF
-    place, values = distance[near] * BINS_PER_PX, image[near]
-    bins, centres = np.rint(place).astype(int), np.arange(-HALF, HALF + 1)
+    place = distance[near] * BINS_PER_PX
+    values = image[near]
+    bins = np.rint(place).astype(int)
+    centres = np.arange(-HALF, HALF + 1)
 
     def mean(x: np.ndarray) -> np.ndarray:
         counts, sums = (np.bincount(bins + HALF, weights, centres.size) for weights in (None, x))

@@ -208,7 +208,9 @@ def normal_equations(
     Returns:
         (PARTS, PARTS) and (PARTS,): left and right side for the weights of the curve.
     """
-    normal, curve, rest = edge.normal, edge.curve, edge.rest
+    normal = edge.normal
+    curve = edge.curve
+    rest = edge.rest
     if counts is not None:
         times = np.sqrt(counts[np.minimum(edge.strip, len(counts) - 1)])
         times = np.append(times, np.ones(NUMBERS))

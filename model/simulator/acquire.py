@@ -62,7 +62,9 @@ def simulate_planned(
 ) -> np.ndarray:
     """A scene with only the effects that its plan calls for: digital numbers (H / r - 2 margin, W / r - 2 margin)."""
     if "mtf" not in plan.skipped:
-        kept, width, ratio = without(sensor, plan.skipped), scene.radiance.shape[-1], scene.oversampling
+        kept = without(sensor, plan.skipped)
+        width = scene.radiance.shape[-1]
+        ratio = scene.oversampling
         return acquire(scene.spectrum, width, kept, ratio, draw, role, margin_px=margin_px, skip=plan.skipped)
     # Without any blur a target pixel is the mean of its scene pixels, which needs no transform.
     ratio, (height, width) = scene.oversampling, scene.radiance.shape
@@ -155,6 +157,7 @@ def crop_margin(image: np.ndarray, margin_px: int) -> np.ndarray:
     height, width = image.shape[-2:]
     if min(height, width) <= 2 * margin_px:
         expected = f"more than {2 * margin_px} target pixels a side, the margin that the blur needs"
-        got, remedy = f"{width} x {height} target pixels", "give a larger scene or a smaller oversampling"
+        got = f"{width} x {height} target pixels"
+        remedy = "give a larger scene or a smaller oversampling"
         raise ImageError("scene", expected=expected, got=got, remedy=remedy)
     return image[..., margin_px : height - margin_px, margin_px : width - margin_px]

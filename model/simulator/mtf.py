@@ -54,10 +54,12 @@ def mtf(fx: ArrayLike, fy: ArrayLike, blur: Blur, antialias_sigma_px: float = 0.
     Returns:
         (H, W) float64; complex128 for a point-spread function.
     """
-    fx, fy = np.asarray(fx, np.float64), np.asarray(fy, np.float64)
+    fx = np.asarray(fx, np.float64)
+    fy = np.asarray(fy, np.float64)
     if isinstance(blur, Response):
         if antialias_sigma_px:
-            expected, got = "none beside a whole response", f"one of {antialias_sigma_px:g} px beside the {blur}"
+            expected = "none beside a whole response"
+            got = f"one of {antialias_sigma_px:g} px beside the {blur}"
             remedy = "leave it out: it is part of that"
             raise OptionError("anti-alias filter", expected=expected, got=got, remedy=remedy)
         return np.asarray(blur.at(fx, fy))
@@ -107,7 +109,8 @@ def transfer_function(
     """
     aslant = isinstance(blur, PointSpread)
     vertical = np.fft.fftfreq if aslant else np.fft.rfftfreq
-    fy, fx = vertical(height, 1 / oversampling), np.fft.rfftfreq(width, 1 / oversampling)
+    fy = vertical(height, 1 / oversampling)
+    fx = np.fft.rfftfreq(width, 1 / oversampling)
     found = mtf(fx[None, :], fy[:, None], blur, antialias_sigma_px)
     if smear_px:
         found = found * smear_response(fy[:, None], smear_px)

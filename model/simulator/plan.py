@@ -37,7 +37,8 @@ class SceneStats:
 
 def scene_stats(radiance: np.ndarray, oversampling: int) -> SceneStats:
     """Statistics of a scene's radiance (H, W), in one pass over it."""
-    low, high = float(radiance.min()), float(radiance.max())
+    low = float(radiance.min())
+    high = float(radiance.max())
     step = max(float(np.abs(radiance[1:] - radiance[:-1]).max()), float(np.abs(radiance[0] - radiance[-1]).max()))
     height, width = radiance.shape
     return SceneStats(low, high, step, height, width, oversampling)
@@ -79,7 +80,8 @@ def behind(name: str, change_dn: float, sensor: Instrument) -> float:
     Spilling adds its share, PRNU its largest gain, and noise changes with the signal under it:
     |sqrt(a) - sqrt(b)| <= min(sqrt|a - b|, |a - b| / (2 sqrt(beta))).
     """
-    gain, change = sensor.gain_dn_per_radiance, change_dn
+    gain = sensor.gain_dn_per_radiance
+    change = change_dn
     for later in ORDER[ORDER.index(name) + 1 :]:
         effect = sensor.effects.get(later)
         if isinstance(effect, PixelEffect):
@@ -151,7 +153,8 @@ class Plan:
 def make_plan(sensor: Instrument, stats: SceneStats, tolerance_dn: float = TOLERANCE_DN) -> Plan:
     """Decide for every effect of a sensor on a scene of these statistics."""
     bounds = effect_bounds(sensor, stats)
-    spent, hidden = 0.0, set()
+    spent = 0.0
+    hidden = set()
     # Smallest first: as many effects as the tolerance can pay for are left out.
     for name, change in sorted(bounds.items(), key=lambda item: item[1]):
         if change > 0 and spent + change <= tolerance_dn:
@@ -166,12 +169,16 @@ def make_plan(sensor: Instrument, stats: SceneStats, tolerance_dn: float = TOLER
 
 def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
     """Largest change of any pixel by each effect that can be left out, in DN, through all that comes after it."""
-    gain, ringing = sensor.gain_dn_per_radiance, ringing_of(sensor, stats)
+    gain = sensor.gain_dn_per_radiance
+    ringing = ringing_of(sensor, stats)
     # A blur whose kernel sums to 1, in absolute values to `ringing`: |k * (L - m)| <= ringing * span / 2.
     span = stats.high - stats.low
-    middle, reach = (stats.low + stats.high) / 2, ringing * span / 2
-    low, high = middle - reach, middle + reach
-    total, bounds = ringing, {}
+    middle = (stats.low + stats.high) / 2
+    reach = ringing * span / 2
+    low = middle - reach
+    high = middle + reach
+    total = ringing
+    bounds = {}
     if "smear" in sensor.effects:
         # The smear's kernel less a pulse sums to 0: it sees at most half its size times the span, or steps times
         # moment; the blur behind it enlarges that by its ringing.
@@ -179,7 +186,8 @@ def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
         direct = gain * ringing * min(size * span, moment * stats.step_along)
         bounds["smear"] = behind("smear", direct, sensor)
         # The smear widens the range that every later effect may meet, whether it is applied or left out.
-        low, high = low - direct / gain, high + direct / gain
+        low = low - direct / gain
+        high = high + direct / gain
         # Its kernel is a unit pulse and all that differs from it.
         total *= 1 + 2 * size
     # The blurred pixel and the plain mean of its scene pixels lie in one range: they differ by its width at most.
@@ -187,14 +195,18 @@ def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
     for name, effect in pixel_effects(sensor.effects, "radiance").items():
         direct = effect.bound_dn(sensor, low, high)
         bounds[name] = behind(name, direct, sensor)
-        low, high = low - direct / gain, high + direct / gain  # whether it is applied or not
+        # whether it is applied or not
+        low = low - direct / gain
+        high = high + direct / gain
     noise = gain * NOISE_LIMIT * sensor.noise_sigma(max(high, 0.0))
     bounds["noise"] = behind("noise", noise, sensor)
-    low, high = low - noise / gain, high + noise / gain
+    low = low - noise / gain
+    high = high + noise / gain
     for name, effect in pixel_effects(sensor.effects, "DN").items():
         direct = effect.bound_dn(sensor, low, high)
         bounds[name] = behind(name, direct, sensor)
-        low, high = low - direct / gain, high + direct / gain
+        low = low - direct / gain
+        high = high + direct / gain
     return bounds
 
 

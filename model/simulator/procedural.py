@@ -71,7 +71,8 @@ def _forest(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.rand
     """Tree crowns: a shadow, a dark disc and a sunlit side, over the left third of the lower half."""
     width, height = size
     for _ in range(int(width * height / 2600)):
-        x, y = generator.uniform(0, width * 0.42), generator.uniform(height * 0.55, height)
+        x = generator.uniform(0, width * 0.42)
+        y = generator.uniform(height * 0.55, height)
         if x > width * 0.36 and generator.random() < 0.6:
             continue
         tree(draw, x, y, generator.uniform(14, 34), generator)
@@ -92,7 +93,8 @@ def _town(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random
     width, height = size
     angle = float(generator.uniform(-0.25, 0.25))
     place = turn(width * 0.72, height * 0.55, angle)
-    reach_x, reach_y = width * 0.3, height * 0.62
+    reach_x = width * 0.3
+    reach_y = height * 0.62
     for v in np.arange(-reach_y, reach_y, 420):
         _street(draw, place, [(-reach_x, v), (reach_x, v)], generator)
     for u in np.arange(-reach_x, reach_x + 1, 560):
@@ -120,7 +122,8 @@ def _street(
         draw.line([place(*p) for p in dash], fill=WHITE * 0.7, width=4)
     for s in generator.uniform(40, max(length - 60, 41), int(length / 240)):
         side = 22 * float(generator.choice([-1, 1]))
-        u, v = u0 + along[0] * s - along[1] * side, v0 + along[1] * s + along[0] * side
+        u = u0 + along[0] * s - along[1] * side
+        v = v0 + along[1] * s + along[0] * side
         car = [(u - along[0] * a - along[1] * b, v - along[1] * a + along[0] * b) for a, b in rectangle(20, 9)]
         draw.polygon([shift(place(*p), 5) for p in car], fill=SHADOW)
         draw.polygon([place(*p) for p in car], fill=float(generator.choice([18, 60, 110, 190, 280])))
@@ -134,7 +137,8 @@ def _house(
     generator: np.random.Generator,
 ) -> None:
     """A gable roof, one slope in the sun, its shadow, a chimney and a tree in the yard."""
-    long, wide = generator.uniform(90, 130), generator.uniform(64, 92)
+    long = generator.uniform(90, 130)
+    wide = generator.uniform(64, 92)
     bright = float(generator.uniform(60, 160))
     roof = [(u, v), (u + long, v), (u + long, v + wide), (u, v + wide)]
     draw.polygon([shift(place(*p), 22) for p in roof], fill=SHADOW)
@@ -154,7 +158,8 @@ def _house(
 def _pattern(draw: ImageDraw.ImageDraw, size: tuple[int, int]) -> None:
     """A calibration site at the top: a slanted edge, a Siemens star and bar groups on a concrete pad."""
     side = min(size) * 0.22
-    left, top = size[0] * 0.36, size[1] * 0.08
+    left = size[0] * 0.36
+    top = size[1] * 0.08
     draw.rectangle((left, top, left + 2.6 * side, top + side), fill=CONCRETE)
     edge = [(left + 0.1 * side, top + 0.1 * side), (left + 0.45 * side, top + 0.1 * side)]
     slant = 0.8 * side * math.tan(math.radians(5))
@@ -180,7 +185,8 @@ def _star(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, sectors:
 def texture(height_px: int, width_px: int, generator: np.random.Generator) -> np.ndarray:
     """Multiplicative 1/f texture around 1, some 12 % rms: nothing on the ground is flat."""
     white = generator.standard_normal((height_px, width_px), dtype=np.float32)
-    fy, fx = np.fft.fftfreq(height_px)[:, None], np.fft.rfftfreq(width_px)[None, :]
+    fy = np.fft.fftfreq(height_px)[:, None]
+    fx = np.fft.rfftfreq(width_px)[None, :]
     radius = np.hypot(fx, fy)
     spectrum = fft.rfft2(white) / np.maximum(radius, 1 / 400).astype(np.float32)
     pattern = fft.irfft2(spectrum, s=(height_px, width_px))
@@ -210,7 +216,8 @@ def rectangle(half_long: float, half_wide: float) -> list[Point]:
 
 def turn(x: float, y: float, angle: float) -> Callable[[float, float], Point]:
     """From a turned frame centred at (x, y) to the canvas."""
-    cosine, sine = math.cos(angle), math.sin(angle)
+    cosine = math.cos(angle)
+    sine = math.sin(angle)
     return lambda u, v: (x + cosine * u - sine * v, y + sine * u + cosine * v)
 
 

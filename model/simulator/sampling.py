@@ -69,13 +69,17 @@ def resample(radiance: np.ndarray, height: int, width: int) -> np.ndarray:
     Not scikit-image's `resize`: its splines blur and alias, on a photograph by 26 of 255 and more (measured).
     """
     old_height, old_width = radiance.shape[-2:]
-    fy, fx = np.fft.fftfreq(old_height), np.fft.rfftfreq(old_width)
+    fy = np.fft.fftfreq(old_height)
+    fx = np.fft.rfftfreq(old_width)
     ramp_y, ramp_x = (
         _ramp(f, shift) for f, shift in ((fy, (old_height / height - 1) / 2), (fx, (old_width / width - 1) / 2))
     )
     spectrum = scene_spectrum(radiance) * ramp_y[:, None] * ramp_x
-    rows, columns = min(old_height, height), min(old_width, width)
-    top, bottom, half = (rows + 1) // 2, rows // 2, columns // 2 + 1
+    rows = min(old_height, height)
+    columns = min(old_width, width)
+    top = (rows + 1) // 2
+    bottom = rows // 2
+    half = columns // 2 + 1
     cut = np.zeros((height, width // 2 + 1), spectrum.dtype)
     cut[:top, :half] = spectrum[:top, :half]
     cut[height - bottom :, :half] = spectrum[old_height - bottom :, :half]

@@ -33,7 +33,8 @@ def filter_strips(strips: Iterable[Tensor], height: int, kernel: Tensor) -> Iter
     bit. NaN pixels are filled from their neighbours first, and NaN again in the end.
     """
     # The grid of blocks is fixed from row 0: the result may not depend on how the strips were cut.
-    rows, radius = Rows(strips), kernel.shape[0] // 2
+    rows = Rows(strips)
+    radius = kernel.shape[0] // 2
     for top in range(0, height, BLOCK_PX):
         bottom = min(top + BLOCK_PX, height)
         wide = rows.window(mirrored(top - radius, bottom + radius, height))
@@ -46,7 +47,8 @@ def _block(rows: Tensor, kernel: Tensor, left: int) -> Tensor:
 
     On one thread: with several inside, a transform adds in another order, and other last bits come out.
     """
-    radius, width = kernel.shape[0] // 2, rows.shape[1]
+    radius = kernel.shape[0] // 2
+    width = rows.shape[1]
     right = min(left + BLOCK_PX, width)
     block = rows[:, mirrored(left - radius, right + radius, width)]
     known = torch.isfinite(block)
@@ -87,6 +89,7 @@ def compensation_gain(height: int, width: int, blur_from: Blur, blur_to: Blur, e
     """
     if not 0 <= epsilon < float("inf"):
         raise OptionError("epsilon", expected="0 or more", got=repr(epsilon), remedy="a few thousandths are usual")
-    fy, fx = np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :]
+    fy = np.fft.fftfreq(height)[:, None]
+    fx = np.fft.rfftfreq(width)[None, :]
     r_squared = (fx**2 + fy**2) / NYQUIST**2
     return restoring_gain(mtf(fx, fy, blur_from), mtf(fx, fy, blur_to), r_squared, epsilon)

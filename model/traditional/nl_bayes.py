@@ -206,8 +206,10 @@ def window_distances(guide: Tensor, rows: Tensor, columns: Tensor, side_px: int,
         (R * C, window_px^2). The reference's distance to itself is -1: it wins every tie.
     """
     half = window_px // 2
-    box_rows, box_columns = _boxes(rows, side_px, guide.dtype), _boxes(columns, side_px, guide.dtype)
-    height, width = box_rows.shape[1], box_columns.shape[1]
+    box_rows = _boxes(rows, side_px, guide.dtype)
+    box_columns = _boxes(columns, side_px, guide.dtype)
+    height = box_rows.shape[1]
+    width = box_columns.shape[1]
     centre = guide[half : half + height, None, half : half + width]
     distances = guide.new_empty(len(rows), len(columns), window_px, window_px)
     for dy in range(window_px):
@@ -252,9 +254,11 @@ def denoise_pass(
     runs = reference_runs(height, stride_px)
     carried: Sums | None = None
     for run, following in zip(runs, [*runs[1:], None], strict=True):
-        top, bottom = int(run[0]) - margin, int(run[-1]) + stride_px + margin
+        top = int(run[0]) - margin
+        bottom = int(run[-1]) + stride_px + margin
         rows = mirrored(top, bottom, height)
-        noisy_rows, guide_rows = noisy.window(rows), guide.window(rows)
+        noisy_rows = noisy.window(rows)
+        guide_rows = guide.window(rows)
         sums = _row_of_tiles(noisy_rows, guide_rows, run - run[0], noise, settings, stride_px)
         # Tiles of two rows overlap: what the row above left below its own share counts here.
         if carried is not None:
@@ -276,19 +280,23 @@ def _row_of_tiles(
     noisy: Tensor, guide: Tensor, centres: Tensor, noise: Noise, settings: PassSettings, stride_px: int
 ) -> Sums:
     """The sums of one row of tiles over (h, W); `centres` count from the first reference's own."""
-    margin, width = settings.margin_px, noisy.shape[1]
+    margin = settings.margin_px
+    width = noisy.shape[1]
     wide = mirrored(-margin, width + stride_px - 1 + margin, width)
-    noisy_wide, guide_wide = noisy[:, wide], guide[:, wide]
+    noisy_wide = noisy[:, wide]
+    guide_wide = guide[:, wide]
     runs = reference_runs(width, stride_px)
 
     def estimate(run: Tensor) -> Sums:
         area = slice(int(run[0]), int(run[-1]) + stride_px + 2 * margin)
-        rows, columns = centres, run - run[0]
+        rows = centres
+        columns = run - run[0]
         if not bool(torch.isfinite(noisy_wide[:, area]).all()):  # what is left between missing pixels is narrow
             rows, columns = (torch.arange(int(place[-1]) + stride_px) for place in (rows, columns))
         return _tile(noisy_wide[:, area], guide_wide[:, area], (rows, columns), noise, settings)
 
-    total, count = torch.zeros_like(noisy_wide), torch.zeros_like(noisy_wide)
+    total = torch.zeros_like(noisy_wide)
+    count = torch.zeros_like(noisy_wide)
     for run, (tile_total, tile_count) in zip(runs, map_tiles(estimate, runs), strict=True):
         left = int(run[0])
         total[:, left : left + tile_total.shape[1]] += tile_total
@@ -302,8 +310,10 @@ def _tile(noisy: Tensor, guide: Tensor, places: Places, noise: Noise, settings: 
     if not bool(known.any()):
         return torch.zeros_like(noisy), torch.zeros_like(noisy)
     side = settings.side_px
-    patches, guides = patch_matrix(noisy.nan_to_num(0), side), patch_matrix(guide.nan_to_num(0), side)
-    total, count = torch.zeros_like(patches), patches.new_zeros(len(patches), 1)
+    patches = patch_matrix(noisy.nan_to_num(0), side)
+    guides = patch_matrix(guide.nan_to_num(0), side)
+    total = torch.zeros_like(patches)
+    count = patches.new_zeros(len(patches), 1)
     for numbers, taken in similar_groups(guide, known, places, settings):
         members = _rows_of(patches, numbers)
         model = _rows_of(guides, numbers) if settings.clean_guide else members
@@ -333,7 +343,8 @@ def similar_groups(
     first, steps = window_numbers(*places, guide.shape[1] - settings.side_px + 1, settings.window_px)
     if not bool(known.all()):
         _rule_out(distances, first + steps, patch_matrix(known, settings.side_px).all(1))
-    usual, most = settings.similar, min(settings.most_similar, distances.shape[1])
+    usual = settings.similar
+    most = min(settings.most_similar, distances.shape[1])
     candidate, nearest = nearest_first(distances, usual, most)
     # Beyond the usual number a patch of pass 2 still counts if its pixels differ by ALIKE_RMS at most.
     alike = ALIKE_RMS**2 * settings.side_px**2 if settings.clean_guide else 0.0

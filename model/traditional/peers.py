@@ -69,7 +69,8 @@ def _deconvolved(deconvolve: Callable[[np.ndarray, np.ndarray], np.ndarray], dn:
     """
     full_scale = chain.degraded.max_dn / chain.degraded.gain_dn_per_radiance
     rows, columns = (mirrored(-PAD_PX, size + PAD_PX, size) for size in dn.shape)
-    height, width = len(rows), len(columns)
+    height = len(rows)
+    width = len(columns)
     wide = ((dn.double() - chain.degraded.offset_dn) / chain.degraded.max_dn)[rows][:, columns].numpy()
     blur, target = (transfer_function(height, width, 1, s.blur) for s in (chain.degraded, chain.reference))
     sharp = fft.rfft2(deconvolve(wide, blur)) * target

@@ -84,7 +84,9 @@ def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Itera
     the image, and the tallest strip.
     """
     radiance = (to_radiance(strip, chain.degraded) for strip in finite_or_missing(strips))
-    sensor, kernel, quality = with_rounding_noise(chain.degraded), chain.kernel(), quality_named(chain.quality)
+    sensor = with_rounding_noise(chain.degraded)
+    kernel = chain.kernel()
+    quality = quality_named(chain.quality)
     if chain.order == "denoise-first":
         clean = denoise_radiance(radiance, height, sensor, Noise(WORKING_SIGMA), quality)
         restored = filter_strips(clean, height, kernel)

@@ -114,7 +114,9 @@ def measure(strips: Iterable[Tensor], sensor: Instrument) -> NoiseAndScene:
     a grid of its own, and the sums of the bands are added in their order.
     """
     digitised = with_rounding_noise(sensor)
-    sums, pixels, above = np.zeros(4), 0, None
+    sums = np.zeros(4)
+    pixels = 0
+    above = None
     for band in bands(strips):
         dn = band.double().numpy()
         radiance = to_radiance(dn, sensor)
@@ -154,7 +156,8 @@ def _sums(radiance: Array, above: Array | None, unsaturated: Mask, sensor: Instr
     across = np.diff(radiance, axis=1, prepend=np.nan)
     along = np.diff(radiance, axis=0, prepend=first)
     light, pixels = _blocks(radiance)
-    squares, axes = np.zeros_like(light), np.zeros_like(light)
+    squares = np.zeros_like(light)
+    axes = np.zeros_like(light)
     for differences in (across, along):
         total, pairs = _blocks(np.square(differences))
         squares += total / np.maximum(pairs, 1)
@@ -186,7 +189,8 @@ def difference_energy(sensor: Instrument) -> float:
 
     Frequency 0 does not count: the mean of an image is no contrast.
     """
-    fy, fx = np.fft.fftfreq(GRID)[:, None], np.fft.fftfreq(GRID)[None, :]
+    fy = np.fft.fftfreq(GRID)[:, None]
+    fx = np.fft.fftfreq(GRID)[None, :]
     r_squared = (fx**2 + fy**2) / NYQUIST**2
     r_squared[0, 0] = np.inf
     differences = 2 * np.sin(np.pi * fx) ** 2 + 2 * np.sin(np.pi * fy) ** 2

@@ -20,7 +20,8 @@ class Rows:
 
     def window(self, rows: Tensor) -> Tensor:
         """The rows of those numbers: (R,) to (R, W); windows must move downwards."""
-        top, bottom = int(rows.min()), int(rows.max()) + 1
+        top = int(rows.min())
+        bottom = int(rows.max()) + 1
         while self._top + sum(map(len, self._held)) < bottom:
             self._held.append(next(self._strips))
         # Strips above the window are never asked for again: forgetting them bounds the memory.

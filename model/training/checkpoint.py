@@ -53,7 +53,8 @@ class TrainingRecipe:
         numbers |= {f"weight of {term} in the loss": weight for term, weight in asdict(self.loss).items()}
         for name, value in numbers.items():
             if not (math.isfinite(value) and value >= 0):
-                expected, remedy = "a finite number, 0 or above", "correct it"
+                expected = "a finite number, 0 or above"
+                remedy = "correct it"
                 raise OptionError(name, expected=expected, got=f"{value:g}", remedy=remedy)
 
     def rate_at(self, step: int) -> float:
@@ -98,10 +99,13 @@ class Guards:
 
     def passed(self, step: int, loss: float) -> None:
         """Take note of a step's loss."""
-        self.sum, self.count = self.sum + loss, self.count + 1
+        self.sum = self.sum + loss
+        self.count = self.count + 1
         if self.count < WINDOW_STEPS:
             return
-        mean, self.sum, self.count = self.sum / self.count, 0.0, 0
+        mean = self.sum / self.count
+        self.sum = 0.0
+        self.count = 0
         if self.best is not None and mean > DIVERGED * self.best:
             raise _error(step, f"a loss near {self.best:.4g}", f"{mean:.4g}: it diverged")
         self.best = mean if self.best is None else min(self.best, mean)
@@ -193,7 +197,8 @@ def _check_parts(tensors: dict[str, Tensor], network: Network, steps: int) -> No
             wanted |= {f"moment.{name}.{moment}": parameter for moment in MOMENTS}
             wanted[f"moment.{name}.step"] = parameter.new_zeros(())
     for name, like in wanted.items():
-        value, moment = tensors[name], name.rsplit(".", 1)[1]
+        value = tensors[name]
+        moment = name.rsplit(".", 1)[1]
         if value.shape != like.shape or value.dtype != like.dtype:
             raise ValueError(f"a tensor {tuple(value.shape)} of {value.dtype} in place of {tuple(like.shape)}")
         least, most = {"step": (0, steps), "exp_avg_sq": (0, math.inf)}.get(moment, (-math.inf, math.inf))

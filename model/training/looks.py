@@ -52,7 +52,9 @@ class Looks:
 
     def draw(self, generator: np.random.Generator) -> Look:
         """Draw the look of one pass."""
-        light, contrast, softness_px = float(generator.uniform(*self.exposures)), 1.0, 0.0
+        light = float(generator.uniform(*self.exposures))
+        contrast = 1.0
+        softness_px = 0.0
         if generator.random() < self.lit_share:
             light = log_uniform(generator, self.lights)
         if generator.random() < self.calm_share:

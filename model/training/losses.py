@@ -44,14 +44,16 @@ class RestorationLoss:
     """The weighted sum of the terms, in float32 whatever the autocast around it; that of LPIPS where it is given."""
 
     def __init__(self, weights: LossWeights = PAPER, perceptual: Lpips | None = None) -> None:
-        self.weights, self.perceptual = weights, perceptual if weights.lpips else None
+        self.weights = weights
+        self.perceptual = perceptual if weights.lpips else None
 
     def __call__(self, restored: Tensor, reference: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
         """The loss, and its terms before weighting, of images (N, 1, H, W) in [0, 1] of full scale, not clipped."""
         weights = self.weights
         # In bfloat16 the differences of nearly equal images would lose most of their digits.
         with torch.autocast(restored.device.type, enabled=False):
-            restored, reference = restored.float(), reference.float()
+            restored = restored.float()
+            reference = reference.float()
             if weights.coarse != 1:
                 restored = restored - (1 - weights.coarse) * coarse(restored - reference)
             terms = {"l1": (restored - reference).abs().mean()}

@@ -139,7 +139,8 @@ def transfer_of(
         found = transfer_function(height, width, oversampling, blur, antialias_px, smear_px)
         return torch.from_numpy(found).to(device)
     down, across = frequencies(height, width, oversampling, device)
-    fy, fx = down[: height // 2 + 1, None].abs(), across[None]
+    fy = down[: height // 2 + 1, None].abs()
+    fx = across[None]
     radius = torch.hypot(fy, fx)
     if isinstance(blur, MtfTable):
         gamma_x, gamma_y = _table_gammas(blur, radius)

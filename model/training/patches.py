@@ -54,7 +54,8 @@ def draw_turn(generator: np.random.Generator, quarters: bool, mirrors: bool = Tr
     A plain network learns one sensor. Where its two axes differ they must not change places, and `quarters` is False:
     four symmetries are left. Where its blur is lopsided it stays as it is, and `mirrors` is False.
     """
-    quarter, mirrored = int(generator.integers(4)), bool(generator.integers(2))
+    quarter = int(generator.integers(4))
+    mirrored = bool(generator.integers(2))
     if not mirrors:
         return 0, False
     return quarter if quarters else quarter - quarter % 2, mirrored
@@ -75,7 +76,8 @@ def pair_files(folder: Path) -> list[Files]:
     degraded, reference = ({p.stem: p for p in list_images(folder / role)} for role in ("degraded", "reference"))
     alone = sorted(degraded.keys() ^ reference.keys())
     if alone:
-        expected, got = "each name in degraded/ and in reference/", f"{alone[0]!r} in one of them only"
+        expected = "each name in degraded/ and in reference/"
+        got = f"{alone[0]!r} in one of them only"
         remedy = "complete the pairs; 'beers-deploy simulate' writes such folders"
         raise ImageError(str(folder), expected=expected, got=got, remedy=remedy)
     return [(path, reference[name]) for name, path in degraded.items()]

@@ -137,7 +137,9 @@ class Validation:
     """
 
     def __init__(self, scenes: Sequence[Scene], degraded: Sensor | SensorFamily, reference: Sensor) -> None:
-        self.names, self.pairs, self.sensors = list[str](), list[tuple[Tensor, Tensor]](), list[Instrument]()
+        self.names = list[str]()
+        self.pairs = list[tuple[Tensor, Tensor]]()
+        self.sensors = list[Instrument]()
         for number, scene in enumerate(scenes):
             ratio = fitting_oversampling(scene.radiance, OVERSAMPLINGS, LEAST_SIDE_PX)
             if ratio is None:
@@ -252,7 +254,8 @@ def data_sha256(run: Run, loss: RestorationLoss) -> str:
         run: what the options say.
         loss: with or without LPIPS, whose weights may be missing at the second time.
     """
-    patches, files = run.patches, [file for folder in run.images for file in list_images(folder)]
+    patches = run.patches
+    files = [file for folder in run.images for file in list_images(folder)]
     for pair in pair_files(run.pairs) if run.pairs else []:
         files += pair
     stated = [
@@ -277,7 +280,8 @@ def data_sha256(run: Run, loss: RestorationLoss) -> str:
 
 def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
     """Where batches come from, the images held out, and the names of those trained on."""
-    recipe, sensors = run.recipe, (run.patches.family or run.patches.degraded, run.patches.reference)
+    recipe = run.recipe
+    sensors = (run.patches.family or run.patches.degraded, run.patches.reference)
     if run.pairs is not None:
         files = pair_files(run.pairs)
         degraded = run.patches.degraded
@@ -303,7 +307,8 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
 
 def read_scenes(run: Run) -> list[Scene]:
     """The images of the run's folders."""
-    files, scenes = [file for folder in run.images for file in list_images(folder)], list[Scene]()
+    files = [file for folder in run.images for file in list_images(folder)]
+    scenes = list[Scene]()
     if not files:
         return []
     with steps("reading", len(files)) as bar:

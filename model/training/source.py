@@ -70,7 +70,11 @@ class PatchSource:
         workers: int = 1,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.recipe, self.batch, self.seed, self.rank, self.workers = recipe, batch, seed, rank, workers
+        self.recipe = recipe
+        self.batch = batch
+        self.seed = seed
+        self.rank = rank
+        self.workers = workers
         common = int(np.lcm.reduce(recipe.oversamplings))
         self._scenes = [prepare(scene, common, device) for scene in scenes]
 
@@ -97,7 +101,9 @@ class PatchSource:
     def _shard(self, number: int) -> Batch:
         # Keyed by its number and not drawn in sequence: a resumed run makes the same shard.
         generator = Draw(self.seed, number * self.workers + self.rank).generator("shard")
-        wanted, visits, count = self.batch * self.SHARD_BATCHES, list[Visit](), 0
+        wanted = self.batch * self.SHARD_BATCHES
+        visits = list[Visit]()
+        count = 0
         for _ in range(50 * wanted):
             made = visit(self._scenes[generator.integers(len(self._scenes))], self.recipe, generator)
             if made is None:
@@ -174,7 +180,8 @@ def _told(patches: Tensor, sensor: Instrument, quarter: int, mirrored: bool) -> 
 def _told_of(sensor: Instrument, factor: int, quarter: int, mirrored: bool) -> tuple[Tensor, Bank]:
     """The vector (4,) and the bank of a sensor of `factor` times the gain, for patches that were turned."""
     brighter = replace(sensor, gain_dn_per_radiance=sensor.gain_dn_per_radiance * factor)
-    vector, bank = vector_tensor(brighter), network_bank(brighter)
+    vector = vector_tensor(brighter)
+    bank = network_bank(brighter)
     if quarter % 2:
         vector = vector[[1, 0, 2, 3]]
     details = turned(torch.from_numpy(bank.details), quarter, mirrored)

@@ -71,8 +71,13 @@ class Step:
         rounding: Rounding | None,
         agree: Agree | None,
     ) -> None:
-        self.network, self.loss, self.forward, self.agree = network, loss, forward, agree
-        self.gradient_norm, self.bfloat16, self.rounding = gradient_norm, bfloat16, rounding
+        self.network = network
+        self.loss = loss
+        self.forward = forward
+        self.agree = agree
+        self.gradient_norm = gradient_norm
+        self.bfloat16 = bfloat16
+        self.rounding = rounding
         self.device = next(network.parameters()).device
         self.average = {k: v.detach().clone() for k, v in network.state_dict().items()}
         rate = torch.zeros((), device=self.device)

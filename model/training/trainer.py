@@ -114,7 +114,8 @@ class Spent:
     """Time since it was made, and how much of it went into waiting for patches."""
 
     def __init__(self) -> None:
-        self.begun, self.waited_s = time.monotonic(), 0.0
+        self.begun = time.monotonic()
+        self.waited_s = 0.0
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
@@ -165,10 +166,13 @@ class Trainer:
         conditioned: bool = False,
         rounding: Rounding | None = None,
     ) -> None:
-        self.recipe, self.worker = recipe, worker or Worker()
+        self.recipe = recipe
+        self.worker = worker or Worker()
         self.loss, self.device = loss or RestorationLoss(recipe.loss), self.worker.device(device)
         require_loss(self.loss)
-        self.step, self.guards, self.data = 0, Guards(), ""
+        self.step = 0
+        self.guards = Guards()
+        self.data = ""
         self.network: Network = (BankedConvBEERS if conditioned else ConvBEERS)(variant)
         initialise(self.network, torch.Generator().manual_seed(recipe.seed))
         if start is not None:
@@ -180,7 +184,8 @@ class Trainer:
         agree = largest_of_all if several else None
         options = (recipe.gradient_norm, precision == "bfloat16", rounding, agree)
         self._take = Step(self.network, self.loss, forward, *options)
-        self.average, self.optimiser = self._take.average, self._take.optimiser
+        self.average = self._take.average
+        self.optimiser = self._take.optimiser
         self._unseen = list[Tensor]()
 
     def run(self, batches: Batches, checkpoint: Path, schedule: Schedule) -> None:
@@ -192,7 +197,8 @@ class Trainer:
             schedule: see there; of several workers, the first keeps to it.
         """
         schedule = schedule if self.worker.first else Schedule()
-        spent, saved = Spent(), time.monotonic()
+        spent = Spent()
+        saved = time.monotonic()
         rows = list[list[float]]()
         with held_back() as interrupt:
             following = batches(self.step)
@@ -205,7 +211,8 @@ class Trainer:
                     rows += self.seen()
                 if self._due(schedule.report_steps):
                     schedule.report(self.step, self._means(rows), spent.figures(self._patches(len(rows))))
-                    rows, spent = [], Spent()
+                    rows = []
+                    spent = Spent()
                 if self._due(schedule.validate_steps):
                     schedule.validate(self.step, self.averaged())
                 if save:

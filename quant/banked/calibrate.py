@@ -76,8 +76,11 @@ def _analytic(scale: int, result: int, shifts: Shifts, kernels: Kernels) -> IntC
     bits as the correction's, `result`, beside which they lie.
     """
     coarse = int(kernels == "fitted")
-    pixels, copies, inputs = scale**2, COPIES[2] - coarse, len(channels(kernels))
-    fine, rows = ANALYTIC_COPIES - coarse, range(pixels)
+    pixels = scale**2
+    copies = COPIES[2] - coarse
+    inputs = len(channels(kernels))
+    fine = ANALYTIC_COPIES - coarse
+    rows = range(pixels)
     # A single weight must hold what the weights of all fine copies add up to.
     shift = 6 if coarse else int(np.floor(np.log2(127 * copies)))
     weight = np.zeros((ANALYTIC_COPIES, pixels, inputs, pixels, 1, 1), np.int8)
@@ -97,11 +100,13 @@ def _spread(total: int, parts: int) -> list[int]:
 
 def body_graph(weights: Weights) -> Graph:
     """The float body, from a bank's results and four planes of a sensor's values to the correction in units."""
-    variant, tensors = weights.variant, weights.tensors
+    variant = weights.variant
+    tensors = weights.tensors
     graph: list[Op] = [_head(weights)]
 
     def conv(name: str, source: str, output: str, activation: Activation = Activation.none) -> None:
-        weight, bias = tensors[f"{name}.weight"], tensors[f"{name}.bias"]
+        weight = tensors[f"{name}.weight"]
+        bias = tensors[f"{name}.bias"]
         graph.append(Conv(name, source, output, weight, bias, activation, window=same(weight)))
 
     stream = "head"
@@ -120,7 +125,8 @@ def _head(weights: Weights) -> Conv:
     """The head on a bank's results, all copies of each, and on the planes of a sensor's values at its middle tap."""
     variant = weights.variant
     given = weights.tensors["head.weight"].reshape(variant.features, 1 + FILTERS, variant.pixels, 3, 3)
-    counts, units = COPIES, 2.0**BITS / UNIT_STEPS
+    counts = COPIES
+    units = 2.0**BITS / UNIT_STEPS
     copies = [(0, counts[0], 1.0), *((1 + k, counts[1], units) for k in range(FILTERS))]
     read = [given[:, kernel] * (unit / count) for kernel, count, unit in copies for _ in range(count)]
     unread = np.zeros((variant.features, counts[2] * variant.pixels, 3, 3))  # the coarse one among them
@@ -211,7 +217,8 @@ def _without_values(op: IntConv | Op) -> IntConv | Op:
 
 def _plan(weights: Weights, shifts: Shifts) -> Plan:
     """What is to be quantised: the body, from a bank's results."""
-    graph, scale = body_graph(weights), weights.variant.scale
+    graph = body_graph(weights)
+    scale = weights.variant.scale
     width = len(channels()) * scale**2 + SENSOR_VALUES
     ends = Ends(width, 1, adds_image=False, gains=2, outputs=scale**2, direct=True)
     inner = tuple(lone_tensors(graph))
@@ -236,7 +243,8 @@ def family_images(
         kernels: of the banks.
         patch_px: side of a patch.
     """
-    like, reference = load_sensor(LIKE), load_sensor(REFERENCE)
+    like = load_sensor(LIKE)
+    reference = load_sensor(REFERENCE)
     patches = draw_patches(scenes, like, reference, PATCHES, seed, patch_px, SensorFamily(like.nominal(), SNR))
 
     def results(number: int) -> np.ndarray:

@@ -81,7 +81,8 @@ def family_of(model: onnx.ModelProto) -> Family | None:
     if words is None:
         return None
     with contradictions("INT8 model"):
-        core, said = read_core(model), json.loads(words)
+        core = read_core(model)
+        said = json.loads(words)
         biases = {str(name): np.array(values, np.float64) for name, values in said.items()}
         body = {op.name: op for op in core.convolutions if op.name in biases}
         wanted = {name: (len(op.bias), 1 + SENSOR_VALUES * (op.input == BANK)) for name, op in body.items()}
@@ -139,7 +140,8 @@ def with_delta(core: IntCore, delta: bytes, where: str = "delta") -> tuple[IntCo
     try:
         line, _, numbers = zlib.decompressobj().decompress(delta, LARGEST_DELTA).partition(b"\n")
         said = json.loads(line)
-        left, ops = np.frombuffer(numbers, np.int8), list[IntConv | Op]()
+        left = np.frombuffer(numbers, np.int8)
+        ops = list[IntConv | Op]()
         known = {op.name: op for op in core.convolutions}
         told = {known[name].name: tuple(map(int, bits)) for name, bits in said["bits"].items()}
         for op in core.ops:

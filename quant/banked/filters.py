@@ -103,7 +103,8 @@ def whole_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted")
 
 def _copies(wanted: NDArray[np.float64], kernels: Sequence[int]) -> NDArray[np.int64]:
     """Weights (O, 4, 7, 7): each further copy of a kernel makes up for what rounding has left of those before it."""
-    left, found = np.zeros_like(wanted), list[NDArray[np.int64]]()
+    left = np.zeros_like(wanted)
+    found = list[NDArray[np.int64]]()
     for kernel in kernels:
         whole = _in_four(wanted[kernel] + left[kernel]) if kernel else _of_image(wanted[0])
         found.append(whole)
@@ -149,7 +150,8 @@ def shaped(wanted: NDArray[np.float64]) -> NDArray[np.int64]:
     while (excess := int(whole.sum())) != 0:
         error = (whole - wanted) * np.sign(excess)
         whole[np.argsort(-error, kind="stable")[: abs(excess)]] -= np.sign(excess)
-    slope, curve = COVARIANCE @ (whole - wanted), np.diag(COVARIANCE)
+    slope = COVARIANCE @ (whole - wanted)
+    curve = np.diag(COVARIANCE)
     pair = curve[:, None] + curve[None, :] - 2 * COVARIANCE
     while True:
         change = 2 * (slope[:, None] - slope[None, :]) + pair  # raise the row's, lower the column's

@@ -35,7 +35,8 @@ def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None
     writer = BoardWriter()
     writer.quantised("planes.dequantised", PLANES, core.frac_bits[PLANES])
     for op in core.ops:
-        feeds, output = ["planes.dequantised" if i == PLANES else i for i in op.inputs], f"{op.output}.float"
+        feeds = ["planes.dequantised" if i == PLANES else i for i in op.inputs]
+        output = f"{op.output}.float"
         writer.operation(op, feeds, output)
         writer.quantised(op.output, output, core.frac_bits[op.output])
     return _core_file(writer, core.ends, about, tile_px)
@@ -81,7 +82,8 @@ class BoardWriter(GraphWriter):
     def operation(self, op: IntConv | Op, feeds: list[str], output: str) -> None:
         """Write an operation on tensors seen as float, a convolution's weights and bias as int8 seen so too."""
         if isinstance(op, IntConv):
-            weight, kind = onnx_weight(op.weight, op.transposed), (op.activation, op.window, op.groups, op.transposed)
+            weight = onnx_weight(op.weight, op.transposed)
+            kind = (op.activation, op.window, op.groups, op.transposed)
             numbers = {"weight": (weight, op.weight_frac_bits), "bias": (op.bias, op.bias_frac_bits)}
             feeds = [*feeds, *(self._dequantised(f"{op.name}.{role}", *each) for role, each in numbers.items())]
             op = Conv(op.name, op.input, op.output, op.weight, op.bias, *kind)
@@ -121,7 +123,8 @@ def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> on
 def required_tile(tile_px: int | None) -> int:
     """The tile's side, which an NPU's file must be fixed to."""
     if tile_px is None:
-        expected, remedy = "a side in pixels: the compiler of an NPU takes stated sizes alone", "give it, such as 640"
+        expected = "a side in pixels: the compiler of an NPU takes stated sizes alone"
+        remedy = "give it, such as 640"
         raise OptionError("tile", expected=expected, got="none", remedy=remedy)
     return tile_px
 
@@ -131,7 +134,8 @@ def _apart(op: IntConv | Op) -> Iterator[IntConv | Op]:
     if not isinstance(op, IntConv | Add) or op.activation not in CLAMPS:
         yield op
         return
-    inner, kind = f"{op.output}.linear", op.activation
+    inner = f"{op.output}.linear"
+    kind = op.activation
     yield replace(op, output=inner, activation=Activation.none)
     yield Pointwise(f"{op.name}.{kind.name}", inner, op.output, kind)
 
@@ -156,14 +160,16 @@ class _PairWriter(BoardWriter):
     def read(self, tensor: str, name: str = "") -> str:
         """One more reader of a tensor: a pair for it alone. Returns the name of what it reads."""
         self._readers[tensor] += 1
-        reader, numbers = f"{tensor}.{self._readers[tensor]}", self.scale(tensor, self._frac_bits[tensor])
+        reader = f"{tensor}.{self._readers[tensor]}"
+        numbers = self.scale(tensor, self._frac_bits[tensor])
         middle = self.node("QuantizeLinear", f"{reader}.int8", [self.source(tensor), *numbers])
         return self.node("DequantizeLinear", name or reader, [middle, *numbers])
 
 
 def save_config(core: Path, device: str) -> Path:
     """Write what AMD's compiler reads beside the file of a core: the device, and for the rest its own defaults."""
-    names, vaiml = ("init", "vaiml_partition"), {"device": device, "optimize_level": 2}
+    names = ("init", "vaiml_partition")
+    vaiml = {"device": device, "optimize_level": 2}
     first, second = ({"name": name, "plugin": f"vaip-pass_{name}"} for name in names)
     passes = [first, {**second, "vaiml_config": vaiml}]
     said = {"passes": passes, "target": "VAIML", "targets": [{"name": "VAIML", "pass": [*names]}]}

@@ -124,7 +124,8 @@ def _clamp(w: HostWriter, core: IntCore, op: IntConv | Add) -> None:
 
 def _leaky(w: HostWriter, core: IntCore, op: IntConv) -> None:
     """max(256 x, 26 x) of the int32 sums, exact in float64, rounded once."""
-    name, product = op.output, op.weight_frac_bits + core.frac_bits[op.input]
+    name = op.output
+    product = op.weight_frac_bits + core.frac_bits[op.input]
     feeds = [op.input, w.constant(f"{op.name}.weight", op.weight), w.zero_point(), _weight_zero(w, op.name)]
     w.node("ConvInteger", f"{name}.products", feeds, name=op.name, **_attributes(op))
     bias = w.constant(f"{op.name}.bias", _bias(core, op)[:, None, None])
@@ -144,7 +145,9 @@ def _leaky(w: HostWriter, core: IntCore, op: IntConv) -> None:
 
 def _transposed(w: HostWriter, core: IntCore, op: IntConv) -> None:
     """One convolution for each phase of the enlarged lattice, then a pixel shuffle, then the pads cut."""
-    stride, top, left = op.window.strides[0], op.window.pads[0], op.window.pads[1]
+    stride = op.window.strides[0]
+    top = op.window.pads[0]
+    left = op.window.pads[1]
     weight, reach = phases(op.weight, stride)
     phased = replace(op, output=f"{op.output}.phases", weight=weight, window=Window(pads=(reach,) * 4))
     both = replace(core, frac_bits={**core.frac_bits, phased.output: core.frac_bits[op.output]})
@@ -186,7 +189,8 @@ def _weighted(
 ) -> None:
     """Weights (K, 1, kh, kw) for each channel: a depthwise convolution whose result has its input's scale."""
     channels = channels_of(core.ops, {PLANES: core.ends.planes * core.ends.channels})[op.input]
-    unit, weight = w.unit(core.frac_bits[op.input]), np.tile(weight.astype(np.int8), (channels, 1, 1, 1))
+    unit = w.unit(core.frac_bits[op.input])
+    weight = np.tile(weight.astype(np.int8), (channels, 1, 1, 1))
     feeds = [ends[0], unit, w.zero_point(), w.constant(f"{op.name}.weight", weight), w.unit(shift)]
     feeds += [_weight_zero(w, op.name), unit, w.zero_point()]
     attributes = {**window_attributes(window), "kernel_shape": list(weight.shape[2:])}
@@ -198,7 +202,8 @@ def _resize(w: HostWriter, core: IntCore, op: Resize) -> None:
         write_float(w, op, op.inputs, op.output)
         return
     weight, shift = bilinear_weights(op.factor)
-    wide, phased = f"{op.output}.edged", f"{op.output}.phases"
+    wide = f"{op.output}.edged"
+    phased = f"{op.output}.phases"
     w.node("Pad", wide, [op.input, w.constant("edge_pads", np.array([0, 0, 1, 1, 0, 0, 1, 1]))], mode="edge")
     _weighted(w, core, op, (wide, phased), weight[:, None], shift, Window())
     write_shuffle(w, Shuffle(f"{op.name}.shuffle", phased, op.output, op.factor), phased, op.output)
@@ -230,7 +235,8 @@ def read_core(model: onnx.ModelProto) -> IntCore:
     said = metadata(model).get(KEY)
     if said is not None:
         return described_core(said, constants(model))
-    expected, remedy = "a file that describes its integers", "make it with 'beers-deploy quantize'"
+    expected = "a file that describes its integers"
+    remedy = "make it with 'beers-deploy quantize'"
     raise ModelError("INT8 core", expected=expected, got="a file without a description", remedy=remedy)
 
 
@@ -247,7 +253,8 @@ def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
     except ModelError as error:
         return [f"no integers to compare with: {error.got}"]
     with contradictions("INT8 model"):
-        meant, faults = host_model(core, {}, fixed_tile_px(model)).graph, list[str]()
+        meant = host_model(core, {}, fixed_tile_px(model)).graph
+        faults = list[str]()
     for kind, found, wanted in (
         ("constant", model.graph.initializer, meant.initializer),
         ("node", model.graph.node, meant.node),

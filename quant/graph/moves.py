@@ -72,10 +72,12 @@ def _shuffle(chain: list[Node], sizes: list[int], graph: OnnxGraph) -> Node | No
         growth = _growth(result, shape)
         if growth is None:
             continue
-        up, block = growth > 1, max(growth.numerator, growth.denominator)
+        up = growth > 1
+        block = max(growth.numerator, growth.denominator)
         trials = ((mode, Shuffle("", "", "", block, up, first)(image)) for mode, first in ORDERS.items())
         mode = next((mode for mode, moved in trials if block > 1 and np.array_equal(moved, result)), "")
-        kind, ends = "DepthToSpace" if up else "SpaceToDepth", ([chain[0].inputs[0]], [chain[-1].outputs[0]])
+        kind = "DepthToSpace" if up else "SpaceToDepth"
+        ends = ([chain[0].inputs[0]], [chain[-1].outputs[0]])
         node = Node.of(helper.make_node(kind, *ends, chain[-1].name, blocksize=block))
         return replace(node, name=chain[0].name, attributes={"blocksize": block, "mode": mode})
     return None
@@ -140,7 +142,8 @@ class Resizing:
     def of(cls, node: Node, graph: OnnxGraph) -> "Resizing":
         """What a node states."""
         old = node.op_type == "Upsample" or len(node.inputs) == 2  # before opset 11
-        given, scales = node.attributes.get, graph.numbers(node, 1 if old else 2, "scales") or []
+        given = node.attributes.get
+        scales = graph.numbers(node, 1 if old else 2, "scales") or []
         factors = dict(zip((axis % 4 for axis in given("axes", range(4))), scales, strict=bool(scales)))
         return cls(
             tuple(factors.get(axis, 1.0) for axis in range(4)) if factors else (),
@@ -153,5 +156,6 @@ class Resizing:
         """Whether nearest pixels, enlarged by a factor, are those whose block each pixel of the result lies in."""
         if self.where not in PLACES or self.rounding not in ROUNDINGS:
             return False
-        place, rounded = PLACES[self.where], ROUNDINGS[self.rounding]
+        place = PLACES[self.where]
+        rounded = ROUNDINGS[self.rounding]
         return all(rounded(place(k, factor)) == k // factor for k in range(factor))

@@ -73,12 +73,14 @@ def cut(graph: Graph, channels: int, flat: bool, softmax: bool) -> Network:
     Pixel shuffles there move values and cost the host next to nothing; DPUs have been seen to compute them wrongly.
     """
     graph, last = _without_shuffles(graph)
-    end, adds_image = graph[-1] if graph else None, False
+    end = graph[-1] if graph else None
+    adds_image = False
     if isinstance(end, Add) and IMAGE in end.inputs and end.activation is Activation.none:
         adds_image = True
         graph, back = _without_shuffles(_ended(graph[:-1], end.inputs[1 - end.inputs.index(IMAGE)]))
     else:
-        back, last = last, ()
+        back = last
+        last = ()
     front: list[Shuffle] = []
     while isinstance(first := _only_reader(graph), Shuffle) and not first.up:
         front.append(first)
@@ -162,7 +164,8 @@ def check_network(network: Network) -> None:
 
 def sized(graph: Graph, size: Pair) -> Graph:
     """The graph for images of one size (rows, columns), the windows of global pooling known."""
-    sizes, found = {IMAGE: size}, list[Op]()
+    sizes = {IMAGE: size}
+    found = list[Op]()
     for op in graph:
         read = sizes[op.inputs[0]]
         if any(sizes[name] != read for name in op.inputs):

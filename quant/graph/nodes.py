@@ -64,7 +64,8 @@ class Window:
 
     def slid(self, axis: int, size: int, ceil: bool = False) -> int:
         """How many places it has on so many pixels; with `ceil` the last may reach beyond the padding."""
-        stride, before = self.stride[axis], self.pads[axis]
+        stride = self.stride[axis]
+        before = self.pads[axis]
         room = size + before + self.pads[axis + 2] - self.extent(axis)
         return min(-(-room // stride), (size + before - 1) // stride) + 1 if ceil else room // stride + 1
 
@@ -76,7 +77,8 @@ class Window:
     def padded(self, auto_pad: str, size: Pair) -> "Window":
         """With the pads that `auto_pad` asks for on such a map: as many places as size / stride, rounded up."""
         total = [0, 0] if auto_pad == "VALID" else [self._lacking(axis, size[axis]) for axis in (0, 1)]
-        less, more = [t // 2 for t in total], [t - t // 2 for t in total]
+        less = [t // 2 for t in total]
+        more = [t - t // 2 for t in total]
         begin, end = (more, less) if auto_pad == "SAME_LOWER" else (less, more)
         return replace(self, pads=(begin[0], begin[1], end[0], end[1]))
 
@@ -98,7 +100,8 @@ class Node:
     @classmethod
     def of(cls, proto: onnx.NodeProto, functions: Functions = ()) -> "Node":
         """What a file holds of it, which may define functions."""
-        name, op_type = proto.name or proto.output[0], operator_name(proto, functions)
+        name = proto.name or proto.output[0]
+        op_type = operator_name(proto, functions)
         return cls(op_type, name, tuple(proto.input), tuple(proto.output), attributes_of(proto), proto)
 
     def __str__(self) -> str:
@@ -113,7 +116,8 @@ class Node:
         """
         given = self.attributes.get
         sides = kernel or given("kernel_shape", ()), given("strides", (1, 1)), given("dilations", (1, 1))
-        pads, beyond = given("pads", (0, 0, 0, 0)), given("output_padding", (0, 0))
+        pads = given("pads", (0, 0, 0, 0))
+        beyond = given("output_padding", (0, 0))
         if [len(each) for each in (*sides, pads, beyond)] != [2, 2, 2, 4, 2]:
             return None
         (rows, columns), stride, dilation = sides
@@ -227,7 +231,8 @@ def out_shape(
 def _inferred(node: Node, known: list[Shape], constants: Mapping[str, np.ndarray]) -> Shape | None:
     """What onnx knows of one standard operator."""
     shapes = iter(known)
-    types, data = {}, {}
+    types = {}
+    data = {}
     for name in filter(None, node.inputs):
         if name in constants:
             value = constants[name]

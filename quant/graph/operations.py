@@ -109,7 +109,8 @@ class Window:
 
 def same(weight: np.ndarray) -> Window:
     """Of stride 1, with the padding that keeps the size: for weights (O, I, kh, kw) of odd sides."""
-    rows, columns = weight.shape[2] // 2, weight.shape[3] // 2
+    rows = weight.shape[2] // 2
+    columns = weight.shape[3] // 2
     return Window(pads=(rows, columns, rows, columns))
 
 

@@ -56,7 +56,8 @@ def stated(node: Node, graph: OnnxGraph) -> Iterator[tuple[str, Scale]]:
         places = {RESULT: (0, 1)} | {i: (i + 1, i + 2) for i in range(2, len(node.inputs), 3)}
     for place, (scale, zero_point) in places.items():
         name = node.outputs[0] if place == RESULT else node.inputs[place]
-        scales, zeros = graph.constants.get(node.inputs[scale], np.zeros(0)), graph.value(node, zero_point)
+        scales = graph.constants.get(node.inputs[scale], np.zeros(0))
+        zeros = graph.value(node, zero_point)
         if zeros is None:  # around 0, of the constant's own type, the one that is asked for, or ONNX's default
             asked = helper.tensor_dtype_to_np_dtype(node.attributes.get("output_dtype") or TensorProto.UINT8)
             zeros = np.zeros(1, graph.constants[name].dtype if name in graph.constants else asked)
@@ -80,7 +81,9 @@ class Integers:
 
     def __init__(self, graph: OnnxGraph) -> None:
         self.present = any(node.op_type in FORMATS for node in graph.nodes)
-        self._graph, self._constants, self._results = graph, graph.constants, frozenset(graph.outputs)
+        self._graph = graph
+        self._constants = graph.constants
+        self._results = frozenset(graph.outputs)
         self._int8 = {name for name, kind in graph.types.items() if kind in BYTES}
         self._wide: set[str] = set()
         self._seen: dict[str, str] = {}  # and the int8 tensor that each is
@@ -135,7 +138,8 @@ class Integers:
 
         Several where the file contradicts itself, the writer's first; none where it says nothing.
         """
-        own, numbers = dict(stated(node, self._graph)), self._numbers(node)
+        own = dict(stated(node, self._graph))
+        numbers = self._numbers(node)
         found = {role: self._formats.get(self.resolve(name), ()) for role, name in self._tensors(node).items()}
         return found | {role: (own[n],) if n in own else self._formats.get(n, ()) for role, n in numbers.items()}
 
@@ -170,7 +174,8 @@ class Integers:
 
     def _follow(self, node: Node) -> None:
         """Work out what a node's results hold, from what its inputs hold."""
-        source, result = node.inputs[0] if node.inputs else "", node.outputs[0]
+        source = node.inputs[0] if node.inputs else ""
+        result = node.outputs[0]
         if node.op_type == "DequantizeLinear":
             aliases = self._seen if self.constant(source) is None else self._same
             aliases[result] = self.resolve(source)  # at once: a chain of aliases would be walked again by each reader

@@ -178,7 +178,8 @@ class _Reader:
 
     def _weights(self, node: Node) -> tuple[np.ndarray, np.ndarray]:
         """Of a convolution, (O, I / groups, kh, kw), and its bias (O,)."""
-        weight, bias = self.source.value(node, 1), self.source.value(node, 2)
+        weight = self.source.value(node, 1)
+        bias = self.source.value(node, 2)
         if weight is None:
             raise refused_graph("weights that are constants", f"computed ones at {node}")
         self._require(weight.ndim == 4, node, "convolutions over rows and columns", f"weights of {weight.ndim} sizes")
@@ -197,7 +198,8 @@ class _Reader:
 
     def _convtranspose(self, node: Node) -> Op:
         weight, bias = self._weights(node)
-        given, strides = node.attributes, node.attributes.get("strides", [1, 1])
+        given = node.attributes
+        strides = node.attributes.get("strides", [1, 1])
         plain = int(given.get("group", 1)) == 1 and not any(given.get("output_padding", [0]))
         self._require(plain, node, "transposed convolutions of one group, without output padding")
         even = set(given.get("dilations", [1])) == {1} and len(set(strides)) == 1 and "output_shape" not in given
@@ -207,7 +209,8 @@ class _Reader:
         return Conv(node.name, node.inputs[0], node.outputs[0], weight, bias, window=window, transposed=True)
 
     def _window(self, node: Node, kernel: Sequence[int] = ()) -> tuple[Pair, Window]:
-        window, auto = node.window(kernel), str(node.attributes.get("auto_pad", ""))
+        window = node.window(kernel)
+        auto = str(node.attributes.get("auto_pad", ""))
         if window is None:
             raise refused_graph("windows over rows and columns", f"another at {node}")
         known = window.stride == (1, 1) or not auto.startswith("SAME")
@@ -255,7 +258,8 @@ class _Reader:
         channels = self._channels_of(source)
         self._require(value.size in (1, channels), node, f"{channels} numbers", f"{value.size}")
         each = np.broadcast_to(flat.astype(np.float32), (channels,))
-        one, none = np.ones(channels, np.float32), np.zeros(channels, np.float32)
+        one = np.ones(channels, np.float32)
+        none = np.zeros(channels, np.float32)
         factor, offset = {"Add": (one, each), "Sub": (one, -each), "Mul": (each, none)}[node.op_type]
         return Conv(node.name, source, node.outputs[0], factor[:, None, None, None], offset, groups=channels)
 
@@ -282,7 +286,8 @@ class _Reader:
         found = Resizing.of(node, self.source)
         sound = found.factors[:2] == (1, 1) and found.factors[2] == found.factors[3]
         self._require(sound, node, "a resize by a constant factor of rows and columns")
-        factor, where = int(found.factors[2]), found.where
+        factor = int(found.factors[2])
+        where = found.where
         self._require(found.factors[2] == factor >= 1, node, "a whole factor", f"{found.factors[2]:g}")
         if found.mode == "linear":
             half = where in ("half_pixel", "pytorch_half_pixel") and factor in (2, 4)
@@ -297,7 +302,8 @@ class _Reader:
         """A pixel shuffle, or Reshape and Transpose as exporters spell one."""
         mode = node.attributes.get("mode", "DCR") if node.op_type not in MOVES else ""
         self._require(mode in ORDERS, node, "Reshape and Transpose that spell a pixel shuffle")
-        up, block = node.op_type == "DepthToSpace", int(node.attributes["blocksize"])
+        up = node.op_type == "DepthToSpace"
+        block = int(node.attributes["blocksize"])
         name = node.proto.name or node.name  # of several nodes the last one's
         return Shuffle(name, node.inputs[0], node.outputs[0], block, up, ORDERS[mode])
 

@@ -104,14 +104,16 @@ def without_tail(model: ModelProto, known: Collection[str]) -> tuple[ModelProto,
 
 
 def _parted(model: ModelProto, nodes: list[NodeProto], tail: list[NodeProto], source: str) -> tuple[ModelProto, Tail]:
-    body, output = deepcopy(model), model.graph.output[0]
+    body = deepcopy(model)
+    output = model.graph.output[0]
     del body.graph.node[:], body.graph.output[:]
     body.graph.node.extend(nodes)
     body.graph.output.append(helper.make_tensor_value_info(source, TensorProto.FLOAT, None))
     names = {name: f"host_tail.{name}" for node in tail for name in (*node.input, *node.output) if name}
     names |= {source: CORRECTION, output.name: RESULT}
     kept = [tensor for tensor in model.graph.initializer if tensor.name in names]
-    read, result = onnx.ValueInfoProto(name=CORRECTION), onnx.ValueInfoProto(name=RESULT, type=output.type)
+    read = onnx.ValueInfoProto(name=CORRECTION)
+    result = onnx.ValueInfoProto(name=RESULT, type=output.type)
     read.type.tensor_type.elem_type = TensorProto.FLOAT
     graph = helper.make_graph([_renamed(node, names) for node in tail], "tail", [read], [result])
     for tensor in kept:

@@ -68,7 +68,8 @@ def write_float(w: GraphWriter, op: Op, feeds: Sequence[str], output: str) -> No
         output: the name of its result.
     """
     activation = Activation.none if isinstance(op, Pointwise) else getattr(op, "activation", Activation.none).written
-    offset, end = getattr(op, "offset", 0.0), output
+    offset = getattr(op, "offset", 0.0)
+    end = output
     if offset:
         output = f"{end}.whole"
     result = output if activation is Activation.none else f"{op.output}.linear"

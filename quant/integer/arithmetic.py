@@ -62,7 +62,8 @@ def _products(windows: np.ndarray, weight: np.ndarray, groups: int) -> np.ndarra
     """Of windows (N, I, H, W, kh, kw) and weights (O, I / groups, kh, kw)."""
     count, channels, height, width = windows.shape[:4]
     sums = np.empty((count, len(weight), height, width), np.int64)
-    each, outputs = channels // groups, len(weight) // groups
+    each = channels // groups
+    outputs = len(weight) // groups
     rows = max(STRIP_VALUES // (each * weight[0, 0].size * width), 1)
     for number, group, top in product(range(count), range(groups), range(0, height, rows)):
         strip = windows[number, group * each : (group + 1) * each, top : top + rows]

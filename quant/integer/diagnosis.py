@@ -35,7 +35,8 @@ class Seen:
         seen = self.seen
         if shifted:
             rows, columns = (slice(side // 4, side - side // 4) for side in seen.shape[2:])
-            made, seen = made[..., rows, columns], seen[..., rows, columns]
+            made = made[..., rows, columns]
+            seen = seen[..., rows, columns]
         return int((made != seen).sum()) if made.shape == seen.shape else seen.size
 
 
@@ -60,7 +61,9 @@ def explain(core: IntCore, ops: Sequence[Layer], cases: Sequence[Seen], half_eve
         cases: in which its results differ.
         half_even: how a sound board rounds ties: to even, or else up.
     """
-    output, faults, best = ops[-1].output if ops else PLANES, Faulty(core, half_even), (MOST_LEFT, "")
+    output = ops[-1].output if ops else PLANES
+    faults = Faulty(core, half_even)
+    best = (MOST_LEFT, "")
     counts = [case.unlike(case.tensors[output]) for case in cases]
     worst = cases[int(np.argmax(counts))]
     alone = faults.of_layer(ops[-1], worst) if ops else faults.of_tensor(PLANES, lambda known: known[PLANES], worst)
@@ -141,7 +144,8 @@ class Faulty:
             yield from _halo(meant)
         of = [_channel_like(worst.tensors[name], worst.seen[:, k], k) for k in range(worst.seen.shape[1])]
         if None not in of:
-            moved, sources = ", ".join(f"{each} at {k}" for k, each in enumerate(of) if each != k), np.array(of)
+            moved = ", ".join(f"{each} at {k}" for k, each in enumerate(of) if each != k)
+            sources = np.array(of)
             yield f"channels stand in another order: {moved}", lambda known: meant(known)[:, sources]
         yield "rows and columns changed places", lambda known: meant(known).swapaxes(2, 3)
         yield from _shifted(meant)
@@ -184,7 +188,8 @@ def _kind(op: Layer) -> str:
 
 def _padded(op: IntConv, inside: Compute, mode: str) -> Compute:
     top, left, bottom, right = op.window.pads
-    sizes, more = ((0, 0), (0, 0), (top, bottom), (left, right)), {"constant_values": INT8_MIN}
+    sizes = ((0, 0), (0, 0), (top, bottom), (left, right))
+    more = {"constant_values": INT8_MIN}
 
     def compute(known: Tensors) -> np.ndarray:
         wide = np.pad(known[op.input], sizes, mode, **(more if mode == "constant" else {}))  # type: ignore[call-overload]

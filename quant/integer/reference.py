@@ -94,7 +94,8 @@ def run_core(
     core: IntCore, planes: np.ndarray, half_even: bool = False, faults: Faults = SOUND
 ) -> tuple[dict[str, np.ndarray], list[LayerReport]]:
     """Every tensor of the core for its int8 planes (N, P, H, W), as int16, and a report a layer."""
-    tensors, reports = {PLANES: faults.touch(PLANES, planes.astype(np.int16))}, []
+    tensors = {PLANES: faults.touch(PLANES, planes.astype(np.int16))}
+    reports = []
     for op in core.ops:
         sums, shift, bound, finer = layer_sums(core, op, tensors, faults)
         whole, ties = rounded(sums, shift, half_even)

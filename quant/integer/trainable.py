@@ -61,7 +61,8 @@ class TrainableCore(torch.nn.Module):
     def __init__(self, core: IntCore, still: Collection[str] = ()) -> None:
         """Parameters that begin at the core's whole numbers; convolutions that write what is `still` stay so."""
         super().__init__()
-        self._core, self._convs = core, [_one_copy(op, core.ends) for op in core.convolutions]
+        self._core = core
+        self._convs = [_one_copy(op, core.ends) for op in core.convolutions]
         self.weights = torch.nn.ParameterList(torch.tensor(op.weight).float() for op in self._convs)
         self.biases = torch.nn.ParameterList(torch.tensor(op.bias).float() for op in self._convs)
         for op, *numbers in zip(self._convs, self.weights, self.biases, strict=True):
@@ -74,7 +75,9 @@ class TrainableCore(torch.nn.Module):
         """The core with its weights and biases as they stand, in whole numbers."""
         found = zip(self._convs, map(_whole, self.weights), map(_whole, self.biases), strict=True)
         trained = {op.name: replace(op, weight=weight, bias=bias) for op, weight, bias in found}
-        ops, ends, last = [trained.get(op.name, op) for op in self._core.ops], self._core.ends, self._core.ops[-1]
+        ops = [trained.get(op.name, op) for op in self._core.ops]
+        ends = self._core.ends
+        last = self._core.ops[-1]
         if ends.copies > 1 and isinstance(last, IntConv):
             one = trained[last.name]
             bias = self.biases[-1].detach().numpy() if ends.offsets else one.bias
@@ -87,7 +90,8 @@ class TrainableCore(torch.nn.Module):
 
     def tensors(self, planes: Tensor) -> dict[str, Tensor]:
         """Every tensor (N, C, H, W) by its name in whole numbers; of a correction in copies one, unrounded."""
-        found, numbers = {PLANES: planes}, iter(zip(self._convs, self.weights, self.biases, strict=True))
+        found = {PLANES: planes}
+        numbers = iter(zip(self._convs, self.weights, self.biases, strict=True))
         for op in self._core.ops:
             read = [found[name] for name in op.inputs]
             if isinstance(op, IntConv):
@@ -98,7 +102,8 @@ class TrainableCore(torch.nn.Module):
 
     def _convolved(self, op: IntConv, weight: Tensor, bias: Tensor, image: Tensor) -> Tensor:
         """A convolution's result, of its parameters and what it reads."""
-        ends, frac_bits = self._core.ends, self._core.frac_bits[op.output]
+        ends = self._core.ends
+        frac_bits = self._core.frac_bits[op.output]
         unit = 2.0 ** (frac_bits - op.weight_frac_bits - self._core.frac_bits[op.input])
         bias_unit = 2.0 ** (frac_bits - op.bias_frac_bits)
         if op.output == CORRECTION and ends.copies > 1:
@@ -144,7 +149,8 @@ def _rounded(lifted: Tensor, activation: Activation, frac_bits: int) -> Tensor:
 
 def _add(op: Add, read: Sequence[Tensor], bits: Bits) -> Tensor:
     """Nothing is rounded, nor lifted, where the result is as fine as what is added."""
-    frac_bits, finest = bits[op.output], max(bits[name] for name in op.inputs)
+    frac_bits = bits[op.output]
+    finest = max(bits[name] for name in op.inputs)
     one, other = (_times(values, frac_bits - bits[name]) for name, values in zip(op.inputs, read, strict=True))
     sums = one + other
     if finest > frac_bits or op.activation is Activation.leaky_relu:
@@ -186,7 +192,8 @@ def _resize(op: Resize, read: Sequence[Tensor], _: Bits) -> Tensor:
 
 
 def _shuffle(op: Shuffle, read: Sequence[Tensor], _: Bits) -> Tensor:
-    image, squares = read[0], op.block**2
+    image = read[0]
+    squares = op.block**2
     if op.up:
         return functional.pixel_shuffle(image if op.columns_first else _turned(image, squares), op.block)
     moved = functional.pixel_unshuffle(image, op.block)
@@ -241,7 +248,8 @@ def _all_copies(last: IntConv, ends: Ends, weight: np.ndarray, bias: np.ndarray)
         weight: of the copy that was trained, (O, I, kh, kw) in whole numbers.
         bias: of that copy, (O,), in whole numbers; of a window in units of its scale with the offset.
     """
-    one, coarse = _one_copy(last, ends), np.arange(ends.copies) == (0 if ends.offsets else 1)
+    one = _one_copy(last, ends)
+    coarse = np.arange(ends.copies) == (0 if ends.offsets else 1)
     shares = np.where(coarse, 1 / GAIN, 1)
     weights = _moved(last.weight, shares, weight.astype(float) - one.weight)
     if not ends.offsets:

@@ -33,7 +33,8 @@ def with_copies(
         images: (1, C, H, W) on which a dead channel is zero.
         ends: what the host does to the images.
     """
-    found, last = dict[str, np.ndarray](), runs(graph, names)
+    found = dict[str, np.ndarray]()
+    last = runs(graph, names)
     sizes = largest_sizes(graph, [run[-1] for run in last], images, ends) if last else ()
     for run, size in zip(last, sizes, strict=True):
         sources, copies = _pairs(graph, run[-1], size)
@@ -64,13 +65,15 @@ def _pairs(graph: Graph, name: str, sizes: np.ndarray) -> tuple[np.ndarray, np.n
         for op in graph
         if isinstance(op, Conv) and op.input == name
     )
-    order, dead = np.argsort(-np.square(sizes) * weights, kind="stable"), np.flatnonzero(sizes == 0)
+    order = np.argsort(-np.square(sizes) * weights, kind="stable")
+    dead = np.flatnonzero(sizes == 0)
     count = min(len(dead), len(sizes) - len(dead))
     return order[:count], dead[:count]
 
 
 def _copied(op: Conv, run: list[str], sources: np.ndarray, copies: np.ndarray) -> Conv:
-    weight, bias = op.weight.copy(), op.bias.copy()
+    weight = op.weight.copy()
+    bias = op.bias.copy()
     if op.output in run:
         weight[copies], bias[copies] = weight[sources], bias[sources]
     if op.input == run[-1]:

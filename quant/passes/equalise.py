@@ -70,10 +70,13 @@ def rescaled(graph: Graph, stream: Stream, factors: np.ndarray) -> Graph:
 
 
 def _scaled(op: Conv, factors: np.ndarray, stream: Stream) -> Conv:
-    weight, bias, ceiling = op.weight.astype(np.float64), op.bias.astype(np.float64), op.ceiling
+    weight = op.weight.astype(np.float64)
+    bias = op.bias.astype(np.float64)
+    ceiling = op.ceiling
     if op.output in stream:
         own = factors[stream[op.output]]
-        weight, bias = weight * own[:, None, None, None], bias * own
+        weight = weight * own[:, None, None, None]
+        bias = bias * own
         ceiling = op.ceilings * own if op.activation is Activation.relu6 else None
     if op.input in stream:
         own = factors[stream[op.input]]
@@ -123,7 +126,8 @@ def with_room(graph: Graph, step: float, images: Iterable[np.ndarray], ends: End
         ends: what the host does to the images.
     """
     add = graph[-2]
-    last, limit = dict.fromkeys((*add.inputs, add.output), slice(None)), INT8_MAX * step
+    last = dict.fromkeys((*add.inputs, add.output), slice(None))
+    limit = INT8_MAX * step
     largest = np.max(largest_sizes(graph, list(last), images, ends), axis=0)
     return equalise(graph, last, limit / np.maximum(ROOM * largest, limit))
 
@@ -178,7 +182,8 @@ class Best:
 def race(costs_of: Costs, factors: np.ndarray, best: Best) -> Best:
     """The better of two, the costliest crops first: six of seven trials fail, and most of them show it on two."""
     order = np.argsort(-best.costs, kind="stable")
-    costs, seen = np.zeros(len(order)), 0
+    costs = np.zeros(len(order))
+    seen = 0
     while seen < len(order):
         crops = order[seen : max(2 * seen, FIRST_CROPS)]
         costs[crops] = costs_of(crops)

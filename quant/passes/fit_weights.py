@@ -111,7 +111,9 @@ def fit_weights(graph: Graph, core: IntCore, images: Remade[np.ndarray], shifts:
         images: (1, C, H, W) in [0, 1], of which some are looked at.
         shifts: the windows of the target.
     """
-    ops, ends, seen = list[IntConv | Op](), core.ends, _seen(graph, core, images)
+    ops = list[IntConv | Op]()
+    ends = core.ends
+    seen = _seen(graph, core, images)
     last_read = {name: op.name for op in graph for name in op.inputs}
     for op, nearest in zip(graph, core.ops, strict=True):
         whole = nearest

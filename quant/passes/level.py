@@ -132,7 +132,8 @@ def _better(factors: np.ndarray, costs_of: Callable[[np.ndarray], Costs], best: 
 
     Given up where every eighth of the crops says that it is clearly worse.
     """
-    cost, some = costs_of(factors), np.arange(0, len(best.costs), EVERY)
+    cost = costs_of(factors)
+    some = np.arange(0, len(best.costs), EVERY)
     if cost(some).sum() > CLEARLY * best.costs[some].sum():
         return best
     costs = cost(None)

@@ -66,7 +66,8 @@ def lower(graph: Graph, frac_bits: Mapping[str, int], trial: Trial) -> Graph:
     names = lowerable(graph)
     if not names:
         return graph
-    least, everything = trial(graph)(None).sum(), graph
+    least = trial(graph)(None).sum()
+    everything = graph
     for name in names:
         everything = lowered(everything, name, frac_bits[name] + 1)
     if trial(everything)(None).sum() < least:
@@ -75,5 +76,6 @@ def lower(graph: Graph, frac_bits: Mapping[str, int], trial: Trial) -> Graph:
         tried = lowered(graph, name, frac_bits[name] + 1)
         cost = trial(tried)(None).sum()
         if cost < least:
-            graph, least = tried, cost
+            graph = tried
+            least = cost
     return graph

@@ -66,7 +66,8 @@ def _placed(linking: Sequence[Op], names: Sequence[str], graph: Graph) -> Stream
     if not any(isinstance(op, Concat) for op in own):
         return dict.fromkeys(names, slice(None))
     widths = channels_of(graph, {PLANES: next(op.weight.shape[1] for op in graph if isinstance(op, Conv))})
-    links, first = [link for op in own for link in _links(op, widths)], {names[0]: 0}
+    links = [link for op in own for link in _links(op, widths)]
+    first = {names[0]: 0}
     while len(first) < len(names):
         for part, whole, by in links:
             if whole in first:

@@ -111,7 +111,8 @@ class Judge:
         """Keep a core that loses less than all before."""
         loss = self.loss(core)
         if loss < self.least:
-            self.core, self.least = core, loss
+            self.core = core
+            self.least = loss
 
 
 class Descent:
@@ -121,7 +122,10 @@ class Descent:
     """
 
     def __init__(self, trainable: TrainableCore, samples: list[Sample], tuning: Tuning) -> None:
-        self._trainable, self._samples, self._rate, self.done = trainable, samples, tuning.rate, 0
+        self._trainable = trainable
+        self._samples = samples
+        self._rate = tuning.rate
+        self.done = 0
         self._generator = torch.Generator().manual_seed(tuning.seed)
         self._optimiser = torch.optim.Adam(trainable.parameters(), eps=1e-15)  # errors are small without references
         self._batch = max(BATCH_PIXELS // math.prod(samples[0].planes.shape[2:]), 1)
@@ -154,8 +158,10 @@ def tune(
     samples = list(_samples(core.ends, full, tuning.pairs))
     held = (samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples)[:MOST_HELD_OUT]
     seen = [sample for k, sample in enumerate(samples) if (k + 1) % HELD_OUT_EVERY] or samples
-    trainable, judge = TrainableCore(core, still), Judge(core, held)
-    descent, rounds = Descent(trainable, seen, tuning), (tuning.steps,) if tuning.steps else ROUNDS
+    trainable = TrainableCore(core, still)
+    judge = Judge(core, held)
+    descent = Descent(trainable, seen, tuning)
+    rounds = (tuning.steps,) if tuning.steps else ROUNDS
     most = f"{'' if tuning.steps else 'at most '}{sum(rounds)}"
     for steps in rounds:
         before = judge.least
@@ -177,7 +183,8 @@ def _samples(ends: Ends, full: Graph, pairs: Remade[Pair]) -> Iterator[Sample]:
         if not (reference.size and ends.is_image):
             yield Sample(image, planes, result, None, 1.0)
             continue
-        given, made = times(reference.shape), times(ends.finished(image, floats).shape)
+        given = times(reference.shape)
+        made = times(ends.finished(image, floats).shape)
         if given != made:
             remedy = "give references of the size that the network makes"
             raise ImageError("reference", expected=f"one of {made}", got=given, remedy=remedy)

@@ -55,7 +55,8 @@ def _sum(_: Nodes, node: NodeProto) -> list[NodeProto] | None:
     """A Sum of several as Adds, one after the other."""
     if node.op_type != "Sum" or len(node.input) < 2:
         return None
-    last, adds = node.input[0], []
+    last = node.input[0]
+    adds = []
     for number, name in enumerate(node.input[1:], 1):
         whole = number == len(node.input) - 1
         output = node.output[0] if whole else f"{node.output[0]}.{number}"
@@ -104,7 +105,8 @@ def _affine(graph: Nodes, node: NodeProto) -> tuple[str, Affine] | None:
 
 def _arithmetic(kind: str, value: np.ndarray, place: int) -> Affine | None:
     """What one constant a channel does to the operand at this place."""
-    one, zero = np.ones_like(value), np.zeros_like(value)
+    one = np.ones_like(value)
+    zero = np.zeros_like(value)
     if kind == "Add":
         return Affine(one, value)
     if kind == "Mul":
@@ -184,7 +186,8 @@ def _cast(shapes: Shapes, graph: Nodes, node: NodeProto) -> list[NodeProto] | No
 
 def _mean(shapes: Shapes, _: Nodes, node: NodeProto) -> list[NodeProto] | None:
     given = attributes_of(node)
-    axes, image = {axis % 4 for axis in given.get("axes", [])}, len(shapes.get(node.input[0], ())) == 4
+    axes = {axis % 4 for axis in given.get("axes", [])}
+    image = len(shapes.get(node.input[0], ())) == 4
     if node.op_type != "ReduceMean" or not image or axes != {2, 3}:
         return None
     pooled = node.output[0] if given.get("keepdims", 1) else f"{node.output[0]}.pooled"
@@ -198,9 +201,11 @@ def _mean(shapes: Shapes, _: Nodes, node: NodeProto) -> list[NodeProto] | None:
 def _in_front(graph: Nodes, shapes: Shapes) -> None:
     """What works on each channel by itself, folded into all the convolutions that read it, where that is exact."""
     readers = graph.readers()
-    ends, folded = set(graph.ends), set[int]()
+    ends = set(graph.ends)
+    folded = set[int]()
     for node in graph.nodes[::-1]:
-        result, found = node.output[0], _affine(graph, node)
+        result = node.output[0]
+        found = _affine(graph, node)
         behind = readers.get(result, [])
         if found is None or not behind or result in ends or not _keeps_channels(*found, shapes):
             continue

@@ -122,7 +122,8 @@ def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
                 model.SerializeToString(), options, ["CPUExecutionProvider"], disabled_optimizers=ALTERING
             )
         except Exception as error:  # onnxruntime raises a class of its own for each status code
-            got, remedy = " ".join(str(error).split())[:160], "check the file with onnx.checker, and export it again"
+            got = " ".join(str(error).split())[:160]
+            remedy = "check the file with onnx.checker, and export it again"
             raise refused(where, "a model that onnxruntime runs", got, remedy) from error
         folded.ParseFromString(path.read_bytes())
     return folded
@@ -158,7 +159,8 @@ def _place_corners(model: onnx.ModelProto) -> None:
 def _tidy(folded: onnx.ModelProto, model: onnx.ModelProto) -> None:
     """What is said beside the graph is the file's own; constants that nothing reads are dropped."""
     folded.ir_version = IR_VERSION
-    folded.producer_name, folded.producer_version = model.producer_name, model.producer_version
+    folded.producer_name = model.producer_name
+    folded.producer_version = model.producer_version
     _replace(folded.metadata_props, model.metadata_props)
     graph = folded.graph
     graph.name = model.graph.name

@@ -53,7 +53,8 @@ class Nodes:
 
     def write(self) -> None:
         """Put the nodes that lead to an output, and the constants, into the graph."""
-        needed, kept = set(self.ends), list[NodeProto]()
+        needed = set(self.ends)
+        kept = list[NodeProto]()
         for node in reversed(self.nodes):
             if needed.intersection(node.output):
                 needed.update(node.input)

@@ -26,7 +26,8 @@ def require_inference(model: onnx.ModelProto, where: str) -> None:
     Raises:
         ModelError: a Dropout or a BatchNormalization in training mode, or in a mode that the file leaves open.
     """
-    opset, constants = opset_of(model), _constants(model.graph)
+    opset = opset_of(model)
+    constants = _constants(model.graph)
     for node in model.graph.node:
         if node.domain in STANDARD and node.op_type in TRAINED and TRAINED[node.op_type](node, opset, constants):
             got = f"{node.op_type} {node.name or node.output[0]!r} in training mode"

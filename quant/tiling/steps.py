@@ -43,7 +43,8 @@ class Step:
             last: of them.
             size: of the source where the image is one cell of the lattice: it may end on either side of it.
         """
-        low, high = math.ceil(first / self.growth + self.low), math.floor(last / self.growth + self.high)
+        low = math.ceil(first / self.growth + self.low)
+        high = math.floor(last / self.growth + self.high)
         if self.mirrored:  # beyond an end of the source stands what is mirrored, or copied, from within
             return min(low, 2 * (size - 1) - high), max(high, -low)
         return min(low, size - 1), max(high, 0)
@@ -88,14 +89,17 @@ class Along:
 
     def slid(self, window: Window, ceil: bool = False) -> Step:
         """A window that slides over its padded source."""
-        extra, before = window.slid(self.axis, self.extra, ceil), window.pads[self.axis]
+        extra = window.slid(self.axis, self.extra, ceil)
+        before = window.pads[self.axis]
         high = window.extent(self.axis) - 1 - before
         return Step(Fraction(1, window.stride[self.axis]), extra, Fraction(-before), Fraction(high))
 
     def put_down(self, window: Window) -> Step:
         """A window that is put down at each pixel of its source; the result is cut by the padding."""
-        stride, before = window.stride[self.axis], window.pads[self.axis]
-        low, high = Fraction(before - window.extent(self.axis) + 1, stride), Fraction(before, stride)
+        stride = window.stride[self.axis]
+        before = window.pads[self.axis]
+        low = Fraction(before - window.extent(self.axis) + 1, stride)
+        high = Fraction(before, stride)
         return Step(Fraction(stride), window.put_down(self.axis, self.extra), low, high)
 
 
@@ -133,7 +137,8 @@ def _pad(at: Along) -> Step:
     """Padding by itself; less than none cuts off."""
     mode = at.given("mode", "constant")
     at.require(mode != "wrap", "which joins opposite borders")
-    pads, axes = at.numbers(1, "pads"), at.numbers(3, "axes", range(4))
+    pads = at.numbers(1, "pads")
+    axes = at.numbers(3, "axes", range(4))
     at.require(len(pads) == 2 * len(axes), "of an unknown padding")
     ends = [at.own(part, axes, 0) for part in (pads[: len(axes)], pads[len(axes) :])]
     step = at.slid(Window(pads=(ends[0], ends[0], ends[1], ends[1])))
@@ -146,8 +151,10 @@ FAR = 1 << 30
 
 def _slice(at: Along) -> Step:
     """A part that is counted from the borders, or every n-th pixel."""
-    starts, ends = at.numbers(1, "starts"), at.numbers(2, "ends")
-    axes, steps = at.numbers(3, "axes", range(len(starts))), at.numbers(4, "steps", [1] * len(starts))
+    starts = at.numbers(1, "starts")
+    ends = at.numbers(2, "ends")
+    axes = at.numbers(3, "axes", range(len(starts)))
+    steps = at.numbers(4, "steps", [1] * len(starts))
     start, end, step = (at.own(*each) for each in ((starts, axes, 0), (ends, axes, FAR), (steps, axes, 1)))
     at.require(start >= 0 and step > 0 and (end < 0 or end >= FAR), "which cuts at a place that is fixed")
     behind = min(end, 0)

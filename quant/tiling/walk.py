@@ -135,7 +135,8 @@ class _Walk:
     """Follows the image along one side, from node to node, and back what a cell of the lattice reads."""
 
     def __init__(self, graph: OnnxGraph, axis: int) -> None:
-        self._graph, self._axis = graph, axis
+        self._graph = graph
+        self._axis = axis
         self._shapes = {name: value.shape for name, value in graph.constants.items()}
         self._grids = dict.fromkeys(graph.inputs, _Grid(Fraction(1), 0))
         self._steps: list[tuple[Node, Step]] = []
@@ -145,7 +146,8 @@ class _Walk:
         output = graph.outputs[0]
         if output not in self._grids:
             raise refused("an output that depends on the image", "one of constants alone")
-        self.scale, extra = self._grids[output].per_px, self._grids[output].extra
+        self.scale = self._grids[output].per_px
+        extra = self._grids[output].extra
         if extra:
             raise refused("an output of the image's size or a multiple", f"{extra:+d} pixels a side")
         self.lattice_px = math.lcm(*(grid.per_px.denominator for grid in self._grids.values()))

@@ -115,7 +115,8 @@ MEASURED_S, MEASURED_PX = 0.470, 256
 @pytest.mark.parametrize("board", board_names())
 def test_the_stored_time_of_the_pipeline_is_what_the_model_says(board: str) -> None:
     """Of rates measured on another day: within a fifth at each end."""
-    target, quality = load_target(board), QUALITIES["standard"]
+    target = load_target(board)
+    quality = QUALITIES["standard"]
     explained = math.fsum(MEASURED.times_s(chain_work(MEASURED_PX, MEASURED_PX, quality)).values()) / MEASURED_S
     times_s = MEASURED.times_s(chain_work(HEIGHT_PX, WIDTH_PX, quality))
     shares = {kind: explained * time_s / math.fsum(times_s.values()) for kind, time_s in times_s.items()}

@@ -44,7 +44,7 @@ def test_the_project_keeps_its_limits() -> None:
 @pytest.mark.parametrize("limit", [0.0, 1.0])
 def test_a_limit_that_is_passed_is_told(monkeypatch: pytest.MonkeyPatch, limit: float) -> None:
     found = {name: counts.counted(("benchmarks",)) for name in counts.PARTS}
-    monkeypatch.setitem(counts.LIMITS, "tokens a line", {"source": limit})
-    monkeypatch.setitem(counts.LIMITS, "paired assignments", {})
+    monkeypatch.setattr(counts, "DENSITY_LIMITS", {"source": limit})
+    monkeypatch.setattr(counts, "PAIRED_LIMITS", {})
     (sentence,) = counts.over(found)
     assert f"{limit:.2f} at most" in sentence

@@ -146,7 +146,8 @@ def test_a_network_that_quantize_refuses_is_an_error_whose_reason_is_in_the_summ
 
 def obeyed(stdout: str) -> list[str]:
     """Return the workflow commands that GitHub obeys in an output, without what follows their second colons."""
-    found, token = list[str](), ""
+    found = list[str]()
+    token = ""
     for line in stdout.splitlines():
         if token and line == f"::{token}::":
             token = ""
@@ -164,7 +165,8 @@ def test_names_are_never_run(runner: Runner) -> None:
 
 
 def test_the_action_says_what_it_takes() -> None:
-    action, page = read_yaml(ACTION), (ROOT / "docs" / "how-to" / "gate.md").read_text(encoding="utf-8")
+    action = read_yaml(ACTION)
+    page = (ROOT / "docs" / "how-to" / "gate.md").read_text(encoding="utf-8")
     assert action["inputs"]["sensor"]["default"] == SENSOR
     for kind in ("inputs", "outputs"):
         for name, about in action[kind].items():

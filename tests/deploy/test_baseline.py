@@ -29,7 +29,8 @@ def document(mae: float = 5e-4, **arguments: object) -> dict[str, Any]:
     """What a gate writes that passed."""
     figures = {"MAE": measured(mae, "of full scale", "here"), "PSNR float": measured(50.0, "dB", "here")}
     inputs = (Input("float.onnx", "a" * 64), Input("sensor s", "b" * 64))
-    row, check = Row("gate", "INT8 against float", figures), Check("MAE", mae, 1.0, "of full scale")
+    row = Row("gate", "INT8 against float", figures)
+    check = Check("MAE", mae, 1.0, "of full scale")
     return Table("gate", {**ASKED, **arguments}, inputs, (row,), (check,)).to_dict()
 
 
@@ -199,7 +200,8 @@ def test_a_folder_is_known_by_its_files(change: str, tmp_path: Path) -> None:
 
 
 def test_a_baseline_holds_the_mae(scenes: Path, tmp_path: Path) -> None:
-    first, second = tmp_path / "first.json", tmp_path / "again.json"
+    first = tmp_path / "first.json"
+    second = tmp_path / "again.json"
     command = ["gate", "--images", scenes, "--patches", 2]
     done(*command, "--json", first)
     before = read_baseline(first, {**ASKED, "images": scenes}).mae

@@ -90,7 +90,8 @@ def test_a_picture_is_drawn(tmp_path: Path) -> None:
 
 def test_of_a_float_file_check_says_what_quantize_would(tmp_path: Path) -> None:
     """Both give the same reason, so that nobody passes one to be refused by the other."""
-    taken, other = float_convbeers(tmp_path / "taken.onnx", 1, 8), tmp_path / "other.onnx"
+    taken = float_convbeers(tmp_path / "taken.onnx", 1, 8)
+    other = tmp_path / "other.onnx"
     model = onnx.load(taken)
     model.graph.node[-1].op_type = "Div"  # the global add
     onnx.save(model, other)

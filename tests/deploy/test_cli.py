@@ -78,7 +78,8 @@ def test_the_version_in_full_says_what_the_kernels_were_asked() -> None:
 
 
 def test_restore_writes_a_whole_twelve_bit_image(tmp_path: Path) -> None:
-    image, out = acquisition(tmp_path / "raw.tif"), tmp_path / "made" / "restored.tif"
+    image = acquisition(tmp_path / "raw.tif")
+    out = tmp_path / "made" / "restored.tif"
     done("restore", image, out)
     restored = tifffile.imread(out)
     assert restored.dtype == np.uint16
@@ -117,7 +118,8 @@ def test_restore_refuses_what_is_no_image(content: bytes | None, word: str, tmp_
 
 
 def test_a_photograph_is_no_raw_image_until_its_scale_is_named(tmp_path: Path) -> None:
-    picture, out = tmp_path / "photo.jpg", tmp_path / "out.tif"
+    picture = tmp_path / "photo.jpg"
+    out = tmp_path / "out.tif"
     Image.fromarray(np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8)).save(picture)
     fails(["restore", str(picture), str(out)], "--full-scale")
     assert not out.exists()

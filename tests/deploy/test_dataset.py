@@ -239,7 +239,8 @@ def test_every_effect_has_a_typical_value_and_every_scene_loads() -> None:
 
 
 def test_effects_are_added_and_forbidden() -> None:
-    profile, haze = load_sensor("pleiades-degraded"), load_scene_call("haze-over-sea")
+    profile = load_sensor("pleiades-degraded")
+    haze = load_scene_call("haze-over-sea")
     assert set(calling_for(profile, haze, ["prnu"], ["veil"]).effects) == {"striping", "prnu"}
     stated = calling_for(profile, haze, ["veil"]).effects["veil"]["transmittance"]
     assert stated.low == 0.6  # the scene's own value, not the typical one
@@ -248,7 +249,8 @@ def test_effects_are_added_and_forbidden() -> None:
 
 
 def test_each_effect_says_who_asks_for_it() -> None:
-    profile, haze = load_sensor("pleiades-degraded"), load_scene_call("haze-over-sea")
+    profile = load_sensor("pleiades-degraded")
+    haze = load_scene_call("haze-over-sea")
     base = {"mtf": "sensor pleiades-degraded", "noise": "sensor pleiades-degraded"}
     assert origins(profile, None) == base
     assert origins(profile, haze, ["prnu", "striping"], ["veil"]) == base | {

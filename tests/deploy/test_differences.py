@@ -44,7 +44,8 @@ def test_the_same_document_has_not_changed(tmp_path: Path) -> None:
     ],
 )
 def test_a_limit_knows_its_direction_and_its_unit(limit: str, code: int, tmp_path: Path) -> None:
-    before, after = document(tmp_path / "a.json"), document(tmp_path / "b.json", psnr=46.4, mae=0.00066)
+    before = document(tmp_path / "a.json")
+    after = document(tmp_path / "b.json", psnr=46.4, mae=0.00066)
     output = done("diff", before, after, "--fail-on", limit, code=code)
     assert "2 changed" in output
     assert ("FAILED gate / network" in output) == bool(code)
@@ -52,20 +53,23 @@ def test_a_limit_knows_its_direction_and_its_unit(limit: str, code: int, tmp_pat
 
 def test_figures_that_come_and_go_are_counted_and_a_watched_one_that_goes_fails(tmp_path: Path) -> None:
     extra = Row("gate", "other", {"SSIM": measured(0.99, "ratio", "pairs"), "LPIPS": unavailable("distance", "none")})
-    with_more, without = document(tmp_path / "a.json", more=(extra,)), document(tmp_path / "b.json")
+    with_more = document(tmp_path / "a.json", more=(extra,))
+    without = document(tmp_path / "b.json")
     assert "2 gone, 0 new" in done("diff", with_more, without)
     assert "0 gone, 2 new" in done("diff", without, with_more)
     done("diff", with_more, without, "--fail-on", "SSIM<-1", code=1)
 
 
 def test_from_nothing_any_rise_is_endless() -> None:
-    limit, none = parse_limit("saturated>5%"), measured(0.0, "%", "seen")
+    limit = parse_limit("saturated>5%")
+    none = measured(0.0, "%", "seen")
     for value, broken in ((0.0, False), (1e-9, True)):
         assert limit.broken_by(Change(("t", "n", "saturated"), none, measured(value, "%", "seen"))) is broken
 
 
 def test_a_written_comparison_is_a_document_again(tmp_path: Path) -> None:
-    before, after = document(tmp_path / "a.json"), document(tmp_path / "b.json", psnr=40)
+    before = document(tmp_path / "a.json")
+    after = document(tmp_path / "b.json", psnr=40)
     done("diff", before, after, "--json", tmp_path / "c.json")
     assert read_document(tmp_path / "c.json")["command"] == "diff"
 

@@ -34,7 +34,8 @@ def network() -> ConvBEERS:
 @pytest.mark.parametrize("scale", [1, 2, 3])
 @pytest.mark.parametrize("tile_px", [None, 36])
 def test_torch_and_onnxruntime_agree(scale: int, tile_px: int | None, tmp_path: Path) -> None:
-    network, path = plain(Variant(2, 8, scale)), tmp_path / "float.onnx"
+    network = plain(Variant(2, 8, scale))
+    path = tmp_path / "float.onnx"
     save_onnx(to_onnx(network, {"variant": "test"}, tile_px), path)
     assert require_parity(network, path, tile_px or 33) < 1e-6
     assert fixed_tile_px(onnx.load(path)) == tile_px
@@ -46,14 +47,16 @@ def test_torch_and_onnxruntime_agree(scale: int, tile_px: int | None, tmp_path: 
 
 @pytest.mark.parametrize("name", shipped_names())
 def test_torch_and_onnxruntime_agree_on_shipped_weights(name: str) -> None:
-    weights, sensor = shipped_weights(name), load_sensor("pleiades-degraded")
+    weights = shipped_weights(name)
+    sensor = load_sensor("pleiades-degraded")
     require_parity(torch_network(weights, sensor.nominal()), float_for(weights, name, sensor), 38)
 
 
 @pytest.mark.parametrize(("scale", "rows", "columns"), [(1, 37, 29), (2, 38, 46)])
 def test_a_network_behind_a_bank_is_exported_for_one_sensor(scale: int, rows: int, columns: int) -> None:
     """Its filters, unit and head's bias are constants then; tiled, with mirrored borders, it gives the same."""
-    banked, sensor = behind_a_bank(Variant(1, 8, scale), 0.1), load_sensor("pleiades-degraded").nominal()
+    banked = behind_a_bank(Variant(1, 8, scale), 0.1)
+    sensor = load_sensor("pleiades-degraded").nominal()
     model = banked_to_onnx(Weights(arrays(banked.state_dict()), banked.variant, {}), sensor, {})
     image = np.random.default_rng(1).random((2, 1, rows, columns), dtype=np.float32) * 0.02 + 0.4
     with torch.inference_mode():
@@ -68,7 +71,8 @@ def test_a_network_behind_a_bank_is_exported_for_one_sensor(scale: int, rows: in
 
 def test_the_shipped_network_at_half_resolution_restores_the_same_image() -> None:
     """Rearranged on both sides: in torch's order of the channels and in ONNX's."""
-    small, sensor = load_network(shipped_weights("convbeers-xs"))[0], load_sensor("pleiades-degraded").nominal()
+    small = load_network(shipped_weights("convbeers-xs"))[0]
+    sensor = load_sensor("pleiades-degraded").nominal()
     coarse = grow(small, VARIANTS["convbeers-half"], torch.Generator().manual_seed(0))
     both = [Weights(arrays(network.state_dict()), network.variant, {}) for network in (small, coarse)]
     image = np.random.default_rng(1).random((1, 1, 34, 50), dtype=np.float32)
@@ -84,7 +88,8 @@ def overflowing(network: ConvBEERS) -> ConvBEERS:
 
 
 def test_a_network_that_gives_nan_is_not_exported(network: ConvBEERS, tmp_path: Path) -> None:
-    weights, out = tmp_path / "run.safetensors", tmp_path / "float.onnx"
+    weights = tmp_path / "run.safetensors"
+    out = tmp_path / "float.onnx"
     save_network(weights, overflowing(network), {})
     said = refused("export", "--network", weights, "--out", out)
     assert "expected finite pixels" in said
@@ -102,11 +107,13 @@ def test_an_export_that_computes_something_else_is_refused(network: ConvBEERS) -
 @pytest.mark.parametrize("sensor", ["pleiades-degraded", "pleiades-variable"])
 def test_conditioned_weights_become_the_sensors(conditioned: Path, sensor: str, tmp_path: Path) -> None:
     """And the same sensor makes the same bytes."""
-    path, again = tmp_path / "x.onnx", tmp_path / "again.onnx"
+    path = tmp_path / "x.onnx"
+    again = tmp_path / "again.onnx"
     for file in (path, again):
         assert "warning" not in done("export", "--network", conditioned, "--sensor", sensor, "--out", file)
     assert path.read_bytes() == again.read_bytes()
-    unfolded, nominal = load_network(conditioned)[0], load_sensor(sensor).nominal()
+    unfolded = load_network(conditioned)[0]
+    nominal = load_sensor(sensor).nominal()
     plain = told(unfolded, vector_tensor(nominal), network_bank(nominal))
     image = np.random.default_rng(1).random((1, 1, 27, 35), dtype=np.float32)
     with torch.inference_mode():
@@ -125,7 +132,8 @@ def test_a_users_own_sensor_and_what_lies_outside_the_ranges_is_said(conditioned
 def test_plain_weights_take_no_sensor_and_conditioned_ones_the_default(
     network: ConvBEERS, conditioned: Path, tmp_path: Path
 ) -> None:
-    plain_weights, out = tmp_path / "plain.safetensors", tmp_path / "x.onnx"
+    plain_weights = tmp_path / "plain.safetensors"
+    out = tmp_path / "x.onnx"
     save_network(plain_weights, network, {})
     useless = refused("export", "--network", plain_weights, "--sensor", "pleiades-degraded", "--out", out)
     assert "train --conditioned" in useless
@@ -152,7 +160,8 @@ def test_the_deltas_of_exposures_make_the_networks_that_restore_runs(
     for name in names:
         assert f"{name}: {(tmp_path / name).stat().st_size} bytes" in said.replace("\n", "")
     for factor in factors:
-        delta, applied = tmp_path / f"my-x{factor}.delta", tmp_path / f"x{factor}.onnx"
+        delta = tmp_path / f"my-x{factor}.delta"
+        applied = tmp_path / f"x{factor}.onnx"
         assert delta.stat().st_size < 3000
         done("export", "--network", SMALL, "--apply", delta, "--out", applied)
         assert applied.read_bytes() == expected[factor].read_bytes()
@@ -174,7 +183,8 @@ def test_a_damaged_delta_is_named(tmp_path: Path) -> None:
 def test_the_files_of_exposures_are_refused_before_any_work(tmp_path: Path) -> None:
     """Where one is an input, another output or cannot be written; and where the sensor does not exist."""
     sensor = own_sensor(tmp_path).rename(tmp_path / "my-x4.toml")
-    before, out = sensor.read_bytes(), tmp_path / "my-x8.onnx"
+    before = sensor.read_bytes()
+    out = tmp_path / "my-x8.onnx"
     words = ["export", "--network", SMALL, "--out", out, "--delta"]
     assert "an input of this run" in refused(*words, tmp_path / "my.toml", "--sensor", sensor)
     assert "another output takes" in refused(*words, tmp_path / "my.onnx")

@@ -32,7 +32,8 @@ class Tiny(torch.nn.Module):
     def __init__(self) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(0)
-        self.head, self.tail = torch.nn.Conv2d(1, 4, 3, padding=1), torch.nn.Conv2d(4, 1, 3, padding=1)
+        self.head = torch.nn.Conv2d(1, 4, 3, padding=1)
+        self.tail = torch.nn.Conv2d(4, 1, 3, padding=1)
         for weight in self.parameters():
             weight.data = 0.1 * torch.randn(weight.shape, generator=generator)
 

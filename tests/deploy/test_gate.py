@@ -70,7 +70,8 @@ def own_constant(model: onnx.ModelProto, name: str, value: np.ndarray) -> str:
 
 def drop_a_relu(model: onnx.ModelProto) -> None:
     relu = node(model, "body.2.first.relu")
-    source, target = relu.input[0], relu.output[0]
+    source = relu.input[0]
+    target = relu.output[0]
     model.graph.node.remove(relu)
     for reader in model.graph.node:
         reader.input[:] = [source if name == target else name for name in reader.input]
@@ -83,7 +84,8 @@ def give_a_float_scale(model: onnx.ModelProto) -> None:
 
 def clip_an_activation(model: onnx.ModelProto) -> None:
     """A block's inner tensor at a scale four too fine: it saturates."""
-    conv, reader = node(model, "body.1.first"), node(model, "body.1.second")
+    conv = node(model, "body.1.first")
+    reader = node(model, "body.1.second")
     scale = next(numpy_helper.to_array(t) for t in model.graph.initializer if t.name == conv.input[6])
     conv.input[6] = own_constant(model, "scale_too_fine", scale / np.float32(16))
     reader.input[1] = "scale_too_fine"
@@ -303,7 +305,8 @@ def test_a_baseline_shows_a_wrong_bias_in_nearly_any_layer(factor: int, unseen: 
     The two that are left out add nothing but where a copy is rounded.
     """
     weights, path = shipped_pair(SMALL, BLIND)
-    session, sound = open_session(float_model(weights)), onnx.load(path)
+    session = open_session(float_model(weights))
+    sound = onnx.load(path)
     before = compare(session, open_session(sound), unseen.pairs).mae
     found = [node.input[8] for node in sound.graph.node if node.op_type == "QLinearConv"]
     names = [name for name in found if name not in ("bank.bias", "analytic.bias")]
@@ -328,7 +331,8 @@ def as_nodes(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def test_constants_may_be_nodes() -> None:
-    sound, other = onnx.load(shipped_pair("convbeers-xs")[1]), as_nodes(onnx.load(shipped_pair("convbeers-xs")[1]))
+    sound = onnx.load(shipped_pair("convbeers-xs")[1])
+    other = as_nodes(onnx.load(shipped_pair("convbeers-xs")[1]))
     assert count_relus(other) == count_relus(sound) == Relus(4, 0)
     assert [t.name for t in rounded_tensors(other)] == [t.name for t in rounded_tensors(sound)]
     assert read_core(other).frac_bits == read_core(sound).frac_bits
@@ -350,7 +354,8 @@ def test_results_that_are_never_below_zero_need_no_relu() -> None:
 
 
 def test_a_file_of_another_quantiser_is_judged_without_the_rules_of_a_dpu(model: Path, tmp_path: Path) -> None:
-    path, reference_model = tmp_path / "free.onnx", load_onnx(model)
+    path = tmp_path / "free.onnx"
+    reference_model = load_onnx(model)
     noise = list(np.random.default_rng(0).random((2, 1, 1, 32, 32), np.float32))
     quantize_static(model, path, Calibration(noise), per_channel=True)
     free = Network(onnx.load(path), "free", path)
@@ -372,7 +377,8 @@ def test_two_networks_of_one_kind_are_refused(reference_model: onnx.ModelProto, 
 
 
 def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(tmp_path: Path) -> None:
-    samples, limits = tmp_path / "samples.npy", tmp_path / "limits.toml"
+    samples = tmp_path / "samples.npy"
+    limits = tmp_path / "limits.toml"
     np.save(samples, np.random.default_rng(0).uniform(0.1, 0.9, (2, 1, 40, 40)).astype(np.float32))
     command = ["gate", *shipped_pair("convbeers-xs"), "--samples", samples, "--max-mae", "0.1"]
     said = done(*command)
@@ -384,7 +390,8 @@ def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(t
 
 def test_references_that_do_not_fit_are_refused_and_the_sample_is_named(tmp_path: Path) -> None:
     image = np.random.default_rng(0).uniform(0.1, 0.9, (2, 1, 40, 40)).astype(np.float32)
-    path, limits = tmp_path / "s.npz", tmp_path / "limits.toml"
+    path = tmp_path / "s.npz"
+    limits = tmp_path / "limits.toml"
     limits.write_text("mae = 0.1\npsnr_drop_db = 20\n", encoding="utf-8")
     command = ["gate", *shipped_pair(SMALL), "--samples", path, "--limits", limits]
     np.savez(path, image=image, reference=image * 4095)

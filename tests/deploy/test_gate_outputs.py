@@ -39,7 +39,9 @@ def pair(tmp_path: Path) -> tuple[Path, Path]:
 
 
 def test_a_refused_gate_leaves_no_older_verdict_and_tells_the_ci(tmp_path: Path) -> None:
-    document, junit, record = tmp_path / "gate.json", tmp_path / "gate.xml", tmp_path / "record"
+    document = tmp_path / "gate.json"
+    junit = tmp_path / "gate.xml"
+    record = tmp_path / "record"
     done("gate", *SMALL, "--json", document, "--junit", junit, "--record", record)
     assert json.loads(document.read_text())["verdict"] == "passed"
     assert sorted(path.name for path in record.iterdir()) == ["record.cdx.json", "record.html", "record.json"]
@@ -160,7 +162,9 @@ def test_a_file_without_its_description_loses_no_check_silently(pair: tuple[Path
 
 
 def test_what_refuses_the_outputs_deletes_an_older_verdict_and_says_why(tmp_path: Path) -> None:
-    document, junit, file = tmp_path / "gate.json", tmp_path / "gate.xml", tmp_path / "file"
+    document = tmp_path / "gate.json"
+    junit = tmp_path / "gate.xml"
+    file = tmp_path / "file"
     file.touch()
     outputs = ["--json", document, "--junit", junit]
     for words in (["--record", file], ["--max-mae", "nan"], ["--samples", file, "--patches", 2]):
@@ -176,7 +180,8 @@ def test_what_refuses_the_outputs_deletes_an_older_verdict_and_says_why(tmp_path
 
 
 def test_a_record_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    document, folder = tmp_path / "gate.json", tmp_path / "record"
+    document = tmp_path / "gate.json"
+    folder = tmp_path / "record"
 
     def failing(*_: object, **__: object) -> str:
         raise RuntimeError("moved")

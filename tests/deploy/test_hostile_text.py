@@ -53,7 +53,9 @@ class Tags(HTMLParser):
 
     def __init__(self, html: str) -> None:
         super().__init__()
-        self.tags, self.attributes, self.words = set[str](), set[str](), list[str]()
+        self.tags = set[str]()
+        self.attributes = set[str]()
+        self.words = list[str]()
         self.feed(html)
         self.close()
 

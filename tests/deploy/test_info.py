@@ -45,7 +45,8 @@ def test_it_says_what_the_header_says(model: Path, tmp_path: Path) -> None:
 
 def test_of_a_large_image_few_pixels_are_read(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.ones((900, 700), np.uint16))
-    read, rows = TiffSource.read, list[int]()
+    read = TiffSource.read
+    rows = list[int]()
 
     def counting(self: TiffSource, start: int, stop: int) -> np.ndarray:
         rows.append(stop - start)

@@ -61,7 +61,8 @@ def test_the_shipped_int8_network_is_the_default(da: Any, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("kind", ["nan", "value"])
 def test_missing_pixels_stay_as_in_a_file(kind: str, da: Any, model: Path, tmp_path: Path) -> None:
-    pixels, nodata = noise(70, 90), None if kind == "nan" else 7.0
+    pixels = noise(70, 90)
+    nodata = None if kind == "nan" else 7.0
     pixels[20:60, 30:75] = pixels[3, 5] = 7
     pixels = np.where(pixels == 7, np.nan, pixels).astype(np.float32) if kind == "nan" else pixels
     expected = of_file(tmp_path, pixels, Options(model, 23), nodata)
@@ -163,7 +164,8 @@ def test_values_beyond_full_scale_are_refused_at_once_or_when_computed(da: Any, 
 
 
 def test_a_full_scale_left_open_is_asked_for(da: Any, model: Path) -> None:
-    shares, eight = (noise(60, 50) / 4095).astype(np.float32), (noise(60, 50) // 16).astype(np.uint8)
+    shares = (noise(60, 50) / 4095).astype(np.float32)
+    eight = (noise(60, 50) // 16).astype(np.uint8)
     for image in (shares, eight, da.from_array(eight, chunks=20)):
         with pytest.raises(ImageError, match=r"^image: .*full_scale"):
             restore(image, model, tile=23)

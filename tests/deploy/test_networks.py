@@ -62,7 +62,8 @@ def test_int8_is_calibrated_once_and_then_told_any_sensor(
     monkeypatch.setattr(calibrate, "PATCHES", 3)
     monkeypatch.chdir(tmp_path)
     done("quantize", conditioned, "--sensor", SENSOR, "--patches", "1", "--out", "base.onnx")
-    base, sensor = load_onnx(Path("base.onnx")), own_sensor(tmp_path, ("value = 0.07", "value = 0.05"))
+    base = load_onnx(Path("base.onnx"))
+    sensor = own_sensor(tmp_path, ("value = 0.07", "value = 0.05"))
     words = ["export", "--network", "base.onnx", "--out"]
     mine = [*words, "mine.onnx", "--sensor", str(sensor), "--delta", "mine.delta"]
     done(*mine)
@@ -201,7 +202,8 @@ def test_the_gate_takes_the_names() -> None:
 def test_export_writes_a_shipped_networks_integers_for_the_host_and_the_board(tmp_path: Path) -> None:
     done("export", "--network", "convbeers-xs", "--out", tmp_path / "net.onnx")
     assert metadata(load_onnx(tmp_path / "net.onnx"))["variant"] == "convbeers-xs"
-    host, board = str(tmp_path / "int8.onnx"), str(tmp_path / "core.onnx")
+    host = str(tmp_path / "int8.onnx")
+    board = str(tmp_path / "core.onnx")
     words = ["export", "--network", "convbeers-half-xs-int8", "--sensor", "blind", "--tile", "64", "--out", host]
     done(*words, "--board-file", board)
     assert metadata(load_onnx(Path(host)))["sensor"] == "blind"

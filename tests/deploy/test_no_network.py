@@ -55,13 +55,16 @@ def done(*arguments: object) -> None:
 
 
 def test_the_chain_opens_no_socket(tmp_path: Path, no_sockets: list[tuple[object, ...]]) -> None:
-    weights, scenes = tmp_path / "w.safetensors", tmp_path / "scenes"
+    weights = tmp_path / "w.safetensors"
+    scenes = tmp_path / "scenes"
     save_network(weights, plain(Variant(1, 4)), {"degraded": "pleiades-degraded"})
     scenes.mkdir()
     rng = np.random.default_rng(0)
     tifffile.imwrite(scenes / "a.tif", rng.integers(200, 1800, (700, 700)).astype(np.uint16))
     tifffile.imwrite(tmp_path / "raw.tif", rng.integers(200, 1800, (37, 61)).astype(np.uint16))
-    flt, int8, figures = tmp_path / "f.onnx", tmp_path / "i.onnx", tmp_path / "gate.json"
+    flt = tmp_path / "f.onnx"
+    int8 = tmp_path / "i.onnx"
+    figures = tmp_path / "gate.json"
     done("profiles")
     done("export", "--network", weights, "--out", flt)
     done("quantize", flt, "--out", int8, "--images", scenes, "--patches", 2, "--patch", 32)
@@ -100,7 +103,9 @@ def kept(home: Path) -> list[str]:
 def test_no_native_library_opens_one_or_keeps_an_identifier(tmp_path: Path, runtime: str) -> None:
     if runtime == "openvino":
         pytest.importorskip("openvino", reason="the extra 'openvino' is not installed")
-    home, raw, out = tmp_path / "home", tmp_path / "raw.tif", tmp_path / "out.tif"
+    home = tmp_path / "home"
+    raw = tmp_path / "raw.tif"
+    out = tmp_path / "out.tif"
     home.mkdir()
     tifffile.imwrite(raw, np.random.default_rng(0).integers(200, 1800, (37, 61)).astype(np.uint16))
     result = alone(home, "-m", "tests.deploy.sealed", "restore", raw, out, "--runtime", runtime)

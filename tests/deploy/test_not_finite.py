@@ -60,7 +60,8 @@ def overflowing(network: ConvBEERS) -> None:
 
 
 def written(folder: Path, spoil: Spoil, suffix: str) -> Path:
-    path, network = folder / f"net{suffix}", ConvBEERS(VARIANTS[VARIANT]).eval()
+    path = folder / f"net{suffix}"
+    network = ConvBEERS(VARIANTS[VARIANT]).eval()
     with torch.no_grad():
         spoil(network)
     if suffix == ".onnx":

@@ -79,7 +79,8 @@ def _value(parameter: Parameter) -> str:
         written = parameter.kind.startswith("output")
         return f"new-{parameter.name}.svg" if written else _file(f"{parameter.name}.tif")
     if parameter.hint in (int, float):
-        least, most = parameter.info.min or 0, parameter.info.max
+        least = parameter.info.min or 0
+        most = parameter.info.max
         return str(max(least, 1) if most is None else min(max(least, 1), most))
     if issubclass(parameter.hint, StrEnum):
         return str(list(parameter.hint)[-1])

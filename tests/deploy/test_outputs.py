@@ -74,7 +74,8 @@ def test_every_path_of_a_command_is_known_to_be_read_or_written(name: str) -> No
 
 def arguments(name: str, values: dict[str, Path]) -> list[str]:
     """The command with these values; arguments that it cannot do without get files that exist."""
-    options, positional = list[str](), list[str]()
+    options = list[str]()
+    positional = list[str]()
     for key, parameter in parameters(name).items():
         value = values.get(key)
         if parameter.param_type_name == "argument":
@@ -87,7 +88,8 @@ def arguments(name: str, values: dict[str, Path]) -> list[str]:
 
 def given(name: str, folder: Path, **values: Path) -> list[str]:
     """As `arguments`: an input for each argument, an output for each that must be given, unless told otherwise."""
-    paths, whole = PATHS[name], dict(values)
+    paths = PATHS[name]
+    whole = dict(values)
     for key, parameter in parameters(name).items():
         if key in whole:
             continue

@@ -120,7 +120,9 @@ def test_labels_of_the_histogram_can_be_read_on_the_narrowest_page(farthest: int
     for text in (each for each in root.iter() if each.tag.endswith("text")):
         if text.get("transform"):  # upright
             continue
-        wide, x, anchor = text_width(text.text or ""), float(text.get("x") or 0), style_of(text).get("text-anchor")
+        wide = text_width(text.text or "")
+        x = float(text.get("x") or 0)
+        anchor = style_of(text).get("text-anchor")
         left = x - wide if anchor == "end" else x - wide / 2
         assert left >= 0
         assert left + wide <= width

@@ -53,7 +53,8 @@ def test_the_busiest_window_lies_on_the_texture() -> None:
 
 
 def test_compared_crops_share_one_stretch() -> None:
-    dark, bright = np.full((30, 40), 100.0), np.full((30, 40), 900.0)
+    dark = np.full((30, 40), 100.0)
+    bright = np.full((30, 40), 900.0)
     stretch = stretch_of(np.concatenate([dark, bright]))
     picture = np.asarray(strip({"dark": dark, "bright": bright}, [(0, 0)], 20, 2, stretch))
     assert picture[-9, 0] < 20

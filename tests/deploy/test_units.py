@@ -67,7 +67,8 @@ def rounding_db(psnr_db: np.ndarray, bits: int, pixels: int) -> np.ndarray:
     stays within four standard deviations; errors are alike within a patch of 5 x 5 pixels.
     """
     steps = np.hypot(1 / 4095, 1 / (2**bits - 1)) / np.sqrt(12)
-    fx, fy = np.fft.fftfreq(64)[None], np.fft.fftfreq(64)[:, None]
+    fx = np.fft.fftfreq(64)[None]
+    fy = np.fft.fftfreq(64)[:, None]
     ratio = mtf(fx, fy, (0.25, 0.25)) / mtf(fx, fy, (0.07, 0.07))
     share = steps * np.sqrt(float(np.square(ratio).mean()) + 2) / 10 ** (-psnr_db / 20)
     return np.asarray(10 * np.log10(1 + share**2 + 2 * 4 * share / np.sqrt(pixels / 25)))
@@ -99,7 +100,8 @@ def test_a_named_reference_of_other_units_is_converted_in_sight() -> None:
 
 
 def test_recipes_refuse_a_reference_of_other_units() -> None:
-    degraded, reference = with_units(DEGRADED, 10, 12), load_sensor("pleiades-reference")
+    degraded = with_units(DEGRADED, 10, 12)
+    reference = load_sensor("pleiades-reference")
     with pytest.raises(ProfileError, match=r"10 DN per W/m2/sr/um, 12 bits.*10\.2375"):
         PatchRecipe(degraded, reference)
     with pytest.raises(ProfileError, match="reference of pleiades-degraded"):

@@ -44,7 +44,8 @@ runner = CliRunner()
 def document(path: Path, value: object, name: str = "int8") -> Path:
     """Results with one figure of any value."""
     asked = dict.fromkeys(PATCHES)
-    row, check = Row("gate", name, {"MAE": measured(1.0, "", "here")}), Check("MAE", 0.5, 2.0, "of full scale")
+    row = Row("gate", name, {"MAE": measured(1.0, "", "here")})
+    check = Check("MAE", 0.5, 2.0, "of full scale")
     made = Table("gate", asked, (), (row,), (check,)).to_dict()
     path.write_text(json.dumps(made).replace('"value": 1.0', f'"value": {value}'), encoding="utf-8")
     return path

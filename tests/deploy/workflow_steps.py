@@ -92,7 +92,9 @@ class Runner:
         context["steps.python.outputs.python-path"] = sys.executable  # of a step that is left out
         own = Runner(self.folder)  # its steps have ids of their own
         own.run_steps(action["runs"]["steps"], context)
-        self.red, self.stderr, self.stdout = own.red, own.stderr, self.stdout + own.stdout
+        self.red = own.red
+        self.stderr = own.stderr
+        self.stdout = self.stdout + own.stdout
         known = context | own.outputs
         return {name: value_of(about["value"], known) for name, about in action["outputs"].items()}
 
@@ -121,7 +123,8 @@ class Runner:
         self.outputs |= {f"steps.{step['id']}.outputs.{name}": text for name, _, text in lines}
         self.stdout += done.stdout
         if done.returncode:
-            self.red, self.stderr = True, done.stderr
+            self.red = True
+            self.stderr = done.stderr
 
     @property
     def environment(self) -> dict[str, str]:

@@ -109,6 +109,7 @@ def outputs(command: str) -> list[Path]:
     """Files that a command is said to write, relative to its folder."""
     if not command.startswith(NAME):
         return [Path(name) for name in re.findall(r"--out (\S+)", command)]
-    name, given = shlex.split(command)[1], context_of(command).params
+    name = shlex.split(command)[1]
+    given = context_of(command).params
     named = [(key, kind) for key, kind in PATHS[name].written.items() if given[key]]
     return [given[key] / INSIDE[name] if kind == FOLDER else given[key] for key, kind in named]

@@ -17,7 +17,8 @@ pytestmark = pytest.mark.slow
 @pytest.mark.parametrize("name", vars(bd)["__all__"])
 def test_the_example_gives_what_it_shows(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    parser, text = doctest.DocTestParser(), getattr(bd, name).__doc__
+    parser = doctest.DocTestParser()
+    text = getattr(bd, name).__doc__
     example = parser.get_doctest(text, {"bd": bd, "np": np}, name, None, None)
     assert example.examples
     with small_studies():

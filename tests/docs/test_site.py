@@ -97,7 +97,8 @@ class Server(SimpleHTTPRequestHandler):
     """Serves the site, a page with a script in it, and takes what the script tells."""
 
     def __init__(self, script: str, told: "Queue[Any]", *given: Any, directory: str) -> None:
-        self.script, self.told = script, told
+        self.script = script
+        self.told = told
         super().__init__(*given, directory=directory)
 
     def log_message(self, *_: object) -> None:
@@ -128,7 +129,8 @@ def run(site: Path, tmp_path: Path) -> Run:
 
     def answer(script: str, *, dark: bool = False) -> Any:
         told: Queue[Any] = Queue()
-        handler, browse = partial(Server, script, told, directory=str(site)), command(tmp_path, dark=dark)
+        handler = partial(Server, script, told, directory=str(site))
+        browse = command(tmp_path, dark=dark)
         with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
             thread = Thread(target=server.serve_forever)
             thread.start()

@@ -104,7 +104,9 @@ class Walk:
         path.write_text(text, encoding="utf-8")
 
     def _run_all(self, block: str) -> None:
-        expected, self._code, self._last = self._code, 0, ""
+        expected = self._code
+        self._code = 0
+        self._last = ""
         for command in block.replace("\\\n", " ").splitlines():
             done = self.run(command)
             if done.returncode != expected:
@@ -151,7 +153,9 @@ class Walk:
         )
 
     def _compare(self, shown: str) -> None:
-        lines, vary, self._vary = iter(plain(self._last)), self._vary, False
+        lines = iter(plain(self._last))
+        vary = self._vary
+        self._vary = False
         for line in plain(shown):
             if line != "..." and not any(agrees(line, found, vary) for found in lines):
                 raise PageError(f"not printed, or not in this place:\n{line}\nwhat was printed:\n{self._last}")

@@ -31,7 +31,8 @@ def shapes(name: str) -> list[tuple[int, int, int, int]]:
 
 
 def differences(network: nn.Module, model: onnx.ModelProto, sizes: list[tuple[int, int, int, int]]) -> list[float]:
-    session, found = open_session(model), []
+    session = open_session(model)
+    found = []
     for size in sizes:
         image = np.random.default_rng(0).random(size, dtype=np.float32)
         with torch.inference_mode():
@@ -50,7 +51,8 @@ def test_the_exported_network_equals_torch_at_odd_and_even_sizes(name: str) -> N
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_sizes_and_channels_are_those_that_the_example_states(name: str) -> None:
-    example, network = NETWORKS[name], made(name)
+    example = NETWORKS[name]
+    network = made(name)
     for size in shapes(name):
         with torch.inference_mode():
             output = network(torch.rand(size, generator=torch.Generator().manual_seed(0)))

@@ -51,7 +51,8 @@ def of_bytes(content: bytes, others: Sequence[bytes], rng: Rng) -> bytes:
     other = pick(others, rng)
     c = int(rng.integers(0, len(other) + 1))
     number = pick(NUMBERS, rng)
-    order, width = ("<>"[int(rng.integers(2))], int(rng.integers(4)))
+    order = "<>"[int(rng.integers(2))]
+    width = int(rng.integers(4))
     packed = struct.pack(f"{order}{'BHIQ'[width]}", number % 2 ** (8 << width))
     token = pick(TOKENS, rng)
     flipped = bytes([content[a] ^ (1 << int(rng.integers(8)))]) if a < len(content) else b""
@@ -88,7 +89,8 @@ def of_xml(content: bytes, rng: Rng) -> bytes:
         return content
     (parent, child), (_, other) = (pick(pairs, rng) for _ in range(2))
     texts = (*map(str, NUMBERS), *TEXTS, *PATHS, other.text or "")
-    text, kind = pick(texts, rng), rng.random()
+    text = pick(texts, rng)
+    kind = rng.random()
     if kind < 0.1:
         parent.remove(child)
     elif kind < 0.2:
@@ -120,7 +122,8 @@ def of_safetensors(content: bytes, rng: Rng) -> bytes:
 
 def of_png(content: bytes, rng: Rng) -> bytes:
     """Change a chunk's kind or bytes, and its checksum with them."""
-    chunks, at = [], 8
+    chunks = []
+    at = 8
     while at + 12 <= len(content):
         size = int.from_bytes(content[at : at + 4])
         chunks.append(content[at + 4 : at + 8 + size])
@@ -174,7 +177,8 @@ def _field(message: Message, rng: Rng) -> None:
     if not descriptor.is_repeated:
         _field(value, rng) if isinstance(value, Message) else _set(message, descriptor, rng)
         return
-    place, kind = int(rng.integers(len(value))), rng.random()
+    place = int(rng.integers(len(value)))
+    kind = rng.random()
     if kind < 0.1:
         del value[place]
     elif kind < 0.2:
@@ -209,11 +213,13 @@ def _tree(value: object, rng: Rng) -> object:
     if not isinstance(value, dict | list) or not value or rng.random() >= 0.85:
         return _leaf(value, rng)
     if isinstance(value, dict):
-        key, kind = pick(list(value), rng), rng.random()
+        key = pick(list(value), rng)
+        kind = rng.random()
         if kind < 0.1:
             return {name: inner for name, inner in value.items() if name != key}
         return {**value, **({pick(TEXTS, rng): value[key]} if kind < 0.2 else {key: _tree(value[key], rng)})}
-    place, kind = int(rng.integers(len(value))), rng.random()
+    place = int(rng.integers(len(value)))
+    kind = rng.random()
     if kind < 0.2:
         return value[:place] + value[place + 1 :] if kind < 0.1 else value + value[place:]
     return [*value[:place], _tree(value[place], rng), *value[place + 1 :]]

@@ -45,7 +45,8 @@ def onnx_seeds(folder: Path) -> list[bytes]:
 
 def exported_seeds(_: Path) -> list[bytes]:
     """What exporters leave: constants computed, normalisation, padding, other opsets, 16-bit floats."""
-    sizes, scaled = CASES["sizes of constants"][0], CASES["normalised and scaled again"][0]
+    sizes = CASES["sizes of constants"][0]
+    scaled = CASES["normalised and scaled again"][0]
     idle = CASES["what does nothing"][0]
     networks = [made(sizes), made(scaled, 9), made(sizes, 20), made(idle, kind=onnx.TensorProto.FLOAT16)]
     return [network.SerializeToString() for network in networks]

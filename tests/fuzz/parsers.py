@@ -207,7 +207,8 @@ XML = ("VRT", "DIMAP")
 
 def of_gdal(kind: str, name: str) -> Parser:
     """What GDAL reads, with the tiles that an index names beside it."""
-    seeds, read = partial(gdal_seeds, name=name), partial(read_with_tiles, name=name)
+    seeds = partial(gdal_seeds, name=name)
+    read = partial(read_with_tiles, name=name)
     return Parser(kind, Path(name).suffix.lower(), seeds, read, of_xml if kind in XML else None)
 
 

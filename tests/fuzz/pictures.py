@@ -44,7 +44,8 @@ def tiff_seeds(folder: Path) -> list[bytes]:
 
 
 def image_of(given: dict[str, str]) -> bytes:
-    stream, pixels = io.BytesIO(), np.random.default_rng(1).integers(0, 256, (17, 19)).astype(np.uint8)
+    stream = io.BytesIO()
+    pixels = np.random.default_rng(1).integers(0, 256, (17, 19)).astype(np.uint8)
     Image.fromarray(pixels).save(stream, **given)
     return stream.getvalue()
 

@@ -33,7 +33,8 @@ PATCHES = ("--patches", "4", "--patch", "48")
 
 def outputs(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Restored pixels and the integers of INT8 files by name; predicted and counted figures by verb and network."""
-    images, networks = _images(folder), _networks(folder)
+    images = _images(folder)
+    networks = _networks(folder)
     arrays: dict[str, np.ndarray] = {}
     figures: dict[str, Any] = {}
     for name, (float_model, int8_model) in networks.items():

@@ -15,7 +15,8 @@ def plain(variant: Variant, seed: int = 0) -> ConvBEERS:
 
 def behind_a_bank(variant: Variant, spread: float) -> BankedConvBEERS:
     """Told each sensor by biases of that standard deviation."""
-    network, generator = BankedConvBEERS(variant), torch.Generator().manual_seed(0)
+    network = BankedConvBEERS(variant)
+    generator = torch.Generator().manual_seed(0)
     initialise(network, generator)
     torch.nn.init.normal_(network.bias.weight, 0.0, spread, generator)
     return network.eval()

@@ -90,7 +90,8 @@ def error(kernel: np.ndarray, made: Instrument, epsilon: float) -> float:
     """What a restoration of scenes of power 1 / r^2 errs, noise of power epsilon counted."""
     fy, fx, r = frequencies()
     blur, target = (sensor_mtf(fx[:1], fy[:, :1], each) for each in (made, REFERENCE))
-    gain, seen = response(kernel), r > 0
+    gain = response(kernel)
+    seen = r > 0
     errors = np.abs(gain * blur - target)[seen] ** 2 / r[seen] ** 2 + epsilon * np.abs(gain[seen]) ** 2
     return float(errors.mean())
 
@@ -99,12 +100,14 @@ def error(kernel: np.ndarray, made: Instrument, epsilon: float) -> float:
 @given(CONTRAST, CONTRAST, st.floats(36, 219), st.integers(0, 2**20))
 def test_no_other_kernel_of_its_size_restores_better(across: float, along: float, snr: float, seed: int) -> None:
     """Any change of a kernel that keeps its sum makes the error larger."""
-    made, generator = sensor(across, along, snr), np.random.default_rng(seed)
+    made = sensor(across, along, snr)
+    generator = np.random.default_rng(seed)
     bank = network_bank(made)
     itself = np.zeros((SIDE_PX, SIDE_PX))
     itself[SIDE_PX // 2, SIDE_PX // 2] = 1
     for k in range(FILTERS):
-        kernel, epsilon = itself + bank.details[k:].sum(0), EPSILON_PER_SIGMA * bank.sigma * STEP ** (k - 1)
+        kernel = itself + bank.details[k:].sum(0)
+        epsilon = EPSILON_PER_SIGMA * bank.sigma * STEP ** (k - 1)
         least = error(kernel, made, epsilon)
         change = generator.standard_normal(kernel.shape)
         change -= change.mean()
@@ -117,7 +120,8 @@ def test_the_fitted_kernel_errs_less_than_the_pipelines_filter_cut_small(contras
     made = sensor(contrast, contrast)
     epsilon = EPSILON_PER_SIGMA * noise_over_full_scale(made)
     whole = compensation_kernel(contrast, REFERENCE.blur, epsilon).numpy()
-    middle, radius = len(whole) // 2, SIDE_PX // 2
+    middle = len(whole) // 2
+    radius = SIDE_PX // 2
     near = whole[middle - radius : middle + radius + 1, middle - radius : middle + radius + 1]
     itself = np.zeros((SIDE_PX, SIDE_PX))
     itself[radius, radius] = 1
@@ -152,6 +156,7 @@ def test_in_places_of_pixels_the_filters_give_the_same(scale: int) -> None:
 @given(CONTRAST, CONTRAST, st.floats(36, 219))
 def test_a_sensor_vector_tells_the_bank_of_its_sensor(across: float, along: float, snr: float) -> None:
     made = sensor(across, along, snr)
-    told, own = bank_of_vector(sensor_vector(made).values), network_bank(made)
+    told = bank_of_vector(sensor_vector(made).values)
+    own = network_bank(made)
     assert told.sigma == pytest.approx(own.sigma)
     np.testing.assert_allclose(told.details, own.details, atol=1e-9)

@@ -79,7 +79,8 @@ def blurred(restored: Pixels, sensor: Instrument) -> NDArray[np.float64]:
     """Compute H x, the image mirrored at its borders."""
     height, width = restored.shape
     mirrored = np.pad(restored.astype(np.float64), ((0, height), (0, width)), mode="symmetric")
-    fy, fx = np.fft.fftfreq(2 * height)[:, None], np.fft.fftfreq(2 * width)[None]
+    fy = np.fft.fftfreq(2 * height)[:, None]
+    fx = np.fft.fftfreq(2 * width)[None]
     ratio = sensor_mtf(fx, fy, sensor) / sensor_mtf(fx, fy, REFERENCE)
     found = np.fft.ifft2(np.fft.fft2(mirrored) * ratio / ratio[0, 0]).real
     return np.asarray(found[:height, :width])
@@ -100,7 +101,8 @@ def noisy(image: Pixels, sensor: Instrument, seed: int = 1) -> NDArray[np.float3
 def corrected(step: Consistency, raw: Pixels, restored: Pixels) -> NDArray[np.float32]:
     """Compute the correction of a whole image."""
     height, width = restored.shape
-    down, across = Placed(height, 0, 0, height), Placed(width, 0, 0, width)
+    down = Placed(height, 0, 0, height)
+    across = Placed(width, 0, 0, width)
     return step.correction(raw.astype(np.float32), restored.astype(np.float32), down, across, (0, 0))
 
 
@@ -111,7 +113,8 @@ def corrected_in_part(step: Consistency, raw: Pixels, restored: Pixels, cut: Cut
     first_raw = max(top - RAW_REACH_PX, 0), max(left - RAW_REACH_PX, 0)
     part = restored[first[0] : bottom + REACH_PX, first[1] : right + REACH_PX]
     part_raw = raw[first_raw[0] : bottom + RAW_REACH_PX, first_raw[1] : right + RAW_REACH_PX]
-    down, across = Placed(height, first[0], top, bottom), Placed(width, first[1], left, right)
+    down = Placed(height, first[0], top, bottom)
+    across = Placed(width, first[1], left, right)
     return step.correction(part_raw.astype(np.float32), part.astype(np.float32), down, across, first_raw)
 
 
@@ -148,7 +151,8 @@ def test_any_part_is_corrected_as_the_whole_image_is_bit_for_bit(
         restored[height // 3 : height // 2, width // 4 : width // 2] = np.nan
     if "saturated" in lacks:
         raw[some[0][::-1], some[1]] = FULL_SCALE
-    whole, step = corrected(step_for(name), raw, restored), step_for(name)
+    whole = corrected(step_for(name), raw, restored)
+    step = step_for(name)
     part = corrected_in_part(step, raw, restored, (top, bottom, left, right))
     np.testing.assert_array_equal(part, whole[top:bottom, left:right])
     assert np.isfinite(whole).all()
@@ -159,9 +163,11 @@ def test_no_pixel_farther_than_the_reach_matters_and_the_farthest_does(
     reach_px: int, changes: int, value: float
 ) -> None:
     """The pixels at the image's border reach farthest: the block at the border is left out."""
-    generator, step = np.random.default_rng(5), step_for("formula")
+    generator = np.random.default_rng(5)
+    step = step_for("formula")
     images = generator.random((2, 333, 301)) * 2000 + 1000
-    before, seen = corrected(step, *images), []
+    before = corrected(step, *images)
+    seen = []
     for at in (*range(8), *range(150, 158)):  # how far a pixel reaches depends on where in its block it lies
         for further_px in (0, 1):
             changed = images.copy()
@@ -192,7 +198,8 @@ def test_a_constant_image_stays(name: str, height: int, width: int, share: float
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_consistent_pair_stays(name: str) -> None:
     """Measured: 0.3 to 0.8 DN rms of 480 DN of contrast, of noise of 9 DN."""
-    restored, sensor = scene(), SENSORS[name]
+    restored = scene()
+    sensor = SENSORS[name]
     change = corrected(step_for(name), blurred(restored, sensor), restored)[INSIDE]
     assert rms(change) < 1.0
     assert np.abs(change).max() < 4
@@ -219,9 +226,12 @@ ERRORS = {
 @pytest.mark.parametrize("error", ERRORS)
 def test_smooth_errors_are_removed_in_noise_and_once_is_enough(name: str, error: str) -> None:
     """The noise is the same with the error and without it, so the difference is the error's correction alone."""
-    sensor, step, wrong = SENSORS[name], step_for(name), ERRORS[error]
+    sensor = SENSORS[name]
+    step = step_for(name)
+    wrong = ERRORS[error]
     raw = noisy(blurred(scene(), sensor), sensor)
-    without, restored = corrected(step, raw, scene()), scene() + wrong
+    without = corrected(step, raw, scene())
+    restored = scene() + wrong
     change = corrected(step, raw, restored)
     rest = (change - without + wrong)[INSIDE]
     assert rms(rest) < 0.02 * rms(wrong[INSIDE])
@@ -231,8 +241,10 @@ def test_smooth_errors_are_removed_in_noise_and_once_is_enough(name: str, error:
 
 def test_a_gain_error_of_all_detail_is_removed_from_the_mean() -> None:
     """Detail smaller than two blocks keeps its error: 11 % of the error's rms on this scene (measured)."""
-    sensor, step = SENSORS["formula"], step_for("formula")
-    raw, wrong = noisy(blurred(scene(), sensor), sensor), 0.01 * scene()
+    sensor = SENSORS["formula"]
+    step = step_for("formula")
+    raw = noisy(blurred(scene(), sensor), sensor)
+    wrong = 0.01 * scene()
     rest = (corrected(step, raw, scene() + wrong) - corrected(step, raw, scene()) + wrong)[INSIDE]
     assert abs(rest.mean()) < 0.02 * wrong[INSIDE].mean()
     assert rms(rest) < 0.15 * rms(wrong[INSIDE])
@@ -244,8 +256,10 @@ def test_little_noise_comes_back_on_even_ground(name: str) -> None:
 
     Interpolation between means of blocks is no projection: it keeps half of what alternates from block to block.
     """
-    sensor, step = SENSORS[name], step_for(name)
-    ground, sigma = np.full((ROWS, COLUMNS), 1500.0), sigma_dn(sensor, 1500)
+    sensor = SENSORS[name]
+    step = step_for(name)
+    ground = np.full((ROWS, COLUMNS), 1500.0)
+    sigma = sigma_dn(sensor, 1500)
     raw = noisy(ground, sensor)
     first = corrected(step, raw, ground)
     second = corrected(step, raw, ground + first)
@@ -257,7 +271,8 @@ def test_little_noise_comes_back_on_even_ground(name: str) -> None:
 
 def test_means_of_blocks_are_those_of_the_raw_image_within_the_noise() -> None:
     """After the step the residual's block means lie within the noise of a block's mean, an eighth of a pixel's."""
-    sensor, step = SENSORS["formula"], step_for("formula")
+    sensor = SENSORS["formula"]
+    step = step_for("formula")
     raw = noisy(blurred(scene(), sensor), sensor)
     restored = scene() * 0.99 - 4
     residuals = []
@@ -305,7 +320,8 @@ def holed(name: str) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[
 @pytest.mark.parametrize("name", ["formula", "lopsided point"])
 def test_missing_pixels_change_nothing_farther_than_the_reach(name: str) -> None:
     raw, restored, whole = holed(name)
-    change, far = corrected(step_for(name), raw, restored), ~around_hole(REACH_PX)
+    change = corrected(step_for(name), raw, restored)
+    far = ~around_hole(REACH_PX)
     far[HOLE] = False
     np.testing.assert_array_equal(change[far], whole[far])
     assert far.sum() > 10_000
@@ -319,7 +335,8 @@ def test_around_a_hole_the_correction_is_nearly_the_one_without_it(name: str) ->
     Nearer than 8 px most pixels have no block whose residual is known, and their correction is 0.
     """
     raw, restored, whole = holed(name)
-    change, sigma = corrected(step_for(name), raw, restored), sigma_dn(SENSORS[name], 1500)
+    change = corrected(step_for(name), raw, restored)
+    sigma = sigma_dn(SENSORS[name], 1500)
     assert np.isfinite(change).all()
     for nearer_px, farther_px, most in ((8, 16, 0.3), (16, 24, 0.2), (24, 40, 0.1), (40, REACH_PX, 0.03)):
         ring = around_hole(farther_px) & ~around_hole(nearer_px)
@@ -341,11 +358,13 @@ def test_raw_values_of_missing_pixels_do_not_matter(value: float) -> None:
 @pytest.mark.parametrize("name", ["formula", "lopsided point"])
 def test_around_a_clipped_area_nothing_is_brightened(name: str) -> None:
     """A roof of 5200 DN, clipped: its residual is no noise. The control counts clipped pixels like others."""
-    sensor, step = SENSORS[name], step_for(name)
+    sensor = SENSORS[name]
+    step = step_for(name)
     bright = scene().copy()
     bright[150:182, 140:190] = 5200
     unclipped = blurred(bright, sensor)
-    raw, restored = np.minimum(unclipped, FULL_SCALE), np.minimum(bright, FULL_SCALE)
+    raw = np.minimum(unclipped, FULL_SCALE)
+    restored = np.minimum(bright, FULL_SCALE)
     around = np.zeros(raw.shape, bool)
     around[138:194, 128:202] = True
     around &= raw < FULL_SCALE

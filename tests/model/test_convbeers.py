@@ -17,7 +17,8 @@ def test_the_parameters_are_those_of_the_paper(name: str, parameters: int) -> No
 def test_the_radius_is_how_far_a_gradient_reaches(blocks: int, scale: int) -> None:
     """Of the first pixel of a place, whose other pixels are below it."""
     variant = Variant(blocks=blocks, features=4, scale=scale)
-    side, middle = 4 * scale * radius_px(variant) + scale, 2 * scale * radius_px(variant)
+    side = 4 * scale * radius_px(variant) + scale
+    middle = 2 * scale * radius_px(variant)
     image = torch.rand(1, 1, side, side, generator=torch.Generator().manual_seed(1)).requires_grad_()
     network = plain(variant)
     for module in network.modules():
@@ -65,9 +66,11 @@ def test_any_size_keeps_its_shape(scale: int) -> None:
 
 def test_at_half_resolution_a_shift_by_a_place_shifts_the_result_and_a_pixel_does_not() -> None:
     """The four pixels of a place are channels of their own: the lattice, by which tiles are cut, is 2."""
-    network, side = plain(Variant(1, 4, 2)), 32
+    network = plain(Variant(1, 4, 2))
+    side = 32
     image = torch.rand(1, 1, side, side, generator=torch.Generator().manual_seed(1))
-    inner, whole = slice(12, -12), network(image)
+    inner = slice(12, -12)
+    whole = network(image)
     apart = [
         float((network(image.roll(step, -1)).roll(-step, -1) - whole)[..., inner, inner].detach().abs().max())
         for step in (2, 1)
@@ -80,10 +83,8 @@ VECTORS = torch.tensor([[-0.9, -0.8, 0.3, 0.2], [0.5, 0.1, -0.7, -0.6], [0.0, 0.
 
 
 def test_each_image_of_a_batch_meets_its_own_sensor() -> None:
-    network, images = (
-        behind_a_bank(Variant(2, 5), 0.3),
-        torch.rand(3, 1, 13, 17, generator=torch.Generator().manual_seed(0)),
-    )
+    network = behind_a_bank(Variant(2, 5), 0.3)
+    images = torch.rand(3, 1, 13, 17, generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
         together = network(images, told_of(VECTORS))
         for number in range(3):

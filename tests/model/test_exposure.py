@@ -90,7 +90,8 @@ def test_a_pixel_takes_the_highest_factor_that_leaves_headroom(
     seed: int, height: int, width: int, radius_px: int, offset: float
 ) -> None:
     """By a loop over pixels; so HEADROOM holds everywhere within the radius."""
-    image, factors = image_of(seed, height, width), (1, 4, 8)
+    image = image_of(seed, height, width)
+    factors = (1, 4, 8)
     chosen = choose_factors(image, factors, radius_px, FULL_SCALE, offset)
     for row, column in np.random.default_rng(seed).integers(0, (height, width), (20, 2)):
         around = image[max(row - radius_px, 0) : row + radius_px + 1, max(column - radius_px, 0) :]
@@ -104,10 +105,14 @@ def test_a_pixel_takes_the_highest_factor_that_leaves_headroom(
 def test_a_part_chooses_as_the_whole_image_does(
     data: st.DataObject, seed: int, height: int, width: int, radius_px: int
 ) -> None:
-    image, factors = image_of(seed, height, width), (1, 2, 4)
-    top, left = data.draw(st.integers(0, height - 1)), data.draw(st.integers(0, width - 1))
-    bottom, right = data.draw(st.integers(top + 1, height)), data.draw(st.integers(left + 1, width))
-    row, column = max(top - radius_px, 0), max(left - radius_px, 0)
+    image = image_of(seed, height, width)
+    factors = (1, 2, 4)
+    top = data.draw(st.integers(0, height - 1))
+    left = data.draw(st.integers(0, width - 1))
+    bottom = data.draw(st.integers(top + 1, height))
+    right = data.draw(st.integers(left + 1, width))
+    row = max(top - radius_px, 0)
+    column = max(left - radius_px, 0)
     part = image[row : bottom + radius_px, column : right + radius_px]
     found = choose_factors(part, factors, radius_px, FULL_SCALE, 0.0)[top - row :, left - column :]
     whole = choose_factors(image, factors, radius_px, FULL_SCALE, 0.0)[top:bottom, left:right]

@@ -80,7 +80,8 @@ def test_no_corner_of_the_ranges_is_starved() -> None:
     """Blurred and noisy together, and each mixture: more than one sensor in a hundred for each of eight corners."""
     generator = np.random.default_rng(0)
     vectors = torch.stack([vector_tensor(FAMILY.draw(generator)) for _ in range(3000)])
-    low, high = vectors[:, [0, 1, 3]] < -1 / 3, vectors[:, [0, 1, 3]] > 1 / 3
+    low = vectors[:, [0, 1, 3]] < -1 / 3
+    high = vectors[:, [0, 1, 3]] > 1 / 3
     for sharp in (False, True):
         for noisy in (False, True):
             blur = (high if sharp else low)[:, :2].all(1)

@@ -36,7 +36,8 @@ def convolved(image: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray
 
 def test_the_answer_holds_for_convolutions() -> None:
     """The largest products: their sum at the middle of an image, in units of a two hundredth of it."""
-    image, weight = np.full((1, 32, 9, 11), 255, np.uint8), np.full((32, 32, 3, 3), 127, np.int8)
+    image = np.full((1, 32, 9, 11), 255, np.uint8)
+    weight = np.full((32, 32, 3, 3), 127, np.int8)
     middle = convolved(image, weight, 32 * 9 * 255 * 127 / 200)[0, :, 1:-1, 1:-1]
     assert bool((middle == 200).all()) == int8_adds_exactly()
 

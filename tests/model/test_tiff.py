@@ -79,7 +79,8 @@ def test_a_strip_beyond_the_end_is_refused_before_it_is_read(tmp_path: Path) -> 
 
 def test_a_size_that_is_no_whole_number_is_refused(tmp_path: Path) -> None:
     path = tiff(tmp_path / "a.tif", GREY.tobytes())
-    whole, broken = struct.pack("<HHII", 257, 4, 1, 16), struct.pack("<HHIf", 257, 11, 1, 16.0)
+    whole = struct.pack("<HHII", 257, 4, 1, 16)
+    broken = struct.pack("<HHIf", 257, 11, 1, 16.0)
     assert whole in path.read_bytes()
     path.write_bytes(path.read_bytes().replace(whole, broken))
     refused(path, ImageError, "readable|whole numbers")
@@ -144,7 +145,8 @@ def test_a_chunk_stated_longer_than_the_file_takes_no_memory(tmp_path: Path) -> 
 @pytest.mark.parametrize("side", [2_000_000, 2**31 - 1])
 def test_a_gigantic_png_header_allocates_nothing(side: int, tmp_path: Path) -> None:
     """A small file whose header claims another size."""
-    path, header = tmp_path / "huge.png", struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
+    path = tmp_path / "huge.png"
+    header = struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
     Image.fromarray(GREY).save(path)
     content = bytearray(path.read_bytes())
     content[16:33] = header + struct.pack(">I", zlib.crc32(b"IHDR" + header))

@@ -76,7 +76,8 @@ def harsh_core(seed: int, channels: int) -> IntCore:
 @pytest.mark.parametrize("channels", [5, 16, 32])
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
 def test_the_largest_products_are_added_exactly(seed: int, channels: int) -> None:
-    core, seen = harsh_core(seed, channels), image(edges, (13, 21), seed)
+    core = harsh_core(seed, channels)
+    seen = image(edges, (13, 21), seed)
     whole = correction(core, split(seen), half_even=True)
     assert len(np.unique(whole)) > 40
     restored = np.clip(seen + whole, 0, 1)

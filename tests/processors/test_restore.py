@@ -36,7 +36,8 @@ def by_reference(dn: np.ndarray, name: str) -> np.ndarray:
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s"])
 def test_an_array_becomes_what_the_integer_reference_says(name: str) -> None:
-    dn, model = raw(61, 97), shipped_pair(name)[1]
+    dn = raw(61, 97)
+    model = shipped_pair(name)[1]
     expected = by_reference(dn, name)
     assert (expected != dn).mean() > 0.5
     for tile_px, threads in ((640, 1), (48, 2)):

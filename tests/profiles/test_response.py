@@ -52,7 +52,8 @@ def formula(frequency: np.ndarray, contrast: float) -> np.ndarray:
 
 def test_a_table_says_what_stands_in_it(tmp_path: Path) -> None:
     profile = load_sensor(str(sensor_file(tmp_path, TABLE)))
-    sensor, f = profile.nominal(), np.array([[0.0, 0.25, 0.5]])
+    sensor = profile.nominal()
+    f = np.array([[0.0, 0.25, 0.5]])
     assert isinstance(sensor.response, MtfTable)
     assert sensor.response.at(f, np.zeros((1, 1)))[0] == pytest.approx([1, 0.5, 0.12])
     assert sensor.response.at(np.zeros((1, 1)), f.T)[:, 0] == pytest.approx([1, 0.4, 0.05])
@@ -85,7 +86,8 @@ def test_a_point_spread_is_its_transform_about_its_centroid(tmp_path: Path) -> N
     wanted = np.fft.fft2(samples, (96, 96)) * shift / samples.sum()
     assert sensor.response is not None
     assert np.abs(sensor.response.at(f[None], f[:, None]) - wanted).max() < 3e-6
-    across, along = (abs(wanted[0, 12]), abs(wanted[12, 0]))
+    across = abs(wanted[0, 12])
+    along = abs(wanted[12, 0])
     assert sensor.mtf_axes == pytest.approx((across, along), abs=3e-6)
 
 
@@ -113,7 +115,8 @@ def test_the_unit_of_the_samples_does_not_matter(scale: float, tmp_path: Path) -
 def test_the_empty_rim_of_a_point_spread_is_cut_and_changes_nothing(tmp_path: Path) -> None:
     samples = lopsided()
     (tmp_path / "wide").mkdir()
-    tight, wide = with_psf(tmp_path, samples).response, with_psf(tmp_path / "wide", np.pad(samples, 400)).response
+    tight = with_psf(tmp_path, samples).response
+    wide = with_psf(tmp_path / "wide", np.pad(samples, 400)).response
     assert isinstance(wide, PointSpread)
     assert wide.height <= samples.shape[0]
     assert wide.width <= samples.shape[1]
@@ -233,7 +236,8 @@ def test_a_damaged_file_gets_one_sentence(content: bytes, tmp_path: Path) -> Non
 
 def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:
     plain = load_sensor("pleiades-degraded")
-    alpha, beta = plain.nominal().alpha, plain.nominal().beta
+    alpha = plain.nominal().alpha
+    beta = plain.nominal().beta
     profile = load_sensor(str(sensor_file(tmp_path, "mtf_nyquist = 0.07", f"alpha = {alpha}\nbeta = {beta}")))
     assert profile.nominal() == plain.nominal()
     assert (profile.radiance_0.low, profile.radiance_1.low) == (25, 100)  # of the shipped full scale, 400

@@ -109,7 +109,8 @@ def test_every_draw_is_physical_and_within_its_ranges(name: str, seed: int) -> N
 
 
 def test_impossible_pairs_are_counted() -> None:
-    profile, rng = load_sensor("dior-high"), np.random.default_rng(0)
+    profile = load_sensor("dior-high")
+    rng = np.random.default_rng(0)
     rejected = sum(profile.draw_counted(rng)[1] for _ in range(400))
     share = rejected / (rejected + 400)
     assert 0.70 < share < 0.80  # 24.9 % of the pairs are valid

@@ -82,7 +82,8 @@ def test_profiles_print_the_file_to_start_from(tmp_path: Path) -> None:
 def test_the_pages_commands_are_understood_and_use_what_was_written_before() -> None:
     """Read by the command line itself, not run; each input is the page's own, the user's, or an earlier output."""
     (block,) = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
-    group, known = get_command(app), {"scene.png", "raw.tif", "my-sensor.toml"}
+    group = get_command(app)
+    known = {"scene.png", "raw.tif", "my-sensor.toml"}
     assert isinstance(group, TyperGroup)
     lines = [line.split()[1:] for line in block.splitlines()]
     for name, *words in lines:

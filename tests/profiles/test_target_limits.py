@@ -72,7 +72,8 @@ def test_every_number_within_the_limits_is_taken(
     data: st.DataObject, place: tuple[str, str], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     limits = LIMITS[place]
-    real, whole = st.floats(limits.low, limits.high), st.integers(int(limits.low), int(limits.high))
+    real = st.floats(limits.low, limits.high)
+    whole = st.integers(int(limits.low), int(limits.high))
     value = float(data.draw(whole if limits.whole else real))
     profile = load_target(board(tmp_path_factory.mktemp("board"), *place, repr(value)))
     constants = profile.configuration("C32B3")[1] if place[0] == BUILD else profile.tables[place[0]]

@@ -29,7 +29,8 @@ def test_the_boards_are_the_targets_with_a_dpu() -> None:
 
 
 def test_the_pages_board_is_the_zcu102_but_for_what_it_states(tmp_path: Path) -> None:
-    mine, base = load_dpu(written(tmp_path, EXAMPLE)), load_dpu("zcu102", "B2304")
+    mine = load_dpu(written(tmp_path, EXAMPLE))
+    base = load_dpu("zcu102", "B2304")
     assert (mine.name, mine.cores, mine.batch) == ("B2304", 2, 2)
     assert mine.engine_ops_per_s == pytest.approx(2304 * 250e6)
     stated = {("array", "pl_clock_hz"), ("memory", "ddr_bytes_per_s"), ("tile", "memory_bytes")}
@@ -47,7 +48,8 @@ def test_the_pages_board_is_the_zcu102_but_for_what_it_states(tmp_path: Path) ->
 
 
 def test_the_zcu104_is_the_zcu102_but_for_cores_clock_and_memory() -> None:
-    one, other = load_target("zcu102"), load_target("zcu104")
+    one = load_target("zcu102")
+    other = load_target("zcu104")
     differing = {
         (table, key)
         for table, constants in one.tables.items()

@@ -43,10 +43,12 @@ def with_relu6(size: float) -> Graph:
     """A depthwise convolution between others, behind each a ReLU6; the larger `size`, the more is clipped."""
     generator = np.random.default_rng(0)
     shapes = {"a": (5, 3, 3, 3), "b": (5, 1, 3, 3), "c": (4, 5, 1, 1), CORRECTION: (1, 4, 3, 3)}
-    graph, source = list[Op](), PLANES
+    graph = list[Op]()
+    source = PLANES
     for name, shape in shapes.items():
         weight = (size * generator.normal(0.2, 1, shape)).astype(np.float32)
-        bias, groups = generator.normal(0, 1, shape[0]).astype(np.float32), 5 if name == "b" else 1
+        bias = generator.normal(0, 1, shape[0]).astype(np.float32)
+        groups = 5 if name == "b" else 1
         activation = Activation.none if name == CORRECTION else Activation.relu6
         graph.append(Conv(name, source, name, weight, bias, activation, same(weight), groups))
         source = name

@@ -36,7 +36,8 @@ SIDE_PX = 48
 
 def images(name: str, count: int = 3, side_px: int = SIDE_PX) -> list[np.ndarray]:
     """Smooth patches with an edge, of the network's channels and size: (1, C, h, w) float32 in [0, 1]."""
-    side, generator = NETWORKS[name].side_px or side_px, np.random.default_rng(7)
+    side = NETWORKS[name].side_px or side_px
+    generator = np.random.default_rng(7)
     rows, columns = np.mgrid[:side, :side] / side
     found = []
     for k in range(count):
@@ -58,7 +59,8 @@ def quantised(name: str) -> Quantised:
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_int8_stays_near_float(name: str) -> None:
-    made, seen = quantised(name), images(name)[1]
+    made = quantised(name)
+    seen = images(name)[1]
     wanted = made.core.ends.clipped(result_of(open_session(float_network(name)), seen))
     found = result_of(open_session(made.host), seen)
     assert found.shape == wanted.shape
@@ -67,7 +69,8 @@ def test_int8_stays_near_float(name: str) -> None:
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_the_integer_reference_is_the_runtime_bit_for_bit(name: str) -> None:
-    made, seen = quantised(name), images(name)[2]
+    made = quantised(name)
+    seen = images(name)[2]
     found = agreement(made.core, made.host, seen)
     assert [layer.report.name for layer in found.layers if layer.unequal] == []
     whole = result_of(open_session(made.host), seen)
@@ -164,7 +167,8 @@ def one_convolution(weight: float, bias: float) -> onnx.ModelProto:
 def test_windows_make_a_result_finer_than_8_bits(weight: float, bias: float, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = images("ffdnet")
     patches = patches_of(seen)
-    model, errors = one_convolution(weight, bias), []
+    model = one_convolution(weight, bias)
+    errors = []
     for dual in (True, False):
         if not dual:
             monkeypatch.setattr("beers_deploy.quant.quantise.takes_gains", lambda _: False)

@@ -62,7 +62,8 @@ def test_the_pair_shows_the_same_ground(drawn: Patches) -> None:
 def test_the_ranges_are_covered_without_gaps(scenes: list[Scene]) -> None:
     """With 40 strata, each 1/40 of the candidates: no gap in the MTF exceeds a few strata, and both ends are seen."""
     views = draw_patches(scenes, VARIABLE, REFERENCE, count=40, seed=0, patch_px=40).views
-    low, high = VARIABLE.mtf_nyquist.low, VARIABLE.mtf_nyquist.high
+    low = VARIABLE.mtf_nyquist.low
+    high = VARIABLE.mtf_nyquist.high
     found = (np.sort([view.degraded.mtf_nyquist for view in views]) - low) / (high - low)
     assert found[0] < 2 / 40
     assert found[-1] > 1 - 2 / 40
@@ -106,7 +107,9 @@ def test_scenes_too_small_for_a_patch_are_refused(scenes: list[Scene]) -> None:
 @pytest.mark.parametrize("shape", [(TILE_PX, 31), (TILE_PX + 1, 37), (2 * TILE_PX + 3, TILE_PX + 70)])
 def test_pieces_hold_what_the_whole_image_gives(graph: Graph, shape: tuple[int, int]) -> None:
     """And no run returns more than a piece with its halo, which bounds memory."""
-    names, whole, halo_px = tensors(graph), image(*shape), halo_of(graph)
+    names = tensors(graph)
+    whole = image(*shape)
+    halo_px = halo_of(graph)
     assert halo_px is not None
     session = open_session(graph_to_onnx(graph, names))
     wanted = session.run(names, {PLANES: planes_of(whole)})

@@ -84,7 +84,8 @@ def test_each_group_is_fitted_to_what_it_reads_in_int8_and_to_its_float_mean(
 ) -> None:
     generator = np.random.default_rng(seed)
     exact = generator.normal(0, 1, (500, groups, 6)) + generator.normal(2, 2, (500, groups, 1))
-    read, unit = np.floor(2 * exact) / 2, 2.0**-3
+    read = np.floor(2 * exact) / 2
+    unit = 2.0**-3
     weight = generator.uniform(-10, 10, (outputs * groups, 6, 1, 1)).astype(np.float32)
     moments = Moments.of_none(groups, 6)
     moments.add(read.astype(np.float32), exact.astype(np.float32))

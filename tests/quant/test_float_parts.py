@@ -17,7 +17,8 @@ from tests.quant.quick import Calibration
 def decoy(hidden: str) -> onnx.ModelProto:
     """A float layer; and beside it a quantised one whose result counts for nothing."""
     w = GraphWriter()
-    unit, zero = w.constant("unit", np.array(2.0**-7, np.float32)), w.constant("zero", np.array(0, np.int8))
+    unit = w.constant("unit", np.array(2.0**-7, np.float32))
+    zero = w.constant("zero", np.array(0, np.int8))
     w.node("QuantizeLinear", "q", ["x", unit, zero])
     w.node("DequantizeLinear", "dq", ["q", unit, zero])
     weight = w.constant("w", np.full((1, 1, 1, 1), 0.5, np.float32))

@@ -96,7 +96,8 @@ def test_a_nearest_resize_is_taken_where_it_makes_blocks(where: str, rounding: s
             "Resize", "restored", ["x", "", w.constant("s", np.array([1, 1, factor, factor], np.float32))], "r", **how
         )
 
-    model, pixels = behind_conv(write), np.random.default_rng(0).random((1, 1, 5, 7), np.float32)
+    model = behind_conv(write)
+    pixels = np.random.default_rng(0).random((1, 1, 5, 7), np.float32)
     found = result_of(open_session(model), pixels)[:, :1]
     # With aligned corners the places depend on the image's size: right for this one is not right for all.
     if where != "align_corners" and np.array_equal(found, pixels.repeat(factor, 2).repeat(factor, 3)):

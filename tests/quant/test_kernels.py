@@ -36,7 +36,8 @@ def convolution(
     weight: np.ndarray, kind: type[np.uint8 | np.int8], groups: int = 1, per_channel: bool = False, middle: int = 3
 ) -> onnx.ModelProto:
     """QLinearConv of images (N, C, H, W) of 8 bits by int8 weights (O, C / groups, k, k), asymmetric, with a bias."""
-    outputs, terms = len(weight), weight[0].size
+    outputs = len(weight)
+    terms = weight[0].size
     unit = 2.0 ** -np.ceil(np.log2(terms * 127))
     constants = {
         "unit": np.float32(1),
@@ -62,7 +63,8 @@ def by_definition(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
     groups = model.graph.node[0].attribute[0].i
     shifted = image.astype(np.int64) - int(held["middle"])
     weight = held["weight"].astype(np.int64) - held["weight_middle"].astype(np.int64).reshape(-1, *([1] * 3))[:1]
-    per_group, kernel = weight.shape[1], weight.shape[2]
+    per_group = weight.shape[1]
+    kernel = weight.shape[2]
     height, width = (side - kernel + 1 for side in image.shape[2:])
     sums = np.zeros((len(image), len(weight), height, width), np.int64)
     for o in range(len(weight)):
@@ -102,7 +104,8 @@ def test_any_convolution_is_added_exactly(
 
 def test_left_alone_they_saturate_where_the_processor_does() -> None:
     """The control: without the ways the numbers are wrong on such a processor, and right on any other."""
-    image, weight = np.full((1, 32, 5, 5), 255, np.uint8), np.full((16, 32, 3, 3), 127, np.int8)
+    image = np.full((1, 32, 5, 5), 255, np.uint8)
+    weight = np.full((16, 32, 3, 3), 127, np.int8)
     model = convolution(weight, np.uint8)
     result = open_session(model, 1, exact=False).run(None, {"image": image})[0]
     assert np.array_equal(result, by_definition(model, image)) == int8_adds_exactly()
@@ -155,7 +158,8 @@ SMALL = [shipped_pair(name)[1] for name in ("convbeers-xs", "convbeers-s")]
 @pytest.mark.parametrize("path", SMALL, ids=lambda path: path.stem)
 @pytest.mark.parametrize("optimise", [False, True])
 def test_shipped_networks_are_those_of_the_integer_reference(path: Path, optimise: bool) -> None:
-    model, generator = load_onnx(path), np.random.default_rng(5)
+    model = load_onnx(path)
+    generator = np.random.default_rng(5)
     core = read_core(model)
     drawn = generator.random((1, 1, 37, 53)), generator.integers(0, 2, (1, 1, 24, 41))
     for image in (each.astype(np.float32) for each in drawn):
@@ -179,7 +183,8 @@ def test_a_relu_that_somebody_else_looks_at_is_left_alone() -> None:
     relu = next(node.output[0] for node in model.graph.node if node.op_type == "Max")
     model.graph.output.append(helper.make_tensor_value_info(relu, TensorProto.UINT8, None))
     image = np.random.default_rng(0).random((1, 1, 13, 21), dtype=np.float32)
-    as_written, ways = open_session(model, 1, exact=False), open_session(model, 1, exact=True)
+    as_written = open_session(model, 1, exact=False)
+    ways = open_session(model, 1, exact=True)
     lowest = ways.run([relu], {"image": image})[0].min()
     assert lowest == as_written.run([relu], {"image": image})[0].min() == 128
 
@@ -248,7 +253,8 @@ def as_written(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("path", [shipped_pair()[1], SMALL[0]], ids=lambda path: path.stem)
 def test_no_convolution_stays_narrow_and_the_numbers_are_the_same(path: Path) -> None:
-    model, generator = load_onnx(path), np.random.default_rng(0)
+    model = load_onnx(path)
+    generator = np.random.default_rng(0)
     wider = filled(model)
     onnx.checker.check_model(wider)
     for old, new in zip(shapes_of_weights(model), shapes_of_weights(wider), strict=True):

@@ -36,8 +36,10 @@ from tests.quant.quick import in_float, patches_of, quickly, with_relu6
 def read(name: str) -> tuple[onnx.ModelProto, Graph, Ends, Chain]:
     model = simplest(to_onnx(name, build(name, torch.Generator().manual_seed(0))), name)
     network = read_network(model)
-    graph, ends = read_planes(network.graph), ends_of(network)
-    widths, alone = channels_of(graph, {PLANES: ends.planes * ends.channels}), lone_tensors(graph)
+    graph = read_planes(network.graph)
+    ends = ends_of(network)
+    widths = channels_of(graph, {PLANES: ends.planes * ends.channels})
+    alone = lone_tensors(graph)
     return model, graph, ends, Chain(tuple(alone), tuple(widths[tensor] for tensor in alone))
 
 
@@ -76,7 +78,8 @@ def test_what_others_read_or_factors_do_not_pass_is_left_alone() -> None:
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 1.0, 3.0]))
 def test_relu6_is_the_end_of_int8_whatever_the_factors(seed: int, size: float) -> None:
-    graph, ends = with_relu6(size), Ends()
+    graph = with_relu6(size)
+    ends = Ends()
     chain = Chain(tuple(lone_tensors(graph)), (5, 5, 4))
     assert chain.tensors == ("a", "b", "c")
     scaled = chain.scaled(graph, np.random.default_rng(seed).lognormal(-2, 1, 14))
@@ -147,7 +150,8 @@ def test_unequal_channels_err_half_as_much_once_they_are_levelled(monkeypatch: p
             norm.weight.mul_(factors)
             norm.bias.mul_(factors)  # type: ignore[union-attr]
             conv.weight.div_(factors[:, None, None])
-    model, seen = simplest(to_onnx("dncnn", network), "dncnn"), images()
+    model = simplest(to_onnx("dncnn", network), "dncnn")
+    seen = images()
     patches = patches_of(seen)
 
     def mae() -> float:

@@ -46,8 +46,10 @@ def conv(source: str, output: str, shape: tuple[int, int, int, int], seed: int, 
 
 def network(seed: int = 0) -> Graph:
     """Two tensors that only convolutions without padding read, one of them 2 x 3, and two that are padded."""
-    first, depthwise = conv(PLANES, "a", (5, 3, 3, 3), seed), conv("a", "b", (5, 1, 3, 3), seed + 1, groups=5)
-    point, large = conv("b", "c", (4, 5, 1, 1), seed + 2), conv("c", "d", (3, 4, 2, 3), seed + 3, window=VALID)
+    first = conv(PLANES, "a", (5, 3, 3, 3), seed)
+    depthwise = conv("a", "b", (5, 1, 3, 3), seed + 1, groups=5)
+    point = conv("b", "c", (4, 5, 1, 1), seed + 2)
+    large = conv("c", "d", (3, 4, 2, 3), seed + 3, window=VALID)
     return first, depthwise, point, large, conv("d", CORRECTION, (1, 3, 3, 3), seed + 4, activation=Activation.none)
 
 
@@ -77,14 +79,16 @@ def test_behind_relu_and_read_without_padding() -> None:
 @given(st.integers(0, 99), st.integers(2, 9), st.sampled_from([0.3, 3.0]))
 def test_the_float_network_stays(seed: int, frac_bits: int, size: float) -> None:
     for graph, name in ((network(seed), "c"), (with_relu6(size), "b")):
-        wanted, found = result(graph), result(lowered(graph, name, frac_bits))
+        wanted = result(graph)
+        found = result(lowered(graph, name, frac_bits))
         np.testing.assert_allclose(found, wanted, atol=1e-4 * max(np.abs(wanted).max(), 2.0**-frac_bits))
 
 
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 99))
 def test_every_file_holds_the_references_integers(seed: int) -> None:
-    core, seen = core_of(both_lowered(network(seed))), image(19, 19, seed)
+    core = core_of(both_lowered(network(seed)))
+    seen = image(19, 19, seed)
     assert shift_faults(core) == []
     host = host_model(core, {})
     assert not any(layer.unequal for layer in agreement(core, host, seen).layers)
@@ -128,7 +132,8 @@ def crops(count: int) -> Remade[np.ndarray]:
 
 
 def test_the_layer_errs_half_as_much() -> None:
-    graph, seen = network(), crops(4)
+    graph = network()
+    seen = crops(4)
     lost = []
     for each in (graph, lowered(graph, "b", 6)):
         core = build_core(each, BITS | {"b": 5}, ends=Ends(planes=3, adds_image=False))
@@ -138,7 +143,8 @@ def test_the_layer_errs_half_as_much() -> None:
 
 
 def test_fitted_biases_give_back_what_was_taken() -> None:
-    seen, ends = crops(8), Ends(planes=3, adds_image=False)
+    seen = crops(8)
+    ends = Ends(planes=3, adds_image=False)
     wanted = np.mean([in_float(network(), each, ends) for each in seen])
     graph = both_lowered(network())
     core = fit_weights(graph, build_core(graph, BITS, ends=ends), seen)

@@ -18,7 +18,9 @@ from tests.quant.tiling.small_networks import Row, taps
 def windowed(draw: st.DrawFn) -> Row:
     """A transposed convolution, one with automatic padding, or a pool."""
     pairs = st.tuples(*[st.integers(1, 3)] * 2)
-    kernel, strides, pads = draw(pairs), draw(pairs), draw(st.tuples(*[st.integers(0, 2)] * 4))
+    kernel = draw(pairs)
+    strides = draw(pairs)
+    pads = draw(st.tuples(*[st.integers(0, 2)] * 4))
     moves: dict[str, Any] = {"strides": strides, "dilations": draw(pairs)}
     kind = draw(st.sampled_from(["ConvTranspose", "Conv", "MaxPool"]))
     if kind == "MaxPool":
@@ -48,8 +50,10 @@ def test_moves_are_those_of_onnx(perm: list[int], sizes: list[int], axis: int) -
     image = np.arange(120).reshape(1, 6, 4, 5)
     for kind, stated in {"Transpose": perm, "Reshape": sizes, "Unsqueeze": [axis], "Squeeze": [0]}.items():
         if kind == "Transpose":
-            node, feeds = helper.make_node(kind, ["x"], ["y"], perm=stated), {"x": image}
+            node = helper.make_node(kind, ["x"], ["y"], perm=stated)
+            feeds = {"x": image}
         else:
-            node, feeds = helper.make_node(kind, ["x", "s"], ["y"]), {"x": image, "s": np.array(stated)}
+            node = helper.make_node(kind, ["x", "s"], ["y"])
+            feeds = {"x": image, "s": np.array(stated)}
         (expected,) = list(ReferenceEvaluator(node).run(None, feeds))
         np.testing.assert_array_equal(MOVES[kind][1](image, stated), expected)

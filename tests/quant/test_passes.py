@@ -97,7 +97,9 @@ def skipping(seed: int = 0) -> Graph:
 
 
 def test_a_stream_goes_through_pools_enlargements_and_concats() -> None:
-    graph, fine, coarse = skipping(), slice(2, 5), slice(0, 2)
+    graph = skipping()
+    fine = slice(2, 5)
+    coarse = slice(0, 2)
     wanted = {"head": fine, "inner": fine, "sum": fine, "pooled": fine, "deep": coarse, "up": coarse}
     assert stream_of(graph) == wanted | {"both": slice(0, 5)}
     planes = {PLANES: np.random.default_rng(1).normal(0, 3, (1, 3, 6, 10)).astype(np.float32)}
@@ -138,7 +140,8 @@ def test_the_last_sum_has_room_for_the_largest_values(graph: Graph, patches: Pat
     paired = half_lsb_pair(equalise(graph, stream_of(graph), first_guess(ranges, 0.5, loud)), step)
     roomy = with_room(paired, step, images)
     np.testing.assert_allclose(correction(roomy), correction(paired), atol=1e-5)
-    before, after = largest(paired, images), largest(roomy, images)
+    before = largest(paired, images)
+    after = largest(roomy, images)
     assert (after * ROOM <= 127 * step * (1 + 1e-5)).all()
     assert (after <= before * (1 + 1e-5)).all()
     for name in sorted(

@@ -44,7 +44,8 @@ def qdq(scale: float, zero_point: np.ndarray | None, relu: bool = False) -> onnx
     ids=["int8", "uint8 around 128", "uint8 from 0", "no zero point", "a ReLU reads it"],
 )
 def test_shares_are_those_of_the_values(zero_point: np.ndarray | None, relu: bool, lost: Lost) -> None:
-    scale, signed = 1 / 400, (IMAGE - 0.5) * 2
+    scale = 1 / 400
+    signed = (IMAGE - 0.5) * 2
     shares = saturated_shares(qdq(scale, zero_point, relu), [signed[:1], signed[1:]])
     assert shares == {"whole": pytest.approx(lost(signed / np.float32(scale)).mean(), abs=1e-3)}
     assert shares["whole"] > 0.1

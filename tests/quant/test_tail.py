@@ -32,7 +32,8 @@ SIDE_PX = 160
 
 def detector() -> onnx.ModelProto:
     """Untrained, with statistics of its own, and a last layer whose boxes and scores differ from place to place."""
-    network, generator = DetectorNetwork(2), torch.Generator().manual_seed(0)
+    network = DetectorNetwork(2)
+    generator = torch.Generator().manual_seed(0)
     initialise(network, generator)
     with torch.no_grad():
         network.tail.weight.mul_(3)
@@ -61,7 +62,8 @@ def test_the_tail_begins_behind_the_last_convolution() -> None:
 
 
 def test_the_tail_by_itself_is_what_the_runtime_computes() -> None:
-    model, seen = detector(), images()[0]
+    model = detector()
+    seen = images()[0]
     tail = read_network(model).tail
     assert tail is not None
     last = next(node for node in reversed(model.graph.node) if node.op_type == "Conv").output[0]
@@ -121,7 +123,8 @@ def graph_text(kind: str) -> str:
 @pytest.mark.parametrize("text", [graph_text("Loop"), graph_text("Conv"), "bm8gZ3JhcGg=", "not base64"])
 def test_a_description_with_another_tail_is_one_sentence(text: str) -> None:
     spoilt = copied(quantised().host)
-    ends, entry = quantised().core.ends, next(each for each in spoilt.metadata_props if each.key == KEY)
+    ends = quantised().core.ends
+    entry = next(each for each in spoilt.metadata_props if each.key == KEY)
     assert ends.tail is not None
     entry.value = entry.value.replace(ends.tail.text, text)
     with pytest.raises(ModelError, match="contradict"):

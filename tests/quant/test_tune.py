@@ -154,7 +154,8 @@ def test_it_goes_on_by_itself_while_held_out_pairs_gain(
     steps: int,
 ) -> None:
     monkeypatch.setattr("beers_deploy.quant.passes.tune.ROUNDS", (12, 2))
-    graph, tuning = read_planes(correction_graph(float_onnx)), Tuning(alone(patches), None, rate)
+    graph = read_planes(correction_graph(float_onnx))
+    tuning = Tuning(alone(patches), None, rate)
     assert tune(spoilt(quantised.core), graph, tuning)[1] == steps
 
 

@@ -167,7 +167,8 @@ def test_what_a_runtime_would_do_for_an_untrusted_file_is_refused(
 def test_unknown_opsets_are_refused_and_batches_where_images_come_singly(
     model: onnx.ModelProto, tmp_path: Path
 ) -> None:
-    old, four = deepcopy(model), deepcopy(model)
+    old = deepcopy(model)
+    four = deepcopy(model)
     old.opset_import[0].version = 99
     onnx.save(old, tmp_path / "opset.onnx")
     for to_run in (True, False):
@@ -250,7 +251,8 @@ def test_an_unknown_operator_of_two_tensors_hides_the_shape(tmp_path: Path) -> N
 def test_a_long_chain_of_activations_is_followed_in_a_moment(tmp_path: Path) -> None:
     """Once it ended in a RecursionError: each was looked past for the QuantizeLinear behind it."""
     sketch = Sketch(1)
-    scale, zero = sketch.constant(np.array(0.5, np.float32)), sketch.constant(np.array(0, np.int8))
+    scale = sketch.constant(np.array(0.5, np.float32))
+    zero = sketch.constant(np.array(0, np.int8))
     last = sketch.node("DequantizeLinear", sketch.node("QuantizeLinear", "image", scale, zero), scale, zero)
     for _ in range(1200):
         last = sketch.node("Relu", last)

@@ -62,7 +62,8 @@ def test_the_host_files_bits(network: Callable[[], Graph], data: st.DataObject, 
     bits = {name: data.draw(st.integers(2, 7)) for name in ops.tensors(network())}
     core = build_core(network(), {PLANES: PLANES_FRAC_BITS, **bits})
     image = np.random.default_rng(seed).random((1, 1, tile_px, tile_px), np.float32)
-    model, host = vint8_model(core, {}, tile_px), host_model(core, {})
+    model = vint8_model(core, {}, tile_px)
+    host = host_model(core, {})
     for optimise in (True, False):
         found = open_session(model, optimise=optimise).run(None, {PLANES: planes_of(image)})[0]
         np.testing.assert_array_equal(found, correction(core, core.ends.split(image), half_even=True))
@@ -78,7 +79,8 @@ def test_the_layout_of_amds_quantiser(network: Callable[[], Graph]) -> None:
     assert [(each.domain, each.version) for each in model.opset_import] == [("", 17)]
     assert model.producer_name == "beers-deploy"
     assert all(d.dim_value for v in (*model.graph.input, *model.graph.output) for d in v.type.tensor_type.shape.dim)
-    nodes, held = model.graph.node, constants(model)
+    nodes = model.graph.node
+    held = constants(model)
     readers = Counter(name for node in nodes for name in node.input)
     written = {name: node.op_type for node in nodes for name in node.output}
     for node in nodes:

@@ -29,7 +29,8 @@ def hold_to_reference(trainable: TrainableCore, planes: np.ndarray) -> None:
     with torch.no_grad():
         found = trainable.tensors(torch.from_numpy(planes.astype(np.float32)))
         result = trainable(torch.from_numpy(planes.astype(np.float32))).numpy()
-    ends, whole = core.ends, merged_correction(core, wanted)
+    ends = core.ends
+    whole = merged_correction(core, wanted)
     for name, values in wanted.items():
         if name != CORRECTION or ends.copies == 1:
             np.testing.assert_array_equal(found[name].numpy(), values, err_msg=name)

@@ -114,7 +114,8 @@ def test_a_broken_int8_network_fails(pair: list[Path], tmp_path: Path) -> None:
 
 def test_a_halo_one_pixel_short_fails(subject: Subject) -> None:
     """Of the network's receptive radius: tile plans differ."""
-    image, radius_px = BY_NAME["no noise"].draw(48, np.random.default_rng(0))[0], subject.float32.tiling.halo_px
+    image = BY_NAME["no noise"].draw(48, np.random.default_rng(0))[0]
+    radius_px = subject.float32.tiling.halo_px
     whole = subject.float32.restore(image)
     for halo_px, same in ((radius_px, True), (radius_px - 1, False)):
         plan = make_plan((1, *image.shape), 2 * radius_px + 9, halo_px, Tiling(halo_px))

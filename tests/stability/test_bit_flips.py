@@ -88,7 +88,8 @@ def test_the_same_seed_flips_the_same_bits(target: FaultTarget, rows: dict[str, 
 @pytest.mark.parametrize("memory", list(MEMORIES))
 def test_an_injection_leaves_the_target_alone(memory: str, target: FaultTarget) -> None:
     image = target.pairs[0][0]
-    before, fault_free = image.copy(), restored(Injected(target.core, SOUND, image, 0))
+    before = image.copy()
+    fault_free = restored(Injected(target.core, SOUND, image, 0))
     injected = MEMORIES[memory].inject(target.core, image, 50_000, np.random.default_rng(0))
     assert injected.flips > 0
     assert not np.array_equal(restored(injected), fault_free)
@@ -112,7 +113,8 @@ def test_at_half_resolution_maps_have_a_bit_for_each_channel_of_each_place(coars
 def test_all_guards_cost_under_two_per_cent_on_the_board(variant: str) -> None:
     core = as_stored(open_subject(Path(variant), None).core)
     relus = {op.output: 96 for op in core.ops if isinstance(op, IntConv) and op.activation is Activation.relu}
-    dpu, target = load_dpu("vck190", None), FaultTarget(core, Guards(relus, 1024.0, checksums(core)), ())
+    dpu = load_dpu("vck190", None)
+    target = FaultTarget(core, Guards(relus, 1024.0, checksums(core)), ())
     found = price_rows(target, predict_file(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
     *parts, together = (db(row, "time") for row in found)
     assert together == pytest.approx(sum(parts))

@@ -28,11 +28,13 @@ def ssim_by_two_passes(image: np.ndarray, reference: np.ndarray, data_range: flo
     weights = np.outer(side, side) / side.sum() ** 2
     x, y = (sliding_window_view(a.astype(np.float64), weights.shape) for a in (image, reference))
     mean_x, mean_y = ((a * weights).sum((2, 3)) for a in (x, y))
-    from_x, from_y = x - mean_x[..., None, None], y - mean_y[..., None, None]
+    from_x = x - mean_x[..., None, None]
+    from_y = y - mean_y[..., None, None]
     var_x, var_y, both = (
         (a * b * weights).sum((2, 3)) for a, b in ((from_x, from_x), (from_y, from_y), (from_x, from_y))
     )
-    c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
+    c1 = (0.01 * data_range) ** 2
+    c2 = (0.03 * data_range) ** 2
     light = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
     return float((light * (2 * both + c2) / (var_x + var_y + c2)).mean())
 
@@ -85,6 +87,7 @@ def test_no_inverse_amplifies_beyond_what_its_regularisation_proves(
 ) -> None:
     """T H / (H^2 + epsilon r^2) is at most T / (2 sqrt(epsilon) r), whatever the blur H."""
     gain = compensation_gain(32, 30, mtf_from, mtf_to, epsilon)
-    fy, fx = np.fft.fftfreq(32)[:, None], np.fft.rfftfreq(30)
+    fy = np.fft.fftfreq(32)[:, None]
+    fx = np.fft.rfftfreq(30)
     radius = np.hypot(fy, fx) / NYQUIST
     assert float((gain * 2 * epsilon**0.5 * radius / mtf(fx, fy, mtf_to)).max()) <= 1 + 1e-9

@@ -76,7 +76,8 @@ def test_the_stored_bias_is_int8_and_the_network_the_same(quantised: Quantised) 
     assert all(op.bias.dtype == np.int8 for op in stored.convolutions)
     assert weight_bits(stored) == 8 * sum(op.weight.size + op.bias.size for op in stored.convolutions)
     planes = split(image())
-    before, after = run_core(quantised.core, planes)[0], run_core(stored, planes)[0]
+    before = run_core(quantised.core, planes)[0]
+    after = run_core(stored, planes)[0]
     for name in before:
         np.testing.assert_array_equal(before[name], after[name])
 

@@ -61,7 +61,8 @@ def test_trap_3_a_filter_beside_an_uncalibrated_blur_leaves_half() -> None:
 
 def contrast_of_cut_kernel(radius_px: int, frequency: float, side: int = 512) -> float:
     """MTF at a frequency of the 7 % kernel cut at a radius and divided by its sum."""
-    fy, fx = np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)
+    fy = np.fft.fftfreq(side)[:, None]
+    fx = np.fft.rfftfreq(side)
     kernel = np.roll(np.fft.irfft2(mtf(fx, fy, 0.07), (side, side)), (side // 2, side // 2), (0, 1))
     inside = slice(side // 2 - radius_px, side // 2 + radius_px + 1)
     cut = kernel[inside, inside] / kernel[inside, inside].sum()
@@ -97,7 +98,8 @@ def groups(kind: str) -> Tensor:
 
 @pytest.mark.parametrize("kind", ["few", "saturated", "black"])
 def test_trap_13_a_bare_covariance_has_no_factor_and_the_estimate_is_finite(kind: str) -> None:
-    patches, noise = groups(kind), Noise(12.0)
+    patches = groups(kind)
+    noise = Noise(12.0)
     centred = (patches - patches.mean(1, keepdim=True)).double()
     covariance = centred.mT @ centred / patches.shape[1]
     assert int(torch.linalg.cholesky_ex(covariance)[1]) != 0

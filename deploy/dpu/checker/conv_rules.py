@@ -67,7 +67,8 @@ def conv_window(op: Operation, dpu: Dpu) -> Finding | None:
 
 def conv_area(op: Operation, dpu: Dpu) -> Finding | None:
     """The kernel's height * width is at most {conv[area_max]} ({conv[area_max].source})."""
-    area, most = op.window.kernel[0] * op.window.kernel[1], dpu.value("conv", "area_max")
+    area = op.window.kernel[0] * op.window.kernel[1]
+    most = dpu.value("conv", "area_max")
     if area <= most:
         return None
     side = math.isqrt(max(int(most), 1))
@@ -77,7 +78,8 @@ def conv_area(op: Operation, dpu: Dpu) -> Finding | None:
 
 def conv_dilation(op: Operation, dpu: Dpu) -> Finding | None:
     """Dilation * input channels is at most {limits[channels]} ({documents[operators]}, conv2d)."""
-    size, most = max(op.window.dilation) * op.channels[0], dpu.channels_max
+    size = max(op.window.dilation) * op.channels[0]
+    most = dpu.channels_max
     if max(op.window.dilation) == 1 or size <= most:
         return None
     remedy = f"use a dilation of at most {most // op.channels[0]}, or fewer input channels"
@@ -98,7 +100,9 @@ def depthwise_kernel(op: Operation, dpu: Dpu) -> Finding | None:
 
     Their product is at most {depthwise[window_max]} ({depthwise[window_max].source}).
     """
-    kernel, limit, most = op.window.kernel, dpu.limit("depthwise", "kernel"), dpu.whole("depthwise", "window_max")
+    kernel = op.window.kernel
+    limit = dpu.limit("depthwise", "kernel")
+    most = dpu.whole("depthwise", "window_max")
     if not outside(kernel, limit) and kernel[0] * kernel[1] <= most:
         return None
     reason = f"kernel ({shown(kernel)}) is not in the DPU's range {limit}, area at most {most}"
@@ -159,7 +163,8 @@ def transposed_channels(op: Operation, dpu: Dpu) -> Finding | None:
 
 def alu_padding(op: Operation, dpu: Dpu, table: str) -> Finding | None:
     """The padding that the ALU engine can do, for depthwise convolutions and pools."""
-    begin, end = dpu.limit(table, "pad_begin"), dpu.limit(table, "pad_end")
+    begin = dpu.limit(table, "pad_begin")
+    end = dpu.limit(table, "pad_end")
     if not outside(op.window.pads[:2], begin) and not outside(op.window.pads[2:], end):
         return None
     reason = f"pads {op.window.pads} are not in the DPU's range: top, left {begin}; bottom, right {end}"

@@ -33,7 +33,8 @@ def symmetric(op: Operation, dpu: Dpu) -> Finding | None:
 
 def int8_alone(op: Operation, dpu: Dpu) -> Finding | None:
     """Tensors are int8 around {numbers[zero_point]} ({numbers[zero_point].source})."""
-    wanted, others = {dpu.value("numbers", "zero_point")}, {r: s for r, s in op.scales.items() if r != "bias"}
+    wanted = {dpu.value("numbers", "zero_point")}
+    others = {r: s for r, s in op.scales.items() if r != "bias"}
     faults = [r for r, s in others.items() if s.integer_type != "int8" or set(s.zero_points) != wanted]
     return Finding(f"{', '.join(faults)}: not int8 around 0", f"quantise to int8; {AGAIN}") if faults else None
 
@@ -60,7 +61,8 @@ def one_format(op: Operation, dpu: Dpu) -> Finding | None:
 
 def shift_cut(op: Operation, dpu: Dpu) -> Finding | None:
     """Weight + input - output fractional bits: {numbers[shift_cut]} ({documents[quantiser]})."""
-    cut, limit = _cut(op), dpu.limit("numbers", "shift_cut")
+    cut = _cut(op)
+    limit = dpu.limit("numbers", "shift_cut")
     return None if cut is None or not outside((cut,), limit) else Finding(f"shift_cut {cut}, allowed {limit}", MOVE)
 
 
@@ -69,20 +71,26 @@ def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
 
     And at least min(0, shift_cut + 8 - {numbers[accumulator_bits]}).
     """
-    product, cut, bias = product_frac_bits(op), _cut(op), _frac_bits(op, "bias")
+    product = product_frac_bits(op)
+    cut = _cut(op)
+    bias = _frac_bits(op, "bias")
     if product is None or cut is None or bias is None:
         return None
     low = min(0, cut + 8 - dpu.whole("numbers", "accumulator_bits"))
-    high, shift = dpu.whole("numbers", "shift_bias_max"), product - bias
+    high = dpu.whole("numbers", "shift_bias_max")
+    shift = product - bias
     return None if low <= shift <= high else Finding(f"shift_bias {shift}, allowed {low} to {high}", MOVE)
 
 
 def bias_width(op: Operation, dpu: Dpu) -> Finding | None:
     """A bias shifted to the products' scale fits {numbers[bias_bits]} bits ({numbers[bias_bits].source})."""
-    product, frac_bits, values = product_frac_bits(op), _frac_bits(op, "bias"), op.constants.get("bias")
+    product = product_frac_bits(op)
+    frac_bits = _frac_bits(op, "bias")
+    values = op.constants.get("bias")
     if product is None or frac_bits is None or values is None:
         return None
-    largest, most = np.abs(values.astype(np.float64)).max(initial=0), 2 ** (dpu.whole("numbers", "bias_bits") - 1) - 1
+    largest = np.abs(values.astype(np.float64)).max(initial=0)
+    most = 2 ** (dpu.whole("numbers", "bias_bits") - 1) - 1
     size = largest * 2.0 ** (product - frac_bits)
     remedy = "train with smaller biases, or with larger weights behind a smaller scale"
     return None if size <= most else Finding(f"a bias of {size:g} in units of the products, at most {most}", remedy)
@@ -90,14 +98,17 @@ def bias_width(op: Operation, dpu: Dpu) -> Finding | None:
 
 def shift_read(op: Operation, dpu: Dpu) -> Finding | None:
     """The fractional bits of an add's inputs lie {numbers[shift_read]} apart ({documents[quantiser]})."""
-    inputs, limit = _inputs(op), dpu.limit("numbers", "shift_read")
+    inputs = _inputs(op)
+    limit = dpu.limit("numbers", "shift_read")
     shift = max(inputs) - min(inputs) if inputs else 0
     return Finding(f"shift_read {shift}, allowed {limit}", MOVE) if outside((shift,), limit) else None
 
 
 def shift_write(op: Operation, dpu: Dpu) -> Finding | None:
     """An add's coarsest input - output fractional bits: {numbers[shift_write]} ({documents[quantiser]})."""
-    inputs, output, limit = _inputs(op), _frac_bits(op, "output"), dpu.limit("numbers", "shift_write")
+    inputs = _inputs(op)
+    output = _frac_bits(op, "output")
+    limit = dpu.limit("numbers", "shift_write")
     if not inputs or output is None or not outside((min(inputs) - output,), limit):
         return None
     return Finding(f"shift_write {min(inputs) - output}, allowed {limit}", MOVE)
@@ -114,7 +125,8 @@ def same_scale(op: Operation, dpu: Dpu) -> Finding | None:
 
 def product_frac_bits(op: Operation) -> int | None:
     """The scale of a convolution's sums of products, None without one."""
-    weight, source = _frac_bits(op, "weight"), _frac_bits(op, "input 0")
+    weight = _frac_bits(op, "weight")
+    source = _frac_bits(op, "input 0")
     return None if weight is None or source is None else weight + source
 
 
@@ -130,12 +142,14 @@ def _inputs(op: Operation) -> list[int]:
 
 
 def _cut(op: Operation) -> int | None:
-    product, output = product_frac_bits(op), _frac_bits(op, "output")
+    product = product_frac_bits(op)
+    output = _frac_bits(op, "output")
     return None if product is None or output is None else product - output
 
 
 def _words(scale: Scale) -> str:
-    scales, zeros = ", ".join(f"{s:.9g}" for s in scale.scales[:1]), scale.zero_points[:1]
+    scales = ", ".join(f"{s:.9g}" for s in scale.scales[:1])
+    zeros = scale.zero_points[:1]
     return f"{scale.integer_type} at scale {scales or 'unknown'} around {zeros[0] if zeros else 'nothing'}"
 
 
@@ -171,7 +185,8 @@ def int32_bias(op: Operation, dpu: Dpu) -> Finding | None:
     """
     if "bias" not in op.constants or op.op_type != "QLinearConv" or product_frac_bits(op) is None:
         return None
-    values, high = op.constants["bias"], dpu.whole("numbers", "shift_bias_max")
+    values = op.constants["bias"]
+    high = dpu.whole("numbers", "shift_bias_max")
     remedy = f"round the bias to int8 at a scale of its own; {AGAIN}"
     if values is None or _kind(values) != "int32":
         return Finding(f"its bias is {_kind(values)}", remedy)

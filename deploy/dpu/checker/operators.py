@@ -125,7 +125,8 @@ def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:
     """
     yield op
     if "array" in dpu.tables and fully_connected(op):  # an NPU's file does not state the array that it would fit
-        values, outputs = math.prod(op.in_shapes[0] or ()), min(op.channels[1], dpu.channels_max)
+        values = math.prod(op.in_shapes[0] or ())
+        outputs = min(op.channels[1], dpu.channels_max)
         part = replace(op, channels=(op.channels[0], outputs), out_shape=(outputs, 1, 1))
         yield part
         yield replace(part, in_shapes=((values, 1, 1),), window=Window(), channels=(values, outputs))
@@ -133,7 +134,8 @@ def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:
 
 def fully_connected(op: Operation) -> bool:
     """Whether a convolution is as large as its map, and so has a result of one pixel."""
-    shape, window = op.in_shapes[0] if op.in_shapes else None, op.window
+    shape = op.in_shapes[0] if op.in_shapes else None
+    window = op.window
     whole = shape is not None and window.kernel == shape[1:] and window.dilation == (1, 1) and not any(window.pads)
     return op.kind == "conv" and whole
 

@@ -153,7 +153,8 @@ def activation_of_sums(op: Operation, dpu: Dpu) -> Finding | None:
 
 def leaky_relu_alpha(op: Operation, dpu: Dpu) -> Finding | None:
     """LeakyReLU has alpha = 26 / 256 = {leaky_relu[alpha].low} ({documents[operators]}, leaky_relu)."""
-    given, wanted = op.attributes.get("alpha", 0.01), dpu.value("leaky_relu", "alpha")
+    given = op.attributes.get("alpha", 0.01)
+    wanted = dpu.value("leaky_relu", "alpha")
     is_leaky = op.op_type in ("LeakyRelu", "QLinearLeakyRelu")
     if not is_leaky or (isinstance(given, int | float) and abs(given - wanted) < 1e-6):
         return None
@@ -182,7 +183,8 @@ def pad_mode(op: Operation, dpu: Dpu) -> Finding | None:
 
 def resize_mode(op: Operation, dpu: Dpu) -> Finding | None:
     """Resize is nearest without align_corners, or bilinear ({documents[operators]}, resize)."""
-    mode, corners = op.attributes.get("mode", "nearest"), op.attributes.get(CORNERS, "half_pixel")
+    mode = op.attributes.get("mode", "nearest")
+    corners = op.attributes.get(CORNERS, "half_pixel")
     if mode == "linear" or (mode == "nearest" and corners != "align_corners"):
         return None
     return Finding(f"resize mode {mode} with {corners}", "use nearest with coordinate mode asymmetric")
@@ -193,7 +195,8 @@ def resize_scale(op: Operation, dpu: Dpu) -> Finding | None:
 
     With half-pixel centres {resize[half_pixel_scale]} ({resize[half_pixel_scale].source}).
     """
-    before, after = op.in_shapes[0] if op.in_shapes else None, op.out_shape
+    before = op.in_shapes[0] if op.in_shapes else None
+    after = op.out_shape
     if op.attributes.get("mode") != "linear" or before is None or after is None:
         return None
     half = op.attributes.get(CORNERS, "half_pixel") == "half_pixel"

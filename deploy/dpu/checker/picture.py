@@ -46,7 +46,8 @@ def write_picture(placement: Placement, title: str, path: Path) -> None:
 
 def draw(placement: Placement, title: str) -> Markup:
     """The picture as an SVG file; a node's whole name appears when the pointer rests on its box."""
-    nodes, heading = placement.nodes, textwrap.wrap(title, TITLE_LETTERS)
+    nodes = placement.nodes
+    heading = textwrap.wrap(title, TITLE_LETTERS)
     legend_y = 12 + LINE_PX * len(heading)
     heights = (BOX_PX + LINE_PX * len(_lines(node)) + GAP_PX for node in nodes)
     *tops, height = accumulate(heights, initial=legend_y + BOX_PX + GAP_PX)
@@ -109,6 +110,8 @@ def _path(start_y: int, end_y: int, rows: int) -> "Outline":
 
     if rows == 1:
         return Outline([(LEFT_PX + 12, start_y + BOX_PX), (LEFT_PX + 12, end_y)])
-    reach, middle, end = LEFT_PX - 5 * min(rows, 12), start_y + BOX_PX // 2, end_y + 14
+    reach = LEFT_PX - 5 * min(rows, 12)
+    middle = start_y + BOX_PX // 2
+    end = end_y + 14
     points = [(LEFT_PX, middle), (reach, middle), (reach, end), (LEFT_PX, end)]
     return Outline(points, [Outline.MOVETO, *[Outline.CURVE4] * 3])

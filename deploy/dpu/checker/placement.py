@@ -115,7 +115,8 @@ def _parts(network: Network) -> list[Part]:
     parts: list[Part] = []
     finished: set[str] = set()
     for op in operations:
-        leads, trails = op.output not in behind, op.output not in before
+        leads = op.output not in behind
+        trails = op.output not in before
         if is_foreign(op.op_type):  # what no processor here computes is not the host's either
             parts.append("dpu-core")
         elif leads and _is_host_front(op, network, trails=trails):

@@ -73,7 +73,8 @@ def float_islands(placement: Placement, dpu: Dpu, tile_px: int) -> str:
 
 def is_island(node: PlacedNode, placement: Placement) -> bool:
     """Whether a quantised file leaves a node in float that stands between its integers."""
-    op, weight = node.op, node.op.constants.get("weight")
+    op = node.op
+    weight = node.op.constants.get("weight")
     in_float = not op.integer or (weight is not None and weight.dtype == np.float32)
     return not placement.note and node.device == "DPU" and op.kind != "dequantise" and in_float
 

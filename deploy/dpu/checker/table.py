@@ -54,7 +54,8 @@ class Checked(Table):
     @property
     def lines(self) -> list[str]:
         """What a person wants to know, in a few lines."""
-        placement, npu = self.placement, self.dpu.target.npu
+        placement = self.placement
+        npu = self.dpu.target.npu
         lines = [] if npu else _crossings(placement)
         lines += [f"{name}: {text}" for name, text in remarks_on(placement, self.dpu, self.tile_px).items()]
         if placement.note:
@@ -86,11 +87,13 @@ def check(
         >>> bool(bd.check("convbeers-xs-int8", "kv260"))
         True
     """
-    read, asked = Network.load(network, sensor=SENSOR, to_run=False), ruled(TargetProfile.load(board), dpu)
+    read = Network.load(network, sensor=SENSOR, to_run=False)
+    asked = ruled(TargetProfile.load(board), dpu)
     tile_px = own_tile_px(read.model) or TILE_PX if tile is None else require_side(tile)
     placement = place(network_of(read.model, tile_px, read.label), asked)
     arguments: dict[str, object] = {"target": asked.target.name, "dpu": asked.name, "tile": tile_px}
-    rows, npu = tuple(_rows(placement, asked, tile_px)), bool(asked.target.npu)
+    rows = tuple(_rows(placement, asked, tile_px))
+    npu = bool(asked.target.npu)
     checks = [legality(placement, npu=npu), *(_file_checks(read.model, asked) if npu else [])]
     about = ("check", arguments, (read.input,), rows, tuple(checks))
     return Checked(*about, placement=placement, dpu=asked, tile_px=tile_px, network=read)
@@ -123,7 +126,8 @@ def _file_checks(model: onnx.ModelProto, dpu: Dpu) -> list[Check]:
     if not is_quantised(model) or KEY in metadata(model):
         return []
     opset = max(each.version for each in model.opset_import if each.domain in ("", "ai.onnx"))
-    most, named = dpu.limit("file", "opset_max"), [*model.graph.input, *model.graph.output]
+    most = dpu.limit("file", "opset_max")
+    named = [*model.graph.input, *model.graph.output]
     sides = [f"{v.name} {d.dim_param}" for v in named for d in v.type.tensor_type.shape.dim if not d.dim_value]
     return [
         Check("opset", opset, most.low, "opset", detail=most.source),

@@ -171,7 +171,8 @@ def predict(placement: Placement, dpu: Dpu, task: Task | None = None, step_px: f
         names = ", ".join(node.op.name for node in placement.cutting[:3])
         remedy = "run 'beers-deploy check' for the reasons and remedies"
         raise ModelError("cost model", expected="a core that runs whole on the DPU", got=names, remedy=remedy)
-    constants, structure = Constants.of(dpu), Structure.of(dpu)
+    constants = Constants.of(dpu)
+    structure = Structure.of(dpu)
     works = count_work(placement.core, dpu)
     if not any(work.operations for work in works):
         remedy = "give a network with convolutions"
@@ -182,7 +183,8 @@ def predict(placement: Placement, dpu: Dpu, task: Task | None = None, step_px: f
     parts = zip(works, *((each / speed).tolist() for each in times), strict=True)
     layers = tuple(LayerCost(*part) for part in parts)
     refused = [node.op for node in placement.failed]
-    cores, refused_s = dpu.whole("cpu", "cores"), refused_interval_s(refused, dpu)
+    cores = dpu.whole("cpu", "cores")
+    refused_s = refused_interval_s(refused, dpu)
     task = task or task_of(placement)
     step_s = consistency_interval_s(step_px, dpu) if step_px else (0.0, 0.0)
     host_s = float(placed_work(placement, task) @ constants.host_s_per_unit) / cores / host_speed
@@ -230,7 +232,8 @@ def dpu_power(dpu: Dpu) -> Figure:
     """Power in W while the DPU runs, with the range assumed for it; unavailable where none is published."""
     if "dpu_run_w" not in dpu.tables.get("power", {}):
         return unavailable("W", f"no power of {dpu.target.name} under its DPU is published")
-    anchor, assumed = dpu.limit("power", "dpu_run_w"), dpu.limit("power", "dpu_range_w")
+    anchor = dpu.limit("power", "dpu_run_w")
+    assumed = dpu.limit("power", "dpu_range_w")
     source = f"assumption anchored at {anchor.source}; range: {assumed.source}"
     return predicted(anchor.low, "W", (assumed.low, assumed.high), source)
 
@@ -239,7 +242,8 @@ def layer_energy_j(layer: LayerCost, dpu: Dpu) -> Interval:
     """Least and most energy of a layer for one image, its share of the batch's weights included."""
     work = layer.work
     moved = work.map_bytes + work.weight_bytes / dpu.batch
-    product, byte = dpu.limit("power", "product_j"), dpu.limit("power", "memory_byte_j")
+    product = dpu.limit("power", "product_j")
+    byte = dpu.limit("power", "memory_byte_j")
     products = work.operations / 2
     return products * product.low + moved * byte.low, products * product.high + moved * byte.high
 

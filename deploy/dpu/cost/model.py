@@ -106,11 +106,13 @@ class Layers:
     @classmethod
     def of(cls, works: Sequence[Work], dpu: Dpu) -> Self:
         """The layers of one network."""
-        array, lanes = dpu.engine_ops_per_s, dpu.lane_steps_per_s
+        array = dpu.engine_ops_per_s
+        lanes = dpu.lane_steps_per_s
         columns = [
             (w.array_operations / array, w.lane_steps / lanes, w.weight_bytes, w.map_bytes, w.launched) for w in works
         ]
-        clock_hz, memory = dpu.value("array", "pl_clock_hz"), dpu.limit("memory", "ddr_bytes_per_s").high
+        clock_hz = dpu.value("array", "pl_clock_hz")
+        memory = dpu.limit("memory", "ddr_bytes_per_s").high
         board = (clock_hz, memory, dpu.handlers, dpu.cores)
         return cls(*np.array([(*row, *board) for row in columns], dtype=np.float64).reshape(-1, 9).T)
 
@@ -127,7 +129,8 @@ class Layers:
 
     def time_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
         """Time of each layer, for a batch (n,)."""
-        compute, memory = self.compute_s(constants), self.memory_s(constants, alone=alone)
+        compute = self.compute_s(constants)
+        memory = self.memory_s(constants, alone=alone)
         busy: Array = np.maximum(compute, memory) + (1 - structure.overlap) * np.minimum(compute, memory)
         return busy + constants.layer_s * self.launched
 
@@ -146,7 +149,8 @@ def regime_of(host_bound: bool, map_bytes: float) -> Regime:
 
 def frame_rate(dpu_s: float, host_s: float, crowding: float) -> float:
     """Images a second, from the time that the DPU and the host's cores take for one image."""
-    longer, shorter = max(dpu_s, host_s), min(dpu_s, host_s)
+    longer = max(dpu_s, host_s)
+    shorter = min(dpu_s, host_s)
     return float(1 / (longer * (1 + (shorter / longer) ** crowding) ** (1 / crowding)))
 
 
@@ -213,7 +217,8 @@ def refused_interval_s(operations: Sequence[Operation], dpu: Dpu) -> Interval:
     """
     if not operations:
         return 0.0, 0.0
-    times, cores = [_core_s(op, dpu) for op in operations], dpu.whole("cpu", "cores")
+    times = [_core_s(op, dpu) for op in operations]
+    cores = dpu.whole("cpu", "cores")
     return math.fsum(low for low, _ in times) / cores, math.fsum(high for _, high in times) / cores
 
 

@@ -97,10 +97,12 @@ def _read(path: Path) -> Sequence[Mapping[str, object]]:
         runs = read_json(path)
     except (OSError, ValueError) as error:
         missing = unreadable(path)
-        got, remedy = missing or str(error), "check the path" if missing else EXAMPLE
+        got = missing or str(error)
+        remedy = "check the path" if missing else EXAMPLE
         raise OptionError(str(path), expected="a file of JSON", got=got, remedy=remedy) from error
     if not isinstance(runs, list) or not 0 < len(runs) <= RUNS or not all(isinstance(run, dict) for run in runs):
-        expected, got = f"a list of 1 to {RUNS} runs", type(runs).__name__
+        expected = f"a list of 1 to {RUNS} runs"
+        got = type(runs).__name__
         raise OptionError(str(path), expected=expected, got=got, remedy=EXAMPLE)
     return runs
 
@@ -110,7 +112,8 @@ def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run
         expected = ", ".join(sorted(KEYS))
         raise OptionError(where, expected=expected, got=str(sorted(entry)), remedy=EXAMPLE)
     if entry.get("provider") == "CPUExecutionProvider":
-        expected, got = "a run of the board", "one of onnxruntime's CPU provider"
+        expected = "a run of the board"
+        got = "one of onnxruntime's CPU provider"
         raise OptionError(where, expected=expected, got=got, remedy="measure it with the board's provider")
     tile_px = _number(entry.get("tile_px", 640), "tile_px", TILE_PX, where)
     if tile_px != int(tile_px):

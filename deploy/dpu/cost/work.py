@@ -52,7 +52,8 @@ class Work:
 
 def count_work(operations: Sequence[Operation], dpu: Dpu) -> tuple[Work, ...]:
     """The work of operations that run one behind the other on the DPU."""
-    flow, found = _Flow(operations, dpu), []
+    flow = _Flow(operations, dpu)
+    found = []
     for op in operations:
         if op.kind not in FUSED:
             counts = op.operations, _array_operations(op, dpu), _lane_steps(op, dpu)
@@ -113,7 +114,8 @@ class _Flow:
     """
 
     def __init__(self, operations: Sequence[Operation], dpu: Dpu) -> None:
-        self._kept_bytes, self._lanes = kept_bytes(dpu), dpu.input_parallel
+        self._kept_bytes = kept_bytes(dpu)
+        self._lanes = dpu.input_parallel
         self._same: dict[str, str] = {}
         for op in operations:
             if op.kind in FUSED:
@@ -153,14 +155,16 @@ class _Flow:
             name = self._sums[name]
         if self._readers[name] and name not in self._stored and not self._leaves(name):
             return 0
-        size, piece = _size(op.out_shape), self._pieces.get(name)
+        size = _size(op.out_shape)
+        piece = self._pieces.get(name)
         return size // piece * _up(piece, BURST_BYTES) if piece else size
 
     def _piece_channels(self, operations: Sequence[Operation]) -> dict[str, int]:
         """Channels of a pixel that lie in one piece, by result; a shuffle at a network's end is left to the host."""
         found: dict[str, int] = {}
         for op in operations:
-            taken, given = next(iter(op.in_shapes), None), op.out_shape
+            taken = next(iter(op.in_shapes), None)
+            given = op.out_shape
             if op.kind == "pixel shuffle" and taken and given and self._readers[self._root(op.output)]:
                 found[self._root(op.output)] = min(taken[0], given[0])
             if op.kind == "concat":

@@ -78,7 +78,8 @@ def find_faults(source: Source, name: str) -> FaultList:
     for fault in _found_in_strips(source):
         (lines if fault.column < 0 else pixels).add(fault)
         if len(pixels) > MANY * raster.height_px * raster.width_px * raster.bands:
-            got, remedy = f"more than {MANY:.0%} of the pixels alone", "list the faulty ones in a file"
+            got = f"more than {MANY:.0%} of the pixels alone"
+            remedy = "list the faulty ones in a file"
             raise ImageError(name, expected="few faulty pixels", got=got, remedy=remedy)
     columns = {(fault.column, fault.band) for fault in lines if fault.row < 0}
     rows = {(fault.row, fault.band) for fault in lines if fault.column < 0}
@@ -98,9 +99,11 @@ def _replaced(stripes: Stripes) -> list[int]:
 
 def _found_in_strips(source: Source) -> Iterator[Fault]:
     """Find dead rows and wrong pixels, strip by strip."""
-    raster, steps = source.raster, value_steps(source)
+    raster = source.raster
+    steps = value_steps(source)
     for top, stop in strips(raster.height_px, STRIP_PX):
-        start, end = max(top - PATCH_PX, 0), min(stop + PATCH_PX, raster.height_px)
+        start = max(top - PATCH_PX, 0)
+        end = min(stop + PATCH_PX, raster.height_px)
         for band, pixels in enumerate(as_floats(raster, source.read(start, end))):
             number = band_number(band, raster)
             dead = np.flatnonzero(constant_columns(pixels.T)) + start
@@ -118,8 +121,10 @@ class FixedSource:
     """
 
     def __init__(self, source: Source, faults: FaultList) -> None:
-        self._source, self.faults = source, faults
-        self.raster, self.files = source.raster, source.files
+        self._source = source
+        self.faults = faults
+        self.raster = source.raster
+        self.files = source.files
         self.veil: Plane | None = source.veil
 
     def read(self, start: int, stop: int) -> np.ndarray:
@@ -127,7 +132,8 @@ class FixedSource:
         raster = self.raster
         if not self.faults.mask(raster, start, stop).any():
             return self._source.read(start, stop)
-        top, end = max(start - REACH_PX, 0), min(stop + REACH_PX, raster.height_px)
+        top = max(start - REACH_PX, 0)
+        end = min(stop + REACH_PX, raster.height_px)
         stored = self._source.read(top, end)
         missing = raster.missing(stored) if raster.may_miss else np.zeros(stored.shape, bool)
         faulty = self.faults.mask(raster, top, end)
@@ -158,11 +164,14 @@ def replace_pixels(plane: np.ndarray, bad: np.ndarray, sound: np.ndarray, nodata
         nodata: a value that no replaced pixel may take; None for none.
     """
     places = np.argwhere(bad)
-    total, weights = np.zeros(len(places)), np.zeros(len(places))
-    closest, distance = np.zeros(len(places)), np.full(len(places), np.inf)
+    total = np.zeros(len(places))
+    weights = np.zeros(len(places))
+    closest = np.zeros(len(places))
+    distance = np.full(len(places), np.inf)
     for one, other, weight in WAYS:
         (left, near), (right, far) = (_nearest(plane, sound, places, np.array(side)) for side in (one, other))
-        both, either = np.isfinite(near) & np.isfinite(far), np.isfinite(near) | np.isfinite(far)
+        both = np.isfinite(near) & np.isfinite(far)
+        either = np.isfinite(near) | np.isfinite(far)
         single = np.where(near <= far, left, right)
         with np.errstate(invalid="ignore"):
             between = (left * far + right * near) / (near + far)
@@ -184,7 +193,8 @@ def _nearest(
     plane: np.ndarray, sound: np.ndarray, places: np.ndarray, side: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the value of the nearest sound pixel to one side of each place, and how far it is; inf without one."""
-    values, distances = np.zeros(len(places)), np.full(len(places), np.inf)
+    values = np.zeros(len(places))
+    distances = np.full(len(places), np.inf)
     for steps in range(1, REACH_PX + 1):
         rows, columns = (places + steps * side).T
         inside = (rows >= 0) & (rows < plane.shape[0]) & (columns >= 0) & (columns < plane.shape[1])

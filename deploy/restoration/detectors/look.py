@@ -64,7 +64,8 @@ def look_at_detectors(source: Source, full_scale: float = np.inf) -> tuple[BandF
     raster = source.raster
     found = [_Found(step) for step in value_steps(source)]
     for top, stop in _strips(raster.height_px, raster.width_px, raster.bands):
-        start, end = max(top - MARGIN_PX, 0), min(stop + MARGIN_PX, raster.height_px)
+        start = max(top - MARGIN_PX, 0)
+        end = min(stop + MARGIN_PX, raster.height_px)
         within = slice(top - start, stop - start)
         for band, pixels in enumerate(as_floats(raster, source.read(start, end))):
             found[band].add(start, within, pixels, full_scale)

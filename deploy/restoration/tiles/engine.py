@@ -98,7 +98,8 @@ class Restorer:
 
     def read(self, source: Source, start: int, stop: int) -> Strip:
         """The strip that tiles from row `start` to `stop` (excluded) need."""
-        start, stop = max(start - self.margin_px, 0), min(stop + self.margin_px, self.raster.height_px)
+        start = max(start - self.margin_px, 0)
+        stop = min(stop + self.margin_px, self.raster.height_px)
         return checked_strip(self.raster, start, source.read(start, stop), self.full_scale, self.name, self.clips)
 
     def tile(self, strip: Strip, group: int, rows: Span, columns: Span) -> Tile:
@@ -132,7 +133,8 @@ class Restorer:
             rows: of which the kept ones count.
             columns: likewise.
         """
-        scale, bands = int(self.tiling.scale), self._bands(group)
+        scale = int(self.tiling.scale)
+        bands = self._bands(group)
         down = slice((rows.keep_start - at[0]) * scale, (rows.keep_stop - at[0]) * scale)
         across = slice((columns.keep_start - at[1]) * scale, (columns.keep_stop - at[1]) * scale)
         missing = self._missing(strip, bands, rows, columns)
@@ -162,7 +164,8 @@ class Restorer:
         self, strip: Strip, restored: np.ndarray, at: tuple[int, int], bands: slice, rows: Span, columns: Span
     ) -> np.ndarray:
         """What the consistency step adds to the kept pixels, (bands, h, w)."""
-        top, left = max(rows.keep_start - RAW_REACH_PX, 0), max(columns.keep_start - RAW_REACH_PX, 0)
+        top = max(rows.keep_start - RAW_REACH_PX, 0)
+        left = max(columns.keep_start - RAW_REACH_PX, 0)
         down = slice(top - strip.top, rows.keep_stop + RAW_REACH_PX - strip.top)
         across = slice(left - strip.left, columns.keep_stop + RAW_REACH_PX - strip.left)
         raw = strip.pixels[bands, down, across].astype(np.float32)
@@ -190,14 +193,16 @@ class Restorer:
         if strip.missing is None:
             return None
         missing = strip.missing[strip.kept(bands, rows, columns)]
-        tiling, scale = self.tiling, int(self.tiling.scale)
+        tiling = self.tiling
+        scale = int(self.tiling.scale)
         if tiling.channels_in != tiling.channels_out:
             missing = np.repeat(missing.any(axis=0, keepdims=True), tiling.channels_out, axis=0)
         return missing.repeat(scale, axis=1).repeat(scale, axis=2) if scale > 1 else missing
 
     def _unrestored(self, strip: Strip, missing: np.ndarray, bands: slice, rows: Span, columns: Span) -> np.ndarray:
         """What missing pixels are stored as: as they were, or the nodata value where bands do not correspond."""
-        tiling, scale = self.tiling, int(self.tiling.scale)
+        tiling = self.tiling
+        scale = int(self.tiling.scale)
         if tiling.channels_in != tiling.channels_out:
             none = np.nan if self.raster.out_dtype.kind == "f" else 0
             blank = none if self.raster.nodata is None else self.raster.nodata
@@ -221,12 +226,15 @@ class Restorer:
         """A window with its missing pixels filled, as far as the image goes."""
         radius_px = self.tiling.halo_px
         # Beyond the last pixel a slice ends by itself; before the first one it would begin at the other end.
-        left, right = max(columns.start - strip.left - radius_px, 0), columns.stop - strip.left + radius_px
-        top, bottom = max(rows.start - radius_px, 0) - strip.top, rows.stop + radius_px - strip.top
+        left = max(columns.start - strip.left - radius_px, 0)
+        right = columns.stop - strip.left + radius_px
+        top = max(rows.start - radius_px, 0) - strip.top
+        bottom = rows.stop + radius_px - strip.top
         around = (bands, slice(max(top, 0), bottom), slice(left, right))
         planes = zip(strip.pixels[around], flags[around], strict=True)
         filled = np.stack([fill_from_nearest(pixels, missing, radius_px) for pixels, missing in planes])
-        above, aside = rows.start - strip.top - max(top, 0), columns.start - strip.left - left
+        above = rows.start - strip.top - max(top, 0)
+        aside = columns.start - strip.left - left
         return filled[:, above : above + rows.stop - rows.start, aside : aside + columns.stop - columns.start]
 
 
@@ -238,7 +246,8 @@ def checked_strip(
     raster: Raster, top: int, pixels: np.ndarray, full_scale: float, name: str, clips: bool = False, left: int = 0
 ) -> Strip:
     """Rows from `top` on, (bands, rows, width) as stored, and which of their pixels are missing."""
-    missing, pixels = raster.missing(pixels) if raster.may_miss else None, np.ma.getdata(pixels)
+    missing = raster.missing(pixels) if raster.may_miss else None
+    pixels = np.ma.getdata(pixels)
     missing = missing if missing is not None and missing.any() else None
     known = True if missing is None else ~missing
     # Where nothing is known, 0 is taken for both, which is inside.
@@ -246,7 +255,8 @@ def checked_strip(
     if low < 0 or (high > full_scale and not (clips and np.isfinite(high))):
         where = f"{name}, rows {top} to {top + pixels.shape[1] - 1}"
         remedy = "give the sensor's highest number as `full_scale`, or mark missing pixels as nodata"
-        got, remedy = f"values from {low:g} to {high:g}", remedy_outside(low, high, remedy)
+        got = f"values from {low:g} to {high:g}"
+        remedy = remedy_outside(low, high, remedy)
         raise ImageError(where, expected=f"digital numbers of 0 to {full_scale:g}", got=got, remedy=remedy)
     return Strip(top, pixels, missing, high > full_scale, left)
 

@@ -77,7 +77,8 @@ def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
     steps, _ = consistency_steps(*about)
     task = delayed(Task(raster, exposed, options.full_scale, options.sensor_bits, plan.tiling, steps))
     reach_px = REACH_PX if steps else 0
-    tile, finish = delayed(restore_tile), delayed(finish_tile)
+    tile = delayed(restore_tile)
+    finish = delayed(finish_tile)
     groups = range(plan.groups)
     margin_px = max(raster.fill_margin_px(plan.radius_px), RAW_REACH_PX if steps else 0)
     read = {place: _read(bands, plan, margin_px, *place) for place in product(groups, plan.rows, plan.columns)}

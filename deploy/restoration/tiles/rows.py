@@ -67,7 +67,8 @@ class HeldRows:
 
     def window(self, bands: slice, rows: slice, columns: slice) -> np.ndarray:
         """The pixels (bands, h, w) of some rows and columns of the image."""
-        start, pieces = self.top, list[np.ndarray]()
+        start = self.top
+        pieces = list[np.ndarray]()
         for part in self.parts:
             inside = slice(max(rows.start - start, 0), max(rows.stop - start, 0))
             pieces.append(part[bands, inside, columns])
@@ -92,12 +93,14 @@ def restore_rows(
     """
     if not rows:
         return
-    reach_px, first = restorer.reach_px, rows[0].keep_start
+    reach_px = restorer.reach_px
+    first = rows[0].keep_start
     wanted = rows_to_run(plan, restorer, rows)
     # A single reader, since a source keeps what it decoded for the rows before, for the next ones to take.
     with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(at_once) as pool:
         try:
-            waiting, held = deque[NetworkRow](), HeldRows()
+            waiting = deque[NetworkRow]()
+            held = HeldRows()
             for row in _network_rows(source, plan, restorer, wanted, (reader, pool), tick):
                 if not reach_px:
                     yield _finished(row, held, plan, restorer, pool)
@@ -117,7 +120,8 @@ def rows_to_run(plan: Plan, restorer: Restorer, rows: Sequence[Span]) -> list[Sp
     """The rows of tiles that the network runs on so that `rows` can be finished."""
     if not rows:
         return []
-    start, stop = rows[0].keep_start - restorer.reach_px, rows[-1].keep_stop + restorer.reach_px
+    start = rows[0].keep_start - restorer.reach_px
+    stop = rows[-1].keep_stop + restorer.reach_px
     return [row for row in plan.rows if row.keep_stop > start and row.keep_start < stop]
 
 
@@ -158,7 +162,8 @@ def _network_row(row: Span, strip: Strip, tiles: Iterable[Tile], plan: Plan, tic
 
 def _finished(row: NetworkRow, held: HeldRows, plan: Plan, restorer: Restorer, pool: Executor) -> RestoredRow:
     """Finish a row of tiles, tile by tile, once all that they need is held."""
-    count, reach_px = plan.tiling.channels_out, restorer.reach_px
+    count = plan.tiling.channels_out
+    reach_px = restorer.reach_px
     top = max(row.span.keep_start - reach_px, 0)
     rows = slice(top, row.span.keep_stop + reach_px)
 
@@ -180,7 +185,8 @@ def _finished(row: NetworkRow, held: HeldRows, plan: Plan, restorer: Restorer, p
 
 def _gathered(tiles: Iterable[Tile], pixels: np.ndarray, plan: Plan, tick: Callable[[], None]) -> Tally:
     """Put the tiles of a row into `pixels` (bands, rows, width); return what was seen of all."""
-    tally, count = Tally(), plan.tiling.channels_out
+    tally = Tally()
+    count = plan.tiling.channels_out
     for (group, columns), tile in zip(places(plan), tiles, strict=True):
         across = slice(columns.keep_start * plan.scale, columns.keep_stop * plan.scale)
         pixels[group * count : (group + 1) * count, :, across] = tile.pixels
@@ -206,7 +212,8 @@ def restore_array(
         at_once: tiles in work at a time.
         look: is shown what was seen of all of it, and may refuse it.
     """
-    result, tally = np.empty(plan.out_shape, restorer.raster.out_dtype), Tally()
+    result = np.empty(plan.out_shape, restorer.raster.out_dtype)
+    tally = Tally()
     for row in restore_rows(source, plan, restorer, plan.rows, lambda: None, at_once):
         result[:, row.span.keep_start * plan.scale : row.span.keep_stop * plan.scale] = row.pixels
         tally += row.tally
@@ -223,7 +230,8 @@ def restore_floats(
     NaN is a missing pixel, and stays.
     """
     if plan.out_shape != (1, *dn.shape):
-        got, remedy = f"one of {times(plan.out_shape)}", "restore files with it, or arrays by beers_deploy.library"
+        got = f"one of {times(plan.out_shape)}"
+        remedy = "restore files with it, or arrays by beers_deploy.library"
         raise ModelError("ONNX model", expected=f"a result of {times(dn.shape)}", got=got, remedy=remedy)
     pixels = np.asarray(dn, np.float32)[None]
     _, height_px, width_px = pixels.shape

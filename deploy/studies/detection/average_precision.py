@@ -96,7 +96,8 @@ def match(truth: Boxes, found: Boxes) -> tuple[np.ndarray, np.ndarray, np.ndarra
     """
     passed = np.repeat((truth.ignored | _of_other_size(truth))[:, None], len(OVERLAPS), axis=1)
     ignored = np.repeat(_of_other_size(found)[:, None], len(OVERLAPS), axis=1)
-    hits, taken = np.zeros_like(ignored), np.zeros_like(passed)
+    hits = np.zeros_like(ignored)
+    taken = np.zeros_like(passed)
     overlaps = iou(found.corners, truth.corners, truth.ignored) * (found.classes[:, None] == truth.classes)
     for one in np.argsort(-found.scores, kind="stable"):
         if overlaps[one].max(initial=0) < OVERLAPS[0]:
@@ -204,11 +205,13 @@ def precisions(hits: Hits, kind: int, weights: np.ndarray, size: int = ALL, leve
     found = np.full((len(weights), levels, len(RECALLS)), np.nan)
     for level in range(levels):
         counted = np.flatnonzero((hits.classes == kind) & ~hits.ignored[size, level])
-        images, hit = hits.images[counted], np.flatnonzero(hits.hits[size, level, counted])
+        images = hits.images[counted]
+        hit = np.flatnonzero(hits.hits[size, level, counted])
         for draw in np.flatnonzero(totals):
             # Precision peaks at hits alone, so a draw has to look at nothing else.
             each = weights[draw, images]
-            true, so_far = np.cumsum(each[hit]), np.cumsum(each)[hit]
+            true = np.cumsum(each[hit])
+            so_far = np.cumsum(each)[hit]
             precision = np.divide(true, so_far, out=np.zeros(len(true)), where=so_far > 0)
             best = np.append(np.maximum.accumulate(precision[::-1])[::-1], 0.0)  # beyond the last hit there is none
             found[draw, level] = best[np.searchsorted(true / totals[draw], RECALLS)]
@@ -220,18 +223,22 @@ def _confidence_curves(hits: Hits, weights: np.ndarray) -> np.ndarray:
 
     Precision is 1 of a class of which nothing is found, as Ultralytics has it.
     """
-    total, known = np.zeros((3, len(weights), len(CONFIDENCES))), np.zeros((len(weights), 1))
+    total = np.zeros((3, len(weights), len(CONFIDENCES)))
+    known = np.zeros((len(weights), 1))
     levels = np.searchsorted(CONFIDENCES, hits.scores, side="right") - 1
 
     def reaching(which: np.ndarray) -> np.ndarray:
-        places, shape = (hits.images[which], levels[which]), (weights.shape[1], len(CONFIDENCES))
+        places = (hits.images[which], levels[which])
+        shape = (weights.shape[1], len(CONFIDENCES))
         by_level = weights @ csr_array((np.ones(len(places[0])), places), shape)
         return np.asarray(by_level[:, ::-1].cumsum(axis=1)[:, ::-1])
 
     for kind, objects in enumerate(hits.objects[ALL]):
-        counts, mine = (weights @ objects)[:, None], hits.classes == kind
+        counts = (weights @ objects)[:, None]
+        mine = hits.classes == kind
         true, found = reaching(mine & hits.hits[ALL, 0]), reaching(mine & ~hits.ignored[ALL, 0])
-        precision, recall = np.where(found > 0, true / np.maximum(found, 1), 1.0), true / np.maximum(counts, 1)
+        precision = np.where(found > 0, true / np.maximum(found, 1), 1.0)
+        recall = true / np.maximum(counts, 1)
         f1 = 2 * precision * recall / np.where(recall > 0, precision + recall, 1.0)
         total += np.where(counts > 0, [precision, recall, f1], 0.0)
         known += counts > 0

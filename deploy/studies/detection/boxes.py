@@ -65,7 +65,8 @@ class Boxes:
         """The parts inside an image: what lies outside whole is left out, what is mostly outside is ignored."""
         limits = np.array([width_px, height_px, width_px, height_px])
         inside = np.clip(self.corners, 0, limits)
-        known, whole = areas(inside), areas(self.corners)
+        known = areas(inside)
+        whole = areas(self.corners)
         ignored = self.ignored | (known < LEAST_VISIBLE * whole)
         return replace(self, corners=inside, ignored=ignored)[known > 0]
 
@@ -83,17 +84,21 @@ def iou(one: np.ndarray, other: np.ndarray, ignored: np.ndarray | bool = False) 
         other: corners.
         ignored: (M,) of which of `other` the overlap is the share of `one` inside it.
     """
-    low, high = np.maximum(one[:, None, :2], other[None, :, :2]), np.minimum(one[:, None, 2:], other[None, :, 2:])
-    shared, own = np.prod(np.maximum(high - low, 0), axis=2), areas(one)[:, None]
+    low = np.maximum(one[:, None, :2], other[None, :, :2])
+    high = np.minimum(one[:, None, 2:], other[None, :, 2:])
+    shared = np.prod(np.maximum(high - low, 0), axis=2)
+    own = areas(one)[:, None]
     whole = np.where(ignored, own, own + areas(other) - shared)
     return np.asarray(np.divide(shared, whole, out=np.zeros_like(shared), where=whole > 0))
 
 
 def suppress(found: Boxes) -> Boxes:
     """Non-maximum suppression within each class: what stays of boxes as a detector gives them, best score first."""
-    left, kept = np.argsort(-found.scores, kind="stable")[:CANDIDATES], list[int]()
+    left = np.argsort(-found.scores, kind="stable")[:CANDIDATES]
+    kept = list[int]()
     while len(left) and len(kept) < MOST:
-        best, left = int(left[0]), left[1:]
+        best = int(left[0])
+        left = left[1:]
         kept.append(best)
         crowded = found.classes[left] == found.classes[best]
         crowded[crowded] = iou(found.corners[best][None], found.corners[left[crowded]])[0] > OVERLAP
@@ -119,10 +124,12 @@ class Letterbox:
             got = f"{height_px} x {width_px} px"
             expected = f"an image that keeps a pixel in a detector's input of {size_px} px"
             raise OptionError("image", expected=expected, got=got, remedy="cut it into squares")
-        top, left = (size_px - height) // 2, (size_px - width) // 2
+        top = (size_px - height) // 2
+        left = (size_px - width) // 2
         self._border = (top, size_px - height - top), (left, size_px - width - left), (0, 0)
         # By axis, for the sides are rounded to whole pixels: one gain for both would be off by up to half a pixel.
-        self._gain, self._shift = np.tile([width / width_px, height / height_px], 2), np.tile([left, top], 2)
+        self._gain = np.tile([width / width_px, height / height_px], 2)
+        self._shift = np.tile([left, top], 2)
 
     def image(self, rgb: np.ndarray) -> np.ndarray:
         """The input, (3, size_px, size_px) float32, of an image (height_px, width_px, 3) in 0 to 1."""

@@ -98,7 +98,8 @@ def _answer(session: InferenceSession, path: Path, image: np.ndarray) -> np.ndar
     except CODE_FAULTS:
         raise
     except Exception as error:  # onnxruntime raises a class of its own for each status code
-        got, remedy = " ".join(str(error).split())[:160], "export it again, for one size of image"
+        got = " ".join(str(error).split())[:160]
+        remedy = "export it again, for one size of image"
         raise ModelError(str(path), expected="a detector that runs", got=got, remedy=remedy) from error
 
 
@@ -111,7 +112,8 @@ def _literal(text: str) -> Any:
 
 
 def _require_layout(model: onnx.ModelProto, task: Any, classes: int, path: Path) -> None:
-    channels, outputs = _sizes(model.graph.input[0])[1:2], [_sizes(value) for value in model.graph.output]
+    channels = _sizes(model.graph.input[0])[1:2]
+    outputs = [_sizes(value) for value in model.graph.output]
     if task == "detect" and channels == [3] and len(outputs) == 1 and _is_read(outputs[0], classes):
         return
     read = f"for RGB, 1 x {4 + classes} x anchors for {classes} classes (raw) or 1 x N x 6 (nms=True or end2end)"
@@ -132,7 +134,8 @@ def _sizes(value: onnx.ValueInfoProto) -> list[int]:
 
 def _size_px(fixed: int | None, stated: Any, asked: int | None, path: Path) -> int:
     if fixed and asked not in (None, fixed):
-        expected, remedy = f"{fixed}, which {path.name} is fixed to", f"export it for {asked} px, or leave `side` out"
+        expected = f"{fixed}, which {path.name} is fixed to"
+        remedy = f"export it for {asked} px, or leave `side` out"
         raise OptionError("side", expected=expected, got=f"{asked}", remedy=remedy)
     if isinstance(stated, list) and len(stated) == 2 and stated[0] == stated[1]:
         stated = stated[0]
@@ -147,7 +150,8 @@ def _flag(model: onnx.ModelProto) -> str:
     """What suppression inside the file costs; the confidence it cuts at stands nowhere but in its graph."""
     if not any(node.op_type == "NonMaxSuppression" for node in model.graph.node):
         return ""
-    known, compared = constants(model), (node.input for node in model.graph.node if node.op_type == "Greater")
+    known = constants(model)
+    compared = (node.input for node in model.graph.node if node.op_type == "Greater")
     limits = [known[name].max() for names in compared for name in names if name in known and known[name].size]
     if limits and max(limits) <= CUT:
         return ""
@@ -159,7 +163,8 @@ def _flag(model: onnx.ModelProto) -> str:
 def _raw(output: np.ndarray) -> Boxes:
     """Every pair of an anchor and a class whose score counts; px of the input."""
     classes, anchors = np.nonzero(output[4:] > LEAST_SCORE)
-    middle, half = output[:2, anchors].T.astype(np.float64), output[2:4, anchors].T.astype(np.float64) / 2
+    middle = output[:2, anchors].T.astype(np.float64)
+    half = output[2:4, anchors].T.astype(np.float64) / 2
     return Boxes.of(np.hstack([middle - half, middle + half]), classes, output[4 + classes, anchors])
 
 
@@ -194,7 +199,8 @@ def parse_classes(text: str) -> dict[str, str]:
     pairs = [[part.strip() for part in entry.split("=")] for entry in text.split(",") if entry.strip()]
     sound = pairs and all(len(pair) == 2 and all(map(letters, pair)) for pair in pairs)
     if not sound or len({letters(pair[0]) for pair in pairs}) < len(pairs):
-        expected, remedy = "LABELLED=DETECTOR,..., each labelled class once", "write car=vehicle,minibus=vehicle"
+        expected = "LABELLED=DETECTOR,..., each labelled class once"
+        remedy = "write car=vehicle,minibus=vehicle"
         raise OptionError(OPTION, expected=expected, got=repr(text), remedy=remedy)
     return dict(pairs)
 
@@ -212,7 +218,8 @@ def class_numbers(labelled: Sequence[str], detector: Sequence[str], given: Mappi
     """
     number = {letters(name): i for i, name in enumerate(detector)}
     if len(number) < len(detector):
-        expected, got = "classes told apart by their letters", "two classes of the same letters"
+        expected = "classes told apart by their letters"
+        got = "two classes of the same letters"
         raise OptionError("detector", expected=expected, got=got, remedy="export one whose classes differ")
     for whose, asked, names in (("the labelled", given, labelled), ("the detector's", given.values(), detector)):
         for name in asked:

@@ -128,7 +128,8 @@ def _read_each(images: Sequence[Path], where: Path, named_in: Sequence[Path]) ->
 def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> LabelledSet:
     names = sorted(sorted({name for one in files for name, *_ in one.boxes}), key=letters)
     number = {name: i for i, name in enumerate(names)}
-    images, lost = [], list[str]()
+    images = []
+    lost = list[str]()
     for one in sorted(files, key=lambda one: one.image.name):
         whole = Boxes.of(
             [corners for _, corners, _ in one.boxes],
@@ -149,13 +150,15 @@ def _size_px(one: _File) -> tuple[int, int]:
     """Height and width of an image in px; its labels must have been made for them."""
     height, width = image_size_px(one.image)
     if min(one.size_px) > 0 and one.size_px != (height, width):
-        expected, got = f"labels of an image of {height} x {width} px", f"{one.size_px[0]:g} x {one.size_px[1]:g} px"
+        expected = f"labels of an image of {height} x {width} px"
+        got = f"{one.size_px[0]:g} x {one.size_px[1]:g} px"
         raise _faulty(one.source, expected, got, "give the image that was labelled")
     return height, width
 
 
 def _remarks(truths: Sequence[Boxes], lost: Sequence[str]) -> list[str]:
-    empty, ignored = sum(not len(truth) for truth in truths), sum(int(truth.ignored.sum()) for truth in truths)
+    empty = sum(not len(truth) for truth in truths)
+    ignored = sum(int(truth.ignored.sum()) for truth in truths)
     first = lost[0] if lost else ""
     remarks = (
         (empty, f"Images without a labelled object, all found there is false: {empty} of {len(truths)}."),
@@ -171,7 +174,8 @@ def _read_voc_tree(folder: Path, split: str | None) -> list[_File]:
     labels = folder / "Annotations"
     labels = labels / HORIZONTAL if (labels / HORIZONTAL).is_dir() else labels
     lists = {path.stem: path for path in sorted((folder / "ImageSets" / "Main").glob("*.txt"))}
-    stems, wanted = list(images), split or "test"
+    stems = list(images)
+    wanted = split or "test"
     if wanted in lists:
         # A list of one class has a number behind each name.
         stems = sorted({line.split()[0] for line in _lines(lists[wanted])})
@@ -239,7 +243,8 @@ def _inside(folder: Path, name: str) -> Path | None:
 
 
 def _read_yolo(image: Path, labels: Path, names: Sequence[str]) -> _File:
-    lines, size_px = _lines(labels) if labels.exists() else [], image_size_px(image)
+    lines = _lines(labels) if labels.exists() else []
+    size_px = image_size_px(image)
     return _File(image, labels, [_yolo_box(line, labels, names, size_px) for line in lines])
 
 
@@ -249,7 +254,8 @@ def _yolo_box(line: str, path: Path, names: Sequence[str], size_px: tuple[int, i
         raise _faulty(path, "YOLO's 'class cx cy w h'", repr(line[:80]))
     number, *shares = _numbers(words, path, "class and coordinates")
     if number not in range(len(names)):
-        expected, remedy = f"a class from 0 to {len(names) - 1}", "name it in data.yaml or classes.txt"
+        expected = f"a class from 0 to {len(names) - 1}"
+        remedy = "name it in data.yaml or classes.txt"
         raise _faulty(path, f"{expected}, of which there is a name", words[0][:20], remedy)
     if min(shares) < -SPAN or max(shares) > 1 + SPAN:
         remedy = "divide pixels by the image's width and height"
@@ -269,7 +275,8 @@ def yolo_names(folders: Sequence[Path]) -> tuple[str, ...]:
                 return found
         if (folder / "classes.txt").is_file():
             return tuple(line.strip() for line in _lines(folder / "classes.txt"))
-    expected, places = "data.yaml or classes.txt with the names of the classes", ", ".join(map(str, folders))
+    expected = "data.yaml or classes.txt with the names of the classes"
+    places = ", ".join(map(str, folders))
     raise OptionError("YOLO labels", expected=expected, got=f"neither in {places}", remedy="add one")
 
 
@@ -278,7 +285,8 @@ def _yaml_names(path: Path) -> tuple[str, ...]:
     try:
         import yaml  # type: ignore[import-untyped]  # its stubs are one more package, for one function
     except ImportError as error:
-        got, remedy = "no such package", "pip install 'beers-deploy[detect]', or write classes.txt"
+        got = "no such package"
+        remedy = "pip install 'beers-deploy[detect]', or write classes.txt"
         raise MissingExtraError(str(path), expected="PyYAML to read it", got=got, remedy=remedy) from error
     text = _read_bytes(path, NAMES_BYTES)
     try:

@@ -46,7 +46,8 @@ def write_page(compared: Sequence[Comparison], rows: Sequence[Row], notes: Seque
     truths = [each.scene.truth for each in compared[0].scenes]
     objects = sum(int((~truth.ignored).sum()) for truth in truths)
     title = f"What restoration buys a detector: {objects} objects on {len(truths)} images"
-    pictures, said = [curves(compared), *crops(compared)], (*notes, *NOTES, *PAPER_NOTES)
+    pictures = [curves(compared), *crops(compared)]
+    said = (*notes, *NOTES, *PAPER_NOTES)
     write_report(Report(title, headline(compared), tables, pictures, said), path)
 
 
@@ -59,7 +60,8 @@ def curves(compared: Sequence[Comparison]) -> Picture:
 
 
 def _curve(found: Comparison, row: str) -> Curve:
-    hits, once = found.hits[row], np.ones((1, len(found.scenes)), np.int64)
+    hits = found.hits[row]
+    once = np.ones((1, len(found.scenes)), np.int64)
     values = mean_known(np.array([precisions(hits, kind, once)[0, 0] for kind in range(len(found.names))]))
     points = tuple(zip(RECALLS.tolist(), values.tolist(), strict=True))
     return Curve(row, list(found.hits).index(row) % len(SERIES), row == REFERENCE, points)
@@ -99,7 +101,8 @@ def _picture(compared: Sequence[Comparison], number: int) -> Picture:
 
 def _middle(found: Comparison, number: int) -> np.ndarray:
     """(2,) x and y in scene pixels of the object, a lost one if there is any, with most such near it."""
-    truth, lost = found.scenes[number].scene.truth, _lost(found, number)
+    truth = found.scenes[number].scene.truth
+    lost = _lost(found, number)
     shown = truth.corners[lost] if lost.any() else truth.corners
     if not len(shown):
         return np.zeros(2)
@@ -110,7 +113,8 @@ def _middle(found: Comparison, number: int) -> np.ndarray:
 
 def _cell(found: Comparison, row: str, number: int, middle: np.ndarray) -> np.ndarray:
     """An enlarged crop around a place of the scene, what is missed, falsely found and found drawn over it."""
-    scene, ratio = found.scenes[number], found.sensors.oversampling
+    scene = found.scenes[number]
+    ratio = found.sensors.oversampling
     truth, (boxes, hits, ignored, taken) = scene.scene.truth, _matched(found, row, number)
     rgb = np.rint(255 * scene.shown(found.methods[row])).astype(np.uint8)
     most = np.maximum(np.array(rgb.shape[1::-1]) - CROP_PX, 0)

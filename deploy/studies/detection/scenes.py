@@ -45,9 +45,11 @@ def synthetic_scene(generator: np.random.Generator, height_px: int, width_px: in
     canvas = Canvas(height_px, width_px, generator)
     angle, (x, y) = generator.uniform(-0.5, 0.5), generator.uniform(-0.5, 0.5, 2) * PLOT_M
     # Half the diagonal: how far from the centre there is something to draw.
-    world, reach = drawing.turn(x, y, angle), math.hypot(width_px, height_px) * SCENE_GSD_M / 2 + PLOT_M
+    world = drawing.turn(x, y, angle)
+    reach = math.hypot(width_px, height_px) * SCENE_GSD_M / 2 + PLOT_M
     places = (np.arange(math.ceil(2 * reach / PLOT_M)) + 0.5) * PLOT_M - reach
-    half_m, turn = (PLOT_M - STREET_M) / 2 - KERB_M, drawing.turn
+    half_m = (PLOT_M - STREET_M) / 2 - KERB_M
+    turn = drawing.turn
     plots = [Plot(canvas, turn(*world(u, v), angle), half_m) for v in places for u in places]
     strips = [Plot(canvas, turn(*world(p + PLOT_M / 2, 0), angle + math.pi / 2), reach) for p in places]
     strips += [Plot(canvas, turn(*world(0, p + PLOT_M / 2), angle), reach) for p in places]
@@ -124,17 +126,20 @@ class Plot:
 
     def tree(self, x: float, y: float) -> None:
         """Draw a tree of 1.5 to 3.5 m radius, unless an object stands there."""
-        radius, middle = self.random.uniform(1.5, 3.5) / SCENE_GSD_M, self._pixel(x, y)
+        radius = self.random.uniform(1.5, 3.5) / SCENE_GSD_M
+        middle = self._pixel(x, y)
         if self.canvas.is_free(*drawing.around(*middle, 2 * radius)):
             drawing.tree(self.canvas.draw, *middle, radius, self.random)
 
     def put(self, kind: int, parts: list[Part], x: float, y: float, turned: float, height_m: float) -> bool:
         """Put an object at (x, y), turned, if it lies whole within plot and scene and clear of others."""
-        own, shadow_px = drawing.turn(x, y, turned), height_m / SCENE_GSD_M
+        own = drawing.turn(x, y, turned)
+        shadow_px = height_m / SCENE_GSD_M
         outlines = [[own(*point) for point in polygon] for polygon, _ in parts]
         polygons = [[self._pixel(*point) for point in outline] for outline in outlines]
         points = np.concatenate(polygons)
-        low, high = points.min(0) - GAP_PX, points.max(0) + GAP_PX + shadow_px
+        low = points.min(0) - GAP_PX
+        high = points.max(0) + GAP_PX + shadow_px
         if np.abs(np.concatenate(outlines)).max() > self.half_m or low.min() < 0 or (high >= self.canvas.size).any():
             return False
         if not self.canvas.is_free(*low, *high):
@@ -164,7 +169,8 @@ def vehicle(generator: np.random.Generator) -> list[Part]:
 def ship(generator: np.random.Generator) -> list[Part]:
     """A hull with a bow, its hatches or a long deck, and the bridge astern."""
     half = 0.5 * math.exp(generator.uniform(math.log(9), math.log(70)))
-    wide, hull = half / generator.uniform(3, 5), generator.uniform(50, 160)
+    wide = half / generator.uniform(3, 5)
+    hull = generator.uniform(50, 160)
     outline = [(x * half, y * wide) for x, y in ((-1, -0.8), (-0.9, -1), (0.5, -1), (0.8, -0.6), (1, 0))]
     parts = [(outline + [(x, -y) for x, y in reversed(outline[:-1])], hull)]
     for start, end in pairwise(np.linspace(-0.45, 0.55, int(generator.integers(2, 6))) * half):
@@ -174,9 +180,12 @@ def ship(generator: np.random.Generator) -> list[Part]:
 
 def aircraft(generator: np.random.Generator) -> list[Part]:
     """Swept wings, tailplane, engines and, on top, the fuselage."""
-    half, paint = 0.5 * math.exp(generator.uniform(math.log(12), math.log(38))), generator.uniform(170, 270)
-    long, sweep = half * generator.uniform(0.9, 1.15), half * generator.uniform(0.15, 0.6)
-    thick, chord = 0.11 * half, 0.32 * half
+    half = 0.5 * math.exp(generator.uniform(math.log(12), math.log(38)))
+    paint = generator.uniform(170, 270)
+    long = half * generator.uniform(0.9, 1.15)
+    sweep = half * generator.uniform(0.15, 0.6)
+    thick = 0.11 * half
+    chord = 0.32 * half
     fuselage = [(-long, 0.0), (-0.7 * long, thick), (0.8 * long, thick), (long, 0.0)]
     parts = [
         (_swept(0.25 * long, half, chord, sweep), 0.9 * paint),
@@ -190,7 +199,8 @@ def aircraft(generator: np.random.Generator) -> list[Part]:
 
 def tank(radius_m: float, generator: np.random.Generator) -> list[Part]:
     """A round tank with a rim and a roof a little darker or brighter, the stair's hatch on it."""
-    paint, angle = generator.uniform(110, 250), generator.uniform(0, math.tau)
+    paint = generator.uniform(110, 250)
+    angle = generator.uniform(0, math.tau)
     hatch = 0.6 * radius_m * math.cos(angle), 0.6 * radius_m * math.sin(angle)
     return [
         (_disc(0.0, 0.0, radius_m), paint),
@@ -243,8 +253,10 @@ def _harbour(plot: Plot) -> None:
         plot.put(VEHICLE, vehicle(plot.random), plot.random.uniform(-half, half), 3.5 - half, 0.0, 0.8)
 
     def sail(x: float, y: float) -> bool:
-        moored, anywhere = plot.random.choice([0, math.pi / 2]), plot.random.uniform(0, math.tau)
-        parts, turned = ship(plot.random), plot.random.choice([moored, anywhere])
+        moored = plot.random.choice([0, math.pi / 2])
+        anywhere = plot.random.uniform(0, math.tau)
+        parts = ship(plot.random)
+        turned = plot.random.choice([moored, anywhere])
         hull = np.array([drawing.turn(x, y, turned)(*point) for point in parts[0][0]])
         clear_of_pier = hull[:, 0].max() < pier or hull[:, 0].min() > pier + 4
         clear = clear_of_pier and hull[:, 1].min() > 7 - plot.half_m
@@ -275,7 +287,8 @@ def _tank_farm(plot: Plot) -> None:
     start = -step * (count - 1) / 2
     for row in range(count):
         for column in range(count):
-            x, y = start + step * column, start + step * row
+            x = start + step * column
+            y = start + step * row
             for side in (-0.48 * step, 0.48 * step):
                 plot.line((x + side, y - 0.48 * step), (x + side, y + 0.48 * step), drawing.CONCRETE, 0.8)
                 plot.line((x - 0.48 * step, y + side), (x + 0.48 * step, y + side), drawing.CONCRETE, 0.8)
@@ -288,7 +301,8 @@ def _tank_farm(plot: Plot) -> None:
 def _car_park(plot: Plot) -> None:
     """Rows of stalls between lanes, some 60 % taken, a few trees in between."""
     plot.pad(drawing.ASPHALT * plot.random.uniform(0.9, 1.6))
-    half, taken = plot.half_m, plot.random.uniform(0.2, 0.9)
+    half = plot.half_m
+    taken = plot.random.uniform(0.2, 0.9)
     for y in np.arange(6.0 - half, half - 4, 13.0):
         for x in np.arange(3.0 - half, half - 3, 2.9):
             plot.line((x - 1.45, y - 2.6), (x - 1.45, y + 2.6), drawing.WHITE * 0.6, 0.25)
@@ -304,7 +318,8 @@ def _houses(plot: Plot) -> None:
     half = plot.half_m
     for y in np.arange(14.0 - half, half - 8, 24.0):
         for x in np.arange(12.0 - half, half - 8, 20.0):
-            long, wide = plot.random.uniform(9, 16), plot.random.uniform(7, 11)
+            long = plot.random.uniform(9, 16)
+            wide = plot.random.uniform(7, 11)
             _house(plot, x - long / 2, y - wide / 2, long, wide)
             plot.tree(x + plot.random.uniform(-9, 9), y + 11)
     for y in np.arange(26.0 - half, half - 4, 24.0):
@@ -331,7 +346,8 @@ def _scatter(
 
 
 def _field(plot: Plot) -> None:
-    base, half = plot.random.choice([38, 55, 70, 88]), plot.half_m
+    base = plot.random.choice([38, 55, 70, 88])
+    half = plot.half_m
     plot.pad(base)
     for x in np.arange(-half, half, plot.random.uniform(0.8, 2.5)):
         plot.line((x, -half), (x, half), base * 0.85, 0.4)

@@ -97,7 +97,8 @@ class AcquiredScene:
         return replace(found, corners=found.corners * self.sensors.oversampling)
 
     def _acquired(self, profile: Sensor, role: str) -> np.ndarray:
-        sensor, radiance = profile.draw(self.draw.generator("sensor")), self.scene.radiance(profile.nominal())
+        sensor = profile.draw(self.draw.generator("sensor"))
+        radiance = self.scene.radiance(profile.nominal())
         return acquire_padded(radiance, sensor, self.sensors.oversampling, self.draw, role)
 
 
@@ -173,7 +174,9 @@ def _compared(
             for row, method in rows.items():
                 boxes[row].append(each.boxes(detector, method))
                 bar.advance(1, row)
-    names, truths, sites = detector.names, [scene.truth for scene in scenes], [scene.site for scene in scenes]
+    names = detector.names
+    truths = [scene.truth for scene in scenes]
+    sites = [scene.site for scene in scenes]
     hits = {row: find_hits(truths, found, len(names)) for row, found in boxes.items()}
     scores = score_rows(hits, names, site_weights(sites, seed))
     return Comparison(sensors, rows, list(acquired(scenes, sensors, seed)), boxes, hits, *scores, names)

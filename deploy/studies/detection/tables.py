@@ -85,7 +85,8 @@ def _figure(found: Comparison, values: np.ndarray, unit: str = PERCENT) -> Figur
     """A share of 0 to 1, or a difference of two, (1 + draws,), times 100; its interval where sites are enough."""
     if isnan(values[0]):
         return unavailable(unit, NO_OBJECT)
-    source, ends = f"{len(found.scenes)} images of {found.sites} sites", interval(values, found.sites)
+    source = f"{len(found.scenes)} images of {found.sites} sites"
+    ends = interval(values, found.sites)
     if ends is None:
         return measured(100 * float(values[0]), unit, source)
     source = f"{source}, 95 % bootstrap interval over sites ({DRAWS} draws)"

@@ -152,7 +152,8 @@ def with_steps(
     around: Around,
 ) -> Restore:
     """A network with the steps around it; the consistency step only where a sensor is known."""
-    instrument, aim = sensor.nominal(), None
+    instrument = sensor.nominal()
+    aim = None
     if around.consistency and sensor.name != NOT_KNOWN:
         aim = reference.in_units_of(instrument)
     return network_method(model, instrument.max_dn, brighter, instrument, aim)

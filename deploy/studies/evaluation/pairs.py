@@ -81,7 +81,8 @@ def check_brightness(brightness: Iterable[float]) -> list[float]:
     factors = list(dict.fromkeys((1.0, *brightness)))
     for factor in factors:
         if not 0 < factor <= 1:
-            expected, remedy = "factors of radiance above 0 and up to 1", "give factors such as 1,0.25,0.05"
+            expected = "factors of radiance above 0 and up to 1"
+            remedy = "give factors such as 1,0.25,0.05"
             raise OptionError("brightness", expected=expected, got=f"{factor:g}", remedy=remedy)
     return factors
 
@@ -105,7 +106,8 @@ def simulate_pairs(
     Returns:
         The pairs, and the names of scenes too small to use.
     """
-    pairs, small = [], []
+    pairs = []
+    small = []
     for number, scene in enumerate(scenes):
         ratio = acquire.fitting_oversampling(scene.radiance, oversamplings, acquire.LEAST_SIDE_PX)
         if ratio is None:
@@ -121,7 +123,8 @@ def simulate_pairs(
         pairs.append(NamedPair(scene.name, seen, meant, oversampling=ratio, noise_free=clean))
     if not pairs:
         least = oversamplings[-1] * (2 * acquire.MARGIN_PX + acquire.LEAST_SIDE_PX)
-        expected, got = f"scenes of {least} pixels a side or more", f"{len(small)} smaller ones"
+        expected = f"scenes of {least} pixels a side or more"
+        got = f"{len(small)} smaller ones"
         raise ImageError("images", expected=expected, got=got, remedy="give larger images")
     return pairs, small
 
@@ -158,7 +161,8 @@ def read_pairs(folder: Path, max_dn: int = MAX_DN, recipe: PairsRecipe | None = 
         seen, meant = (read_acquisition(path, max_dn=max_dn) for path in (degraded, reference))
         if seen.shape != meant.shape:
             sizes = " and ".join(f"{a.shape[1]} x {a.shape[0]}" for a in (seen, meant))
-            expected, remedy = "two images of one size", "crop them alike"
+            expected = "two images of one size"
+            remedy = "crop them alike"
             raise ImageError(f"pair {degraded.stem}", expected=expected, got=sizes, remedy=remedy)
         place = recipe.site(degraded.stem) if recipe else None
         pairs.append(NamedPair(degraded.stem, seen, meant, place))

@@ -138,7 +138,8 @@ def evaluate(
         sensor, reference = made[0].profiles
     factors = check_brightness(brightness)
     if pairs is not None and len(factors) > 1:
-        expected, remedy = "no brightness with pairs, which are as they are", "give images instead of pairs"
+        expected = "no brightness with pairs, which are as they are"
+        remedy = "give images instead of pairs"
         raise OptionError("brightness", expected=expected, got="both", remedy=remedy)
     recipe = read_pairs_recipe(folder) if folder else None
     sensors = profiles_for(sensor, reference, recipe, log)
@@ -148,7 +149,8 @@ def evaluate(
         around = Around(consistency, exposure)
         ways = [_method(name, each, sensors, told, around) for name, each in asked.items()]
         instruments = _instruments(weights, sensors[0])
-        said, seen = list[str](), list[Row]()
+        said = list[str]()
+        seen = list[Row]()
         if made is not None:
             loaded = [_named(number, pair) for number, pair in enumerate(made)]
         elif folder is not None:

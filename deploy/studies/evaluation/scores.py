@@ -175,7 +175,8 @@ class Instruments:
 
 def score(method: Method, pairs: Sequence[NamedPair], instruments: Instruments, seed: int) -> list[Row]:
     """The mean row of a method, then one row an image."""
-    rows, scores = [], []
+    rows = []
+    scores = []
     with steps(method.name, len(pairs)) as bar:
         for pair in pairs:
             values = instruments.score(method.restore(pair.degraded), pair)

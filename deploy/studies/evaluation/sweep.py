@@ -30,7 +30,8 @@ NOISE = ((15.0, 50.0), (25.0, 55.0), (30.0, 80.0), (70.0, 150.0), (90.0, 190.0))
 
 def conditions(nominal: Instrument, profile: Sensor) -> dict[str, Instrument]:
     """The nominal sensor; other MTFs, both axes alike or not; other SNRs; both at once; and one with another gain."""
-    low, worst = _noisy(nominal, profile, 25, 55), _noisy(nominal, profile, 15, 50)
+    low = _noisy(nominal, profile, 25, 55)
+    worst = _noisy(nominal, profile, 15, 50)
     weak = replace(nominal, gain_dn_per_radiance=0.7 * nominal.gain_dn_per_radiance)
     return {
         NOMINAL: nominal,
@@ -88,8 +89,12 @@ def run_sweep(
         seed: of every random draw.
         brightness: factor of the scenes' radiance. The MTF is measured at 1 alone: edges do not depend on it.
     """
-    psnr, mtf, pairs = dict[Key, np.ndarray](), dict[Key, Figure](), list[NamedPair]()
-    nominal, aim, ratios = profile.nominal(), reference.nominal(), oversamplings_of(profile)
+    psnr = dict[Key, np.ndarray]()
+    mtf = dict[Key, Figure]()
+    pairs = list[NamedPair]()
+    nominal = profile.nominal()
+    aim = reference.nominal()
+    ratios = oversamplings_of(profile)
     loaded = scenes_at(brightness, load_scenes(images, aim, seed))
     scenes = {site_of(scene.name): scene for scene in reversed(loaded)}
     tried = [method_named(name, profile, reference) for name in (DEGRADED, TRADITIONAL)]
@@ -101,7 +106,8 @@ def run_sweep(
             pairs, _ = simulate_pairs(list(scenes.values()), sensor, aim.in_units_of(sensor), seed, ratios)
             edges = acquire_edges(sensor, seed) if brightness == 1 else []
             for supposed, other, method in trials[name]:
-                key, knowing = (name, supposed, method.name), method.knowing(other)
+                key = (name, supposed, method.name)
+                knowing = method.knowing(other)
                 psnr[key] = _psnr_db(knowing, pairs, sensor.max_dn)
                 if brightness == 1 and supposed in (name, NOMINAL):
                     mtf[key] = restored_mtf(knowing, edges, sensor.max_dn)
@@ -211,7 +217,8 @@ class Found:
     def _wrong(self) -> list[Row]:
         """PSNR where each method supposes another sensor than the true one, and what it loses by that."""
         pairs = dict.fromkeys(key[:2] for key in self.psnr if key[1] not in (key[0], NOMINAL))
-        psnr, lost = [], []
+        psnr = []
+        lost = []
         for truth, supposed in pairs:
             wrong = {key[2]: values[0] for key, values in self.psnr.items() if key[:2] == (truth, supposed)}
             cost = {name: self.psnr[truth, truth, name][0] - values for name, values in wrong.items()}

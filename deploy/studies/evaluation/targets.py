@@ -197,7 +197,8 @@ def snr_name(radiance: float) -> str:
 
 def flat_figure(flat: np.ndarray) -> Figure:
     """Return the linear SNR of a flat field (h, w): its mean over its standard deviation."""
-    mean, deviation = float(flat.mean(dtype=np.float64)), float(flat.std(dtype=np.float64, ddof=1))
+    mean = float(flat.mean(dtype=np.float64))
+    deviation = float(flat.std(dtype=np.float64, ddof=1))
     if deviation <= 1e-6 * mean:
         return unavailable("ratio", "nothing is left of the noise in a flat field")
     return measured(mean / deviation, "ratio", f"one flat field of {flat.shape[1]} x {flat.shape[0]}, L / sigma")

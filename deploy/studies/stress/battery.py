@@ -70,7 +70,8 @@ def run_battery(
         seed: of the images.
         side_px: of images whose case has no size of its own.
     """
-    results, reasons = [], {stage: _cannot_be_looked_at(subject, stage) for stage in stages}
+    results = []
+    reasons = {stage: _cannot_be_looked_at(subject, stage) for stage in stages}
     # On images this small a second thread only waits.
     with one_thread_per_operation(), steps("stressing", len(cases) * len(stages)) as bar:
         for case in cases:
@@ -226,7 +227,8 @@ def markdown(rows: Sequence[Row]) -> str:
 
 def table_lines(rows: Sequence[Row]) -> list[str]:
     """The lines of one table; unit and mode stand in its head where they are those of a whole column."""
-    found, words = list(rows), words_of(list(rows))
+    found = list(rows)
+    words = words_of(list(rows))
     common = {key: (unit_of(key, found), common_mode(key, found)) for row in found for key in row.figures}
     abouts = {key: ", ".join(filter(None, both)) for key, both in common.items()}
     lines = [["", *(f"{key} ({about})" if about else key for key, about in abouts.items()), *words]]

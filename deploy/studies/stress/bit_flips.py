@@ -64,7 +64,8 @@ class FaultTarget:
 def make_target(subject: Subject, source: Calibration) -> FaultTarget:
     """The core as the board stores it, guards that calibration patches teach, and other patches to try it on."""
     core = faults.as_stored(subject.core)
-    taught, tried = replace(source, patches=CALIBRATION_PATCHES), replace(source, seed=source.seed + HELD_OUT_SEED)
+    taught = replace(source, patches=CALIBRATION_PATCHES)
+    tried = replace(source, seed=source.seed + HELD_OUT_SEED)
     guards = faults.learn_guards(core, (core.ends.split(image) for image in taught.drawn.degraded))
     return FaultTarget(core, guards, list(tried.drawn.pairs))
 
@@ -162,8 +163,10 @@ def _price_row(name: str, time_s: float, source: str, prediction: Prediction, sp
     tile_s = prediction.batch_time_s / prediction.batch
     slow, fast = prediction.fps_interval
     # The host prepares the next tile while the DPU runs: only what does not fit beside it costs frames.
-    before_s, beside_s = max(tile_s, prediction.host_s), max(tile_s, prediction.host_s + time_s)
-    times_s, most = (time_s / spread, time_s * spread), 100 * time_s * spread * fast
+    before_s = max(tile_s, prediction.host_s)
+    beside_s = max(tile_s, prediction.host_s + time_s)
+    times_s = (time_s / spread, time_s * spread)
+    most = 100 * time_s * spread * fast
     figures = {
         "time": predicted(1e3 * time_s, "ms/tile", (1e3 * times_s[0], 1e3 * times_s[1]), source),
         "of a tile, if nothing hides": predicted(100 * time_s / tile_s, "%", (100 * times_s[0] * slow, most), source),

@@ -57,7 +57,8 @@ def as_stored(core: IntCore) -> IntCore:
 
 
 def _narrow(op: IntConv) -> IntConv:
-    bias, shift = op.bias.astype(np.int64), 0
+    bias = op.bias.astype(np.int64)
+    shift = 0
     # Bits go from the low end as long as the bias is too large for int8.
     while (np.clip(bias >> shift, INT8_MIN, INT8_MAX) != bias >> shift).any():
         shift += 1
@@ -225,7 +226,8 @@ def _flip_copy(core: IntCore, per_megabit: float, generator: np.random.Generator
 
 def _maps(core: IntCore, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
     """Faults enter every tensor once, between the operation that writes it and those that read it."""
-    places, channels = image[0, 0].size // core.ends.place_px**2, map_channels(core)
+    places = image[0, 0].size // core.ends.place_px**2
+    channels = map_channels(core)
     counts = {name: flip_count(INT8_BITS * places * n, per_megabit, generator) for name, n in channels.items()}
     seed = int(generator.integers(2**63))
     # The same bits whenever it runs, clamped or not.

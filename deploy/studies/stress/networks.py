@@ -150,7 +150,8 @@ CORES_PX, LARGE_CORE_PX = (16, 29), 250
 
 def float32(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
     """The float network in float32, and against float64 where it is plain convolutions, on an image (H, W) in DN."""
-    network, graph = subject.float32, subject.graph
+    network = subject.float32
+    graph = subject.graph
     measures = restoration(network, case, image, GAIN_DN)
     if case.pixels == "sound" and not case.large and graph is not None:
         whole = network.extended(_fractions(image))
@@ -193,7 +194,8 @@ def restoration(network: Network, case: Case, image: np.ndarray, gain_dn: float)
 
 def reference(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
     """The INT8 network in whole numbers alone, on 48 x 48 pixels of larger images (H, W)."""
-    core, network = subject.core, subject.quantised
+    core = subject.core
+    network = subject.quantised
     if case.pixels != "sound":
         return []
     crop = network.extended(_fractions(image[:CROP_PX, :CROP_PX]))

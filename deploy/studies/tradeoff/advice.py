@@ -144,11 +144,14 @@ def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
     Two predictions of one board share most of their error: the interval of a ratio of latencies is the board's
     `pair_width`, and nothing where only the count of tiles differs. Predictions of two boards share none of it.
     """
-    value, source = a.value(cost) / b.value(cost), f"{cost} over that of {b.name}"
+    value = a.value(cost) / b.value(cost)
+    source = f"{cost} over that of {b.name}"
     if cost.startswith("host"):
         return measured(value, "x", f"{source}, medians of interleaved runs")
     (a_low, a_high), (b_low, b_high) = (ends(each.figures[cost]) for each in (a, b))
-    interval, first, second = (a_low / b_high, a_high / b_low), a.point, b.point
+    interval = (a_low / b_high, a_high / b_low)
+    first = a.point
+    second = b.point
     if first and second and first.dpu and second.dpu:
         width = first.dpu.target.tables["cost"].get("pair_width")
         if replace(first, halo_px=second.halo_px) == second:
@@ -167,7 +170,8 @@ def front_rows(front: Sequence[Measured], cost: str, compare: Comparison) -> lis
     """Return a front's members by number, each with its difference from the next cheaper one."""
     rows: list[Row] = []
     for place, each in enumerate(front, 1):
-        figures, word = figures_to_compare(each, cost), "cheapest"
+        figures = figures_to_compare(each, cost)
+        word = "cheapest"
         if rows:
             cheaper = front[place - 2]
             gain = compare.difference(each, cheaper)
@@ -230,7 +234,8 @@ def parse_constraints(option: str, text: str | None) -> list[Constraint]:
 def _parse(option: str, text: str) -> Constraint:
     found = CONSTRAINT.fullmatch(text.lower())
     if found is None or not math.isfinite(float(found["limit"])):
-        expected, remedy = "NAME<=NUMBER or NAME>=NUMBER", "write 'latency<=20s' or 'psnr>=44'"
+        expected = "NAME<=NUMBER or NAME>=NUMBER"
+        remedy = "write 'latency<=20s' or 'psnr>=44'"
         raise OptionError(option, expected=expected, got=repr(text), remedy=remedy)
     if found["name"] not in NAMES:
         expected = f"one of {', '.join(NAMES)}"
@@ -265,7 +270,8 @@ def recommend(
     Returns:
         The recommended point, None where none keeps the constraints; and a line that says so.
     """
-    constraints, cost = [*budget, *need], chosen_cost(points, budget)
+    constraints = [*budget, *need]
+    cost = chosen_cost(points, budget)
     kept = within(points, constraints, cost)
     limits = f" for {' and '.join(map(str, constraints))}" if constraints else ""
     if not kept:

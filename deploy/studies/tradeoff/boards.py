@@ -61,7 +61,8 @@ def board_rows(
             rows.append(Row(TABLE, board, {}, {"point": "none", VERDICT: "; ".join(reasons)}))
             continue
         if taken is not None and taken.text.get("board") == board:
-            best, verdict = taken, "this is the recommended point"
+            best = taken
+            verdict = "this is the recommended point"
         else:
             best, _ = choose(kept, asked.compare, cheapest=bool(asked.need) and not asked.budget)
             verdict = _compared(best, taken, cost, asked.compare)
@@ -102,13 +103,15 @@ def _missed(constraint: Constraint, points: Sequence[Measured]) -> str:
         figure = points[0].figures.get(constraint.key)
         return f"no point has the figure {constraint.key}{f': {figure.reason}' if figure else ''}"
     closest = min(known, key=constraint.violation)
-    extreme, found = "least" if constraint.at_most else "most", closest.value(constraint.key)
+    extreme = "least" if constraint.at_most else "most"
+    found = closest.value(constraint.key)
     return f"no point within {constraint}: the {extreme} is {constraint.in_words(found)} ({closest.name})"
 
 
 def _compared(point: Measured, taken: Measured | None, cost: str, compare: Comparison) -> str:
     if taken is None:  # its cost or PSNR is missing where another board's points are compared
         return "within the limits"
-    difference, ratio = compare.difference(point, taken), point.value(cost) / taken.value(cost)
+    difference = compare.difference(point, taken)
+    ratio = point.value(cost) / taken.value(cost)
     quality = f"PSNR {difference} dB against" if difference.value else "the PSNR of"
     return f"{quality} the recommended point, for {ratio:.3g} times its {cost}"

@@ -88,7 +88,8 @@ class Measurements:
         try:
             return cls(path, dict(json.loads(path.read_text(encoding="utf-8"))["measurements"]))
         except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
-            expected, remedy = "measurements that this command kept", "remove it: they are made anew"
+            expected = "measurements that this command kept"
+            remedy = "remove it: they are made anew"
             raise OptionError(str(path), expected=expected, got="another file", remedy=remedy) from error
 
     def make(self, key: str, measure: Callable[[], Any]) -> Any:
@@ -161,7 +162,8 @@ class Benchmark:
             return 1.0
         sensor = self.degraded.nominal()
         factors = (1, *(factor for factor, _ in point.variant.brighter))
-        tiles, runs = 0, 0
+        tiles = 0
+        runs = 0
         for pair in self.pairs:
             plan = tiles_of_point(point, pair.degraded.shape)
             counts = tiles_by_factor(pair.degraded, plan, factors, sensor.max_dn, sensor.offset_dn)
@@ -193,7 +195,8 @@ class Benchmark:
 
 def restore_in_tiles(point: Point, degraded: Sensor, reference: Sensor) -> Restore:
     """A network in a point's tiles, with the steps around it that `restore` takes."""
-    file, sensor = point.variant.file or Path(), degraded.nominal()
+    file = point.variant.file or Path()
+    sensor = degraded.nominal()
     infer, _ = open_runtime(Runtime.onnxruntime, model_of(file), threads=0)
     others = {factor: Packed(path.read_bytes(), Runtime.onnxruntime, 0) for factor, path in point.variant.brighter}
     network = ExposedNetwork({1: infer, **others}, tiling_of_file(file).halo_px, sensor.offset_dn)
@@ -252,7 +255,8 @@ class Labelled:
 
     def measure(self, method: Method) -> dict[str, object]:
         """mAP50 of the detector on every scene as a method restores it, and its interval over sites."""
-        sensors, seed = SensorPair(self.benchmark.degraded, self.benchmark.reference), self.benchmark.seed
+        sensors = SensorPair(self.benchmark.degraded, self.benchmark.reference)
+        seed = self.benchmark.seed
         found = [each.boxes(self.detector, method) for each in acquired(self.scenes, sensors, seed)]
         hits = find_hits([scene.truth for scene in self.scenes], found, len(self.detector.names))
         sites = [scene.site for scene in self.scenes]
@@ -268,7 +272,8 @@ class Labelled:
         stored = kept.make(key, lambda: self.measure(method))
         if stored["value"] is None:
             return unavailable("%", "no labelled object")
-        sites, ends = len({each.site for each in self.scenes}), stored["interval"]
+        sites = len({each.site for each in self.scenes})
+        ends = stored["interval"]
         source = f"{len(self.scenes)} labelled images of {sites} sites, interval by bootstrap over sites"
         return measured(100 * stored["value"], "%", source, (100 * ends[0], 100 * ends[1]) if ends else None)
 

@@ -162,7 +162,8 @@ def _places(points: Sequence[Measured], cost: str) -> tuple[list[float], list[fl
 def _draw_front(axes: "Axes", drawn: Drawn) -> None:
     axes.step(*_places(drawn.front, drawn.cost), where="post", color=LIGHT["soft"], lw=1, zorder=1)
     for point, row in zip(drawn.front, drawn.front_rows, strict=True):
-        x, y = point.value(drawn.cost), point.value(PSNR)
+        x = point.value(drawn.cost)
+        y = point.value(PSNR)
         axes.plot(ends(point.figures[drawn.cost]), [y, y], color=LIGHT["line"], lw=2, zorder=0)
         gain = row.figures.get("PSNR gain")
         if gain is not None and gain.interval is not None:

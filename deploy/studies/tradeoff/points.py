@@ -137,7 +137,8 @@ def _variants(
         expected = f"a shipped network ({', '.join(shipped_names())}), or an ONNX or safetensors file"
         raise OptionError("network", expected=expected, got=repr(name), remedy="correct that name")
     given = float_file(path, sensor, log)
-    model, method = float_model(given), name if name in shipped_names() else path.stem
+    model = float_model(given)
+    method = name if name in shipped_names() else path.stem
     _require_tiles(name, tiling_of(model))
     if is_quantised(model):
         yield Variant(method, INT8, given)
@@ -276,10 +277,12 @@ def board_figures(point: Point, whole: Swath, slower: float | None = None, runs:
     if point.dpu is not None:
         halo_px = radius_px(point.variant) if point.halo_px is None else point.halo_px
         swath = replace(whole, tile_px=point.tile_px, halo_px=halo_px, runs=runs, consistency=True)
-        latency, power = dpu_latency(point.variant, point.dpu, swath), dpu_power(point.dpu)
+        latency = dpu_latency(point.variant, point.dpu, swath)
+        power = dpu_power(point.dpu)
     elif point.board is not None and slower is not None:
         row = tables.processor_row(whole, point.board)
-        latency, power = row.figures["latency"], row.figures["power"]
+        latency = row.figures["latency"]
+        power = row.figures["power"]
         if latency.value is not None and latency.interval is not None:
             low_s, high_s = (end * slower for end in latency.interval)
             source = f"{latency.source}; times of the chains here: {slower:.2f} of {CHAIN}"

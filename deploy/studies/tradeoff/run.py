@@ -93,7 +93,8 @@ def tradeoff(
         >>> found.best.network.precision
         'int8'
     """
-    boards, width_height = boards_of(board), parse_size(size) if isinstance(size, str) else size
+    boards = boards_of(board)
+    width_height = parse_size(size) if isinstance(size, str) else size
     _require_different(boards)
     for each in boards:
         Constants.of(dpu_of(each))  # a board without them is refused before anything is measured
@@ -104,7 +105,8 @@ def tradeoff(
     names = [each if isinstance(each, str) else str(Network.load(each).file) for each in networks]
     keep = nullcontext(cache) if cache is not None else TemporaryDirectory(prefix="beers-deploy-")
     with keep as folder, reporting(progress):
-        kept, swath = Measurements.open(Path(folder) / "measurements.json"), Swath(*width_height)
+        kept = Measurements.open(Path(folder) / "measurements.json")
+        swath = Swath(*width_height)
         quantise = partial(make_int8, folder=Path(folder) / "int8", scenes=calibrated, sensor=degraded, seed=seed)
         points = points_of(network_variants(names, degraded, quantise, log), boards, swath)
         pairs, said = pairs_of_scenes(scenes, degraded, aim, seed)

@@ -18,7 +18,8 @@ NAMES = ("bright", "dark")
 def squares(seed: int) -> Picture:
     """Two squares on grey, a bright one and a dark one, in the upper and the lower half."""
     generator = np.random.default_rng(seed)
-    image, corners = np.full((SIDE_PX, SIDE_PX), 0.5, np.float32), []
+    image = np.full((SIDE_PX, SIDE_PX), 0.5, np.float32)
+    corners = []
     for top, value in ((0, 1.0), (32, 0.0)):
         side = int(generator.integers(8, 16))
         x, y = (int(v) for v in generator.integers(1, 31 - side, 2))

@@ -55,7 +55,8 @@ def test_published_rows_are_the_papers_and_agree_with_each_other() -> None:
 
 
 def test_efficiency_is_only_as_good_as_its_parts() -> None:
-    time, power = measured(2.0, "s", "clock"), measured(5.0, "W", "counter")
+    time = measured(2.0, "s", "clock")
+    power = measured(5.0, "W", "counter")
     assert efficiency(1000, time, power).mode == "measured"
     assert efficiency(1000, time, unavailable("W", "no counter")).reason == "no counter"
     mixed = efficiency(1000, predicted(2.0, "s", (1.0, 4.0), "model"), power)
@@ -63,7 +64,8 @@ def test_efficiency_is_only_as_good_as_its_parts() -> None:
 
 
 def test_bench_writes_a_valid_document(tmp_path: Path) -> None:
-    image, out = tmp_path / "raw.tif", tmp_path / "out.json"
+    image = tmp_path / "raw.tif"
+    out = tmp_path / "out.json"
     tifffile.imwrite(image, np.random.default_rng(0).integers(300, 900, (51, 63), dtype=np.uint16))
     model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
     done("bench", model, "--image", image, "--tile", 32, "--json", out)
@@ -76,9 +78,11 @@ def test_bench_writes_a_valid_document(tmp_path: Path) -> None:
 
 
 def test_layers_are_shown_when_asked_for_and_written_always(tmp_path: Path) -> None:
-    model, out = integer_convbeers(tmp_path / "net.onnx", 1, 8), tmp_path / "out.json"
+    model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
+    out = tmp_path / "out.json"
     command = ("bench", model, "--size", "41x33", "--tile", 32, "--no-traditional", "--json", out)
-    brief, full = done(*command), done(*command, "--layers")
+    brief = done(*command)
+    full = done(*command, "--layers")
     assert ("LdFM" in brief, "LdFM" in full) == (False, True)
     assert ("--layers" in brief, "--layers" in full) == (True, False)
     assert full.index("LdFM") < full.index("throughput")
@@ -110,7 +114,8 @@ def test_small_tiles_keep_maps_on_chip_and_cost_work(tmp_path: Path) -> None:
 
 
 def test_all_configurations_are_swept(tmp_path: Path) -> None:
-    model, out = integer_convbeers(tmp_path / "net.onnx", 1, 8), tmp_path / "out.json"
+    model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
+    out = tmp_path / "out.json"
     done(*("bench", model, "--size", "41x33", "--tile", "64,32", "--dpu", "all", "--no-traditional", "--json", out))
     swept = [str(row["name"]) for row in valid(out)["rows"] if row["table"] == "sweep"]
     assert swept == [f"vck190 {name}, tiles of {tile}" for name in DPU.target.configurations for tile in (64, 32)]
@@ -135,7 +140,8 @@ def test_the_host_takes_one_tile_size(tmp_path: Path) -> None:
 
 
 def test_bench_on_this_machine(tmp_path: Path) -> None:
-    model, out = integer_convbeers(tmp_path / "net.onnx", 1, 8), tmp_path / "host.json"
+    model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
+    out = tmp_path / "host.json"
     assert "no proxy" in done("bench", model, "--target", "host", "--tile", 32, "--json", out)
     row, *_ = valid(out)["rows"]
     assert isinstance(row["figures"], dict)
@@ -184,7 +190,8 @@ def test_whole_tiles_of_the_published_swath(halo_px: int, tiles: int) -> None:
 
 def test_a_file_that_is_replaced_during_the_run_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its digest would be that of a network for which nothing was predicted."""
-    model, out = integer_convbeers(tmp_path / "net.onnx", 1, 8), tmp_path / "out.json"
+    model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
+    out = tmp_path / "out.json"
     predict = boards.bench_board
 
     def replaced(*given: Any, **more: Any) -> Any:

@@ -20,7 +20,8 @@ SWATH = Swath(*parse_size(PAPER_SIZE))
 
 def test_crops_are_measured_and_the_swath_is_their_proportion() -> None:
     row = measure_chain(np.full((70, 90), 1000, np.float32), *SENSORS).row(SWATH)
-    time, latency = row.figures["time"], row.figures["latency"]
+    time = row.figures["time"]
+    latency = row.figures["latency"]
     assert (time.mode, time.unit, latency.mode) == ("measured", "s/Mpx", "predicted")
     assert latency.value == pytest.approx((time.value or 0) * SWATH.pixels / 1e6)
     assert "3 crops of 90 x 70" in latency.source

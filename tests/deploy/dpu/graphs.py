@@ -72,7 +72,8 @@ class IntegerSketch(Sketch):
     ) -> str:
         pads = [weight[2] // 2, weight[3] // 2] * 2
         kernel = self.constant(np.ones(weight, np.int8))
-        scale, zero = self.constant(np.array(weight_scale, np.float32)), self.numbers[1]
+        scale = self.constant(np.array(weight_scale, np.float32))
+        zero = self.numbers[1]
         start = [] if bias is None else [self.constant(bias)]
         feeds = (source, *self.numbers, kernel, scale, zero, *self.numbers, *start)
         return self.node("QLinearConv", *feeds, pads=pads)

@@ -132,7 +132,8 @@ def wide(kernel: tuple[int, int], channels: int) -> Operation:
 @given(st.integers(1, 16), st.integers(1, 16), st.integers(1, 8192))
 def test_weights_fit_by_each_manuals_formula(height: int, width: int, channels: int) -> None:
     """UG1414 3.5, conv2d; for the VCK190 by dpu_op_filter.py."""
-    op, area = wide((height, width), channels), height * width
+    op = wide((height, width), channels)
+    area = height * width
     depths = {"zcu102": area * -(-channels // 16), "vek280": area * -(-channels // 32) * 8 + 4}
     depths["vck190"] = area * -(-channels // 16) * 2
     most = {"zcu102": 2048, "vek280": 65528, "vck190": 8192}
@@ -169,8 +170,10 @@ def test_a_batch_has_an_image_for_each_batch_handler_of_each_core() -> None:
 @pytest.mark.parametrize("name", ZYNQ)
 def test_a_smaller_dpu_has_a_smaller_array_and_smaller_banks(name: str, size: str) -> None:
     """PG338: the name is the operations of a cycle; banks of the width of the channels, 2048 deep."""
-    dpu, clock_hz = load_dpu(name, size), load_target(name).value("array", "pl_clock_hz")
-    lanes, pixels = dpu.input_parallel, dpu.whole("array", "pixel_parallel")
+    dpu = load_dpu(name, size)
+    clock_hz = load_target(name).value("array", "pl_clock_hz")
+    lanes = dpu.input_parallel
+    pixels = dpu.whole("array", "pixel_parallel")
     cycle = 2 * lanes * dpu.output_parallel * pixels
     assert size == f"B{cycle}"
     assert dpu.engine_ops_per_s == pytest.approx(cycle * clock_hz, rel=1e-5)

@@ -39,7 +39,8 @@ def rules(model: onnx.ModelProto) -> set[str]:
 @cache
 def quantised(spread: float) -> Quantised:
     """A small network of random weights, its biases so large."""
-    network, generator = plain(Variant(blocks=1, features=4), seed=7), torch.Generator().manual_seed(7)
+    network = plain(Variant(blocks=1, features=4), seed=7)
+    generator = torch.Generator().manual_seed(7)
     with torch.no_grad():
         for name, value in network.named_parameters():
             if name.endswith("bias"):

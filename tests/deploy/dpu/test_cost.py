@@ -32,7 +32,8 @@ def papers_prediction(papers: Path) -> Prediction:
 def test_the_papers_network(papers_prediction: Prediction) -> None:
     """35 convolutions and 17 adds; every map of 26.2 MB goes out and in, and each add loads two and stores one."""
     assert papers_prediction.operations == pytest.approx(997.5e9, rel=1e-3)
-    wide, image = 64 * 640 * 640, 640 * 640
+    wide = 64 * 640 * 640
+    image = 640 * 640
     moves = image + wide + 33 * 2 * wide + 17 * 3 * wide + wide + image
     assert papers_prediction.streamed_bytes == moves
 
@@ -115,14 +116,16 @@ def moved(works: tuple[Work, ...]) -> int:
 
 def test_what_three_branches_read_passes_through_memory(tmp_path: Path) -> None:
     """A module of three branches: its input read thrice; of two branches: not."""
-    found, burst = {}, BURST_BYTES / 16
+    found = {}
+    burst = BURST_BYTES / 16
     for branches in (2, 3):
         s = Sketch(16)
         stem = s.conv("image", (16, 16, 3, 3))
         joined = s.node("Concat", *(s.conv(stem, (16, 16, 1, 1)) for _ in range(branches)), axis=1)
         works = works_of(s, s.conv(joined, (8, 16 * branches, 1, 1)), tmp_path / "n.onnx", 32)
         found[branches] = moved(works) / (16 * 32 * 32)
-    image, result = 1, 0.5
+    image = 1
+    result = 0.5
     assert found == {2: image + 2 * burst + 2 + result, 3: image + 1 + 3 + 3 * burst + 3 + result}
 
 
@@ -142,7 +145,8 @@ def test_an_add_of_maps_beyond_the_chip_is_a_pass_of_its_own(
     tmp_path: Path, side: int, maps: int, convs: int
 ) -> None:
     """Two loads and a store; of maps that fit it is fused, and moves nothing."""
-    sums, wide = [], (32, 32, 3, 3)
+    sums = []
+    wide = (32, 32, 3, 3)
     for added in (False, True):
         s = Sketch(32)
         x = first = s.conv("image", wide)
@@ -168,7 +172,8 @@ def test_a_pixel_shuffle_costs_the_bursts_of_its_pieces(tmp_path: Path, block: i
 
 
 def test_a_transposed_convolution_runs_over_the_zeros_between_its_pixels(tmp_path: Path) -> None:
-    grown, plain = Sketch(32), Sketch(32)
+    grown = Sketch(32)
+    plain = Sketch(32)
     enlarged = grown.node("ConvTranspose", "image", grown.weight(32, 32, 2, 2), strides=[2, 2])
     (work,) = works_of(grown, enlarged, tmp_path / "n.onnx", 64)
     (other,) = works_of(plain, plain.conv("image", (32, 32, 2, 2), pads=[0, 0, 1, 1]), tmp_path / "p.onnx", 128)
@@ -222,7 +227,8 @@ def test_a_task_that_is_stated_takes_the_place_of_what_the_file_tells(tmp_path: 
     """Heads that are read and no more, or ranked: the file is the same."""
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "h.onnx", sketch.conv("image", (80, 8, 3, 3)))
-    read, ranked = predict_file(path, DPU, 96), predict_file(path, DPU, 96, "sort")
+    read = predict_file(path, DPU, 96)
+    ranked = predict_file(path, DPU, 96, "sort")
     assert (read.task, ranked.task) == ("copy", "sort")
     assert ranked.host_s > read.host_s
     assert ranked.batch_time_s == read.batch_time_s
@@ -237,8 +243,10 @@ def test_regimes() -> None:
 def test_latency_is_that_of_one_core_and_one_thread(tmp_path: Path) -> None:
     """Cores share the memory and the host: alone a core and a thread are no slower than among others."""
     path = float_convbeers(tmp_path / "n.onnx", 2, 16)
-    three, one = load_dpu("zcu102"), load_dpu("kv260")
-    found, single = predict_file(path, three), predict_file(path, one)
+    three = load_dpu("zcu102")
+    one = load_dpu("kv260")
+    found = predict_file(path, three)
+    single = predict_file(path, one)
     assert (three.handlers, one.handlers) == (1, 1)
     assert found.alone_s <= found.batch_time_s
     assert single.alone_s == pytest.approx(single.batch_time_s)
@@ -250,7 +258,8 @@ def test_energy_counts_products_and_bytes(tmp_path: Path) -> None:
     """One 3 x 3 layer of 32 features that stays on chip: products and a third of its weights."""
     prediction = predict_file(float_convbeers(tmp_path / "f.onnx", 1, 32), DPU, 96)
     low, high = layer_energy_j(prediction.layers[2], DPU)
-    products, weights = 9 * 32 * 32 * 96 * 96, 9 * 32 * 32
+    products = 9 * 32 * 32 * 96 * 96
+    weights = 9 * 32 * 32
     assert low == pytest.approx(products * 0.023e-12 + weights / 3 * 162.5e-12)
     assert high == pytest.approx(products * 0.23e-12 + weights / 3 * 325e-12)
 

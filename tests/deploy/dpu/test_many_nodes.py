@@ -33,7 +33,8 @@ def steps(model: onnx.ModelProto, path: Path) -> int:
     def called(frame: FrameType, _event: str, _argument: object) -> TraceFunction | None:
         if not str(frame.f_globals.get("__name__")).startswith("beers_deploy"):
             return None
-        frame.f_trace_opcodes, frame.f_trace_lines = True, False
+        frame.f_trace_opcodes = True
+        frame.f_trace_lines = False
         return step
 
     before = sys.gettrace()

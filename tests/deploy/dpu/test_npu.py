@@ -40,7 +40,8 @@ def biased(size: int) -> Draw:
     """A bias that is shifted by 8 bits."""
 
     def draw(s: QdqSketch, x: str) -> str:
-        weight, bias = s.stored(np.ones((4, 4, 3, 3), np.int8)), s.stored(np.full(4, -size, np.int8), 6)
+        weight = s.stored(np.ones((4, 4, 3, 3), np.int8))
+        bias = s.stored(np.full(4, -size, np.int8), 6)
         return s.pair(s.node("Conv", x, weight, bias, pads=[1] * 4))
 
     return draw

@@ -102,7 +102,8 @@ def test_two_nodes_may_read_the_same_constant_at_two_scales(tmp_path: Path) -> N
     """As an optimiser leaves them that stores equal bytes once: each has its own copy on the board."""
 
     def draw(s: QdqSketch, x: str) -> str:
-        weight, bias = s.constant(np.ones((4, 4, 3, 3), np.int8)), s.stored(np.zeros(4, np.int8))
+        weight = s.constant(np.ones((4, 4, 3, 3), np.int8))
+        bias = s.stored(np.zeros(4, np.int8))
         for frac_bits in (7, 5):
             seen = s.node("DequantizeLinear", weight, *s.scale(frac_bits))
             x = s.pair(s.node("Conv", x, seen, bias, pads=[1] * 4))

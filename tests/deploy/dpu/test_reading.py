@@ -30,7 +30,8 @@ def test_three_encodings_are_one_network(tmp_path: Path) -> None:
         core(make(tmp_path / f"{k}.onnx", 2, 24))
         for k, make in enumerate((float_convbeers, integer_convbeers, board_convbeers))
     ]
-    head, tail = spelt[0][0], spelt[0][-2]
+    head = spelt[0][0]
+    tail = spelt[0][-2]
     assert head[4] == (1, 24)
     assert tail[4] == (24, 1)
     # The head differs in what stands before it (a quantiser or nothing), the global add in which files hold it.

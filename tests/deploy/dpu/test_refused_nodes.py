@@ -80,7 +80,8 @@ def test_time_is_in_proportion_to_the_work_and_lies_between_peak_and_plain_code(
     (low, high), larger = (refused_interval_s([op], dpu) for op in ops)
     assert larger == pytest.approx((4 * low, 4 * high))
     assert refused_interval_s(ops[:1] * 3, dpu) == pytest.approx((3 * low, 3 * high))
-    clock, cores = dpu.limit("cpu", "clock_ghz"), dpu.whole("cpu", "cores")
+    clock = dpu.limit("cpu", "clock_ghz")
+    cores = dpu.whole("cpu", "cores")
     written = 4 * ops[0].out_bytes
     assert low * cores > written / dpu.limit("cpu", "moved_bytes_per_s").high
     assert high * cores > ops[0].out_bytes / (1e9 * clock.low)

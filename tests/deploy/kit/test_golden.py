@@ -168,7 +168,8 @@ def test_adds_that_wrap_are_named(tmp_path: Path) -> None:
 
 
 def test_of_the_last_layer_alone_a_rule_is_still_named(vectors: Path, golden: Golden, tmp_path: Path) -> None:
-    run, last = FAULTS["ties"][0], golden.core.ops[-1].output
+    run = FAULTS["ties"][0]
+    last = golden.core.ops[-1].output
     said = compare_golden(vectors, results(golden, tmp_path / "r", run, lambda name: name == last)).checks[0].detail
     assert "were not handed out" in said
     assert "ties are rounded to even instead of up, in every layer" in said
@@ -176,9 +177,11 @@ def test_of_the_last_layer_alone_a_rule_is_still_named(vectors: Path, golden: Go
 
 def test_results_are_taken_as_boards_write_them(tmp_path: Path) -> None:
     """Channels last, uint8 around 128, and floats; other numbers, names and shapes are refused."""
-    vectors, seen = write_golden("convbeers-xs-int8", tmp_path / "golden", tile=TILE_PX), tmp_path / "r" / "noise"
+    vectors = write_golden("convbeers-xs-int8", tmp_path / "golden", tile=TILE_PX)
+    seen = tmp_path / "r" / "noise"
     golden = read_golden(vectors)
-    names, sound = list(files_of(golden.core).items()), golden.cases["noise"]
+    names = list(files_of(golden.core).items())
+    sound = golden.cases["noise"]
     seen.mkdir(parents=True)
     (first, one), (second, two), (third, three) = names[1:4]
     np.save(seen / one, np.moveaxis(sound[first], 1, -1).astype(np.int8))
@@ -195,7 +198,8 @@ def test_results_are_taken_as_boards_write_them(tmp_path: Path) -> None:
 
 
 def test_the_command_writes_and_compares(tmp_path: Path) -> None:
-    out, seen = tmp_path / "golden", tmp_path / "seen"
+    out = tmp_path / "golden"
+    seen = tmp_path / "seen"
     done("golden", "convbeers-xs", "--tile", TILE_PX, "--out", out)
     for case in ("scene", "noise"):
         shutil.copytree(out / case, seen / case)

@@ -67,7 +67,8 @@ def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> 
     np.save(tmp_path / "image.npy", image)
     command = [sys.executable, "-c", BARE, "-", str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]
     subprocess.run(command, cwd=folder, check=True)
-    lattice_px, scale = int8.tiling.lattice_px, int(int8.tiling.scale)
+    lattice_px = int8.tiling.lattice_px
+    scale = int(int8.tiling.scale)
     wide = np.pad(image, [(0, 0), *((0, -side % lattice_px) for side in image.shape[1:])], "edge")
     whole = int8(wide[None])[0][:, : 131 * scale, : 203 * scale]
     assert np.array_equal(np.load(tmp_path / "out.npy"), whole)
@@ -154,7 +155,8 @@ def test_the_host_part_chooses_factors_and_takes_the_consistency_step_as_the_lib
     kit: Path, sensor: bd.Sensor, image: np.ndarray
 ) -> None:
     """Bit for bit, with saturated pixels and without."""
-    host, radius_px = runpy.run_path(str(kit / "host.py")), facts(kit)["halo_px"]
+    host = runpy.run_path(str(kit / "host.py"))
+    radius_px = facts(kit)["halo_px"]
     chosen = choose_factors(image, sorted(FACTORS), radius_px, 1.0, OFFSET_DN / 4095)
     assert {*np.unique(chosen)} == FACTORS
     np.testing.assert_array_equal(host["factors"](image[None, None]), chosen)
@@ -180,7 +182,8 @@ def test_a_network_in_memory_gets_the_consistency_step_alone(
 
 
 def test_a_sensor_that_does_not_exist_or_changes_nothing_is_one_sentence(tmp_path: Path) -> None:
-    board, in_memory = bd.Board.load("vck190"), bd.Network.load(NAME)
+    board = bd.Board.load("vck190")
+    in_memory = bd.Network.load(NAME)
     with pytest.raises(ProfileError, match=r"profile 'hubble': expected one of .*got 'hubble'"):
         board.kit(NAME, tmp_path / "kit", tile=TILE_PX, sensor="hubble")
     with pytest.raises(OptionError, match=r"sensor: expected none where .* got blind"):

@@ -10,7 +10,8 @@ from beers_deploy.report.plots import DARK, LIGHT, look, new_figure, round_value
 
 @given(st.floats(-6, 6), st.floats(0.01, 12), st.integers(3, 16), st.booleans())
 def test_ticks_are_few_rising_and_on_the_axis(start: float, decades: float, most: int, logarithmic: bool) -> None:
-    low, high = 10**start, 10 ** (start + decades)
+    low = 10**start
+    high = 10 ** (start + decades)
     values = round_values(low, high, most, logarithmic=logarithmic)
     assert 1 <= len(values) <= most
     assert values == sorted(set(values))

@@ -33,7 +33,8 @@ def write(path: Path, pixels: np.ndarray, driver: str, **options: Any) -> Path:
     with warnings.catch_warnings(action="ignore"), rasterio.open(path, "w", driver=driver, **about) as file:
         file.write(pixels)
         if driver == "GTiff":
-            file.descriptions, file.scales = [f"B{k}" for k in range(bands)], [0.1 * (k + 1) for k in range(bands)]
+            file.descriptions = [f"B{k}" for k in range(bands)]
+            file.scales = [0.1 * (k + 1) for k in range(bands)]
     return path
 
 

@@ -45,7 +45,8 @@ def until(running: subprocess.Popen[str], word: str) -> bool:
 
 def stop_after(tiles: int, patch: pytest.MonkeyPatch, error: BaseException) -> None:
     """Raise an error in the engine after so many tiles."""
-    count, tile = iter(range(10**6)), Restorer.tile
+    count = iter(range(10**6))
+    tile = Restorer.tile
 
     def stopping(self: Restorer, *rest: object) -> Tile:
         if next(count) == tiles:

@@ -67,7 +67,8 @@ def noise(path: Path, size: tuple[int, int] = SIZE) -> np.ndarray:
 def whole(path: Path, pixels: np.ndarray) -> np.ndarray:
     """The result without the engine: the image extended by copies of its last row and column, and cut again."""
     model, (height, width) = load_onnx(path), pixels.shape[-2:]
-    tiling, bands = tiling_of(model), pixels.reshape(-1, height, width)
+    tiling = tiling_of(model)
+    bands = pixels.reshape(-1, height, width)
     more = [-side % tiling.lattice_px for side in (height, width)]
     image = np.pad(bands, ((0, 0), (0, more[0]), (0, more[1])), mode="edge").astype(np.float32)
     (result,) = tensors_of(open_session(model, 1), None, image[None] / np.float32(4095))
@@ -90,7 +91,8 @@ def test_the_walk_finds_what_each_needs(name: str) -> None:
 
 @pytest.mark.parametrize("tile_px", [56, 83])
 def test_tiled_is_whole_at_an_odd_size(tile_px: int, path: Path, tmp_path: Path) -> None:
-    pixels, options = noise(path), Options(path, tile_px, threads=1)
+    pixels = noise(path)
+    options = Options(path, tile_px, threads=1)
     expected = whole(path, pixels)
     assert len(np.unique(expected)) > 50
     np.testing.assert_array_equal(by_file(pixels, tmp_path, options), expected)
@@ -98,7 +100,8 @@ def test_tiled_is_whole_at_an_odd_size(tile_px: int, path: Path, tmp_path: Path)
 
 
 def test_one_lattice_less_of_halo_shows_seams(path: Path, tmp_path: Path) -> None:
-    tiling, pixels = tiling_of(load_onnx(path)), noise(path)
+    tiling = tiling_of(load_onnx(path))
+    pixels = noise(path)
     options = Options(path, 56, str(tiling.halo_px - tiling.lattice_px), threads=1)
     assert (by_file(pixels, tmp_path, options) != whole(path, pixels)).any()
 
@@ -194,7 +197,8 @@ AREA, POINT = (1, 1, 0, 1, 1025, 0, 1, 1), (1, 1, 0, 1, 1025, 0, 1, 2)
 @pytest.mark.parametrize("keys", [AREA, POINT])
 def test_places_on_earth_stay_where_they_are(keys: tuple[int, ...]) -> None:
     """By tie point and by matrix: the middle of four pixels is that of the one they came from."""
-    tie, scale = (3.0, 5.0, 0.0, 700.0, 900.0, 0.0), (2.0, 4.0, 0.0)
+    tie = (3.0, 5.0, 0.0, 700.0, 900.0, 0.0)
+    scale = (2.0, 4.0, 0.0)
     matrix = (2.0, 0.5, 0, 10, 0.25, -4, 0, 20, 0, 0, 1, 0, 0, 0, 0, 1)
     values = {33550: scale, 33922: tie, 34264: matrix}
     tags = tuple((code, 12, len(value), value, True) for code, value in values.items())
@@ -202,7 +206,8 @@ def test_places_on_earth_stay_where_they_are(keys: tuple[int, ...]) -> None:
     middle = 0.5 if keys is AREA else 0.0
 
     def by_tie(given: dict[int, Any], column: float, row: float) -> list[float]:
-        point, size = given[33922], given[33550]
+        point = given[33922]
+        size = given[33550]
         return [point[3] + (column + middle - point[0]) * size[0], point[4] - (row + middle - point[1]) * size[1]]
 
     def by_matrix(given: dict[int, Any], column: float, row: float) -> list[float]:

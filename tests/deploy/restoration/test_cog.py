@@ -127,8 +127,10 @@ def test_the_disk_is_asked_for_all_that_stands_on_it_at_a_time(
     shape: tuple[int, int, int], model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One byte less is refused before any work; what was asked for is taken, and tags and indexes beside it."""
-    image, out = images.write_tiff(tmp_path / "in.tif", np.full(shape, 700, np.uint16)), tmp_path / "out.tif"
-    options, free = Options(model, tile_px=256, cog=True, compression=Compression.none), 0
+    image = images.write_tiff(tmp_path / "in.tif", np.full(shape, 700, np.uint16))
+    out = tmp_path / "out.tif"
+    options = Options(model, tile_px=256, cog=True, compression=Compression.none)
+    free = 0
     tiles = shape[0] * -(-shape[1] // 256) * -(-shape[2] // 256) * 256**2
     needed = 2 * shape[0] * shape[1] * shape[2] + 2 * tiles + disk_bytes(shape, 2)
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=free))
@@ -136,7 +138,9 @@ def test_the_disk_is_asked_for_all_that_stands_on_it_at_a_time(
     with pytest.raises(MachineError, match="of disk"):
         restore_file(image, out, options)
     assert [path.name for path in tmp_path.iterdir()] == ["in.tif"]
-    free, taken, replace_file = needed, list[int](), Path.replace
+    free = needed
+    taken = list[int]()
+    replace_file = Path.replace
 
     def counted(self: Path, target: Path) -> Path:
         if target == out:

@@ -232,7 +232,8 @@ def test_a_restoration_sees_the_replaced_pixels(image: Path, model: Path, tmp_pa
 
 def test_a_stopped_run_goes_on_with_the_same_faults_and_no_others(image: Path, model: Path, tmp_path: Path) -> None:
     (tmp_path / "list.csv").write_text("7,8\n")
-    out, options = tmp_path / "out.tif", Options(model, 64, fix_detectors="found")
+    out = tmp_path / "out.tif"
+    options = Options(model, 64, fix_detectors="found")
     restore_file(image, tmp_path / "expected.tif", options)
     with stopped_after(4):
         restore_file(image, out, options)

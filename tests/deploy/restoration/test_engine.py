@@ -62,7 +62,8 @@ def test_as_many_tiles_are_in_work_as_were_asked_for() -> None:
 def test_after_an_error_or_a_stop_no_further_tile_is_begun(
     factor: float, error: type[BaseException], words: str
 ) -> None:
-    calls, going = [], threading.Event()
+    calls = []
+    going = threading.Event()
 
     def slow(image: np.ndarray) -> np.ndarray:
         calls.append(1)

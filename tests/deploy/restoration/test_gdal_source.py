@@ -34,7 +34,9 @@ def test_rows_are_those_of_the_image(name: str, tmp_path: Path) -> None:
 
 
 def test_the_restored_pixels_are_the_same_from_every_format(model: Path, tmp_path: Path) -> None:
-    pixels, options, results = images.digital_numbers(), Options(model, tile_px=64), []
+    pixels = images.digital_numbers()
+    options = Options(model, tile_px=64)
+    results = []
     for name, write in images.FORMATS.items():
         folder = tmp_path / name
         folder.mkdir()
@@ -60,7 +62,8 @@ def test_polynomials_bits_and_gains_of_a_dimap_are_kept(cog: bool, model: Path, 
         assert source.raster.bits == 10
     restore_file(image, tmp_path / "out.tif", Options(model, cog=cog))
     with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
-        kept, stated = after.rpcs.to_dict(), before.rpcs.to_dict()
+        kept = after.rpcs.to_dict()
+        stated = before.rpcs.to_dict()
         for key in stated.keys() - {"err_bias", "err_rand"}:
             np.testing.assert_allclose(kept[key], stated[key], rtol=0, atol=1e-9)
         assert [after.tags(band)["RADIANCE_GAIN"] for band in (1, 2)] == ["9.0", "9.1"]
@@ -111,7 +114,8 @@ def test_missing_pixels_stay_missing(model: Path, tmp_path: Path) -> None:
 
 
 def test_the_cache_is_counted_with_the_blocks_of_a_mosaic_s_tiles(tmp_path: Path) -> None:
-    pixels, rows = images.digital_numbers(), 1 << 20
+    pixels = images.digital_numbers()
+    rows = 1 << 20
     one = images.write_jp2(tmp_path / "a.jp2", pixels)
     images.write(tmp_path / "strip.tif", pixels, "GTiff", blockysize=140)
     size = f'rasterXSize="{images.WIDTH}" rasterYSize="{images.HEIGHT}"'
@@ -164,7 +168,8 @@ def test_what_gdal_needs_and_cannot_take_is_said(
 
 def test_a_tile_is_no_output(model: Path, tmp_path: Path) -> None:
     image = images.write_dimap(tmp_path / "DIM.XML", images.digital_numbers())
-    tile, out = tmp_path / "IMG_R2C1.TIF", tmp_path / "out.tif"
+    tile = tmp_path / "IMG_R2C1.TIF"
+    out = tmp_path / "out.tif"
     before = tile.read_bytes()
     with pytest.raises(BeersError, match="an input of this run"):
         restore_file(image, tile, Options(model))
@@ -182,7 +187,8 @@ def test_a_changed_tile_makes_another_image(tmp_path: Path) -> None:
 
 
 def test_alpha_and_masks_of_gdal_s_formats_are_missing_pixels(tmp_path: Path) -> None:
-    pixels, hidden = images.digital_numbers(bands=2), np.zeros((images.HEIGHT, images.WIDTH), bool)
+    pixels = images.digital_numbers(bands=2)
+    hidden = np.zeros((images.HEIGHT, images.WIDTH), bool)
     hidden[30:50, 40:] = True
     pixels[1] = np.where(hidden, 0, 4095)
     images.write_jp2(tmp_path / "alpha.jp2", pixels, NBITS=12, PHOTOMETRIC="MINISBLACK", ALPHA="YES")
@@ -197,7 +203,8 @@ def test_alpha_and_masks_of_gdal_s_formats_are_missing_pixels(tmp_path: Path) ->
 
 
 def test_a_cog_keeps_mask_and_alpha(model: Path, tmp_path: Path) -> None:
-    pixels, hidden = images.digital_numbers(bands=1)[0], np.zeros((images.HEIGHT, images.WIDTH), bool)
+    pixels = images.digital_numbers(bands=1)[0]
+    hidden = np.zeros((images.HEIGHT, images.WIDTH), bool)
     hidden[30:50, 40:] = True
     tifffile.imwrite(tmp_path / "mask.tif", pixels)
     both = np.stack([pixels, ~hidden * 4095]).astype(np.uint16)

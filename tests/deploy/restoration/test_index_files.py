@@ -121,7 +121,8 @@ def run(in_ar, out_ar, *rest, **more):
 
 @pytest.mark.parametrize("trusted", [False, True])
 def test_code_in_an_index_is_never_run(trusted: bool, tmp_path: Path) -> None:
-    index, made = folder_of(tmp_path) / "a.vrt", tmp_path / "made"
+    index = folder_of(tmp_path) / "a.vrt"
+    made = tmp_path / "made"
     index.write_text(CODE.format(made=str(made), source=ONE))
     with pytest.raises(ImageError), open_source(index, trusted=trusted) as source:
         source.read(0, 9)

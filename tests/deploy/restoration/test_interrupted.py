@@ -103,7 +103,8 @@ def image(tmp_path: Path) -> Path:
 
 
 def test_damaged_rows_are_made_again_and_it_is_said(image: Path, model: Path, tmp_path: Path) -> None:
-    whole, out = tmp_path / "whole.tif", tmp_path / "out.tif"
+    whole = tmp_path / "whole.tif"
+    out = tmp_path / "out.tif"
     restore_file(image, whole, Options(model, TILE_PX))
     with stopped_after(40):
         restore_file(image, out, Options(model, TILE_PX))
@@ -178,7 +179,8 @@ def test_a_sidecar_that_comes_or_goes_is_another_image(image: Path, model: Path,
 def test_an_image_that_is_replaced_while_it_is_read_is_refused(
     touched: bool, image: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    finish, other = Restorer.finish, tmp_path / "other.tif"
+    finish = Restorer.finish
+    other = tmp_path / "other.tif"
     tifffile.imwrite(other, noise(700, 260, seed=2), tile=(16, 16))
 
     def replacing(self: Restorer, *rest: object) -> object:

@@ -120,7 +120,9 @@ def test_a_run_that_ends_just_then_takes_no_lock_along(tmp_path: Path, monkeypat
     """Between opening the file and locking it, the run that held it ends: the lock must be on the new file."""
     import fcntl
 
-    folder, taken, ends = tmp_path / ".out.part", fcntl.flock, iter([True, True, False])
+    folder = tmp_path / ".out.part"
+    taken = fcntl.flock
+    ends = iter([True, True, False])
 
     def ending(handle: int, operation: int) -> None:
         if operation & fcntl.LOCK_EX and next(ends):
@@ -137,7 +139,9 @@ def test_a_run_that_ends_just_then_takes_no_lock_along(tmp_path: Path, monkeypat
 
 
 def test_many_that_try_are_never_two_at_once(tmp_path: Path) -> None:
-    inside, most, refused = [0], [0], [0]
+    inside = [0]
+    most = [0]
+    refused = [0]
 
     def trying() -> None:
         for _ in range(100):
@@ -164,7 +168,8 @@ def test_links_in_the_place_of_a_run_s_files_are_refused_and_nothing_behind_them
     image: Path, tmp_path: Path
 ) -> None:
     model = shipped_pair("convbeers-xs", BLIND)[1]
-    mine, out = tmp_path / "mine", tmp_path / "out.tif"
+    mine = tmp_path / "mine"
+    out = tmp_path / "out.tif"
     mine.mkdir()
     for name in ("out.tif", "cog.tif.aux", "rows.raw"):
         (mine / name).write_bytes(b"mine")

@@ -80,7 +80,8 @@ def exact_ways(path: Path, tile_px: int) -> dict[str, Restored]:
 def test_with_exact_seams_every_command_gives_the_pixels_of_restore(
     precision: str, path: Path, tmp_path: Path
 ) -> None:
-    pixels, tile_px = image(), TILES_PX[precision]
+    pixels = image()
+    tile_px = TILES_PX[precision]
     expected = restored(tmp_path, pixels, Options(path, tile_px))[0]
     assert (expected != pixels).mean() > 0.5
     np.testing.assert_array_equal(restore(pixels, path, tile=tile_px), expected)
@@ -89,7 +90,9 @@ def test_with_exact_seams_every_command_gives_the_pixels_of_restore(
 
 
 def test_with_a_halo_below_the_radius_they_have_the_same_seams(precision: str, path: Path, tmp_path: Path) -> None:
-    pixels, tile_px, halo_px = image(), TILES_PX[precision], SMALL_HALOS_PX[precision]
+    pixels = image()
+    tile_px = TILES_PX[precision]
+    halo_px = SMALL_HALOS_PX[precision]
     options = Options(path, tile_px, str(halo_px), sensors={"": SENSOR})
     expected = restored(tmp_path, pixels, options)[0]
     assert (expected != restored(tmp_path, pixels, Options(path, tile_px, sensors={"": SENSOR}))[0]).any()
@@ -102,7 +105,8 @@ def test_with_a_halo_below_the_radius_they_have_the_same_seams(precision: str, p
 
 
 def test_floats_are_those_of_restore_unrounded(precision: str, path: Path, tmp_path: Path) -> None:
-    dn, tile_px = np.minimum(image() + np.float32(0.37), np.float32(4095)), TILES_PX[precision]
+    dn = np.minimum(image() + np.float32(0.37), np.float32(4095))
+    tile_px = TILES_PX[precision]
     expected = restored(tmp_path, dn, Options(path, tile_px))[0]
     assert (expected % 1 > 0).mean() > 0.5
     np.testing.assert_array_equal(restore(dn, path, tile=tile_px), expected)

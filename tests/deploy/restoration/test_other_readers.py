@@ -156,7 +156,8 @@ def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
         f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} -c "from beers_deploy.cli import app; app()" "$@"\n'
     )
     program.chmod(0o755)
-    script, outs = ROOT / "examples" / "qgis_restore.py", [tmp_path / "restored.tif", tmp_path / "restored.xyz"]
+    script = ROOT / "examples" / "qgis_restore.py"
+    outs = [tmp_path / "restored.tif", tmp_path / "restored.xyz"]
     (done, _), (refused, why) = answer(qgis, "-c", IN_QGIS.replace("{}", RUN), script, program, image, *outs)["runs"]
     assert done
     assert not refused

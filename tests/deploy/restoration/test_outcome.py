@@ -81,7 +81,8 @@ def test_a_network_that_brightens_or_darkens_by_three_percent_is_told(
     network.graph.initializer.append(numpy_helper.from_array(np.array(factor, np.float32), "factor"))
     network.graph.node.append(onnx.helper.make_node("Mul", ["plain", "factor"], [last], "brighten"))
     onnx.save(network, tmp_path / "network.onnx")
-    image, said = tmp_path / "in.tif", list[str]()
+    image = tmp_path / "in.tif"
+    said = list[str]()
     tifffile.imwrite(image, bd.simulate(sensor=SENSOR, size=200, seed=1).degraded)
     restore_file(image, tmp_path / "out.tif", Options(tmp_path / "network.onnx"), said.append)
     assert any("the mean went from" in sentence for sentence in said) is is_told

@@ -29,7 +29,8 @@ def test_every_kept_pixel_has_its_halo_or_touches_the_border(size: int, tile_px:
 
 @given(st.integers(1, 2000), st.integers(13, 200), st.integers(0, 6))
 def test_an_even_side_needs_as_many_tiles_and_none_shorter_does(size: int, tile_px: int, halo_px: int) -> None:
-    side, count = even_side_px(size, tile_px, halo_px), len(plan_side(size, tile_px, halo_px))
+    side = even_side_px(size, tile_px, halo_px)
+    count = len(plan_side(size, tile_px, halo_px))
     assert side <= tile_px
     assert len(plan_side(size, side, halo_px)) == count
     if side > 2 * halo_px + 1 and count > 1:

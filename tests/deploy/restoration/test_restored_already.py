@@ -96,7 +96,8 @@ def test_filled_parts_of_a_raw_image_do_not_count(nodata: int | None) -> None:
 
 
 def test_the_command_says_it_and_goes_on(tmp_path: Path) -> None:
-    image, out = tmp_path / "in.tif", tmp_path / "out.tif"
+    image = tmp_path / "in.tif"
+    out = tmp_path / "out.tif"
     tifffile.imwrite(image, PROCESSED["smoothed"](raw(1)))
     assert "look at the image: it looks restored already" in done("restore", image, out, "--network", NETWORK)
     assert out.exists()

@@ -47,7 +47,8 @@ def asked(model: Path) -> list[object]:
 def test_killed_at_random_moments_it_is_resumed_to_the_same_bytes(
     image: Path, model: Path, expected: bytes, tmp_path: Path
 ) -> None:
-    out, rng = tmp_path / "out.tif", np.random.default_rng()
+    out = tmp_path / "out.tif"
+    rng = np.random.default_rng()
     out.write_bytes(b"old")
     finished = 0
     for _ in range(KILLS):
@@ -83,7 +84,8 @@ def test_ctrl_c_says_how_to_go_on(image: Path, model: Path, expected: bytes, tmp
 def test_finished_rows_are_not_restored_again(
     image: Path, model: Path, expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, options = tmp_path / "out.tif", Options(model, TILE_PX)
+    out = tmp_path / "out.tif"
+    options = Options(model, TILE_PX)
     with stopped_after(50):
         restore_file(image, out, options)
     with pytest.raises(OptionError, match="resume"):
@@ -109,7 +111,10 @@ def test_a_full_disk_is_one_sentence_and_loses_no_finished_row(
     calls: int, image: Path, model: Path, expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The disk fills up at the first rows, at later ones, or while the output is written."""
-    out, options, count, sync = tmp_path / "out.tif", Options(model, TILE_PX), iter(range(10**6)), os.fsync
+    out = tmp_path / "out.tif"
+    options = Options(model, TILE_PX)
+    count = iter(range(10**6))
+    sync = os.fsync
 
     def full(handle: int) -> None:
         if next(count) == calls or calls == 1000:

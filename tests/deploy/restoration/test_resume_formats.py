@@ -21,7 +21,8 @@ def test_killed_among_its_rows_and_at_its_cog_it_is_resumed_to_the_same_bytes(
     name: str, model: Path, tmp_path: Path
 ) -> None:
     image = images.FORMATS[name](tmp_path / name, images.digital_numbers())
-    expected, out = tmp_path / "expected.tif", tmp_path / "out.tif"
+    expected = tmp_path / "expected.tif"
+    out = tmp_path / "out.tif"
     restore_file(image, expected, Options(model, TILE_PX, threads=1, cog=True))
     before = {path.name for path in tmp_path.iterdir()}
     out.write_bytes(b"old")

@@ -55,7 +55,8 @@ def test_one_pixel_less_than_the_radius_shows_seams_and_says_so(model: Path, tmp
     pixels = noise(61, 83).astype(np.float32)
     restored, row = restore(tmp_path, pixels, Options(model, tile_px=23, halo=str(RADIUS_PX - 1)))
     assert (restored != whole_image(model, pixels)).any()
-    largest, mean = row.figures["seam error max"], row.figures["seam error mean"]
+    largest = row.figures["seam error max"]
+    mean = row.figures["seam error mean"]
     assert largest.value is not None
     assert mean.value is not None
     assert largest.value > mean.value > 0
@@ -137,10 +138,12 @@ def test_georeference_and_rpcs_are_kept(model: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["nan", "tag"])
 def test_missing_pixels_stay_and_spoil_nothing(kind: str, model: Path, tmp_path: Path) -> None:
-    known, missing = noise(70, 90).astype(np.float32), np.zeros((70, 90), bool)
+    known = noise(70, 90).astype(np.float32)
+    missing = np.zeros((70, 90), bool)
     missing[20:60, 30:75] = missing[3, 5] = True
     if kind == "nan":
-        spoilt, tags = np.where(missing, np.nan, known).astype(np.float32), []
+        spoilt = np.where(missing, np.nan, known).astype(np.float32)
+        tags = []
     else:
         spoilt = np.where(missing, 7, np.where(known == 7, 8, known)).astype(np.uint16)
         tags = [(42113, "s", 0, "7", True)]
@@ -158,7 +161,8 @@ def test_missing_pixels_stay_and_spoil_nothing(kind: str, model: Path, tmp_path:
 
 
 def test_a_filled_pixel_is_the_nearest_known_one() -> None:
-    pixels, missing = np.arange(12.0).reshape(2, 6), np.zeros((2, 6), bool)
+    pixels = np.arange(12.0).reshape(2, 6)
+    missing = np.zeros((2, 6), bool)
     missing[0, 1:] = missing[1, :2] = True
     np.testing.assert_array_equal(fill_from_nearest(pixels, missing, 2), [[0, 0, 0, 9, 10, 11], [8, 8, 8, 9, 10, 11]])
     assert fill_from_nearest(pixels, np.ones((2, 6), bool), 2).max() == 0

@@ -53,7 +53,8 @@ def image(tmp_path: Path) -> Path:
 
 def both(folder: Path, options: Options, scheduler: str) -> tuple[bytes, bytes]:
     """The bytes of one process, and those of two workers."""
-    one, two = folder / "one.tif", folder / "two.tif"
+    one = folder / "one.tif"
+    two = folder / "two.tif"
     restore_file(folder / "in.tif", one, options)
     row = restore_file(folder / "in.tif", two, replace(options, scheduler=scheduler))
     assert row.text["workers"] == scheduler
@@ -96,7 +97,8 @@ def test_and_with_int8_and_users_own(make: Callable[[], onnx.ModelProto], schedu
 
 
 def test_a_run_begun_here_is_finished_by_workers(image: Path, model: Path, scheduler: str, tmp_path: Path) -> None:
-    options, out = Options(model, TILE_PX), tmp_path / "out.tif"
+    options = Options(model, TILE_PX)
+    out = tmp_path / "out.tif"
     restore_file(image, tmp_path / "expected.tif", options)
     with stopped_after(40):
         restore_file(image, out, options)
@@ -108,7 +110,8 @@ def test_a_run_begun_here_is_finished_by_workers(image: Path, model: Path, sched
 def test_a_worker_that_is_killed_changes_nothing(
     image: Path, model: Path, local: Any, scheduler: str, tmp_path: Path
 ) -> None:
-    options, killed = Options(model, TILE_PX), []
+    options = Options(model, TILE_PX)
+    killed = []
     restore_file(image, tmp_path / "expected.tif", options)
 
     def kill(text: str) -> None:

@@ -93,7 +93,8 @@ def test_what_cannot_be_seen_is_no_contradiction() -> None:
 
 
 def test_commands_say_it_and_strict_refuses(raw: np.ndarray, tmp_path: Path) -> None:
-    image, out = tmp_path / "raw.tif", tmp_path / "out.tif"
+    image = tmp_path / "raw.tif"
+    out = tmp_path / "out.tif"
     tifffile.imwrite(image, raw)
     wrong = SENSOR.replace(snr_0=25, snr_1=55).save(tmp_path / "wrong.toml")
     network = ("--network", "convbeers-xs-int8")

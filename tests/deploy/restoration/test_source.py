@@ -92,7 +92,8 @@ def test_reading_downwards_decodes_each_segment_once(
             return super()._decode(row)
 
     with tifffile.TiffFile(path) as file:
-        source, top = Counting(path, file.pages.first), 0
+        source = Counting(path, file.pages.first)
+        top = 0
         for height in heights:
             bottom = min(top + height, HEIGHT)
             rows = source.read(max(top - overlap, 0), bottom)

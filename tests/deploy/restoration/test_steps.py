@@ -66,7 +66,8 @@ def as_floats(pixels: np.ndarray) -> np.ndarray:
 
 def options(name: str, sensors: Mapping[str, Sensor] | None = None, exposure: bool = True, **more: Any) -> Options:
     """Build what the command makes of --network, --sensor and --no-exposure."""
-    known, given = sensors or {"": SENSOR}, Path(name)
+    known = sensors or {"": SENSOR}
+    given = Path(name)
     files = {band: network_file(given, sensor) for band, sensor in known.items()}
     brighter = {band: brighter_files(given, sensor) for band, sensor in known.items()} if exposure else {}
     return Options(
@@ -117,7 +118,8 @@ def test_a_dask_array_gives_the_same_and_its_workers_read_no_files(monkeypatch: 
 @pytest.mark.parametrize("floats", [False, True])
 def test_a_dask_array_has_the_full_scale_of_its_sensor(floats: bool) -> None:
     da = pytest.importorskip("dask.array", reason="the extra 'dask' is not installed")
-    sensor, pixels = SENSOR.replace(bits=14), image()[:60, 70:] * 4
+    sensor = SENSOR.replace(bits=14)
+    pixels = image()[:60, 70:] * 4
     pixels = pixels.astype(np.float32) if floats else pixels
     expected = by_array(pixels, INT8, sensor=sensor, full_scale=None)
     lazy = by_array(da.from_array(pixels, chunks=50), INT8, sensor=sensor, full_scale=None, tile=57)
@@ -186,7 +188,8 @@ def test_the_command_says_which_steps_were_taken(
     words: tuple[str, ...], figures: set[str], text: dict[str, str | None], tmp_path: Path
 ) -> None:
     tifffile.imwrite(tmp_path / "in.tif", image())
-    out, results = tmp_path / "out.tif", tmp_path / "results.json"
+    out = tmp_path / "out.tif"
+    results = tmp_path / "results.json"
     files = ("restore", tmp_path / "in.tif", out, "--json", results)
     done(*files, "--network", INT8, "--sensor", SENSOR.name, *words)
     switches = {"consistency": "--no-consistency" not in words, "exposure": "--no-exposure" not in words}
@@ -258,7 +261,8 @@ def test_a_network_of_other_pixels_or_bands_gets_none(
 @pytest.mark.parametrize("name", [FLOAT, INT8])
 def test_the_mean_of_a_dark_image_is_kept(name: str) -> None:
     """Measured at 30 DN: 3.3 and 3.8 % darker without the steps, less than 0.001 % off with both."""
-    nominal, level_dn = SENSOR.nominal(), 30
+    nominal = SENSOR.nominal()
+    level_dn = 30
     sigma = nominal.noise_sigma(level_dn / nominal.gain_dn_per_radiance) * nominal.gain_dn_per_radiance
     noise = np.random.default_rng(0).normal(0, sigma, (97, 110))
     dark = np.rint(level_dn + noise).astype(np.float32)
@@ -269,7 +273,8 @@ def test_the_mean_of_a_dark_image_is_kept(name: str) -> None:
 
 def test_few_rows_are_held_of_a_tall_image(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The consistency step needs its reach above and below a row of tiles, which ends within two others."""
-    most, add = [0], HeldRows.add
+    most = [0]
+    add = HeldRows.add
 
     def counting(self: HeldRows, row: NetworkRow) -> None:
         add(self, row)

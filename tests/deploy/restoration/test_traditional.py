@@ -103,7 +103,8 @@ def test_a_budget_that_does_not_suffice_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_command_needs_a_sensor_and_no_option_of_a_network(tmp_path: Path) -> None:
-    image, out = tmp_path / "in.tif", tmp_path / "out.tif"
+    image = tmp_path / "in.tif"
+    out = tmp_path / "out.tif"
     tifffile.imwrite(image, noise())
     start = ["restore", str(image), str(out)]
     chain = [*start, "--method", "traditional"]

@@ -56,7 +56,8 @@ def test_a_mask_is_missing_pixels_and_is_kept(
 ) -> None:
     if compression in (Compression.zstd, Compression.lzw):
         pytest.importorskip("imagecodecs")
-    pixels, mask = pixels_of_test(), ~HIDDEN if bits == 1 else np.where(HIDDEN, 0, 255).astype(np.uint8)
+    pixels = pixels_of_test()
+    mask = ~HIDDEN if bits == 1 else np.where(HIDDEN, 0, 255).astype(np.uint8)
     with tifffile.TiffWriter(tmp_path / "in.tif") as file:
         file.write(pixels, metadata=None)
         if not beside:
@@ -71,7 +72,8 @@ def test_a_mask_is_missing_pixels_and_is_kept(
 
 
 def test_what_gdal_keeps_beside_an_image_counts(model: Path, tmp_path: Path) -> None:
-    image, beside = tmp_path / "in.tif", tmp_path / "in.tif.aux.xml"
+    image = tmp_path / "in.tif"
+    beside = tmp_path / "in.tif.aux.xml"
     pixels = np.where(HIDDEN, NODATA, pixels_of_test()).astype(np.uint16)
     tifffile.imwrite(image, pixels)
     band = "<PAMDataset><PAMRasterBand band='1'>{}</PAMRasterBand></PAMDataset>"
@@ -105,7 +107,8 @@ def test_alpha_goes_through_untouched(kind: str, planes: Any, bands: int, model:
     restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=23))
     with tifffile.TiffFile(tmp_path / "out.tif") as file:
         page = file.pages.first
-        found, said = page.asarray(), (page.photometric, page.extrasamples)
+        found = page.asarray()
+        said = (page.photometric, page.extrasamples)
     assert said == ({"rgb": 2, "minisblack": 1}[photometric], ({"assocalpha": 1, "unassalpha": 2}[kind],))
     np.testing.assert_array_equal(found[-1], alpha)
     for band in found[:-1]:
@@ -211,7 +214,8 @@ def scaled(model: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[f
 
     def make(factor: float, offset: float) -> Path:
         found = onnx.load(model)
-        graph, last = found.graph, found.graph.output[0].name
+        graph = found.graph
+        last = found.graph.output[0].name
         for node in graph.node:
             node.output[:] = [name if name != last else "plain" for name in node.output]
         for name, value in (("factor", factor), ("offset", offset)):

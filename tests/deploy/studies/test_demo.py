@@ -24,7 +24,8 @@ def test_the_demo_takes_a_raw_image_through_the_whole_chain(tmp_path: Path, monk
     text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
     mine = tmp_path / "mine.toml"
     mine.write_text(text.replace("10.2375", "10.0"))
-    out, figures = tmp_path / "out", tmp_path / "figures.json"
+    out = tmp_path / "out"
+    figures = tmp_path / "figures.json"
     done("demo", "--image", raw, "--out", out, "--json", figures, "--sensor", mine)
     made = {path.name for path in out.iterdir()}
     assert made == {"report.html", "float.onnx", "int8.onnx", "core.onnx", "restored.tif", "before-after.png"}

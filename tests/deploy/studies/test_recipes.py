@@ -59,7 +59,8 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
     folders: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("beers_deploy.quant.banked.calibrate.PATCHES", 6)
-    recipe, out = tmp_path / "own.toml", tmp_path / "run"
+    recipe = tmp_path / "own.toml"
+    out = tmp_path / "run"
     recipe.write_text(RECIPE)
     command = ["train", "--recipe", recipe, *given(folders), "--out", out]
     done(*command)

@@ -11,7 +11,8 @@ def interval(values: list[float], sites: list[str]) -> tuple[float, float]:
 
 
 def test_it_covers_the_mean_as_often_as_it_says() -> None:
-    generator, hits = np.random.default_rng(1), 0
+    generator = np.random.default_rng(1)
+    hits = 0
     for _ in range(200):
         offsets = generator.normal(40, 3, 25)
         values = [offset + generator.normal(0, 0.2) for offset in offsets for _ in range(3)]
@@ -29,14 +30,16 @@ def test_images_of_one_site_are_not_taken_for_many() -> None:
 
 
 def test_the_same_seed_gives_the_same_interval() -> None:
-    values, sites = [1.0, 2.0, 4.0, 5.0, 9.0], list("abcde")
+    values = [1.0, 2.0, 4.0, 5.0, 9.0]
+    sites = list("abcde")
     assert interval(values, sites) == interval(values, sites)
     assert interval(values, sites) == pytest.approx((2.2, 6.8), abs=0.7)
 
 
 @pytest.mark.parametrize("count", [1, 2, LEAST_SITES - 1, LEAST_SITES, 9])
 def test_below_five_sites_there_is_no_interval_and_it_is_said(count: int) -> None:
-    values, sites = list(np.linspace(40, 44, 3 * count)), [f"s{k % count}" for k in range(3 * count)]
+    values = list(np.linspace(40, 44, 3 * count))
+    sites = [f"s{k % count}" for k in range(3 * count)]
     found, words = site_interval(values, sites, np.random.default_rng(0))
     if count < LEAST_SITES:
         assert found is None

@@ -73,7 +73,8 @@ def test_the_rounding_is_taken_off(sigma: float) -> None:
 
 def test_what_lies_beyond_the_blocks_is_less_sure() -> None:
     line = model(cut_blocks(noisy(5.0), MAX_DN))
-    inside, outside = line.at(1000), line.at(40)
+    inside = line.at(1000)
+    outside = line.at(40)
     assert (inside.extrapolated, outside.extrapolated) == (False, True)
     assert np.ptp(outside.interval) > 1.5 * np.ptp(inside.interval)
 

@@ -110,8 +110,10 @@ def vgg_maps(x: Tensor, weights: Weights, pool: Callable[[Tensor], Tensor] = lam
 
 
 def plain_lpips(network: str, image: np.ndarray, reference: np.ndarray) -> float:
-    shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
-    weights, heads = made_up(network), load_file(PUBLISHED / f"lpips-{network}.safetensors")
+    shift = np.array([-0.030, -0.088, -0.188])
+    scale = np.array([0.458, 0.448, 0.450])
+    weights = made_up(network)
+    heads = load_file(PUBLISHED / f"lpips-{network}.safetensors")
     maps = {"squeeze": squeeze_maps, "vgg": vgg_maps}[network]
     colours = [(2 * np.stack([a] * 3) - 1 - shift[:, None, None]) / scale[:, None, None] for a in (image, reference)]
     total = 0.0
@@ -123,7 +125,8 @@ def plain_lpips(network: str, image: np.ndarray, reference: np.ndarray) -> float
 
 
 def plain_dists(image: np.ndarray, reference: np.ndarray) -> float:
-    weights, published = made_up("vgg"), load_file(PUBLISHED / "dists.safetensors")
+    weights = made_up("vgg")
+    published = load_file(PUBLISHED / "dists.safetensors")
     alpha, beta = (published[name].astype(np.float64) for name in ("alpha", "beta"))
     mean, std = (torch.tensor(x, dtype=torch.float64)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
     colours = [torch.from_numpy(np.stack([a] * 3))[None] for a in (image, reference)]
@@ -145,7 +148,8 @@ def plain_dists(image: np.ndarray, reference: np.ndarray) -> float:
 )
 def test_agrees_with_a_plain_computation(name: str, sides: tuple[int, int], folder: Path) -> None:
     image, reference = pair(*sides)
-    metric, planes = load(name, folder), [a[0, 0].double().numpy() for a in (image, reference)]
+    metric = load(name, folder)
+    planes = [a[0, 0].double().numpy() for a in (image, reference)]
     plain = plain_dists(*planes) if name == "dists" else plain_lpips(name, *planes)
     assert float(metric(image, reference)) == pytest.approx(plain, rel=1e-5)
     assert float(metric.double()(image.double(), reference.double())) == pytest.approx(plain, rel=1e-7)
@@ -175,7 +179,8 @@ def test_the_gradient_is_that_of_the_value(folder: Path) -> None:
     image, reference = (a.double() for a in pair(33, 33))
     step = torch.from_numpy(np.random.default_rng(1).standard_normal(image.shape)) * 1e-6
     for name in ("squeeze", "dists"):
-        metric, at = load(name, folder).double(), image.clone().requires_grad_()
+        metric = load(name, folder).double()
+        at = image.clone().requires_grad_()
         metric(at, reference).sum().backward()
         assert at.grad is not None
         with torch.no_grad():

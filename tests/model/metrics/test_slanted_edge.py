@@ -80,7 +80,9 @@ def test_a_gaussian_edge_gives_its_mtf_wherever_it_lies(sigma_px: float, angle_d
 
 def test_sharpening_shows_as_much_as_it_does() -> None:
     """A filter of 3 taps across: gain 1 + b (1 - cos(2 pi f)) / 2, so 1 + b at Nyquist."""
-    boost, before, after = 2.0, [], []
+    boost = 2.0
+    before = []
+    after = []
     for seed in range(20):
         image = noisy(0.07, ANGLE_DEG, seed).astype(np.float64)
         turned = (image[:, :-2] + image[:, 2:]) / 2 - image[:, 1:-1]

@@ -98,8 +98,10 @@ def gaussian_pixel(sigma_x: float, sigma_y: float, per_px: int, side: int) -> Po
 def lopsided_point(per_px: int = 4, rows: int = 37, columns: int = 48) -> PointSpread:
     """Aslant, with a tail to one side and a faint dark ring: its response is complex."""
     y, x = (np.arange(size) - (size - 1) / 2 for size in (rows, columns))
-    y, x = y[:, None] / per_px, x / per_px
-    core, tail = np.exp(-2 * y**2 - 1.5 * (x + 0.3 * y) ** 2), np.exp(-(y**2) - (x - 1) ** 2)
+    y = y[:, None] / per_px
+    x = x / per_px
+    core = np.exp(-2 * y**2 - 1.5 * (x + 0.3 * y) ** 2)
+    tail = np.exp(-(y**2) - (x - 1) ** 2)
     return point_spread(core + 0.2 * tail - 0.02 * np.exp(-((np.hypot(x, y) - 2.5) ** 2)), per_px)
 
 

@@ -22,7 +22,8 @@ QUIET = Instrument(0.07, alpha=0.0, beta=0.0, gain_dn_per_radiance=10.0, bits=16
 @pytest.mark.parametrize("cycles_per_px", [0.1, 0.25, 0.4])
 @pytest.mark.parametrize("mtf_nyquist", [0.03, 0.07, 0.25])
 def test_a_sine_keeps_the_contrast_that_the_mtf_says(cycles_per_px: float, mtf_nyquist: float) -> None:
-    ratio, pixels = 4, 40
+    ratio = 4
+    pixels = 40
     x = (np.arange(pixels * ratio) + 0.5) / ratio
     wave = 1000 + 500 * np.cos(2 * math.pi * cycles_per_px * x)
     radiance = np.tile(wave.astype(np.float32), (pixels * ratio, 1))

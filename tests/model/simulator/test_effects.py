@@ -53,11 +53,14 @@ def scene(height: int = 340, width: int = 390, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize("name", TABLES)
 def test_skipping_equals_applying_at_neutral_parameters_bit_for_bit(name: str) -> None:
     """Whether the plan leaves the effect out or skips nothing: the operator itself must change no bit."""
-    radiance, draw = scene(171, 195), Draw(3)
-    neutral, without_it = stages.plain_sensor(**{name: NEUTRAL[name]}), stages.plain_sensor()
+    radiance = scene(171, 195)
+    draw = Draw(3)
+    neutral = stages.plain_sensor(**{name: NEUTRAL[name]})
+    without_it = stages.plain_sensor()
     one, other = (stages.before_digitising(radiance, sensor, 3, draw) for sensor in (neutral, without_it))
     assert np.array_equal(one, other)
-    prepared, everything = prepare_scene(radiance, 3), Plan((), TOLERANCE_DN)
+    prepared = prepare_scene(radiance, 3)
+    everything = Plan((), TOLERANCE_DN)
     expected = simulate_planned(prepared, without_it, draw, everything, margin_px=5)
     for plan in (make_plan(neutral, prepared.stats), everything):
         assert np.array_equal(simulate_planned(prepared, neutral, draw, plan, margin_px=5), expected)
@@ -105,7 +108,8 @@ def test_what_spills_stays_in_its_column_and_never_exceeds_the_excess() -> None:
 
 def test_defects_come_at_their_rate_and_at_the_ends_of_the_range() -> None:
     dn = stages.alone(Defects(2000, 3000), np.full((1000, 1001), 700.0, np.float32), seed=2)
-    dead, hot = int((dn == 0).sum()), int((dn == 4095).sum())
+    dead = int((dn == 0).sum())
+    hot = int((dn == 4095).sum())
     for count, expected in ((dead, 2002), (hot, 3003)):
         assert abs(count - expected) < 5 * math.sqrt(expected)
     assert int((dn == 700).sum()) == dn.size - dead - hot
@@ -136,8 +140,10 @@ def test_a_full_well_gives_back_no_more_than_its_share_of_what_it_cuts_off(
     well: float, share: float, length_px: float, rows: int, seed: int
 ) -> None:
     image = scene(rows, 9, seed)
-    flooded, clipped = stages.alone(FullWell(well, share, length_px), image).astype(float), image.clip(max=well)
-    cut, gained = (image.astype(float) - clipped).sum(0), (flooded - clipped).sum(0)
+    flooded = stages.alone(FullWell(well, share, length_px), image).astype(float)
+    clipped = image.clip(max=well)
+    cut = (image.astype(float) - clipped).sum(0)
+    gained = (flooded - clipped).sum(0)
     assert (flooded >= clipped).all()
     assert float(flooded.max()) <= well * (1 + 1e-6)
     assert (gained <= share * cut + 1e-3).all()

@@ -129,7 +129,8 @@ def test_no_bound_is_ever_exceeded(radiance: np.ndarray, sensor: Instrument, rat
 @given(scenes, sensors, st.sampled_from([1, 2, 3, 5]), st.integers(0, 99))
 def test_the_plan_keeps_within_its_tolerance(radiance: np.ndarray, sensor: Instrument, ratio: int, seed: int) -> None:
     scene = prepare_scene(radiance, ratio)
-    radiance, plan = scene.radiance, make_plan(sensor, scene.stats)
+    radiance = scene.radiance
+    plan = make_plan(sensor, scene.stats)
     whole = stages.before_digitising(radiance, sensor, ratio, Draw(seed))
     planned = stages.before_digitising(radiance, sensor, ratio, Draw(seed), plan.skipped)
     assert np.abs(whole - planned).max() <= TOLERANCE_DN + ROUNDING_DN
@@ -175,7 +176,8 @@ def test_a_quarter_of_any_bound_would_be_caught(name: str) -> None:
 
 def test_the_bound_of_defects_holds_where_the_signal_is_above_full_scale() -> None:
     """A dead pixel loses all of the signal, also what the converter would have cut off."""
-    radiance, sensor = np.full((60, 75), 760.0, np.float32), stages.plain_sensor(defects=Defects(50_000, 50_000))
+    radiance = np.full((60, 75), 760.0, np.float32)
+    sensor = stages.plain_sensor(defects=Defects(50_000, 50_000))
     bound = effect_bounds(sensor, scene_stats(radiance, 3))["defects"]
     assert change(radiance, sensor, 3, "defects", 0) <= bound + ROUNDING_DN
 
@@ -222,7 +224,8 @@ def test_a_plan_is_data() -> None:
 
 
 def test_a_flat_scene_is_simulated_without_a_transform() -> None:
-    flat, sensor = np.full((200, 220), 60.0, np.float32), stages.plain_sensor()
+    flat = np.full((200, 220), 60.0, np.float32)
+    sensor = stages.plain_sensor()
     scene = prepare_scene(flat, 2)
     plan = make_plan(sensor, scene.stats)
     assert "mtf" in plan.skipped

@@ -36,7 +36,8 @@ BLURS: dict[str, tuple[Response | tuple[float, float], tuple[float, float]]] = {
 @pytest.mark.parametrize("name", [name for name in BLURS if name != "lopsided"])
 def test_a_slanted_edge_shows_both_contrasts(name: str) -> None:
     (blur, wanted), side, ratio, middle = BLURS[name], 200, 4, slice(60, 140)
-    scene, transfer = slanted_edge(side, ratio, 5.0), transfer_function(side * ratio, side * ratio, ratio, blur)
+    scene = slanted_edge(side, ratio, 5.0)
+    transfer = transfer_function(side * ratio, side * ratio, ratio, blur)
     upright, lying = (sample(scene_spectrum(s), transfer, side * ratio, ratio) for s in (scene, scene.T))
     assert [edge_mtf(image[middle, middle], 5.0) for image in (upright, lying.T)] == pytest.approx(wanted, abs=0.005)
 
@@ -71,7 +72,8 @@ def test_no_blur_shifts_a_blob_or_changes_its_light(name: str, ratio: int) -> No
 @pytest.mark.parametrize("contrasts", [(0.07, 0.07), UNEVEN, (0.25, 0.3), (0.01, 0.2)])
 @pytest.mark.parametrize("steps", [1, 5, 7])
 def test_a_table_of_the_formula_is_the_formula(contrasts: tuple[float, float], steps: int) -> None:
-    fx, fy = np.linspace(-3, 3, 61)[None], np.linspace(-2, 2, 47)[:, None]
+    fx = np.linspace(-3, 3, 61)[None]
+    fy = np.linspace(-2, 2, 47)[:, None]
     table = stages.formula_table(*contrasts, steps)
     np.testing.assert_allclose(mtf(fx, fy, table), mtf(fx, fy, contrasts), rtol=1e-9, atol=1e-14)
 
@@ -79,8 +81,10 @@ def test_a_table_of_the_formula_is_the_formula(contrasts: tuple[float, float], s
 def test_the_optics_of_one_table_are_round() -> None:
     """The square detector apart, contrast depends on the radius alone: along a diagonal as along an axis."""
     table = replace(MEASURED, along=MEASURED.across)
-    radius, zero = np.linspace(0.01, 0.9, 40)[None], np.zeros((1, 1))
-    fx, fy = 0.8 * radius, 0.6 * radius
+    radius = np.linspace(0.01, 0.9, 40)[None]
+    zero = np.zeros((1, 1))
+    fx = 0.8 * radius
+    fy = 0.6 * radius
     aslant = np.stack([mtf(fx[:, k : k + 1], fy[:, k : k + 1], table).ravel() for k in range(40)], 1)
     optics = mtf(radius, zero, table) / np.sinc(radius)
     np.testing.assert_allclose(aslant / np.sinc(fx) / np.sinc(fy), optics, rtol=1e-9, atol=1e-12)
@@ -94,7 +98,8 @@ def test_a_point_of_the_formula_gives_the_formulas_images(odd: bool, side: int) 
     Elsewhere the tail beyond the window is missing; an even side has one row too many at one end, which moves the
     centroid by thousandths of a pixel.
     """
-    ratio, point = 4, stages.formula_point(UNEVEN, 4, 64, odd)
+    ratio = 4
+    point = stages.formula_point(UNEVEN, 4, 64, odd)
     radiance = 300 * np.random.default_rng(3).random((side * ratio, side * ratio), np.float32)
     radiance[: side * ratio // 2] *= 0.2
     wanted, found = (
@@ -107,7 +112,8 @@ def test_a_point_of_the_formula_gives_the_formulas_images(odd: bool, side: int) 
 @pytest.mark.parametrize("name", BLURS)
 def test_smear_comes_on_top_and_the_filter_is_part_of_it(name: str) -> None:
     blur, _ = BLURS[name]
-    whole, plain = transfer_function(30, 36, 3, blur, 0.0, 1.5), transfer_function(30, 36, 3, blur)
+    whole = transfer_function(30, 36, 3, blur, 0.0, 1.5)
+    plain = transfer_function(30, 36, 3, blur)
     smear = np.sinc(1.5 * np.fft.fftfreq(30, 1 / 3))[:, None]
     np.testing.assert_allclose(whole, plain * smear, rtol=1e-5, atol=1e-7)
     if not isinstance(blur, tuple):

@@ -25,7 +25,8 @@ def one_after_the_other(
 ) -> np.ndarray:
     """Blur, then smear, then shift, each with a transform of its own in float64; then pick every r-th pixel."""
     height, width = radiance.shape
-    fy, fx = np.fft.fftfreq(height, 1 / ratio)[:, None], np.fft.rfftfreq(width, 1 / ratio)[None]
+    fy = np.fft.fftfreq(height, 1 / ratio)[:, None]
+    fx = np.fft.rfftfreq(width, 1 / ratio)[None]
     shift = 2j * math.pi * (ratio - 1) / 2 / ratio
     image = radiance.astype(np.float64)
     for response in (
@@ -55,7 +56,8 @@ def test_fused_equals_sequential(
 @pytest.mark.parametrize("ratio", [1, 2, 3, 5, 8])
 def test_haze_after_sampling_equals_haze_before_the_blur(ratio: int) -> None:
     """An affine change of the light commutes with a blur that keeps the mean: so it may wait for the small grid."""
-    haze, radiance = Haze(0.7, 15.0), 300 * np.random.default_rng(0).random((17 * ratio, 23 * ratio), np.float32)
+    haze = Haze(0.7, 15.0)
+    radiance = 300 * np.random.default_rng(0).random((17 * ratio, 23 * ratio), np.float32)
     transfer = transfer_function(*radiance.shape, ratio, 0.07, 0.2, 1.5)
     fused = stages.alone(haze, sample(scene_spectrum(radiance), transfer, radiance.shape[1], ratio))
     expected = one_after_the_other(stages.alone(haze, radiance.astype(np.float64)), ratio, 0.07, 0.2, 1.5)
@@ -99,14 +101,16 @@ def test_what_the_grid_does_not_divide_is_cropped() -> None:
 
 @pytest.mark.parametrize("ratio", [1, 2, 3, 5])
 def test_an_offset_moves_the_grid_over_the_scene(ratio: int) -> None:
-    radiance, transfer = scene(13 * ratio, 21 * ratio), transfer_function(13 * ratio, 21 * ratio, ratio, 0.07)
+    radiance = scene(13 * ratio, 21 * ratio)
+    transfer = transfer_function(13 * ratio, 21 * ratio, ratio, 0.07)
     moved = sample(scene_spectrum(radiance), transfer, 21 * ratio, ratio, offset_px=(2.0, -3.0))
     rolled = sample(scene_spectrum(np.roll(radiance, (-2, 3), (0, 1))), transfer, 21 * ratio, ratio)
     np.testing.assert_allclose(moved, rolled, rtol=0, atol=1e-3)
 
 
 def test_a_stack_of_scenes_is_sampled_one_by_one() -> None:
-    scenes, transfer = np.stack([scene(39, 63, seed) for seed in range(3)]), transfer_function(39, 63, 3, 0.07)
+    scenes = np.stack([scene(39, 63, seed) for seed in range(3)])
+    transfer = transfer_function(39, 63, 3, 0.07)
     stack = sample(scene_spectrum(scenes), transfer, 63, 3)
     assert stack.shape == (3, 13, 21)
     for one, image in zip(scenes, stack, strict=True):

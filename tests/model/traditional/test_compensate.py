@@ -41,8 +41,10 @@ def test_without_regularisation_it_is_the_ratio_of_the_mtfs() -> None:
 
 def test_without_regularisation_a_point_spread_is_undone_whole() -> None:
     """What it shifted and turned lies straight again: gain times blur is the target, phase and all."""
-    fx, fy = np.fft.rfftfreq(34)[None], np.fft.fftfreq(26)[:, None]
-    blur, target = mtf(fx, fy, lopsided_point()), mtf(fx, fy, 0.25)
+    fx = np.fft.rfftfreq(34)[None]
+    fy = np.fft.fftfreq(26)[:, None]
+    blur = mtf(fx, fy, lopsided_point())
+    target = mtf(fx, fy, 0.25)
     undone = compensation_gain(26, 34, lopsided_point(), 0.25, epsilon=0) * blur
     assert np.abs(blur.imag).max() > 0.02
     np.testing.assert_allclose(undone, target, rtol=1e-9, atol=1e-12)
@@ -89,7 +91,8 @@ def test_the_kernel_keeps_the_gain_off_dc(mtf_from: float) -> None:
 
 
 def test_strips_and_blocks_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    image, kernel = texture(203, 187), compensation_kernel(0.07, 0.25, EPSILON)
+    image = texture(203, 187)
+    kernel = compensation_kernel(0.07, 0.25, EPSILON)
     whole = compensate(image, 0.07, 0.25, EPSILON)
     strips = torch.cat(list(filter_strips(torch.split(image, 7), 203, kernel)))
     assert torch.equal(strips, whole)

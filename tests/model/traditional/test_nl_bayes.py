@@ -145,7 +145,8 @@ def test_missing_pixels_stay_missing_and_nobody_sees_them(camera: Tensor) -> Non
     """Beside a hole the result is what it would be, a little worse for want of company."""
     clean = camera[96:169, 160:235]
     noisy = with_noise(clean, SIGMA)
-    restored, whole = nl_bayes(with_hole(noisy), WHITE), nl_bayes(noisy, WHITE)
+    restored = nl_bayes(with_hole(noisy), WHITE)
+    whole = nl_bayes(noisy, WHITE)
     known = torch.isfinite(with_hole(noisy))
     assert torch.equal(torch.isfinite(restored), known)
     ring = known & (torch.nn.functional.max_pool2d((~known)[None, None].float(), 9, 1, 4)[0, 0] > 0)
@@ -215,7 +216,8 @@ def test_a_flat_group_becomes_its_mean() -> None:
 
 def test_the_published_settings() -> None:
     """At the sigma of the chain: 45 of 23 x 23 patches, then at least 15 of 7 x 7."""
-    first, second = first_pass(SIGMA), second_pass(SIGMA, QUALITIES["standard"])
+    first = first_pass(SIGMA)
+    second = second_pass(SIGMA, QUALITIES["standard"])
     assert (first.side_px, first.similar, first.window_px, first.excess) == (5, 45, 23, 1.1)
     assert (second.side_px, second.similar, second.most_similar, second.window_px) == (5, 15, 60, 7)
     assert (first_pass(30).side_px, first_pass(30).window_px) == (7, 45)
@@ -228,7 +230,8 @@ def test_infinity_is_refused() -> None:
 
 def test_threads_change_nothing(camera: Tensor) -> None:
     noisy = with_noise(camera[96:205, 160:273], SIGMA)
-    before, results = torch.get_num_threads(), list[Tensor]()
+    before = torch.get_num_threads()
+    results = list[Tensor]()
     for threads in (1, 2):
         torch.set_num_threads(threads)
         results.append(nl_bayes(noisy, WHITE))
@@ -242,8 +245,11 @@ def image(height: int, width: int) -> torch.Tensor:
 
 
 def test_distances_are_the_sums_of_squared_differences() -> None:
-    guide, side, window = image(23, 28), 5, 7
-    rows, columns = torch.tensor([0, 3, 6, 12]), torch.tensor([0, 4, 8, 12, 17])
+    guide = image(23, 28)
+    side = 5
+    window = 7
+    rows = torch.tensor([0, 3, 6, 12])
+    columns = torch.tensor([0, 4, 8, 12, 17])
     distances = window_distances(guide, rows, columns, side, window)
     first, steps = window_numbers(rows, columns, 28 - side + 1, window)
     patches = patch_matrix(guide, side)

@@ -97,7 +97,8 @@ def blurred_pair(radiance: Tensor, sensor: Instrument) -> tuple[Tensor, Tensor]:
     """Digital numbers through the sensor, and the radiance at 25 % MTF without noise."""
     rows = mirrored(-64, radiance.shape[0] + 64, radiance.shape[0])
     wide = radiance[rows][:, rows].numpy()
-    size, inside = wide.shape[0], slice(64, -64)
+    size = wide.shape[0]
+    inside = slice(64, -64)
     dim, sharp = (
         sample(scene_spectrum(wide), transfer_function(size, size, 1, mtf), size, 1)[inside, inside]
         for mtf in (sensor.mtf_nyquist, 0.25)

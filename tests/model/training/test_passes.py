@@ -44,7 +44,8 @@ SENSORS = {
 @pytest.mark.parametrize("ratio", [2, 3, 5])
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_pass_shows_what_the_simulator_shows(name: str, ratio: int) -> None:
-    scene, sensor = procedural_scene(307, 331, np.random.default_rng(4)), SENSORS[name]
+    scene = procedural_scene(307, 331, np.random.default_rng(4))
+    sensor = SENSORS[name]
     phase = (0.3, -0.8)
     radiance = crop_divisible(scene.radiance, ratio)
     skip = ("noise", "digitising")
@@ -60,7 +61,8 @@ def test_a_look_keeps_the_mean_times_its_light_and_the_contrast_that_it_says(
     light: float, contrast: float, softness_px: float
 ) -> None:
     radiance = torch.rand(36, 44, generator=torch.Generator().manual_seed(0))
-    fy, fx = torch.fft.fftfreq(36), torch.fft.rfftfreq(44)
+    fy = torch.fft.fftfreq(36)
+    fx = torch.fft.rfftfreq(44)
     made = looked(torch.fft.rfft2(radiance), Look(light, contrast, softness_px), fy, fx)
     found = torch.fft.irfft2(made, s=radiance.shape)
     assert float(found.mean()) == pytest.approx(light * float(radiance.mean()), rel=1e-4)

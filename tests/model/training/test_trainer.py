@@ -51,7 +51,8 @@ def train(
 
 
 def test_a_conditioned_run_moves_every_part_and_what_it_makes_of_a_sensor(tmp_path: Path) -> None:
-    before, after = Trainer(VARIANT, TrainingRecipe(steps=8), conditioned=True), train(tmp_path, conditioned=True)
+    before = Trainer(VARIANT, TrainingRecipe(steps=8), conditioned=True)
+    after = train(tmp_path, conditioned=True)
     moved = {
         name.split(".")[0]: not torch.equal(value, after.network.state_dict()[name])
         for name, value in before.network.state_dict().items()
@@ -134,7 +135,8 @@ def test_nan_batches_stop_the_run_and_touch_no_weight(tmp_path: Path) -> None:
 
 
 def test_one_nan_batch_is_skipped_and_the_run_goes_on(tmp_path: Path) -> None:
-    trainer, seen = Trainer(VARIANT, TrainingRecipe(steps=6, batch=3)), []
+    trainer = Trainer(VARIANT, TrainingRecipe(steps=6, batch=3))
+    seen = []
     schedule = Schedule(1, report=lambda *_: seen.append(copies(trainer)))
     trainer.run(poisoned(frozenset({2})).batches, tmp_path / "c", schedule)
     moved = [not all(map(torch.equal, one, other)) for one, other in pairwise(seen)]
@@ -161,7 +163,8 @@ def test_ctrl_c_finishes_the_step_and_leaves_a_checkpoint_of_it(number: int, tmp
     with pytest.raises(KeyboardInterrupt):
         trainer.run(source().batches, tmp_path / "checkpoint.safetensors", Schedule(1, report=report))
     assert trainer.step == 4
-    resumed, unbroken = train(tmp_path, resume=True), train(tmp_path / "b")
+    resumed = train(tmp_path, resume=True)
+    unbroken = train(tmp_path / "b")
     assert all(map(torch.equal, copies(resumed), copies(unbroken)))
 
 
@@ -207,7 +210,8 @@ def test_fine_tuning_starts_from_the_weights_given(tmp_path: Path) -> None:
 
 
 def test_in_float32_the_network_is_the_plain_one_and_in_bfloat16_its_body_is_rounded() -> None:
-    network, image = ConvBEERS(VARIANT), torch.rand(2, 1, 13, 21, generator=torch.Generator().manual_seed(0))
+    network = ConvBEERS(VARIANT)
+    image = torch.rand(2, 1, 13, 21, generator=torch.Generator().manual_seed(0))
     plain = network(image)
     rounded = network(image, bfloat16=True)
     assert not torch.equal(rounded, plain)
@@ -218,7 +222,8 @@ def test_in_float32_the_network_is_the_plain_one_and_in_bfloat16_its_body_is_rou
 def test_a_run_goes_on_in_the_other_format_and_the_loss_with_it(first: Precision, tmp_path: Path) -> None:
     """Begun on one processor and resumed on another."""
     other: Precision = "float32" if first == "bfloat16" else "bfloat16"
-    checkpoint, seen = tmp_path / "checkpoint.safetensors", list[tuple[int, float]]()
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    seen = list[tuple[int, float]]()
     recipe = TrainingRecipe(steps=40, batch=3, warm_up_steps=2, learning_rate=3e-3)
 
     def note(step: int, terms: Mapping[str, float], _: Speed) -> None:

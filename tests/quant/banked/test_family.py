@@ -47,7 +47,8 @@ def weights_of(made: BankedConvBEERS) -> Weights:
 
 @pytest.fixture(scope="module", params=[1, 2])
 def pair(request: pytest.FixtureRequest) -> tuple[BankedConvBEERS, Family]:
-    made, scale = network(request.param), int(request.param)
+    made = network(request.param)
+    scale = int(request.param)
     images = [bank_results(textured(48, 48, k), bank_of_vector(each), each, scale) for k, each in enumerate(SENSORS)]
     middle = bank_of_vector((0.0, 0.0, 0.0, 0.0))
     return made, quantise_family(weights_of(made), middle, Remade(images.__getitem__, len(images)))
@@ -83,7 +84,8 @@ def test_points_and_saturated_edges_are_corrected_as_far_as_in_float(
     with torch.inference_mode():
         wanted = made(torch.from_numpy(image), told_of(torch.tensor([vector]))).clamp(0, 1).numpy()
     found = run(open_session(host_model(core_of(family, vector), {})), image)
-    bank, most = bank_of_vector(vector), np.abs(wanted - image).max()
+    bank = bank_of_vector(vector)
+    most = np.abs(wanted - image).max()
     reach = LARGEST * bank.unit / bank.gain
     assert vector != SENSORS[0] or most > 1.3 * reach
     assert np.abs(found - wanted).max() < 0.3 * most
@@ -95,7 +97,8 @@ def test_a_float_network_rounded_as_its_file_errs_as_that_does(
     pair: tuple[BankedConvBEERS, Family], vector: tuple[float, ...]
 ) -> None:
     made, family = pair
-    image, told = 0.3 + 0.3 * textured(46, 58, 9), told_of(torch.tensor([vector]))
+    image = 0.3 + 0.3 * textured(46, 58, 9)
+    told = told_of(torch.tensor([vector]))
     stream, *inner = (torch.from_numpy(each)[:, None, None] for each in map_steps(family, weights_of(made)))
     with torch.inference_mode():
         plain = made(torch.from_numpy(image), told)
@@ -112,7 +115,8 @@ def test_the_steps_of_maps_turn_float_weights_into_the_files(pair: tuple[BankedC
     stream, *inner = map_steps(family, weights_of(made))
     convolutions = {op.name: op for op in family.core.convolutions}
     for k, read in enumerate(inner):  # what the steps were not found by
-        op, given = convolutions[f"body.{k}.second"], made.state_dict()[f"body.{k}.second.weight"].numpy()
+        op = convolutions[f"body.{k}.second"]
+        given = made.state_dict()[f"body.{k}.second.weight"].numpy()
         bits = op.weight_frac_bits + family.core.frac_bits[op.input] - family.core.frac_bits[op.output]
         wanted = (given * (read * 2.0**bits / stream[:, None])[:, :, None, None]).clip(-128, 127)
         assert np.sqrt(np.square(op.weight - wanted).mean()) < 1  # of 127; without levelling tens
@@ -121,7 +125,8 @@ def test_the_steps_of_maps_turn_float_weights_into_the_files(pair: tuple[BankedC
 def test_the_file_is_what_its_integers_ask_for_and_the_reference_gives_the_same(
     pair: tuple[BankedConvBEERS, Family],
 ) -> None:
-    core, image = core_of(pair[1], SENSORS[0]), textured(30, 34, 5)
+    core = core_of(pair[1], SENSORS[0])
+    image = textured(30, 34, 5)
     file = host_model(core, {"precision": "int8 legal"})
     assert encoding_faults(file) == []
     again = read_core(file)
@@ -146,7 +151,8 @@ def test_a_body_finer_by_its_gain_makes_what_it_makes_at_a_gain_of_one(
     pair: tuple[BankedConvBEERS, Family], vector: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Far from int8's ends, but for rounding: the image, filters and biases agree on the gain."""
-    image, bank = 0.4 + 0.02 * textured(46, 58, 3), bank_of_vector(vector)
+    image = 0.4 + 0.02 * textured(46, 58, 3)
+    bank = bank_of_vector(vector)
     own = run(open_session(host_model(core_of(pair[1], vector), {})), image)
     monkeypatch.setattr("beers_deploy.model.bank.GAINS", (1.0, 1.0))
     plain = run(open_session(host_model(core_of(pair[1], vector), {})), image)
@@ -202,13 +208,18 @@ def test_words_of_another_network_are_refused(pair: tuple[BankedConvBEERS, Famil
 
 def test_tiles_give_the_whole_images_result(pair: tuple[BankedConvBEERS, Family]) -> None:
     """Mirrored borders reach no farther inside than the halo."""
-    file, image = host_model(core_of(pair[1], SENSORS[1]), {}), textured(96, 80, 6)
-    session, tiling = open_session(file), tiling_of(file)
-    whole, halo = run(session, image), tiling.halo_px
+    file = host_model(core_of(pair[1], SENSORS[1]), {})
+    image = textured(96, 80, 6)
+    session = open_session(file)
+    tiling = tiling_of(file)
+    whole = run(session, image)
+    halo = tiling.halo_px
     assert tiling.lattice_px == pair[0].variant.scale
     for top, left in ((0, 0), (32, 24), (64, 48)):
-        bottom, right = top + 32, left + 32
-        above, before = max(top - halo, 0), max(left - halo, 0)
+        bottom = top + 32
+        right = left + 32
+        above = max(top - halo, 0)
+        before = max(left - halo, 0)
         tile = run(session, np.ascontiguousarray(image[..., above : bottom + halo, before : right + halo]))
         kept = tile[..., top - above : bottom - above, left - before : right - before]
         np.testing.assert_array_equal(kept, whole[..., top:bottom, left:right])

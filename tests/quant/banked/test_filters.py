@@ -35,7 +35,8 @@ def sums(image: np.ndarray, own: Bank) -> np.ndarray:
 def textured(rows: int, columns: int, seed: int = 0) -> np.ndarray:
     """Ground as a sensor sees it, from a twentieth to nearly all of full scale: (1, 1, rows, columns) float32."""
     generator = np.random.default_rng(seed)
-    fy, fx = np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns)[None, :]
+    fy = np.fft.fftfreq(rows)[:, None]
+    fx = np.fft.rfftfreq(columns)[None, :]
     frequency = np.hypot(fy, fx)
     falling = np.fft.rfft2(generator.standard_normal((rows, columns))) * np.exp(-5 * frequency) / (frequency + 0.02)
     ground = np.asarray(np.fft.irfft2(falling, (rows, columns)))
@@ -88,9 +89,11 @@ def test_the_weights_are_int8_and_near_the_filters(vector: tuple[float, ...]) ->
 @given(VECTOR)
 def test_the_mean_of_the_copies_is_what_the_filter_gives(vector: tuple[float, ...]) -> None:
     """To a fraction of a step on ground of all scales, so that rounding the weights costs less than the result's."""
-    own, image = bank_of_vector(vector), textured(90, 101)
+    own = bank_of_vector(vector)
+    image = textured(90, 101)
     centred = np.lib.stride_tricks.sliding_window_view(image[0, 0].astype(np.float64), (SIDE_PX, SIDE_PX))
-    found, read = sums(image, own)[0], [kernel for kernel, _ in channels()]
+    found = sums(image, own)[0]
+    read = [kernel for kernel, _ in channels()]
     for kernel in range(1, COARSE + 1):
         known = own.kernels[-1] / WIDE if kernel == COARSE else own.kernels[kernel]
         wanted = own.gain * UNIT_STEPS * np.einsum("ijkl,kl->ij", centred, known)
@@ -108,8 +111,10 @@ def test_copies_are_rounded_at_places_spread_over_a_step() -> None:
 
 
 def test_at_half_resolution_the_same_filters_meet_the_same_pixels() -> None:
-    own, image = bank_of_vector((0.3, -0.4, 0.1, 0.2)), textured(32, 36)
-    fine, coarse = whole_bank(own, 1, 1), whole_bank(own, 2, 1)
+    own = bank_of_vector((0.3, -0.4, 0.1, 0.2))
+    image = textured(32, 36)
+    fine = whole_bank(own, 1, 1)
+    coarse = whole_bank(own, 2, 1)
     assert fine.frac_bits == coarse.frac_bits
     planes = split_planes(image)
     blocks = planes.reshape(1, 4, 16, 2, 18, 2).transpose(0, 1, 3, 5, 2, 4).reshape(1, 16, 16, 18)

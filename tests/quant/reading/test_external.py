@@ -60,7 +60,8 @@ def stating(key: str, value: str) -> Damage:
 
 
 def test_the_same_network_apart_and_whole_computes_the_same(saved: Path) -> None:
-    whole, apart = load_onnx(saved.parents[1] / "whole.onnx"), load_onnx(saved)
+    whole = load_onnx(saved.parents[1] / "whole.onnx")
+    apart = load_onnx(saved)
     assert apart.graph.initializer == whole.graph.initializer
     expected, result = (run(open_session(model, 1), IMAGE) for model in (whole, apart))
     np.testing.assert_array_equal(result, expected)
@@ -142,7 +143,8 @@ def test_constants_of_nodes_are_not_looked_for(saved: Path) -> None:
 
 
 def test_a_digest_tells_networks_apart_that_differ_in_the_file_beside_alone(saved: Path) -> None:
-    before, own = network_sha256(saved), sha256(saved)
+    before = network_sha256(saved)
+    own = sha256(saved)
     assert before != own
     beside = saved.parent / "weights.bin"
     beside.write_bytes(beside.read_bytes()[::-1])

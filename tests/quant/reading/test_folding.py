@@ -84,7 +84,9 @@ def test_weights_of_16_bits_become_float32(kind: int) -> None:
 
 def test_names_and_what_is_said_of_a_network_stay() -> None:
     model = made([conv(), node("Identity", "c", to="i"), node("Relu", "i"), conv("c", "z")], outputs=("y", "z"))
-    model.graph.node[0].name, model.graph.node[2].name = "", "c"  # the first is named by its output, were it free
+    # the first is named by its output, were it free
+    model.graph.node[0].name = ""
+    model.graph.node[2].name = "c"
     helper.set_model_props(model, {"variant": "mine"})
     short = simplest(model, "a.onnx")
     assert [v.name for v in (*short.graph.input, *short.graph.output)] == ["x", "y", "z"]

@@ -73,7 +73,9 @@ def test_the_same_nodes_in_use_are_folded(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["dropout", "normalisation"])
 def test_no_command_runs_it(name: str, tmp_path: Path) -> None:
-    path, image, out = tmp_path / "network.onnx", tmp_path / "image.tif", tmp_path / "out.tif"
+    path = tmp_path / "network.onnx"
+    image = tmp_path / "image.tif"
+    out = tmp_path / "out.tif"
     path.write_bytes(TRAINING[name].SerializeToString())
     tifffile.imwrite(image, np.full((4, 40, 50), 900, np.uint16), photometric="minisblack", planarconfig="separate")
     int8 = tmp_path / "int8.onnx"

@@ -61,7 +61,8 @@ class Row:
 
     def add(self, kind: str, *others: onnx.TensorProto | str, **attributes: Any) -> "Row":
         """One more, and what it reads behind the last result: constants, and tensors by name."""
-        feeds, name = [self.tensor], f"t{len(self.nodes)}"
+        feeds = [self.tensor]
+        name = f"t{len(self.nodes)}"
         for other in others:
             feeds.append(other if isinstance(other, str) else f"{name}.{len(feeds)}")
             if not isinstance(other, str):
@@ -138,7 +139,9 @@ class Builder(Row):
 
     def __init__(self, draw: Any) -> None:
         super().__init__()
-        self.draw, self.channels, self.at = draw, 1, Fraction(1)
+        self.draw = draw
+        self.channels = 1
+        self.at = Fraction(1)
         self.skips: dict[Fraction, tuple[str, int]] = {}
 
     def number(self, least: int, most: int) -> int:
@@ -153,7 +156,8 @@ class Builder(Row):
         self.channels = channels
 
     def conv(self, stride: int = 1) -> None:
-        kernel, dilation = self.number(1, 4), self.number(1, 2)
+        kernel = self.number(1, 4)
+        dilation = self.number(1, 2)
         extent = (kernel - 1) * dilation + 1
         pads = self.pads(self.number(max(extent - stride, 0), extent - 1))
         self.convolve(kernel, strides=[stride] * 2, dilations=[dilation] * 2, pads=pads)
@@ -163,7 +167,8 @@ class Builder(Row):
         self.conv(self.number(2, 3))
 
     def pool(self) -> None:
-        extent, kind = self.number(2, 4), self.draw(st.sampled_from(["MaxPool", "AveragePool"]))
+        extent = self.number(2, 4)
+        kind = self.draw(st.sampled_from(["MaxPool", "AveragePool"]))
         counted = {"count_include_pad": 1} if kind == "AveragePool" else {}
         self.add(kind, kernel_shape=[extent] * 2, strides=[2, 2], pads=self.pads(extent - 2), **counted)
         self.at /= 2
@@ -313,13 +318,15 @@ def spans(size_px: int, kept_px: int, halo_px: int) -> list[tuple[int, int, int,
 
 def check_tiles(model: onnx.ModelProto, image: np.ndarray, all_cells: tuple[int, ...], short_px: int = 0) -> None:
     """Tiles of so many lattice cells give the whole image (1, C, H, W) bit for bit; the halo may be too short."""
-    tiling, session = tiling_of(model), open_session(any_size(model), 1)
+    tiling = tiling_of(model)
+    session = open_session(any_size(model), 1)
     more = [(0, -n % tiling.lattice_px) for n in image.shape[2:]]
     image = np.pad(image, ((0, 0), (0, 0), *more), mode="edge")
     expected = result_of(session, image)
     assert expected.shape == (1, tiling.channels_out, *(int(n * tiling.scale) for n in image.shape[2:]))
     for cells in all_cells:
-        kept_px, rows = cells * tiling.lattice_px, []
+        kept_px = cells * tiling.lattice_px
+        rows = []
         sides = [spans(size, kept_px, tiling.halo_px - short_px) for size in image.shape[2:]]
         for top, bottom, low, high in sides[0]:
             row = []

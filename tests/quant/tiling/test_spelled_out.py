@@ -21,7 +21,8 @@ from tests.quant.tiling.small_networks import graph, whole
 
 def exported(network: nn.Module, any_size: bool, folder: Path, opset: int = 17) -> onnx.ModelProto:
     """As torch's own exporter leaves it."""
-    path, axes = folder / "network.onnx", {2: "H", 3: "W"}
+    path = folder / "network.onnx"
+    axes = {2: "H", 3: "W"}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.onnx.export(

@@ -41,7 +41,8 @@ def detector(
         about: metadata; None leaves one out.
     """
     given = {"names": NAMES, "task": "detect", "stride": 32, "imgsz": [64, 64], **about}
-    sizes, names = ",".join(map(str, answer.shape)), [f"output{i}" for i in range(outputs)]
+    sizes = ",".join(map(str, answer.shape))
+    names = [f"output{i}" for i in range(outputs)]
     last = "sum" if cut is None else "suppressed"
     results = "".join(f"{name} = Identity({last})\n" for name in names)
     model = onnx.parser.parse_model(f"""<ir_version: 8, opset_import: ["": 17]>

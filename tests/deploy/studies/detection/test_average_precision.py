@@ -47,7 +47,8 @@ def drawn(rng: np.random.Generator, count: int, ties: bool = False, ignored: flo
         near[:, 2:] = np.maximum(near[:, 2:], near[:, :2] + 1)
         named = np.where(rng.random(len(again)) < 0.8, truth.classes[again], rng.integers(0, 3, len(again)))
         false = boxes(rng, int(rng.integers(0, 6)))
-        corners, classes = np.vstack([near, false.corners]), np.concatenate([named, false.classes])
+        corners = np.vstack([near, false.corners])
+        classes = np.concatenate([named, false.classes])
         passed = Boxes.of(truth.corners, truth.classes, ignored=rng.random(len(truth)) < ignored)
         pairs.append((passed, Boxes.of(corners, classes, rng.random(len(corners)).round(1 if ties else 12))))
     return pairs
@@ -73,7 +74,8 @@ def by_pycocotools(pairs: Pairs, size: str = "all") -> np.ndarray:
         evaluation = COCOeval(_table([t for t, _ in pairs]), _table([f for _, f in pairs]), "bbox")
         evaluation.params.maxDets = [1000]
         low, high = SIZES_PX[size]
-        evaluation.params.areaRng, evaluation.params.areaRngLbl = [[low**2, high**2]], [size]
+        evaluation.params.areaRng = [[low**2, high**2]]
+        evaluation.params.areaRngLbl = [size]
         evaluation.evaluate()
         evaluation.accumulate()
     found = evaluation.eval["precision"][:, :, :, 0, 0].mean(axis=1).T  # overlap, recall, class
@@ -98,7 +100,8 @@ def _table(images: Sequence[Boxes]) -> COCO:
 @given(SEEDS, st.integers(1, 8), st.booleans(), st.sampled_from(list(SIZES_PX)))
 def test_average_precision_is_that_of_pycocotools(seed: int, count: int, ties: bool, size: str) -> None:
     pairs = drawn(np.random.default_rng(seed), count, ties)
-    weights, number = np.ones((1, count), np.int64), list(SIZES_PX).index(size)
+    weights = np.ones((1, count), np.int64)
+    number = list(SIZES_PX).index(size)
     ours = [precisions(hits_of(pairs), kind, weights, number, 10)[0].mean(axis=-1) for kind in range(len(NAMES))]
     np.testing.assert_allclose(ours, by_pycocotools(pairs, size), rtol=0, atol=1e-12)
 
@@ -125,11 +128,13 @@ def test_precision_and_recall_are_those_of_what_is_left_at_a_confidence(seed: in
     pairs = drawn(np.random.default_rng(seed), 5)
     figures = scored(pairs, NAMES, confidence)
     left = hits_of([(truth, found[found.scores >= confidence]) for truth, found in pairs])
-    precision, recall = [], []
+    precision = []
+    recall = []
     for kind, objects in enumerate(left.objects[0].sum(axis=1)):
         if objects:
             mine = left.classes == kind
-            true, counted = left.hits[0, 0, mine].sum(), (~left.ignored[0, 0, mine]).sum()
+            true = left.hits[0, 0, mine].sum()
+            counted = (~left.ignored[0, 0, mine]).sum()
             precision.append(true / counted if counted else 1.0)
             recall.append(true / objects)
     expected = (np.mean(precision), np.mean(recall)) if recall else (np.nan, np.nan)

@@ -19,7 +19,8 @@ def drawn(rng: np.random.Generator, count: int) -> np.ndarray:
 @given(st.integers(0, 2**32 - 1))
 def test_an_overlap_is_that_of_the_pixels_they_cover(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    low, side = rng.integers(0, 10, (2, 2)), rng.integers(1, 10, (2, 2))
+    low = rng.integers(0, 10, (2, 2))
+    side = rng.integers(1, 10, (2, 2))
     corners = np.hstack([low, low + side]).astype(float)
     masks = np.zeros((2, 20, 20), bool)
     for mask, (left, top, right, bottom) in zip(masks, corners.astype(int), strict=True):
@@ -55,8 +56,11 @@ def test_suppression_keeps_the_best_and_no_more_than_300() -> None:
 @settings(max_examples=80)
 @given(SIDES, SIDES, st.integers(3, 8))
 def test_the_letterbox_takes_a_box_there_and_back(height: int, width: int, eighths: int) -> None:
-    height, width, size = 7 * height + 5, 7 * width + 6, 32 * eighths + 1
-    box, corners = Letterbox(height, width, size), np.array([[0, 0, width, height], [1.25, 2.5, width / 3, height]])
+    height = 7 * height + 5
+    width = 7 * width + 6
+    size = 32 * eighths + 1
+    box = Letterbox(height, width, size)
+    corners = np.array([[0, 0, width, height], [1.25, 2.5, width / 3, height]])
     there = box.to_input(corners)
     assert np.abs(box.to_image(there) - corners).max() < 0.01
     assert there.min() >= -1e-9
@@ -67,7 +71,9 @@ def test_the_letterbox_takes_a_box_there_and_back(height: int, width: int, eight
 @given(SIDES, SIDES, st.integers(3, 8))
 def test_pixels_go_where_the_letterbox_takes_their_box(height: int, width: int, eighths: int) -> None:
     """Of an image whose pixels say where they are."""
-    height, width, size = 3 * height + 40, 3 * width + 41, 32 * eighths + 1
+    height = 3 * height + 40
+    width = 3 * width + 41
+    size = 32 * eighths + 1
     y, x = np.mgrid[0:height, 0:width] + 0.5
     image = np.stack([x / width, y / height, np.full(x.shape, 0.5)], axis=2).astype(np.float32)
     box = Letterbox(height, width, size)

@@ -43,7 +43,8 @@ def test_suppression_inside_the_file_is_flagged_with_its_confidence(tmp_path: Pa
 
 def test_the_size_is_the_file_s_or_the_one_asked_for(tmp_path: Path) -> None:
     answer = raw((32, 32, 16, 8, 0.9, 0))
-    fixed, free = detector(tmp_path / "a.onnx", answer), detector(tmp_path / "b.onnx", answer, size_px="side")
+    fixed = detector(tmp_path / "a.onnx", answer)
+    free = detector(tmp_path / "b.onnx", answer, size_px="side")
     assert [open_detector(fixed, 1, asked).size_px for asked in (None, 64)] == [64, 64]
     assert [open_detector(free, 1, asked).size_px for asked in (None, 128)] == [64, 128]
     with pytest.raises(OptionError, match=r"side: expected 64, which a.onnx is fixed to, got 128"):
@@ -103,7 +104,8 @@ def test_no_more_than_300_boxes_are_given(tmp_path: Path) -> None:
 
 
 def test_a_class_is_found_by_its_letters_or_by_what_the_user_says() -> None:
-    labelled, detector = ("car", "Storage-Tank", "minibus", "Tree"), ("ship", "vehicle", "storagetank")
+    labelled = ("car", "Storage-Tank", "minibus", "Tree")
+    detector = ("ship", "vehicle", "storagetank")
     assert class_numbers(labelled, detector, {"car": "Vehicle"}).tolist() == [1, 2, -1, -1]
     given = parse_classes(" car = vehicle, Mini-Bus=vehicle ")
     assert class_numbers(("car", "minibus"), ("vehicle",), given).tolist() == [0, 0]

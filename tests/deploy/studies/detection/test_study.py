@@ -47,7 +47,10 @@ def bright(image: np.ndarray) -> np.ndarray:
     rows, columns = np.nonzero(image[0, 0] > 0.75)
     answer = np.zeros((1, 6, 21), np.float32)
     if len(rows):
-        left, top, right, bottom = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+        left = columns.min()
+        top = rows.min()
+        right = columns.max() + 1
+        bottom = rows.max() + 1
         answer[0, :5, 0] = (left + right) / 2, (top + bottom) / 2, right - left, bottom - top, 0.9
     return answer
 
@@ -72,7 +75,8 @@ def test_all_rows_are_shown_under_the_stretch_of_the_reference() -> None:
 
 def handmade(sites: int = 12, **found: int) -> Comparison:
     """Sites of one ship each, of which each row finds so many, and all surely."""
-    scenes, pair = [scene((30, 30, 90, 80), name=str(number)) for number in range(sites)], sensors("dior-high")
+    scenes = [scene((30, 30, 90, 80), name=str(number)) for number in range(sites)]
+    pair = sensors("dior-high")
     truths = [each.truth for each in scenes]
     boxes = {
         row: [truth if k < count else Boxes.of([], []) for k, truth in enumerate(truths)]

@@ -201,7 +201,8 @@ def test_who_can_know_a_sensor_says_so_and_what_depends_on_none_stays_as_it_is()
 def test_clipped_pixels_do_not_count() -> None:
     """Trap 17: above full scale the truth is unknown, in the reference as in the input."""
     one = pair()
-    reference, degraded = one.reference.copy(), one.degraded.copy()
+    reference = one.reference.copy()
+    degraded = one.degraded.copy()
     reference[3:9, 5:11], degraded[20:25, 5:11] = 4095, 4095
     restored = degraded.copy()
     before = fidelity_db(restored, reference, degraded)
@@ -244,7 +245,8 @@ def test_the_reference_without_noise_is_the_same_acquisition_otherwise() -> None
     assert np.array_equal(one.degraded, same.degraded)
     assert np.array_equal(one.reference, same.reference)
     assert one.noise_free is not None
-    noise, sensor = one.reference - one.noise_free, SENSORS[1]
+    noise = one.reference - one.noise_free
+    sensor = SENSORS[1]
     light = np.clip(one.noise_free / sensor.gain_dn_per_radiance, 0, None)
     variance = (sensor.alpha * light + sensor.beta) * sensor.gain_dn_per_radiance**2 + 1 / 12
     sound = one.reference < sensor.max_dn
@@ -301,7 +303,8 @@ def test_the_largest_bias_is_that_of_the_worst_image_with_its_sign() -> None:
 
 def test_clipped_pixels_and_the_offset_are_no_bias_and_black_has_none() -> None:
     level = np.full((40, 41), 500, np.float32)
-    restored, unclipped = level.copy(), np.ones(level.shape, bool)
+    restored = level.copy()
+    unclipped = np.ones(level.shape, bool)
     restored[15:20, 15:20], unclipped[15:20, 15:20] = 4095, False
     assert bias_percent(restored, level, unclipped) == 0
     assert bias_percent(restored, level) > 1

@@ -88,7 +88,8 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Swept:
         return lambda dn: dn + np.float32(1000 * sensor.mtf_nyquist)
 
     able = Method("able", half, BLIND, specialise)
-    folder, scene = tmp_path_factory.mktemp("scenes"), procedural_scene(500, 560, np.random.default_rng(5))
+    folder = tmp_path_factory.mktemp("scenes")
+    scene = procedural_scene(500, 560, np.random.default_rng(5))
     tifffile.imwrite(folder / "scene.tif", scene.radiance)
     rows = run_sweep([Method("half", half, BLIND), able], folder, PROFILE, REFERENCE, 0).rows
     return {table: {row.name: row for row in rows} for table, rows in by_table(rows).items()}, given
@@ -112,7 +113,8 @@ def test_a_network_that_can_know_the_sensor_knows_that_of_each_condition(swept: 
 
 
 def test_the_truth_pays_where_the_sensor_has_drifted(swept: Swept) -> None:
-    nominal, drifted = psnr(swept, "nominal"), psnr(swept, "MTF 3%")
+    nominal = psnr(swept, "nominal")
+    drifted = psnr(swept, "MTF 3%")
     assert nominal(TRUTH_KNOWN) == nominal(NOMINAL_KNOWN)
     assert drifted(TRUTH_KNOWN) > drifted(NOMINAL_KNOWN) + 1
     assert nominal("half") < nominal("degraded") - 5
@@ -120,7 +122,8 @@ def test_the_truth_pays_where_the_sensor_has_drifted(swept: Swept) -> None:
 
 def test_another_gain_is_told_to_the_chains_and_kept(swept: Swept) -> None:
     """The reference has the gain of the input, so brightness is no error of a method that knows no gains."""
-    nominal, dim = psnr(swept, "nominal"), psnr(swept, "dim")
+    nominal = psnr(swept, "nominal")
+    dim = psnr(swept, "dim")
     assert dim(NOMINAL_KNOWN) == dim(TRUTH_KNOWN)
     assert dim("degraded") == pytest.approx(nominal("degraded") + 3.1, abs=0.5)
 
@@ -196,7 +199,8 @@ def test_without_networks_there_are_no_gains() -> None:
 def test_the_command_sweeps_the_networks_alone_at_each_brightness(tmp_path: Path) -> None:
     scene = np.random.default_rng(0).integers(200, 1800, (500, 560)).astype(np.uint16)
     tifffile.imwrite(tmp_path / "scene.tif", scene)
-    found, methods = tmp_path / "found.json", "degraded,convbeers-xs"
+    found = tmp_path / "found.json"
+    methods = "degraded,convbeers-xs"
     done("evaluate", "--images", tmp_path, "--methods", methods, "--sweep", "--brightness", 0.1, "--json", found)
     whole, dim = (
         {row["name"]: row["figures"] for row in valid(found)["rows"] if row["table"] == f"sweep, PSNR{end}"}

@@ -59,7 +59,8 @@ def test_what_lacks_a_figure_or_was_published_is_not_on_the_front() -> None:
 
 
 def test_differences_are_paired_and_reach_less_far_than_the_sites_differ() -> None:
-    small, medium = made("small", 45.0, 2.0), made("medium", 45.5, 4.0)
+    small = made("small", 45.0, 2.0)
+    medium = made("medium", 45.5, 4.0)
     found = COMPARE.difference(medium, small)
     assert found.interval is not None
     assert found.value == pytest.approx(0.5)
@@ -70,14 +71,17 @@ def test_differences_are_paired_and_reach_less_far_than_the_sites_differ() -> No
 
 
 def test_the_same_pictures_do_not_differ_on_however_few_sites() -> None:
-    one, other = made("one", 45.0, 2.0), replace(made("one", 45.0, 2.0), name="other")
+    one = made("one", 45.0, 2.0)
+    other = replace(made("one", 45.0, 2.0), name="other")
     found = Comparison(("a",) * 6, 0).difference(one, other)
     assert (found.value, found.interval) == (0.0, (0.0, 0.0))
 
 
 def test_below_five_sites_values_decide_beyond_a_margin() -> None:
     few = Comparison(("a", "a", "b", "b", "c", "c"), 0)
-    one, better, alike = made("one", 45.0, 2.0), made("better", 45.2, 3.0), made("alike", 45.02, 3.0)
+    one = made("one", 45.0, 2.0)
+    better = made("better", 45.2, 3.0)
+    alike = made("alike", 45.02, 3.0)
     found = few.difference(better, one)
     assert found.interval is None
     assert verdict(found) == TOO_FEW

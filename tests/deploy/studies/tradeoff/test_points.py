@@ -74,7 +74,8 @@ def test_shipped_networks_come_in_both_precisions_with_the_sensors_profile() -> 
 
 
 def test_an_own_network_is_quantised_and_one_that_cannot_be_stays_float(tmp_path: Path) -> None:
-    path, said = float_file(tmp_path / "net.onnx"), list[str]()
+    path = float_file(tmp_path / "net.onnx")
+    said = list[str]()
     found = network_variants([str(path)], SENSOR, lambda file: file, said.append)
     assert [variant.precision for variant in found] == [FLOAT, INT8]
     found = network_variants([str(path)], SENSOR, refused, said.append)
@@ -106,7 +107,8 @@ def test_a_network_of_one_tile_size_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_fastest_tile_is_a_multiple_of_the_step_and_no_other_is_faster(variant: Variant) -> None:
-    found, radius = fastest_tile_px(variant, DPU, WHOLE), radius_px(variant)
+    found = fastest_tile_px(variant, DPU, WHOLE)
+    radius = radius_px(variant)
     assert found % TILE_STEP_PX == 0
     assert 2 * radius < found <= TILE_PX
 
@@ -154,7 +156,8 @@ def test_a_chain_on_a_boards_processor_takes_what_the_target_states_by_the_ratio
     chain = Variant("traditional-best")
     stated = Constant((10.0, 40.0), "inferred", "a test")
     tables = {**DPU.target.tables, "cpu": {**DPU.target.tables["cpu"], "chain_s_per_mpx": stated}}
-    board, swath = replace(DPU.target, tables=tables), Swath(1000, 2000)
+    board = replace(DPU.target, tables=tables)
+    swath = Swath(1000, 2000)
     latency = board_figures(Point(chain, board), swath, slower=3.0)["board latency"]
     assert latency.value == pytest.approx(2 * 3 * 20)
     assert latency.interval == pytest.approx((60, 240))
@@ -163,7 +166,8 @@ def test_a_chain_on_a_boards_processor_takes_what_the_target_states_by_the_ratio
 
 
 def test_what_was_measured_is_kept_by_what_it_depends_on(tmp_path: Path) -> None:
-    path, calls = tmp_path / "measurements.json", list[int]()
+    path = tmp_path / "measurements.json"
+    calls = list[int]()
 
     def measure() -> list[int]:
         calls.append(1)

@@ -120,7 +120,8 @@ def test_a_stopped_run_goes_on_and_says_the_same(
     kept = json.loads((out / "measurements.json").read_text())
     left = dict(list(kept["measurements"].items())[:2])
     (tmp_path / "measurements.json").write_text(json.dumps({**kept, "measurements": left}))
-    counts, score = list[bool](), Benchmark.score
+    counts = list[bool]()
+    score = Benchmark.score
 
     def counted(
         benchmark: Benchmark, restore: Restore, exact: Restore | None = None
@@ -164,7 +165,8 @@ def test_an_int8_file_is_made_once(folder: Path, tmp_path: Path) -> None:
 
 def test_two_boards_give_the_same_answer_in_either_order(folder: Path, study: tuple[Tradeoff, Path]) -> None:
     """The VCK190 is faster, and takes more power than this budget allows."""
-    boards, budget = ("vck190", "zcu104"), "latency<=60s,power<=20W"
+    boards = ("vck190", "zcu104")
+    budget = "latency<=60s,power<=20W"
     one, other = (studied(folder, study[1], board=each, budget=budget) for each in (boards, boards[::-1]))
     assert one.best is not None
     assert one.best.text["board"] == "zcu104"
@@ -226,7 +228,8 @@ def test_a_detector_is_shown_what_each_method_restored(folder: Path, tmp_path: P
     (tmp_path / "labels.json").write_text(json.dumps(labels))
     degraded = load_sensor("dior-medium")
     benchmark = Benchmark([], degraded, reference_for(degraded), None, 0)
-    looked, kept = Labelled.open(tmp_path, None, None, benchmark), Measurements(tmp_path / "measurements.json")
+    looked = Labelled.open(tmp_path, None, None, benchmark)
+    kept = Measurements(tmp_path / "measurements.json")
     figure = looked.figure(Point(Variant("as it is")), Method("as it is", lambda dn: dn, ""), kept)
     assert figure.unit == "%"
     assert 0 <= (figure.value or 0.0) <= 100
