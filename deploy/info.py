@@ -75,7 +75,8 @@ def info_row(image: Path, options: Options, target: TargetProfile, measure: bool
 
 def missing_words(raster: Raster) -> str:
     """Which pixels are missing: those of the nodata value, and those that a mask or alpha hides."""
-    hidden = [f"where its {'alpha' if raster.has_alpha else 'mask'} is 0"] if raster.veil else []
+    veil = "alpha" if raster.has_alpha else "mask"
+    hidden = [f"where its {veil} is 0"] if raster.veil else []
     valued = [] if raster.nodata is None else [f"{raster.nodata:g}"]
     return ", ".join([*valued, *hidden]) or "none"
 

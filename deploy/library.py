@@ -153,7 +153,8 @@ def restore(
             path = Path(image if isinstance(image, str | os.PathLike) else image.name)
             return _restore_path(path, replace(job.options, resume=resume, cog=cog), job, out)
         if out is not None or resume or cog:
-            name = "out" if out is not None else "cog" if cog else "resume"
+            asked = {"out": out is not None, "cog": cog, "resume": resume}
+            name = next(option for option, given in asked.items() if given)
             remedy = "save the result yourself"
             raise OptionError(name, expected="none beside an array", got="one", remedy=remedy)
         return _restore_any(image, job)

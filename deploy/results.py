@@ -88,6 +88,7 @@ class Table:
         """The whole as the schema of results documents wants it."""
         inputs = [each if isinstance(each, Input) else input_of(each) for each in self.inputs]
         checks = [check.to_json() for check in self.checks]
+        verdict = "passed" if self else "failed"
         document: dict[str, object] = {
             "schema": SCHEMA_NAME,
             "schema_version": SCHEMA_VERSION,
@@ -96,7 +97,7 @@ class Table:
             "arguments": {key: _plain(value) for key, value in self.arguments.items()},
             "inputs": [each._asdict() for each in inputs],
             "host": host(),
-            **({"verdict": "passed" if self else "failed", "checks": checks} if checks else {}),
+            **({"verdict": verdict, "checks": checks} if checks else {}),
             "rows": [
                 {
                     "table": row.table,

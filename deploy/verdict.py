@@ -269,7 +269,9 @@ def gate(
     if (allowed.metric_loss is None) < (metric is None):
         remedy = "name the metric, or leave that limit out"
         raise OptionError("metric", expected="one beside the limit metric_loss", got="none", remedy=remedy)
-    wanted = "psnr_drop_db" if allowed.psnr_drop_db is not None else "a metric" if metric else ""
+    wanted = "a metric" if metric else ""
+    if allowed.psnr_drop_db is not None:
+        wanted = "psnr_drop_db"
     own = samples_of(theirs.model, samples) if wanted and samples is not None else None
     _require_references(own, wanted)
     how: dict[str, Any] = {"sensor": known, "images": images, "patches": patches, "seed": seed, "metric": metric}

@@ -51,6 +51,7 @@ from beers_deploy.quant.passes.equalise import (
 from beers_deploy.quant.passes.fit_weights import fit_weights
 from beers_deploy.quant.passes.level import Chain, chain_ranges, largest_values, level
 from beers_deploy.quant.passes.lower import lower
+from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.passes.stream import (
     MAX_CHANNELS,
     STREAM_FRAC_BITS,
@@ -107,7 +108,7 @@ class Plan:
 
     `chain` is what is levelled besides the streams, or where there are none. What is calibrated and searched is the
     map in front of the network's `tail`, which is put behind it in the end: values of boxes that no object has would
-    outweigh all others. `pairs` is whether the last sum of a stream is computed as a half-LSB pair.
+    outweigh all others.
     """
 
     graph: Graph
@@ -115,7 +116,7 @@ class Plan:
     streams: list[Stream]
     chain: Chain
     shifts: Shifts
-    pairs: bool = True
+    passes: Passes = ALL
 
     def with_windows(self, frac_bits: int, images: Iterable[np.ndarray]) -> "Plan":
         """The result in windows over all that it is in float, finer by GAIN than its own scale of so many bits.
@@ -123,7 +124,8 @@ class Plan:
         Itself where something is added to the result, or no convolution writes it, or one of too many channels.
         """
         alone = self.ends.gains == 1 and not self.ends.adds_image
-        if not (alone and takes_gains(self.graph) and self.ends.outputs <= MAX_CHANNELS // 2):
+        finer = self.passes.dual_range and takes_gains(self.graph)
+        if not (alone and finer and self.ends.outputs <= MAX_CHANNELS // 2):
             return self
         low = np.array(np.inf)
         high = np.array(-np.inf)
@@ -143,7 +145,7 @@ class Plan:
 
     def paired(self, graph: Graph) -> Graph:
         """The graph with the half-LSB pair where that is wanted and possible; else itself."""
-        return half_lsb_pair(graph, STREAM_STEP) if self.pairs and self.streams else graph
+        return half_lsb_pair(graph, STREAM_STEP) if self.passes.half_lsb_pair and self.streams else graph
 
     def ended(self, graph: Graph) -> Graph:
         """The graph with windows or two gains where the result has them."""
@@ -177,7 +179,7 @@ def quantise_model(
     about: dict[str, str],
     shifts: Shifts = SHIFTS,
     tuning: "Tuning | None" = None,
-    pairs: bool = True,
+    passes: Passes = ALL,
     log: Log = no_log,
 ) -> Quantised:
     """Quantise a float network under the DPU's rules: int8, symmetric, per tensor, power-of-two scales.
@@ -190,7 +192,7 @@ def quantise_model(
         about: metadata of the files.
         shifts: the windows of the target.
         tuning: on what, how long and how fast the whole numbers are trained at last; None leaves them.
-        pairs: whether the residual stream's last sum is computed as a half-LSB pair.
+        passes: that reduce the error.
         log: is told each step.
 
     Raises:
@@ -198,9 +200,10 @@ def quantise_model(
     """
     network = read_network(model)
     graph = read_planes(network.graph)
-    ends = ends_of(network, 2 if network.adds_image and takes_gains(graph) else 1)
+    finer = passes.dual_range and network.adds_image and takes_gains(graph)
+    ends = ends_of(network, 2 if finer else 1)
     found = streams(graph)
-    plan = Plan(graph, ends, found, _chain(graph, ends, found), shifts, pairs)
+    plan = Plan(graph, ends, found, _chain(graph, ends, found), shifts, passes)
     core, final, last_sum = rounded(plan, patches.degraded, log)
     core = replace(core, ends=replace(core.ends, tail=network.tail))
     if tuning:
@@ -222,13 +225,15 @@ def quantise_model(
     return Quantised(host_model(core, about, fixed_tile_px(model)), core, relu_count(graph), final)
 
 
-def choose_frac_bits(graph: Graph, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL) -> dict[str, int]:
+def choose_frac_bits(
+    graph: Graph, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL, least_squares: bool = True
+) -> dict[str, int]:
     """Least-squares scale of every tensor of a plane-reading graph over images (1, C, H, W) in [0, 1].
 
     Tensors that must share a scale (`quant.graph.tied`) get that of least error in all of them together.
 
     Two passes, so images that can be passed over twice: the largest values, then the squared errors of the scales
-    around them.
+    around them. Without `least_squares` the scales of the first pass stay, in which nothing is clipped.
     """
     names = tensors(graph)
     shared = tied(graph)
@@ -241,6 +246,8 @@ def choose_frac_bits(graph: Graph, images: Iterable[np.ndarray], ends: Ends = ON
     for results in values_of(graph, names, images, ends):
         largest = np.maximum(largest, [float(np.abs(r).max()) for r in results])
     first = [unclipped_frac_bits(m) for m in together(largest, np.max)]
+    if not least_squares:
+        return {PLANES: PLANES_FRAC_BITS, **dict(zip(names, first, strict=True))}
     errors = np.zeros((len(names), CANDIDATES))
     for results in values_of(graph, names, images, ends):
         errors += [_errors(r[0], f) for r, f in zip(results, first, strict=True)]
@@ -258,7 +265,7 @@ def _errors(tensor: np.ndarray, first: int) -> np.ndarray:
 def rounded(plan: Plan, images: Remade[np.ndarray], log: Log = no_log) -> tuple[IntCore, Graph, frozenset[str]]:
     """A plan's graph in whole numbers, the float graph that was rounded, and the tensors of its last sum."""
     log("scale of each tensor")
-    frac_bits = choose_frac_bits(plan.graph, images, plan.ends)
+    frac_bits = choose_frac_bits(plan.graph, images, plan.ends, plan.passes.least_squares)
     plan = plan.without_large_sums(frac_bits).with_windows(frac_bits[CORRECTION], images)
     graph = _balanced(plan, frac_bits, images, log)
     paired = plan.paired(graph)
@@ -268,7 +275,12 @@ def rounded(plan: Plan, images: Remade[np.ndarray], log: Log = no_log) -> tuple[
         last_sum = frozenset(paired[-2].inputs)
     final = plan.ended(paired)
     log("rounding of the weights")
-    return fit_weights(final, plan.core(final, frac_bits), images, plan.shifts), final, last_sum
+    return _fitted(plan, final, plan.core(final, frac_bits), images), final, last_sum
+
+
+def _fitted(plan: Plan, graph: Graph, core: IntCore, images: Remade[np.ndarray]) -> IntCore:
+    """The core with its weights fitted, where the plan says so."""
+    return fit_weights(graph, core, images, plan.shifts) if plan.passes.fitted_weights else core
 
 
 def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], log: Log) -> Graph:
@@ -288,16 +300,17 @@ def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray],
         return crop_costs(host_model(built(tried)[1], {}), targets)
 
     def fitted(tried: Graph) -> Costs:
-        return crop_costs(host_model(fit_weights(*built(tried), images, plan.shifts), {}), targets)
+        return crop_costs(host_model(_fitted(plan, *built(tried), images), {}), targets)
 
     def searched(graph: Graph, copies: Copies) -> Graph:
         graph = plan.chain.scaled(graph, plan.chain.unscaled(frac_bits))
         graph = _equalised(graph, plan, trial, images, log) if plan.streams else graph
         graph = _levelled(graph, plan, trial, images, log, copies) if plan.chain.tensors else graph
-        return lower(graph, frac_bits | dict.fromkeys(plan.chain.tensors, STREAM_FRAC_BITS), fitted)
+        shared = frac_bits | dict.fromkeys(plan.chain.tensors, STREAM_FRAC_BITS)
+        return lower(graph, shared, fitted) if plan.passes.full_range_relu else graph
 
     graph = searched(plan.graph, {})
-    if plan.ends.offsets:
+    if plan.ends.offsets and plan.passes.copies:
         other, copies = with_copies(plan.graph, plan.chain.tensors, images, plan.ends)
         if copies:
             graph = min((graph, searched(other, copies)), key=lambda tried: float(fitted(tried)(None).sum()))
@@ -324,7 +337,10 @@ def _equalised(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray
         log(f"equalising the channels of residual stream {number + 1} of {len(plan.streams)}")
         if number:
             graph = equalise(graph, stream, 1 / first_guess(ranges[number], LEVELLING[0], 1.0))
-        graph = equalise(graph, stream, search(graph, stream, ranges[number], trial))
+        factors = first_guess(ranges[number], 0.0, 1.0)
+        if plan.passes.equalising:
+            factors = search(graph, stream, ranges[number], trial)
+        graph = equalise(graph, stream, factors)
     return graph
 
 

@@ -233,8 +233,9 @@ def _stored(path: Path) -> tuple[np.ndarray, np.ndarray]:
     except ValueError as error:
         expected = "a .npy or .npz file of numbers, or a folder of images"
         raise ImageError(str(path), expected=expected, got=str(error), remedy=REMEDY) from error
-    image = "image" if "image" in arrays else next(iter(arrays)) if len(arrays) == 1 else None
-    if image is None:
+    # One array alone may have any name.
+    image = next(iter(arrays)) if len(arrays) == 1 else "image"
+    if image not in arrays:
         got = ", ".join(arrays) or "no array"
         raise ImageError(str(path), expected="arrays named image and reference", got=got, remedy=REMEDY)
     return arrays[image], arrays.get("reference", NO_REFERENCE)

@@ -58,7 +58,11 @@ def _file_text(name: str | None) -> str:
         remedy = f"name one, such as {SENSOR}"
         raise OptionError("--toml", expected="the name of a profile beside it", got="none", remedy=remedy)
     _shown(name)
-    kind = "sensors" if name in sensor_names() else "scenes" if name in scene_names() else "targets"
+    kind = "targets"
+    if name in sensor_names():
+        kind = "sensors"
+    elif name in scene_names():
+        kind = "scenes"
     return profile_path(kind, name).read_text(encoding="utf-8")
 
 

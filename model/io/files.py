@@ -78,7 +78,11 @@ def _require_apart(outputs: list[Path], filled: list[Path], inputs: Iterable[Pat
 def require_regular(path: Path) -> None:
     """Refuse an output at which a folder, a link, a pipe or a device stands; a regular file or nothing may."""
     if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
-        got = "a symbolic link" if path.is_symlink() else "a folder" if path.is_dir() else "no regular file"
+        got = "no regular file"
+        if path.is_symlink():
+            got = "a symbolic link"
+        elif path.is_dir():
+            got = "a folder"
         raise _unwritable(path, got, expected="a regular file or a new name")
 
 

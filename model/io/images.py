@@ -28,6 +28,9 @@ FRAME_NUMBERS = re.compile(
 """The end of a name that tells frames of one site apart: _0034, _5dded5bc_23, _DJI_0005, _P1010012, _386690-220241,
 _2016_pre_1. Nothing else can be known by a name: the site is what it begins with."""
 
+READ_AS = {"L": "L", "LA": "L", "I;16": "I;16", "I": "I", "F": "F"}
+"""Pillow's modes, and that in which pixels of one band are taken; all others become RGB."""
+
 PACKED_BYTES = 1 << 30
 """Of a PNG or JPEG file."""
 
@@ -167,7 +170,7 @@ def _read_other(path: Path) -> np.ndarray:
             Image.open(io.BytesIO(read_whole(path, PACKED_BYTES)), formats=("PNG", "JPEG")) as image,
         ):
             _check_memory(path, image.width * image.height * len(image.getbands()))
-            mode = image.mode if image.mode in ("L", "I;16", "I", "F") else "L" if image.mode == "LA" else "RGB"
+            mode = READ_AS.get(image.mode, "RGB")
             return np.asarray(image if mode == image.mode else image.convert(mode))
     finally:
         Image.MAX_IMAGE_PIXELS = limit

@@ -5,7 +5,7 @@ file's own weights, all nodes must come out the same (`quant.encodings.encoding_
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -84,8 +84,13 @@ def _described(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
 
 def _require_small(said: object) -> None:
     """Numbers that size something are looked at before anything is made of them."""
-    for each in said.values() if isinstance(said, dict) else said if isinstance(said, list) else ():
-        _require_small(each)
+    parts: Iterable[object] = ()
+    if isinstance(said, dict):
+        parts = said.values()
+    elif isinstance(said, list):
+        parts = said
+    for part in parts:
+        _require_small(part)
     if isinstance(said, int | float) and not abs(said) <= LARGEST:
         raise ValueError(f"a size of {said}")
 

@@ -224,7 +224,9 @@ def _shifted(meant: Compute) -> Iterator[Explanation]:
 def _channel_like(right: np.ndarray, channel: np.ndarray, place: int) -> int | None:
     """The number of the channel of `right` (N, C, H, W) that is the same as one (N, H, W); `place` where it is."""
     same = (right == channel[:, None]).all((0, 2, 3))
-    return place if same[place] else int(same.argmax()) if same.any() else None
+    if same[place]:
+        return place
+    return int(same.argmax()) if same.any() else None
 
 
 def _flipped(values: np.ndarray, place: tuple[int, ...], bit: int) -> np.ndarray:

@@ -33,6 +33,7 @@ from beers_deploy.quant.passes.equalise import (
     search,
     with_room,
 )
+from beers_deploy.quant.passes.selection import Passes
 from beers_deploy.quant.passes.stream import (
     STREAM_FRAC_BITS,
     Stream,
@@ -234,17 +235,13 @@ def test_the_fine_gain_is_believed_until_its_end() -> None:
 
 
 def test_all_passes_lose_far_less_than_none(
-    float_onnx: onnx.ModelProto, patches: Patches, quantised: Quantised, monkeypatch: pytest.MonkeyPatch
+    float_onnx: onnx.ModelProto, patches: Patches, quantised: Quantised
 ) -> None:
     def mae(made: Quantised) -> float:
         return compare(open_session(float_onnx), open_session(made.host), patches.pairs).mae
 
-    monkeypatch.setattr("beers_deploy.quant.quantise.takes_gains", lambda _: False)
-    monkeypatch.setattr(
-        "beers_deploy.quant.quantise.search", lambda _g, _s, ranges, _trial: first_guess(ranges, 0.0, 1.0)
-    )
-    monkeypatch.setattr("beers_deploy.quant.quantise.fit_weights", lambda _graph, core, *_: core)
-    rounded = quantise_model(float_onnx, patches, {}, pairs=False)
+    few = Passes(half_lsb_pair=False, dual_range=False, equalising=False, fitted_weights=False)
+    rounded = quantise_model(float_onnx, patches, {}, passes=few)
     last = rounded.core.ops[-1]
     assert isinstance(last, IntConv)
     assert len(last.weight) == 1

@@ -100,12 +100,17 @@ def place(network: Network, dpu: Dpu) -> Placement:
     broken = [judge(op, dpu, network.quantised) if part == "dpu-core" else () for op, part in pairs]
     if not network.quantised:
         parts = _left_to_the_host(network, parts, broken)
-    devices: list[Device] = [
-        "host" if part != "dpu-core" else "CPU" if found else "DPU" for part, found in zip(parts, broken, strict=True)
-    ]
+    devices = [_device(part, bool(rules)) for part, rules in zip(parts, broken, strict=True)]
     subgraphs = _subgraphs(network.operations, devices)
     nodes = tuple(map(PlacedNode, network.operations, parts, devices, broken, subgraphs))
     return Placement(nodes, tuple(_cuts(network, nodes)), "" if network.quantised else FLOAT_NOTE)
+
+
+def _device(part: Part, breaks_rules: bool) -> Device:
+    """Where an operation of a part runs."""
+    if part != "dpu-core":
+        return "host"
+    return "CPU" if breaks_rules else "DPU"
 
 
 def _parts(network: Network) -> list[Part]:

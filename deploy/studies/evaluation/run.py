@@ -225,7 +225,11 @@ def _seen(pairs: Sequence[NamedPair], sensor: Sensor, name: str, strict: bool, l
 def _inputs(asked: Iterable[str], weights: Path | None, scenes: Path | None, pairs: Path | None) -> Iterator[Path]:
     """The files that the figures rest on: networks, weights of LPIPS, scenes or pairs."""
     yield from (path for path in (*map(Path, asked), *([weights] if weights else [])) if path.is_file())
-    folders = [scenes] if scenes else [pairs / role for role in ("degraded", "reference")] if pairs else []
+    folders: list[Path] = []
+    if scenes:
+        folders = [scenes]
+    elif pairs:
+        folders = [pairs / "degraded", pairs / "reference"]
     yield from (path for folder in folders for path in list_images(folder))
 
 

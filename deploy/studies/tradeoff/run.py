@@ -216,11 +216,12 @@ def _method_name(variant: Variant) -> str:
 
 
 def _text(point: Point, method: Method) -> dict[str, str]:
+    halo = "exact" if point.halo_px is None else str(point.halo_px)
     return {
         "board": point.board.name if point.board else "this machine",
         "configuration": point.dpu.name if point.dpu else "none",
         "tile": str(point.tile_px) if point.dpu else "none",
-        "halo": ("exact" if point.halo_px is None else str(point.halo_px)) if point.dpu else "none",
+        "halo": halo if point.dpu else "none",
         "method": point.variant.method,
         "precision": point.variant.precision,
         "sensor": method.sensor_known,
