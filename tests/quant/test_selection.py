@@ -23,7 +23,7 @@ def waves(phase: int) -> np.ndarray:
     rows, columns = np.mgrid[:48, :36] / 40
     image = 0.3 + 0.1 * np.sin(7 * rows + phase) * np.cos(5 * columns)
     image[5::16, 7::12] = 1.0
-    return image.astype(np.float32)[None, None]
+    return np.asarray(image, np.float32)[None, None]
 
 
 @pytest.fixture(scope="module")
