@@ -40,8 +40,13 @@ from beers_deploy.studies.evaluation.pairs import simulate_pairs
 
 LIKE, REFERENCE = (load_sensor(name).nominal() for name in ("pleiades-degraded", "pleiades-reference"))
 MTF_RANGE = (0.02, 0.12)
-RATIO, SCENES, LEAST_SIDE_PX, TARGET_PX, LEAN_DEG = 4, 12, 140, 120, 7.0
-DARK, BRIGHT = 30.0, 160.0
+RATIO = 4
+SCENES = 12
+LEAST_SIDE_PX = 140
+TARGET_PX = 120
+LEAN_DEG = 7.0
+DARK = 30.0
+BRIGHT = 160.0
 
 
 def main() -> None:

@@ -29,9 +29,12 @@ from beers_deploy.restoration.detectors.look import BandFaults, look_at_detector
 from beers_deploy.restoration.source import ArraySource, Raster
 
 LIKE = load_sensor("pleiades-degraded").nominal()
-LEAST_SIDE_PX, SIDE_PX, RATIOS = 140, 2048, (4, 2)
+LEAST_SIDE_PX = 140
+SIDE_PX = 2048
+RATIOS = (4, 2)
 STACKED = 4
-LIGHTS, NOISES = (1.0, 1.0, 0.25, 0.05, 2.0), (1.0, 1.0, 0.2)
+LIGHTS = (1.0, 1.0, 0.25, 0.05, 2.0)
+NOISES = (1.0, 1.0, 0.2)
 Image = np.ndarray
 
 

@@ -29,9 +29,14 @@ from beers_deploy.profiles.response import NYQUIST, MtfTable
 from beers_deploy.profiles.sensor import Instrument
 
 LIKE = load_sensor("pleiades-degraded").nominal()
-OVERSAMPLING, SIDE_PX, MARGIN_PX = 4, 112, 24
-DARK, BRIGHT, LEANS_DEG = 50.0, 120.0, (2.0, 25.0)
-CONTRASTS, UNEVEN = (0.04, 0.07, 0.12), (0.05, 0.1)
+OVERSAMPLING = 4
+SIDE_PX = 112
+MARGIN_PX = 24
+DARK = 50.0
+BRIGHT = 120.0
+LEANS_DEG = (2.0, 25.0)
+CONTRASTS = (0.04, 0.07, 0.12)
+UNEVEN = (0.05, 0.1)
 SETS = ((1, 40), (4, 24), (8, 20), (14, 17))
 """How many edges of how many pixels' length are measured together."""
 SHOWN = (0.1, 0.25, NYQUIST)

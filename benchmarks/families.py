@@ -52,13 +52,17 @@ FAMILIES = "4x64@2,8x48@2,2x32@2,u48@2,u64@2,d8x64@2,d8x96@2,k2x32@2,k3x48@2,u32
 NAME = re.compile(r"(?P<kind>[udkawb]?)(?:(?P<blocks>\d+)x)?(?P<features>\d+)(?:@(?P<scale>\d+))?")
 CORRECTIONS = ("second", "project", "tail", "end")
 """What is added to something else starts small, so that a network starts near the identity."""
-SENSOR, REFERENCE = "pleiades-degraded", "pleiades-reference"
-BATCH, PATCH_PX, RATE = 16, 64, 5e-4
+SENSOR = "pleiades-degraded"
+REFERENCE = "pleiades-reference"
+BATCH = 16
+PATCH_PX = 64
+RATE = 5e-4
 HELD_OUT_EVERY = 4
 """Of so many sites one is not trained on."""
 HELD_OUT = 64
 """Patches of 128 x 128 that all are judged by."""
-CONFIGURATIONS, TILES_PX = ("C32B6", "C64B5"), (128, 176, 256, 320, 640)
+CONFIGURATIONS = ("C32B6", "C64B5")
+TILES_PX = (128, 176, 256, 320, 640)
 LOSS = RestorationLoss(LossWeights(lpips=0.0, fft=0.0))
 
 

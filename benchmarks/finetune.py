@@ -25,7 +25,8 @@ from beers_deploy.quant.passes.tune import Descent, Sample, Tuning
 from beers_deploy.quant.samples import Remade
 from examples.networks import UNet
 
-PATCHES, SIDE_PX = 4, 128
+PATCHES = 4
+SIDE_PX = 128
 
 
 class Added(nn.Sequential):

@@ -29,7 +29,9 @@ from rasterio.windows import Window
 from beers_deploy.bench.swath import parse_size
 from beers_deploy.restoration.source import open_source
 
-BLOCK_PX, STRIP_PX, TIFF = 1024, 640, "TIFF"
+BLOCK_PX = 1024
+STRIP_PX = 640
+TIFF = "TIFF"
 COUNTED = """
 import resource, sys
 from beers_deploy.cli import app

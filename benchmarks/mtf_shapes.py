@@ -24,14 +24,20 @@ from beers_deploy.restoration.method import Restore
 from beers_deploy.studies.evaluation.methods import TRADITIONAL, method_named, method_without_network
 from beers_deploy.studies.evaluation.pairs import NamedPair, simulate_pairs
 
-CONTRAST, SEED, BORDER_PX, OVERSAMPLINGS = 0.07, 0, 57, (4, 2)
-MID, WIDTH, DEPTH = 0.22, 0.12, 0.10
+CONTRAST = 0.07
+SEED = 0
+BORDER_PX = 57
+OVERSAMPLINGS = (4, 2)
+MID = 0.22
+WIDTH = 0.12
+DEPTH = 0.10
 """Frequency and width in cycles per pixel of the sag and of the bulge, and their depth."""
 CUTOFFS = (0.5, 3.0)
 """Of a circular pupil, in cycles per pixel: the one that gives the contrast lies between."""
 
 Curve = NDArray[np.float64]
-DEGRADED, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+DEGRADED = load_sensor("pleiades-degraded")
+REFERENCE = load_sensor("pleiades-reference")
 
 
 def main() -> None:

@@ -21,8 +21,10 @@ from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.evaluation.pairs import NamedPair, oversamplings_of, simulate_pairs
 from beers_deploy.studies.evaluation.scores import bias_percent
 
-CROP_PX, SEED = 700, 0
-DEGRADED, REFERENCE = load_sensor(SENSOR), load_sensor("pleiades-reference")
+CROP_PX = 700
+SEED = 0
+DEGRADED = load_sensor(SENSOR)
+REFERENCE = load_sensor("pleiades-reference")
 
 
 def main() -> None:

@@ -18,9 +18,13 @@ from beers_deploy.model.metrics.edge_curve import edge_in
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.metrics.uneven_edge import EdgeLine
 
-SHARE_LOW, SHARE_HIGH = 0.1, 0.9
-BINS_PER_PX, HALF_PX = 4, 6
-PERCENTILES, ZOOM, GAP_PX = (0.5, 99.5), 2, 6
+SHARE_LOW = 0.1
+SHARE_HIGH = 0.9
+BINS_PER_PX = 4
+HALF_PX = 6
+PERCENTILES = (0.5, 99.5)
+ZOOM = 2
+GAP_PX = 6
 
 
 class Box(NamedTuple):

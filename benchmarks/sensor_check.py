@@ -31,7 +31,8 @@ from beers_deploy.restoration.source import ArraySource, Raster, open_source
 from beers_deploy.studies.evaluation.methods import profile_of
 
 BASE = load_sensor("pleiades-degraded")
-THIRD, SIDE_PX = 4 / 3, 2048
+THIRD = 4 / 3
+SIDE_PX = 2048
 Image = np.ndarray
 
 

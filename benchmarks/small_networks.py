@@ -35,11 +35,15 @@ from examples.networks import ESPCN, Classifier, DnCNN
 from examples.samples import batches_of
 
 SIDE_PX = {"dncnn": 64, "espcn": 64, "classifier": 32}
-SEPARABLE, DENSE = 32, 16
+SEPARABLE = 32
+DENSE = 16
 """Features of networks with depthwise convolutions, and of those without."""
-BATCH, RATE, FAST = 4, 2e-3, 5e-3
+BATCH = 4
+RATE = 2e-3
+FAST = 5e-3
 """Samples of a step, and learning rates: of all networks, and of those that the image itself passes through."""
-TUNED, MORE = Way("beers-deploy, fine-tuned", False, OURS), 8
+TUNED = Way("beers-deploy, fine-tuned", False, OURS)
+MORE = 8
 """Quantised and fine-tuned, in this process, on so many times the samples."""
 ADAROUND_STEPS = "1000"
 """A layer's, Quark's own default."""

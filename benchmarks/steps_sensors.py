@@ -25,14 +25,19 @@ from beers_deploy.studies.evaluation.pairs import NamedPair, simulate_pairs
 from beers_deploy.studies.evaluation.sweep import NOMINAL, conditions
 
 NETWORKS = "convbeers-half-xs,convbeers-xs,convbeers-half,convbeers-s"
-BRIGHTNESSES, FULL_SCALE, SEED, BORDER_PX, OVERSAMPLINGS = (1, 0.25, 0.05), 4095, 0, 57, (4, 2)
+BRIGHTNESSES = (1, 0.25, 0.05)
+FULL_SCALE = 4095
+SEED = 0
+BORDER_PX = 57
+OVERSAMPLINGS = (4, 2)
 AROUND = {
     "neither": Around(consistency=False, exposure=False),
     "consistency": Around(consistency=True, exposure=False),
     "exposure": Around(consistency=False, exposure=True),
     "both": Around(consistency=True, exposure=True),
 }
-DEGRADED, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+DEGRADED = load_sensor("pleiades-degraded")
+REFERENCE = load_sensor("pleiades-reference")
 
 Scores = dict[str, dict[str, dict[str, float]]]
 """Mean PSNR in dB by brightness and sensor, by network, and by what is around it."""

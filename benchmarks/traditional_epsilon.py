@@ -35,12 +35,17 @@ from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.sensor import Instrument, noise_from_snr
 from beers_deploy.studies.evaluation.pairs import NamedPair, simulate_pairs
 
-BORDER_PX, SIDE_PX, OVERSAMPLING, SEED = 24, 150, 4, 0
+BORDER_PX = 24
+SIDE_PX = 150
+OVERSAMPLING = 4
+SEED = 0
 LEAST_SIDE_PX = 300
 """Of a photograph: smaller ones leave too few pixels within the border."""
 
 BRIGHTNESSES = (1, 1 / 4, 1 / 20)
-FLAT_MEAN, FLAT_CONTRAST, FLAT_LEAST = 80.0, 0.3, 1.0
+FLAT_MEAN = 80.0
+FLAT_CONTRAST = 0.3
+FLAT_LEAST = 1.0
 """Radiance in W/m2/sr/um and share of the contrast of a scene that is not stretched, and its least radiance."""
 
 EPSILONS = np.array([0.0, *(1e-5 * 2.0 ** np.arange(17))])

@@ -33,7 +33,10 @@ from beers_deploy.model.training.trainer import Precision, Trainer
 from beers_deploy.model.variants import VARIANTS
 from beers_deploy.profiles import load_sensor
 
-BATCH, PATCH_PX, TURNS, SIMULATED = 8, 96, 5, 256
+BATCH = 8
+PATCH_PX = 96
+TURNS = 5
+SIMULATED = 256
 LOSS = LossWeights(lpips=0.0)
 
 

@@ -17,7 +17,8 @@ import tempfile
 from importlib.util import find_spec
 from pathlib import Path
 
-CPUID, UNKNOWN = b"\x0f\xa2", b"\x0f\x0b"
+CPUID = b"\x0f\xa2"
+UNKNOWN = b"\x0f\x0b"
 
 HANDLER = r"""
 #define _GNU_SOURCE

@@ -255,7 +255,11 @@ def _installation() -> Iterator[str]:
             yield f"{package}: not installed"
 
 
-RESTORE, INT8, BOARDS, STUDY, TRAIN = "Restore", "Quantise and judge", "Boards", "Study", "Sensors and training"
+RESTORE = "Restore"
+INT8 = "Quantise and judge"
+BOARDS = "Boards"
+STUDY = "Study"
+TRAIN = "Sensors and training"
 """Panels of the help."""
 
 COMMANDS: dict[str, tuple[Callable[..., None], str, str]] = {

@@ -10,9 +10,11 @@ from typing import Any, TypeVar
 
 from beers_deploy.profiles.errors import MachineError, optional
 
-ANSWER_S, JOIN_S = 10, 30
+ANSWER_S = 10
+JOIN_S = 30
 """How long a scheduler may take to answer, and a first worker to be there."""
-POLL_S, WORKERLESS_S = 5, 60
+POLL_S = 5
+WORKERLESS_S = 60
 """While a result is waited for: how often workers are counted, and how long there may be none."""
 PACKAGES = ("beers-deploy", "numpy", "onnxruntime", "scipy")
 """Workers compute with these, so every worker must have the versions of this process: they decide the last bits."""

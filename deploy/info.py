@@ -32,7 +32,8 @@ from beers_deploy.restoration.source import Raster, open_source
 from beers_deploy.restoration.steps import keeps_pixels
 
 HEADER = "the file's own header"
-PROJECTED, GEOGRAPHIC = 3072, 2048
+PROJECTED = 3072
+GEOGRAPHIC = 2048
 """Keys of GeoTIFF that hold an EPSG code (OGC 19-008r4, annex D)."""
 RUNS = 3
 UNTIMED = "no tile was timed here: --measure times some"

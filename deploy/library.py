@@ -45,7 +45,8 @@ from beers_deploy.restoration.tiles.lazy import restore_lazily
 from beers_deploy.restoration.tiles.rows import restore_array
 from beers_deploy.results import Table
 
-NETWORK, TRADITIONAL = "network", "traditional"
+NETWORK = "network"
+TRADITIONAL = "traditional"
 
 
 def restore(

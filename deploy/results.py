@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-SCHEMA_NAME, SCHEMA_VERSION = "beers-deploy/results", 2
+SCHEMA_NAME = "beers-deploy/results"
+SCHEMA_VERSION = 2
 SCHEMA_PATH = Path(__file__).parent / "schema" / "results-2.json"
 
 

@@ -31,13 +31,15 @@ from beers_deploy.profiles.response import NYQUIST
 from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
 
-FILTERS, SIDE_PX = 4, 7
+FILTERS = 4
+SIDE_PX = 7
 """7 x 7 holds 98.6 to 99.95 % of a filter's energy, and is the largest square that the window of a DPU takes."""
 
 GRID = 64
 """Frequencies along an axis. Finer ones move no tap by more than 3e-4 of a filter's largest."""
 
-EPSILON_PER_SIGMA, STEP = 1.32, 4.0
+EPSILON_PER_SIGMA = 1.32
+STEP = 4.0
 """Regularisation at Nyquist of W_1, over sigma, and from each filter to the next."""
 
 UNIT = 20.0

@@ -19,8 +19,10 @@ from beers_deploy.profiles.errors import OptionError
 if TYPE_CHECKING:
     import numpy as np
 
-CHANNELS, SIDE_PX = 32, 3
-ACTIVATION, WEIGHT = 255, 127
+CHANNELS = 32
+SIDE_PX = 3
+ACTIVATION = 255
+WEIGHT = 127
 """Two neighbouring products of these make 64 770: twice what int16 holds."""
 RESULT = 200
 """What the sum of a whole window becomes in 8 bits."""
@@ -87,7 +89,8 @@ def _largest_convolution() -> bytes:
     return bytes(model.SerializeToString())
 
 
-COMM, CPUINFO = Path("/proc/self/comm"), Path("/proc/cpuinfo")
+COMM = Path("/proc/self/comm")
+CPUINFO = Path("/proc/cpuinfo")
 """Linux: what runs this process, and one block of lines for each core."""
 WINDOWS_KEY = r"HARDWARE\DESCRIPTION\System\CentralProcessor\0"
 

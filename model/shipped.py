@@ -8,7 +8,8 @@ SHIPPED = Path(__file__).parent / "weights"
 
 VARIANT = "convbeers-s"
 
-DETECTOR, DETECTOR_INT8 = SHIPPED / "detector.onnx", SHIPPED / "detector-int8.onnx"
+DETECTOR = SHIPPED / "detector.onnx"
+DETECTOR_INT8 = SHIPPED / "detector-int8.onnx"
 """What finds vehicles, ships, aircraft and tanks of drawn scenes: in float32, and under the DPU's rules."""
 
 INT8 = "-int8"

@@ -14,7 +14,8 @@ Kernels = Literal["cut", "fitted"]
 """How the filters in front of a network become kernels of 7 x 7: cut out of the whole, or fitted. Networks behind the
 second kind were trained on many curves of the MTF (`model.curves`)."""
 
-BANK_PLANES, SENSOR_VALUES = 5, 4
+BANK_PLANES = 5
+SENSOR_VALUES = 4
 """What a head behind a bank reads: the image and four planes of each pixel, and the numbers of a sensor vector."""
 
 

@@ -160,10 +160,12 @@ def _contrast_at_nyquist(response: Response) -> tuple[float, float]:
 
 READING = 0.005
 """How far a table may lie above what the square detector leaves: half the last digit of two. The detector counts."""
-MOST_FREQUENCIES, LEAST_STEP = 1000, 1e-4
+MOST_FREQUENCIES = 1000
+LEAST_STEP = 1e-4
 SAMPLES_PER_PX = (2.0, 64.0)
 """With fewer than two, nothing is said of the frequencies that sampling by the sensor folds back."""
-FILE_SIDE, KEPT_SIDE = 4096, 1024
+FILE_SIDE = 4096
+KEPT_SIDE = 1024
 """Samples a side: of a file, and of what is kept of it, which a recipe holds as text."""
 CUT_SHARE = 1e-6
 """Of the absolute weight: rows and columns at the rim that hold less are cut. No frequency changes by more than twice

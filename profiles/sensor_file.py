@@ -43,7 +43,8 @@ def sensor_names() -> list[str]:
     return shipped_names("sensors")
 
 
-BLIND, BLIND_PROFILE = "blind", "pleiades-variable"
+BLIND = "blind"
+BLIND_PROFILE = "pleiades-variable"
 """The name of a sensor that is not known, and the profile in whose ranges it then counts to be."""
 
 
@@ -234,7 +235,8 @@ CHECKS: dict[str, Check] = {
     ),
 }
 """What each constant may be, both ends of a range: in words, and what to do otherwise."""
-LEAST, MOST = 1e-12, 1e12
+LEAST = 1e-12
+MOST = 1e12
 """Of any constant that is not 0: beyond lies no instrument, and powers of it no float."""
 
 

@@ -16,7 +16,8 @@ from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import PLANES, Activation, Add, Conv, Graph, Mul, Op, Window, ties_scales
 from beers_deploy.quant.graph.operations import SIX, OneInput
 
-INT8_MIN, INT8_MAX = -128, 127
+INT8_MIN = -128
+INT8_MAX = 127
 CANDIDATES = 6
 """Scales tried: the one that clips nothing, and the finer ones after it."""
 

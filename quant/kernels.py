@@ -27,8 +27,10 @@ from onnx import TensorProto, helper, numpy_helper
 from beers_deploy.quant.onnx_file import constants
 from beers_deploy.quant.untrusted import opset_of, refused
 
-INT16_MAX, INT16_MIN = 32767, -32768
-MIDDLE, UINT8_MAX = 128, 255
+INT16_MAX = 32767
+INT16_MIN = -32768
+MIDDLE = 128
+UINT8_MAX = 255
 
 
 class Way(StrEnum):

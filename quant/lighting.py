@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from beers_deploy.profiles.sensor import Instrument
 
-DARKEST, DARK = 1 / 20, 1 / 4
+DARKEST = 1 / 20
+DARK = 1 / 4
 """Factors on the radiance of patches lit as on a dark day, log-uniform between the two."""
 
 BRIGHTEST_PIXELS = 0.999

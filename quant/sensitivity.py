@@ -41,7 +41,8 @@ IN_INT8 = ".in_int8"
 
 WORST = 4
 BEYOND_DN = (1, 2, 4, 8, 16, 32, 64)
-ROUNDING, CLIPPING = 1.4, 1.6
+ROUNDING = 1.4
+CLIPPING = 1.6
 """std / MAE, 1.25 for a Gaussian: up to the first it is rounding, beyond the second clipping."""
 
 
@@ -256,7 +257,8 @@ def sizes_row(spread: Spread) -> Row:
     return Row("error sizes", "INT8 against float", figures)
 
 
-MUCH_DB, SAME_CLASS = 0.2, 0.99
+MUCH_DB = 0.2
+SAME_CLASS = 0.99
 """From here on, or below, a network has lost so much that it is worth asking where."""
 
 

@@ -87,10 +87,17 @@ def _rates(kernels: Mapping[str, Kernel]) -> dict[str, float]:
     return {name: kernel.amount / statistics.median(taken_s[name][1:]) for name, kernel in kernels.items()}
 
 
-REFERENCES, COVERED_PX, WINDOW_PX, MEMBERS, SIDE_PX = 24, 74, 23, 45, 5
+REFERENCES = 24
+COVERED_PX = 74
+WINDOW_PX = 23
+MEMBERS = 45
+SIDE_PX = 5
 """Of a tile of the first pass at standard quality; its groups are REFERENCES^2."""
-GROUPS, PIXELS = REFERENCES**2, SIDE_PX**2
-TRANSFORM_PX, PRODUCT_PX, CALLS = 512, 512, 400
+GROUPS = REFERENCES**2
+PIXELS = SIDE_PX**2
+TRANSFORM_PX = 512
+PRODUCT_PX = 512
+CALLS = 400
 
 
 def _box_sums(generator: torch.Generator) -> Kernel:
@@ -185,7 +192,8 @@ def _large_product(generator: torch.Generator) -> Kernel:
     return Kernel(lambda: factor @ factor, 2 * PRODUCT_PX**3)
 
 
-TEXT_BYTES, FARTHEST_BITS = 1 << 17, 17
+TEXT_BYTES = 1 << 17
+FARTHEST_BITS = 17
 
 
 def _decoding(_: torch.Generator) -> Kernel:
@@ -222,7 +230,8 @@ KERNELS: Mapping[str, Callable[[torch.Generator], Kernel]] = {
 """One for each kind of work, and one for each resource that is none."""
 
 
-WIDTH_PX, HEIGHT_PX = 13600, 9016
+WIDTH_PX = 13600
+HEIGHT_PX = 9016
 QUALITY = "standard"
 """What the pipeline takes when nothing is said."""
 RUNS = 5

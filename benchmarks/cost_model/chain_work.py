@@ -43,9 +43,13 @@ Work = Counter[str]
 """Amount of each kind."""
 
 FLOAT_BYTES = 4
-CALLS_A_TILE, CALLS_A_WINDOW_ROW, CALLS_A_PATCH_PIXEL = 150, 12, 10
+CALLS_A_TILE = 150
+CALLS_A_WINDOW_ROW = 12
+CALLS_A_PATCH_PIXEL = 10
 """Operations of `nl_bayes._tile`, of a turn of `window_distances`, and of two turns of `overlap_add`."""
-MATRIX_PASSES, MATRIX_GATHERS, IMAGE_PASSES = 8, 4, 30
+MATRIX_PASSES = 8
+MATRIX_GATHERS = 4
+IMAGE_PASSES = 30
 """Readings and writings of a group's covariance outside its factorisation, in order and where it was chosen by a
 mask, and of the image outside NL-Bayes."""
 

@@ -31,7 +31,9 @@ STEP = 1e-5
 SHIFTS = np.outer((0.0, -0.4, 0.4), np.eye(len(NAMES))[NAMES.index("memory_efficiency")])
 """Where the fit begins, from the start: where one part of a layer outruns another the cost has kinks, and the nearest
 low point need not be the lowest."""
-ENOUGH, STUCK, MOST = 1e-5, 1e5, 200
+ENOUGH = 1e-5
+STUCK = 1e5
+MOST = 200
 """A step that gains less than this share of the cost is the last, and so is one that needs this much damping, or the
 one with this number: along a kink steps grow ever smaller."""
 

@@ -41,7 +41,8 @@ from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Figure, Row, number, predicted, published, unavailable
 
-TABLE, LAYERS = "bench", "layers"
+TABLE = "bench"
+LAYERS = "layers"
 CHAIN = "chain_s_per_mpx"
 """In a target's [cpu]: time of the traditional pipeline for 10^6 pixels on all cores."""
 PAPER = "ConvBEERS paper, table of the VCK190 benchmark, 13600 x 9016"

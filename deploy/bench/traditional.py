@@ -20,7 +20,8 @@ from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
 from beers_deploy.profiles import Sensor
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted
 
-CROP_PX, CROPS = 256, 3
+CROP_PX = 256
+CROPS = 3
 
 
 @dataclass(frozen=True)

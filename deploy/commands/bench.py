@@ -37,7 +37,8 @@ BOARD_ONLY = (
     "layers",
 )
 HOST_ONLY = ("threads",)
-BOARD, HOSTS = f"{DEFAULT_TARGET}{MODEL_SUFFIX}", ("host", "host-cpu")
+BOARD = f"{DEFAULT_TARGET}{MODEL_SUFFIX}"
+HOSTS = ("host", "host-cpu")
 BOARDS = ", ".join(board_names())
 PREDICTED = "No board was used: the DPU's figures come from a cost model, its power from an assumption."
 LAYERS = "--layers shows where the time goes, layer by layer; --json holds it always."

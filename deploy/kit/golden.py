@@ -33,9 +33,12 @@ from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px
 from beers_deploy.quant.untrusted import times
 from beers_deploy.results import Input, Table
 
-SCHEMA, SCHEMA_VERSION = "beers-deploy/golden", 1
+SCHEMA = "beers-deploy/golden"
+SCHEMA_VERSION = 1
 TILE_PX = 64
-INDEX, NETWORK, PICTURE = "golden.json", "int8.onnx", "image.npy"
+INDEX = "golden.json"
+NETWORK = "int8.onnx"
+PICTURE = "image.npy"
 SCENE_PX = 8
 """Pixels of the drawn scene for one of an image."""
 

@@ -19,8 +19,10 @@ from typing import Any
 
 import numpy as np
 
-F, HERE = np.float32, Path(__file__).parent
-BLOCK, NEAR = 8, 8
+F = np.float32
+HERE = Path(__file__).parent
+BLOCK = 8
+NEAR = 8
 """Pixels: the side of a block of the consistency step, and the radius of the near part of its blur."""
 S = json.loads((HERE / "host.json").read_text(encoding="utf-8"))
 UNITS = {1: S["unit"], **{int(factor): unit for factor, unit in S["exposures"].items()}}

@@ -27,7 +27,8 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # before it is loaded: from
 import onnxruntime as ort
 
 POWER_SAMPLE_S = 0.05
-WARM_UP_CALLS, LATENCY_CALLS = 5, 20
+WARM_UP_CALLS = 5
+LATENCY_CALLS = 20
 
 
 def main() -> int:

@@ -24,7 +24,8 @@ from beers_deploy.quant.onnx_file import load_onnx, metadata
 from beers_deploy.report.page import Report, Section, render
 from beers_deploy.results import Table
 
-SCHEMA, SCHEMA_VERSION = "beers-deploy/record", 1
+SCHEMA = "beers-deploy/record"
+SCHEMA_VERSION = 1
 NAMES = "record.json", "record.html", "record.cdx.json"
 LIMITATIONS = (
     "Nothing here has run on a board: figures of a board are predicted by a cost model, or published.",

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from beers_deploy.quant.sensitivity import Spread  # which would load torch for a plot
 
 PX_PER_INCH = 72
-FONT_PX, TITLE_PX = 13, 15
+FONT_PX = 13
+TITLE_PX = 15
 
 LIGHT = {
     "ink": "#1b1f24", "soft": "#5b6470", "line": "#d5dae0", "page": "#ffffff",
@@ -114,7 +115,8 @@ def round_values(low: float, high: float, most: int, *, logarithmic: bool) -> li
     return values
 
 
-SVG, XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
+SVG = "http://www.w3.org/2000/svg"
+XLINK = "http://www.w3.org/1999/xlink"
 
 
 def svg_of(figure: "Figure", name: str, titles: Mapping[str, str] | None = None) -> Markup:
@@ -186,9 +188,13 @@ class Curve:
 
 CURVES_PX = (960, 370)
 CURVES_FRAME = {"left": 0.065, "right": 0.985, "wspace": 0.12}
-ABOVE_PX, BELOW_PX, X_TITLE_PX, LEGEND_PX = 40, 81, 37, 6
+ABOVE_PX = 40
+BELOW_PX = 81
+X_TITLE_PX = 37
+LEGEND_PX = 6
 """Of panels: room above and below; and from below how high the axis' title and the legend stand."""
-LEGEND_NAMES, LEGEND_ROW_PX = 4, 22
+LEGEND_NAMES = 4
+LEGEND_ROW_PX = 22
 """In a row of the legend, at most, and how high a row is."""
 
 

@@ -15,10 +15,16 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.restoration.index_files import read_xml
 from beers_deploy.restoration.source import NODATA_TAG, Raster, Tag, usable_nodata
 
-PIXEL_SCALE, TIE_POINTS, TRANSFORMATION, KEYS, POLYNOMIALS = 33550, 33922, 34264, 34735, 50844
-RASTER_TYPE, POINTS = 1025, 2
+PIXEL_SCALE = 33550
+TIE_POINTS = 33922
+TRANSFORMATION = 34264
+KEYS = 34735
+POLYNOMIALS = 50844
+RASTER_TYPE = 1025
+POINTS = 2
 """The key that says whether a raster is of areas or of points, and what it says of points."""
-OFFSETS, SCALES = (2, 3), (7, 8)
+OFFSETS = (2, 3)
+SCALES = (7, 8)
 """Of lines and samples, among the numbers of rational polynomials."""
 
 

@@ -24,7 +24,8 @@ MAGIC = (
 )
 """How the files begin that an index may name: none of them names others."""
 
-VRT, VRT_PATHS = "VRTDataset", {"sourcefilename", "sourcedataset"}
+VRT = "VRTDataset"
+VRT_PATHS = {"sourcefilename", "sourcedataset"}
 MOST_BITS = 16
 PIXELS = "data_file_path"
 DIMAP_PATHS = {PIXELS, "component_path"}

@@ -15,12 +15,18 @@ from beers_deploy.model.family import RANGES
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Figure, measured
 
-MANY_AT_ENDS, FAR, FLAT, FEW = 0.9, 0.5, 0.001, 1000
+MANY_AT_ENDS = 0.9
+FAR = 0.5
+FLAT = 0.001
+FEW = 1000
 """Refused: more of the results at an end of full scale, a mean moved by more of it, less contrast left; of fewer
 pixels nothing is."""
 SOME_AT_ENDS = 0.05
 """Told: more of the results at an end."""
-MEAN_KEPT, LEAST_MOVE, SCATTER, DARK_MOVE = 0.015, 0.0003, 2.0, RANGES["sigma_dark"][1] / 2
+MEAN_KEPT = 0.015
+LEAST_MOVE = 0.0003
+SCATTER = 2.0
+DARK_MOVE = RANGES["sigma_dark"][1] / 2
 """Told: a mean moved by more than the sum of these shares: of itself; of full scale (1 DN of 12 bits); of the
 standard error of the mean, since a border of zeros changes a small image; and of full scale, for the dark part.
 

@@ -243,7 +243,8 @@ def require_codec(compression: Compression) -> None:
         raise MissingExtraError("compression", expected="an installed codec", got=got, remedy=remedy) from error
 
 
-PLAIN, COG = "out.tif", "cog.tif"
+PLAIN = "out.tif"
+COG = "cog.tif"
 ToCog = Callable[[Path, Path], None]
 """Writes a TIFF again, cloud-optimised."""
 

@@ -40,24 +40,32 @@ from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.source import Source
 
-WINDOW_PX, ACROSS = 512, 4
+WINDOW_PX = 512
+ACROSS = 4
 """Side of a window, and how many at most lie side by side, and below one another."""
 EDGES = 20
 """Enough along an axis: more would take time and tell no more."""
-STEP_PX, CELL_PX, FEW_WINDOWS = 4, (8, 4), 4
+STEP_PX = 4
+CELL_PX = (8, 4)
+FEW_WINDOWS = 4
 """Every so many rows are searched for edges, by such cells; an image of few windows may have few: it is searched as
 thoroughly as by `characterise`."""
-CANDIDATES, CANDIDATES_OF_WINDOW = 6000, 400
+CANDIDATES = 6000
+CANDIDATES_OF_WINDOW = 400
 """Steepest places along an axis that are compared with plain edges, of all windows and of each at least."""
-FITS, FITS_OF_WINDOW = 128, 8
+FITS = 128
+FITS_OF_WINDOW = 8
 """Squares along an axis that are fitted, of all windows and of each at least: 1 ms each (measured)."""
 WINDOWS_AT_ONCE = 4
 """Whose squares are fitted together: fewer at a time take longer."""
-DRAWS, SEED = 20, 0
+DRAWS = 20
+SEED = 0
 """Of sensors from a profile with ranges."""
-NOISE_KEPT, BLUR_KEPT = 1.25, 1.15
+NOISE_KEPT = 1.25
+BLUR_KEPT = 1.15
 """Factors of the noise's variance, and of the MTF, that an interval may lie off by before anything is said."""
-SMOOTH, QUIET_PERCENT = 0.45, 10.0
+SMOOTH = 0.45
+QUIET_PERCENT = 10.0
 """Of the noise told: less in a tenth of the blocks is the work of a filter. By chance they hold 0.6 of it."""
 ABOVE = 0.001
 """Share of pixels above full scale that no image of the sensor has."""

@@ -31,12 +31,15 @@ NODATA_TAG = 42113
 CARRIED_TAGS = (33550, 33922, 34264, 34735, 34736, 34737, 42112, NODATA_TAG, 50844)
 """GeoTIFF's scale, tie points, transformation and keys; GDAL's metadata and nodata; rational polynomials."""
 
-RESTORED, RESTORED_BY = "beers-deploy restore", "RESTORED_BY"
+RESTORED = "beers-deploy restore"
+RESTORED_BY = "RESTORED_BY"
 """What a restored image names as its software, and the item of its metadata where it is cloud-optimised."""
-RGB, RGB_BANDS = 2, ("red", "green", "blue")
+RGB = 2
+RGB_BANDS = ("red", "green", "blue")
 """TIFF's photometric interpretation of bands of these colours."""
 
-SIDE_PX, BANDS = 1 << 22, 1 << 12
+SIDE_PX = 1 << 22
+BANDS = 1 << 12
 """An image has a plan of its tiles before any pixel is read: a header alone must not make that large."""
 
 Tag = tuple[int, int, int, Any, bool]

@@ -34,7 +34,8 @@ from beers_deploy.restoration.tiles.rows import RestoredRow
 STRIP_PX = 128
 """Rows read at a time."""
 
-FIXED_BYTES, BYTES_PER_COLUMN = 100_000_000, 40_000
+FIXED_BYTES = 100_000_000
+BYTES_PER_COLUMN = 40_000
 """Of memory that the pipeline takes, and more for each pixel of a row: some 700 rows, in several float32 copies.
 Measured at 400 and 1200 columns: 75 MB and 30 kB."""
 

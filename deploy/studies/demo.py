@@ -39,15 +39,22 @@ from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.report.page import Picture, Report, Section
 from beers_deploy.verdict import gate
 
-BITS, SIDE_PX, GATE_PATCHES = 12, 640, 12
-CROP_PX, ZOOM, LARGEST_PX = 110, 3, 1280
+BITS = 12
+SIDE_PX = 640
+GATE_PATCHES = 12
+CROP_PX = 110
+ZOOM = 3
+LARGEST_PX = 1280
 SWATH_PX = (13600, 9016)
 """Width and height of the paper's swath."""
 WITHIN_S = 60.0
 """What a swath may take, for the smallest board to be named."""
 FILES = ("report.html", "float.onnx", "int8.onnx", "core.onnx", "restored.tif", "before-after.png")
 """What a run leaves in its folder; core.onnx is the network in the board's encoding."""
-INPUT, TRADITIONAL, INT8, REFERENCE = "degraded input", "traditional", f"{VARIANT}, INT8", "reference"
+INPUT = "degraded input"
+TRADITIONAL = "traditional"
+INT8 = f"{VARIANT}, INT8"
+REFERENCE = "reference"
 
 SWATH_CAPTION = (
     "The traditional pipeline is measured on crops of this image and scaled; the paper's rows are what it printed "

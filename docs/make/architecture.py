@@ -14,7 +14,8 @@ INSTALLED = "beers_deploy"
 PACKAGES = ("deploy", "quant", "model", "profiles")
 WHOLE = ("quant", "profiles")
 """Drawn as one box each."""
-BEGIN, END = "<!-- packages: made by docs/make/architecture.py -->\n", "<!-- end of packages -->\n"
+BEGIN = "<!-- packages: made by docs/make/architecture.py -->\n"
+END = "<!-- end of packages -->\n"
 
 
 def box_of(name: str) -> str:

@@ -14,7 +14,8 @@ from beers_deploy.studies.stress.bit_flips import SETS, flip_curves_svg, flip_ro
 from beers_deploy.studies.stress.networks import open_subject
 
 DOCS = Path(__file__).parents[1]
-PAGE, PICTURE = DOCS / "explanation" / "bit-flips.md", DOCS / "assets" / "bit-flips.svg"
+PAGE = DOCS / "explanation" / "bit-flips.md"
+PICTURE = DOCS / "assets" / "bit-flips.svg"
 VARIANTS = ("convbeers-s", "convbeers-half", "convbeers-xs")
 SOURCE = Calibration(load_sensor("pleiades-degraded"), None, patches=6, patch_px=96, seed=0)
 BOARD = "vck190"

@@ -21,8 +21,11 @@ from beers_deploy.profiles.scene_call import calling_for, load_scene_call, scene
 from beers_deploy.profiles.sensor import Instrument
 
 DOCS = Path(__file__).parents[1]
-PAGE, PICTURE = DOCS / "explanation" / "effects.md", DOCS / "assets" / "effects.png"
-RATIO, SIDE_PX, COLUMNS = 5, 96, 6
+PAGE = DOCS / "explanation" / "effects.md"
+PICTURE = DOCS / "assets" / "effects.png"
+RATIO = 5
+SIDE_PX = 96
+COLUMNS = 6
 
 SHOWN: dict[str, dict[str, float]] = {
     "smear": {"length_px": 3.0},

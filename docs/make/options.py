@@ -14,7 +14,8 @@ from typer.main import get_command
 
 from beers_deploy.cli import COMMANDS, app
 
-FILE, FOLDER = "file", "folder"
+FILE = "file"
+FOLDER = "folder"
 
 
 @dataclass(frozen=True)

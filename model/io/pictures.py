@@ -9,7 +9,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 GAMMA = 1 / 1.8
-LABEL_PX, GAP_PX = 22, 4
+LABEL_PX = 22
+GAP_PX = 4
 
 
 @dataclass(frozen=True)

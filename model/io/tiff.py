@@ -47,7 +47,8 @@ def tifffile_works() -> bool:
     return True
 
 
-REDUCED, MASK = 1, 4
+REDUCED = 1
+MASK = 4
 """Bits of TIFF's NewSubfileType."""
 MASK_PHOTOMETRIC = 4
 LIGHT = {1, 2, 6}

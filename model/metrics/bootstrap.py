@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-DRAWS, LEVEL = 4000, 0.95
+DRAWS = 4000
+LEVEL = 0.95
 WORDS = "95 % bootstrap interval over sites"
 
 LEAST_SITES = 5

@@ -37,7 +37,8 @@ PART = 0.02
 """Least gain of a part of a line."""
 AGREE = 0.75
 """Share of the blocks in which a line must be off to the same side."""
-ISOLATED, LEAST_ISOLATED = 0.75, 0.55
+ISOLATED = 0.75
+LEAST_ISOLATED = 0.55
 """Least isolation of a line that is measured well, and of any: 1 for a detector. Of a thin bright line it is 0.70,
 0.46, 0.27 and 0.02 where the MTF at Nyquist is 30, 20, 15 and 10 % (a Gaussian centred on a pixel)."""
 SPREAD_SIGNIFICANT = 4.0

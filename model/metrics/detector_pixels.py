@@ -11,15 +11,20 @@ PATCH_PX = 4
 """Pixels around one that are compared with it."""
 LEAST = 9.0
 """Standard deviations of the texture and noise around by which a wrong pixel is off at least."""
-ISOLATED, SURE = 0.75, 1.5
+ISOLATED = 0.75
+SURE = 1.5
 """Least isolation of a wrong pixel, so many standard errors taken off: 1 for a detector. Of a point of light it is
 0.70, 0.46, 0.27 and 0.02 where the MTF at Nyquist is 30, 20, 15 and 10 % (a Gaussian centred on a pixel)."""
-DEAD, BRIGHT, DARK = 0.3, 0.6, 10.0
+DEAD = 0.3
+BRIGHT = 0.6
+DARK = 10.0
 """A pixel below the first share of its ground, whose neighbours are all above the second: no shadow is that narrow.
 Ground below so many standard deviations is too dark to tell."""
 CANDIDATE = 2.0
 """Multiple of the mean step between neighbours by which a candidate lies outside of all its neighbours."""
-CUT, CUT_NOISE, CUT_STEPS = 0.3, 0.03, 3.0
+CUT = 0.3
+CUT_NOISE = 0.03
+CUT_STEPS = 3.0
 """Share of equal pixels from which the ground is taken to be cut off, and the noise, over the ground and in steps,
 that is then assumed."""
 QUIET = 0.001

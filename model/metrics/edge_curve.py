@@ -44,7 +44,9 @@ FREQUENCIES = np.round(np.arange(0.0, 0.71, 0.05), 2)
 """Of the table, in cycles per pixel: up to the corner of the spectrum, where restoration still uses the curve."""
 START = weights_of(np.exp(-4.0 * CORNERS))
 """The curve to begin with: 8.6 % at Nyquist."""
-FIRST_PASSES, PASSES, ROUNDS = 6, 2, 5
+FIRST_PASSES = 6
+PASSES = 2
+ROUNDS = 5
 
 TIERS = ((0.012, 3, 0.02), (0.03, 8, 0.08), (0.06, 10, 0.08))
 """Of edges found by search: largest texture over step, how many such edges are needed, and the least relative
@@ -66,18 +68,24 @@ EVEN = 0.012
 UNEVEN_PX = 20.0
 """By how much texture as large as the step scatters the softness of edges found by search (measured)."""
 
-SCATTER_PX, SOFT_PX, OUTLIERS, OUTLIER_RANGE_PX = 0.15, 0.3, 0.05, 8.0
+SCATTER_PX = 0.15
+SOFT_PX = 0.3
+OUTLIERS = 0.05
+OUTLIER_RANGE_PX = 8.0
 """Of softness: scatter of steps beyond their errors, and mean excess of others, both before any edge is seen; share
 of edges that are neither, and where these lie."""
 KEPT_DEVIATIONS = 2.5
-CONTRADICTION_DEVIATIONS, CONTRADICTION_PX = 3.0, 0.4
+CONTRADICTION_DEVIATIONS = 3.0
+CONTRADICTION_PX = 0.4
 """0.4 px is 18 % of the contrast at Nyquist."""
 
-SHARP_CPX, SHARPEST = 0.25, 0.96
+SHARP_CPX = 0.25
+SHARPEST = 0.96
 """Contrast there over that of a perfect lens, above which no blurred edge lies."""
 
 DRAWS = 200
-LOW_PERCENT, HIGH_PERCENT = 5.0, 95.0
+LOW_PERCENT = 5.0
+HIGH_PERCENT = 95.0
 NORMAL_QUANTILE = 1.645
 FLOOR = 0.02
 """Least relative standard error of edges that somebody vouches for, of what the model cannot know: far tails, bows,
@@ -94,7 +102,8 @@ LEAST_CONTRAST = 1e-4
 SEARCHED = Limits(20, 0.12, 0.8)
 MAX_ROUGHNESS = 0.15
 """What a square must keep to be fitted: looser than for a target, because its planes and texture are fitted too."""
-POINTED_STEP_SIGMA, POINTED_UNEVENNESS = 10.0, 0.2
+POINTED_STEP_SIGMA = 10.0
+POINTED_UNEVENNESS = 0.2
 
 Edge = tuple[EdgePixels, EdgeLine]
 

@@ -23,14 +23,20 @@ GAMMAS = np.linspace(0.0, 10.0, 101)
 STEEPER = (4.0, 8.0)
 """Gaussian parts that are tried on an edge that the profile's curve does not fit."""
 
-PER_PX, REACH_PX = 16, 24
-PERIOD_PX, HIGHEST_F = 250, 2.5
+PER_PX = 16
+REACH_PX = 24
+PERIOD_PX = 250
+HIGHEST_F = 2.5
 """The tabulated edge repeats after so many pixels, with the other sign; waves beyond so many cycles a pixel are 0."""
-START_GAMMA, LEAST_GAMMA, LARGEST_GAMMA = 4.0, 0.05, 9.9
-MAX_PLACE_PX, MAX_SLOPE = 3.0, math.tan(math.radians(35))
+START_GAMMA = 4.0
+LEAST_GAMMA = 0.05
+LARGEST_GAMMA = 9.9
+MAX_PLACE_PX = 3.0
+MAX_SLOPE = math.tan(math.radians(35))
 MAX_STEP = np.array([0.7, 0.1, 1.5])
 """Of place, slope and gamma in one pass."""
-PASSES, CONVERGED = 15, 1e-3
+PASSES = 15
+CONVERGED = 1e-3
 
 Noise = Callable[[np.ndarray], np.ndarray]
 """Variance of the noise of pixels with these values, of any shape, in the square of their unit."""
@@ -78,7 +84,9 @@ class Limits:
     error: float = 0.6
 
 
-FOUND, POINTED_AT, ANY = Limits(30, 0.012), Limits(10, 0.03), Limits(0, math.inf, math.inf)
+FOUND = Limits(30, 0.012)
+POINTED_AT = Limits(10, 0.03)
+ANY = Limits(0, math.inf, math.inf)
 """For edges found by search among much that is none, for those that a person vouches for, and for those known."""
 
 

@@ -7,7 +7,8 @@ import numpy as np
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import MAX_DN
 
-SSIM_SIGMA_PX, SSIM_RADIUS_PX = 1.5, 5
+SSIM_SIGMA_PX = 1.5
+SSIM_RADIUS_PX = 5
 MIN_SIDE_PX = 2 * SSIM_RADIUS_PX + 1
 
 

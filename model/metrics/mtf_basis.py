@@ -20,8 +20,10 @@ CORNERS = np.linspace(0, 1, 21)
 PARTS = CORNERS.size
 """The last part stands for what is left beyond 1 cycle per pixel."""
 
-SAMPLES_PER_PX, REACH_PX = 16, 24
-HIGHEST_CPX, WAVES = 2.5, 1250
+SAMPLES_PER_PX = 16
+REACH_PX = 24
+HIGHEST_CPX = 2.5
+WAVES = 1250
 """Waves that make the tabulated edge: it repeats after 500 pixels."""
 
 BENDS = (0.2, 0.4, 0.8)

@@ -20,18 +20,24 @@ import numpy as np
 
 from beers_deploy.model.metrics.refusal import Refusal
 
-SIDE_PX, PART_BLOCKS = 16, 4
-SLOW, MIDDLE, FINE = 0.2, 0.5, 0.55
+SIDE_PX = 16
+PART_BLOCKS = 4
+SLOW = 0.2
+MIDDLE = 0.5
+FINE = 0.55
 """Cycles per pixel."""
 SPECTRUM = (0.3, 0.4, 0.5, 0.55, 0.6, 0.65, 0.7071)
 """Ends of the bands in which noise is shown, cycles per pixel; the last is the corner of the spectrum."""
 
 STRUCTURES = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
 """How much structure a block may have, of its noise: the least that leaves enough blocks."""
-ENOUGH, LEAST, LEAST_PARTS = 300, 60, 5
+ENOUGH = 300
+LEAST = 60
+LEAST_PARTS = 5
 MAX_LEAK = 0.5
 """Of the energy of the corners, what may come from texture."""
-MAX_COLOUR, COLOUR_SCATTER = 0.15, 3.0
+MAX_COLOUR = 0.15
+COLOUR_SCATTER = 3.0
 """What the noise at middle frequencies may differ from that of the corners by: white noise does not."""
 MOSAIC = 0.2
 """Of the noise at the finest detail, what a mosaic of colour filters leaves at middle frequencies, at most."""
@@ -39,10 +45,13 @@ MIN_RANGE = 0.25
 """Least spread of the blocks' means, of the brightest: less gives no line."""
 ROUNDING = 1 / 12
 """Variance that rounding to whole digital numbers adds, DN^2."""
-LEAST_NOISE, QUIET_PERCENT = 0.5 * ROUNDING, 5.0
+LEAST_NOISE = 0.5 * ROUNDING
+QUIET_PERCENT = 5.0
 """Above rounding, DN^2, in the quietest blocks: what was restored or resampled has less."""
-DRAWS, PASSES = 200, 6
-FINE_WAVES, MAX_SCATTER = 21, 3.5
+DRAWS = 200
+PASSES = 6
+FINE_WAVES = 21
+MAX_SCATTER = 3.5
 """Waves beyond FINE in a block; how many deviations of their mean square, by chance, a block may lie off."""
 EDGE_PERCENT = 2.0
 """Of the blocks lie below, and above, the radiances that are said to be measured."""

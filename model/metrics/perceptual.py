@@ -39,7 +39,8 @@ BACKBONES: Mapping[str, BackboneSpec] = {
     "squeeze": BackboneSpec("squeezenet1_1", (1, 4, 7, 9, 10, 11, 12), min_side_px=17),
     "vgg": BackboneSpec("vgg16", (3, 8, 15, 22, 29), min_side_px=16),
 }
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class Fire(nn.Module):

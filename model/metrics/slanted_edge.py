@@ -26,7 +26,9 @@ WINDOW_PX = 10
 BINS_PER_PX = 4
 HALF = WINDOW_PX * BINS_PER_PX + 1
 """Bins on each side: one more than the window, for the derivative."""
-MIN_CONTRAST_SIGMA, MAX_CLIPPED, MAX_SHIFT_PX = 10, 0.01, 2.0
+MIN_CONTRAST_SIGMA = 10
+MAX_CLIPPED = 0.01
+MAX_SHIFT_PX = 2.0
 PASSES = 3
 
 

@@ -32,7 +32,8 @@ HUBER = 2.5
 MAD = 1.4826
 """Standard deviation over the median absolute deviation, of normal values."""
 
-LEVELS, NUMBERS = 6, 9
+LEVELS = 6
+NUMBERS = 9
 """Numbers of both planes; with those of the line."""
 MAX_STEP = np.array([0.7, 0.1, 0.3])
 """Of place, slope and bow in one pass."""

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from beers_deploy.model.simulator.procedural import texture
 from beers_deploy.model.simulator.sampling import Scene
 
-SIDE_PX, SQUARE_PX = 1080, 180
+SIDE_PX = 1080
+SQUARE_PX = 180
 """Of a chart, and of each square: whole target pixels at every oversampling from 2 to 6."""
 
 LEVELS = (3.0, 390.0)

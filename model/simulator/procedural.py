@@ -19,13 +19,20 @@ from beers_deploy.model.io.images import list_images
 from beers_deploy.model.simulator.sampling import Scene, read_scene
 from beers_deploy.profiles.sensor import Instrument
 
-SCENES, SCENE_SIDE_PX = 3, 2400
+SCENES = 3
+SCENE_SIDE_PX = 2400
 """Drawn where no folder of images is given."""
 
 Point = tuple[float, float]
 """(x, y) in the canvas's pixels."""
 
-SHADOW, ASPHALT, GRASS, SOIL, CONCRETE, WHITE, WATER = 12.0, 30.0, 45.0, 75.0, 120.0, 260.0, 16.0
+SHADOW = 12.0
+ASPHALT = 30.0
+GRASS = 45.0
+SOIL = 75.0
+CONCRETE = 120.0
+WHITE = 260.0
+WATER = 16.0
 
 
 def procedural_scene(height_px: int, width_px: int, generator: np.random.Generator) -> Scene:

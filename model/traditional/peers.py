@@ -21,8 +21,11 @@ from beers_deploy.model.traditional.pipeline import Chain
 from beers_deploy.model.traditional.rows import mirrored
 
 PAD_PX = 64
-WIENER_BALANCE, RICHARDSON_LUCY_STEPS = 0.01, 20
-NLM_PATCH_PX, NLM_DISTANCE_PX, NLM_STRENGTH = 5, 6, 0.6
+WIENER_BALANCE = 0.01
+RICHARDSON_LUCY_STEPS = 20
+NLM_PATCH_PX = 5
+NLM_DISTANCE_PX = 6
+NLM_STRENGTH = 0.6
 
 Peer = Callable[[Tensor, Chain], Tensor]
 """(H, W) digital numbers of the degraded sensor, and the two sensors, to those of the reference."""

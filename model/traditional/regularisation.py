@@ -55,7 +55,8 @@ reference. With this bound 64 % are left (measured)."""
 LARGEST_EPSILON = 1.0
 """The bound of epsilon in the dark."""
 
-LEAST_NOISE, LEAST_CONTRAST = 0.005, 0.02
+LEAST_NOISE = 0.005
+LEAST_CONTRAST = 0.02
 """The least N, and the least mean of g - 2 v, over the mean of v.
 
 NL-Bayes leaves 1 % of the noise in flat fields. Differences of 22 500 pixels measure 2 v to within about 0.02 v, so

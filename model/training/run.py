@@ -51,7 +51,8 @@ from beers_deploy.profiles.sensor import Instrument, Sensor, numbers_of
 STEP = re.compile(r"[0-9]{1,18}(?=,)")
 """What a line of a log begins with."""
 
-VALIDATION_CROP_PX, ZOOM = 96, 2
+VALIDATION_CROP_PX = 96
+ZOOM = 2
 
 SENSOR_VIEWS = 4
 """Sensors that each validation image is seen by where the network is conditioned: they differ by far more."""

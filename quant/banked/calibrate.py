@@ -53,7 +53,8 @@ from beers_deploy.quant.samples import PATCH_PX, Remade
 LIKE = "pleiades-degraded"
 """The profile that gives gain and bits; what is computed is over full scale."""
 
-ANALYTIC, BODY = "analytic", "body.correction"
+ANALYTIC = "analytic"
+BODY = "body.correction"
 """The results that lie side by side: the analytic restoration, and the body's correction of it."""
 
 
@@ -228,7 +229,8 @@ def _plan(weights: Weights, shifts: Shifts) -> Plan:
     return Plan(graph, ends, streams(graph), chain, shifts, Passes(half_lsb_pair=False))
 
 
-PATCHES, SNR = 80, (90.0, 165.0)
+PATCHES = 80
+SNR = (90.0, 165.0)
 """Of calibration: sensors whose gain lies near 1, so that the body sees what all others will show it at theirs."""
 
 

@@ -22,7 +22,9 @@ from beers_deploy.model.bank import FILTERS, SIDE_PX, UNIT_STEPS, WIDE, Bank, in
 from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.sensor import MAX_DN
 
-STEP_DN, MIDDLE_DN, PART = 16, 2048, 2
+STEP_DN = 16
+MIDDLE_DN = 2048
+PART = 2
 """Of the planes: the coarse ones' step and their zero, and by what the last divides the remainder."""
 
 PLANES_PER_CHANNEL = 4

@@ -12,7 +12,8 @@ import numpy as np
 
 from beers_deploy.profiles.sensor import MAX_DN
 
-IMAGE, CORRECTION = "image", "correction"
+IMAGE = "image"
+CORRECTION = "correction"
 """What a network reads, and what its last operation writes."""
 
 Pair = tuple[int, int]

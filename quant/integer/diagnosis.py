@@ -44,7 +44,8 @@ MOST_LEFT = 0.1
 """Of the differences, by a fault that explains the rest: there may be two at a time."""
 SHIFTED = "the tile is shifted by "
 PADDINGS = {"copies of the border": "edge", "a mirror image": "reflect", "-128": "constant"}
-MOST_CHANNELS, LIKELY = 4, 12
+MOST_CHANNELS = 4
+LIKELY = 12
 """Channels that are looked through for a wrong bit, which shows in one; and weights of each that are tried."""
 HALO_MAX_PX = 16
 SIDES = {"outer": (1, 1, 1, 1), "upper": (1, 0, 0, 0), "left": (0, 1, 0, 0), "lower": (0, 0, 1, 0)}

@@ -43,7 +43,8 @@ brightest ground among the patches, a DnCNN lost 1.4 dB by it instead of 0.6 (me
 FEW_TENSORS = 4
 """Of a chain beside a stream, to be tried one by one."""
 
-EVERY, CLEARLY = 8, 1.1
+EVERY = 8
+CLEARLY = 1.1
 """A guess is tried on one of so many crops first, and dropped where it costs so much more there."""
 
 

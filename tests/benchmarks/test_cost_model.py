@@ -109,7 +109,8 @@ MEASURED = Rates(
     },
     {"products": 9.00e10, "integers": 4.70e9, "memory": 4.68e10},
 )
-MEASURED_S, MEASURED_PX = 0.470, 256
+MEASURED_S = 0.470
+MEASURED_PX = 256
 
 
 @pytest.mark.parametrize("board", board_names())

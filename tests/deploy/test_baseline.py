@@ -22,7 +22,8 @@ from tests.deploy.command_line import done, refused
 ASKED: dict[str, Any] = {"sensor": "pleiades-degraded", "images": None, "patches": 2, "seed": 0}
 
 
-MAE, KEPT = measured(5e-4, "of full scale", "here"), Check("MAE", 5e-4, 1.0, "of full scale")
+MAE = measured(5e-4, "of full scale", "here")
+KEPT = Check("MAE", 5e-4, 1.0, "of full scale")
 
 
 def document(mae: float = 5e-4, **arguments: object) -> dict[str, Any]:

@@ -39,7 +39,8 @@ def made(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-VARIABLE, REFERENCE = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
+VARIABLE = load_sensor("pleiades-variable")
+REFERENCE = load_sensor("pleiades-reference")
 
 
 def small(scene: Path, patch_px: int | None = 24) -> DatasetRecipe:

@@ -21,9 +21,11 @@ from tests.docs.walk import ROOT, Walk
 from tests.model.networks import plain
 
 HOW_TO = ROOT / "docs" / "how-to"
-SITES, SCENE_PX = 6, 820
+SITES = 6
+SCENE_PX = 820
 """As `benchmarks/characterise.py` needs them."""
-FEW, FEW_PX = 2, 480
+FEW = 2
+FEW_PX = 480
 MADE = """
 beers-deploy simulate scene.png --sensor pleiades-degraded --out made
 beers-deploy export --network narrow.safetensors --out float.onnx

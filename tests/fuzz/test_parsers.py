@@ -23,7 +23,8 @@ from beers_deploy.profiles.errors import BeersError
 from tests.fuzz.mutation import damaged
 from tests.fuzz.parsers import PARSERS, Parser
 
-EXECUTIONS, ARBITRARY = 60 * int(os.environ.get("BEERS_FUZZ", "1")), 15
+EXECUTIONS = 60 * int(os.environ.get("BEERS_FUZZ", "1"))
+ARBITRARY = 15
 SEED = int(os.environ.get("BEERS_FUZZ_SEED", "0"))
 CPU_S = 5.0
 FREE_BYTES = 1 << 28

@@ -27,7 +27,9 @@ from examples.networks import build
 from examples.networks import to_onnx as example_to_onnx
 
 KEPT = Path(__file__).resolve().parent / "outputs"
-SHIPPED, PLAIN, OTHER = "convbeers-xs", "plain", "dncnn"
+SHIPPED = "convbeers-xs"
+PLAIN = "plain"
+OTHER = "dncnn"
 PATCHES = ("--patches", "4", "--patch", "48")
 
 

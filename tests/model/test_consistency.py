@@ -55,7 +55,8 @@ OTHERS: dict[str, tuple[Instrument, float]] = {
 means of blocks."""
 
 INSIDE = np.s_[40:-40, 40:-40]
-ROWS, COLUMNS = 333, 301
+ROWS = 333
+COLUMNS = 301
 
 
 @cache

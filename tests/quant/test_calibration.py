@@ -20,7 +20,8 @@ from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import TILE_PX, crops, halo_of, open_session, planes_of, tensor_values
 from tests.quant.quick import image
 
-VARIABLE, REFERENCE = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
+VARIABLE = load_sensor("pleiades-variable")
+REFERENCE = load_sensor("pleiades-reference")
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,8 @@ from beers_deploy.quant.calibration import Calibration, draw_patches, unseen_pat
 from beers_deploy.quant.lighting import CALIBRATION, JUDGING, Lighting, assign_lightings, full_scale_radiance
 from beers_deploy.quant.sample_range import range_of
 
-SENSOR, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+SENSOR = load_sensor("pleiades-degraded")
+REFERENCE = load_sensor("pleiades-reference")
 BY_NAME = {lighting.name: lighting for lighting in JUDGING}
 
 

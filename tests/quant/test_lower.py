@@ -33,7 +33,8 @@ from beers_deploy.quant.session import open_session, planes_of
 from beers_deploy.quant.structure import count_relus, saturated_shares
 from tests.quant.quick import image, in_float, with_relu6
 
-STRIDED, VALID = Window(strides=(2, 3)), Window()
+STRIDED = Window(strides=(2, 3))
+VALID = Window()
 BITS = {PLANES: PLANES_FRAC_BITS, "a": 5, "b": 5, "c": 5, "d": 5, CORRECTION: 5}
 
 

@@ -18,7 +18,8 @@ from beers_deploy.quant.integer.reference import correction
 from beers_deploy.quant.onnx_file import constants
 from beers_deploy.quant.session import open_session, planes_of, run
 
-ONE, TWO = Window(pads=(1, 1, 1, 1)), Window(strides=(2, 2), pads=(1, 1, 1, 1))
+ONE = Window(pads=(1, 1, 1, 1))
+TWO = Window(strides=(2, 2), pads=(1, 1, 1, 1))
 PAIR = ("QuantizeLinear", "DequantizeLinear")
 
 

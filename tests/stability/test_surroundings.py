@@ -30,7 +30,9 @@ from beers_deploy.profiles.sensor_file import REFERENCE
 from beers_deploy.studies.stress.cases import CASES, FULL_DN, Case
 from beers_deploy.studies.stress.checks import FLAT_DN, gain, ringing
 
-RATIO, FLOAT32_DN, NOISE_DN = 2, 0.05, 5.0
+RATIO = 2
+FLOAT32_DN = 0.05
+NOISE_DN = 5.0
 BY_NAME = {case.name: case for case in CASES}
 SOUND = [case for case in CASES if case.pixels == "sound" and not case.large]
 LOST = [case for case in CASES if case.pixels in ("missing", "infinite")]

@@ -29,7 +29,8 @@ PROJECT = (
     "README.md",
     "LICENSE",
 )
-SIDE_PX, SCENE_PX = 96, 400
+SIDE_PX = 96
+SCENE_PX = 400
 SAMPLES = 4
 
 

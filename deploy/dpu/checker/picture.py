@@ -20,13 +20,21 @@ if TYPE_CHECKING:
 FILLS = {"DPU": "#56b4e9", "CPU": "#e69f00", "host": "#cccccc"}
 """Okabe and Ito's colours, distinct to any colour vision, and light enough for black text."""
 
-INK, EDGE = "#111111", "#777777"
+INK = "#111111"
+EDGE = "#777777"
 """Of words in a box and of lines, on light and on dark screens."""
 
-LINE_PX, BOX_PX, GAP_PX, LEFT_PX, NAME_PX, MARGIN_PX = 18, 28, 12, 72, 276, 16
+LINE_PX = 18
+BOX_PX = 28
+GAP_PX = 12
+LEFT_PX = 72
+NAME_PX = 276
+MARGIN_PX = 16
 WIDTH_PX = LEFT_PX + NAME_PX + MARGIN_PX
 """Narrower than a phone's screen: a wider picture is cut off there, or its words scaled down."""
-NAME_LETTERS, LINE_LETTERS, TITLE_LETTERS = 29, 34, 46
+NAME_LETTERS = 29
+LINE_LETTERS = 34
+TITLE_LETTERS = 46
 VIEWPORT = '<meta name="viewport" content="width=device-width"><style>body{margin:0}</style>'
 
 

@@ -24,7 +24,9 @@ from beers_deploy.profiles.figures import Row, predicted, published
 from beers_deploy.profiles.toml import read_json, unreadable
 
 EXAMPLE = 'write [{"model": "core.onnx", "configuration": "C32B3", "tile_px": 640, "fps": 9.5}]'
-RUNS, TILE_PX, FAR = 1000, (16, 1 << 16), 10_000
+RUNS = 1000
+TILE_PX = (16, 1 << 16)
+FAR = 10_000
 """Most runs; least and most of a tile's side; and how many times off a rate of this network may be predicted."""
 POWER_W = (0.01, 1000.0)
 SCATTER = 3

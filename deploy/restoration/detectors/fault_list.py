@@ -16,8 +16,10 @@ from beers_deploy.model.io.files import write_text
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.restoration.source import Raster
 
-OPTION, FOUND = "--fix-detectors", "found"
-HEADER, ALL = ("column", "row", "band"), "*"
+OPTION = "--fix-detectors"
+FOUND = "found"
+HEADER = ("column", "row", "band")
+ALL = "*"
 DIGITS = 9
 """Of a number: no image is larger."""
 

@@ -25,11 +25,14 @@ from beers_deploy.restoration.source import Raster, Source
 
 LOOKED_PX = 1 << 23
 """Pixels of all bands that are looked at: one to two seconds on one core (measured)."""
-STRIP_PX, LEAST_STRIP_PX, LEAST_ROWS_PX = 128, 16, 64
+STRIP_PX = 128
+LEAST_STRIP_PX = 16
+LEAST_ROWS_PX = 64
 """Rows of a strip, the least of them, and the least of all strips together."""
 MARGIN_PX = 4
 """Rows around a strip that its rows and pixels are compared with."""
-BLOCKS, SECTION_PX = 8, 32
+BLOCKS = 8
+SECTION_PX = 32
 """Blocks along a line, and the least width of a section of a strip."""
 LEAST = 0.003
 """Gain of a column that matters, over the level; the patterns of two pixels likewise."""

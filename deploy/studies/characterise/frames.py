@@ -16,9 +16,11 @@ TILE_PX = 1024
 BOX_PX = 2 * int(HALF_PX) + 1
 """Shortest side of a box with an edge."""
 MAX_DN = 65535
-CLIPPED_PIXELS, PILE = 10, 4
+CLIPPED_PIXELS = 10
+PILE = 4
 """Pixels at one value, 2^n - 1, and how many times as many as just below: what shows that it is full scale."""
-DARKEST_PERCENT, DARK_SHARE = 0.01, 0.02
+DARKEST_PERCENT = 0.01
+DARK_SHARE = 0.02
 """Where the darkest pixels of all frames lie above this share of full scale, a black level is probable."""
 
 

@@ -30,7 +30,8 @@ SEED = 0
 AXES = ("across", "along")
 OWN_LEAK = 0.1
 """Of the finest detail of one frame, what may be texture where its noise is held against the others'."""
-STILL_STRUCTURE, STILL_DRIFT = 2.0, 0.02
+STILL_STRUCTURE = 2.0
+STILL_DRIFT = 0.02
 """Of the difference of two frames of a still scene: structure over noise, and the largest change of level."""
 
 

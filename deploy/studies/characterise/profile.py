@@ -16,7 +16,8 @@ from beers_deploy.studies.characterise.instrument import AXES, Mtf, Noise, Snr
 
 PARTS = (16, 4)
 """Of full scale: the radiances at which SNRs are stated, as those that a network is told of."""
-GSD_M, OVERSAMPLING = 0.5, 4
+GSD_M = 0.5
+OVERSAMPLING = 4
 SHOWN_CPX = {"at 0.1 cycles per pixel": 0.1, "at 0.25 cycles per pixel": 0.25, "at Nyquist": 0.5}
 MARGIN = 1e-5
 """Of an SNR, by which it stays off the bounds of physics: decimals are rounded."""

@@ -14,7 +14,10 @@ from beers_deploy.profiles.errors import OptionError
 
 LEAST_VISIBLE = 0.3
 """Share of a box inside the image below which finding it counts neither for nor against a detector."""
-PADDING, OVERLAP, MOST, CANDIDATES = 114 / 255, 0.7, 300, 30_000
+PADDING = 114 / 255
+OVERLAP = 0.7
+MOST = 300
+CANDIDATES = 30_000
 """As Ultralytics validates: the grey around an image, the overlap above which the lower scored of two boxes goes, the
 boxes kept of an image, and those looked at, best scores first."""
 

@@ -29,7 +29,8 @@ from beers_deploy.studies.detection.detector import class_names, letters
 SPLITS = ("test", "val", "valid", "train")
 """Where no split is asked for, the first that is there: what a detector was trained on comes last."""
 LAYOUTS = "labels as VOC (.xml), COCO (.json) or YOLO (.txt)"
-LABEL_BYTES, NAMES_BYTES = 1 << 23, 1 << 16
+LABEL_BYTES = 1 << 23
+NAMES_BYTES = 1 << 16
 """Limits of a file of labels (25 000 boxes of XML), and of data.yaml, of which PyYAML reads so much in 0.4 s."""
 SPAN = 1e-3
 """By how much a share of YOLO's may pass 0 or 1: tools write six digits or fewer."""

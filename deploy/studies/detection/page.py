@@ -16,8 +16,12 @@ from beers_deploy.studies.detection.study import REFERENCE, Comparison
 from beers_deploy.studies.detection.tables import BY_SIZE, MAIN, PAPER_NOTES, headline
 from beers_deploy.studies.evaluation.methods import DEGRADED
 
-CROP_PX, ZOOM, PICTURES = 88, 3, 4
-FOUND, MISSED, FALSE = "#2fd39b", "#ff5a36", "#ffd21f"
+CROP_PX = 88
+ZOOM = 3
+PICTURES = 4
+FOUND = "#2fd39b"
+MISSED = "#ff5a36"
+FALSE = "#ffd21f"
 """Colours of boxes."""
 
 CAPTIONS = {

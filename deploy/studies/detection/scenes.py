@@ -27,7 +27,9 @@ GAP_PX = 3
 """Scene pixels that stay free around an object and its shadow."""
 TRIES = 4
 """Times that a place is looked for before an object is left out."""
-PLOT_M, STREET_M, KERB_M = 96.0, 9.0, 2.0
+PLOT_M = 96.0
+STREET_M = 9.0
+KERB_M = 2.0
 PAINTS = [18.0, 60.0, 110.0, 190.0, 280.0]
 """Radiances of vehicles, black to white: those of the procedural scene."""
 

@@ -11,16 +11,22 @@ from beers_deploy.studies.detection.average_precision import DRAWS, SIZES_PX, in
 from beers_deploy.studies.detection.study import REFERENCE, Comparison
 from beers_deploy.studies.evaluation.methods import DEGRADED
 
-PERCENT, POINTS = "%", "points"
+PERCENT = "%"
+POINTS = "points"
 """Units: a share, and a difference of two shares."""
 
-MAIN, OWN, BY_CLASS, BY_SIZE = "detection", "each at its own best confidence", "mAP50 by class", "mAP50 by size"
+MAIN = "detection"
+OWN = "each at its own best confidence"
+BY_CLASS = "mAP50 by class"
+BY_SIZE = "mAP50 by size"
 """What the names of the tables begin with; the sensor's follows."""
 
 NO_OBJECT = "no object to be found"
 NO_LOSS = "no loss that can be told from 0: the interval of reference less degraded holds it"
 
-GAIN, LOSS, REGAINED = "gain over degraded", "loss to reference", "share of loss regained"
+GAIN = "gain over degraded"
+LOSS = "loss to reference"
+REGAINED = "share of loss regained"
 
 
 def detection_rows(found: Comparison) -> list[Row]:

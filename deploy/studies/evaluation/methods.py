@@ -44,7 +44,8 @@ CHAINS: dict[str, tuple[str, Order]] = {
 WITHOUT_NETWORK = (DEGRADED, *CHAINS)
 """The input itself, and the traditional pipelines and their peers."""
 
-KNOWN, BLIND = "known", "blind"
+KNOWN = "known"
+BLIND = "blind"
 """What a method knows of the sensor."""
 
 

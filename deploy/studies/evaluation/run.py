@@ -250,7 +250,9 @@ def _method(
     return Method(name, with_steps(network.model, {}, sensors[0], sensors[1].nominal(), around), known)
 
 
-SITES, CROP_PX, ZOOM = 4, 96, 2
+SITES = 4
+CROP_PX = 96
+ZOOM = 2
 HELD = 16
 """Images at most that are held against the sensor."""
 

@@ -50,8 +50,10 @@ def _distance(metric: Lpips | Dists, image: np.ndarray, reference: np.ndarray) -
 
 DISTANCE = "distance"
 NOISE_FREE = "PSNR, reference without noise"
-INNER, INNER_NOISE_FREE = "inner PSNR", f"inner {NOISE_FREE}"
-BIAS, LARGEST_BIAS = "bias of the mean", "largest bias of the mean"
+INNER = "inner PSNR"
+INNER_NOISE_FREE = f"inner {NOISE_FREE}"
+BIAS = "bias of the mean"
+LARGEST_BIAS = "largest bias of the mean"
 DETAILS: tuple[str, ...] = (NOISE_FREE, INNER, INNER_NOISE_FREE, "PSNR gain", BIAS)
 """Scores that say more about PSNR, or about the level of an image."""
 UNITS = {"PSNR": "dB", "SSIM": "ratio", **dict.fromkeys(DETAILS, "dB"), BIAS: "%", LARGEST_BIAS: "%"}

@@ -151,7 +151,8 @@ def interval_of_mean(values: Sequence[float]) -> tuple[float, float]:
 
 ANGLES_DEG = (3.0, 5.0, 8.0, 11.0)
 REPEATS = 3
-SIDE_PX, EDGE_PX = 240, 80
+SIDE_PX = 240
+EDGE_PX = 80
 
 
 def acquire_edges(sensor: Instrument, seed: int) -> Edges:
@@ -210,7 +211,8 @@ POINT_BACKGROUNDS = (20.0, 100.0)
 """W/m2/sr/um."""
 POINT_RADIANCES = (12.0, 40.0, 120.0)
 """Light of a point, as what it adds to the mean radiance of one pixel, W/m2/sr/um."""
-POINTS_A_SIDE, POINT_STEP_PX = 6, 48
+POINTS_A_SIDE = 6
+POINT_STEP_PX = 48
 APERTURE_PX = 33
 """Side of the square over which the light of a point is added up. A restoration may move light by its receptive
 field, and the consistency step by two of its blocks, 16 px."""
@@ -274,15 +276,18 @@ PATTERN_BACKGROUND = 100.0
 OF_REFERENCE = "of the reference"
 """Unit of the contrast transfer: 1 is the contrast of the reference."""
 
-BAR_CONTRASTS, BAR_PERIODS_PX = (0.05, 0.10), (2.0, 8 / 3, 3.0)
+BAR_CONTRASTS = (0.05, 0.10)
+BAR_PERIODS_PX = (2.0, 8 / 3, 3.0)
 """Contrast is the amplitude of the wave over the background."""
-BARS_PX, BARS_MEASURED_PX = 144, 64
+BARS_PX = 144
+BARS_MEASURED_PX = 64
 """The side is a multiple of all periods, since scenes wrap around at their borders."""
 
 ZONE_CONTRASTS = (0.08, 0.30)
 ZONE_BAND: tuple[float, float] = (0.35, 0.45)
 """Spatial frequencies that are measured, cycles per pixel."""
-ZONE_PX, ZONE_NYQUIST_PX = 288, 96
+ZONE_PX = 288
+ZONE_NYQUIST_PX = 96
 """Side, and the radius at which the pattern reaches half a cycle per pixel and ends."""
 
 

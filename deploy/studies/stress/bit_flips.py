@@ -137,7 +137,8 @@ READ = (
     "bytes over the rate at which the host hands them to the DPU "
     "(fitted, docs/explanation/cost-model.md; assumed to hold here)"
 )
-AT_ONCE, INSTRUCTIONS = 16, 2
+AT_ONCE = 16
+INSTRUCTIONS = 2
 
 
 def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Row]:

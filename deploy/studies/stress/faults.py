@@ -18,7 +18,9 @@ from beers_deploy.quant.graph import PLANES, Activation, channels_of
 from beers_deploy.quant.integer.reference import SOUND, Faults, merged_correction, run_core
 
 MEGABIT = 1e6
-INT8_BITS, PIXEL_BITS, SHIFT_BITS = 8, 12, 6
+INT8_BITS = 8
+PIXEL_BITS = 12
+SHIFT_BITS = 6
 Shifts = dict[tuple[str, str], int]
 """By operation and field, as `Faults` takes them."""
 

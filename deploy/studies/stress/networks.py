@@ -138,13 +138,17 @@ def steepest_signs(graph: Graph, image: np.ndarray) -> np.ndarray:
     return np.asarray(gradient[0, 0].sign().numpy())
 
 
-GAIN_DN, STEEPEST_DN, FLOAT32_DN = 16.0, 64.0, 0.05
+GAIN_DN = 16.0
+STEEPEST_DN = 64.0
+FLOAT32_DN = 0.05
 INT8_GAIN_DN = 128.0
 """A change of 1 DN can move a rounding in every layer, and a pixel from the fine gain to the coarse one."""
 ROUNDING_DN = 128.0
 """What the DPU's tie rounding (half up) may change: one unit in any layer, carried on."""
-MORE_THREADS, CROP_PX = 2, 48
-CORES_PX, LARGE_CORE_PX = (16, 29), 250
+MORE_THREADS = 2
+CROP_PX = 48
+CORES_PX = (16, 29)
+LARGE_CORE_PX = 250
 """What a tile keeps beside its two halos."""
 
 

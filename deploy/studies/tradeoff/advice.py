@@ -23,7 +23,8 @@ from beers_deploy.studies.tradeoff.points import UNITS, Point
 
 LATENCY = "board latency"
 COSTS = (LATENCY, "board energy", "host p50")
-PSNR, MAP50 = "PSNR", "mAP50"
+PSNR = "PSNR"
+MAP50 = "mAP50"
 NAMES: dict[str, tuple[str, str]] = {
     "psnr": (PSNR, "dB"),
     "ssim": ("SSIM", "ratio"),
@@ -42,7 +43,9 @@ ALIKE_DB = 0.05
 WORTH_A_WORD_DB = 0.002
 """Gains below it that are not significant are not mentioned."""
 
-SIGNIFICANT, NOT_SIGNIFICANT, TOO_FEW = "significant", "not significant", "too few sites to tell"
+SIGNIFICANT = "significant"
+NOT_SIGNIFICANT = "not significant"
+TOO_FEW = "too few sites to tell"
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,8 @@ from beers_deploy.studies.tradeoff.advice import (
     within,
 )
 
-TABLE, VERDICT = "boards", "verdict"
+TABLE = "boards"
+VERDICT = "verdict"
 
 
 @dataclass(frozen=True)

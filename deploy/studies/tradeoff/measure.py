@@ -51,7 +51,8 @@ from beers_deploy.studies.tradeoff.points import HALO_STEP_PX, Point, Variant, m
 Scores = Mapping[str, float | None]
 """Figures of one image by name; None where an instrument is not there."""
 
-LPIPS, SEAM_ERROR = "LPIPS-squeeze", "seam error"
+LPIPS = "LPIPS-squeeze"
+SEAM_ERROR = "seam error"
 NOT_SHOWN = (*DETAILS, SEAM_ERROR)
 """Of the scores of an image, in the means of a point."""
 
@@ -278,7 +279,8 @@ class Labelled:
         return measured(100 * stored["value"], "%", source, (100 * ends[0], 100 * ends[1]) if ends else None)
 
 
-TILE_PX, ROUNDS = 256, 9
+TILE_PX = 256
+ROUNDS = 9
 
 
 def measure_host(
@@ -308,7 +310,8 @@ def host_figures(times_s: Sequence[float], pixels: int) -> dict[str, Figure]:
     return {f"host p{p}": measured(float(np.percentile(values, p)), "s/Mpx", source) for p in (50, 90)}
 
 
-PATCHES, PATCH_PX = 32, 96
+PATCHES = 32
+PATCH_PX = 96
 """Calibration of a network that comes without INT8: fewer and smaller patches than `quantize` takes."""
 
 

@@ -16,22 +16,29 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SIZE_PX, TEXT_PX = (560, 520), 15
+SIZE_PX = (560, 520)
+TEXT_PX = 15
 """Of the plot: wide enough for a desk, and its words large enough on a telephone, where it is scaled down."""
-FRONT_PX2, OTHERS_PX2, RING_PX2 = 90, 34, 330
+FRONT_PX2 = 90
+OTHERS_PX2 = 34
+RING_PX2 = 330
 """Areas of marks: of the front, of other points, and of the ring around the recommended point."""
 NEAR_PX = 16
 """Marks no farther apart share a label."""
 PALE = 0.45
 MARKERS = ("o", "s", "D", "^", "v", "P", "X")
-CHAINS, LIBRARIES = "traditional pipelines", "other libraries"
+CHAINS = "traditional pipelines"
+LIBRARIES = "other libraries"
 RECOMMENDED = "recommended"
-AT_MOST, AT_LEAST = "\N{LESS-THAN OR EQUAL TO}", "\N{GREATER-THAN OR EQUAL TO}"
+AT_MOST = "\N{LESS-THAN OR EQUAL TO}"
+AT_LEAST = "\N{GREATER-THAN OR EQUAL TO}"
 HOST = "this machine"
-RIGHT, EDGE_PX = 0.97, 8
+RIGHT = 0.97
+EDGE_PX = 8
 """Where the axes end as a share of the figure, unless a label needs room; and what is left free at the edge, because
 a browser's font may be wider than the one that was measured."""
-LEGEND_COLUMNS, LEGEND_ROW = 2, 0.045
+LEGEND_COLUMNS = 2
+LEGEND_ROW = 0.045
 """Of the legend, the height of a row as a share of the figure."""
 
 CAPTION = (

@@ -34,10 +34,12 @@ from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, board_names
 from beers_deploy.quant.onnx_file import is_quantised, load_onnx
 from beers_deploy.quant.tiling.walk import Tiling, tiling_of
 
-FLOAT, INT8 = "float32", "INT8"
+FLOAT = "float32"
+INT8 = "INT8"
 FLOAT_ON_DPU = "the DPU takes INT8 alone"
 
-TILE_STEP_PX, HALO_STEP_PX = 16, 8
+TILE_STEP_PX = 16
+HALO_STEP_PX = 8
 """Tiles and halos that are tried are multiples of these."""
 HALOS_PX = (0, HALO_STEP_PX, 2 * HALO_STEP_PX)
 """Halos below the exact one that are tried."""

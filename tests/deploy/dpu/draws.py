@@ -11,7 +11,8 @@ from beers_deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import Sketch, Value
 
 Draw = Callable[[Sketch, str], str]
-DPU, TILE_PX = load_dpu("vck190"), 288
+DPU = load_dpu("vck190")
+TILE_PX = 288
 
 
 def broken_rules(path: Path, dpu: Dpu = DPU, tile_px: int = TILE_PX) -> list[str]:

@@ -22,7 +22,8 @@ from examples.networks import build, to_onnx
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import one_guess
 
-SHIPPED, USERS = ("convbeers-xs-int8", "convbeers-half-xs-int8"), ("unet", "mobile")
+SHIPPED = ("convbeers-xs-int8", "convbeers-half-xs-int8")
+USERS = ("unet", "mobile")
 TILE_PX = 32
 
 

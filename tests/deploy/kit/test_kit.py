@@ -92,7 +92,9 @@ def test_the_host_part_refuses_what_it_cannot_restore(shape: tuple[int, ...], tm
 
 
 OFFSET_DN = 60
-NAME, TILE_PX, FACTORS = "convbeers-xs-int8", 96, {1, 4, 8}
+NAME = "convbeers-xs-int8"
+TILE_PX = 96
+FACTORS = {1, 4, 8}
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,10 @@ import pytest
 
 rasterio: Any = pytest.importorskip("rasterio")
 
-BANDS, HEIGHT, WIDTH, TILE_PX = 2, 150, 118, 64
+BANDS = 2
+HEIGHT = 150
+WIDTH = 118
+TILE_PX = 64
 SPLIT = 64, 80
 """The row and the column at which a mosaic of four tiles is cut."""
 

@@ -191,7 +191,8 @@ def test_a_result_of_another_shape_than_the_file_says_is_refused(tmp_path: Path)
         by_file(np.ones((30, 30), np.uint16), tmp_path, Options(path, 40))
 
 
-AREA, POINT = (1, 1, 0, 1, 1025, 0, 1, 1), (1, 1, 0, 1, 1025, 0, 1, 2)
+AREA = (1, 1, 0, 1, 1025, 0, 1, 1)
+POINT = (1, 1, 0, 1, 1025, 0, 1, 2)
 
 
 @pytest.mark.parametrize("keys", [AREA, POINT])

@@ -12,7 +12,8 @@ from beers_deploy.restoration.source import Raster, open_source
 from tests.deploy.command_line import done, refused
 from tests.deploy.restoration import images
 
-FIRST, SECOND = "pleiades-degraded", "blind"
+FIRST = "pleiades-degraded"
+SECOND = "blind"
 
 
 def restored(image: Path, sensor: str, *more: str) -> tuple[np.ndarray, str]:

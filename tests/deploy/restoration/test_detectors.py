@@ -19,7 +19,10 @@ from beers_deploy.restoration.source import ArraySource, Raster, VeiledSource
 from tests.deploy.command_line import done, refused
 from tests.deploy.restoration.runs import stopped_after
 
-HEIGHT, WIDTH, LEVEL, NOISE = 140, 120, 600.0, 5.0
+HEIGHT = 140
+WIDTH = 120
+LEVEL = 600.0
+NOISE = 5.0
 
 
 def ground(*shape: int, seed: int = 0) -> np.ndarray:

@@ -19,7 +19,8 @@ from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 from beers_deploy.restoration.tiles.rows import restore_rows
 
 SHAPE = (2, 75, 133)
-TILE_PX, RADIUS_PX = 32, 3
+TILE_PX = 32
+RADIUS_PX = 3
 
 
 def running(infer: Infer, at_once: int, tick: Callable[[], None] = lambda: None) -> np.ndarray:

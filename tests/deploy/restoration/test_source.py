@@ -28,7 +28,8 @@ CODECS: dict[str, dict[str, Any]] = {
     "lzw": {"tile": (16, 16), "compression": "lzw", "predictor": True},
     "zstd": {"rowsperstrip": 9, "compression": "zstd"},
 }
-HEIGHT, WIDTH = 61, 83
+HEIGHT = 61
+WIDTH = 83
 
 
 def pixels_of(dtype: str, *bands: int) -> np.ndarray:

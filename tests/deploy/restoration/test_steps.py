@@ -28,13 +28,15 @@ from tests.deploy.command_line import done
 from tests.deploy.restoration.runs import restored, stopped_after
 from tests.quant.tiling.small_networks import espcn, four_bands
 
-FLOAT, INT8 = "convbeers-xs", "convbeers-xs-int8"
+FLOAT = "convbeers-xs"
+INT8 = "convbeers-xs-int8"
 SENSOR = load_sensor("pleiades-degraded")
 NOISY = load_sensor("dior-high")
 """Its noise allows no factor above 1."""
 SHAPE = 129, 141
 TILES_PX = (57, 100)
-BRIGHT_FROM, RADIUS_PX = 100, 14
+BRIGHT_FROM = 100
+RADIUS_PX = 14
 """The first bright column, and the receptive radius of the two networks."""
 NODATA = 0
 
@@ -166,7 +168,9 @@ def test_a_run_is_not_resumed_with_other_steps(switch: dict[str, Any], tmp_path:
         restore_file(tmp_path / "in.tif", tmp_path / "out.tif", replace(resumed, **switch))
 
 
-CONSISTENCY, RUNS, BRIGHTENED = "consistency step", "network runs", "brightened pixels"
+CONSISTENCY = "consistency step"
+RUNS = "network runs"
+BRIGHTENED = "brightened pixels"
 
 
 @cache

@@ -8,7 +8,9 @@ from scipy.ndimage import gaussian_filter
 
 from beers_deploy.model.metrics.detector_pixels import PATCH_PX, wrong_pixels
 
-SIDE_PX, LEVEL, NOISE = 90, 500.0, 5.0
+SIDE_PX = 90
+LEVEL = 500.0
+NOISE = 5.0
 seeds = st.integers(0, 2**20)
 
 

@@ -12,7 +12,9 @@ from beers_deploy.model.simulator.mtf import Blur, gamma_from_mtf, transfer_func
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import sample, scene_spectrum
 
-RATIO, SIDE_PX, SIGMA = 4, 120, 6.0
+RATIO = 4
+SIDE_PX = 120
+SIGMA = 6.0
 
 
 def noise(values: np.ndarray) -> np.ndarray:

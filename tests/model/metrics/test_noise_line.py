@@ -12,7 +12,9 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.profiles.sensor import Instrument, noise_from_snr
 
-RATIO, GAIN, MAX_DN = 4, 10.2375, 4095
+RATIO = 4
+GAIN = 10.2375
+MAX_DN = 4095
 PAIRS = ((50.0, 110.0), (80.0, 170.0), (20.0, 45.0))
 RADIANCES = (25.0, 100.0)
 

@@ -27,7 +27,8 @@ from beers_deploy.profiles.errors import ImageError, ModelError
 
 Weights = dict[str, np.ndarray]
 Maps = list[Tensor]
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
 STEMS = {"squeeze": "squeezenet1_1", "vgg": "vgg16"}
 
 

@@ -12,7 +12,11 @@ from beers_deploy.model.simulator.mtf import mtf, transfer_function
 from beers_deploy.model.simulator.sampling import sample, scene_spectrum
 from beers_deploy.profiles.sensor import Instrument, noise_from_snr
 
-RATIO, SCENE_PX, SIDE_PX, GAIN, ANGLE_DEG = 5, 240, 80, 10.2375, 8.0
+RATIO = 5
+SCENE_PX = 240
+SIDE_PX = 80
+GAIN = 10.2375
+ANGLE_DEG = 8.0
 ALPHA, BETA = noise_from_snr(25, 50, 100, 110)
 MIDDLE = slice((SCENE_PX - SIDE_PX) // 2, (SCENE_PX + SIDE_PX) // 2)
 

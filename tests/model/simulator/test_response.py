@@ -16,7 +16,8 @@ from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.response import MtfTable, Response, centroid, unpacked
 from tests.model.simulator import stages
 
-GAIN, UNEVEN = 10.2375, (0.12, 0.05)
+GAIN = 10.2375
+UNEVEN = (0.12, 0.05)
 SIGMAS = 0.35, 0.5
 BEHIND_0, BEHIND_1 = (math.exp(-2 * (math.pi * sigma * 0.5) ** 2) * 2 / math.pi for sigma in SIGMAS)
 GAUSSIAN = BEHIND_0, BEHIND_1

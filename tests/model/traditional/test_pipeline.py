@@ -171,7 +171,8 @@ def test_the_chain_restores_a_point_spread_as_the_formula_it_was_made_of(camera:
 
 
 AXES = replace(DEGRADED, mtf_nyquist=0.12, mtf_nyquist_along=0.04)
-TURNED, ONE = replace(AXES, mtf_nyquist=0.04, mtf_nyquist_along=0.12), replace(AXES, mtf_nyquist_along=None)
+TURNED = replace(AXES, mtf_nyquist=0.04, mtf_nyquist_along=0.12)
+ONE = replace(AXES, mtf_nyquist_along=None)
 DISC = with_response(DEGRADED, leaning_disc())
 WRONG = [(DEGRADED, replace(DEGRADED, mtf_nyquist=0.04), "denoise-first")]
 WRONG += [(DEGRADED, replace(DEGRADED, mtf_nyquist=0.15), "denoise-first")]

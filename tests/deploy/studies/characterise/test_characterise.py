@@ -20,7 +20,10 @@ from beers_deploy.studies.characterise.frames import Frames, cut_box
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 
-RATIO, SIDE, GAIN, BOARD_PX = 4, 1280, 10.2375, 100
+RATIO = 4
+SIDE = 1280
+GAIN = 10.2375
+BOARD_PX = 100
 SNRS = (50.0, 110.0)
 SENSOR = Instrument(0.09, *noise_from_snr(25, SNRS[0], 100, SNRS[1]), GAIN, 12, {}, 0.05)
 

@@ -26,7 +26,8 @@ from beers_deploy.studies.detection.study import (
 from beers_deploy.studies.detection.tables import GAIN, LOSS, NO_LOSS, REGAINED, detection_rows, headline
 from beers_deploy.studies.evaluation.methods import Method
 
-GROUND, SHIP = 20.0, 250.0
+GROUND = 20.0
+SHIP = 250.0
 """Radiances in W/m2/sr/um."""
 NAMES = ("ship", "tank")
 

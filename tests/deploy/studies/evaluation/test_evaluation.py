@@ -48,7 +48,8 @@ from beers_deploy.studies.evaluation.scores import (
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 
-DEGRADED, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+DEGRADED = load_sensor("pleiades-degraded")
+REFERENCE = load_sensor("pleiades-reference")
 SENSORS = DEGRADED.nominal(), REFERENCE.nominal()
 PLAIN = Instruments({"LPIPS-squeeze": "no weights"})
 

@@ -28,7 +28,8 @@ from beers_deploy.studies.evaluation.sweep import (
 from tests.deploy.command_line import done
 from tests.deploy.documents import valid
 
-PROFILE, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+PROFILE = load_sensor("pleiades-degraded")
+REFERENCE = load_sensor("pleiades-reference")
 NOMINAL = PROFILE.nominal()
 DRIFTED = replace(NOMINAL, mtf_nyquist=0.03)
 DIM = replace(NOMINAL, gain_dn_per_radiance=0.7 * NOMINAL.gain_dn_per_radiance)

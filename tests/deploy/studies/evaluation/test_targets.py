@@ -25,7 +25,8 @@ from beers_deploy.studies.evaluation.targets import (
     target_row,
 )
 
-DEGRADED, REFERENCE = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+DEGRADED = load_sensor("pleiades-degraded")
+REFERENCE = load_sensor("pleiades-reference")
 SENSORS = DEGRADED.nominal(), REFERENCE.nominal()
 IDENTITY = Method("identity", lambda dn: dn, BLIND)
 
