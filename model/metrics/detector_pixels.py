@@ -90,11 +90,13 @@ def _wrong(patches: np.ndarray, step: float) -> np.ndarray:
     cut = (patches == ground[:, None, None]).mean((1, 2)) > CUT
     floor = np.where(cut, CUT_NOISE * np.abs(ground) + CUT_STEPS * step, np.maximum(step, QUIET * np.abs(ground)))
     scatter = np.maximum(scatter, floor)
+    middle = patches[:, 3:6, 3:6].reshape(len(patches), 9)
+    around = np.delete(middle, 4, axis=1)
+    # A star that full scale cuts off is lower than its sides promise, and still above them: that is no fault.
+    outward = np.where(middle[:, 4] > np.nanmax(around, axis=1), centre, -centre)
     with np.errstate(invalid="ignore", divide="ignore"):
         isolation = 2 * (far - near) / centre
         unsure = 1.5 * scatter / np.abs(centre)
-        alone = (np.abs(centre) > LEAST * scatter) & (isolation - SURE * unsure > ISOLATED)
-    middle = patches[:, 3:6, 3:6].reshape(len(patches), 9)
-    around = np.delete(middle, 4, axis=1)
+        alone = (outward > LEAST * scatter) & (isolation - SURE * unsure > ISOLATED)
     dead = (middle[:, 4] < DEAD * ground) & (around.min(1) > BRIGHT * ground) & (ground > DARK * scatter)
     return np.asarray(np.isfinite(isolation) & (alone | dead))
