@@ -1,4 +1,6 @@
-"""What is installed is one package: `beers_deploy` is deploy/, with model/, quant/ and profiles/ inside it."""
+"""What is installed is one package: `beers_deploy` is deploy/, with model/, quant/ and profiles/
+inside it.
+"""
 
 from shutil import rmtree
 
@@ -6,12 +8,18 @@ from setuptools import find_namespace_packages, setup
 from setuptools.command.build_py import build_py
 
 INSIDE = ("model", "quant", "profiles")
-folders = find_namespace_packages(include=[f"{name}{end}" for name in ("deploy", *INSIDE) for end in ("", ".*")])
+folders = find_namespace_packages(
+    include=[f"{name}{end}" for name in ("deploy", *INSIDE) for end in ("", ".*")]
+)
 
 
 def installed(name: str) -> str:
     """What a folder's package is called where it is installed."""
-    return name.replace("deploy", "beers_deploy", 1) if name.startswith("deploy") else f"beers_deploy.{name}"
+    return (
+        name.replace("deploy", "beers_deploy", 1)
+        if name.startswith("deploy")
+        else f"beers_deploy.{name}"
+    )
 
 
 class FreshBuild(build_py):

@@ -1,12 +1,13 @@
-"""Report what the action's gate found: a Markdown summary, outputs of the step, and annotations of the pull request.
+"""Report what the action's gate found: a Markdown summary, outputs of the step, and annotations of
+the pull request.
 
     python verdict.py EXIT_CODE RESULTS.json STDERR.txt
 
-It runs on any Python. `$GITHUB_STEP_SUMMARY` and `$GITHUB_OUTPUT` name the files that it adds to; annotations are
-workflow commands on standard output.
+It runs on any Python. `$GITHUB_STEP_SUMMARY` and `$GITHUB_OUTPUT` name the files that it adds to;
+annotations are workflow commands on standard output.
 
-Names of nodes and files come from the network under test, so all text is escaped for where it goes: a table of the
-summary, a code block, or a workflow command.
+Names of nodes and files come from the network under test, so all text is escaped for where it goes:
+a table of the summary, a code block, or a workflow command.
 """
 
 import json
@@ -42,7 +43,10 @@ def main(code: int, results: Path, stderr: Path) -> None:
     values = {name: figures[figure]["value"] for name, figure in OUTPUTS.items()}
     lines = [f"{name}={value:.6g}" for name, value in values.items() if value is not None]
     add("GITHUB_OUTPUT", [f"verdict={VERDICTS[code]}", *lines])
-    add("GITHUB_STEP_SUMMARY", ["", f"## INT8 gate: {VERDICTS[code]}", "", *table(document["checks"])])
+    add(
+        "GITHUB_STEP_SUMMARY",
+        ["", f"## INT8 gate: {VERDICTS[code]}", "", *table(document["checks"])],
+    )
     for each in document["checks"]:
         if not each["passed"]:
             detail = f" ({plain(each['detail'])})" if each["detail"] else ""
@@ -51,14 +55,20 @@ def main(code: int, results: Path, stderr: Path) -> None:
 
 
 def verdict_of(code: int, results: Path) -> dict[str, Any] | None:
-    """Return the gate's document; None if the gate judged nothing, or if the document has another verdict."""
+    """Return the gate's document; None if the gate judged nothing, or if the document has another
+    verdict.
+    """
     if code not in VERDICTS:
         return None
     try:
         document = json.loads(results.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return document if isinstance(document, dict) and document.get("verdict") == VERDICTS[code] else None
+    return (
+        document
+        if isinstance(document, dict) and document.get("verdict") == VERDICTS[code]
+        else None
+    )
 
 
 def reason_in(stderr: Path) -> str:
@@ -83,7 +93,13 @@ def table(checks: list[dict[str, Any]]) -> list[str]:
     rows = []
     for each in checks:
         verdict = "ok" if each["passed"] else "**failed**"
-        cells = cell(each["name"]), number(each["value"]), cell(allowed(each)), verdict, cell(each["detail"])
+        cells = (
+            cell(each["name"]),
+            number(each["value"]),
+            cell(allowed(each)),
+            verdict,
+            cell(each["detail"]),
+        )
         rows.append(f"| {' | '.join(cells)} |")
     return ["| check | found | allowed | | |", "|---|---|---|---|---|", *rows]
 
@@ -99,12 +115,16 @@ def number(value: float | None) -> str:
 
 
 def plain(text: str) -> str:
-    """Replace each character that is not printable (line breaks, controls, changes of direction) by a space."""
+    """Replace each character that is not printable (line breaks, controls, changes of direction) by
+    a space.
+    """
     return "".join(letter if letter.isprintable() else " " for letter in text)
 
 
 def cell(text: str) -> str:
-    """Escape text for a cell of a Markdown table; an entity stands for its character and is never markup."""
+    """Escape text for a cell of a Markdown table; an entity stands for its character and is never
+    markup.
+    """
     return MARKDOWN.sub(lambda found: f"&#{ord(found[0])};", plain(text))
 
 

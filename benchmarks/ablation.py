@@ -1,8 +1,11 @@
-"""What each pass of the legal quantisation buys: the gate's figures with all of them, and with each one left out.
+"""What each pass of the legal quantisation buys: the gate's figures with all of them, and with each
+one left out.
 
-    python benchmarks/ablation.py NETWORK.onnx [--sensor pleiades-degraded] [--images DIR] [--patches 64] [--seed 0]
+    python benchmarks/ablation.py NETWORK.onnx [--sensor pleiades-degraded] [--images DIR] \
+        [--patches 64] [--seed 0]
 
-Patches are those of `quantize`, and the figures those of `gate` on patches that calibration did not see.
+Patches are those of `quantize`, and the figures those of `gate` on patches that calibration did not
+see.
 """
 
 import argparse
@@ -30,7 +33,9 @@ def ablations() -> Iterator[tuple[str, Passes]]:
 
 def main() -> None:
     """Print a row an ablation."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("network", type=Path)
     parser.add_argument("--sensor", default="pleiades-degraded")
     parser.add_argument("--images", type=Path)
@@ -40,7 +45,11 @@ def main() -> None:
     arguments = parser.parse_args()
     model = float_model(float_file(arguments.network, load_sensor(arguments.sensor)))
     calibration = Calibration(
-        load_sensor(arguments.sensor), arguments.images, arguments.patches, arguments.patch, arguments.seed
+        load_sensor(arguments.sensor),
+        arguments.images,
+        arguments.patches,
+        arguments.patch,
+        arguments.seed,
     )
     session = open_any_size(model)
     unseen = calibration.unseen.pairs

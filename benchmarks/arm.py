@@ -2,10 +2,10 @@
 
     python benchmarks/arm.py ROOT [--json FILE]
 
-As root on Debian with debootstrap and qemu-user (apt-get install debootstrap qemu-user). ROOT becomes a small ARM
-system, 0.5 GB: bookworm's Python, and the packages of the versions here from their own wheels. It is kept, and what
-is there already is not made again. Nothing is changed outside of it. docs/explanation/processors.md says what
-came out.
+As root on Debian with debootstrap and qemu-user (apt-get install debootstrap qemu-user). ROOT
+becomes a small ARM system, 0.5 GB: bookworm's Python, and the packages of the versions here from
+their own wheels. It is kept, and what is there already is not made again. Nothing is changed
+outside of it. docs/explanation/processors.md says what came out.
 """
 
 import argparse
@@ -23,11 +23,16 @@ from beers_deploy.network_files import shipped_pair
 
 PROJECT = Path(__file__).resolve().parents[1]
 PROCESSORS = ("cortex-a72", "neoverse-n1", "max")
-"""Of `qemu-aarch64 -cpu help`: NEON alone; dot products of int8 too; matrix products of int8 too."""
+"""Of `qemu-aarch64 -cpu help`: NEON alone; dot products of int8 too; matrix
+products of int8 too.
+"""
 NETWORKS = ("convbeers-xs", "convbeers-s")
 PINNED = ("numpy", "onnx", "onnxruntime", "pillow", "psutil", "tifffile")
 OTHERS = ("filelock", "hypothesis", "jinja2", "jsonschema", "pytest", "rich", "typer")
-PLATFORMS = [f"{name}_aarch64" for name in ("manylinux_2_28", "manylinux_2_27", "manylinux_2_26", "manylinux2014")]
+PLATFORMS = [
+    f"{name}_aarch64"
+    for name in ("manylinux_2_28", "manylinux_2_27", "manylinux_2_26", "manylinux2014")
+]
 TESTS = ("test_integers.py", "test_restore.py")
 """Of tests/processors: what needs no torch, whose ARM wheel alone has 0.5 GB."""
 CPUINFO = """processor\t: 0
@@ -40,21 +45,39 @@ CPU part\t: 0xd08
 CPU revision\t: 3
 
 """
-"""A Cortex-A72's. An emulated process would see the x86 host's, on which onnxruntime's ARM build crashes."""
+"""A Cortex-A72's.
+
+An emulated process would see the x86 host's, on which onnxruntime's ARM build crashes.
+"""
 
 
 def build(root: Path) -> None:
-    """Make the ARM system: Debian's packages unpacked, never run, so that no kernel support is asked for."""
+    """Make the ARM system: Debian's packages unpacked, never run, so that no kernel support is
+    asked for.
+    """
     if not (root / "usr/bin/python3.11").exists():
         packages = ["--variant=minbase", "--include=python3,libstdc++6", "bookworm", str(root)]
         _call(["debootstrap", "--foreign", "--arch=arm64", *packages])
         for package in sorted((root / "var/cache/apt/archives").glob("*.deb")):
-            with subprocess.Popen(["dpkg-deb", "--fsys-tarfile", package], stdout=subprocess.PIPE) as unpacked:  # noqa: S603, S607
-                _call(["tar", "-x", "-C", str(root), "--keep-directory-symlink"], stdin=unpacked.stdout)
+            with subprocess.Popen(  # noqa: S603
+                ["dpkg-deb", "--fsys-tarfile", package],  # noqa: S607
+                stdout=subprocess.PIPE,
+            ) as unpacked:
+                _call(
+                    ["tar", "-x", "-C", str(root), "--keep-directory-symlink"],
+                    stdin=unpacked.stdout,
+                )
     if not _site(root).exists():
         names = [*(f"{name}=={version(name)}" for name in PINNED), *OTHERS]
         platforms = [word for name in PLATFORMS for word in ("--platform", name)]
-        options = ["--only-binary=:all:", "--python-version", "3.11", "--target", str(_site(root)), *platforms]
+        options = [
+            "--only-binary=:all:",
+            "--python-version",
+            "3.11",
+            "--target",
+            str(_site(root)),
+            *platforms,
+        ]
         _call([sys.executable, "-m", "pip", "install", "--quiet", *options, *names])
     project = ["--no-deps", "--upgrade", "--target", str(_site(root)), str(PROJECT)]
     _call([sys.executable, "-m", "pip", "install", "--quiet", *project])
@@ -67,14 +90,27 @@ def build(root: Path) -> None:
 
 def on_arm(root: Path, processor: str, *arguments: str) -> None:
     """Run the ARM system's Python with the project, one thread, as that processor."""
-    emulator = ["qemu-aarch64", "-cpu", processor, "-L", str(root), str(root / "usr/bin/python3.11")]
+    emulator = [
+        "qemu-aarch64",
+        "-cpu",
+        processor,
+        "-L",
+        str(root),
+        str(root / "usr/bin/python3.11"),
+    ]
     told = {name: value for name, value in os.environ.items() if not name.startswith("OPENBLAS_")}
-    told |= {"PYTHONPATH": f"{_site(root)}:{PROJECT}", "OPENBLAS_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    told |= {
+        "PYTHONPATH": f"{_site(root)}:{PROJECT}",
+        "OPENBLAS_NUM_THREADS": "1",
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
     _call([*emulator, *arguments], env=told, cwd=PROJECT)
 
 
 def restored(networks: list[Path], out: Path) -> None:
-    """Write what `restore` makes of one image with each network, float32 of full scale 4095, by its file's name."""
+    """Write what `restore` makes of one image with each network, float32 of full scale 4095, by its
+    file's name.
+    """
     from beers_deploy.library import restore
 
     generator = np.random.default_rng(4)
@@ -85,7 +121,9 @@ def restored(networks: list[Path], out: Path) -> None:
 
 
 def compare(root: Path, processors: tuple[str, ...]) -> dict[str, dict[str, float]]:
-    """The largest difference in DN from this processor's pixels, by emulated processor and network."""
+    """The largest difference in DN from this processor's pixels, by emulated
+    processor and network.
+    """
     with tempfile.TemporaryDirectory() as folder:
         files = [file for name in NETWORKS for file in shipped_pair(name)]
         here = Path(folder) / "here.npz"
@@ -96,7 +134,9 @@ def compare(root: Path, processors: tuple[str, ...]) -> dict[str, dict[str, floa
             out = Path(folder) / f"{processor}.npz"
             on_arm(root, processor, __file__, "--restore", str(out), *map(str, files))
             pixels = np.load(out)
-            found[processor] = {name: float(np.abs(pixels[name] - expected[name]).max()) for name in expected}
+            found[processor] = {
+                name: float(np.abs(pixels[name] - expected[name]).max()) for name in expected
+            }
     return found
 
 
@@ -110,11 +150,15 @@ def _call(command: list[str], **how: object) -> None:
 
 def main() -> None:
     """Build, compare, test; exit code 1 where an INT8 pixel differs."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("root", type=Path, nargs="?")
     parser.add_argument("--processors", nargs="+", default=PROCESSORS)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--restore", nargs="+", type=Path, metavar=("OUT", "NETWORK"), help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--restore", nargs="+", type=Path, metavar=("OUT", "NETWORK"), help=argparse.SUPPRESS
+    )
     asked = parser.parse_args()
     if asked.restore:
         restored(asked.restore[1:], asked.restore[0])
@@ -123,14 +167,22 @@ def main() -> None:
     build(root)
     found = compare(root, tuple(asked.processors))
     for processor, differences in found.items():
-        print(processor, ", ".join(f"{name}: {value:.3g} DN apart" for name, value in differences.items()))
+        print(
+            processor,
+            ", ".join(f"{name}: {value:.3g} DN apart" for name, value in differences.items()),
+        )
     if asked.json:
         asked.json.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
     tests = [f"tests/processors/{name}" for name in TESTS]
     for processor in asked.processors:
         print(f"integer tests as {processor}", flush=True)
         on_arm(root, processor, "-m", "pytest", "-p", "no:cacheprovider", *tests)
-    if any(value for differences in found.values() for name, value in differences.items() if name.endswith("int8")):
+    if any(
+        value
+        for differences in found.values()
+        for name, value in differences.items()
+        if name.endswith("int8")
+    ):
         sys.exit(1)
 
 

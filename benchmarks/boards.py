@@ -1,7 +1,8 @@
-"""What boards change of the INT8 files made for each: `python benchmarks/boards.py --images aerial-train/`.
+"""What boards change of the INT8 files made for each: `python benchmarks/boards.py --images
+aerial-train/`.
 
-Every shipped network is calibrated once for each board, on the same patches; each file is checked on its board and
-compared with that of the first board, and with the shipped one.
+Every shipped network is calibrated once for each board, on the same patches; each file is checked
+on its board and compared with that of the first board, and with the shipped one.
 """
 
 import argparse
@@ -37,7 +38,8 @@ def files(images: Path | None, variants: list[str]) -> None:
             first = first or found
             refused = len(place(network_of(made, 640), dpu_of(target)).failed)
             print(
-                f"{variant:14} {name:8} {time.perf_counter() - start:5.0f} s, nodes refused {refused}, "
+                f"{variant:14} {name:8} {time.perf_counter() - start:5.0f} s, nodes refused "
+                f"{refused}, "
                 f"{found[:12]}, {'as' if found == first else 'NOT as'} the first board's, "
                 f"{'as' if found == shipped else 'not as'} shipped",
                 flush=True,

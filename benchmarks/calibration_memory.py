@@ -1,9 +1,11 @@
-"""Peak memory and time of `quantize` for few and many patches, and for large ones: each in a process of its own.
+"""Peak memory and time of `quantize` for few and many patches, and for large ones: each in a
+process of its own.
 
     python benchmarks/calibration_memory.py --float mine.onnx --images aerial/
 
-Memory is the largest resident set that the system counted for the process: the interpreter, torch and onnxruntime are
-in it (measured alone in the first line), and so are the scenes, which stay in memory whatever is drawn from them.
+Memory is the largest resident set that the system counted for the process: the interpreter, torch
+and onnxruntime are in it (measured alone in the first line), and so are the scenes, which stay in
+memory whatever is drawn from them.
 """
 
 import argparse
@@ -21,7 +23,9 @@ CASES = ((64, 128), (1024, 128), (16, 640))
 
 
 def measure(command: list[str]) -> tuple[float, float, float]:
-    """Peak MB of one process, its seconds by the clock, and its seconds of computing on all cores."""
+    """Peak MB of one process, its seconds by the clock, and its seconds of
+    computing on all cores.
+    """
     started = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)  # noqa: S603 - our own command
     _, status, usage = os.wait4(process.pid, 0)
@@ -29,7 +33,11 @@ def measure(command: list[str]) -> tuple[float, float, float]:
     if process.returncode:
         raise SystemExit(f"{' '.join(command)} failed")
     unit = 1 if sys.platform == "darwin" else 1024  # ru_maxrss is in bytes there, in KiB elsewhere
-    return usage.ru_maxrss * unit / 1e6, time.perf_counter() - started, usage.ru_utime + usage.ru_stime
+    return (
+        usage.ru_maxrss * unit / 1e6,
+        time.perf_counter() - started,
+        usage.ru_utime + usage.ru_stime,
+    )
 
 
 def main() -> None:
@@ -44,10 +52,22 @@ def main() -> None:
         network = str(arguments.float)
         int8 = str(Path(folder) / "int8.onnx")
         for patches, side in CASES:
-            drawn = ["--sensor", "pleiades-variable", "--patches", str(patches), "--patch", str(side), *scenes]
-            peak, seconds, computing = measure([*COMMAND, "quantize", network, "--out", int8, *drawn])
+            drawn = [
+                "--sensor",
+                "pleiades-variable",
+                "--patches",
+                str(patches),
+                "--patch",
+                str(side),
+                *scenes,
+            ]
+            peak, seconds, computing = measure(
+                [*COMMAND, "quantize", network, "--out", int8, *drawn]
+            )
             work = f"{patches:5d} of {f'{side} x {side}':16s}"
-            print(f"{work} {peak:7.0f} MB {seconds:6.0f} s, computing {computing:.0f} s", flush=True)
+            print(
+                f"{work} {peak:7.0f} MB {seconds:6.0f} s, computing {computing:.0f} s", flush=True
+            )
 
 
 if __name__ == "__main__":

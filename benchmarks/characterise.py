@@ -1,12 +1,14 @@
-"""What `characterise` finds on simulated images of known sensors: errors, and how often the intervals hold the truth.
+"""What `characterise` finds on simulated images of known sensors: errors, and how often the
+intervals hold the truth.
 
     python benchmarks/characterise.py --images aerial-test/ --weights convbeers-s.safetensors
 
-Each sensor sees twelve of the folder's photographs; then with a checkerboard laid into one of them (60 m a side at
-0.5 m, two by two fields, as calibration sites have), searched for and pointed at. MTF 2 to 12 %, along the track down
-to 0.4 of that across, every other sensor with another curve than the formula's (`model.curves`); noise as networks
-are trained for (`model.family.SensorFamily`). With weights, a network told the profile that was written restores one
-of the photographs, beside the same network told the truth.
+Each sensor sees twelve of the folder's photographs; then with a checkerboard laid into one of them
+(60 m a side at 0.5 m, two by two fields, as calibration sites have), searched for and pointed at.
+MTF 2 to 12 %, along the track down to 0.4 of that across, every other sensor with another curve
+than the formula's (`model.curves`); noise as networks are trained for
+(`model.family.SensorFamily`). With weights, a network told the profile that was written restores
+one of the photographs, beside the same network told the truth.
 """
 
 import argparse
@@ -38,7 +40,9 @@ from beers_deploy.studies.characterise.instrument import AXES
 from beers_deploy.studies.characterise.profile import SHOWN_CPX
 from beers_deploy.studies.evaluation.pairs import simulate_pairs
 
-LIKE, REFERENCE = (load_sensor(name).nominal() for name in ("pleiades-degraded", "pleiades-reference"))
+LIKE, REFERENCE = (
+    load_sensor(name).nominal() for name in ("pleiades-degraded", "pleiades-reference")
+)
 MTF_RANGE = (0.02, 0.12)
 RATIO = 4
 SCENES = 12
@@ -51,15 +55,22 @@ BRIGHT = 160.0
 
 def main() -> None:
     """Print tables in Markdown."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--images", type=Path, required=True)
     parser.add_argument("--sensors", type=int, default=20)
     parser.add_argument("--seed", type=int, default=22)
     parser.add_argument("--weights", type=Path, help="of a conditioned network")
     arguments = parser.parse_args()
     scenes = [read_scene(path, LIKE) for path in list_images(arguments.images)]
-    scenes = [scene for scene in scenes if fitting_oversampling(scene.radiance, [RATIO], LEAST_SIDE_PX)]
-    ways = {name: Findings() for name in ("photographs alone", "one with a checkerboard", "two boxes on it")}
+    scenes = [
+        scene for scene in scenes if fitting_oversampling(scene.radiance, [RATIO], LEAST_SIDE_PX)
+    ]
+    ways = {
+        name: Findings()
+        for name in ("photographs alone", "one with a checkerboard", "two boxes on it")
+    }
     lost = list[float]()
     generator = np.random.default_rng(arguments.seed)
     for number in range(arguments.sensors):
@@ -70,20 +81,33 @@ def main() -> None:
             if arguments.weights is not None and found is not None:
                 profile = Path(folder) / "found.toml"
                 profile.write_text(profile_toml(found), encoding="utf-8")
-                lost.append(psnr_lost(arguments.weights, chosen[0], sensor, load_sensor(str(profile)).nominal()))
+                lost.append(
+                    psnr_lost(
+                        arguments.weights, chosen[0], sensor, load_sensor(str(profile)).nominal()
+                    )
+                )
     print("| figure | images | found | error, median | mean, signed | worst | in the interval |")
     print("|---|---|---|---|---|---|---|")
     for name, findings in ways.items():
         for line in findings.lines(name):
             print(line)
     if lost:
-        print(f"\nPSNR lost, dB: mean {np.mean(lost):.3f}, median {np.median(lost):.3f}, worst {max(lost):.3f}")
+        print(
+            f"\nPSNR lost, dB: mean {np.mean(lost):.3f}, median {np.median(lost):.3f}, worst "
+            f"{max(lost):.3f}"
+        )
 
 
 def look(
-    ways: dict[str, "Findings"], sensor: Instrument, scenes: Sequence[Scene], number: int, folder: Path
+    ways: dict[str, "Findings"],
+    sensor: Instrument,
+    scenes: Sequence[Scene],
+    number: int,
+    folder: Path,
 ) -> Characterised | None:
-    """Characterise one sensor in each way; what was found where the checkerboard had to be searched for."""
+    """Characterise one sensor in each way; what was found where the checkerboard had to be searched
+    for.
+    """
     alone, searched, pointed = ways.values()
     alone.look(sensor, written(scenes, sensor, number, folder, None))
     target = max(range(len(scenes)), key=lambda i: min(scenes[i].radiance.shape))
@@ -100,22 +124,32 @@ def boxes_on_target(path: Path) -> tuple[str, str]:
 
 
 def psnr_lost(weights: Path, scene: Scene, sensor: Instrument, found: Instrument) -> float:
-    """By a network that knows the sensor that was found, beside the same that knows the true one, in dB."""
+    """By a network that knows the sensor that was found, beside the same that knows the true one,
+    in dB.
+    """
     (pair,), _ = simulate_pairs([scene], sensor, REFERENCE.in_units_of(sensor), 0)
     image = torch.from_numpy(pair.degraded.astype(np.float32) / sensor.max_dn)[None, None]
     scores = []
     for known in (sensor, found):
         with torch.inference_mode():
             restored = torch_network(weights, known)(image)[0, 0] * sensor.max_dn
-        scores.append(fidelity_db(restored.round().clamp(0, sensor.max_dn).numpy(), pair.reference, pair.degraded))
+        scores.append(
+            fidelity_db(
+                restored.round().clamp(0, sensor.max_dn).numpy(), pair.reference, pair.degraded
+            )
+        )
     return scores[0] - scores[1]
 
 
 def draw(generator: np.random.Generator, shaped: bool) -> Instrument:
-    """A sensor with the family's noise and an MTF of 2 to 12 %, its curve the formula's or another."""
+    """A sensor with the family's noise and an MTF of 2 to 12 %, its curve the
+    formula's or another.
+    """
     contrast = math.exp(generator.uniform(*np.log(MTF_RANGE)))
     along = max(contrast * LEAST_ALONG ** float(generator.uniform() ** 2), MTF_RANGE[0])
-    sensor = replace(SensorFamily(LIKE).draw(generator), mtf_nyquist=contrast, mtf_nyquist_along=along)
+    sensor = replace(
+        SensorFamily(LIKE).draw(generator), mtf_nyquist=contrast, mtf_nyquist_along=along
+    )
     if not shaped:
         return sensor
     table = draw_table(contrast, along, generator)
@@ -152,7 +186,9 @@ def written(
 def with_target(radiance: np.ndarray) -> np.ndarray:
     """The scene (H, W) with the checkerboard in its middle."""
     upright = slanted_edge(TARGET_PX, RATIO, LEAN_DEG, (-1.0, 1.0))
-    board = (DARK + BRIGHT) / 2 + (BRIGHT - DARK) / 2 * upright * slanted_edge(TARGET_PX, RATIO, -LEAN_DEG, (-1, 1)).T
+    board = (DARK + BRIGHT) / 2 + (BRIGHT - DARK) / 2 * upright * slanted_edge(
+        TARGET_PX, RATIO, -LEAN_DEG, (-1, 1)
+    ).T
     top, left = ((size - board.shape[0]) // 2 for size in radiance.shape)
     laid = radiance.copy()
     laid[top : top + board.shape[0], left : left + board.shape[1]] = board
@@ -163,11 +199,15 @@ def with_target(radiance: np.ndarray) -> np.ndarray:
 class Findings:
     """Relative error, and whether the interval held the truth, of each figure that was found."""
 
-    contrasts: dict[str, list[tuple[float, bool]]] = field(default_factory=lambda: {words: [] for words in SHOWN_CPX})
+    contrasts: dict[str, list[tuple[float, bool]]] = field(
+        default_factory=lambda: {words: [] for words in SHOWN_CPX}
+    )
     snr: list[tuple[float, bool]] = field(default_factory=list)
     asked: int = 0
 
-    def look(self, sensor: Instrument, paths: tuple[Path, ...], boxes: tuple[str, ...] = ()) -> Characterised | None:
+    def look(
+        self, sensor: Instrument, paths: tuple[Path, ...], boxes: tuple[str, ...] = ()
+    ) -> Characterised | None:
         """Characterise one sensor."""
         self.asked += 2
         try:
@@ -181,9 +221,13 @@ class Findings:
                 continue
             for words, frequency in SHOWN_CPX.items():
                 value, interval = curve.at(frequency)
-                self.contrasts[words].append(judged(value, interval, true_contrast(sensor, axis, frequency)))
+                self.contrasts[words].append(
+                    judged(value, interval, true_contrast(sensor, axis, frequency))
+                )
         for snr in found.snrs:
-            self.snr.append(judged(snr.value, snr.interval, snr.radiance / sensor.noise_sigma(snr.radiance)))
+            self.snr.append(
+                judged(snr.value, snr.interval, snr.radiance / sensor.noise_sigma(snr.radiance))
+            )
         return found if found.mtf.curves else None
 
     def lines(self, name: str) -> Iterator[str]:
@@ -196,7 +240,10 @@ class Findings:
             errors = np.array([error for error, _ in pairs])
             held = sum(inside for _, inside in pairs)
             sizes = np.abs(errors)
-            shown = f"{np.median(sizes):.1%} | {errors.mean():+.1%} | {sizes.max():.1%} | {held} of {len(pairs)}"
+            shown = (
+                f"{np.median(sizes):.1%} | {errors.mean():+.1%} | {sizes.max():.1%} | "
+                f"{held} of {len(pairs)}"
+            )
             yield f"| {figure} | {name} | {len(pairs)} of {self.asked} | {shown} |"
 
 

@@ -1,7 +1,8 @@
-"""Measure how the time of `check` grows with the number of nodes: `python -m benchmarks.check_nodes`.
+"""Measure how the time of `check` grows with the number of nodes: `python -m
+benchmarks.check_nodes`.
 
-Each kind of network takes another way through reading and checking. The time is that of the process, so that a busy
-machine changes little.
+Each kind of network takes another way through reading and checking. The time is that of the
+process, so that a busy machine changes little.
 """
 
 import time
@@ -31,11 +32,15 @@ class Chain:
         self.nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
 
-    def then(self, op_type: str, *inputs: str, domain: str = "", **attributes: int | list[int]) -> str:
+    def then(
+        self, op_type: str, *inputs: str, domain: str = "", **attributes: int | list[int]
+    ) -> str:
         """Append a node of these inputs, or of the last tensor, and return its result."""
         self.last, sources = f"{op_type}{len(self.nodes)}", list(inputs or (self.last,))
         node = helper.make_node(op_type, sources, [self.last], name=self.last, domain=domain)
-        node.attribute.extend(helper.make_attribute(key, value) for key, value in attributes.items())
+        node.attribute.extend(
+            helper.make_attribute(key, value) for key, value in attributes.items()
+        )
         self.nodes.append(node)
         return self.last
 
@@ -98,7 +103,9 @@ def integers(chain: Chain) -> None:
             "weight": np.clip(WEIGHT * 64, -127, 127).astype(np.int8),
             "bias": np.zeros(CHANNELS, np.int32),
         }
-        chain.constants.extend(numpy_helper.from_array(value, name) for name, value in values.items())
+        chain.constants.extend(
+            numpy_helper.from_array(value, name) for name, value in values.items()
+        )
         chain.then("QuantizeLinear", "image", "scale", "zero")
     before = chain.last
     read = ("scale", "zero")
@@ -121,11 +128,16 @@ def network(kind: Callable[[Chain], None], nodes: int) -> onnx.ModelProto:
 
 def main() -> None:
     """Print the seconds of each kind and size."""
-    print(f"{processor_name()}; seconds of processor time to read and check a network of so many nodes")
+    print(
+        f"{processor_name()}; seconds of processor time to read and check a network of so many "
+        "nodes"
+    )
     print(f"{'kind':12}", *(f"{nodes:>8}" for nodes in NODES))
     with TemporaryDirectory() as folder:
         for kind in KINDS:
-            taken_s = [_seconds(network(kind, nodes), Path(folder) / "chain.onnx") for nodes in NODES]
+            taken_s = [
+                _seconds(network(kind, nodes), Path(folder) / "chain.onnx") for nodes in NODES
+            ]
             print(f"{kind.__name__:12}", *(f"{each_s:8.2f}" for each_s in taken_s), flush=True)
 
 

@@ -2,9 +2,10 @@
 
     python benchmarks/detector_faults.py --images aerial-test/ --images aerial-train/ [--count 400]
 
-Each image is seen by a sensor of the family that networks are trained for (`model.family.SensorFamily`): photographs
-of the folders, random textures, drawn towns, and drawn scenes whose edges, crops and roofs lie along the columns and
-rows; at 1/20 to twice the light, with the sensor's noise or a fifth of it. Then faults are put into the photographs.
+Each image is seen by a sensor of the family that networks are trained for
+(`model.family.SensorFamily`): photographs of the folders, random textures, drawn towns, and drawn
+scenes whose edges, crops and roofs lie along the columns and rows; at 1/20 to twice the light, with
+the sensor's noise or a fifth of it. Then faults are put into the photographs.
 """
 
 import argparse
@@ -40,14 +41,18 @@ Image = np.ndarray
 
 def main() -> None:
     """Print tables in Markdown."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--images", type=Path, required=True, action="append")
     parser.add_argument("--count", type=int, default=400)
     parser.add_argument("--faulty", type=int, default=40)
     parser.add_argument("--seed", type=int, default=64)
     arguments = parser.parse_args()
     scenes = [read_scene(path, LIKE) for folder in arguments.images for path in list_images(folder)]
-    scenes = [scene for scene in scenes if fitting_oversampling(scene.radiance, RATIOS, LEAST_SIDE_PX)]
+    scenes = [
+        scene for scene in scenes if fitting_oversampling(scene.radiance, RATIOS, LEAST_SIDE_PX)
+    ]
     clean = Counter[str]()
     alarms = Counter[tuple[str, str]]()
     worst = Counter[str]()
@@ -67,7 +72,9 @@ def main() -> None:
 
 
 def detections(scenes: Sequence[Scene], count: int, seed: int) -> None:
-    """Print how many of the faults in photographs are detected: in single ones, and in strips of several."""
+    """Print how many of the faults in photographs are detected: in single ones, and in strips of
+    several.
+    """
     generator = np.random.default_rng(seed)
     kinds = {"one photograph": 1, f"{STACKED} below one another": STACKED}
     seen = Counter[tuple[str, str]]()
@@ -92,7 +99,9 @@ def detections(scenes: Sequence[Scene], count: int, seed: int) -> None:
 
 def stacked(scenes: Sequence[Scene], count: int, generator: np.random.Generator) -> np.ndarray:
     """Return the radiance of photographs below one another, as wide as the narrowest of them."""
-    chosen = [scenes[int(number)].radiance for number in generator.integers(len(scenes), size=count)]
+    chosen = [
+        scenes[int(number)].radiance for number in generator.integers(len(scenes), size=count)
+    ]
     width_px = min(each.shape[1] for each in chosen)
     return np.concatenate([each[:, :width_px] for each in chosen])
 
@@ -126,7 +135,9 @@ def column(gain: float) -> Fault:
 def dead_column(value: float) -> Fault:
     """One column of one value."""
 
-    def put(image: Image, sensor: Instrument, generator: np.random.Generator) -> tuple[Image, Detected]:
+    def put(
+        image: Image, sensor: Instrument, generator: np.random.Generator
+    ) -> tuple[Image, Detected]:
         place = int(generator.integers(3, image.shape[1] - 3))
         faulty = image.copy()
         faulty[:, place] = value * sensor.max_dn
@@ -138,14 +149,22 @@ def dead_column(value: float) -> Fault:
 def pixels(sigmas: float) -> Fault:
     """Ten pixels off by so many standard deviations of the noise; 0 is dead."""
 
-    def put(image: Image, sensor: Instrument, generator: np.random.Generator) -> tuple[Image, Detected]:
+    def put(
+        image: Image, sensor: Instrument, generator: np.random.Generator
+    ) -> tuple[Image, Detected]:
         faulty = image.copy()
         places = {tuple(generator.integers(3, side - 3) for side in image.shape) for _ in range(10)}
         for place in places:
-            noise = sensor.noise_sigma(image[place] / sensor.gain_dn_per_radiance) * sensor.gain_dn_per_radiance
+            noise = (
+                sensor.noise_sigma(image[place] / sensor.gain_dn_per_radiance)
+                * sensor.gain_dn_per_radiance
+            )
             faulty[place] = image[place] + sigmas * noise if sigmas else 0
         wanted = {tuple(map(int, place)) for place in places}
-        return faulty, lambda found: (len(wanted & set(map(tuple, found.pixels.tolist()))), len(wanted))
+        return faulty, lambda found: (
+            len(wanted & set(map(tuple, found.pixels.tolist()))),
+            len(wanted),
+        )
 
     return put
 
@@ -167,7 +186,9 @@ FAULTS: Mapping[str, Fault] = {
 }
 
 
-def acquisitions(scenes: Sequence[Scene], count: int, seed: int) -> Iterator[tuple[str, Image, Instrument, str]]:
+def acquisitions(
+    scenes: Sequence[Scene], count: int, seed: int
+) -> Iterator[tuple[str, Image, Instrument, str]]:
     """Clean images: what each shows, the image, its sensor, and words for both."""
     generator = np.random.default_rng(seed)
     kinds = ("photograph", "photograph", "texture", "drawn town", "drawn along the axes")
@@ -185,7 +206,10 @@ def acquisitions(scenes: Sequence[Scene], count: int, seed: int) -> Iterator[tup
         sensor = SensorFamily(LIKE, other_curves=0.3).draw(generator)
         light, noise = (float(generator.choice(each)) for each in (LIGHTS, NOISES))
         quiet = replace(sensor, alpha=sensor.alpha * noise**2, beta=sensor.beta * noise**2)
-        words = f"number {number}, {name}, ratio {ratio}, light {light:g}, noise {noise:g}, MTF {sensor.mtf_axes}"
+        words = (
+            f"number {number}, {name}, ratio {ratio}, light {light:g}, noise {noise:g}, MTF "
+            f"{sensor.mtf_axes}"
+        )
         yield kind, acquired(radiance * np.float32(light), quiet, number, ratio), quiet, words
 
 
@@ -210,7 +234,9 @@ def along_the_axes(generator: np.random.Generator) -> np.ndarray:
         part[:] = generator.uniform(10, 250)
         period = int(generator.integers(5, 60))
         share = generator.uniform(0.2, 0.8)
-        lines = (np.arange(max(part.shape)) % period < share * period) * generator.uniform(-0.5, 1.0)
+        lines = (np.arange(max(part.shape)) % period < share * period) * generator.uniform(
+            -0.5, 1.0
+        )
         if generator.random() < 0.6:  # crops or the sheets of a roof
             across = generator.random() < 0.5
             part *= 1 + (lines[None, : part.shape[1]] if across else lines[: part.shape[0], None])

@@ -1,9 +1,11 @@
-"""The MTF table that uneven edges give: errors, how often the interval holds the truth, how many are refused.
+"""The MTF table that uneven edges give: errors, how often the interval holds the truth, how many
+are refused.
 
     python benchmarks/edge_curves.py --images aerial-train/
 
-An edge lies between two pieces of the folder's photographs, each with texture of 5 or 10 % of the step, leans by 2 to
-25 degrees, and is seen by sensors of different MTF curves with the noise of `pleiades-degraded`.
+An edge lies between two pieces of the folder's photographs, each with texture of 5 or 10 % of the
+step, leans by 2 to 25 degrees, and is seen by sensors of different MTF curves with the noise of
+`pleiades-degraded`.
 """
 
 import argparse
@@ -17,7 +19,13 @@ import numpy as np
 from beers_deploy.model.curves import FREQUENCIES as TABULATED
 from beers_deploy.model.curves import pupil_contrast
 from beers_deploy.model.io.images import list_images
-from beers_deploy.model.metrics.edge_curve import FREQUENCIES, Edge, MtfCurve, edge_in, measure_curve
+from beers_deploy.model.metrics.edge_curve import (
+    FREQUENCIES,
+    Edge,
+    MtfCurve,
+    edge_in,
+    measure_curve,
+)
 from beers_deploy.model.metrics.noise_line import ROUNDING
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.metrics.slanted_edge import slanted_edge
@@ -43,7 +51,9 @@ SHOWN = (0.1, 0.25, NYQUIST)
 
 
 class Outcome(NamedTuple):
-    """Of one measurement: relative errors, whether the intervals held the truth, and whether it was refused."""
+    """Of one measurement: relative errors, whether the intervals held the truth, and whether it was
+    refused.
+    """
 
     errors: np.ndarray
     held: np.ndarray
@@ -52,14 +62,19 @@ class Outcome(NamedTuple):
 
 def main() -> None:
     """Print a row for each curve and each set of edges."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--images", type=Path, required=True)
     parser.add_argument("--repeats", type=int, default=6)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     generator = np.random.default_rng(arguments.seed)
     textures = Textures([pixels_of(path) for path in list_images(arguments.images)], generator)
-    print("| curve | edges | error at 0.1, 0.25, 0.5, root mean square | in the 90 % interval | refused |")
+    print(
+        "| curve | edges | error at 0.1, 0.25, 0.5, root mean square | in the 90 % interval | "
+        "refused |"
+    )
     print("|---|---|---|---|---|")
     everything = list[Outcome]()
     for name in CURVES:
@@ -80,7 +95,9 @@ def row(title: str, found: Sequence[Outcome]) -> str:
     return f"| {title} | {shown} | {covered} | {refused:.0%} |"
 
 
-def outcomes(name: str, count: int, length_px: int, repeats: int, textures: "Textures") -> Iterator[Outcome]:
+def outcomes(
+    name: str, count: int, length_px: int, repeats: int, textures: "Textures"
+) -> Iterator[Outcome]:
     """Measure sets of edges of one kind of curve, for each contrast and unevenness."""
     for contrast in CONTRASTS:
         for uneven in UNEVEN:
@@ -89,7 +106,9 @@ def outcomes(name: str, count: int, length_px: int, repeats: int, textures: "Tex
             truth = np.asarray(sensor.response.at(np.array([SHOWN]), np.zeros((1, 1)))[0])
             for _ in range(repeats):
                 edges = [textures.edge(sensor, uneven, length_px) for _ in range(count)]
-                curve = measure_curve([e for e in edges if not isinstance(e, Refusal)], np.random.default_rng(0))
+                curve = measure_curve(
+                    [e for e in edges if not isinstance(e, Refusal)], np.random.default_rng(0)
+                )
                 if isinstance(curve, MtfCurve):
                     yield judged(curve, truth)
 
@@ -135,7 +154,13 @@ class Textures:
         scene = np.maximum(dark * (1 - share) + bright * share, 1.0).astype(np.float32)
         draw = Draw(int(self.generator.integers(1 << 30)))
         dn = acquire(
-            scene_spectrum(scene), scene.shape[1], sensor, OVERSAMPLING, draw, "degraded", margin_px=MARGIN_PX
+            scene_spectrum(scene),
+            scene.shape[1],
+            sensor,
+            OVERSAMPLING,
+            draw,
+            "degraded",
+            margin_px=MARGIN_PX,
         )
         pixels = to_uint16(dn).astype(np.float64)
         top = (pixels.shape[0] - length_px) // 2

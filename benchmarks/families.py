@@ -1,19 +1,23 @@
-"""Families of networks that a DPU could like, each trained with equal effort: what they restore, and predicted time.
+"""Families of networks that a DPU could like, each trained with equal effort: what they restore,
+and predicted time.
 
-    python benchmarks/families.py --images aerial/ --out families/ [--families 4x64@2,u48@2] [--steps 1000]
+    python benchmarks/families.py --images aerial/ --out families/ \
+        [--families 4x64@2,u48@2] [--steps 1000]
                                   [--device cuda]
 
-Each is trained from scratch for one sensor, which it is not told, on as many patches as any other, and judged on the
-sites that training keeps apart: PSNR in float32 and in INT8 (calibrated on drawn scenes), and predicted seconds of a
-swath of 13600 x 9016 with exact seams on a VCK190, each with its best tile and configuration. Weights go to the
-folder; a network whose weights lie there is not trained again.
+Each is trained from scratch for one sensor, which it is not told, on as many patches as any other,
+and judged on the sites that training keeps apart: PSNR in float32 and in INT8 (calibrated on drawn
+scenes), and predicted seconds of a swath of 13600 x 9016 with exact seams on a VCK190, each with
+its best tile and configuration. Weights go to the folder; a network whose weights lie there is not
+trained again.
 
-Names: BLOCKSxFEATURES as the paper's blocks, uFEATURES a U-Net of two levels, dBLOCKSxFEATURES blocks of a widening
-1 x 1, a depthwise 5 x 5 and a narrowing 1 x 1 convolution, kBLOCKSxFEATURES blocks of 5 x 5 convolutions,
-aBLOCKSxFEATURES the paper's blocks with dilated convolutions in the middle ones, wBLOCKSxFEATURES blocks four times
-as wide inside, bBLOCKSxFEATURES the paper's blocks and beside them half as many at half the resolution; @SCALE: at
-1 / SCALE of the resolution. The last three see farther or say more at equal time. What a family is worth in the
-end, longer training tells: `beers-deploy train`.
+Names: BLOCKSxFEATURES as the paper's blocks, uFEATURES a U-Net of two levels, dBLOCKSxFEATURES
+blocks of a widening 1 x 1, a depthwise 5 x 5 and a narrowing 1 x 1 convolution, kBLOCKSxFEATURES
+blocks of 5 x 5 convolutions, aBLOCKSxFEATURES the paper's blocks with dilated convolutions in the
+middle ones, wBLOCKSxFEATURES blocks four times as wide inside, bBLOCKSxFEATURES the paper's blocks
+and beside them half as many at half the resolution; @SCALE: at 1 / SCALE of the resolution. The
+last three see farther or say more at equal time. What a family is worth in the end, longer training
+tells: `beers-deploy train`.
 """
 
 import argparse
@@ -67,7 +71,9 @@ LOSS = RestorationLoss(LossWeights(lpips=0.0, fft=0.0))
 
 
 class Restoring(nn.Module):
-    """Image plus correction, (N, 1, H, W) to the same: a head, a body between maps of equal size, a tail."""
+    """Image plus correction, (N, 1, H, W) to the same: a head, a body between maps of equal size, a
+    tail.
+    """
 
     def __init__(self, features: int, scale: int, body: nn.Module) -> None:
         super().__init__()
@@ -124,11 +130,15 @@ def widening_block(features: int) -> ResidualBlock:
 
 
 class Beside(nn.Module):
-    """What is given, the paper's blocks of it, and half as many blocks at half the resolution, added up."""
+    """What is given, the paper's blocks of it, and half as many blocks at half the resolution,
+    added up.
+    """
 
     def __init__(self, blocks: int, features: int) -> None:
         super().__init__()
-        self.fine = nn.Sequential(*(ResidualBlock(features) for _ in range(blocks)), conv(features, features))
+        self.fine = nn.Sequential(
+            *(ResidualBlock(features) for _ in range(blocks)), conv(features, features)
+        )
         self.down = nn.Conv2d(features, features, 3, stride=2, padding=1)
         self.coarse = nn.Sequential(*(ResidualBlock(features) for _ in range(blocks // 2)))
         self.end = conv(features, 4 * features)
@@ -141,7 +151,9 @@ class Beside(nn.Module):
 
 
 class Levels(nn.Module):
-    """A block, two more at half the resolution with twice the features, and a block; the skip is added."""
+    """A block, two more at half the resolution with twice the features, and a block; the skip is
+    added.
+    """
 
     def __init__(self, features: int) -> None:
         super().__init__()
@@ -184,7 +196,9 @@ def build(name: str, generator: torch.Generator) -> Restoring:
     for path, module in network.named_modules():
         if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
             small = 0.1 if path.endswith((*CORRECTIONS, f"body.{blocks}")) else 1.0
-            fan_in = module.weight[0].numel() if isinstance(module, nn.Conv2d) else module.in_channels
+            fan_in = (
+                module.weight[0].numel() if isinstance(module, nn.Conv2d) else module.in_channels
+            )
             with torch.no_grad():
                 module.weight.normal_(0.0, small * (2 / fan_in) ** 0.5, generator=generator)
                 module.bias.zero_()  # type: ignore[union-attr]
@@ -192,7 +206,9 @@ def build(name: str, generator: torch.Generator) -> Restoring:
 
 
 def trained(name: str, source: PatchSource, count: int, path: Path, device: str) -> Restoring:
-    """The network after so many steps by Adam, L1, the rate falling to 0 as a half cosine; kept in `path`."""
+    """The network after so many steps by Adam, L1, the rate falling to 0 as a half cosine; kept in
+    `path`.
+    """
     network = build(name, torch.Generator().manual_seed(0))
     if path.exists():
         network.load_state_dict(load_file(path))
@@ -219,7 +235,9 @@ def trained(name: str, source: PatchSource, count: int, path: Path, device: str)
 def psnr_cell(model: onnx.ModelProto, patches: Patches) -> str:
     """Mean PSNR of the patches, dB over full scale."""
     restore = Network.load(model)
-    levels = [psnr_db(restore(seen)[0, 0].clip(0, 1), meant[0, 0], 1.0) for seen, meant in patches.pairs]
+    levels = [
+        psnr_db(restore(seen)[0, 0].clip(0, 1), meant[0, 0], 1.0) for seen, meant in patches.pairs
+    ]
     return f"{np.mean(levels):.2f}"
 
 
@@ -229,13 +247,17 @@ def swath_cell(model: onnx.ModelProto) -> str:
     for configuration, tile_px in product(CONFIGURATIONS, TILES_PX):
         if 2 * tiling_of(model).halo_px < tile_px:
             _, time_s, low_s, high_s = on_a_swath(model, load_dpu("vck190", configuration), tile_px)
-            found.append((time_s, f"{time_s:.3g} [{low_s:.3g}, {high_s:.3g}] ({tile_px}, {configuration})"))
+            found.append(
+                (time_s, f"{time_s:.3g} [{low_s:.3g}, {high_s:.3g}] ({tile_px}, {configuration})")
+            )
     return min(found)[1]
 
 
 def main() -> None:
     """Print a row a family."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--images", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--families", default=FAMILIES)
@@ -249,9 +271,14 @@ def main() -> None:
     held = [scene for scene in scenes if site_of(scene.name) in apart]
     kept = [scene for scene in scenes if site_of(scene.name) not in apart]
     judging = draw_patches(held, *sensors, HELD_OUT, 1)
-    source = PatchSource(kept, PatchRecipe(*sensors, patch_px=PATCH_PX), BATCH, 0, device=arguments.device)
+    source = PatchSource(
+        kept, PatchRecipe(*sensors, patch_px=PATCH_PX), BATCH, 0, device=arguments.device
+    )
     drawn = Calibration(load_sensor(SENSOR), None, 64, 128, 0).drawn
-    print(f"{processor_name()}, {arguments.steps * BATCH} patches each, judged by {HELD_OUT} of {len(apart)} sites")
+    print(
+        f"{processor_name()}, {arguments.steps * BATCH} patches each, judged by {HELD_OUT} of "
+        f"{len(apart)} sites"
+    )
     heads = "family", "1000 parameters", "halo, px", "float32 dB", "INT8 dB", "s a swath, best tile"
     print("|", " | ".join(heads), "|\n" + "|---" * len(heads) + "|")
     for name in arguments.families.split(","):

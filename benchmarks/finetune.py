@@ -1,10 +1,11 @@
-"""What a step of fine-tuning costs against a plain float step of the same network on the same patches, in one run.
+"""What a step of fine-tuning costs against a plain float step of the same network on the same
+patches, in one run.
 
     python -m benchmarks.finetune
 
-Three networks with drawn weights, four patches of 128 x 128 a step. The float step is forward, loss, backward and
-Adam in torch, in whichever of its two memory layouts is faster. Both are interleaved, so that what else the machine
-does falls on each of them.
+Three networks with drawn weights, four patches of 128 x 128 a step. The float step is forward,
+loss, backward and Adam in torch, in whichever of its two memory layouts is faster. Both are
+interleaved, so that what else the machine does falls on each of them.
 """
 
 import argparse
@@ -39,7 +40,9 @@ class Added(nn.Sequential):
 
 
 def depthwise(features: int = 32) -> nn.Module:
-    """A depthwise and a pointwise convolution between two others, ReLU6 behind each, without a global add."""
+    """A depthwise and a pointwise convolution between two others, ReLU6 behind each, without a
+    global add.
+    """
     filters = nn.Conv2d(features, features, 3, padding=1, groups=features)
     middle = (filters, nn.ReLU6(), nn.Conv2d(features, features, 1), nn.ReLU6())
     return nn.Sequential(_conv(1, features), nn.ReLU6(), *middle, _conv(features, 1))
@@ -55,7 +58,11 @@ def _conv(inputs: int, outputs: int) -> nn.Conv2d:
     return nn.Conv2d(inputs, outputs, 3, padding=1)
 
 
-NETWORKS: dict[str, Callable[[], nn.Module]] = {"depthwise": depthwise, "unet": UNet, "dncnn": dncnn}
+NETWORKS: dict[str, Callable[[], nn.Module]] = {
+    "depthwise": depthwise,
+    "unet": UNet,
+    "dncnn": dncnn,
+}
 
 
 def float_step(network: nn.Module, layout: torch.memory_format) -> Callable[[], None]:
@@ -79,7 +86,9 @@ def tuning_step(core: IntCore) -> Callable[[], None]:
     samples = []
     for _ in range(PATCHES):
         image = generator.random((1, 1, SIDE_PX, SIDE_PX)).astype(np.float32)
-        planes = torch.from_numpy(core.ends.split(image).astype(np.float32)).to(memory_format=torch.channels_last)
+        planes = torch.from_numpy(core.ends.split(image).astype(np.float32)).to(
+            memory_format=torch.channels_last
+        )
         samples.append(Sample(image, planes, torch.zeros(1, 1, SIDE_PX, SIDE_PX), None, 1.0))
     descent = Descent(TrainableCore(core), samples, Tuning(Remade(lambda _: (image, image), 1)))
     return partial(next, descent.round(10**6))
@@ -87,17 +96,26 @@ def tuning_step(core: IntCore) -> Callable[[], None]:
 
 def main() -> None:
     """Print the times and the ratio of each network."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--turns", type=int, default=8)
     turns = parser.parse_args().turns
-    print(f"{processor_name()}, {torch.get_num_threads()} threads, processor time of the fastest of {turns} steps")
+    print(
+        f"{processor_name()}, {torch.get_num_threads()} threads, processor time of the fastest "
+        f"of {turns} steps"
+    )
     for name, make in NETWORKS.items():
         core = read_core(quantize(make(), patches=2, patch_px=64, progress=False).model)
         layouts = torch.contiguous_format, torch.channels_last
         steps = [tuning_step(core), *(float_step(make(), layout) for layout in layouts)]
         taken = [[_seconds(step) for step in steps] for _ in range(turns)]
         tuned, *both = 1e3 * np.min(taken, axis=0)
-        print(f"{name}: float {min(both):.0f} ms, tuning {tuned:.0f} ms, ratio {tuned / min(both):.2f}", flush=True)
+        print(
+            f"{name}: float {min(both):.0f} ms, tuning {tuned:.0f} ms, ratio "
+            f"{tuned / min(both):.2f}",
+            flush=True,
+        )
 
 
 def _seconds(step: Callable[[], None]) -> float:

@@ -1,9 +1,11 @@
-"""One image as TIFF, JPEG 2000, VRT of four tiles and COG: what restoring each takes beside the plain TIFF.
+"""One image as TIFF, JPEG 2000, VRT of four tiles and COG: what restoring each takes beside the
+plain TIFF.
 
     python benchmarks/formats.py [--size 13600x9016] [--model convbeers-xs-int8] [--repeats 1]
 
-Each run is a process of its own with one thread; times are of the processor, so that they hold on a busy machine.
-Decoding is timed apart, as reading every row by the plan's strips. The digests show that the pixels are the same.
+Each run is a process of its own with one thread; times are of the processor, so that they hold on a
+busy machine. Decoding is timed apart, as reading every row by the plan's strips. The digests show
+that the pixels are the same.
 """
 
 import argparse
@@ -65,12 +67,27 @@ def write(path: Path, pixels: np.ndarray, driver: str, **options: Any) -> Path:
 
 def write_tiff(path: Path, pixels: np.ndarray) -> Path:
     """In tiles, deflated."""
-    return write(path, pixels, "GTiff", tiled=True, blockxsize=256, blockysize=256, compress="deflate", predictor=2)
+    return write(
+        path,
+        pixels,
+        "GTiff",
+        tiled=True,
+        blockxsize=256,
+        blockysize=256,
+        compress="deflate",
+        predictor=2,
+    )
 
 
 def write_jp2(path: Path, pixels: np.ndarray) -> Path:
     """Lossless, in tiles."""
-    lossless = {"QUALITY": "100", "REVERSIBLE": "YES", "BLOCKXSIZE": BLOCK_PX, "BLOCKYSIZE": BLOCK_PX, "NBITS": 12}
+    lossless = {
+        "QUALITY": "100",
+        "REVERSIBLE": "YES",
+        "BLOCKXSIZE": BLOCK_PX,
+        "BLOCKYSIZE": BLOCK_PX,
+        "NBITS": 12,
+    }
     return write(path, pixels, "JP2OpenJPEG", **lossless)
 
 
@@ -84,8 +101,10 @@ def write_vrt(path: Path, pixels: np.ndarray) -> Path:
         write_tiff(path.with_name(f"{k}.tif"), pixels[part.toslices()])
         size = f'xSize="{part.width}" ySize="{part.height}"'
         sources += (
-            f'<SimpleSource><SourceFilename relativeToVRT="1">{k}.tif</SourceFilename><SourceBand>1</SourceBand>'
-            f'<SrcRect xOff="0" yOff="0" {size}/><DstRect xOff="{part.col_off}" yOff="{part.row_off}" {size}/>'
+            "<SimpleSource><SourceFilename "
+            f'relativeToVRT="1">{k}.tif</SourceFilename><SourceBand>1</SourceBand>'
+            f'<SrcRect xOff="0" yOff="0" {size}/><DstRect xOff="{part.col_off}" '
+            f'yOff="{part.row_off}" {size}/>'
             "</SimpleSource>"
         )
     band = f'<VRTRasterBand dataType="UInt16" band="1">{sources}</VRTRasterBand>'
@@ -112,8 +131,21 @@ def restored(image: Path, model: str, *more: str) -> tuple[float, float, str]:
     """Processor time in s, peak memory in GB, and a digest of the pixels."""
     out = image.with_name("out.tif")
     figures = image.with_name("out.json")
-    words = ["restore", str(image), str(out), "--network", model, "--threads", "1", "--json", str(figures), *more]
-    done = subprocess.run([sys.executable, "-c", COUNTED, *words], capture_output=True, text=True, check=True)  # noqa: S603
+    words = [
+        "restore",
+        str(image),
+        str(out),
+        "--network",
+        model,
+        "--threads",
+        "1",
+        "--json",
+        str(figures),
+        *more,
+    ]
+    done = subprocess.run(  # noqa: S603
+        [sys.executable, "-c", COUNTED, *words], capture_output=True, text=True, check=True
+    )
     row = json.loads(figures.read_text())["rows"][0]["figures"]
     digest = hashlib.sha256(tifffile.imread(out).tobytes()).hexdigest()[:12]
     out.unlink()
@@ -132,7 +164,9 @@ def decoding_s(image: Path) -> float:
 
 def main() -> None:
     """Print a line a format."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--size", default="13600x9016")
     parser.add_argument("--model", default="convbeers-xs-int8")
     parser.add_argument("--repeats", type=int, default=1)
@@ -149,11 +183,15 @@ def main() -> None:
             first = first or time_s
             speed = f"{first / time_s:.3f} of the TIFF's speed"
             print(
-                f"{label}: {time_s:.1f} s, {speed}; decoding {decoding:.1f} s; {memory_gb:.2f} GB; {digest}",
+                f"{label}: {time_s:.1f} s, {speed}; decoding {decoding:.1f} s; {memory_gb:.2f} "
+                f"GB; {digest}",
                 flush=True,
             )
         time_s, memory_gb, digest = restored(Path(name) / "a.tif", arguments.model, "--cog")
-        print(f"TIFF to COG: {time_s:.1f} s, {first / time_s:.3f} of the speed to TIFF; {memory_gb:.2f} GB; {digest}")
+        print(
+            f"TIFF to COG: {time_s:.1f} s, {first / time_s:.3f} of the speed to TIFF; "
+            f"{memory_gb:.2f} GB; {digest}"
+        )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
-"""Quantise one network our way or onnxruntime's: `int8_peers.py` runs it in a process of its own, to see its memory.
+"""Quantise one network our way or onnxruntime's: `int8_peers.py` runs it in a process of its own,
+to see its memory.
 
     python int8_child.py WAY FLOAT PATCHES OUT     WAY: ours, minmax or percentile
 
-PATCHES is an .npy file (K, C, H, W) of what the network takes. Writes OUT, and prints seconds and peak resident
-memory as the last line, in JSON.
+PATCHES is an .npy file (K, C, H, W) of what the network takes. Writes OUT, and prints seconds and
+peak resident memory as the last line, in JSON.
 """
 
 import json
@@ -18,7 +19,9 @@ import onnx
 from beers_deploy.quant.graph import PLANES, PLANES_FRAC_BITS
 
 STRIDE = 16
-"""Patches that onnxruntime's calibration looks at together; with 64 at once the network of 16 x 64 takes 20 GB."""
+"""Patches that onnxruntime's calibration looks at together; with 64 at once the network of 16 x 64
+takes 20 GB.
+"""
 
 
 def main() -> None:
@@ -48,11 +51,12 @@ def ours(network: Path, images: np.ndarray, out: Path) -> None:
 
 
 def onnxruntimes(way: str, network: Path, inputs: np.ndarray, out: Path) -> None:
-    """QDQ by `quantize_static`: per-channel int8 weights, asymmetric uint8 activations, float scales.
+    """QDQ by `quantize_static`: per-channel int8 weights, asymmetric uint8 activations, float
+    scales.
 
-    By percentile its memory grows with the patches that it looks at together, so it gets STRIDE of them at a time:
-    gigabytes all the same. The planes' scale is given: they are whole numbers of 2^-7 by construction, and no
-    statistics would find that out.
+    By percentile its memory grows with the patches that it looks at together, so it gets STRIDE of
+    them at a time: gigabytes all the same. The planes' scale is given: they are whole numbers of
+    2^-7 by construction, and no statistics would find that out.
     """
     from onnxruntime import quantization as ort
 
@@ -71,19 +75,38 @@ def onnxruntimes(way: str, network: Path, inputs: np.ndarray, out: Path) -> None
             return None if patch is None else {name: patch[None]}
 
     name = onnx.load(network).graph.input[0].name
-    unit = {"scale": np.array(2.0**-PLANES_FRAC_BITS, np.float32), "zero_point": np.array(128, np.uint8)}
+    unit = {
+        "scale": np.array(2.0**-PLANES_FRAC_BITS, np.float32),
+        "zero_point": np.array(128, np.uint8),
+    }
     options: dict[str, Any] = {"CalibPercentile": 99.99, "CalibStridedMinMax": STRIDE}
     options |= (
-        {"TensorQuantOverrides": {PLANES: [{**unit, "quant_type": ort.QuantType.QUInt8}]}} if name == PLANES else {}
+        {"TensorQuantOverrides": {PLANES: [{**unit, "quant_type": ort.QuantType.QUInt8}]}}
+        if name == PLANES
+        else {}
     )
-    method = {"minmax": ort.CalibrationMethod.MinMax, "percentile": ort.CalibrationMethod.Percentile}[way]
-    kinds = {"activation_type": ort.QuantType.QUInt8, "weight_type": ort.QuantType.QInt8, "per_channel": True}
-    ort.quantize_static(network, out, Reader(), calibrate_method=method, extra_options=options, **kinds)
+    method = {
+        "minmax": ort.CalibrationMethod.MinMax,
+        "percentile": ort.CalibrationMethod.Percentile,
+    }[way]
+    kinds = {
+        "activation_type": ort.QuantType.QUInt8,
+        "weight_type": ort.QuantType.QInt8,
+        "per_channel": True,
+    }
+    ort.quantize_static(
+        network, out, Reader(), calibrate_method=method, extra_options=options, **kinds
+    )
 
 
 def peak_mb() -> float:
-    """Largest resident memory of this process; getrusage would count that of its parent before it too."""
-    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines())
+    """Largest resident memory of this process; getrusage would count that of its parent before it
+    too.
+    """
+    status = dict(
+        line.split(":", 1)
+        for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    )
     return int(status["VmHWM"].split()[0]) * 1024 / 1e6
 
 

@@ -1,11 +1,13 @@
-"""INT8 beside float32 on onnxruntime, as this processor computes them and as one without VNNI would have to.
+"""INT8 beside float32 on onnxruntime, as this processor computes them and as one without VNNI would
+have to.
 
     python benchmarks/int8_kernels.py --variant convbeers-s --tile 640 --threads 1 2
 
-`int8` is what every command runs here. `ways` takes, whatever the processor, the ways of one whose int8 kernels
-saturate (`quant.kernels`): where they do, the two are the same. `plain` is the file as it stands, which is right only
-where int8 products add exactly; int8 / plain is what exactness costs. Sessions are interleaved, so that what else the
-machine does falls on each of them; ratios are of the fastest turns. On another processor: benchmarks/without_vnni.py.
+`int8` is what every command runs here. `ways` takes, whatever the processor, the ways of one whose
+int8 kernels saturate (`quant.kernels`): where they do, the two are the same. `plain` is the file as
+it stands, which is right only where int8 products add exactly; int8 / plain is what exactness
+costs. Sessions are interleaved, so that what else the machine does falls on each of them; ratios
+are of the fastest turns. On another processor: benchmarks/without_vnni.py.
 """
 
 import argparse
@@ -29,15 +31,22 @@ VARIANTS = ("convbeers-xs", "convbeers-s", "convbeers")
 
 def main() -> None:
     """Print the ways by layer, then the times and their ratios."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--variant", choices=VARIANTS, nargs="+", default=["convbeers-s"])
     parser.add_argument("--tile", type=int, default=640)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--turns", type=int, default=5)
     arguments = parser.parse_args()
     int8_adds_exactly()
-    print(f"{processor_name()}, onnxruntime {ort.__version__}; int8: {decided()['int8 on onnxruntime']}")
-    image = np.random.default_rng(0).random((1, 1, arguments.tile, arguments.tile), dtype=np.float32)
+    print(
+        f"{processor_name()}, onnxruntime {ort.__version__}; int8: "
+        f"{decided()['int8 on onnxruntime']}"
+    )
+    image = np.random.default_rng(0).random(
+        (1, 1, arguments.tile, arguments.tile), dtype=np.float32
+    )
     for variant in arguments.variant:
         floating, integer = (load_onnx(path) for path in shipped_pair(variant))
         print_ways(variant, integer)
@@ -54,7 +63,12 @@ def print_ways(variant: str, integer: onnx.ModelProto) -> None:
 
 
 def print_times(
-    variant: str, floating: onnx.ModelProto, integer: onnx.ModelProto, image: np.ndarray, threads: int, turns: int
+    variant: str,
+    floating: onnx.ModelProto,
+    integer: onnx.ModelProto,
+    image: np.ndarray,
+    threads: int,
+    turns: int,
 ) -> None:
     """The fastest run of each session, and the ratios."""
     sessions = {
@@ -65,7 +79,9 @@ def print_times(
     }
     calls = [partial(run, session, image) for session in sessions.values()]
     found = interleaved(calls, turns + 1)
-    times_s = {name: [time_s for time_s, _ in taken] for name, taken in zip(sessions, found, strict=True)}
+    times_s = {
+        name: [time_s for time_s, _ in taken] for name, taken in zip(sessions, found, strict=True)
+    }
     fastest_s = {name: min(times[1:]) for name, times in times_s.items()}  # the first turn sets up
     spread = max(median(times[1:]) / fastest_s[name] for name, times in times_s.items())
     shown = ", ".join(f"{name} {time_s:.3f} s" for name, time_s in fastest_s.items())
@@ -73,7 +89,8 @@ def print_times(
     cost = fastest_s["int8"] / fastest_s["plain"]
     print(
         f"{variant}, {image.shape[-1]} x {image.shape[-1]}, {threads} threads: {shown}; "
-        f"float32 / int8 {ratios['int8']:.2f}, float32 / ways {ratios['ways']:.2f}, int8 / plain {cost:.2f}; "
+        f"float32 / int8 {ratios['int8']:.2f}, float32 / ways {ratios['ways']:.2f}, int8 / "
+        f"plain {cost:.2f}; "
         f"median up to {spread:.2f} times the fastest"
     )
 

@@ -1,17 +1,19 @@
-"""Our INT8 beside onnxruntime's and AMD Quark's: the same network, calibration patches and held-out patches, one run.
+"""Our INT8 beside onnxruntime's and AMD Quark's: the same network, calibration patches and held-out
+patches, one run.
 
-    python benchmarks/int8_peers.py --images aerial-train/ --held-out aerial-test/ --quark-python quark/bin/python
+    python benchmarks/int8_peers.py --images aerial-train/ --held-out aerial-test/ \
+        --quark-python quark/bin/python
     python benchmarks/int8_peers.py --float mine.onnx --data samples.npz --held-out-data others.npz
 
-On Linux. Prints a Markdown table. Each way quantises in a process of its own; its peak memory has the interpreter and
-libraries in it. Peers get the plain graph, and the one that we quantise: planes in, the correction out, the add
-left to the host.
+On Linux. Prints a Markdown table. Each way quantises in a process of its own; its peak memory has
+the interpreter and libraries in it. Peers get the plain graph, and the one that we quantise: planes
+in, the correction out, the add left to the host.
 
-With Quark a line below the table compares our VINT8 file with its own, of the rewritten graph: which scales of ours
-its adjuster moves, and whether operators, types and pairs are alike.
+With Quark a line below the table compares our VINT8 file with its own, of the rewritten graph:
+which scales of ours its adjuster moves, and whether operators, types and pairs are alike.
 
-Quark wants other versions of its libraries, so it lives in its own environment. Without the CPU build of torch, pip
-would fetch gigabytes of CUDA packages:
+Quark wants other versions of its libraries, so it lives in its own environment. Without the CPU
+build of torch, pip would fetch gigabytes of CUDA packages:
 
     python3 -m venv quark
     quark/bin/pip install torch==2.13.0 --index-url https://download.pytorch.org/whl/cpu
@@ -91,15 +93,21 @@ class Peered:
         onnx.save(graph_to_onnx(graph, [CORRECTION], self.ends.planes * self.ends.channels), core)
 
     def runner(self, path: Path) -> Restore:
-        """A file as a function of images (1, C, H, W): one that reads planes gets the host's part."""
+        """A file as a function of images (1, C, H, W): one that reads planes
+        gets the host's part.
+        """
         session = open_session(onnx.load(path))
         if session.get_inputs()[0].name != PLANES:
             return lambda image: result_of(session, image)
-        return lambda image: self.ends.finished(image, result_of(session, planes_of(image, self.ends)))
+        return lambda image: self.ends.finished(
+            image, result_of(session, planes_of(image, self.ends))
+        )
 
 
 def scores(in_float: Restore, in_int8: Restore, pairs: list[Pair]) -> list[str]:
-    """The table's columns of accuracy; PSNR and SSIM are means over patches, of images with references alone."""
+    """The table's columns of accuracy; PSNR and SSIM are means over patches, of images with
+    references alone.
+    """
     differences = []
     rows = []
     for image, reference in pairs:
@@ -111,7 +119,13 @@ def scores(in_float: Restore, in_int8: Restore, pairs: list[Pair]) -> list[str]:
     std = float(difference.std())
     db_float, db_int8, similarity, same = np.mean(rows, axis=0)
     sizes = [f"{mae:.6f}", f"{std:.6f}", f"{np.abs(difference).max():.4f}", f"{std / mae:.2f}"]
-    found = f"{db_float:.2f}", f"{db_int8:.2f}", f"{db_float - db_int8:.3f}", f"{similarity:.4f}", f"{100 * same:.2f}"
+    found = (
+        f"{db_float:.2f}",
+        f"{db_int8:.2f}",
+        f"{db_float - db_int8:.3f}",
+        f"{similarity:.4f}",
+        f"{100 * same:.2f}",
+    )
     return [*sizes, *(cell.replace("nan", "") for cell in found)]
 
 
@@ -122,7 +136,9 @@ def _as_in_a_file(result: np.ndarray, image: np.ndarray) -> np.ndarray:
 def _against(reference: np.ndarray, both: list[np.ndarray]) -> list[float]:
     if reference.shape != both[0].shape:
         return [math.nan] * 3
-    similarity = [ssim(one, other, 1.0) for one, other in zip(both[1][0], reference[0], strict=True)]
+    similarity = [
+        ssim(one, other, 1.0) for one, other in zip(both[1][0], reference[0], strict=True)
+    ]
     return [*(psnr_db(result, reference, 1.0) for result in both), float(np.mean(similarity))]
 
 
@@ -133,14 +149,27 @@ def _alike(image: np.ndarray, both: list[np.ndarray]) -> list[float]:
     return [float((both[0].argmax(1) == both[1].argmax(1)).mean())]
 
 
-def quantise(way: Way, files: dict[bool, tuple[Path, Path]], out: Path, python: str) -> tuple[float, float]:
+def quantise(
+    way: Way, files: dict[bool, tuple[Path, Path]], out: Path, python: str
+) -> tuple[float, float]:
     """Run one way; seconds and peak MB.
 
     Raises:
         RuntimeError: it failed; what it said last.
     """
-    command = [python, str(way.script), *way.before, *map(str, files[way.rewritten]), str(out), *way.after]
-    paths = {**os.environ, "PYTHONPATH": str(HERE.parent)} if way.script == OURS else {**os.environ, "PYTHONPATH": ""}
+    command = [
+        python,
+        str(way.script),
+        *way.before,
+        *map(str, files[way.rewritten]),
+        str(out),
+        *way.after,
+    ]
+    paths = (
+        {**os.environ, "PYTHONPATH": str(HERE.parent)}
+        if way.script == OURS
+        else {**os.environ, "PYTHONPATH": ""}
+    )
     at = out.parent  # Quark drops files where it runs
     done = subprocess.run(command, check=False, capture_output=True, text=True, env=paths, cwd=at)  # noqa: S603 - our own
     if done.returncode:
@@ -151,45 +180,79 @@ def quantise(way: Way, files: dict[bool, tuple[Path, Path]], out: Path, python: 
 
 
 def layout(path: Path) -> Counter[tuple[str, ...]]:
-    """How often an operator reads what: of each input the operator that writes it, or the type of a constant."""
+    """How often an operator reads what: of each input the operator that writes it, or the type of a
+    constant.
+    """
     graph = onnx.load(path).graph
-    sources = {tensor.name: onnx.TensorProto.DataType.Name(tensor.data_type) for tensor in graph.initializer}
+    sources = {
+        tensor.name: onnx.TensorProto.DataType.Name(tensor.data_type)
+        for tensor in graph.initializer
+    }
     sources |= {name: node.op_type for node in graph.node for name in node.output}
-    return Counter((node.op_type, *(sources.get(name, "input") for name in node.input)) for node in graph.node)
+    return Counter(
+        (node.op_type, *(sources.get(name, "input") for name in node.input)) for node in graph.node
+    )
 
 
 def vint8_words(host: Path, theirs: Path, tile_px: int, python: str) -> str:
-    """What Quark's adjuster makes of our VINT8 file, and where the layout is not that of Quark's own."""
+    """What Quark's adjuster makes of our VINT8 file, and where the layout is not that of Quark's
+    own.
+    """
     ours = Network.load(host).core("vek385", tile_px).save(host.with_name("vint8.onnx"))
-    done = subprocess.run([python, str(QUARK), "adjust", str(ours)], check=True, capture_output=True, text=True)  # noqa: S603
+    done = subprocess.run(  # noqa: S603
+        [python, str(QUARK), "adjust", str(ours)], check=True, capture_output=True, text=True
+    )
     one = layout(ours)
     other = layout(theirs)
-    return f"VINT8: {done.stdout.strip().splitlines()[-1]}; ours alone {[*(one - other)]}, Quark's {[*(other - one)]}"
+    return (
+        f"VINT8: {done.stdout.strip().splitlines()[-1]}; ours alone {[*(one - other)]}, "
+        f"Quark's {[*(other - one)]}"
+    )
 
 
 COLUMNS = (
-    *("tool", "graph", "MAE", "std", "max", "std / MAE", "PSNR float dB", "PSNR INT8 dB", "drop dB", "SSIM"),
+    *(
+        "tool",
+        "graph",
+        "MAE",
+        "std",
+        "max",
+        "std / MAE",
+        "PSNR float dB",
+        "PSNR INT8 dB",
+        "drop dB",
+        "SSIM",
+    ),
     *("same class %", "s", "peak MB"),
 )
 
 
 def drawn(model: onnx.ModelProto, arguments: argparse.Namespace) -> tuple[list[Pair], list[Pair]]:
-    """What the network is calibrated and judged on: a user's samples where given, else simulated patches."""
+    """What the network is calibrated and judged on: a user's samples where given, else simulated
+    patches.
+    """
     if arguments.data:
-        both = (samples_of(model, path) for path in (arguments.data, arguments.held_out_data or arguments.data))
+        both = (
+            samples_of(model, path)
+            for path in (arguments.data, arguments.held_out_data or arguments.data)
+        )
         calibration, held_out = (list(samples.all.pairs) for samples in both if samples)
         return calibration, held_out
     other = arguments.seed + HELD_OUT_SEED
     return (
         _simulated(arguments.images, arguments.sensor, arguments.patches, arguments.seed),
-        _simulated(arguments.held_out, arguments.held_out_sensor, arguments.held_out_patches, other),
+        _simulated(
+            arguments.held_out, arguments.held_out_sensor, arguments.held_out_patches, other
+        ),
     )
 
 
 def _simulated(images: Path | None, sensor: str, count: int, seed: int) -> list[Pair]:
     profile = load_sensor(sensor)
     aim = reference_for(profile)
-    return list(draw_patches(load_scenes(images, aim.nominal(), seed), profile, aim, count, seed).pairs)
+    return list(
+        draw_patches(load_scenes(images, aim.nominal(), seed), profile, aim, count, seed).pairs
+    )
 
 
 def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
@@ -198,7 +261,10 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
     network = Peered(model, ends_of(read_network(model)))
     calibration, held_out = drawn(model, arguments)
     images = np.concatenate([image for image, _ in calibration])
-    files = {False: (folder / "plain.onnx", folder / "plain.npy"), True: (folder / "core.onnx", folder / "core.npy")}
+    files = {
+        False: (folder / "plain.onnx", folder / "plain.npy"),
+        True: (folder / "core.onnx", folder / "core.npy"),
+    }
     network.written(files[False][0], files[True][0])
     np.save(files[False][1], images)
     np.save(files[True][1], planes_of(images, network.ends))
@@ -212,7 +278,10 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
             continue
         python = sys.executable if way.script == OURS else arguments.quark_python
         if python is None:
-            yield f"| {way.name} | {graph} | unavailable: no --quark-python |{' |' * (len(COLUMNS) - 3)}"
+            yield (
+                f"| {way.name} | {graph} | unavailable: no --quark-python "
+                f"|{' |' * (len(COLUMNS) - 3)}"
+            )
             continue
         out = folder / f"{number:02d}-{way.name.replace(' ', '-')}-{graph}.onnx"
         try:
@@ -220,7 +289,11 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
         except RuntimeError as error:
             yield f"| {way.name} | {graph} | unavailable: {error} |{' |' * (len(COLUMNS) - 3)}"
             continue
-        cells = [*scores(in_float, network.runner(out), held_out), f"{seconds:.0f}", f"{peak_mb:.0f}"]
+        cells = [
+            *scores(in_float, network.runner(out), held_out),
+            f"{seconds:.0f}",
+            f"{peak_mb:.0f}",
+        ]
         yield f"| {way.name} | {graph} | {' | '.join(cells)} |"
         made[f"{way.name}, {graph}"] = out
     host = made.get("beers-deploy, rewritten")
@@ -231,27 +304,51 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
 
 def main() -> None:
     """Print the table; with --keep, the files stay."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--variant", default="convbeers-s", help="shipped weights of this name")
     parser.add_argument("--float", type=Path, help="another float network, .onnx or .safetensors")
-    parser.add_argument("--data", type=Path, help="samples to calibrate on, as 'quantize --samples' takes them")
-    parser.add_argument("--held-out-data", type=Path, help="samples to judge on; those of --data if none")
-    parser.add_argument("--images", type=Path, help="folder of scenes for calibration; drawn ones if none")
-    parser.add_argument("--sensor", default="pleiades-variable", help="profile of the calibration patches")
-    parser.add_argument("--held-out", type=Path, help="folder of scenes for evaluation; drawn ones if none")
-    parser.add_argument("--held-out-sensor", default="pleiades-degraded", help="profile of the held-out patches")
+    parser.add_argument(
+        "--data", type=Path, help="samples to calibrate on, as 'quantize --samples' takes them"
+    )
+    parser.add_argument(
+        "--held-out-data", type=Path, help="samples to judge on; those of --data if none"
+    )
+    parser.add_argument(
+        "--images", type=Path, help="folder of scenes for calibration; drawn ones if none"
+    )
+    parser.add_argument(
+        "--sensor", default="pleiades-variable", help="profile of the calibration patches"
+    )
+    parser.add_argument(
+        "--held-out", type=Path, help="folder of scenes for evaluation; drawn ones if none"
+    )
+    parser.add_argument(
+        "--held-out-sensor", default="pleiades-degraded", help="profile of the held-out patches"
+    )
     parser.add_argument("--patches", type=int, default=64, help="calibration patches of 128 x 128")
     parser.add_argument("--held-out-patches", type=int, default=32)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quark-python", help="interpreter of the environment that AMD Quark is installed in")
-    parser.add_argument("--adaround-iterations", type=int, default=60, help="a layer; Quark's own default is 1000")
-    parser.add_argument("--only", default="", help='rows whose "tool, graph" this regular expression finds')
+    parser.add_argument(
+        "--quark-python", help="interpreter of the environment that AMD Quark is installed in"
+    )
+    parser.add_argument(
+        "--adaround-iterations", type=int, default=60, help="a layer; Quark's own default is 1000"
+    )
+    parser.add_argument(
+        "--only", default="", help='rows whose "tool, graph" this regular expression finds'
+    )
     parser.add_argument("--keep", type=Path, help="folder for the quantised files")
     print_lines(table, parser.parse_args())
 
 
-def print_lines(table: Callable[[argparse.Namespace, Path], Iterator[str]], arguments: argparse.Namespace) -> None:
-    """Print each line of a table as it comes, the files of its networks in the folder of --keep if there is one."""
+def print_lines(
+    table: Callable[[argparse.Namespace, Path], Iterator[str]], arguments: argparse.Namespace
+) -> None:
+    """Print each line of a table as it comes, the files of its networks in the folder of --keep if
+    there is one.
+    """
     with tempfile.TemporaryDirectory() as temporary:
         folder = (arguments.keep or Path(temporary)).resolve()
         folder.mkdir(parents=True, exist_ok=True)

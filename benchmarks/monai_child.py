@@ -1,17 +1,18 @@
-"""MONAI's SlidingWindowInferer on one image, a turn for each line that comes in: `swath.py --monai-python` runs it.
+"""MONAI's SlidingWindowInferer on one image, a turn for each line that comes in: `swath.py
+--monai-python` runs it.
 
     python monai_child.py MODEL.onnx IN.tif OUT.tif TILE_PX OVERLAP THREADS
 
-MONAI lives in an environment of its own, and the network runs on onnxruntime there as it does here. Without the CPU
-build of torch, pip would fetch gigabytes of CUDA packages:
+MONAI lives in an environment of its own, and the network runs on onnxruntime there as it does here.
+Without the CPU build of torch, pip would fetch gigabytes of CUDA packages:
 
     python3 -m venv monai
     monai/bin/pip install torch==2.13.0 --index-url https://download.pytorch.org/whl/cpu
     monai/bin/pip install monai==1.6.1 onnxruntime==1.31.1 tifffile
 
-A turn opens the network, reads the whole image, restores it and writes it, and answers with its seconds of the
-processor in JSON. Windows overlap by
-OVERLAP, a share of the tile, and are blended with equal weights, as MONAI does unless told otherwise.
+A turn opens the network, reads the whole image, restores it and writes it, and answers with its
+seconds of the processor in JSON. Windows overlap by OVERLAP, a share of the tile, and are blended
+with equal weights, as MONAI does unless told otherwise.
 """
 
 import json
@@ -43,11 +44,17 @@ def main() -> None:
     for _ in sys.stdin:
         before_s = time.process_time()
         session = ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-        image = torch.from_numpy(tifffile.imread(source).astype(np.float32) / FULL_SCALE)[None, None]
+        image = torch.from_numpy(tifffile.imread(source).astype(np.float32) / FULL_SCALE)[
+            None, None
+        ]
         with torch.inference_mode():
             restored = inferer(image, predictor(session))[0, 0].numpy()
         dn = np.rint(np.clip(restored * FULL_SCALE, 0, FULL_SCALE)).astype(np.uint16)
-        packed: dict[str, Any] = {"compression": "zlib", "compressionargs": {"level": 1}, "predictor": 2}
+        packed: dict[str, Any] = {
+            "compression": "zlib",
+            "compressionargs": {"level": 1},
+            "predictor": 2,
+        }
         tifffile.imwrite(out, dn, tile=(256, 256), maxworkers=os.cpu_count(), **packed)
         print(json.dumps({"cpu_seconds": time.process_time() - before_s}), flush=True)
 

@@ -1,9 +1,10 @@
-"""Networks and the traditional pipeline under sensors of one contrast at Nyquist and different MTF curves.
+"""Networks and the traditional pipeline under sensors of one contrast at Nyquist and different MTF
+curves.
 
     python benchmarks/mtf_shapes.py --images aerial-test/ [--networks convbeers-s-int8]
 
-Each curve is stated as a table up to Nyquist, where it is 7 %, and all methods know it. One photograph of each site;
-PSNR of inner pixels against the reference without noise.
+Each curve is stated as a table up to Nyquist, where it is 7 %, and all methods know it. One
+photograph of each site; PSNR of inner pixels against the reference without noise.
 """
 
 import argparse
@@ -21,7 +22,11 @@ from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.response import NYQUIST, MtfTable
 from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.restoration.method import Restore
-from beers_deploy.studies.evaluation.methods import TRADITIONAL, method_named, method_without_network
+from beers_deploy.studies.evaluation.methods import (
+    TRADITIONAL,
+    method_named,
+    method_without_network,
+)
 from beers_deploy.studies.evaluation.pairs import NamedPair, simulate_pairs
 
 CONTRAST = 0.07
@@ -42,21 +47,32 @@ REFERENCE = load_sensor("pleiades-reference")
 
 def main() -> None:
     """Print a row a curve: the pipeline's PSNR, and how far each network is above it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--images", type=Path, required=True)
     parser.add_argument("--networks", default="convbeers-s-int8")
     arguments = parser.parse_args()
     names = arguments.networks.split(",")
     aim = REFERENCE.nominal()
-    scenes = {site_of(scene.name): scene for scene in reversed(load_scenes(arguments.images, aim, SEED))}
+    scenes = {
+        site_of(scene.name): scene for scene in reversed(load_scenes(arguments.images, aim, SEED))
+    }
     print(f"| curve | {TRADITIONAL} dB | {' | '.join(names)} |")
     print(f"|---|---|{'---|' * len(names)}")
     for curve, contrasts in curves().items():
         sensor = with_curve(contrasts)
-        pairs, _ = simulate_pairs(list(scenes.values()), sensor, aim.in_units_of(sensor), SEED, OVERSAMPLINGS)
+        pairs, _ = simulate_pairs(
+            list(scenes.values()), sensor, aim.in_units_of(sensor), SEED, OVERSAMPLINGS
+        )
         pipeline = mean_psnr_db(method_without_network(TRADITIONAL, sensor, aim).restore, pairs)
         gains = [mean_psnr_db(network(name, sensor), pairs) - pipeline for name in names]
-        print(f"| {curve} | {pipeline:.2f} |", " | ".join(f"{gain:+.2f}" for gain in gains), "|", flush=True)
+        print(
+            f"| {curve} | {pipeline:.2f} |",
+            " | ".join(f"{gain:+.2f}" for gain in gains),
+            "|",
+            flush=True,
+        )
 
 
 def frequencies() -> Curve:

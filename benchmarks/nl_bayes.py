@@ -2,8 +2,9 @@
 
     python benchmarks/nl_bayes.py [--quality standard] [--sigma 10,20]
 
-The C++ figures are published (IPOL program, one thread of a 2-core EPYC); ours are measured here on one thread. So
-the ratio of times is worth what the two machines have in common; the PSNRs compare exactly.
+The C++ figures are published (IPOL program, one thread of a 2-core EPYC); ours are measured here on
+one thread. So the ratio of times is worth what the two machines have in common; the PSNRs compare
+exactly.
 """
 
 import argparse
@@ -43,31 +44,47 @@ def images() -> Iterator[tuple[str, np.ndarray]]:
 
 def main() -> None:
     """Print a line a cell, then the means."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quality", choices=QUALITIES, default="standard")
     parser.add_argument("--sigma", default="10,20,30")
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     pairs = product(images(), map(int, arguments.sigma.split(",")))
-    cells = [cell(name, clean, sigma, arguments.quality, arguments.repeats) for (name, clean), sigma in pairs]
+    cells = [
+        cell(name, clean, sigma, arguments.quality, arguments.repeats)
+        for (name, clean), sigma in pairs
+    ]
     gain, ratio = np.mean(cells, axis=0)
     print(f"mean: {gain:+.3f} dB, {ratio:.2f} times the C++ time")
 
 
-def cell(name: str, clean: np.ndarray, sigma: int, quality: str, repeats: int) -> tuple[float, float]:
+def cell(
+    name: str, clean: np.ndarray, sigma: int, quality: str, repeats: int
+) -> tuple[float, float]:
     """PSNR above the C++ program's, and the ratio of times (the fastest of some runs)."""
     noise = np.random.default_rng(0).normal(0, sigma, clean.shape)
     noisy = torch.from_numpy((clean + noise).astype(np.float32))
     times_s = []
     for _ in range(repeats):
         started = time.perf_counter()
-        denoised = torch.cat(list(nl_bayes_strips([noisy], len(noisy), Noise(sigma), QUALITIES[quality])))
+        denoised = torch.cat(
+            list(nl_bayes_strips([noisy], len(noisy), Noise(sigma), QUALITIES[quality]))
+        )
         times_s.append(time.perf_counter() - started)
-    level_db, time_s, (cpp_db, cpp_s) = psnr_db(denoised.numpy(), clean, 255), min(times_s), CPP[name, sigma]
+    level_db, time_s, (cpp_db, cpp_s) = (
+        psnr_db(denoised.numpy(), clean, 255),
+        min(times_s),
+        CPP[name, sigma],
+    )
     gain = level_db - cpp_db
     ratio = time_s / cpp_s
-    print(f"{name:10} sigma {sigma}: {level_db:.2f} dB ({gain:+.2f}), {time_s:.2f} s ({ratio:.2f} x)", flush=True)
+    print(
+        f"{name:10} sigma {sigma}: {level_db:.2f} dB ({gain:+.2f}), {time_s:.2f} s ({ratio:.2f} x)",
+        flush=True,
+    )
     return gain, ratio
 
 

@@ -1,12 +1,15 @@
-"""Quantise one ONNX file with AMD Quark: `int8_peers.py` runs it in Quark's own environment. Imports nothing of ours.
+"""Quantise one ONNX file with AMD Quark: `int8_peers.py` runs it in Quark's own environment.
+
+Imports nothing of ours.
 
     PYTHON quark_child.py FLOAT PATCHES OUT HOW
     PYTHON quark_child.py adjust FILE
 
-FLOAT is a float ONNX file, PATCHES an .npy file (K, C, H, W) of what its input takes. HOW is vint8, as AMD's
-tutorials of the VEK385 ask for it, or the iterations of AdaRound under XINT8, 0 for none. Writes OUT, and prints
-seconds and peak resident memory as the last line, in JSON. `adjust` says how many scales of a VINT8 file Quark's
-adjuster moves, and of how many convolutions it does not find the scales.
+FLOAT is a float ONNX file, PATCHES an .npy file (K, C, H, W) of what its input takes. HOW is vint8,
+as AMD's tutorials of the VEK385 ask for it, or the iterations of AdaRound under XINT8, 0 for none.
+Writes OUT, and prints seconds and peak resident memory as the last line, in JSON. `adjust` says how
+many scales of a VINT8 file Quark's adjuster moves, and of how many convolutions it does not find
+the scales.
 """
 
 import json
@@ -65,7 +68,9 @@ def config_of(how: str) -> QConfig | Config:
 
 
 def adjusted(model: onnx.ModelProto) -> dict[str, int]:
-    """Scales that the adjuster moves, and convolutions whose scales it does not find, by their counts."""
+    """Scales that the adjuster moves, and convolutions whose scales it does not find, by their
+    counts.
+    """
     positions = QuantPosManager(ONNXModel(model))
     constants = model.graph.initializer
     before = {tensor.name: tensor.SerializeToString() for tensor in constants}
@@ -78,8 +83,13 @@ def adjusted(model: onnx.ModelProto) -> dict[str, int]:
 
 
 def peak_mb() -> float:
-    """Largest resident memory of this process; getrusage would count that of its parent before it too."""
-    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines())
+    """Largest resident memory of this process; getrusage would count that of its parent before it
+    too.
+    """
+    status = dict(
+        line.split(":", 1)
+        for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    )
     return int(status["VmHWM"].split()[0]) * 1024 / 1e6
 
 

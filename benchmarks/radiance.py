@@ -1,10 +1,12 @@
-"""How far restoration moves the mean of an image, in %: photographs as a sensor sees them, and real crops twice.
+"""How far restoration moves the mean of an image, in %: photographs as a sensor sees them, and real
+crops twice.
 
-    python benchmarks/radiance.py --photographs aerial-test/ --crops pleiades/ [--networks convbeers-s,convbeers-xs]
+    python benchmarks/radiance.py --photographs aerial-test/ --crops pleiades/ \
+        [--networks convbeers-s,convbeers-xs]
 
-One photograph of each site is acquired and restored with the sensor's profile, and its mean compared with the
-reference's. The crops, which were restored on the ground, are degraded as scenes and restored, and restored once more
-as they are. Inner pixels count, as in `evaluate`.
+One photograph of each site is acquired and restored with the sensor's profile, and its mean
+compared with the reference's. The crops, which were restored on the ground, are degraded as scenes
+and restored, and restored once more as they are. Inner pixels count, as in `evaluate`.
 """
 
 import argparse
@@ -29,17 +31,29 @@ REFERENCE = load_sensor("pleiades-reference")
 
 def main() -> None:
     """Print a row a network."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--photographs", type=Path, required=True)
     parser.add_argument("--crops", type=Path, required=True)
-    parser.add_argument("--networks", default=",".join(name + end for name in shipped_names() for end in ("", INT8)))
+    parser.add_argument(
+        "--networks", default=",".join(name + end for name in shipped_names() for end in ("", INT8))
+    )
     arguments = parser.parse_args()
     aim = REFERENCE.nominal()
-    scenes = {site_of(scene.name): scene for scene in reversed(load_scenes(arguments.photographs, aim, SEED))}
+    scenes = {
+        site_of(scene.name): scene
+        for scene in reversed(load_scenes(arguments.photographs, aim, SEED))
+    }
     pairs = acquired(list(scenes.values()))
-    crops = [read_pixels(path)[:CROP_PX, :CROP_PX] for path in sorted(arguments.crops.glob("*.tif"))]
+    crops = [
+        read_pixels(path)[:CROP_PX, :CROP_PX] for path in sorted(arguments.crops.glob("*.tif"))
+    ]
     degraded = acquired([scene_of(str(number), crop, aim) for number, crop in enumerate(crops)])
-    print("| network | photographs | without noise | crops as scenes | crops as they are |\n|---|---|---|---|---|")
+    print(
+        "| network | photographs | without noise | crops as scenes | crops as they are "
+        "|\n|---|---|---|---|---|"
+    )
     for name in arguments.networks.split(","):
         restore = method_named(name, DEGRADED, REFERENCE).restore
         restored = [restore(pair.degraded) for pair in pairs]
@@ -49,7 +63,9 @@ def main() -> None:
             [change(restore(pair.degraded), pair.reference) for pair in degraded],
             [change(restore(crop.astype(np.float32)), crop) for crop in crops],
         )
-        cells = [f"{np.mean(column):.2f} ({min(column):.2f} to {max(column):.2f})" for column in columns]
+        cells = [
+            f"{np.mean(column):.2f} ({min(column):.2f} to {max(column):.2f})" for column in columns
+        ]
         print(f"| {name} |", " | ".join(cells), "|", flush=True)
 
 

@@ -1,9 +1,10 @@
-"""Real frames before and after restoration: noise on flat ground, width of an edge, and crops side by side.
+"""Real frames before and after restoration: noise on flat ground, width of an edge, and crops side
+by side.
 
     python benchmarks/real_camera.py --frames frames/ --restored restored/ --picture real-camera.png
 
-`frames` holds the frames of docs/tutorials/real-camera.md, and `restored` a folder for each method with images of the
-same names, as the tutorial makes them.
+`frames` holds the frames of docs/tutorials/real-camera.md, and `restored` a folder for each method
+with images of the same names, as the tutorial makes them.
 """
 
 import argparse
@@ -42,7 +43,9 @@ class Box(NamedTuple):
 
 
 class Place(NamedTuple):
-    """A crop to show of a frame, flat ground in it, and a box that an edge crosses from top to bottom, if any."""
+    """A crop to show of a frame, flat ground in it, and a box that an edge crosses from top to
+    bottom, if any.
+    """
 
     frame: str
     crop: Box
@@ -58,13 +61,18 @@ PLACES = (
 
 def main() -> None:
     """Print a row for each frame and method, and write the picture."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--frames", type=Path, required=True)
     parser.add_argument("--restored", type=Path, required=True)
     parser.add_argument("--picture", type=Path)
     arguments = parser.parse_args()
     methods = sorted(path for path in arguments.restored.iterdir() if path.is_dir())
-    print("| frame | image | noise on flat ground, % of its level | width of an edge, 10 to 90 %, px |")
+    print(
+        "| frame | image | noise on flat ground, % of its level | width of an edge, 10 to 90 %, "
+        "px |"
+    )
     print("|---|---|---|---|")
     rows = []
     for place in PLACES:
@@ -74,7 +82,11 @@ def main() -> None:
         line = edge_line(place.edge.of(images["raw"])) if place.edge else None
         for name, image in images.items():
             flat = place.flat.of(np.squeeze(image))
-            width = f"{edge_width_px(place.edge.of(np.squeeze(image)), line):.2f}" if place.edge and line else ""
+            width = (
+                f"{edge_width_px(place.edge.of(np.squeeze(image)), line):.2f}"
+                if place.edge and line
+                else ""
+            )
             print(f"| {place.frame} | {name} | {100 * roughness(flat):.2f} | {width} |")
         rows.append(side_by_side([place.crop.of(np.squeeze(image)) for image in images.values()]))
     if arguments.picture is not None:
@@ -89,14 +101,18 @@ def roughness(flat: np.ndarray) -> float:
 
 def edge_line(region: np.ndarray) -> EdgeLine:
     """Return where the edge of a region (H, W) runs."""
-    found = edge_in(region, lambda values: np.full(values.shape, (0.02 * region.mean()) ** 2), "edge")
+    found = edge_in(
+        region, lambda values: np.full(values.shape, (0.02 * region.mean()) ** 2), "edge"
+    )
     if isinstance(found, Refusal):
         raise SystemExit(found.reason)
     return found[1]
 
 
 def edge_width_px(region: np.ndarray, line: EdgeLine) -> float:
-    """Return how far an edge of (H, W) takes from 10 to 90 % of its step, along its normal, of its rows together."""
+    """Return how far an edge of (H, W) takes from 10 to 90 % of its step, along its normal, of its
+    rows together.
+    """
     height, width = region.shape
     y, x = np.mgrid[:height, :width].astype(np.float64)
     y -= (height - 1) / 2

@@ -1,10 +1,11 @@
-"""How often an image is told apart from the sensor that it is wrongly said to be from, and how often a right one is.
+"""How often an image is told apart from the sensor that it is wrongly said to be from, and how
+often a right one is.
 
     python benchmarks/sensor_check.py --images aerial-test/ [--raw pleiades/] [--acquisitions 40]
 
-Each acquisition draws a sensor and a photograph; the image is held against the right profile, and each way to be
-wrong against the profile that a user would name for it. Textures without edges, and towns, are drawn. Times are of
-27 Mpx.
+Each acquisition draws a sensor and a photograph; the image is held against the right profile, and
+each way to be wrong against the profile that a user would name for it. Textures without edges, and
+towns, are drawn. Times are of 27 Mpx.
 """
 
 import argparse
@@ -36,7 +37,9 @@ SIDE_PX = 2048
 Image = np.ndarray
 
 
-def told(sensor: Instrument, mtf: float = 1.0, noise: float = 1.0, gain: float = 1.0, bits: int = 0) -> Sensor:
+def told(
+    sensor: Instrument, mtf: float = 1.0, noise: float = 1.0, gain: float = 1.0, bits: int = 0
+) -> Sensor:
     """The profile of a sensor, its MTF, noise, gain or bits off by a factor, or so many bits."""
     changed = replace(
         sensor,
@@ -68,25 +71,34 @@ def smoothed(image: Image, _: Instrument) -> Image:
 
 
 WRONG: Mapping[str, Callable[[Instrument], Sensor]] = {
-    "MTF a third less": lambda s: told(s, mtf=1 / THIRD), "MTF a third more": lambda s: told(s, mtf=THIRD),
-    "SNR a third less": lambda s: told(s, noise=THIRD), "SNR a third more": lambda s: told(s, noise=1 / THIRD),
-    "gain halved": lambda s: told(s, gain=2.0), "bits wrong, 14": lambda s: told(s, bits=14, gain=4.0),
-}  # fmt: skip
+    "MTF a third less": lambda s: told(s, mtf=1 / THIRD),
+    "MTF a third more": lambda s: told(s, mtf=THIRD),
+    "SNR a third less": lambda s: told(s, noise=THIRD),
+    "SNR a third more": lambda s: told(s, noise=1 / THIRD),
+    "gain halved": lambda s: told(s, gain=2.0),
+    "bits wrong, 14": lambda s: told(s, bits=14, gain=4.0),
+}
 CHANGED: Mapping[str, Callable[[Image, Instrument], Image]] = {
-    "restored": restored, "resampled": resampled, "smoothed": smoothed,
-}  # fmt: skip
+    "restored": restored,
+    "resampled": resampled,
+    "smoothed": smoothed,
+}
 
 
 def main() -> None:
     """Print a table in Markdown."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--images", type=Path, required=True)
     parser.add_argument("--raw", type=Path, help="a folder of images that are told to be Pleiades'")
     parser.add_argument("--acquisitions", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
     counts: dict[str, list[bool]] = {}
-    for sensor, image, kind in acquisitions(arguments.images, arguments.acquisitions, arguments.seed):
+    for sensor, image, kind in acquisitions(
+        arguments.images, arguments.acquisitions, arguments.seed
+    ):
         for name, check in held(image, sensor):
             counts.setdefault(f"{kind}: {name}", []).append(bool(check.doubts))
             if name == "right" and check.doubts:
@@ -118,17 +130,25 @@ def check(image: Image, sensor: Sensor, full_scale: float = LIKE.max_dn) -> Sens
 
 
 def acquisitions(folder: Path, count: int, seed: int) -> Iterator[tuple[Instrument, Image, str]]:
-    """A sensor, an image of it, and what it shows: photographs, and as many textures and drawn towns."""
+    """A sensor, an image of it, and what it shows: photographs, and as many textures and drawn
+    towns.
+    """
     generator = np.random.default_rng(seed)
     scenes = [read_scene(path, LIKE) for path in list_images(folder)]
-    scenes = [scene for scene in scenes if fitting_oversampling(scene.radiance, [RATIO], LEAST_SIDE_PX)]
+    scenes = [
+        scene for scene in scenes if fitting_oversampling(scene.radiance, [RATIO], LEAST_SIDE_PX)
+    ]
     for number in range(count):
         sensor = draw(generator)
         scene = scenes[int(generator.integers(len(scenes)))]
         radiance = crop_divisible(scene.radiance, RATIO)
         yield sensor, seen(radiance, sensor, number), "photograph"
         yield sensor, seen(texture(generator), sensor, number), "texture"
-        yield sensor, seen(procedural_scene(SIDE_PX, SIDE_PX, generator).radiance, sensor, number), "drawn town"
+        yield (
+            sensor,
+            seen(procedural_scene(SIDE_PX, SIDE_PX, generator).radiance, sensor, number),
+            "drawn town",
+        )
 
 
 def seen(radiance: np.ndarray, sensor: Instrument, number: int) -> Image:
@@ -137,10 +157,14 @@ def seen(radiance: np.ndarray, sensor: Instrument, number: int) -> Image:
 
 
 def texture(generator: np.random.Generator, side_px: int = 1024) -> Image:
-    """Radiance of a rough surface: Gaussian, its spectrum falling as 1 / f^p with p from 0.8 to 2."""
+    """Radiance of a rough surface: Gaussian, its spectrum falling as 1 / f^p
+    with p from 0.8 to 2.
+    """
     f = np.hypot(np.fft.fftfreq(side_px)[:, None], np.fft.rfftfreq(side_px)[None])
     f[0, 0] = np.inf
-    waves = generator.normal(size=(side_px, side_px // 2 + 1)) * np.exp(2j * math.pi * generator.random(f.shape))
+    waves = generator.normal(size=(side_px, side_px // 2 + 1)) * np.exp(
+        2j * math.pi * generator.random(f.shape)
+    )
     field = np.fft.irfft2(waves / f ** generator.uniform(0.8, 2.0), (side_px, side_px))
     spread = generator.uniform(0.05, 0.3)
     return np.asarray(np.maximum(100 * (1 + spread * field / field.std()), 5), np.float32)

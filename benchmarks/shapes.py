@@ -1,9 +1,12 @@
-"""What shapes of ConvBEERS cost on boards, before anyone trains them: BLOCKSxFEATURES, at 1/SCALE resolution @SCALE.
+"""What shapes of ConvBEERS cost on boards, before anyone trains them: BLOCKSxFEATURES, at 1/SCALE
+resolution @SCALE.
 
-    python benchmarks/shapes.py [--shapes 4x16,8x32,4x64@2] [--boards vck190:C32B3,vck190:C32B6] [--tile 640]
+    python benchmarks/shapes.py [--shapes 4x16,8x32,4x64@2] [--boards vck190:C32B3,vck190:C32B6] \
+        [--tile 640]
 
-Random weights, quantised without a long search: predicted time does not depend on numbers. A swath of 13600 x 9016 is
-cut into whole tiles with exact seams. What a shape is worth only training tells (`beers-deploy train`, `evaluate`).
+Random weights, quantised without a long search: predicted time does not depend on numbers. A swath
+of 13600 x 9016 is cut into whole tiles with exact seams. What a shape is worth only training tells
+(`beers-deploy train`, `evaluate`).
 """
 
 import argparse
@@ -34,13 +37,19 @@ SIDE_PX = 48
 
 def main() -> None:
     """Print a row a shape."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--shapes", default=SHAPES)
     parser.add_argument("--boards", default="vck190:C32B3", help="each with its configuration")
     parser.add_argument("--tile", type=int, default=640)
     arguments = parser.parse_args()
     boards = [load_dpu(*board.split(":")) for board in arguments.boards.split(",")]
-    heads = [f"{dpu.target.name} {dpu.name}, {unit}" for dpu in boards for unit in ("frame/s", "s a swath")]
+    heads = [
+        f"{dpu.target.name} {dpu.name}, {unit}"
+        for dpu in boards
+        for unit in ("frame/s", "s a swath")
+    ]
     print("| shape | 1000 products a pixel | halo, px |", " | ".join(heads), "|")
     print("|---|---|---|" + "---|" * len(heads))
     for text in arguments.shapes.split(","):
@@ -48,7 +57,12 @@ def main() -> None:
         model = int8(variant)
         products = sum(9 * a * b for a, b in variant.convolutions.values()) / variant.pixels
         cells = [cell for dpu in boards for cell in cells_of(model, dpu, arguments.tile)]
-        print(f"| {text} | {products / 1e3:.0f} | {tiling_of(model).halo_px} |", " | ".join(cells), "|", flush=True)
+        print(
+            f"| {text} | {products / 1e3:.0f} | {tiling_of(model).halo_px} |",
+            " | ".join(cells),
+            "|",
+            flush=True,
+        )
 
 
 def parse_shape(text: str) -> Variant:
@@ -66,12 +80,18 @@ def int8(variant: Variant) -> onnx.ModelProto:
     initialise(network, torch.Generator().manual_seed(0))
     seen = np.random.default_rng(0).random((1, 1, SIDE_PX, SIDE_PX), dtype=np.float32)
     patches = Patches([], Remade(lambda _: (seen, seen), 1), Remade(lambda _: seen, 1))
-    with patch("beers_deploy.quant.passes.equalise.MOST_CHANNELS", 0):  # no channel is tried by itself
+    with patch(
+        "beers_deploy.quant.passes.equalise.MOST_CHANNELS", 0
+    ):  # no channel is tried by itself
         return quantise_model(to_onnx(network.eval(), {}), patches, {}).host
 
 
-def on_a_swath(model: onnx.ModelProto, dpu: Dpu, tile_px: int) -> tuple[Prediction, float, float, float]:
-    """The prediction of a tile; and seconds of the paper's swath in such tiles, with the ends of their interval."""
+def on_a_swath(
+    model: onnx.ModelProto, dpu: Dpu, tile_px: int
+) -> tuple[Prediction, float, float, float]:
+    """The prediction of a tile; and seconds of the paper's swath in such tiles, with the ends of
+    their interval.
+    """
     prediction = predict(place(network_of(model, tile_px), dpu), dpu)
     swath = Swath(*parse_size(PAPER_SIZE), tile_px, tiling_of(model).halo_px)
     latency = swath_latency(prediction, math.ceil(swath.tiles / prediction.batch))
@@ -83,7 +103,10 @@ def cells_of(model: onnx.ModelProto, dpu: Dpu, tile_px: int) -> tuple[str, str]:
     prediction, time_s, low_s, high_s = on_a_swath(model, dpu, tile_px)
     slow, fast = prediction.fps_interval
     star = " *" if prediction.outside else ""
-    return f"{slow:.3g} to {fast:.3g} ({prediction.fps:.3g}){star}", f"{low_s:.3g} to {high_s:.3g} ({time_s:.3g})"
+    return (
+        f"{slow:.3g} to {fast:.3g} ({prediction.fps:.3g}){star}",
+        f"{low_s:.3g} to {high_s:.3g} ({time_s:.3g})",
+    )
 
 
 if __name__ == "__main__":

@@ -1,12 +1,13 @@
 """What INT8 costs twelve small networks that are trained briefly, with AMD Quark beside it.
 
-    python -m benchmarks.small_networks --images aerial-train/ --held-out aerial-test/ --quark-python quark/bin/python
+    python -m benchmarks.small_networks --images aerial-train/ --held-out aerial-test/ \
+        --quark-python quark/bin/python
 
-Prints a Markdown table: what is lost on samples that neither training nor calibration saw, of PSNR on average and on
-the worst sample, of the classifier in points of the share of right answers. With --tuned, also once our whole numbers
-are fine-tuned on more samples, and Quark's weights are rounded by AdaRound. The samples are those of
-`examples.samples`, the environment of Quark that of `int8_peers.py`. Trained networks stay in the folder of --keep,
-where a later run finds them.
+Prints a Markdown table: what is lost on samples that neither training nor calibration saw, of PSNR
+on average and on the worst sample, of the classifier in points of the share of right answers. With
+--tuned, also once our whole numbers are fine-tuned on more samples, and Quark's weights are rounded
+by AdaRound. The samples are those of `examples.samples`, the environment of Quark that of
+`int8_peers.py`. Trained networks stay in the folder of --keep, where a later run finds them.
 """
 
 import argparse
@@ -41,7 +42,9 @@ DENSE = 16
 BATCH = 4
 RATE = 2e-3
 FAST = 5e-3
-"""Samples of a step, and learning rates: of all networks, and of those that the image itself passes through."""
+"""Samples of a step, and learning rates: of all networks, and of those that the image itself passes
+through.
+"""
 TUNED = Way("beers-deploy, fine-tuned", False, OURS)
 MORE = 8
 """Quantised and fine-tuned, in this process, on so many times the samples."""
@@ -49,7 +52,9 @@ ADAROUND_STEPS = "1000"
 """A layer's, Quark's own default."""
 
 
-def conv(inputs: int, outputs: int, act: nn.Module, kernel: int = 3, dilation: int = 1, groups: int = 1) -> nn.Module:
+def conv(
+    inputs: int, outputs: int, act: nn.Module, kernel: int = 3, dilation: int = 1, groups: int = 1
+) -> nn.Module:
     """A convolution that keeps the size, and an activation."""
     padding = dilation * (kernel // 2)
     inner = nn.Conv2d(inputs, outputs, kernel, padding=padding, dilation=dilation, groups=groups)
@@ -85,7 +90,9 @@ class Added(nn.Module):
 
 
 def inverted(inputs: int, outputs: int) -> nn.Module:
-    """MobileNetV2's block: widened twofold, filtered channel by channel, narrowed without an activation."""
+    """MobileNetV2's block: widened twofold, filtered channel by channel, narrowed without an
+    activation.
+    """
     wide = 2 * inputs
     block = [
         conv(inputs, wide, nn.ReLU6(), kernel=1),
@@ -96,7 +103,9 @@ def inverted(inputs: int, outputs: int) -> nn.Module:
 
 
 class MobileUNet(nn.Module):
-    """Two levels of inverted residuals, pooled down, enlarged up, the skip concatenated; a global add."""
+    """Two levels of inverted residuals, pooled down, enlarged up, the skip concatenated; a global
+    add.
+    """
 
     def __init__(self, features: int = 8) -> None:
         super().__init__()
@@ -126,7 +135,9 @@ def transposed() -> nn.Module:
 
 def residual() -> nn.Module:
     """Four residual blocks, with a global add."""
-    blocks = [Added(conv(DENSE, DENSE, nn.ReLU()), conv(DENSE, DENSE, nn.Identity())) for _ in range(4)]
+    blocks = [
+        Added(conv(DENSE, DENSE, nn.ReLU()), conv(DENSE, DENSE, nn.Identity())) for _ in range(4)
+    ]
     return Added(nn.Conv2d(1, DENSE, 3, padding=1), *blocks, nn.Conv2d(DENSE, 1, 3, padding=1))
 
 
@@ -178,7 +189,9 @@ def trained(name: str, folder: Path | None, count: int) -> nn.Module:
     kind, make = NETWORKS[name]
     network = drawn(make(), torch.Generator().manual_seed([*NETWORKS].index(name))).train()
     error = functional.cross_entropy if kind == "classifier" else functional.l1_loss
-    optimiser = torch.optim.Adam(network.parameters(), lr=FAST if name.startswith(("depthwise", "plain")) else RATE)
+    optimiser = torch.optim.Adam(
+        network.parameters(), lr=FAST if name.startswith(("depthwise", "plain")) else RATE
+    )
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, count)
     for image, wanted in islice(batches_of(kind, folder, 0), count):
         optimiser.zero_grad()
@@ -201,7 +214,9 @@ def save(network: nn.Module, side_px: int, path: Path) -> None:
 
 
 def losses(in_float: Restore, in_int8: Restore, held: Drawn) -> np.ndarray:
-    """(K,) what each sample loses: dB of PSNR, or of one that was classified rightly all, 100 points."""
+    """(K,) what each sample loses: dB of PSNR, or of one that was classified rightly all, 100
+    points.
+    """
     found = []
     for image, wanted in zip(held.images, held.wanted, strict=True):
         results = [run(image[None]) for run in (in_float, in_int8)]
@@ -213,8 +228,13 @@ def losses(in_float: Restore, in_int8: Restore, held: Drawn) -> np.ndarray:
     return np.array(found)
 
 
-def cells(name: str, way: Way, python: str, folder: Path, drawn: dict[bool, Drawn], held: Drawn) -> str:
-    """What a way loses: the mean, and the worst sample's of images. `drawn[True]` is what it tunes on."""
+def cells(
+    name: str, way: Way, python: str, folder: Path, drawn: dict[bool, Drawn], held: Drawn
+) -> str:
+    """What a way loses: the mean, and the worst sample's of images.
+
+    `drawn[True]` is what it tunes on.
+    """
     path = folder / f"{slug(name)}.onnx"
     model = load_onnx(path)
     network = Peered(model, ends_of(read_network(model)))
@@ -227,11 +247,17 @@ def cells(name: str, way: Way, python: str, folder: Path, drawn: dict[bool, Draw
         seconds, _ = quantise(way, {False: (path, patches)}, out, python)
     lost = losses(network.runner(path), network.runner(out), held)
     print(name, way.name, f"{seconds:.0f} s", file=sys.stderr)
-    return f"{lost.mean():.2f}, {lost.max():.2f}" if held.wanted.ndim > 1 else f"{lost.mean():.1f} points"
+    return (
+        f"{lost.mean():.2f}, {lost.max():.2f}"
+        if held.wanted.ndim > 1
+        else f"{lost.mean():.1f} points"
+    )
 
 
 def fine_tune(path: Path, drawn: Drawn, out: Path) -> float:
-    """Quantise and fine-tune a network, with references where they are images; the processor time in seconds."""
+    """Quantise and fine-tune a network, with references where they are images; the processor time
+    in seconds.
+    """
     begun = time.process_time()
     samples = (drawn.images, drawn.wanted) if drawn.wanted.ndim > 1 else drawn.images
     save_onnx(quantize(path, samples, finetune="auto", progress=False).model, out)
@@ -261,7 +287,9 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
         path = folder / f"{slug(name)}.onnx"
         if not path.exists():
             save(
-                trained(name, arguments.images, arguments.steps), SIDE_PX[kind] // (2 if kind == "espcn" else 1), path
+                trained(name, arguments.images, arguments.steps),
+                SIDE_PX[kind] // (2 if kind == "espcn" else 1),
+                path,
             )
         drawn = {False: Drawn.of(kind, arguments.images, 5, arguments.batches)}
         if arguments.tuned:
@@ -273,14 +301,26 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--images", type=Path, help="folder of scenes to train and calibrate on; drawn ones if none")
-    parser.add_argument("--held-out", type=Path, help="folder of scenes to judge on; drawn ones if none")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--images", type=Path, help="folder of scenes to train and calibrate on; drawn ones if none"
+    )
+    parser.add_argument(
+        "--held-out", type=Path, help="folder of scenes to judge on; drawn ones if none"
+    )
     parser.add_argument("--steps", type=int, default=1500)
-    parser.add_argument("--batches", type=int, default=8, help="of eight samples: to calibrate on, and to judge on")
+    parser.add_argument(
+        "--batches", type=int, default=8, help="of eight samples: to calibrate on, and to judge on"
+    )
     parser.add_argument("--tuned", action="store_true", help="fine-tune as well; minutes a network")
-    parser.add_argument("--quark-python", help="interpreter of the environment that AMD Quark is installed in")
-    parser.add_argument("--only", default="", help="networks whose names this regular expression finds")
+    parser.add_argument(
+        "--quark-python", help="interpreter of the environment that AMD Quark is installed in"
+    )
+    parser.add_argument(
+        "--only", default="", help="networks whose names this regular expression finds"
+    )
     parser.add_argument("--keep", type=Path, help="folder for the networks")
     print_lines(table, parser.parse_args())
 

@@ -1,4 +1,5 @@
-"""What the two steps around a network change: tables from evaluations with both, one and none of them.
+"""What the two steps around a network change: tables from evaluations with both, one and none of
+them.
 
     beers-deploy evaluate --images aerial-test/ --brightness .25,.05 --methods ... --json both.json
     beers-deploy evaluate ... --no-exposure --json consistency.json
@@ -17,7 +18,9 @@ from typing import Any
 from beers_deploy.profiles.toml import read_json
 
 SCORES = {
-    "inner PSNR, reference without noise": "PSNR of inner pixels against the reference without noise, dB",
+    "inner PSNR, reference without noise": (
+        "PSNR of inner pixels against the reference without noise, dB"
+    ),
     "bias of the mean": "Bias of the mean (largest of a site), %",
 }
 FLUX = "flux of points of "
@@ -30,8 +33,12 @@ Figures = Mapping[str, Mapping[str, Any]]
 
 def main() -> None:
     """Print a table for each score, and one for each kind of target."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("documents", nargs=len(COLUMNS), type=Path, metavar="JSON", help=", ".join(COLUMNS))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "documents", nargs=len(COLUMNS), type=Path, metavar="JSON", help=", ".join(COLUMNS)
+    )
     documents = [figures_of(path) for path in parser.parse_args().documents]
     tables = [name for name in documents[-1] if name.startswith("mean")]
     for key, title in SCORES.items():
@@ -40,7 +47,10 @@ def main() -> None:
     for start, table in ((FLUX, "targets"), (SNR, "mean")):
         names = [key for key in first(documents[-1], table) if key.startswith(start)]
         for name in names:
-            lines = [[method, *cells(documents, table, method, name)] for method in common(documents, table)]
+            lines = [
+                [method, *cells(documents, table, method, name)]
+                for method in common(documents, table)
+            ]
             show(name, ["network", *COLUMNS], lines)
 
 
@@ -64,13 +74,20 @@ def common(documents: Sequence[Mapping[str, Mapping[str, Figures]]], table: str)
     return [name for name in networks if all(name in document[table] for document in documents)]
 
 
-def score_lines(documents: Sequence[Mapping[str, Mapping[str, Figures]]], table: str, key: str) -> list[list[str]]:
+def score_lines(
+    documents: Sequence[Mapping[str, Mapping[str, Figures]]], table: str, key: str
+) -> list[list[str]]:
     """A line a network: the score of each document."""
     radiance = table.partition("radiance x ")[2] or "1"
-    return [[f"{name}, {radiance}", *cells(documents, table, name, key)] for name in common(documents, table)]
+    return [
+        [f"{name}, {radiance}", *cells(documents, table, name, key)]
+        for name in common(documents, table)
+    ]
 
 
-def cells(documents: Sequence[Mapping[str, Mapping[str, Figures]]], table: str, method: str, key: str) -> list[str]:
+def cells(
+    documents: Sequence[Mapping[str, Mapping[str, Figures]]], table: str, method: str, key: str
+) -> list[str]:
     """One figure of a method in each document."""
     return [cell(document[table][method], key) for document in documents]
 

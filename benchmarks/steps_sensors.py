@@ -1,10 +1,12 @@
 """What the two steps around a network change under sixteen sensors, in bright and dark scenes.
 
-    python benchmarks/steps_sensors.py --images aerial-test/ --json steps.json [--networks ...] [--part 0/2]
+    python benchmarks/steps_sensors.py --images aerial-test/ --json steps.json \
+        [--networks ...] [--part 0/2]
     python benchmarks/steps_sensors.py --table steps.json [...]
 
-One photograph of each site, or of every n-th with --every. PSNR of inner pixels against the reference without noise,
-less that of the same network without steps. --part runs every n-th sensor, and --table puts the parts together.
+One photograph of each site, or of every n-th with --every. PSNR of inner pixels against the
+reference without noise, less that of the same network without steps. --part runs every n-th sensor,
+and --table puts the parts together.
 """
 
 import argparse
@@ -45,12 +47,18 @@ Scores = dict[str, dict[str, dict[str, float]]]
 
 def main() -> None:
     """Measure and write, or print the tables of what was measured."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--images", type=Path)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--networks", default=",".join(f"{n},{n}-int8" for n in NETWORKS.split(",")))
+    parser.add_argument(
+        "--networks", default=",".join(f"{n},{n}-int8" for n in NETWORKS.split(","))
+    )
     parser.add_argument("--part", default="0/1")
-    parser.add_argument("--every", type=int, default=1, help="use every n-th site: large networks take hours")
+    parser.add_argument(
+        "--every", type=int, default=1, help="use every n-th site: large networks take hours"
+    )
     parser.add_argument("--table", nargs="+", type=Path, default=[])
     arguments = parser.parse_args()
     if arguments.table:
@@ -83,7 +91,9 @@ def measure(scenes: Sequence[Scene], networks: Sequence[str], out: Path, part: s
             for (network, around), method in methods.items():
                 assert method.specialise is not None  # noqa: S101 - shipped networks take any sensor
                 restore = method.specialise(sensor)
-                found[network][around] = float(np.mean([inner_psnr_db(restore(p.degraded), p) for p in pairs]))
+                found[network][around] = float(
+                    np.mean([inner_psnr_db(restore(p.degraded), p) for p in pairs])
+                )
             scores[f"{brightness:g}, {name}"] = found
         out.write_text(json.dumps(scores, indent=1))
         print(name, flush=True)
@@ -98,23 +108,38 @@ def inner_psnr_db(restored: np.ndarray, pair: NamedPair) -> float:
 
 
 def show(parts: Sequence[Scores]) -> None:
-    """Print a table a brightness: mean gain over the sensors, and in parentheses the least and its sensor."""
+    """Print a table a brightness: mean gain over the sensors, and in parentheses the least and its
+    sensor.
+    """
     scores: Scores = {}
     for part in parts:
         scores |= part
     for brightness in BRIGHTNESSES:
         start = f"{brightness:g}, "
-        sensors = {name.removeprefix(start): found for name, found in scores.items() if name.startswith(start)}
-        print(f"\nRadiance {brightness:g}, {len(sensors)} sensors\n\n| network | consistency | exposure | both |")
+        sensors = {
+            name.removeprefix(start): found
+            for name, found in scores.items()
+            if name.startswith(start)
+        }
+        print(
+            f"\nRadiance {brightness:g}, {len(sensors)} sensors\n\n| network | consistency | "
+            "exposure | both |"
+        )
         print("|---|---|---|---|")
         for network in next(iter(sensors.values())):
-            cells = [gain(sensors, network, around) for around in ("consistency", "exposure", "both")]
+            cells = [
+                gain(sensors, network, around) for around in ("consistency", "exposure", "both")
+            ]
             print(f"| {network} |", " | ".join(cells), "|")
 
 
-def gain(sensors: Mapping[str, Mapping[str, Mapping[str, float]]], network: str, around: str) -> str:
+def gain(
+    sensors: Mapping[str, Mapping[str, Mapping[str, float]]], network: str, around: str
+) -> str:
     """Mean over the sensors in dB, the least and its sensor."""
-    gains = {name: found[network][around] - found[network]["neither"] for name, found in sensors.items()}
+    gains = {
+        name: found[network][around] - found[network]["neither"] for name, found in sensors.items()
+    }
     least = min(gains, key=lambda name: gains[name])
     return f"{np.mean(list(gains.values())):+.2f} ({gains[least]:+.2f}, {least})"
 

@@ -1,13 +1,18 @@
-"""The swath engine beside the bare runtime on the same tiles in memory, and the memory of whole swaths.
+"""The swath engine beside the bare runtime on the same tiles in memory, and the memory of whole
+swaths.
 
-    python benchmarks/swath.py [--size 3000x2000] [--runtimes onnxruntime,openvino] [--swaths 13600x9016,20000x20000]
-    python benchmarks/swath.py --peers [--monai-python monai/bin/python]    (monai_child.py: how to make it)
+    python benchmarks/swath.py [--size 3000x2000] [--runtimes onnxruntime,openvino] \
+        [--swaths 13600x9016,20000x20000]
+    python benchmarks/swath.py --peers [--monai-python monai/bin/python]
 
-Random weights: speed and memory do not depend on them. Engine and bare runtime are interleaved; the ratios are
-of their fastest times, by the clock and by the processor (with --threads 1 the latter also holds on a busy machine).
-Swaths run in a process of their own, through a network of one block. With --peers the engine runs beside
-dask.array.map_overlap, and beside MONAI where its Python is given, from file to file: times interleaved, and how far
-their pixels lie from the engine's, which are the whole image's.
+`monai_child.py` says how to make MONAI's environment.
+
+Random weights: speed and memory do not depend on them. Engine and bare runtime are interleaved; the
+ratios are of their fastest times, by the clock and by the processor (with --threads 1 the latter
+also holds on a busy machine). Swaths run in a process of their own, through a network of one block.
+With --peers the engine runs beside dask.array.map_overlap, and beside MONAI where its Python is
+given, from file to file: times interleaved, and how far their pixels lie from the engine's, which
+are the whole image's.
 """
 
 import argparse
@@ -45,24 +50,36 @@ ENTRY = "from beers_deploy.cli import app; app()"
 
 def main() -> None:
     """Print a line a network and runtime, then a line a swath."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--size", default="3000x2000")
     parser.add_argument("--runtimes", default="onnxruntime")
     parser.add_argument("--variants", default="convbeers-xs,convbeers-s")
     parser.add_argument("--int8", type=Path, help="an INT8 network to time as well")
     parser.add_argument("--swaths", default="")
-    parser.add_argument("--peers", action="store_true", help="beside dask.array.map_overlap, and MONAI where given")
-    parser.add_argument("--monai-python", help="interpreter of the environment that MONAI is installed in")
-    parser.add_argument("--known-rows", type=int, help="rows of the swaths that hold pixels; below them is nodata")
+    parser.add_argument(
+        "--peers", action="store_true", help="beside dask.array.map_overlap, and MONAI where given"
+    )
+    parser.add_argument(
+        "--monai-python", help="interpreter of the environment that MONAI is installed in"
+    )
+    parser.add_argument(
+        "--known-rows", type=int, help="rows of the swaths that hold pixels; below them is nodata"
+    )
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        networks = [random_network(folder, v, VARIANTS[v]) for v in arguments.variants.split(",") if v]
+        networks = [
+            random_network(folder, v, VARIANTS[v]) for v in arguments.variants.split(",") if v
+        ]
         for path in networks + ([arguments.int8] if arguments.int8 else []):
             for runtime in arguments.runtimes.split(","):
-                options = Options(path, TILE_PX, runtime=Runtime(runtime), threads=arguments.threads)
+                options = Options(
+                    path, TILE_PX, runtime=Runtime(runtime), threads=arguments.threads
+                )
                 size = parse_size(arguments.size)
                 repeats = arguments.repeats
                 if arguments.peers or arguments.monai_python:
@@ -70,18 +87,27 @@ def main() -> None:
                 else:
                     speed(folder, options, size, repeats)
         for size in filter(None, arguments.swaths.split(",")):
-            memory(folder, random_network(folder, "one-block", Variant(1, 8)), parse_size(size), arguments.known_rows)
+            memory(
+                folder,
+                random_network(folder, "one-block", Variant(1, 8)),
+                parse_size(size),
+                arguments.known_rows,
+            )
 
 
 def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -> None:
-    """Engine from file to file over the bare runtime on the same windows, already float32 in memory, one by one."""
+    """Engine from file to file over the bare runtime on the same windows, already float32 in
+    memory, one by one.
+    """
     image = folder / "image.tif"
     dn = write_noise(image, size)
     network = onnx.load(options.model)
     tiling = tiling_of(network)
     plan = make_plan((1, *dn.shape), TILE_PX, tiling.halo_px, tiling)
     seen = [dn[r.start : r.stop, c.start : c.stop] for r in plan.rows for c in plan.columns]
-    windows = [np.ascontiguousarray(pixels, np.float32)[None, None] / np.float32(4095) for pixels in seen]
+    windows = [
+        np.ascontiguousarray(pixels, np.float32)[None, None] / np.float32(4095) for pixels in seen
+    ]
     infer, version = open_runtime(options.runtime, network, options.threads)
 
     def bare() -> None:
@@ -93,8 +119,10 @@ def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -
 
     (bare_s, bare_cpu_s), (engine_s, engine_cpu_s) = fastest([bare, engine], repeats)
     print(
-        f"{options.model.stem:18} {version:20} {plan.tiles} tiles: bare {bare_s:.2f} s, engine {engine_s:.2f} s "
-        f"({dn.size / engine_s / 1e6:.3f} Mpx/s); engine over bare {bare_s / engine_s:.3f} by the clock, "
+        f"{options.model.stem:18} {version:20} {plan.tiles} tiles: bare {bare_s:.2f} s, engine "
+        f"{engine_s:.2f} s "
+        f"({dn.size / engine_s / 1e6:.3f} Mpx/s); engine over bare {bare_s / engine_s:.3f} by "
+        "the clock, "
         f"{bare_cpu_s / engine_cpu_s:.3f} by the processor",
         flush=True,
     )
@@ -103,7 +131,9 @@ def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -
 def beside_peers(
     folder: Path, options: Options, size: tuple[int, int], repeats: int, monai_python: str | None
 ) -> None:
-    """Engine and peers from file to file; peers run on onnxruntime or OpenVINO here, MONAI on onnxruntime."""
+    """Engine and peers from file to file; peers run on onnxruntime or OpenVINO here, MONAI on
+    onnxruntime.
+    """
     image = folder / "image.tif"
     dn = write_noise(image, size)
     task = Task(image, options, options.threads or os.cpu_count() or 1)
@@ -113,8 +143,10 @@ def beside_peers(
         largest, mean = difference_dn(task.out("engine"), task.out(name))
         print(
             f"{options.model.stem:18} {options.runtime:12} {name:24} {clock_s:.2f} s "
-            f"({dn.size / clock_s / 1e6:.3f} Mpx/s); over the engine {clock_s / times_s[0, 0]:.2f} by the clock, "
-            f"{cpu_s / times_s[0, 1]:.2f} by the processor; off by {largest:.0f} DN at most, {mean:.4f} on average",
+            f"({dn.size / clock_s / 1e6:.3f} Mpx/s); over the engine "
+            f"{clock_s / times_s[0, 0]:.2f} by the clock, "
+            f"{cpu_s / times_s[0, 1]:.2f} by the processor; off by {largest:.0f} DN at most, "
+            f"{mean:.4f} on average",
             flush=True,
         )
 
@@ -161,7 +193,9 @@ def ways(task: Task, monai_python: str | None) -> Iterator[dict[str, Run]]:
 
 
 def overlapped(task: Task, way: str, chunks_at_once: int) -> Run:
-    """dask.array.map_overlap over chunks that are a tile with their overlap, the cores shared among those at work."""
+    """dask.array.map_overlap over chunks that are a tile with their overlap, the cores shared among
+    those at work.
+    """
     core_px = TILE_PX - 2 * task.halo_px
     halo_px = task.halo_px
     out = task.out(way)
@@ -176,10 +210,16 @@ def overlapped(task: Task, way: str, chunks_at_once: int) -> Run:
             return np.asarray(np.rint(restore_window(block, infer)), np.uint16)
 
         image = da.from_array(tifffile.imread(task.image), chunks=core_px)  # type: ignore[no-untyped-call]
-        lazy = image.map_overlap(restored, depth=halo_px, boundary="none", meta=np.empty((0, 0), np.uint16))
+        lazy = image.map_overlap(
+            restored, depth=halo_px, boundary="none", meta=np.empty((0, 0), np.uint16)
+        )
         pixels = lazy.compute(scheduler="threads", num_workers=chunks_at_once)
         # As the engine writes, but for its strategy of zlib, which tifffile has no option for.
-        packed: dict[str, Any] = {"compression": "zlib", "compressionargs": {"level": 1}, "predictor": 2}
+        packed: dict[str, Any] = {
+            "compression": "zlib",
+            "compressionargs": {"level": 1},
+            "predictor": 2,
+        }
         tifffile.imwrite(out, pixels, tile=(256, 256), maxworkers=os.cpu_count(), **packed)
 
     return run
@@ -187,10 +227,21 @@ def overlapped(task: Task, way: str, chunks_at_once: int) -> Run:
 
 @contextmanager
 def child(task: Task, python: str) -> Iterator[Run]:
-    """MONAI in its process, loaded and waiting; each call is one turn, and returns its seconds of the processor."""
-    given = task.options.model, task.image, task.out("MONAI"), TILE_PX, 2 * task.halo_px / TILE_PX, task.cores
+    """MONAI in its process, loaded and waiting; each call is one turn, and returns its seconds of
+    the processor.
+    """
+    given = (
+        task.options.model,
+        task.image,
+        task.out("MONAI"),
+        TILE_PX,
+        2 * task.halo_px / TILE_PX,
+        task.cores,
+    )
     command = [python, str(Path(__file__).with_name("monai_child.py")), *map(str, given)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:  # noqa: S603
+    with subprocess.Popen(  # noqa: S603
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
 
         def turn() -> float:
             assert process.stdin is not None  # noqa: S101 - asked for above
@@ -219,7 +270,8 @@ def write_noise(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def fastest(works: Sequence[Callable[[], float | None]], repeats: int) -> np.ndarray:
-    """The fastest (clock, processor) times of each in s, interleaved; the first turn is not counted.
+    """The fastest (clock, processor) times of each in s, interleaved; the first turn is not
+    counted.
 
     A work returns what another process took of the processor, if one did.
     """
@@ -247,7 +299,9 @@ def memory(folder: Path, model: Path, size: tuple[int, int], known_rows: int | N
 
 
 def write_swath(path: Path, height: int, width: int, known_rows: int) -> None:
-    """A ramp of uint16 over the known rows, tile by tile; tiles below them are left out of the file, as nodata."""
+    """A ramp of uint16 over the known rows, tile by tile; tiles below them are left out of the
+    file, as nodata.
+    """
     ramp = np.arange(1, 257, dtype=np.uint16) * np.ones((256, 1), np.uint16)
     across = -(-width // 256)
     known = -(-known_rows // 256) * across

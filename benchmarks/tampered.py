@@ -2,9 +2,10 @@
 
     python benchmarks/tampered.py float.onnx int8.onnx [--baseline]
 
-Each tampered file is consistent in itself: its host part, ReLUs and scales fit its integers, so only its results can
-give it away. Prints a Markdown table: the PSNR that it loses over the untampered file, the checks that fail with the
-default limits, and those that fail with a baseline of the untampered file.
+Each tampered file is consistent in itself: its host part, ReLUs and scales fit its integers, so
+only its results can give it away. Prints a Markdown table: the PSNR that it loses over the
+untampered file, the checks that fail with the default limits, and those that fail with a baseline
+of the untampered file.
 """
 
 import argparse
@@ -95,7 +96,9 @@ def tampered(core: IntCore, place: float, change: Change) -> IntCore:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("floating", type=Path)
     parser.add_argument("int8", type=Path)
     arguments = parser.parse_args()
@@ -111,17 +114,23 @@ def main() -> None:
         for name, place, change in TAMPERINGS:
             other = host_model(tampered(core, place, change), metadata(model), fixed_tile_px(model))
             verdict = gate(Network(other, "tampered"), floating, baseline=baseline, progress=False)
-            lost_db = untampered.comparison.result.psnr_int8_db - verdict.comparison.result.psnr_int8_db
+            lost_db = (
+                untampered.comparison.result.psnr_int8_db - verdict.comparison.result.psnr_int8_db
+            )
             failed = [check.name for check in verdict.failed]
             by_default = [check for check in failed if "baseline" not in check]
             stopped["default"] += bool(by_default)
             stopped["baseline"] += bool(failed)
             print(
-                f"| {name} | {lost_db:.2f} | {', '.join(by_default) or '-'} | {', '.join(failed) or '-'} |",
+                f"| {name} | {lost_db:.2f} | {', '.join(by_default) or '-'} | "
+                f"{', '.join(failed) or '-'} |",
                 flush=True,
             )
     passed = {key: len(TAMPERINGS) - count for key, count in stopped.items()}
-    print(f"\nPassed: {passed['default']} of {len(TAMPERINGS)} by default, {passed['baseline']} with a baseline.")
+    print(
+        f"\nPassed: {passed['default']} of {len(TAMPERINGS)} by default, {passed['baseline']} "
+        "with a baseline."
+    )
 
 
 if __name__ == "__main__":

@@ -1,11 +1,13 @@
-"""The regularisation of the traditional pipeline: a scan of epsilon on photographs, and the fit of its two constants.
+"""The regularisation of the traditional pipeline: a scan of epsilon on photographs, and the fit of
+its two constants.
 
     python benchmarks/traditional_epsilon.py --images aerial-train/ --images aerial-train2/
 
-One photograph of each place is acquired under six sensors, at three brightnesses, once stretched to full scale and
-once with a third of the contrast about 80 W/m2/sr/um. NL-Bayes runs once for each image, and the compensation with
-every epsilon of a grid. PSNR is that against the reference without noise, without the border and without saturated
-pixels. Never give the photographs that results are reported on: the constants would be chosen on them.
+One photograph of each place is acquired under six sensors, at three brightnesses, once stretched to
+full scale and once with a third of the contrast about 80 W/m2/sr/um. NL-Bayes runs once for each
+image, and the compensation with every epsilon of a grid. PSNR is that against the reference without
+noise, without the border and without saturated pixels. Never give the photographs that results are
+reported on: the constants would be chosen on them.
 """
 
 import argparse
@@ -46,7 +48,9 @@ BRIGHTNESSES = (1, 1 / 4, 1 / 20)
 FLAT_MEAN = 80.0
 FLAT_CONTRAST = 0.3
 FLAT_LEAST = 1.0
-"""Radiance in W/m2/sr/um and share of the contrast of a scene that is not stretched, and its least radiance."""
+"""Radiance in W/m2/sr/um and share of the contrast of a scene that is not stretched, and its least
+radiance.
+"""
 
 EPSILONS = np.array([0.0, *(1e-5 * 2.0 ** np.arange(17))])
 ZERO = 5e-6
@@ -57,7 +61,9 @@ FINE = np.array([0.0, *np.geomspace(EPSILONS[1], EPSILONS[-1], 100)])
 
 FACTORS = (0, 1 / 8, 1 / 4, 1 / 2, 1, 2, 4, 8)
 BEFORE_PER_PERCENT = 3.3e-3
-"""The rule before this one: epsilon for each per cent of noise at 100 W/m2/sr/um, whatever the image."""
+"""The rule before this one: epsilon for each per cent of noise at 100 W/m2/sr/um, whatever the
+image.
+"""
 
 REFERENCE = load_sensor("pleiades-reference").nominal()
 
@@ -128,8 +134,12 @@ class Curve:
 
 def main() -> None:
     """Print the scan, the constants and what they lose."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--images", type=Path, action="append", required=True, help="A folder; may be repeated.")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--images", type=Path, action="append", required=True, help="A folder; may be repeated."
+    )
     torch.set_num_threads(1)
     curves = scan(parser.parse_args().images)
     print_table(curves)
@@ -137,16 +147,23 @@ def main() -> None:
 
 
 def print_losses(curves: Sequence[Curve]) -> None:
-    """Print the constants that fit best, and the mean and largest loss to the best epsilon of each image."""
+    """Print the constants that fit best, and the mean and largest loss to the best epsilon of each
+    image.
+    """
     fit = fitted_to(curves)
     places = sorted({curve.place for curve in curves})
     rows = {
         "shipped": [curve.loss_db(FIT) for curve in curves],
         "fitted": [curve.loss_db(fit) for curve in curves],
-        "fitted without the place": [loss for place in places for loss in held_out_loss_db(curves, place)],
+        "fitted without the place": [
+            loss for place in places for loss in held_out_loss_db(curves, place)
+        ],
         "before": [curve.best_db - float(curve.at(curve.before)) for curve in curves],
     }
-    print(f"\n{len(curves)} images of {len(places)} places. Constants: {words(fit)}; shipped: {words(FIT)}\n")
+    print(
+        f"\n{len(curves)} images of {len(places)} places. Constants: {words(fit)}; shipped: "
+        f"{words(FIT)}\n"
+    )
     print("| constants | mean loss, dB | largest loss, dB |\n|---|---|---|")
     for name, losses in rows.items():
         print(f"| {name} | {np.mean(losses):.3f} | {max(losses):.2f} |")
@@ -170,7 +187,9 @@ def scan(folders: Sequence[Path]) -> list[Curve]:
 
 
 def photographs(folders: Sequence[Path]) -> Iterator[Scene]:
-    """Yield the middle of the first photograph of each place, named by the place: the first word of a file's name."""
+    """Yield the middle of the first photograph of each place, named by the place: the first word of
+    a file's name.
+    """
     firsts: dict[str, Path] = {}
     for folder in folders:
         for path in list_images(folder):
@@ -206,13 +225,18 @@ def curve_of(scene: Scene, brightness: float, name: str) -> Curve:
 
 
 def restorations(dn: torch.Tensor, name: str) -> Iterator[torch.Tensor]:
-    """Yield an image (H, W) of digital numbers restored with each of EPSILONS, denoised once for all."""
+    """Yield an image (H, W) of digital numbers restored with each of EPSILONS, denoised once for
+    all.
+    """
     sensor = sensors()[name]
     noisy = to_radiance(dn, sensor)
     settings = with_rounding_noise(sensor), Noise(WORKING_SIGMA), QUALITIES["standard"]
     clean = torch.cat(list(denoise_radiance([noisy], len(noisy), *settings)))
     for epsilon in EPSILONS:
-        yield to_dn(torch.cat(list(filter_strips([clean], len(clean), kernel(name, float(epsilon))))), sensor)
+        yield to_dn(
+            torch.cat(list(filter_strips([clean], len(clean), kernel(name, float(epsilon))))),
+            sensor,
+        )
 
 
 @cache
@@ -222,7 +246,9 @@ def kernel(name: str, epsilon: float) -> torch.Tensor:
 
 
 def psnr_db(dn: torch.Tensor, pair: NamedPair, max_dn: int) -> float:
-    """Return the PSNR against the reference without noise, where neither the border nor saturation reaches."""
+    """Return the PSNR against the reference without noise, where neither the border nor saturation
+    reaches.
+    """
     inner = slice(BORDER_PX, -BORDER_PX), slice(BORDER_PX, -BORDER_PX)
     assert pair.noise_free is not None  # noqa: S101 - pairs simulated here have it
     error = (dn.numpy() - pair.noise_free)[inner]
@@ -238,13 +264,18 @@ def fitted_to(curves: Sequence[Curve]) -> Fit:
         return float(np.mean([curve.loss_db(fit) for curve in curves]))
 
     found = minimize(
-        mean_loss_db, [np.log(FIT.scale), FIT.power], method="Nelder-Mead", options={"xatol": 1e-2, "fatol": 1e-5}
+        mean_loss_db,
+        [np.log(FIT.scale), FIT.power],
+        method="Nelder-Mead",
+        options={"xatol": 1e-2, "fatol": 1e-5},
     ).x
     return Fit(float(np.exp(found[0])), float(found[1]))
 
 
 def held_out_loss_db(curves: Sequence[Curve], place: str) -> list[float]:
-    """Return the loss on each image of a place, with the constants fitted to the other places, in dB."""
+    """Return the loss on each image of a place, with the constants fitted to the other places, in
+    dB.
+    """
     fit = fitted_to([curve for curve in curves if curve.place != place])
     return [curve.loss_db(fit) for curve in curves if curve.place == place]
 
@@ -263,10 +294,14 @@ def print_table(curves: Sequence[Curve]) -> None:
 def print_row(name: str, curves: Sequence[Curve]) -> None:
     """Print the means over some images."""
     before = np.mean([curve.at(curve.before) for curve in curves])
-    scaled = [np.mean([curve.at(factor * curve.fitted(FIT)) for curve in curves]) for factor in FACTORS]
+    scaled = [
+        np.mean([curve.at(factor * curve.fitted(FIT)) for curve in curves]) for factor in FACTORS
+    ]
     single = np.mean([curve.at(FINE) for curve in curves], axis=0).max()
     best = np.mean([curve.best_db for curve in curves])
-    print(f"| {name} |", " | ".join(f"{level:.2f}" for level in (before, *scaled, single, best)), "|")
+    print(
+        f"| {name} |", " | ".join(f"{level:.2f}" for level in (before, *scaled, single, best)), "|"
+    )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
-"""Patches a second of a training run, against a bare torch loop over tensors made beforehand, in one run.
+"""Patches a second of a training run, against a bare torch loop over tensors made beforehand, in
+one run.
 
     python benchmarks/training.py --variant convbeers-s
 
-Both are timed in float32 and in bfloat16; and how fast patches are simulated, as photographs show them and varied as
-recipes vary them. What the ratio lacks of 1 is what simulating, guarding, averaging and logging cost. All are
-interleaved, so that what else the machine does falls on each of them.
+Both are timed in float32 and in bfloat16; and how fast patches are simulated, as photographs show
+them and varied as recipes vary them. What the ratio lacks of 1 is what simulating, guarding,
+averaging and logging cost. All are interleaved, so that what else the machine does falls on each of
+them.
 """
 
 import argparse
@@ -42,7 +44,9 @@ LOSS = LossWeights(lpips=0.0)
 
 def main() -> None:
     """Print the rates of the two ways and their ratio."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--variant", choices=VARIANTS, default="convbeers-s")
     parser.add_argument("--steps", type=int, default=48)
     arguments = parser.parse_args()
@@ -59,16 +63,30 @@ def main() -> None:
     whole: dict[str, list[float]] = {name: [] for name in trainers}
     with tempfile.TemporaryDirectory() as folder:
         for _, (name, trainer) in product(range(TURNS + 1), trainers.items()):
-            bare[name].append(rate(steps, partial(bare_loop, Trainer(variant, recipe, precision=name), made, name)))
-            whole[name].append(rate(steps, partial(run, trainer, batches, steps, Path(folder) / "c")))
+            bare[name].append(
+                rate(
+                    steps, partial(bare_loop, Trainer(variant, recipe, precision=name), made, name)
+                )
+            )
+            whole[name].append(
+                rate(steps, partial(run, trainer, batches, steps, Path(folder) / "c"))
+            )
     print(f"{arguments.variant} on {processor_name()}, {torch.get_num_threads()} threads")
     for kind, recipe_of_patches in kinds_of_patches().items():
         made_alone = PatchSource(scenes, recipe_of_patches, BATCH, 0).batches()
         next(made_alone)
-        print(f"simulated alone, {kind}: {rate(SIMULATED, partial(drawn, made_alone, SIMULATED)):.0f} patches/s")
+        print(
+            f"simulated alone, {kind}: "
+            f"{rate(SIMULATED, partial(drawn, made_alone, SIMULATED)):.0f} patches/s"
+        )
     for name in trainers:
-        ratio = median(ours / theirs for ours, theirs in zip(whole[name][1:], bare[name][1:], strict=True))
-        rates = f"bare loop {median(bare[name][1:]):.1f} patches/s, training run {median(whole[name][1:]):.1f}"
+        ratio = median(
+            ours / theirs for ours, theirs in zip(whole[name][1:], bare[name][1:], strict=True)
+        )
+        rates = (
+            f"bare loop {median(bare[name][1:]):.1f} patches/s, training run "
+            f"{median(whole[name][1:]):.1f}"
+        )
         print(f"{name}: {rates}, ratio {ratio:.2f}")  # the first turn warms up
 
 
@@ -78,7 +96,10 @@ def kinds_of_patches() -> dict[str, PatchRecipe]:
     reference = load_sensor("pleiades-reference")
     plain = PatchRecipe(degraded, reference, PATCH_PX, family=SensorFamily(degraded.nominal()))
     family = SensorFamily(degraded.nominal(), other_curves=0.4)
-    return {"ordinary": plain, "varied": replace(plain, family=family, looks=VARIED, noisy_reference=False)}
+    return {
+        "ordinary": plain,
+        "varied": replace(plain, family=family, looks=VARIED, noisy_reference=False),
+    }
 
 
 def drawn(batches: Iterator[Batch], count: int) -> None:
@@ -100,7 +121,9 @@ def bare_loop(trainer: Trainer, batches: list[Batch], precision: Precision) -> N
     optimiser = torch.optim.Adam(trainer.network.parameters(), lr=1e-4)
     for batch in batches:
         degraded = batch.degraded.to(memory_format=torch.channels_last)
-        total, _ = loss(trainer.network(degraded, bfloat16=precision == "bfloat16"), batch.reference)
+        total, _ = loss(
+            trainer.network(degraded, bfloat16=precision == "bfloat16"), batch.reference
+        )
         optimiser.zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
         optimiser.step()

@@ -1,11 +1,13 @@
-"""Run a command on this processor as onnxruntime would find one without VNNI, AVX-512 and AMX, at full speed.
+"""Run a command on this processor as onnxruntime would find one without VNNI, AVX-512 and AMX, at
+full speed.
 
     python benchmarks/without_vnni.py python benchmarks/int8_kernels.py --variant convbeers-s
     python benchmarks/without_vnni.py python -m pytest tests/quant
 
-An emulator shows that results are right, and says nothing of times. This shows both: onnxruntime asks the processor
-by the instruction `cpuid`. In a copy of the library each is replaced by one that no processor knows, and a handler of
-that signal answers in its place, leaving out what is newer than AVX2. Needs Linux on x86-64, gcc and binutils.
+An emulator shows that results are right, and says nothing of times. This shows both: onnxruntime
+asks the processor by the instruction `cpuid`. In a copy of the library each is replaced by one that
+no processor knows, and a handler of that signal answers in its place, leaving out what is newer
+than AVX2. Needs Linux on x86-64, gcc and binutils.
 """
 
 import os
@@ -26,7 +28,7 @@ HANDLER = r"""
 #include <string.h>
 #include <ucontext.h>
 
-/* What stands after AVX2 in leaf 7: AVX-512 of all kinds, VNNI, AMX, and the same for 256 bits (AVX-VNNI). */
+/* What stands after AVX2 in leaf 7: AVX-512 of all kinds, VNNI, AMX, and AVX-VNNI (256 bits). */
 static const unsigned EBX0 = 1u<<16|1u<<17|1u<<21|1u<<26|1u<<27|1u<<28|1u<<30|1u<<31;
 static const unsigned ECX0 = 1u<<1|1u<<6|1u<<11|1u<<12|1u<<14;
 static const unsigned EDX0 = 1u<<2|1u<<3|1u<<8|1u<<22|1u<<23|1u<<24|1u<<25;
@@ -62,7 +64,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         handler = build_handler(Path(folder))
         site = copy_without_cpuid(Path(folder))
-        paths = os.pathsep.join(filter(None, (str(site), str(Path.cwd()), os.environ.get("PYTHONPATH"))))
+        paths = os.pathsep.join(
+            filter(None, (str(site), str(Path.cwd()), os.environ.get("PYTHONPATH")))
+        )
         environment = {**os.environ, "LD_PRELOAD": str(handler), "PYTHONPATH": paths}
         raise SystemExit(subprocess.run(sys.argv[1:], env=environment, check=False).returncode)  # noqa: S603
 
@@ -94,10 +98,15 @@ def copy_without_cpuid(folder: Path) -> Path:
 def cpuid_places(library: Path) -> list[int]:
     """Where the instruction stands in the file, in bytes from its start."""
     code = _printed("objdump", "-d", "-j", ".text", str(library))
-    section = re.search(r"\.text\s+PROGBITS\s+(\w+)\s+(\w+)", _printed("readelf", "-SW", str(library)))
+    section = re.search(
+        r"\.text\s+PROGBITS\s+(\w+)\s+(\w+)", _printed("readelf", "-SW", str(library))
+    )
     assert section is not None  # noqa: S101
     address, offset = (int(number, 16) for number in section.groups())
-    return [int(found[1], 16) - address + offset for found in re.finditer(r"(\w+):\t[^\t]*\tcpuid", code)]
+    return [
+        int(found[1], 16) - address + offset
+        for found in re.finditer(r"(\w+):\t[^\t]*\tcpuid", code)
+    ]
 
 
 def _printed(*command: str) -> str:

@@ -1,16 +1,18 @@
 """`import beers_deploy as bd`: satellite image restoration from training to board, as a library.
 
-Nouns are values: `Sensor`, `Network`, `Board`, `Pair`, `Table`. Verbs return values and write files only where they
-are told to: `simulate`, `restore`, `quantize`, `compare`, `gate`, `check`, `predict`, `evaluate`, `tradeoff` and
-`characterize`. `sensors`, `boards` and `networks` list what is shipped. What is offered is loaded when it is asked
-for. Inside:
+Nouns are values: `Sensor`, `Network`, `Board`, `Pair`, `Table`. Verbs return values and write files
+only where they are told to: `simulate`, `restore`, `quantize`, `compare`, `gate`, `check`,
+`predict`, `evaluate`, `tradeoff` and `characterize`. `sensors`, `boards` and `networks` list what
+is shipped. What is offered is loaded when it is asked for. Inside:
 
-- `network`: a network as a value; `library`, `quantise`, `verdict`, `pairs`, `board`: a verb or two each;
+- `network`: a network as a value; `library`, `quantise`, `verdict`, `pairs`, `board`: a verb or two
+  each;
 - `restoration`: images of any size through a network or the traditional pipeline;
 - `dpu` and `bench`: the checker of operators, the cost model, and what they say of a swath;
-- `results`, `frames`, `report`: figures as tables, JSON, DataFrames and pages; `differences` of two of them;
-- `studies`: what takes hours and writes pages: `evaluation`, `characterise`, `stress`, `detection`, `tradeoff`,
-  `demo`, and `recipes`, which make the shipped networks;
+- `results`, `frames`, `report`: figures as tables, JSON, DataFrames and pages; `differences` of two
+  of them;
+- `studies`: what takes hours and writes pages: `evaluation`, `characterise`, `stress`, `detection`,
+  `tradeoff`, `demo`, and `recipes`, which make the shipped networks;
 - `cli` and `commands`: a file a command, which parses options, calls one function and prints.
 """
 
@@ -30,6 +32,8 @@ def __getattr__(name: str) -> Any:
     try:
         return _loaded(name)
     except ImportError as error:
-        from beers_deploy.profiles.errors import missing_extra  # NumPy, which `__main__` has to survive without
+        from beers_deploy.profiles.errors import (
+            missing_extra,
+        )  # NumPy, which `__main__` has to survive without
 
         raise missing_extra(error, name) from error

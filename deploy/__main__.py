@@ -1,4 +1,6 @@
-"""The command line's entry: `beers-deploy`, or `python -m beers_deploy` where scripts are not on the PATH."""
+"""The command line's entry: `beers-deploy`, or `python -m beers_deploy` where scripts are not on
+the PATH.
+"""
 
 import sys
 import traceback
@@ -8,14 +10,19 @@ CRASHED = 70
 
 
 def main() -> None:
-    """Run the command line; a library that does not load ends with 70, because 1 means that a gate failed."""
+    """Run the command line; a library that does not load ends with 70, because 1 means that a gate
+    failed.
+    """
     try:
         from beers_deploy.cli import app
 
         app(prog_name="beers-deploy")
     except Exception as error:  # noqa: BLE001 - Python itself would end with 1
         traceback.print_exc()
-        print(f"beers-deploy: this installation does not work, install it again: {error!a}", file=sys.stderr)  # noqa: T201
+        print(  # noqa: T201
+            f"beers-deploy: this installation does not work, install it again: {error!a}",
+            file=sys.stderr,
+        )
         sys.exit(CRASHED)
 
 

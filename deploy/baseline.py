@@ -1,4 +1,6 @@
-"""The baseline of a gate: the document of an earlier gate, checked before anything is compared with it."""
+"""The baseline of a gate: the document of an earlier gate, checked before anything is compared with
+it.
+"""
 
 import hashlib
 import json
@@ -21,7 +23,9 @@ PATCHES = ("sensor", "images", "patches", "seed", "samples")
 """The arguments that say what INT8 and float are compared on."""
 
 SAME_DB = 0.01
-"""Between the PSNRs of one float network on two processors: most differ by less than a thousandth."""
+"""Between the PSNRs of one float network on two processors: most differ by less
+than a thousandth.
+"""
 
 SCALE = "of full scale"
 REMEDY = "make it again with 'gate --json' and these arguments"
@@ -45,12 +49,16 @@ class Baseline:
     digests: Mapping[str, frozenset[str]]
     checks: frozenset[str] = frozenset()
 
-    def require_same(self, float_sha256: str, psnr_float_db: float, inputs: Iterable[Input]) -> None:
-        """Raise OptionError if the baseline is of another float network, sensor, or of other images or samples.
+    def require_same(
+        self, float_sha256: str, psnr_float_db: float, inputs: Iterable[Input]
+    ) -> None:
+        """Raise OptionError if the baseline is of another float network, sensor, or of other images
+        or samples.
 
         Args:
             float_sha256: digest of the float network that is judged now.
-            psnr_float_db: its PSNR, by which the network is recognised if it was saved again as another file.
+            psnr_float_db: its PSNR, by which the network is recognised if it was saved again as
+                another file.
             inputs: everything else that the comparison rests on, networks left out.
         """
         same_psnr = abs(psnr_float_db - self.psnr_float_db) < SAME_DB
@@ -61,7 +69,9 @@ class Baseline:
             if before is None:
                 raise self._refused(f"a baseline that rests on {each.name}", "one that does not")
             if before != {each.sha256}:
-                raise self._refused(f"a baseline of the same {each.name}", f"one of another {each.name}")
+                raise self._refused(
+                    f"a baseline of the same {each.name}", f"one of another {each.name}"
+                )
 
     def _refused(self, expected: str, got: str) -> OptionError:
         return OptionError(str(self.path), expected=expected, got=got, remedy=REMEDY)
@@ -75,8 +85,9 @@ def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
         arguments: of the gate that is to be compared with it.
 
     Raises:
-        OptionError: a file that is no results document, of another command, of a gate that failed or of one on other
-            patches, one that contradicts itself, or one without an MAE that was measured over full scale.
+        OptionError: a file that is no results document, of another command, of a gate that failed
+            or of one on other patches, one that contradicts itself, or one without an MAE that was
+            measured over full scale.
     """
     document: Any = read_document(path)
     if document["command"] != "gate":
@@ -84,7 +95,9 @@ def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
         raise OptionError(str(path), expected="what 'gate --json' wrote", got=got, remedy=REMEDY)
     if document["verdict"] != "passed":
         remedy = "give that of a version that passed"
-        raise OptionError(str(path), expected="the document of a gate that passed", got="failed", remedy=remedy)
+        raise OptionError(
+            str(path), expected="the document of a gate that passed", got="failed", remedy=remedy
+        )
     before = document["arguments"]
     for name in PATCHES:
         then = _plain(name, before.get(name))
@@ -96,16 +109,25 @@ def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
     figures: dict[str, Any] = rows[0]["figures"] if rows else {}
     mae = figures.get("MAE", {})
     if mae.get("mode") != "measured" or mae.get("unit") != SCALE or not 0 <= mae["value"] <= 1:
-        raise OptionError(str(path), expected=f"a measured MAE {SCALE}", got=_shown(mae), remedy=REMEDY)
+        raise OptionError(
+            str(path), expected=f"a measured MAE {SCALE}", got=_shown(mae), remedy=REMEDY
+        )
     contradiction = _contradiction(document["checks"], len(rows), mae["value"])
     if contradiction:
-        raise OptionError(str(path), expected="a baseline that agrees with itself", got=contradiction, remedy=REMEDY)
+        raise OptionError(
+            str(path),
+            expected="a baseline that agrees with itself",
+            got=contradiction,
+            remedy=REMEDY,
+        )
     psnr_db = figures.get("PSNR float", {}).get("value")
     digests: dict[str, frozenset[str]] = {}
     for each in document["inputs"]:
         digests[each["name"]] = digests.get(each["name"], frozenset()) | {each["sha256"]}
     checks = frozenset(check["name"] for check in document["checks"])
-    return Baseline(path, float(mae["value"]), math.nan if psnr_db is None else float(psnr_db), digests, checks)
+    return Baseline(
+        path, float(mae["value"]), math.nan if psnr_db is None else float(psnr_db), digests, checks
+    )
 
 
 def _contradiction(checks: Iterable[Mapping[str, Any]], rows: int, mae: float) -> str:
@@ -125,12 +147,18 @@ def _contradiction(checks: Iterable[Mapping[str, Any]], rows: int, mae: float) -
 
 def _shown(figure: Mapping[str, Any]) -> str:
     """Describe a figure, or its absence, for a message."""
-    return f"{figure.get('value')} {figure.get('unit')}, {figure.get('mode')}" if figure else "no MAE"
+    return (
+        f"{figure.get('value')} {figure.get('unit')}, {figure.get('mode')}" if figure else "no MAE"
+    )
 
 
 def _plain(name: str, value: object) -> str:
-    """Return an argument as text; of a folder of images its name, because the folder may lie elsewhere."""
-    return encodable(Path(str(value)).name if name in ("images", "samples", "sensor") else str(value))
+    """Return an argument as text; of a folder of images its name, because the folder may lie
+    elsewhere.
+    """
+    return encodable(
+        Path(str(value)).name if name in ("images", "samples", "sensor") else str(value)
+    )
 
 
 def sensor_input(sensor: Sensor) -> Input:
@@ -155,10 +183,14 @@ def data_inputs(images: Path | None, samples: Path | None) -> list[Input]:
 
 
 def _files_input(kind: str, path: Path, files: Iterable[Path]) -> Input:
-    """Return a file, or the files of a folder that are read: others that lie there change no figure."""
+    """Return a file, or the files of a folder that are read: others that lie there change no
+    figure.
+    """
     if path.is_file():
         return Input(f"{kind} {path.name}", sha256(path))
     digest = hashlib.sha256()
     for file in sorted(files):
-        digest.update(f"{file.relative_to(path).as_posix()} {sha256(file)}\n".encode(errors="surrogateescape"))
+        digest.update(
+            f"{file.relative_to(path).as_posix()} {sha256(file)}\n".encode(errors="surrogateescape")
+        )
     return Input(f"{kind} {path.name}", digest.hexdigest())

@@ -27,7 +27,9 @@ from beers_deploy.quant.encodings import save_config
 from beers_deploy.quant.session import open_session, tensors_of
 from beers_deploy.results import Table, markdown_text
 
-MEASURE, HOST, README = (Path(__file__).parent / "kit" / name for name in ("measure.py", "host.py", "readme.md"))
+MEASURE, HOST, README = (
+    Path(__file__).parent / "kit" / name for name in ("measure.py", "host.py", "readme.md")
+)
 
 
 class Board(TargetProfile):
@@ -49,22 +51,25 @@ class Board(TargetProfile):
     ) -> Path:
         """Write what a board's engineer needs of an INT8 network to a folder, and return it.
 
-        `core.onnx` is the part that the DPU computes, fixed to a tile. `measure.py` times it there and writes
-        `board.json`, which `predict` takes as `measured`. `input.npy` and `expected.npy` are one input of the core
-        and what onnxruntime makes of it on this processor. `host.py` is the host's part around it in plain NumPy,
-        `golden` has what every layer must write, and README.md says what to do there.
+        `core.onnx` is the part that the DPU computes, fixed to a tile. `measure.py` times it there
+        and writes `board.json`, which `predict` takes as `measured`. `input.npy` and `expected.npy`
+        are one input of the core and what onnxruntime makes of it on this processor. `host.py` is
+        the host's part around it in plain NumPy, `golden` has what every layer must write, and
+        README.md says what to do there.
 
-        With a sensor, `host.py` takes the same steps around the network as `restore`: the consistency step, and for
-        a shipped network the exposures, whose cores are `core-x4.onnx` and so on. The golden vectors are those of
-        `core.onnx`.
+        With a sensor, `host.py` takes the same steps around the network as `restore`: the
+        consistency step, and for a shipped network the exposures, whose cores are `core-x4.onnx`
+        and so on. The golden vectors are those of `core.onnx`.
 
         Args:
             int8: the network, quantised under this board's rules.
             out: the folder.
             tile: side of a tile in pixels.
-            record: whether a record of evidence is added: what the network is, and what `check` says of it.
-            sensor: that acquires the images: a `Sensor`, a name or a .toml file. A shipped network is conditioned on
-                it; None is the middle of the sensors that it knows, and leaves the steps around the network out.
+            record: whether a record of evidence is added: what the network is, and what `check`
+                says of it.
+            sensor: that acquires the images: a `Sensor`, a name or a .toml file. A shipped network
+                is conditioned on it; None is the middle of the sensors that it knows, and leaves
+                the steps around the network out.
 
         Raises:
             MissingExtraError: a record, and cyclonedx-python-lib is not installed.
@@ -75,7 +80,11 @@ class Board(TargetProfile):
         known = None if sensor is None else Sensor.load(sensor)
         network = Network.load(int8, sensor=BLIND if known is None else known)
         folder = Path(out)
-        if known is not None and known.name != BLIND and (doubt := other_sensor(network.model, known)):
+        if (
+            known is not None
+            and known.name != BLIND
+            and (doubt := other_sensor(network.model, known))
+        ):
             warnings.warn(doubt, stacklevel=2)
         if record:
             require_library()  # refused before anything is written
@@ -93,10 +102,14 @@ class Board(TargetProfile):
             write_text(folder / "host.json", json.dumps(facts, indent=1) + "\n")
             shutil.copyfile(HOST, folder / "host.py")
         vectors = write_golden(network, folder / "golden", board=self)
-        network.core(self, np.load(vectors / "noise" / PICTURE).shape[-1]).save(vectors / "core.onnx")
+        network.core(self, np.load(vectors / "noise" / PICTURE).shape[-1]).save(
+            vectors / "core.onnx"
+        )
         if record:
             conditioned_on = Sensor.load(BLIND) if known is None else known
-            write_record(check(network, self, tile=tile), network, conditioned_on, folder / "record")
+            write_record(
+                check(network, self, tile=tile), network, conditioned_on, folder / "record"
+            )
         words = {
             "network": markdown_text(network.name),
             "board": markdown_text(self.name),
@@ -109,10 +122,14 @@ class Board(TargetProfile):
 
 
 def _brighter(int8: NetworkLike, sensor: Sensor | None) -> dict[int, Network]:
-    """Return a shipped network for the sensor at higher exposures, by factor; none of any other network."""
+    """Return a shipped network for the sensor at higher exposures, by factor; none of any other
+    network.
+    """
     if sensor is None or not isinstance(int8, str | os.PathLike):
         return {}
-    return {factor: Network.load(path) for factor, path in brighter_files(Path(int8), sensor).items()}
+    return {
+        factor: Network.load(path) for factor, path in brighter_files(Path(int8), sensor).items()
+    }
 
 
 def _write_example(core: Network, folder: Path) -> None:
@@ -135,7 +152,10 @@ def boards() -> Table:
     rows = []
     for name in board_names():
         board = Board.load(name)
-        words = {"configurations": ", ".join(board.configurations), "description": board.description}
+        words = {
+            "configurations": ", ".join(board.configurations),
+            "description": board.description,
+        }
         rows.append(Row("boards", name, {}, words))
     return Table("boards", {}, (), tuple(rows))
 
@@ -161,16 +181,26 @@ def _figure(constant: Constant, unit: str) -> Figure:
     """A constant as a figure: a range is the interval about its middle."""
     interval = None if constant.low == constant.high else (constant.low, constant.high)
     mode: Mode = "measured" if constant.status == "measured" else "published"
-    return Figure((constant.low + constant.high) / 2, unit, mode, f"{constant.status}: {constant.source}", interval)
+    return Figure(
+        (constant.low + constant.high) / 2,
+        unit,
+        mode,
+        f"{constant.status}: {constant.source}",
+        interval,
+    )
 
 
 def networks() -> Table:
-    """The shipped networks, each in float32 and in INT8, told the middle of the sensors that they know.
+    """The shipped networks, each in float32 and in INT8, told the middle of the sensors that they
+    know.
 
     Examples:
         >>> "convbeers-s-int8" in bd.networks().to_pandas().index
         True
     """
     names = [each for name in shipped_names() for each in (name, f"{name}{INT8}")]
-    rows = [Row("networks", each.name, {}, {"precision": each.precision}) for each in map(Network.load, names)]
+    rows = [
+        Row("networks", each.name, {}, {"precision": each.precision})
+        for each in map(Network.load, names)
+    ]
     return Table("networks", {}, (), tuple(rows))

@@ -2,8 +2,8 @@
 
     sensor profile -> simulate -> train -> export -> quantize -> gate -> check -> bench -> restore
 
-Exit codes: 0 done, 1 a gate or check failed, 2 bad input (one sentence on standard error, nothing half-written), 70 a
-fault of this program, 130 interrupted.
+Exit codes: 0 done, 1 a gate or check failed, 2 bad input (one sentence on standard error, nothing
+half-written), 70 a fault of this program, 130 interrupted.
 """
 
 import inspect
@@ -61,20 +61,26 @@ PIPES_RESULTS = "beers_deploy.pipes_results"
 """Key in the context of a command line: True if the results are asked for on standard output."""
 
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Show no progress.")]
-Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Show where in the program an error arose.")]
+Verbose = Annotated[
+    bool, typer.Option("-v", "--verbose", help="Show where in the program an error arose.")
+]
 
 
 class Stream:
-    """Standard output or error that ends no run: what cannot be written is left out, and `lost` says why.
+    """Standard output or error that ends no run: what cannot be written is left out, and `lost`
+    says why.
 
-    A stream that was closed at the start takes everything and loses nothing, as nobody asked for it.
+    A stream that was closed at the start takes everything and loses nothing, as nobody asked for
+    it.
     """
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream or open(os.devnull, "w")  # noqa: PTH123, SIM115 - as long as the process
         self.lost = ""
         if isinstance(self.stream, io.TextIOWrapper):
-            self.stream.reconfigure(errors="backslashreplace")  # a name that a terminal lacks must end no run either
+            self.stream.reconfigure(
+                errors="backslashreplace"
+            )  # a name that a terminal lacks must end no run either
 
     def write(self, text: str) -> int:
         """Write and flush, or leave it out."""
@@ -84,7 +90,9 @@ class Stream:
                 self.stream.flush()
             except OSError as error:
                 self.lost = error.strerror or str(error)
-                with suppress(OSError, ValueError):  # what is buffered must not be tried once more at the end
+                with suppress(
+                    OSError, ValueError
+                ):  # what is buffered must not be tried once more at the end
                     os.dup2(os.open(os.devnull, os.O_WRONLY), self.stream.fileno())
         return len(text)
 
@@ -96,28 +104,40 @@ class Stream:
 
 
 class Group(TyperGroup):
-    """Prints warnings as lines, and keeps standard output for results where they are asked for there."""
+    """Prints warnings as lines, and keeps standard output for results where they are asked for
+    there.
+    """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Note whether the results go to standard output, in which case all else goes to standard error."""
-        # Once parsed, Click keeps the words in an attribute that has another name in each of its versions.
+        """Note whether the results go to standard output, in which case all else goes to standard
+        error.
+        """
+        # Once parsed, Click keeps the words in an attribute that has another name in each of its
+        # versions.
         ctx.meta[PIPES_RESULTS] = ("--json", "-") in pairwise(args) or "--json=-" in args
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the chosen command; what was lost on standard output ends it with 70 when all is done."""
+        """Run the chosen command; what was lost on standard output ends it with 70 when all is
+        done.
+        """
         closed = sys.stdout is None
         out = cast(Any, Stream(sys.stdout))
         sys.stdout = out
         sys.stderr = cast(TextIO, Stream(sys.stderr))
         found = self._invoke(ctx)
         if out.lost or (closed and ctx.meta[PIPES_RESULTS]):
-            typer.echo(f"beers-deploy: standard output: {out.lost or 'closed'}; all else is done", err=True)
+            typer.echo(
+                f"beers-deploy: standard output: {out.lost or 'closed'}; all else is done", err=True
+            )
             ctx.exit(CRASHED)
         return found
 
     def _invoke(self, ctx: Any) -> Any:
-        with warnings.catch_warnings(), results_to(sys.stdout) if ctx.meta[PIPES_RESULTS] else nullcontext():
+        with (
+            warnings.catch_warnings(),
+            results_to(sys.stdout) if ctx.meta[PIPES_RESULTS] else nullcontext(),
+        ):
             warnings.simplefilter("always", OutsideRangeWarning)
             warnings.showwarning = _print_warning
             return super().invoke(ctx)
@@ -126,7 +146,8 @@ class Group(TyperGroup):
 def command(function: Callable[..., None]) -> Callable[..., None]:
     """A command with the options that every one has, and one sentence for whatever ends it.
 
-    What a user can correct ends it with code 2, anything else with 70: a failed gate alone ends with 1.
+    What a user can correct ends it with code 2, anything else with 70: a failed gate alone ends
+    with 1.
     """
 
     @wraps(function)
@@ -147,7 +168,9 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     signature = inspect.signature(function)
     more = {"quiet": Quiet, "verbose": Verbose}
     kind = inspect.Parameter.KEYWORD_ONLY
-    extra = [inspect.Parameter(name, kind, default=False, annotation=hint) for name, hint in more.items()]
+    extra = [
+        inspect.Parameter(name, kind, default=False, annotation=hint) for name, hint in more.items()
+    ]
     own = [*signature.parameters.values(), *extra]
     run.__signature__ = signature.replace(parameters=own)  # type: ignore[attr-defined]
     run.__annotations__ = {**function.__annotations__, **more}
@@ -155,10 +178,14 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def _require_values(named: Mapping[str, object]) -> None:
-    """Refuse an option that is given without a value, such as that of an unset variable: it would count as none."""
+    """Refuse an option that is given without a value, such as that of an unset variable: it would
+    count as none.
+    """
     for name, value in named.items():
         if value == "":
-            raise OptionError(name, expected="a value", got="an empty one", remedy="give one, or leave it out")
+            raise OptionError(
+                name, expected="a value", got="an empty one", remedy="give one, or leave it out"
+            )
 
 
 def ending(error: BaseException, function: Callable[..., None]) -> tuple[str, int]:
@@ -168,7 +195,10 @@ def ending(error: BaseException, function: Callable[..., None]) -> tuple[str, in
     if isinstance(error, BeersError):
         return in_options(str(error), function), 2
     if isinstance(error, MemoryError):
-        return "memory: expected enough for this input, got none left; give a smaller image or tile.", 2
+        return (
+            "memory: expected enough for this input, got none left; give a smaller image or tile.",
+            2,
+        )
     if isinstance(error, KeyboardInterrupt):
         return "interrupted", INTERRUPTED
     at_fault = " or of ".join(["this program", *_library_of(error)])
@@ -176,7 +206,9 @@ def ending(error: BaseException, function: Callable[..., None]) -> tuple[str, in
 
 
 def _library_of(error: BaseException) -> list[str]:
-    """Return name and version of the library in which an error arose; nothing if it arose in this program."""
+    """Return name and version of the library in which an error arose; nothing if it arose in this
+    program.
+    """
     from importlib.metadata import packages_distributions, version
 
     distributions = packages_distributions()
@@ -199,7 +231,9 @@ def in_options(message: str, function: Callable[..., None]) -> str:
     """
 
     def option(found: re.Match[str]) -> str:
-        named = found[1] in parameters and parameters[found[1]].default is not inspect.Parameter.empty
+        named = (
+            found[1] in parameters and parameters[found[1]].default is not inspect.Parameter.empty
+        )
         return f"--{found[1].replace('_', '-')}" if named else found[1]
 
     parameters = inspect.signature(function).parameters
@@ -216,7 +250,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Satellite image restoration from training to board: simulate, train, quantise, check, predict, restore.",
+    help="Satellite image restoration from training to board: simulate, train, quantise, check, "
+    "predict, restore.",
 )
 
 
@@ -237,7 +272,9 @@ def main(
 
 
 def _installation() -> Iterator[str]:
-    """What this installation runs on: its system, its runtimes, and what its kernels were asked, a line each."""
+    """What this installation runs on: its system, its runtimes, and what its kernels were asked, a
+    line each.
+    """
     from importlib.metadata import PackageNotFoundError
     from importlib.metadata import version as version_of
 
@@ -267,7 +304,11 @@ COMMANDS: dict[str, tuple[Callable[..., None], str, str]] = {
     "info": (info.info, "raw.jp2", RESTORE),
     "demo": (demo.demo, "--out demo", RESTORE),
     "export": (export.export, "--network convbeers-s --out float.onnx", INT8),
-    "quantize": (quantize.quantize, "float.onnx --target zcu104 --sensor pleiades-degraded --out int8.onnx", INT8),
+    "quantize": (
+        quantize.quantize,
+        "float.onnx --target zcu104 --sensor pleiades-degraded --out int8.onnx",
+        INT8,
+    ),
     "gate": (gate.gate, "float.onnx int8.onnx --max-mae 0.0007", INT8),
     "diff": (diff.diff, "before.json after.json --fail-on 'MAE>2%' --fail-on 'PSNR<-0.05'", INT8),
     "check": (check.check, "network.onnx --target zcu102 --dpu B4096", BOARDS),
@@ -275,7 +316,10 @@ COMMANDS: dict[str, tuple[Callable[..., None], str, str]] = {
     "bench": (bench.bench, "--target vck190-model --size 13600x9016 --dpu C32B3", BOARDS),
     "evaluate": (
         evaluate.evaluate,
-        "--images aerial/ --methods degraded,traditional,convbeers-s,convbeers-s-int8 --out report/",
+        (
+            "--images aerial/ --methods degraded,traditional,convbeers-s,convbeers-s-int8 --out "
+            "report/"
+        ),
         STUDY,
     ),
     "tradeoff": (tradeoff.tradeoff, "--images aerial/ --out study/ --budget 'latency<=20s'", STUDY),
@@ -286,9 +330,17 @@ COMMANDS: dict[str, tuple[Callable[..., None], str, str]] = {
         STUDY,
     ),
     "profiles": (profiles.profiles, "pleiades-degraded", TRAIN),
-    "characterise": (profiles.characterise, "raw1.tif raw2.tif --bits 12 --out my-sensor.toml", TRAIN),
+    "characterise": (
+        profiles.characterise,
+        "raw1.tif raw2.tif --bits 12 --out my-sensor.toml",
+        TRAIN,
+    ),
     "simulate": (simulate.simulate, "aerial.png --sensor pleiades-degraded --out pairs", TRAIN),
-    "train": (train.train, "--variant convbeers-s --images aerial/ --out runs/s --steps 20000", TRAIN),
+    "train": (
+        train.train,
+        "--variant convbeers-s --images aerial/ --out runs/s --steps 20000",
+        TRAIN,
+    ),
 }
 """Of each verb its function, the words of an example, and its panel."""
 

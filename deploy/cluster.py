@@ -1,4 +1,6 @@
-"""The workers of a Dask scheduler: they compute, and this process alone reads arguments and writes results."""
+"""The workers of a Dask scheduler: they compute, and this process alone reads arguments and writes
+results.
+"""
 
 import logging
 import time
@@ -17,7 +19,9 @@ POLL_S = 5
 WORKERLESS_S = 60
 """While a result is waited for: how often workers are counted, and how long there may be none."""
 PACKAGES = ("beers-deploy", "numpy", "onnxruntime", "scipy")
-"""Workers compute with these, so every worker must have the versions of this process: they decide the last bits."""
+"""Workers compute with these, so every worker must have the versions of this process: they decide
+the last bits.
+"""
 
 T = TypeVar("T")
 
@@ -42,8 +46,12 @@ class Cluster:
             raise _lost("no connection to their scheduler", "start it again") from error
 
     def share(self, value: T) -> T:
-        """What stands for a value in calls: it is sent once, and again where all workers that held it died."""
-        standing: T = self._client.submit(_itself, value, pure=False)  # a future, which calls receive as its result
+        """What stands for a value in calls: it is sent once, and again where all workers that held
+        it died.
+        """
+        standing: T = self._client.submit(
+            _itself, value, pure=False
+        )  # a future, which calls receive as its result
         return standing
 
     def result(self, call: "Future[T]") -> T:
@@ -74,7 +82,9 @@ def open_cluster(scheduler: str | None) -> Iterator[Cluster | None]:
         try:
             yield Cluster(client)
         except distributed.KilledWorker as error:
-            raise _lost("some that died over one call", "give them more memory, or smaller tiles") from error
+            raise _lost(
+                "some that died over one call", "give them more memory, or smaller tiles"
+            ) from error
         except CancelledError as error:
             raise _lost("no connection to their scheduler", "start it again") from error
 
@@ -90,24 +100,32 @@ def _connect(distributed: Any, address: str) -> Any:
     except (OSError, ValueError) as error:
         got = " ".join(str(error).split())[:120]
         remedy = "give its address, such as tcp://host:8786"
-        raise MachineError(f"scheduler {address}", expected="an answer", got=got, remedy=remedy) from error
+        raise MachineError(
+            f"scheduler {address}", expected="an answer", got=got, remedy=remedy
+        ) from error
     try:
         client.wait_for_workers(1, timeout=JOIN_S)
     except OSError as error:
         client.close()
-        raise _lost(f"none within {JOIN_S} s", f"start some with 'dask worker {address}'") from error
+        raise _lost(
+            f"none within {JOIN_S} s", f"start some with 'dask worker {address}'"
+        ) from error
     return client
 
 
 def _require_same_versions(client: Any) -> None:
-    """Ask every worker by a function that any Python has: one of ours would kill a worker without our package."""
+    """Ask every worker by a function that any Python has: one of ours would kill a worker without
+    our package.
+    """
     for package in PACKAGES:
         here = version(package)
         for worker, got in client.run(version, package, on_error="return").items():
             if got != here:
                 expected = f"{package} {here}"
                 remedy = "install the same versions on every machine"
-                raise MachineError(f"worker {worker}", expected=expected, got=str(got), remedy=remedy)
+                raise MachineError(
+                    f"worker {worker}", expected=expected, got=str(got), remedy=remedy
+                )
 
 
 @contextmanager

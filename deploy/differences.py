@@ -1,4 +1,6 @@
-"""What changed between two runs: figures of two results documents, matched by table, row and name."""
+"""What changed between two runs: figures of two results documents, matched by
+table, row and name.
+"""
 
 import json
 import re
@@ -40,7 +42,9 @@ class Change:
 
 @dataclass(frozen=True)
 class Limit:
-    """A change that fails a job: `MAE>2%` (rises by more), `PSNR<-0.05` (falls by more, in its unit)."""
+    """A change that fails a job: `MAE>2%` (rises by more), `PSNR<-0.05` (falls by more, in its
+    unit).
+    """
 
     name: str
     above: bool
@@ -77,12 +81,18 @@ class Changes:
 
 
 def broken(found: Changes, limits: Sequence[Limit]) -> list[str]:
-    """What fails a job, a line each: changes beyond a limit, and figures with a limit that are gone."""
+    """What fails a job, a line each: changes beyond a limit, and figures with a limit that are
+    gone.
+    """
     known = {place[2] for place in (*(change.place for change in found.both), *found.gone)}
     for limit in limits:
         if limit.name not in known:
-            expected = f"a figure of the first document: {', '.join(sorted(known)) or 'it shares none'}"
-            raise OptionError("fail_on", expected=expected, got=repr(limit.name), remedy="correct the name")
+            expected = (
+                f"a figure of the first document: {', '.join(sorted(known)) or 'it shares none'}"
+            )
+            raise OptionError(
+                "fail_on", expected=expected, got=repr(limit.name), remedy="correct the name"
+            )
     changed = [change for change in found.both if any(limit.broken_by(change) for limit in limits)]
     names = {limit.name for limit in limits}
     lines = [f"{' / '.join(change.place)}: {change.before} -> {change.after}" for change in changed]
@@ -94,8 +104,12 @@ def parse_limit(text: str) -> Limit:
     found = LIMIT.fullmatch(text.strip())
     if found is None:
         remedy = "write 'MAE>2%' or 'PSNR<-0.05'"
-        raise OptionError("fail_on", expected="NAME>CHANGE or NAME<CHANGE", got=repr(text), remedy=remedy)
-    return Limit(found["name"], found["side"] == ">", float(found["change"]), bool(found["percent"]))
+        raise OptionError(
+            "fail_on", expected="NAME>CHANGE or NAME<CHANGE", got=repr(text), remedy=remedy
+        )
+    return Limit(
+        found["name"], found["side"] == ">", float(found["change"]), bool(found["percent"])
+    )
 
 
 def read_document(path: Path) -> dict[str, object]:
@@ -120,7 +134,9 @@ def changes(before: Mapping[str, object], after: Mapping[str, object]) -> Change
     old = figures_of(before)
     new = figures_of(after)
     both = tuple(Change(place, figure, new[place]) for place, figure in old.items() if place in new)
-    return Changes(both, tuple(p for p in old if p not in new), tuple(p for p in new if p not in old))
+    return Changes(
+        both, tuple(p for p in old if p not in new), tuple(p for p in new if p not in old)
+    )
 
 
 def figures_of(document: Mapping[str, object]) -> dict[Place, Figure]:
@@ -131,7 +147,8 @@ def figures_of(document: Mapping[str, object]) -> dict[Place, Figure]:
         figures: Mapping[str, dict[str, object]] = row["figures"]  # type: ignore[assignment]
         for name, figure in figures.items():
             place = (str(row["table"]), str(row["name"]), name)
-            found[place] = Figure(**{**figure, "interval": tuple(figure.get("interval") or ()) or None})  # type: ignore[arg-type]
+            interval: tuple[object, ...] | None = tuple(figure.get("interval") or ()) or None  # type: ignore[arg-type]
+            found[place] = Figure(**{**figure, "interval": interval})  # type: ignore[arg-type]
     return found
 
 

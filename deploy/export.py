@@ -1,6 +1,8 @@
-"""ConvBEERS as ONNX: `image` (N, 1, H, W) in [0, 1] to `restored`, written node by node under readable names.
+"""ConvBEERS as ONNX: `image` (N, 1, H, W) in [0, 1] to `restored`, written node by node under
+readable names.
 
-Also how any float network is had as ONNX: from an ONNX file or from weights, which may need to be told a sensor.
+Also how any float network is had as ONNX: from an ONNX file or from weights, which may need to be
+told a sensor.
 """
 
 from pathlib import Path
@@ -34,26 +36,33 @@ def float_for(path: Path, name: str, sensor: Sensor, tile_px: int | None = None)
     return banked_to_onnx(found, sensor.nominal(), about(name, found.recipe, sensor.name), tile_px)
 
 
-def to_onnx(network: "Weights | ConvBEERS", about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
-    """A plain network as an ONNX model; `tile_px` fixes one square image, None leaves number and size free."""
+def to_onnx(
+    network: "Weights | ConvBEERS", about: dict[str, str], tile_px: int | None = None
+) -> onnx.ModelProto:
+    """A plain network as an ONNX model; `tile_px` fixes one square image, None leaves number and
+    size free.
+    """
     scale = network.variant.scale
     require_tile(tile_px, scale)
     writer = GraphWriter()
     arrays = network.tensors if isinstance(network, Weights) else network.state_dict()
     for name, value in arrays.items():
         writer.constant(name, np.asarray(value))
-    deep = _deep(writer, network.variant.blocks, _moved(writer, "SpaceToDepth", "unshuffled", "image", scale))
+    deep = _deep(
+        writer, network.variant.blocks, _moved(writer, "SpaceToDepth", "unshuffled", "image", scale)
+    )
     return _ended(writer, _conv(writer, "tail", deep), scale, about, tile_px)
 
 
 def banked_to_onnx(
     weights: Weights, sensor: Instrument, about: dict[str, str], tile_px: int | None = None
 ) -> onnx.ModelProto:
-    """A network behind the bank of a sensor as an ONNX model: its filters are the first convolution.
+    """A network behind the bank of a sensor as an ONNX model: its filters are the first
+    convolution.
 
-    That convolution gives the image, the planes and the analytic restoration; the last one reads what the body gives
-    and, at one tap, the analytic restoration, which another convolution picks. The image's borders are mirrored in
-    front.
+    That convolution gives the image, the planes and the analytic restoration; the last one reads
+    what the body gives and, at one tap, the analytic restoration, which another convolution picks.
+    The image's borders are mirrored in front.
 
     Args:
         weights: of a `BankedConvBEERS`.
@@ -73,7 +82,9 @@ def banked_to_onnx(
     tensors["head.bias"] = tensors["head.bias"] + tensors.pop("bias.weight") @ vector
     added = np.zeros((pixels, pixels, 3, 3), np.float32)
     added[range(pixels), range(pixels), 1, 1] = 1
-    tensors["tail.weight"] = np.concatenate([tensors["tail.weight"], added], 1) * np.float32(bank.unit)
+    tensors["tail.weight"] = np.concatenate([tensors["tail.weight"], added], 1) * np.float32(
+        bank.unit
+    )
     tensors["analytic.weight"] = np.zeros((pixels, (2 + FILTERS) * pixels, 1, 1), np.float32)
     tensors["analytic.weight"][range(pixels), range(-pixels, 0)] = 1
     tensors["tail.bias"] = tensors["tail.bias"] * np.float32(bank.unit)
@@ -86,7 +97,9 @@ def banked_to_onnx(
     around = writer.constant("around", np.array([0, 0, *[side // 2 * scale] * 2] * 2))
     widened = writer.node("Pad", "widened", ["image", around], mode="reflect")
     read = _moved(writer, "SpaceToDepth", "unshuffled", widened, scale)
-    found = writer.node("Conv", "bank", [read, "bank.weight", "bank.bias"], pads=[0] * 4, kernel_shape=[side, side])
+    found = writer.node(
+        "Conv", "bank", [read, "bank.weight", "bank.bias"], pads=[0] * 4, kernel_shape=[side, side]
+    )
     reach, wide_reach = bank.reach(weights.kernels)
     planes = _held(writer, "planes", found, reach)
     picked = writer.node("Conv", "picked", [found, "analytic.weight"], kernel_shape=[1, 1])
@@ -107,7 +120,9 @@ def _deep(writer: GraphWriter, blocks: int, source: str) -> str:
     stream = head = _conv(writer, "head", source)
     for k in range(blocks):
         inner = writer.node("Relu", f"body.{k}.relu", [_conv(writer, f"body.{k}.first", stream)])
-        stream = writer.node("Add", f"body.{k}.add", [stream, _conv(writer, f"body.{k}.second", inner)])
+        stream = writer.node(
+            "Add", f"body.{k}.add", [stream, _conv(writer, f"body.{k}.second", inner)]
+        )
     return writer.node("Add", "body_end.add", [head, _conv(writer, "body_end", stream)])
 
 
@@ -115,8 +130,12 @@ def _ended(
     writer: GraphWriter, correction: str, scale: int, about: dict[str, str], tile_px: int | None
 ) -> onnx.ModelProto:
     """The model that adds a correction to the image."""
-    writer.node("Add", "restored", ["image", _moved(writer, "DepthToSpace", "shuffled", correction, scale)])
-    graph = writer.graph("convbeers", [image_info("image", 1, tile_px)], [image_info("restored", 1, tile_px)])
+    writer.node(
+        "Add", "restored", ["image", _moved(writer, "DepthToSpace", "shuffled", correction, scale)]
+    )
+    graph = writer.graph(
+        "convbeers", [image_info("image", 1, tile_px)], [image_info("restored", 1, tile_px)]
+    )
     return make_model(graph, {"beers_deploy_version": __version__, "precision": "float32", **about})
 
 
@@ -124,7 +143,9 @@ def require_tile(tile_px: int | None, scale: int) -> None:
     """Refuse a side that a network at 1 / `scale` of the resolution cannot rearrange."""
     if tile_px is not None and tile_px % scale:
         remedy = "choose another, or leave it out"
-        raise OptionError("tile", expected=f"a multiple of {scale} px", got=f"{tile_px} px", remedy=remedy)
+        raise OptionError(
+            "tile", expected=f"a multiple of {scale} px", got=f"{tile_px} px", remedy=remedy
+        )
 
 
 def _conv(writer: GraphWriter, name: str, source: str) -> str:
@@ -133,7 +154,9 @@ def _conv(writer: GraphWriter, name: str, source: str) -> str:
 
 
 def _moved(writer: GraphWriter, operator: str, name: str, source: str, scale: int) -> str:
-    """Pixels into channels or back, in an order in which ONNX and torch agree: the image has one channel."""
+    """Pixels into channels or back, in an order in which ONNX and torch agree: the image has one
+    channel.
+    """
     return writer.node(operator, name, [source], blocksize=scale) if scale > 1 else source
 
 

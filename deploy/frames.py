@@ -1,4 +1,6 @@
-"""Rows of figures as notebooks have them: a pandas DataFrame, a plot of matplotlib, a table of HTML."""
+"""Rows of figures as notebooks have them: a pandas DataFrame, a plot of matplotlib, a table of
+HTML.
+"""
 
 from collections.abc import Sequence
 from html import escape
@@ -28,12 +30,16 @@ def words_of(rows: Sequence[Row]) -> list[str]:
 def _index(rows: Sequence[Row]) -> Any:
     pandas = optional("pandas", "to_pandas")
     if len({row.table for row in rows}) > 1:
-        return pandas.MultiIndex.from_tuples([(row.table, row.name) for row in rows], names=["table", "name"])
+        return pandas.MultiIndex.from_tuples(
+            [(row.table, row.name) for row in rows], names=["table", "name"]
+        )
     return pandas.Index([row.name for row in rows], name=rows[0].table if rows else "name")
 
 
 def wide_frame(rows: Sequence[Row]) -> "pd.DataFrame":
-    """One line a row, a column a figure and a column for each word beside them; units in `attrs["units"]`."""
+    """One line a row, a column a figure and a column for each word beside them; units in
+    `attrs["units"]`.
+    """
     pandas = optional("pandas", "to_pandas")
     columns: dict[str, list[object]] = {}
     for key in figures_of(rows):
@@ -46,7 +52,9 @@ def wide_frame(rows: Sequence[Row]) -> "pd.DataFrame":
 
 
 def tidy_frame(rows: Sequence[Row]) -> "pd.DataFrame":
-    """One line a figure: its table, row and name, value, unit, mode, interval and source (or why there is none)."""
+    """One line a figure: its table, row and name, value, unit, mode, interval and source (or why
+    there is none).
+    """
     pandas = optional("pandas", "to_pandas")
     lines = [
         {
@@ -72,10 +80,17 @@ def bars(rows: Sequence[Row], figure: str | None, ax: "Axes | None") -> "Axes":
     names = figures_of(rows)
     if not names or figure not in (None, *names):
         remedy = "choose one of them"
-        raise OptionError("figure", expected=f"one of {', '.join(names) or 'none'}", got=repr(figure), remedy=remedy)
+        raise OptionError(
+            "figure",
+            expected=f"one of {', '.join(names) or 'none'}",
+            got=repr(figure),
+            remedy=remedy,
+        )
     key = figure or names[0]
     shown = [
-        (row.name, row.figures[key]) for row in rows if key in row.figures and row.figures[key].value is not None
+        (row.name, row.figures[key])
+        for row in rows
+        if key in row.figures and row.figures[key].value is not None
     ]
     axes: Any = ax if ax is not None else optional("matplotlib.pyplot", "plot").subplots()[1]
     for place, (_, each) in enumerate(shown):
@@ -90,7 +105,9 @@ def bars(rows: Sequence[Row], figure: str | None, ax: "Axes | None") -> "Axes":
 
 
 def html_table(title: str, rows: Sequence[Row]) -> str:
-    """One line a row; the mode behind a figure, its source (or why there is none) as its tooltip."""
+    """One line a row; the mode behind a figure, its source (or why there is
+    none) as its tooltip.
+    """
     keys = figures_of(rows)
     words = words_of(rows)
     units = {key: figure.unit for row in rows for key, figure in row.figures.items()}

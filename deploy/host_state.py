@@ -1,4 +1,6 @@
-"""What this machine did while something was measured: load of its CPUs, and the memory that it took."""
+"""What this machine did while something was measured: load of its CPUs, and the memory that it
+took.
+"""
 
 import sys
 from contextlib import suppress
@@ -14,7 +16,9 @@ STATUS = Path("/proc/self/status")
 
 def cpu_load() -> Figure:
     """Load of all CPUs since the last call in this process, other processes included."""
-    return measured(psutil.cpu_percent(), "%", "all CPUs over the same window, other processes included")
+    return measured(
+        psutil.cpu_percent(), "%", "all CPUs over the same window, other processes included"
+    )
 
 
 def resident_bytes() -> int:
@@ -23,7 +27,9 @@ def resident_bytes() -> int:
 
 
 def peak_memory() -> Figure:
-    """Most resident memory of this process since it began, in GB; unavailable where the system does not count it."""
+    """Most resident memory of this process since it began, in GB; unavailable where the system does
+    not count it.
+    """
     peak = _peak_bytes()
     if peak is None:
         return unavailable("GB", "this system counts no peak memory")
@@ -33,7 +39,9 @@ def peak_memory() -> Figure:
 def _peak_bytes() -> int | None:
     if sys.platform == "win32":
         return int(psutil.Process().memory_info().peak_wset)
-    with suppress(OSError, StopIteration):  # getrusage's count on Linux begins with what the process's parent held
+    with suppress(
+        OSError, StopIteration
+    ):  # getrusage's count on Linux begins with what the process's parent held
         lines = STATUS.read_text(encoding="utf-8").splitlines()
         return 1024 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
     try:

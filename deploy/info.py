@@ -1,7 +1,8 @@
 """What the tool makes of an image file, before anyone waits for it.
 
-Of a TIFF only strips are read, which are searched for faults of detectors, and windows where a sensor is told, which
-are held against it. Time here is predicted only from tiles that were timed; time on the board is the cost model's.
+Of a TIFF only strips are read, which are searched for faults of detectors, and windows where a
+sensor is told, which are held against it. Time here is predicted only from tiles that were timed;
+time on the board is the cost model's.
 """
 
 import math
@@ -21,7 +22,14 @@ from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unav
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration.detectors.words import warn_of_detectors
-from beers_deploy.restoration.georeference import KEYS, PIXEL_SCALE, POLYNOMIALS, TIE_POINTS, TRANSFORMATION, geo_keys
+from beers_deploy.restoration.georeference import (
+    KEYS,
+    PIXEL_SCALE,
+    POLYNOMIALS,
+    TIE_POINTS,
+    TRANSFORMATION,
+    geo_keys,
+)
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.plan import Plan, plan_for
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
@@ -39,7 +47,9 @@ RUNS = 3
 UNTIMED = "no tile was timed here: --measure times some"
 
 
-def info_row(image: Path, options: Options, target: TargetProfile, measure: bool = False, log: Log = no_log) -> Row:
+def info_row(
+    image: Path, options: Options, target: TargetProfile, measure: bool = False, log: Log = no_log
+) -> Row:
     """The facts of an image and of its restoration.
 
     Args:
@@ -54,9 +64,13 @@ def info_row(image: Path, options: Options, target: TargetProfile, measure: bool
         raster = source.raster
         scale = known_scale(image.name, raster, options)
         check = SensorCheck()
-        detectors = warn_of_detectors(source, scale.value if isinstance(scale, FullScale) else math.inf, log)
+        detectors = warn_of_detectors(
+            source, scale.value if isinstance(scale, FullScale) else math.inf, log
+        )
         if isinstance(scale, FullScale):
-            check = told_sensor(source, options.sensors, scale.value, str(image), options.strict, log)
+            check = told_sensor(
+                source, options.sensors, scale.value, str(image), options.strict, log
+            )
     plan = plan_for(network, raster.shape, options)
     figures = {
         "width": measured(raster.width_px, "px", HEADER),
@@ -69,8 +83,16 @@ def info_row(image: Path, options: Options, target: TargetProfile, measure: bool
         **detectors,
     }
     open_scale = {"full scale": "open", "full scale from": str(scale)}
-    text = {"pixels": str(raster.dtype), **(scale.text if isinstance(scale, FullScale) else open_scale)}
-    text |= {**place_words(raster), "nodata": missing_words(raster), "halo": plan.halo_words, **check.text}
+    text = {
+        "pixels": str(raster.dtype),
+        **(scale.text if isinstance(scale, FullScale) else open_scale),
+    }
+    text |= {
+        **place_words(raster),
+        "nodata": missing_words(raster),
+        "halo": plan.halo_words,
+        **check.text,
+    }
     return Row("info", image.name, figures, text)
 
 
@@ -85,7 +107,10 @@ def missing_words(raster: Raster) -> str:
 def known_scale(name: str, raster: Raster, options: Options) -> FullScale | str:
     """Full scale as far as no pixel is read; else why it is open."""
     if raster.dtype.kind == "f" and options.full_scale is None:
-        return "the pixels decide when they are read: digital numbers if one is above 2, else state the full scale"
+        return (
+            "the pixels decide when they are read: digital numbers if one is above 2, else "
+            "state the full scale"
+        )
     try:
         return full_scale_of(name, raster, (), options.full_scale, options.sensor_bits)
     except ImageError as error:
@@ -99,7 +124,9 @@ def place_words(raster: Raster) -> Mapping[str, str]:
     words = {"georeference": f"{_code(tags.get(KEYS, ()))}" if placed or KEYS in tags else "none"}
     if PIXEL_SCALE in tags and TIE_POINTS in tags:
         (right, down), (x, y) = tags[PIXEL_SCALE][:2], tags[TIE_POINTS][3:5]
-        words["georeference"] += f", first corner ({x:.9g}, {y:.9g}), pixels of {right:.9g} x {down:.9g}"
+        words["georeference"] += (
+            f", first corner ({x:.9g}, {y:.9g}), pixels of {right:.9g} x {down:.9g}"
+        )
     return words | {"rational polynomials": "yes" if POLYNOMIALS in tags else "none"}
 
 
@@ -131,11 +158,16 @@ def time_here(network: onnx.ModelProto, plan: Plan, options: Options) -> Figure:
 
 
 def time_on_board(model: Path, plan: Plan, target: TargetProfile) -> Figure:
-    """The time of all tiles on a board's DPU, by the cost model, in whole batches and with one exposure each.
+    """The time of all tiles on a board's DPU, by the cost model, in whole batches and with one
+    exposure each.
 
     The host takes the consistency step where the network gives a pixel for each pixel.
     """
-    step_px = plan.height_px * plan.width_px * plan.bands / plan.tiles if keeps_pixels(plan.tiling) else 0.0
+    step_px = (
+        plan.height_px * plan.width_px * plan.bands / plan.tiles
+        if keeps_pixels(plan.tiling)
+        else 0.0
+    )
     try:
         prediction = predict_file(model, dpu_of(target), max(plan.tile_shape), step_px=step_px)
     except BeersError as error:

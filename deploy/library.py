@@ -77,19 +77,24 @@ def restore(
     A network of one band restores bands one by one, another one those that it takes together.
 
     Args:
-        image: (H, W) or (bands, H, W). Of NumPy (masked or not) and torch it is restored at once; of Dask the result
-            is lazy, a chunk for each tile and band, and may be computed on a cluster that has this package; an
-            xarray.DataArray keeps coordinates and attributes, its bands in a dimension "band" wherever that stands.
-            Or the path of an image file, restored into `out`.
+        image: (H, W) or (bands, H, W). Of NumPy (masked or not) and torch it is restored at once;
+            of Dask the result is lazy, a chunk for each tile and band, and may be computed on a
+            cluster that has this package; an xarray.DataArray keeps coordinates and attributes, its
+            bands in a dimension "band" wherever that stands. Or the path of an image file, restored
+            into `out`.
         network: what `Network.load` takes; convbeers-s-int8 if None.
-        sensor: that acquired the image: a `Sensor`, a name, a .toml file, or "blind" where it is not known. A shipped
-            network is conditioned on it, and the consistency step and the traditional pipeline need it.
-        method: "network", or "traditional" for the denoising and deconvolution that networks are compared with.
+        sensor: that acquired the image: a `Sensor`, a name, a .toml file, or "blind" where it is
+            not known. A shipped network is conditioned on it, and the consistency step and the
+            traditional pipeline need it.
+        method: "network", or "traditional" for the denoising and deconvolution that networks are
+            compared with.
         quality: of the traditional pipeline on arrays: fast, standard or best.
-        full_scale: the pixel value that is 1.0 to the network. None is a DataArray's attribute of that name, or 4095
-            (12 bits) for integers of more than 8 bits and for floats of digital numbers; without it 8-bit pixels, and
-            floats that all lie in about 0..1, are refused. Floats of Dask are judged tile by tile when computed.
-        nodata: the value of an array's missing pixels, besides NaN; a DataArray's own `_FillValue` if None.
+        full_scale: the pixel value that is 1.0 to the network. None is a DataArray's attribute of
+            that name, or 4095 (12 bits) for integers of more than 8 bits and for floats of digital
+            numbers; without it 8-bit pixels, and floats that all lie in about 0..1, are refused.
+            Floats of Dask are judged tile by tile when computed.
+        nodata: the value of an array's missing pixels, besides NaN; a DataArray's own `_FillValue`
+            if None.
         tile: longest side of a tile in pixels.
         halo: "exact", or pixels of context around a tile.
         runtime: "onnxruntime" or "openvino".
@@ -99,19 +104,24 @@ def restore(
         cog: write `out` as a Cloud-Optimised GeoTIFF.
         again: take an image that says it was restored already.
         any_result: give a result even if it is clipped, constant or far from the image's mean.
-        strict: refuse an image, none of Dask, that contradicts its sensor; else warn, or say "sensor told" of a file.
-        consistency: make the result agree with the raw image at low spatial frequencies, where the sensor is known.
+        strict: refuse an image, none of Dask, that contradicts its sensor; else warn, or say
+            "sensor told" of a file.
+        consistency: make the result agree with the raw image at low spatial frequencies, where the
+            sensor is known.
         exposure: restore dark parts at a higher exposure, by a shipped network.
-        progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
+        progress: a function that is told each step, False for silence, None for a bar or lines on
+            standard error.
 
     Returns:
-        The same kind and scale, uint8 of uint8, uint16 of other integers, float32 of floats; of the same shape,
-        unless the network makes more pixels or other bands. Missing pixels stay as they are. Of a file a table of the
+        The same kind and scale, uint8 of uint8, uint16 of other integers, float32 of floats; of the
+            same shape,
+        unless the network makes more pixels or other bands. Missing pixels stay as they are. Of a
+            file a table of the
         run, with its `path` and `time_s`.
 
     Raises:
-        ImageError: no such image, pixels that leave the full scale open, or values outside 0 to full scale; of
-            Dask when it is computed.
+        ImageError: no such image, pixels that leave the full scale open, or values outside 0 to
+            full scale; of Dask when it is computed.
         ModelError: a network that cannot be tiled or run.
         OptionError: options that do not go together.
         ProfileError: no such sensor.
@@ -124,12 +134,18 @@ def restore(
         True
     """
     if method not in (NETWORK, TRADITIONAL):
-        raise OptionError("method", expected=f"{NETWORK} or {TRADITIONAL}", got=repr(method), remedy="choose one")
+        raise OptionError(
+            "method", expected=f"{NETWORK} or {TRADITIONAL}", got=repr(method), remedy="choose one"
+        )
     if method == TRADITIONAL:
         changed = {"network": network is not None, "tile": tile != TILE_PX, "halo": halo != "exact"}
         changed |= {"runtime": runtime != Runtime.onnxruntime, "threads": threads != 0}
-        for name in (name for name, given in (changed | {"resume": resume, "cog": cog}).items() if given):
-            raise OptionError(name, expected="none with method traditional", got="one", remedy="leave it out")
+        for name in (
+            name for name, given in (changed | {"resume": resume, "cog": cog}).items() if given
+        ):
+            raise OptionError(
+                name, expected="none with method traditional", got="one", remedy="leave it out"
+            )
     known = Sensor.load(sensor)
     found = Network.load(f"{VARIANT}{INT8}" if network is None else network, sensor=known)
     told = {} if known.name == BLIND else {"": known}
@@ -162,7 +178,9 @@ def restore(
 
 
 def _brighter(network: NetworkLike | None, found: Network, sensor: Sensor) -> dict[int, Path]:
-    """A conditioned network at higher exposures; of any other one none, and a warning if it is another sensor's."""
+    """A conditioned network at higher exposures; of any other one none, and a warning if it is
+    another sensor's.
+    """
     if network is None or isinstance(network, str | os.PathLike):
         given = None if network is None else Path(network)
         if conditioned(given) is not None:
@@ -196,21 +214,34 @@ class Run(Table):
     time_s: float
 
 
-def _restore_path(image: Path, options: Options, job: Job, out: str | os.PathLike[str] | None) -> Run:
+def _restore_path(
+    image: Path, options: Options, job: Job, out: str | os.PathLike[str] | None
+) -> Run:
     if out is None:
         remedy = "name the TIFF to write, or read the image into an array"
         raise OptionError("out", expected="a path beside an image file", got="none", remedy=remedy)
     if job.nodata is not None:
         remedy = "leave it out: the file says which value its missing pixels have"
-        raise OptionError("nodata", expected="none beside an image file", got=f"{job.nodata:g}", remedy=remedy)
+        raise OptionError(
+            "nodata", expected="none beside an image file", got=f"{job.nodata:g}", remedy=remedy
+        )
     path = Path(out)
     if job.method == TRADITIONAL:
-        from beers_deploy.restoration.traditional import restore_file_traditionally  # it takes torch
+        from beers_deploy.restoration.traditional import (
+            restore_file_traditionally,
+        )  # it takes torch
 
-        row = restore_file_traditionally(image, path, replace(options, sensors={"": job.sensor}), no_log)
+        row = restore_file_traditionally(
+            image, path, replace(options, sensors={"": job.sensor}), no_log
+        )
     else:
         row = restore_file(image, path, options, no_log)
-    arguments = {"method": job.method, "sensor": job.sensor.name, "tile": options.tile_px, "halo": options.halo}
+    arguments = {
+        "method": job.method,
+        "sensor": job.sensor.name,
+        "tile": options.tile_px,
+        "halo": options.halo,
+    }
     inputs = (image,) if job.method == TRADITIONAL else (options.model, image)
     time_s = row.figures["time"].value or 0.0
     return Run("restore", arguments, inputs, (row,), path=path, time_s=time_s)
@@ -229,11 +260,15 @@ def _restore_any(image: Any, job: Job) -> Any:
 
 
 def _restore_labelled(image: Any, job: Job) -> Any:
-    """An xarray.DataArray; bands may stand behind the rows and columns where their dimension says so."""
+    """An xarray.DataArray; bands may stand behind the rows and columns where their dimension says
+    so.
+    """
     if hasattr(image, "data_vars"):
         names = ", ".join(map(str, image.data_vars)) or "none"
         remedy = "choose one of its variables"
-        raise ImageError(NAME, expected="an xarray.DataArray", got=f"a Dataset of {names}", remedy=remedy)
+        raise ImageError(
+            NAME, expected="an xarray.DataArray", got=f"a Dataset of {names}", remedy=remedy
+        )
     own = image.attrs
     options = job.options
     require_raw(NAME, is_restored(str(own.get("TIFFTAG_SOFTWARE", "")), own), options.again)
@@ -244,7 +279,9 @@ def _restore_labelled(image: Any, job: Job) -> Any:
     ordered = image if bands is None or image.ndim != 3 else image.transpose(bands, ...)
     if image.ndim == 3 and bands is None and ordered.shape[-1] <= FEW < min(ordered.shape[:-1]):
         raise _bands_last(ordered.shape, "name the dimension of the bands 'band'")
-    pixels = _restore(ordered.data, replace(job, options=replace(options, full_scale=full_scale), nodata=missing))
+    pixels = _restore(
+        ordered.data, replace(job, options=replace(options, full_scale=full_scale), nodata=missing)
+    )
     restored = _labelled(ordered, pixels)
     return restored if restored.ndim != len(dims) else restored.transpose(*dims)
 
@@ -265,13 +302,20 @@ def _restore(image: Any, job: Job) -> Any:
     raster = _raster(bands, job.nodata)
     lazy = hasattr(image, "__dask_graph__")
     if lazy and np.ma.isMaskedArray(getattr(image, "_meta", None)):
-        remedy = "fill it, dask.array.ma.filled(image, 0), and give that value as `nodata`; or compute it first"
-        raise ImageError(NAME, expected="a Dask array without a mask", got="a masked one", remedy=remedy)
+        remedy = (
+            "fill it, dask.array.ma.filled(image, 0), and give that value as `nodata`; or "
+            "compute it first"
+        )
+        raise ImageError(
+            NAME, expected="a Dask array without a mask", got="a masked one", remedy=remedy
+        )
     if job.method == NETWORK:
         restored = (restore_lazily if lazy else _restore_now)(bands, raster, job.options)
     elif lazy:
         remedy = "compute it first, or take a network"
-        raise OptionError("method", expected="network for a Dask array", got=job.method, remedy=remedy)
+        raise OptionError(
+            "method", expected="network for a Dask array", got=job.method, remedy=remedy
+        )
     else:
         restored = _restore_traditionally(bands, raster, job)
     return restored[0] if image.ndim == 2 and len(restored) == 1 else restored
@@ -288,7 +332,14 @@ def _restore_traditionally(bands: np.ndarray, raster: Raster, job: Job) -> np.nd
     full_scale = full_scale_of(NAME, raster, extents, job.options.full_scale, bits).value
     to_dn = np.float32(chain.degraded.max_dn / full_scale)
     restored = []
-    told_sensor(ArraySource(bands, raster), job.options.sensors, full_scale, NAME, job.options.strict, warnings.warn)
+    told_sensor(
+        ArraySource(bands, raster),
+        job.options.sensors,
+        full_scale,
+        NAME,
+        job.options.strict,
+        warnings.warn,
+    )
     for band in bands:
         strip = checked_strip(raster, 0, band[None], full_scale, NAME)
         dn = np.ma.getdata(band).astype(np.float32) * to_dn
@@ -301,15 +352,23 @@ def _restore_traditionally(bands: np.ndarray, raster: Raster, job: Job) -> np.nd
 
 
 def _labelled(image: Any, pixels: Any) -> Any:
-    """Restored pixels with an xarray.DataArray's labels; where they are more than it had, those of their places."""
+    """Restored pixels with an xarray.DataArray's labels; where they are more than it had, those of
+    their places.
+    """
     if pixels.shape == image.shape:
         return image.copy(data=pixels)
     dims = image.dims if pixels.ndim == image.ndim else ("band", *image.dims)
     sizes = dict(zip(dims, pixels.shape, strict=True))
     changed = {dim for dim in image.dims if sizes[dim] != image.sizes[dim]}
-    coordinates = {name: each.copy() for name, each in image.coords.items() if not changed.intersection(each.dims)}
+    coordinates = {
+        name: each.copy()
+        for name, each in image.coords.items()
+        if not changed.intersection(each.dims)
+    }
     for each in coordinates.values():
-        each.attrs.pop("GeoTransform", None)  # of the pixels before; what lies where is told by the places
+        each.attrs.pop(
+            "GeoTransform", None
+        )  # of the pixels before; what lies where is told by the places
     for dim in changed.intersection(image.dims[-2:], image.coords):
         places = _between(image.coords[dim].values, sizes[dim])
         coordinates |= {dim: (dim, places, image.coords[dim].attrs)} if places is not None else {}
@@ -317,7 +376,9 @@ def _labelled(image: Any, pixels: Any) -> Any:
 
 
 def _between(places: np.ndarray, count: int) -> np.ndarray | None:
-    """The middles of `count` pixels over those at `places`, evenly between; None where these are no two numbers."""
+    """The middles of `count` pixels over those at `places`, evenly between; None where these are no
+    two numbers.
+    """
     if len(places) < 2 or places.dtype.kind not in "iuf":
         return None
     at = (np.arange(count) + 0.5) * (len(places) / count) - 0.5
@@ -346,7 +407,9 @@ def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndar
 
 BAND_DIMS = ("band", "bands", "channel", "wavelength")
 FEW = 4
-"""Bands of a photograph: a last axis of no more, behind two longer ones, holds bands and no columns."""
+"""Bands of a photograph: a last axis of no more, behind two longer ones, holds bands and no
+columns.
+"""
 
 
 def _bands_first(image: Any) -> Any:
@@ -378,4 +441,6 @@ def _runtime(name: str) -> Runtime:
         return Runtime(name)
     except ValueError as error:
         expected = " or ".join(Runtime)
-        raise OptionError("runtime", expected=expected, got=repr(name), remedy="choose one") from error
+        raise OptionError(
+            "runtime", expected=expected, got=repr(name), remedy="choose one"
+        ) from error

@@ -22,7 +22,14 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.quant.encodings import board_model, read_core, vint8_model
-from beers_deploy.quant.onnx_file import fixed_tile_px, is_quantised, load_onnx, metadata, read_onnx, save_onnx
+from beers_deploy.quant.onnx_file import (
+    fixed_tile_px,
+    is_quantised,
+    load_onnx,
+    metadata,
+    read_onnx,
+    save_onnx,
+)
 from beers_deploy.quant.reading.external import unchanged
 from beers_deploy.quant.reading.folding import OPSET
 from beers_deploy.quant.session import open_session, result_of
@@ -41,7 +48,9 @@ SensorLike = Sensor | str | os.PathLike[str]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Network:
-    """An ONNX network and where it comes from. `Network.load` makes one of whatever holds a network.
+    """An ONNX network and where it comes from.
+
+    `Network.load` makes one of whatever holds a network.
 
     Attributes:
         model: the network.
@@ -49,7 +58,8 @@ class Network:
         path: the file that holds it; None of one that is in memory alone.
         origin: the float network that it was quantised from, where that was done here.
         layers: of a network that was quantised here, a row for each integer layer.
-        quantised: its integers and the graph that they were rounded from, where it was quantised here by itself.
+        quantised: its integers and the graph that they were rounded from, where it was quantised
+            here by itself.
         file_sha256: of the file as it was read; empty of one that is in memory alone.
 
     Examples:
@@ -74,13 +84,16 @@ class Network:
         example: Sequence[int] = (1, 1, 64, 64),
         to_run: bool = True,
     ) -> "Network":
-        """A network from an ONNX or safetensors file, a shipped name, a ModelProto or a module of torch.
+        """A network from an ONNX or safetensors file, a shipped name, a ModelProto or a module of
+        torch.
 
         Args:
             network: a shipped name has -int8 behind it for INT8; a `Network` is returned as it is.
             sensor: that a shipped network is told: a `Sensor`, a name or a .toml file.
-            example: shape (N, C, H, W) of an image that a module of torch takes; number and size stay free.
-            to_run: whether a runtime may get it; False where a file's nodes are only looked at, whosever they are.
+            example: shape (N, C, H, W) of an image that a module of torch takes; number and size
+                stay free.
+            to_run: whether a runtime may get it; False where a file's nodes are only looked at,
+                whosever they are.
 
         Raises:
             ModelError: no such network, or one that no runtime may get.
@@ -105,15 +118,20 @@ class Network:
         save_onnx(self.model, Path(path))
         return Path(path)
 
-    def core(self, board: TargetProfile | str = DEFAULT_TARGET, tile: int | None = None) -> "Network":
-        """The part of an INT8 network that the DPU or NPU computes, in the encoding that a board's tools read.
+    def core(
+        self, board: TargetProfile | str = DEFAULT_TARGET, tile: int | None = None
+    ) -> "Network":
+        """The part of an INT8 network that the DPU or NPU computes, in the encoding that a board's
+        tools read.
 
         Args:
             board: whose tools; those of an NPU read VINT8, of one tile.
-            tile: side in pixels of the image that it is fixed to; the network's own, or any, if None.
+            tile: side in pixels of the image that it is fixed to; the network's own, or any, if
+                None.
 
         Raises:
-            ModelError: a float network, or an INT8 one that was not quantised under the DPU's rules here.
+            ModelError: a float network, or an INT8 one that was not quantised under the DPU's rules
+                here.
             OptionError: an NPU and no tile, or one that the network cannot rearrange.
         """
         core = read_core(self.model)
@@ -201,12 +219,16 @@ def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
         try:
             names = {"input_names": ["image"], "output_names": ["restored"], "dynamic_axes": free}
             image = torch.zeros(tuple(example))
-            torch.onnx.export(module.eval(), (image,), stream, opset_version=OPSET, dynamo=False, **names)
+            torch.onnx.export(
+                module.eval(), (image,), stream, opset_version=OPSET, dynamo=False, **names
+            )
         except Exception as error:  # whatever a module's own code raises
             got = " ".join(str(error).split())[:160]
             remedy = f"check that it takes an image {times(example)}, or give example=(N, C, H, W)"
             expected = "a module that torch exports"
-            raise ModelError(type(module).__name__, expected=expected, got=got, remedy=remedy) from error
+            raise ModelError(
+                type(module).__name__, expected=expected, got=got, remedy=remedy
+            ) from error
         finally:
             module.train(training)
     return read_onnx(stream.getvalue(), type(module).__name__)

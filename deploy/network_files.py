@@ -1,8 +1,9 @@
 """Which file a command means by a network, and the files that are written for a sensor.
 
-A shipped network is one set of weights, and one INT8 file, for every sensor in range. NAME is that network in float32
-and NAME-int8 in INT8, each conditioned on one sensor: its filters, written in milliseconds from the profile alone.
-Where a file is needed, it lies in a folder of this process, which goes with it.
+A shipped network is one set of weights, and one INT8 file, for every sensor in range. NAME is that
+network in float32 and NAME-int8 in INT8, each conditioned on one sensor: its filters, written in
+milliseconds from the profile alone. Where a file is needed, it lies in a folder of this process,
+which goes with it.
 """
 
 import atexit
@@ -25,7 +26,14 @@ from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.io.tensors import is_conditioned, read_conditioned
 from beers_deploy.model.progress import Log, no_log
-from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
+from beers_deploy.model.shipped import (
+    INT8,
+    SENSOR,
+    SHIPPED,
+    VARIANT,
+    shipped_names,
+    shipped_weights,
+)
 from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.sensor import Sensor, numbers_of
@@ -54,26 +62,39 @@ class Conditioned:
             return float_for(self.weights, self.name, sensor)
         shipped = SHIPPED / f"{self.name}{INT8}.onnx"
         if self.weights.parent != SHIPPED:
-            remedy = f"make one for every sensor: beers-deploy quantize {self.weights} --out {self.name}{INT8}.onnx"
-            raise ModelError(str(self.weights), expected="an INT8 network", got="float weights", remedy=remedy)
+            remedy = (
+                f"make one for every sensor: beers-deploy quantize {self.weights} --out "
+                f"{self.name}{INT8}.onnx"
+            )
+            raise ModelError(
+                str(self.weights), expected="an INT8 network", got="float weights", remedy=remedy
+            )
         return told_int8(load_onnx(shipped), sensor)
 
 
 def conditioned(given: Path | None) -> Conditioned | None:
-    """The network to be told its sensor that is meant, None meaning the default one; None for any other file."""
+    """The network to be told its sensor that is meant, None meaning the default one; None for any
+    other file.
+    """
     if given is None:
         return Conditioned(VARIANT, shipped_weights(VARIANT))
     if _is_shipped(given):
         name = given.name.removesuffix(INT8)
         return Conditioned(name, shipped_weights(name))
-    return Conditioned(given.stem, given) if given.suffix == ".safetensors" and is_conditioned(given) else None
+    return (
+        Conditioned(given.stem, given)
+        if given.suffix == ".safetensors" and is_conditioned(given)
+        else None
+    )
 
 
 def weights_file(given: Path) -> Path:
     """The file given, or the shipped one of that name where no such file lies; nothing is read."""
     if not _is_shipped(given):
         return given
-    return SHIPPED / f"{given.name}.onnx" if given.name.endswith(INT8) else shipped_weights(given.name)
+    return (
+        SHIPPED / f"{given.name}.onnx" if given.name.endswith(INT8) else shipped_weights(given.name)
+    )
 
 
 def _is_shipped(given: Path) -> bool:
@@ -88,27 +109,37 @@ def in_int8(given: Path) -> Path:
 
 
 def pair_of(floating: Path | None, int8: Path | None) -> tuple[Path, Path]:
-    """A float network and its INT8: the files given, or a shipped pair by its name, the default one if None."""
+    """A float network and its INT8: the files given, or a shipped pair by its name, the default one
+    if None.
+    """
     name = Path(VARIANT) if floating is None else floating
     if int8 is None and not name.suffix and not name.exists():
         shipped_weights(name.name)
     elif int8 is None:
         remedy = "give its INT8 file too, or the name of a shipped pair"
-        raise OptionError("INT8", expected=f"the INT8 network of {name.name}", got="none", remedy=remedy)
+        raise OptionError(
+            "INT8", expected=f"the INT8 network of {name.name}", got="none", remedy=remedy
+        )
     return name, in_int8(int8 or name)
 
 
 def network_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
-    """The file of a network: the one given, or a conditioned network's for the sensor, INT8 where its name says so.
+    """The file of a network: the one given, or a conditioned network's for the sensor, INT8 where
+    its name says so.
 
     Args:
-        given: a file, or a shipped name where no such file lies; None is the default network in INT8.
+        given: a file, or a shipped name where no such file lies; None is the default network in
+            INT8.
         sensor: what a conditioned network is told: the middle of each of its ranges.
         log: is told what of the sensor lies outside the range that was trained.
     """
     if given is not None and not (given.suffix or given.exists() or _is_shipped(given)):
-        expected = f"a file, or a shipped network ({', '.join(shipped_names())}, each also with {INT8})"
-        raise ModelError(str(given), expected=expected, got="neither", remedy="correct the name, or the path")
+        expected = (
+            f"a file, or a shipped network ({', '.join(shipped_names())}, each also with {INT8})"
+        )
+        raise ModelError(
+            str(given), expected=expected, got="neither", remedy="correct the name, or the path"
+        )
     int8 = given is None or given.name.endswith(INT8)
     return int8_file(given, sensor, log) if int8 else float_file(given, sensor, log)
 
@@ -128,7 +159,11 @@ def brighter_files(given: Path | None, sensor: Sensor) -> dict[int, Path]:
         return {}
     int8 = given is None or given.name.endswith(INT8)
     factors = factors_for(sensor.nominal())
-    return {factor: _written(network, brightened(sensor, factor), int8, no_log) for factor in factors if factor > 1}
+    return {
+        factor: _written(network, brightened(sensor, factor), int8, no_log)
+        for factor in factors
+        if factor > 1
+    }
 
 
 def float_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
@@ -151,7 +186,9 @@ def shipped_pair(name: str = VARIANT, sensor: str = SENSOR) -> tuple[Path, Path]
 
 
 def warn_outside(sensor: Sensor, kernels: Kernels, log: Log) -> None:
-    """Tell what of a sensor lies outside of what a network was trained on, whose banks have these kernels."""
+    """Tell what of a sensor lies outside of what a network was trained on, whose banks have these
+    kernels.
+    """
     known = sensor.nominal()
     for sentence in (*sensor_vector(known).outside, departure(known, kernels)):
         if sentence:
@@ -159,7 +196,9 @@ def warn_outside(sensor: Sensor, kernels: Kernels, log: Log) -> None:
 
 
 def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
-    """Return a warning if a network was made for another sensor than the one named; else nothing."""
+    """Return a warning if a network was made for another sensor than the one
+    named; else nothing.
+    """
     own = metadata(model).get("sensor", "")
     if own in ("", BLIND, BLIND_PROFILE, sensor.name):
         return ""
@@ -167,7 +206,8 @@ def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
 
 
 def other_precision(model: onnx.ModelProto) -> onnx.ModelProto | None:
-    """A shipped network of the same variant in the other precision, or None; its weights may be others.
+    """A shipped network of the same variant in the other precision, or None; its weights may be
+    others.
 
     Time depends on the shapes, not on the weights: for a comparison of time any weights will do.
     """
@@ -189,7 +229,11 @@ def _folder() -> Path:
 def _written(network: Conditioned, sensor: Sensor, int8: bool, log: Log) -> Path:
     warn_outside(sensor, network.kernels, log)
     stem = network.name + (INT8 if int8 else "")
-    told = json.dumps({"weights": sha256(network.weights), "sensor": numbers_of(sensor)}, sort_keys=True, default=str)
+    told = json.dumps(
+        {"weights": sha256(network.weights), "sensor": numbers_of(sensor)},
+        sort_keys=True,
+        default=str,
+    )
     path = process_file(stem, hashlib.sha256(told.encode()).hexdigest())
     if not path.is_file():
         save_onnx(network.model(sensor, int8), path)
@@ -219,11 +263,15 @@ def told_int8(
     warn_outside(sensor, family.kernels, log)
     known = sensor.nominal()
     core = family.for_sensor(network_bank(known, family.kernels), sensor_vector(known).values)
-    return host_model(core, {**metadata(model), "sensor": sensor.name, **(more or {})}, fixed_tile_px(model))
+    return host_model(
+        core, {**metadata(model), "sensor": sensor.name, **(more or {})}, fixed_tile_px(model)
+    )
 
 
 def told_by_delta(model: onnx.ModelProto, delta: Path) -> onnx.ModelProto:
-    """An INT8 network behind a bank told the sensor of a delta, a file that `export --delta` wrote."""
+    """An INT8 network behind a bank told the sensor of a delta, a file that
+    `export --delta` wrote.
+    """
     try:
         packed = delta.read_bytes()
     except OSError as error:

@@ -1,4 +1,6 @@
-"""Simulated pairs for notebooks and scripts: what a sensor sees of a scene, and what a better one would have seen."""
+"""Simulated pairs for notebooks and scripts: what a sensor sees of a scene, and what a better one
+would have seen.
+"""
 
 import json
 import os
@@ -23,7 +25,9 @@ if TYPE_CHECKING:
     from beers_deploy.model.simulator.sampling import Scene
 
 LARGEST_PX = 4096
-"""The largest side that is simulated at once; `beers-deploy simulate` writes data sets of any size."""
+"""The largest side that is simulated at once; `beers-deploy simulate` writes
+data sets of any size.
+"""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,7 +57,8 @@ class Pair:
         return iter((self.degraded, self.reference))
 
     def psnr(self, image: np.ndarray) -> float:
-        """Peak signal-to-noise ratio in dB of an image (H, W) beside the reference, over the sensor's full scale.
+        """Peak signal-to-noise ratio in dB of an image (H, W) beside the reference, over the
+        sensor's full scale.
 
         Raises:
             ImageError: an image of another shape.
@@ -73,11 +78,15 @@ class Pair:
         if found.shape != self.reference.shape:
             remedy = "compare images of one size"
             got = f"an image of shape {found.shape}"
-            raise ImageError("image", expected=f"one of shape {self.reference.shape}", got=got, remedy=remedy)
+            raise ImageError(
+                "image", expected=f"one of shape {self.reference.shape}", got=got, remedy=remedy
+            )
         return found
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
-        """Write both images as 12-bit TIFFs that `beers-deploy evaluate --pairs` reads, and what made them."""
+        """Write both images as 12-bit TIFFs that `beers-deploy evaluate --pairs` reads, and what
+        made them.
+        """
         out = Path(folder)
         for role, image in (("degraded", self.degraded), ("reference", self.reference)):
             write_tiff(out / role / "0000-drawn.tif", image)
@@ -94,7 +103,8 @@ class Pair:
         stretch = stretch_of(self.reference)
         shown = (("degraded", self.degraded), ("reference", self.reference), ("clean", self.clean))
         pictures = [
-            f'<figure style="display: inline-block; margin: 4px"><img src="{picture_url(stretch.to_bytes(image))}" '
+            '<figure style="display: inline-block; margin: 4px"><img '
+            f'src="{picture_url(stretch.to_bytes(image))}" '
             f'style="max-width: 30em; width: 100%"><figcaption>{name}</figcaption></figure>'
             for name, image in shown
         ]
@@ -114,12 +124,14 @@ def simulate(
     """Simulate what a sensor sees of a scene, and what a better one would have seen.
 
     Args:
-        scene: an image file or its pixels: 8 bits, 16-bit digital numbers, or float radiance in W/m2/sr/um; one is
-            drawn if None.
+        scene: an image file or its pixels: 8 bits, 16-bit digital numbers, or float radiance in
+            W/m2/sr/um; one is drawn if None.
         sensor: of the degraded image; each of its ranges is drawn from.
-        reference: the sensor that is aimed at, in the digital numbers of `sensor`; None for the shipped one.
+        reference: the sensor that is aimed at, in the digital numbers of `sensor`; None for the
+            shipped one.
         size: side in pixels of the images of a drawn scene.
-        calls_for: what the scene calls for: the name of a shipped scene such as night-port, or a .toml file.
+        calls_for: what the scene calls for: the name of a shipped scene such as night-port, or a
+            .toml file.
         effects: further effects by name, at typical values.
         seed: of every random draw.
 
@@ -135,7 +147,9 @@ def simulate(
     """
     if not 1 <= size <= LARGEST_PX:
         remedy = "give another, or simulate a data set with beers-deploy simulate"
-        raise OptionError("size", expected=f"1 to {LARGEST_PX} pixels", got=str(size), remedy=remedy)
+        raise OptionError(
+            "size", expected=f"1 to {LARGEST_PX} pixels", got=str(size), remedy=remedy
+        )
     from beers_deploy.model.simulator.acquire import acquire_three, prepare_scene
     from beers_deploy.model.simulator.detector import Draw, to_uint16
 
@@ -145,7 +159,9 @@ def simulate(
     require_same_units(degraded, aim)
     draw = Draw(seed)
     ratio = int(degraded.oversampling.low)
-    radiance = _scene(scene, aim.nominal(), size, ratio, seed).radiance * (call.radiance_scale.low if call else 1.0)
+    radiance = _scene(scene, aim.nominal(), size, ratio, seed).radiance * (
+        call.radiance_scale.low if call else 1.0
+    )
     seen_by, meant_by = (
         profile.draw(draw.generator(f"sensor-{role}"))
         for role, profile in (("degraded", degraded), ("reference", aim))
@@ -155,7 +171,11 @@ def simulate(
 
 
 def _scene(
-    scene: "str | os.PathLike[str] | np.ndarray | None", sensor: Instrument, size_px: int, ratio: int, seed: int
+    scene: "str | os.PathLike[str] | np.ndarray | None",
+    sensor: Instrument,
+    size_px: int,
+    ratio: int,
+    seed: int,
 ) -> "Scene":
     from beers_deploy.model.simulator.acquire import MARGIN_PX
     from beers_deploy.model.simulator.detector import Draw

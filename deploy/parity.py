@@ -8,7 +8,13 @@ import onnx
 import torch
 
 from beers_deploy.model.bank import network_bank
-from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, OfOneSensor, network_of, vector_tensor
+from beers_deploy.model.convbeers import (
+    BankedConvBEERS,
+    ConvBEERS,
+    OfOneSensor,
+    network_of,
+    vector_tensor,
+)
 from beers_deploy.model.io.tensors import read_conditioned, read_plain
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Instrument
@@ -19,15 +25,20 @@ MAX_DIFFERENCE = 1e-5
 
 
 def torch_network(path: Path, sensor: Instrument | None = None) -> ConvBEERS | OfOneSensor:
-    """The network of torch that an exported one must compute as: of weights, for a sensor where they need one."""
+    """The network of torch that an exported one must compute as: of weights, for a sensor where
+    they need one.
+    """
     network = network_of(read_plain(path) if sensor is None else read_conditioned(path))
     if sensor is not None and isinstance(network, BankedConvBEERS):
         return OfOneSensor(network, vector_tensor(sensor), network_bank(sensor, network.kernels))
     return cast(ConvBEERS, network)  # what `read_plain` read
 
 
-def require_parity(network: ConvBEERS | OfOneSensor, model: Path | onnx.ModelProto, side_px: int) -> float:
-    """Largest absolute difference between torch and onnxruntime on one random image, in [0, 1] of full scale.
+def require_parity(
+    network: ConvBEERS | OfOneSensor, model: Path | onnx.ModelProto, side_px: int
+) -> float:
+    """Largest absolute difference between torch and onnxruntime on one random image, in [0, 1] of
+    full scale.
 
     Args:
         network: of torch.
@@ -50,5 +61,7 @@ def require_parity(network: ConvBEERS | OfOneSensor, model: Path | onnx.ModelPro
     if difference > MAX_DIFFERENCE:
         expected = f"at most {MAX_DIFFERENCE:g} of full scale from torch"
         remedy = "report it: the export is wrong"
-        raise ModelError("exported network", expected=expected, got=f"{difference:g}", remedy=remedy)
+        raise ModelError(
+            "exported network", expected=expected, got=f"{difference:g}", remedy=remedy
+        )
     return difference

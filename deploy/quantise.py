@@ -1,4 +1,6 @@
-"""A float network quantised: what `quantize` makes of it, layer by layer in whole numbers, and where INT8 errs."""
+"""A float network quantised: what `quantize` makes of it, layer by layer in whole numbers, and
+where INT8 errs.
+"""
 
 import os
 from collections.abc import Sequence
@@ -32,7 +34,15 @@ from beers_deploy.quant.integer.reference import integer_rows
 from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata, require_quantised
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import OwnSamples, samples_of
-from beers_deploy.quant.sensitivity import WORST, headline, layer_error_rows, losses, sizes_row, spread_of, worst_row
+from beers_deploy.quant.sensitivity import (
+    WORST,
+    headline,
+    layer_error_rows,
+    losses,
+    sizes_row,
+    spread_of,
+    worst_row,
+)
 from beers_deploy.quant.session import open_any_size
 from beers_deploy.quant.untrusted import contradictions
 from beers_deploy.report.page import Report
@@ -62,25 +72,30 @@ def quantize(
     """Quantise a float network to static INT8.
 
     Args:
-        network: the float network. A shipped name, or weights that `train --conditioned` wrote, are calibrated over
-            the whole family of sensors and told `sensor`.
-        samples: what it is calibrated on: a file, a folder, a batch (N, C, H, W) in [0, 1], two batches (images,
-            references), or an iterable of these such as a DataLoader; None simulates patches.
+        network: the float network. A shipped name, or weights that `train --conditioned` wrote, are
+            calibrated over the whole family of sensors and told `sensor`.
+        samples: what it is calibrated on: a file, a folder, a batch (N, C, H, W) in [0, 1], two
+            batches (images, references), or an iterable of these such as a DataLoader; None
+            simulates patches.
         board: whose rules to obey.
         sensor: of the simulated patches.
         images: folder of scenes for the simulated patches; None for drawn ones.
         patches: how many are simulated.
         patch_px: their side.
-        finetune: for how many steps the whole numbers are trained; "auto" trains until held-out pairs err no less.
+        finetune: for how many steps the whole numbers are trained; "auto" trains until held-out
+            pairs err no less.
         seed: of the patches.
-        progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
+        progress: a function that is told each step, False for silence, None for a bar or lines on
+            standard error.
 
     Returns:
-        The INT8 network: `origin` is the float one, `layers` says how wide each layer's sums are and what saturates.
+        The INT8 network: `origin` is the float one, `layers` says how wide each layer's sums are
+            and what saturates.
 
     Raises:
         ModelError: an operation that the DPU does not compute, or weights of no sensible size.
-        OptionError: a board without a DPU or NPU, samples that the network needs, or options that do not go together.
+        OptionError: a board without a DPU or NPU, samples that the network needs, or options that
+            do not go together.
         ImageError: samples that the network does not take.
         ProfileError: no such board or sensor.
 
@@ -88,7 +103,8 @@ def quantize(
         >>> import torch
         >>> network = torch.nn.Conv2d(1, 1, 3, padding=1)
         >>> samples = np.random.default_rng(0).random((8, 1, 32, 32), np.float32)
-        >>> bd.quantize(bd.Network.load(network, example=(1, 1, 32, 32)), samples, board="zcu102").precision
+        >>> bd.quantize(bd.Network.load(network, example=(1, 1, 32, 32)), samples,
+            board="zcu102").precision
         'int8'
     """
     target = TargetProfile.load(board)
@@ -96,7 +112,9 @@ def quantize(
     banked = conditioned(Path(network)) if isinstance(network, str | os.PathLike) else None
     steps = steps_of(finetune)
     if banked and (steps != 0 or samples is not None):
-        remedy = "leave it out: such a network is calibrated over the whole family of sensors at once"
+        remedy = (
+            "leave it out: such a network is calibrated over the whole family of sensors at once"
+        )
         expected = "no samples or fine-tuning"
         raise OptionError("a network behind a bank", expected=expected, got="one", remedy=remedy)
     origin = Network.load(network, sensor=known)
@@ -123,13 +141,19 @@ def steps_of(finetune: int | str) -> int | None:
     return int(finetune)
 
 
-def _simulated(sensor: Sensor, images: Path | None, patches: int, patch_px: int, seed: int) -> "Calibration":
-    from beers_deploy.quant.calibration import Calibration  # SciPy, which samples of one's own do without
+def _simulated(
+    sensor: Sensor, images: Path | None, patches: int, patch_px: int, seed: int
+) -> "Calibration":
+    from beers_deploy.quant.calibration import (
+        Calibration,
+    )  # SciPy, which samples of one's own do without
 
     return Calibration(sensor, images, patches, patch_px, seed)
 
 
-def _by_itself(origin: Network, calibration: Source, target: TargetProfile, steps: int | None) -> Network:
+def _by_itself(
+    origin: Network, calibration: Source, target: TargetProfile, steps: int | None
+) -> Network:
     shifts = _shifts_of(target)
     tuning = None
     if steps != 0:
@@ -144,11 +168,17 @@ def _by_itself(origin: Network, calibration: Source, target: TargetProfile, step
     return Network(result.host, f"{origin.name}-int8", layers=layers, quantised=result)
 
 
-def _banked(network: Conditioned, calibration: "Calibration", sensor: Sensor, target: TargetProfile) -> Network:
+def _banked(
+    network: Conditioned, calibration: "Calibration", sensor: Sensor, target: TargetProfile
+) -> Network:
     """A network behind a bank, told a sensor; each integer layer on its patches."""
-    family = family_model(network, _folders(calibration.images), calibration.seed, _shifts_of(target))
+    family = family_model(
+        network, _folders(calibration.images), calibration.seed, _shifts_of(target)
+    )
     host = told_int8(family, sensor, {"target": target.name})
-    layers = integer_rows(network.model(sensor, int8=False), read_core(host), host, calibration.drawn.degraded)
+    layers = integer_rows(
+        network.model(sensor, int8=False), read_core(host), host, calibration.drawn.degraded
+    )
     return Network(host, f"{network.name}-int8", layers=layers)
 
 
@@ -161,12 +191,16 @@ def _shifts_of(target: TargetProfile) -> Shifts:
 
 
 def losses_of(network: Network, samples: object = None, **drawn: Any) -> str:
-    """What INT8 costs on what calibration did not see, in one sentence; all as in `sensitivity_report`."""
+    """What INT8 costs on what calibration did not see, in one sentence; all as in
+    `sensitivity_report`.
+    """
     assert network.origin is not None and network.quantised is not None  # noqa: S101, PT018
     model = network.origin.model
     result = network.quantised
     held_out = (samples_of(model, samples) or _simulated(**drawn)).unseen
-    found = compare(open_any_size(model), open_any_size(result.host), held_out.pairs, samples is None)
+    found = compare(
+        open_any_size(model), open_any_size(result.host), held_out.pairs, samples is None
+    )
     return losses(result, found, held_out)
 
 
@@ -190,12 +224,21 @@ def sensitivity_report(
     spread = spread_of(*sessions, held_out.degraded)
     worst = spread.worst(WORST)
     layers = layer_error_rows(result, held_out)
-    rows = [gate_row(found), *layers, *(worst_row(k, held_out, spread) for k in worst), sizes_row(spread)]
-    return rows, sensitivity_page(headline(found, layers), [*rows, *more], spread, held_out, sessions, worst)
+    rows = [
+        gate_row(found),
+        *layers,
+        *(worst_row(k, held_out, spread) for k in worst),
+        sizes_row(spread),
+    ]
+    return rows, sensitivity_page(
+        headline(found, layers), [*rows, *more], spread, held_out, sessions, worst
+    )
 
 
 def rounding_of(int8: Path, weights: Path) -> "Rounding":
-    """How the INT8 file of a network behind a bank rounds its maps; refused where it is of other weights."""
+    """How the INT8 file of a network behind a bank rounds its maps; refused where it is of other
+    weights.
+    """
     import torch
 
     from beers_deploy.model.convbeers import Rounding
@@ -220,15 +263,19 @@ def _folders(images: Path | None) -> list[Path]:
 def family_model(
     network: Conditioned, images: Sequence[Path] = (), seed: int = 0, shifts: Shifts = SHIFTS
 ) -> onnx.ModelProto:
-    """The INT8 file of a network behind a bank, for the middle of the family; any sensor can be told to it.
+    """The INT8 file of a network behind a bank, for the middle of the family; any sensor can be
+    told to it.
 
     Args:
         network: of weights that 'train --conditioned' wrote.
-        images: folders of photographs, beside which about as many drawn scenes are seen; none takes these alone.
+        images: folders of photographs, beside which about as many drawn scenes are seen; none takes
+            these alone.
         seed: of the patches.
         shifts: the windows of the target.
     """
-    from beers_deploy.model.simulator.procedural import load_scenes  # SciPy, which samples of one's own do without
+    from beers_deploy.model.simulator.procedural import (
+        load_scenes,
+    )  # SciPy, which samples of one's own do without
     from beers_deploy.quant.banked.calibrate import family_images, quantise_family
 
     weights = read_conditioned(network.weights)
@@ -242,6 +289,11 @@ def family_model(
         seen = family_images(scenes, scale, seed, weights.kernels)
         middle = bank_of_vector((0.0,) * len(RANGES), weights.kernels)
         family = quantise_family(weights, middle, seen, shifts, log)
-    said = {"variant": network.name, "reference": REFERENCE, "precision": "int8 legal", "calibration_seed": str(seed)}
+    said = {
+        "variant": network.name,
+        "reference": REFERENCE,
+        "precision": "int8 legal",
+        "calibration_seed": str(seed),
+    }
     known = {FAMILY: family.to_words(), WEIGHTS: sha256(network.weights)}
     return host_model(family.core, {**said, **known})

@@ -1,4 +1,6 @@
-"""The one kind of document that commands write with --json: rows of figures that say where they come from."""
+"""The one kind of document that commands write with --json: rows of figures that say where they
+come from.
+"""
 
 import io
 import json
@@ -50,17 +52,22 @@ def inputs_of(*paths: Path | None) -> tuple[Input, ...]:
 
 
 def require_same(before: Iterable[Input], *paths: Path | None) -> None:
-    """Raise OptionError if a file was replaced since `inputs_of`: the digest would be that of another one."""
+    """Raise OptionError if a file was replaced since `inputs_of`: the digest would be that of
+    another one.
+    """
     for then, now in zip(before, inputs_of(*paths), strict=False):
         if then != now:
             expected = "a file that stays as it is"
             remedy = "wait until it is written, then run this again"
-            raise OptionError(then.name, expected=expected, got="a change during this run", remedy=remedy)
+            raise OptionError(
+                then.name, expected=expected, got="a change during this run", remedy=remedy
+            )
 
 
 @dataclass(frozen=True, repr=False)
 class Table:
-    """The figures that one verb found, and where they come from: what `--json` writes and a notebook shows.
+    """The figures that one verb found, and where they come from: what `--json` writes and a
+    notebook shows.
 
     Attributes:
         command: the verb.
@@ -121,8 +128,9 @@ class Table:
         """The figures as a pandas DataFrame.
 
         Args:
-            tidy: one line a figure with value, unit, mode, low, high and source. Otherwise one line a row, a column
-                for each figure and for the words beside them; `attrs["units"]` has the units.
+            tidy: one line a figure with value, unit, mode, low, high and source. Otherwise one line
+                a row, a column for each figure and for the words beside them; `attrs["units"]` has
+                the units.
 
         Raises:
             MissingExtraError: pandas is not installed.
@@ -152,7 +160,9 @@ class Table:
         return all(check.passed for check in self.checks)
 
     def __repr__(self) -> str:
-        names = ", ".join(row.name for row in self.rows[:3]) + (", ..." if len(self.rows) > 3 else "")
+        names = ", ".join(row.name for row in self.rows[:3]) + (
+            ", ..." if len(self.rows) > 3 else ""
+        )
         return f"{type(self).__name__}({self.command}: {len(self.rows)} rows: {printable(names)})"
 
     def __str__(self) -> str:
@@ -165,13 +175,15 @@ class Table:
 
     def _repr_html_(self) -> str:
         """What a notebook shows: each table, the source of a figure as its tooltip."""
-        return "".join(html_table(name, rows) for name, rows in by_table(self.rows).items()) + "".join(
-            f"<p>{escape(visible(note))}</p>" for note in self.notes
-        )
+        return "".join(
+            html_table(name, rows) for name, rows in by_table(self.rows).items()
+        ) + "".join(f"<p>{escape(visible(note))}</p>" for note in self.notes)
 
 
 def host() -> dict[str, object]:
-    """What the measured figures were measured on, and what was asked of its kernels; None for what is not told."""
+    """What the measured figures were measured on, and what was asked of its kernels; None for what
+    is not told.
+    """
     import psutil
 
     return {
@@ -209,15 +221,18 @@ PIPE_WIDTH = 200
 def print_rows(title: str, rows: Iterable[Row], console: Console | None = None) -> None:
     """Print the rows of one table, reasons for missing figures below it.
 
-    One line a row; or, where there are more figures than rows, one line a figure. Where a terminal is too narrow for
-    either, one line a figure of each row: no number is ever cut or broken.
+    One line a row; or, where there are more figures than rows, one line a figure. Where a terminal
+    is too narrow for either, one line a figure of each row: no number is ever cut or broken.
     """
     rows = list(rows)
     console = console or default_console()
     keys = figures_of(rows)
     table = by_figure(rows, keys) if len(keys) > len(rows) else by_row(rows, keys)
     # Measured on a wide console: on its own a table's least width never exceeds the console's.
-    if Measurement.get(console, console.options.update(width=PIPE_WIDTH), table).minimum > console.width:
+    if (
+        Measurement.get(console, console.options.update(width=PIPE_WIDTH), table).minimum
+        > console.width
+    ):
         table = one_by_one(rows)
     table.title = plain(title)
     table.title_justify = "left"
@@ -244,18 +259,24 @@ MARKUP = re.compile(r"[\\`*_\[\]<>&|]")
 
 
 def markdown_text(text: str) -> str:
-    """Return text on one line that Markdown shows as it is: a layer's name comes from the network's file."""
+    """Return text on one line that Markdown shows as it is: a layer's name comes from the network's
+    file.
+    """
     return MARKUP.sub(lambda found: f"\\{found[0]}", one_line(text))
 
 
 def by_row(rows: list[Row], keys: list[str]) -> rich_table.Table:
-    """One line a row; the units in the header, and the mode where it is that of the whole column."""
+    """One line a row; the units in the header, and the mode where it is that of
+    the whole column.
+    """
     table = rich_table.Table("")
     words = words_of(rows)
     for key in keys:
         mode = common_mode(key, rows)
         about = ", ".join(filter(None, (unit_of(key, rows), mode)))
-        table.add_column(Text("\n").join(map(plain, (key, f"({about})") if about else (key,))), justify="right")
+        table.add_column(
+            Text("\n").join(map(plain, (key, f"({about})") if about else (key,))), justify="right"
+        )
     for word in words:
         table.add_column(plain(word), overflow="fold")
     for row in rows:
@@ -265,7 +286,9 @@ def by_row(rows: list[Row], keys: list[str]) -> rich_table.Table:
 
 
 def by_figure(rows: list[Row], keys: list[str]) -> rich_table.Table:
-    """One line a figure, the rows side by side; its mode in a column where it is that of them all."""
+    """One line a figure, the rows side by side; its mode in a column where it
+    is that of them all.
+    """
     table = rich_table.Table("", "unit", "mode")
     for row in rows:
         table.add_column(plain(row.name), justify="right", overflow="fold")
@@ -283,7 +306,10 @@ def one_by_one(rows: list[Row]) -> rich_table.Table:
     table = rich_table.Table("", "", "", "unit")
     table.columns[1].overflow = table.columns[2].overflow = "fold"
     for row in rows:
-        figures = [(plain(key), cell(figure, ""), plain(figure.unit)) for key, figure in row.figures.items()]
+        figures = [
+            (plain(key), cell(figure, ""), plain(figure.unit))
+            for key, figure in row.figures.items()
+        ]
         words = [(plain(word), plain(text), plain("")) for word, text in row.text.items()]
         table.add_section()
         for number, line in enumerate([*figures, *words] or [()]):
@@ -292,14 +318,22 @@ def one_by_one(rows: list[Row]) -> rich_table.Table:
 
 
 def unit_of(key: str, rows: list[Row]) -> str:
-    """The unit of a column: that of all its figures; empty where they differ, as those of a comparison."""
+    """The unit of a column: that of all its figures; empty where they differ, as those of a
+    comparison.
+    """
     units = {row.figures[key].unit for row in rows if key in row.figures}
     return units.pop() if len(units) == 1 else ""
 
 
 def common_mode(key: str, rows: list[Row]) -> str:
-    """The mode of all figures of a column that there are; empty where they differ or none is there."""
-    modes = {row.figures[key].mode for row in rows if key in row.figures and row.figures[key].value is not None}
+    """The mode of all figures of a column that there are; empty where they
+    differ or none is there.
+    """
+    modes = {
+        row.figures[key].mode
+        for row in rows
+        if key in row.figures and row.figures[key].value is not None
+    }
     return modes.pop() if len(modes) == 1 else ""
 
 
@@ -318,5 +352,11 @@ def missing(rows: list[Row]) -> list[str]:
         for key, figure in row.figures.items():
             if figure.value is None:
                 names.setdefault((key, figure.reason), []).append(row.name)
-    few = {place: ", ".join(found) if len(found) < len(rows) / 2 else "" for place, found in names.items()}
-    return [f"- {key}{f' of {few[key, reason]}' if few[key, reason] else ''}: {reason}" for key, reason in names]
+    few = {
+        place: ", ".join(found) if len(found) < len(rows) / 2 else ""
+        for place, found in names.items()
+    }
+    return [
+        f"- {key}{f' of {few[key, reason]}' if few[key, reason] else ''}: {reason}"
+        for key, reason in names
+    ]

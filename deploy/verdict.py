@@ -2,10 +2,11 @@
 
 Looked at, in this order:
 
-1. Patches that calibration did not see, through both networks: MAE, percentile, PSNRs (`quant.gate`), and the results
-   inside the INT8 network that saturate (`quant.structure`).
+1. Patches that calibration did not see, through both networks: MAE, percentile, PSNRs
+  (`quant.gate`), and the results inside the INT8 network that saturate (`quant.structure`).
 2. The MAE that an earlier gate found on the same patches, where a baseline is given.
-3. The INT8 file: the DPU's rules, its ReLUs, its encoding, the same bits with onnxruntime's optimisations as without.
+3. The INT8 file: the DPU's rules, its ReLUs, its encoding, the same bits with onnxruntime's
+  optimisations as without.
 """
 
 import math
@@ -31,7 +32,14 @@ from beers_deploy.profiles.figures import Check, Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, TargetProfile
 from beers_deploy.quant.float_parts import float_note
-from beers_deploy.quant.gate import METRICS, GateResult, judge, judge_saturation, unfit_reference, verdict_row
+from beers_deploy.quant.gate import (
+    METRICS,
+    GateResult,
+    judge,
+    judge_saturation,
+    unfit_reference,
+    verdict_row,
+)
 from beers_deploy.quant.gate import compare as differences_of
 from beers_deploy.quant.limits import Limits, limits_of
 from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px, metadata, require_quantised
@@ -48,12 +56,14 @@ JUNIT_CHARACTERS = 2000
 """Of a message in JUnit XML, at most."""
 
 LITTLE_CHANGE = 0.02
-"""Mean absolute change of the input, over full scale, up to which the default limit of the MAE suits a network.
-ConvBEERS changes it by 0.008."""
+"""Mean absolute change of the input, over full scale, up to which the default limit of the MAE
+suits a network. ConvBEERS changes it by 0.008.
+"""
 
 LEAST_CONTRAST = 0.0014
-"""Mean absolute deviation of the results from the mean of their sample, over full scale: twice the default limit of
-the MAE."""
+"""Mean absolute deviation of the results from the mean of their sample, over full scale: twice the
+default limit of the MAE.
+"""
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -128,19 +138,22 @@ def compare(
     metric: str | None = None,
     progress: Progress = None,
 ) -> Comparison:
-    """Compare an INT8 network with its float network, on patches that calibration did not see or on given samples.
+    """Compare an INT8 network with its float network, on patches that calibration did not see or on
+    given samples.
 
     Args:
         int8: the INT8 network.
         against: the float one; where it is None, the one that `int8` was quantised from here.
-        samples: a path, arrays or whatever `quantize` takes, none of which calibration should have seen; None for
-            simulated patches.
+        samples: a path, arrays or whatever `quantize` takes, none of which calibration should have
+            seen; None for simulated patches.
         sensor: of the simulated patches and of shipped networks.
         images: folder of scenes for them; None for drawn ones.
         patches: how many of 128 x 128 are simulated.
         seed: of the patches.
-        metric: psnr, ssim, mae, top1 or iou, by which results are held against the samples' references too.
-        progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
+        metric: psnr, ssim, mae, top1 or iou, by which results are held against the samples'
+            references too.
+        progress: a function that is told each step, False for silence, None for a bar or lines on
+            standard error.
 
     Raises:
         ModelError: a file that is not what it should be.
@@ -155,7 +168,9 @@ def compare(
     known = Sensor.load(sensor)
     if samples is not None and images is not None:
         remedy = "leave one of them out: images are for simulated patches"
-        raise OptionError("images", expected="none together with samples", got=str(images), remedy=remedy)
+        raise OptionError(
+            "images", expected="none together with samples", got=str(images), remedy=remedy
+        )
     _require_metric(metric)
     ours, theirs = _pair(int8, against, known)
     scenes = None if images is None else Path(images)
@@ -164,7 +179,12 @@ def compare(
         sessions = open_any_size(theirs.model), open_any_size(ours.model)
         result = differences_of(*sessions, judged.pairs, simulated, metric, judged.names)
         shares = saturated_shares(ours.model, judged.degraded)
-    arguments: dict[str, object] = {"float": theirs.name, "int8": ours.name, "sensor": known.name, "images": images}
+    arguments: dict[str, object] = {
+        "float": theirs.name,
+        "int8": ours.name,
+        "sensor": known.name,
+        "images": images,
+    }
     arguments |= {"patches": patches, "seed": seed, "samples": _named(samples)}
     given = Path(samples) if isinstance(samples, str | os.PathLike) else None
     rests_on = [sensor_input(known), *data_inputs(scenes, given)]
@@ -198,13 +218,19 @@ def _named(samples: object) -> str | None:
 
 
 def _range_rows(int8: Network, result: GateResult) -> tuple[list[Row], list[str]]:
-    """Return the range of the samples, the one that the INT8 file records, and a note if bright ground is missing."""
+    """Return the range of the samples, the one that the INT8 file records, and a note if bright
+    ground is missing.
+    """
     judged = result.sample_range
     assert judged is not None  # noqa: S101 - `quant.gate.compare` measures it
     rows = [range_row(judged, "judged on", result.source)]
     recorded = recorded_range(metadata(int8.model))
     if recorded is not None:
-        rows.append(range_row(recorded, "calibrated on", "recorded in the INT8 file, which nothing verifies"))
+        rows.append(
+            range_row(
+                recorded, "calibrated on", "recorded in the INT8 file, which nothing verifies"
+            )
+        )
     note = uncovered(judged, recorded)
     return rows, [note] if note else []
 
@@ -231,7 +257,8 @@ def gate(
         against: the float network.
         samples: what both are compared on.
         board: whose rules the INT8 file must keep.
-        limits: names and numbers, such as {"mae": 0.001}, or a TOML file; what they leave out has its default.
+        limits: names and numbers, such as {"mae": 0.001}, or a TOML file; what they leave out has
+            its default.
         baseline: what an earlier gate that passed wrote as JSON: the MAE may not grow.
         sensor: of the simulated patches.
         images: folder of scenes for them.
@@ -242,7 +269,8 @@ def gate(
 
     Raises:
         ModelError: a file that is not what it should be.
-        OptionError: as in `compare`, limits or a baseline that do not fit, or too little contrast for the limits.
+        OptionError: as in `compare`, limits or a baseline that do not fit, or too little contrast
+            for the limits.
         ImageError: samples that the networks do not take.
         ProfileError: no such board or sensor.
 
@@ -260,21 +288,37 @@ def gate(
     config = limits if isinstance(limits, str | os.PathLike) else None
     told = sensor if isinstance(sensor, str) else known.name
     arguments: dict[str, object] = {"max_mae": allowed.mae, "limits": config, "baseline": baseline}
-    arguments |= {"target": target.name, "sensor": told, "images": images, "patches": patches, "seed": seed}
+    arguments |= {
+        "target": target.name,
+        "sensor": told,
+        "images": images,
+        "patches": patches,
+        "seed": seed,
+    }
     arguments |= {"samples": _named(samples)} | ({"metric": metric} if metric else {})
     before = None if baseline is None else read_baseline(Path(baseline), arguments)
     if before is None and allowed.mae_growth is not None:
         remedy = "give what an earlier 'gate --json' wrote, or leave that limit out"
-        raise OptionError("baseline", expected="one beside the limit mae_growth", got="none", remedy=remedy)
+        raise OptionError(
+            "baseline", expected="one beside the limit mae_growth", got="none", remedy=remedy
+        )
     if (allowed.metric_loss is None) < (metric is None):
         remedy = "name the metric, or leave that limit out"
-        raise OptionError("metric", expected="one beside the limit metric_loss", got="none", remedy=remedy)
+        raise OptionError(
+            "metric", expected="one beside the limit metric_loss", got="none", remedy=remedy
+        )
     wanted = "a metric" if metric else ""
     if allowed.psnr_drop_db is not None:
         wanted = "psnr_drop_db"
     own = samples_of(theirs.model, samples) if wanted and samples is not None else None
     _require_references(own, wanted)
-    how: dict[str, Any] = {"sensor": known, "images": images, "patches": patches, "seed": seed, "metric": metric}
+    how: dict[str, Any] = {
+        "sensor": known,
+        "images": images,
+        "patches": patches,
+        "seed": seed,
+        "metric": metric,
+    }
     found = compare(ours, theirs, samples, **how, progress=progress)
     _require_contrast(found.result)
     psnr_missing = math.isnan(found.result.psnr_float_db) and not math.isnan(found.result.mae)
@@ -286,17 +330,33 @@ def gate(
     checks += judge_saturation(found.shares, allowed)
     must_describe = before is not None and ENCODING in before.checks
     checks += file_checks(theirs.model, ours, target, must_describe)
-    notes = (*found.notes, *_mae_note(found.result, allowed, checks), *float_note(ours.model), *_unchecked(checks))
-    return Verdict("gate", arguments, found.inputs, found.rows, tuple(checks), notes=notes, comparison=found)
+    notes = (
+        *found.notes,
+        *_mae_note(found.result, allowed, checks),
+        *float_note(ours.model),
+        *_unchecked(checks),
+    )
+    return Verdict(
+        "gate", arguments, found.inputs, found.rows, tuple(checks), notes=notes, comparison=found
+    )
 
 
 def _require_contrast(result: GateResult) -> None:
-    """Raise OptionError if a network that returned the mean of each sample would nearly keep the default limit."""
+    """Raise OptionError if a network that returned the mean of each sample would nearly keep the
+    default limit.
+    """
     if not result.contrast < LEAST_CONTRAST:
         return
-    expected = f"results with a mean absolute deviation of at least {LEAST_CONTRAST:g} of full scale"
-    got = f"{result.contrast:.3g}: a network that returned the mean of each sample would hardly differ"
-    raise OptionError("samples", expected=expected, got=got, remedy="give samples with more contrast")
+    expected = (
+        f"results with a mean absolute deviation of at least {LEAST_CONTRAST:g} of full scale"
+    )
+    got = (
+        f"{result.contrast:.3g}: a network that returned the mean of each sample would hardly "
+        "differ"
+    )
+    raise OptionError(
+        "samples", expected=expected, got=got, remedy="give samples with more contrast"
+    )
 
 
 def _mae_note(result: GateResult, limits: Limits, checks: Sequence[Check]) -> list[str]:
@@ -306,48 +366,73 @@ def _mae_note(result: GateResult, limits: Limits, checks: Sequence[Check]) -> li
         return []
     what = "results have another size than the input"
     if not math.isnan(result.input_change):
-        what = f"float results differ from the input by {result.input_change:.3g} of full scale in the mean"
-    suits = f"the MAE limit of {limits.mae:g} suits networks that change their input little (ConvBEERS by 0.008)"
-    return [f"{suits}; here the {what}: choose --max-mae for this network, and look at the PSNR drop"]
+        what = (
+            f"float results differ from the input by {result.input_change:.3g} of full scale "
+            "in the mean"
+        )
+    suits = (
+        f"the MAE limit of {limits.mae:g} suits networks that change their input little "
+        "(ConvBEERS by 0.008)"
+    )
+    return [
+        f"{suits}; here the {what}: choose --max-mae for this network, and look at the PSNR drop"
+    ]
 
 
-def _pair(int8: NetworkLike, against: NetworkLike | None, sensor: Sensor) -> tuple[Network, Network]:
+def _pair(
+    int8: NetworkLike, against: NetworkLike | None, sensor: Sensor
+) -> tuple[Network, Network]:
     """The INT8 network and the float one, each of its precision."""
     theirs = None if against is None else Network.load(against, sensor=sensor)
     ours = Network.load(int8, sensor=sensor)
     theirs = theirs or ours.origin
     if theirs is None:
         remedy = "give it, or quantise it here"
-        raise OptionError("against", expected=f"the float network of {ours.name}", got="none", remedy=remedy)
+        raise OptionError(
+            "against", expected=f"the float network of {ours.name}", got="none", remedy=remedy
+        )
     require_quantised(theirs.model, theirs.label, wanted=False)
     require_quantised(ours.model, ours.label, wanted=True)
     return ours, theirs
 
 
 def _samples(
-    int8: Network, floating: Network, sensor: Sensor, samples: object, images: Path | None, patches: int, seed: int
+    int8: Network,
+    floating: Network,
+    sensor: Sensor,
+    samples: object,
+    images: Path | None,
+    patches: int,
+    seed: int,
 ) -> "tuple[Patches, bool, tuple[str, ...]]":
     """Return what the two are compared on, whether it is simulated, and notes for the reader.
 
-    All samples that were given are judged. The INT8 file says which of them it was calibrated on, but it may not
-    choose its judges: that is a note.
+    All samples that were given are judged. The INT8 file says which of them it was calibrated on,
+    but it may not choose its judges: that is a note.
     """
     own = samples_of(floating.model, samples)
     if own is None:
-        from beers_deploy.quant.calibration import unseen_patches  # SciPy, which samples of one's own do without
+        from beers_deploy.quant.calibration import (
+            unseen_patches,
+        )  # SciPy, which samples of one's own do without
 
         return unseen_patches(sensor, images, patches, seed), True, ()
     calibrated = set(metadata(int8.model).get(CALIBRATED_ON, "").split())
     count = sum(digest_of(degraded) in calibrated for degraded in own.all.degraded)
     if count == 0:
         return own.all, False, ()
-    note = f"by the INT8 file's own record, {count} of the {len(own.all.pairs)} samples were its calibration"
+    note = (
+        f"by the INT8 file's own record, {count} of the {len(own.all.pairs)} samples were "
+        "its calibration"
+    )
     return own.all, False, (f"{note}: on those INT8 loses less than on others",)
 
 
 def _require_metric(metric: str | None) -> None:
     if metric not in (None, *METRICS):
-        raise OptionError("metric", expected=f"one of {', '.join(METRICS)}", got=repr(metric), remedy="choose one")
+        raise OptionError(
+            "metric", expected=f"one of {', '.join(METRICS)}", got=repr(metric), remedy="choose one"
+        )
 
 
 def _require_references(own: OwnSamples | None, wanted: str) -> None:
@@ -358,7 +443,9 @@ def _require_references(own: OwnSamples | None, wanted: str) -> None:
 
 
 def _unchecked(checks: Sequence[Check]) -> list[str]:
-    """Return a note if the encoding was not checked: the judged file itself decides whether it describes integers."""
+    """Return a note if the encoding was not checked: the judged file itself decides whether it
+    describes integers.
+    """
     reason = "the INT8 file does not describe its integers, as a file that 'quantize' wrote does"
     checked = any(check.name == ENCODING for check in checks)
     return [] if checked else [f"not checked: {ENCODING}, because {reason}"]
@@ -367,7 +454,9 @@ def _unchecked(checks: Sequence[Check]) -> list[str]:
 def file_checks(
     float_model: onnx.ModelProto, int8: Network, target: TargetProfile, must_describe: bool = False
 ) -> list[Check]:
-    """Check the INT8 file itself: the rules of the target's DPU or NPU, then what `structure_checks` looks at."""
+    """Check the INT8 file itself: the rules of the target's DPU or NPU, then what
+    `structure_checks` looks at.
+    """
     checks = structure_checks(float_model, int8.model, must_describe)
     if not (target.configurations or target.npu):
         return checks
@@ -377,7 +466,9 @@ def file_checks(
 
 
 def sentence(checks: Sequence[Check], passed: str) -> str:
-    """The line that ends a command: all checks that failed, with value and limit; or their number and `passed`."""
+    """The line that ends a command: all checks that failed, with value and limit; or their number
+    and `passed`.
+    """
     failed = [str(check) for check in checks if not check.passed]
     if not failed:
         return f"passed, all {len(checks)} checks: {passed}"
@@ -386,7 +477,9 @@ def sentence(checks: Sequence[Check], passed: str) -> str:
 
 def junit_error(title: str, message: str) -> str:
     """Return JUnit XML that says that nothing could be judged, and why."""
-    suite = ET.Element("testsuite", name=printable(title), attrib={"tests": "1", "failures": "0", "errors": "1"})
+    suite = ET.Element(
+        "testsuite", name=printable(title), attrib={"tests": "1", "failures": "0", "errors": "1"}
+    )
     case = ET.SubElement(suite, "testcase", classname=printable(title), name="gate")
     text = printable(message, JUNIT_CHARACTERS)
     ET.SubElement(case, "error", message=text).text = text

@@ -1,11 +1,12 @@
-"""Nine networks of the kinds that users bring, and their export: small, but with the operators of the real ones.
+"""Nine networks of the kinds that users bring, and their export: small, but with the operators of
+the real ones.
 
     network = build("unet", torch.Generator().manual_seed(0))
     model = to_onnx("unet", network)
 
-Images are (N, C, H, W) float32, in [0, 1] of full scale. The graphs are what torch's own exporter makes of the
-modules, with all that it leaves behind: batch normalisation folded or not, Constant nodes, ReLU6 as Clip, pixel
-unshuffling as Reshape and Transpose.
+Images are (N, C, H, W) float32, in [0, 1] of full scale. The graphs are what torch's own exporter
+makes of the modules, with all that it leaves behind: batch normalisation folded or not, Constant
+nodes, ReLU6 as Clip, pixel unshuffling as Reshape and Transpose.
 """
 
 import io
@@ -23,11 +24,15 @@ DPU_SLOPE = 26 / 256
 """The only slope of a LeakyReLU that the DPU has."""
 
 CORRECTIONS = ("second", "project", "tail")
-"""Convolutions whose output is added to what came in start small, and a network starts near the identity."""
+"""Convolutions whose output is added to what came in start small, and a network starts near the
+identity.
+"""
 
 
 class DnCNN(nn.Module):
-    """Convolutions with batch normalisation that find the noise; the image minus it (Zhang et al., 2017)."""
+    """Convolutions with batch normalisation that find the noise; the image minus it (Zhang et al.,
+    2017).
+    """
 
     def __init__(self, layers: int = 8, features: int = 32) -> None:
         super().__init__()
@@ -42,19 +47,26 @@ class DnCNN(nn.Module):
 
 
 class FFDNet(nn.Sequential):
-    """Works at half the sampling between pixel unshuffling and shuffling, without a global add (Zhang et al., 2018).
+    """Works at half the sampling between pixel unshuffling and shuffling, without a global add
+    (Zhang et al., 2018).
 
-    Its map of noise levels is left out, one sensor is one level, and so is batch normalisation, whose statistics of
-    a batch would hide how bright each image is. Images (N, 1, H, W) of even sides to the same.
+    Its map of noise levels is left out, one sensor is one level, and so is batch normalisation,
+    whose statistics of a batch would hide how bright each image is. Images (N, 1, H, W) of even
+    sides to the same.
     """
 
     def __init__(self, layers: int = 6, features: int = 32) -> None:
-        body = [_activated(4 if k == 0 else features, features, nn.ReLU()) for k in range(layers - 1)]
-        super().__init__(nn.PixelUnshuffle(2), *body, nn.Conv2d(features, 4, 3, padding=1), nn.PixelShuffle(2))
+        body = [
+            _activated(4 if k == 0 else features, features, nn.ReLU()) for k in range(layers - 1)
+        ]
+        super().__init__(
+            nn.PixelUnshuffle(2), *body, nn.Conv2d(features, 4, 3, padding=1), nn.PixelShuffle(2)
+        )
 
 
 class ESPCN(nn.Sequential):
-    """Twice the sampling from one pixel shuffle at the end (Shi et al., 2016), with ReLU in the place of tanh.
+    """Twice the sampling from one pixel shuffle at the end (Shi et al., 2016), with ReLU in the
+    place of tanh.
 
     Images (N, 1, H, W) to (N, 1, 2 H, 2 W).
     """
@@ -65,7 +77,8 @@ class ESPCN(nn.Sequential):
 
 
 class SESR(nn.Module):
-    """Twice the sampling, two long residuals (Bhardwaj et al., 2022), with ReLU in the place of PReLU.
+    """Twice the sampling, two long residuals (Bhardwaj et al., 2022), with ReLU in the place of
+    PReLU.
 
     Each convolution is what a linear block of theirs collapses to once it is trained.
     """
@@ -73,23 +86,33 @@ class SESR(nn.Module):
     def __init__(self, layers: int = 5, features: int = 16) -> None:
         super().__init__()
         self.head = nn.Sequential(nn.Conv2d(1, features, 5, padding=2), nn.ReLU())
-        self.body = nn.Sequential(*(_activated(features, features, nn.ReLU()) for _ in range(layers)))
+        self.body = nn.Sequential(
+            *(_activated(features, features, nn.ReLU()) for _ in range(layers))
+        )
         self.tail, self.shuffle = nn.Conv2d(features, 4, 5, padding=2), nn.PixelShuffle(2)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Images (N, 1, H, W) to (N, 1, 2 H, 2 W); the image is added to each of the four phases."""
+        """Images (N, 1, H, W) to (N, 1, 2 H, 2 W); the image is added to each
+        of the four phases.
+        """
         shallow = self.head(image)
         enlarged: Tensor = self.shuffle(self.tail(shallow + self.body(shallow)) + image)
         return enlarged
 
 
 class UNet(nn.Module):
-    """Three levels: max pooling down, transposed convolutions up, skips concatenated (Ronneberger et al., 2015)."""
+    """Three levels: max pooling down, transposed convolutions up, skips concatenated (Ronneberger
+    et al., 2015).
+    """
 
     def __init__(self, features: int = 16) -> None:
         super().__init__()
         one, two, four = features, 2 * features, 4 * features
-        self.down_one, self.down_two, self.bottom = _twice(1, one), _twice(one, two), _twice(two, four)
+        self.down_one, self.down_two, self.bottom = (
+            _twice(1, one),
+            _twice(one, two),
+            _twice(two, four),
+        )
         self.up_two, self.up_one = (
             nn.ConvTranspose2d(four, two, 2, stride=2),
             nn.ConvTranspose2d(two, one, 2, stride=2),
@@ -108,7 +131,9 @@ class UNet(nn.Module):
 
 
 class EDSR(nn.Module):
-    """Residual blocks without batch normalisation over four bands at once (Lim et al., 2017, without enlarging)."""
+    """Residual blocks without batch normalisation over four bands at once (Lim et al., 2017,
+    without enlarging).
+    """
 
     def __init__(self, bands: int = 4, blocks: int = 4, features: int = 32) -> None:
         super().__init__()
@@ -137,7 +162,9 @@ class ResidualBlock(nn.Module):
 
 
 class Mobile(nn.Module):
-    """Inverted residuals with ReLU6 and batch normalisation, after MobileNetV2 (Sandler et al., 2018)."""
+    """Inverted residuals with ReLU6 and batch normalisation, after MobileNetV2 (Sandler et al.,
+    2018).
+    """
 
     def __init__(self, blocks: int = 3, features: int = 24) -> None:
         super().__init__()
@@ -152,13 +179,18 @@ class Mobile(nn.Module):
 
 
 class InvertedResidual(nn.Module):
-    """Widened twofold point by point, filtered channel by channel, narrowed again, added to the input."""
+    """Widened twofold point by point, filtered channel by channel, narrowed again, added to the
+    input.
+    """
 
     def __init__(self, features: int) -> None:
         super().__init__()
         self.expand = _batch_normed(features, 2 * features, nn.ReLU6(), kernel=1)
         self.depthwise = _batch_normed(2 * features, 2 * features, nn.ReLU6(), groups=2 * features)
-        self.project, self.norm = nn.Conv2d(2 * features, features, 1, bias=False), nn.BatchNorm2d(features)
+        self.project, self.norm = (
+            nn.Conv2d(2 * features, features, 1, bias=False),
+            nn.BatchNorm2d(features),
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         """Features (N, F, H, W) to the same shape."""
@@ -167,7 +199,9 @@ class InvertedResidual(nn.Module):
 
 
 class Segment(nn.Module):
-    """Two classes for each pixel: strides and a dilation down, bilinear and nearest enlarging up, HardSwish."""
+    """Two classes for each pixel: strides and a dilation down, bilinear and nearest enlarging up,
+    HardSwish.
+    """
 
     def __init__(self, features: int = 16) -> None:
         super().__init__()
@@ -182,12 +216,15 @@ class Segment(nn.Module):
         """Images (N, 1, H, W) of sides that are multiples of 4 to logits (N, 2, H, W)."""
         shallow = self.shallow(image)
         deep = self.narrow(self.context(self.deep(shallow)))
-        merged = self.merge(shallow + functional.interpolate(deep, scale_factor=2.0, mode="bilinear"))
+        merged = self.merge(
+            shallow + functional.interpolate(deep, scale_factor=2.0, mode="bilinear")
+        )
         return functional.interpolate(self.classes(merged), scale_factor=2.0, mode="nearest")
 
 
 class Classifier(nn.Sequential):
-    """Ten classes of whole images: strided and depthwise convolutions, global average pooling, fully connected.
+    """Ten classes of whole images: strided and depthwise convolutions, global average pooling,
+    fully connected.
 
     Images (N, 1, 32, 32) to logits (N, 10).
     """
@@ -200,17 +237,26 @@ class Classifier(nn.Sequential):
         super().__init__(*stages, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(64, 10))
 
 
-def _activated(inputs: int, outputs: int, activation: nn.Module, stride: int = 1, dilation: int = 1) -> nn.Sequential:
+def _activated(
+    inputs: int, outputs: int, activation: nn.Module, stride: int = 1, dilation: int = 1
+) -> nn.Sequential:
     """A 3 x 3 convolution and what follows it."""
     conv = nn.Conv2d(inputs, outputs, 3, stride=stride, padding=dilation, dilation=dilation)
     return nn.Sequential(conv, activation)
 
 
 def _batch_normed(
-    inputs: int, outputs: int, activation: nn.Module, kernel: int = 3, stride: int = 1, groups: int = 1
+    inputs: int,
+    outputs: int,
+    activation: nn.Module,
+    kernel: int = 3,
+    stride: int = 1,
+    groups: int = 1,
 ) -> nn.Sequential:
     """A convolution without bias, batch normalisation and an activation."""
-    conv = nn.Conv2d(inputs, outputs, kernel, stride=stride, padding=kernel // 2, groups=groups, bias=False)
+    conv = nn.Conv2d(
+        inputs, outputs, kernel, stride=stride, padding=kernel // 2, groups=groups, bias=False
+    )
     return nn.Sequential(conv, nn.BatchNorm2d(outputs), activation)
 
 
@@ -281,20 +327,31 @@ def _draw_statistics(norm: nn.BatchNorm2d, generator: torch.Generator) -> None:
 
 
 def to_onnx(name: str, network: nn.Module, fold: bool = True, opset: int = 17) -> onnx.ModelProto:
-    """Export a network as users do: `input` to `output`, batch free, and height and width where they may be.
+    """Export a network as users do: `input` to `output`, batch free, and height and width where
+    they may be.
 
-    `fold` is the exporter's default for a network in evaluation mode: batch normalisation goes into the convolution
-    before it. Without, it stays as the nodes that it is.
+    `fold` is the exporter's default for a network in evaluation mode: batch normalisation goes into
+    the convolution before it. Without, it stays as the nodes that it is.
     """
     example = NETWORKS[name]
     axes = {0: "batch"} if example.side_px else {0: "batch", 2: "height", 3: "width"}
     outer = axes if example.side_px else {0: "batch", 2: "output_height", 3: "output_width"}
     mode = torch.onnx.TrainingMode.EVAL if fold else torch.onnx.TrainingMode.PRESERVE
     image, file = torch.zeros(1, example.inputs, *[example.side_px or 32] * 2), io.BytesIO()
-    named = {"input_names": ["input"], "output_names": ["output"], "dynamic_axes": {"input": axes, "output": outer}}
-    how: dict[str, Any] = {"opset_version": opset, "training": mode, "do_constant_folding": fold, **named}
+    named = {
+        "input_names": ["input"],
+        "output_names": ["output"],
+        "dynamic_axes": {"input": axes, "output": outer},
+    }
+    how: dict[str, Any] = {
+        "opset_version": opset,
+        "training": mode,
+        "do_constant_folding": fold,
+        **named,
+    }
     with warnings.catch_warnings():
-        # The newer exporter wants onnxscript, a package more; this one is what most of today's files come from.
+        # The newer exporter wants onnxscript, a package more; this one is what most of today's
+        # files come from.
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.onnx.export(network, (image,), file, dynamo=False, **how)  # type: ignore[arg-type]
     return onnx.load_model_from_string(file.getvalue())

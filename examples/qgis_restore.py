@@ -1,7 +1,9 @@
-"""`beers-deploy restore` in QGIS's processing toolbox: Scripts, Add Script to Toolbox, then this file.
+"""`beers-deploy restore` in QGIS's processing toolbox: Scripts, Add Script to Toolbox, then this
+file.
 
-QGIS has a Python of its own, and this tool another one: the program is started, nothing of it is imported. Names of
-methods are QGIS's (https://docs.qgis.org/latest/en/docs/user_manual/processing/scripts.html).
+QGIS has a Python of its own, and this tool another one: the program is started, nothing of it is
+imported. Names of methods are QGIS's
+(https://docs.qgis.org/latest/en/docs/user_manual/processing/scripts.html).
 """
 
 import os
@@ -39,12 +41,19 @@ class RestoreImage(QgsProcessingAlgorithm):
     def initAlgorithm(self, configuration: Any = None) -> None:  # noqa: N802, ARG002
         """The fields of its form."""
         self.addParameter(QgsProcessingParameterRasterLayer(IMAGE, "Raw image"))
-        self.addParameter(QgsProcessingParameterString(SENSOR, "Sensor (empty: not known)", optional=True))
-        self.addParameter(QgsProcessingParameterString(PROGRAM, "Path of beers-deploy", "beers-deploy"))
+        self.addParameter(
+            QgsProcessingParameterString(SENSOR, "Sensor (empty: not known)", optional=True)
+        )
+        self.addParameter(
+            QgsProcessingParameterString(PROGRAM, "Path of beers-deploy", "beers-deploy")
+        )
         self.addParameter(QgsProcessingParameterRasterDestination(OUT, "Restored image, .tif"))
 
     def processAlgorithm(  # noqa: N802
-        self, parameters: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback
+        self,
+        parameters: dict[str, Any],
+        context: QgsProcessingContext,
+        feedback: QgsProcessingFeedback,
     ) -> dict[str, Any]:
         """Restore; the program's one sentence is the error of QGIS.
 
@@ -53,17 +62,35 @@ class RestoreImage(QgsProcessingAlgorithm):
         """
         image = self.parameterAsRasterLayer(parameters, IMAGE, context).source()
         out = self.parameterAsOutputLayer(parameters, OUT, context)
-        program, sensor = (self.parameterAsString(parameters, key, context) for key in (PROGRAM, SENSOR))
-        command = [program, "restore", image, out, "--cog", *(["--sensor", sensor] if sensor else [])]
+        program, sensor = (
+            self.parameterAsString(parameters, key, context) for key in (PROGRAM, SENSOR)
+        )
+        command = [
+            program,
+            "restore",
+            image,
+            out,
+            "--cog",
+            *(["--sensor", sensor] if sensor else []),
+        ]
         feedback.pushCommandInfo(" ".join(command))
         # QGIS tells its own Python where its modules lie; another Python must not look there.
-        environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+        environment = {
+            key: value for key, value in os.environ.items() if not key.startswith("PYTHON")
+        }
         try:
             done = subprocess.run(  # noqa: S603 - the user's own program
-                command, capture_output=True, encoding="utf-8", errors="replace", check=False, env=environment
+                command,
+                capture_output=True,
+                encoding="utf-8",
+                errors="replace",
+                check=False,
+                env=environment,
             )
         except OSError as error:
-            raise QgsProcessingException(f"{program}: {error.strerror}; give its whole path") from error
+            raise QgsProcessingException(
+                f"{program}: {error.strerror}; give its whole path"
+            ) from error
         if done.returncode:
             raise QgsProcessingException(done.stderr)
         feedback.pushInfo(done.stdout)

@@ -1,11 +1,12 @@
-"""What the example networks learn from, and are calibrated and judged on: images, and what should become of them.
+"""What the example networks learn from, and are calibrated and judged on: images, and what should
+become of them.
 
     python -m examples.samples unet --count 64 --out samples.npz
 
-Those that restore get pairs of `pleiades-degraded` and its reference, of drawn scenes or of the photographs of a
-folder. The segmentation network finds what is bright in them, the classifier tells ten gratings apart. Writes a .npz
-file as `beers-deploy quantize --samples` reads it: `image` (N, C, H, W) in [0, 1] and, for networks that restore,
-`reference`.
+Those that restore get pairs of `pleiades-degraded` and its reference, of drawn scenes or of the
+photographs of a folder. The segmentation network finds what is bright in them, the classifier tells
+ten gratings apart. Writes a .npz file as `beers-deploy quantize --samples` reads it: `image` (N, C,
+H, W) in [0, 1] and, for networks that restore, `reference`.
 """
 
 import argparse
@@ -38,18 +39,27 @@ RECIPE = PatchRecipe(load_sensor("pleiades-degraded"), load_sensor("pleiades-ref
 GAINS = (0.7, 0.9, 1.0, 1.2)
 """Four bands of one ground, each as bright as this."""
 BRIGHT, AROUND_PX = 0.2, 9
-"""A pixel is bright where the mean of the square around it, in the reference, is above this share of full scale."""
+"""A pixel is bright where the mean of the square around it, in the reference, is above this share
+of full scale.
+"""
 CYCLES, ANGLES, TURN_RAD, NOISE = (4.0, 8.0), 5, 0.1, 0.1
-"""The ten gratings: cycles of an image, directions of each, how far they stray, and the noise on them."""
+"""The ten gratings: cycles of an image, directions of each, how far they stray, and the noise on
+them.
+"""
 MIXED, MOST = 4, 64
 """Passes over scenes whose patches of four bands are mixed, and the most that one of them gives."""
 
 Batch = tuple[Tensor, Tensor]
-"""What a network gets, (N, C, H, W) in [0, 1], and what it should give: as much, or classes of pixels or images."""
+"""What a network gets, (N, C, H, W) in [0, 1], and what it should give: as much, or classes of
+pixels or images.
+"""
 
 
 def batches(name: str, scenes: Sequence[Scene], seed: int) -> Iterator[Batch]:
-    """Endless batches for the network of that name; the same for the same seed. The classifier needs no scenes."""
+    """Endless batches for the network of that name; the same for the same seed.
+
+    The classifier needs no scenes.
+    """
     example = NETWORKS[name]
     if name == "classifier":
         return gratings(torch.Generator().manual_seed(seed), example.side_px or PATCH_PX)
@@ -59,18 +69,26 @@ def batches(name: str, scenes: Sequence[Scene], seed: int) -> Iterator[Batch]:
     if name == "segment":
         return ((image, bright(reference)) for image, reference in pairs)
     if example.scale > 1:
-        return ((functional.avg_pool2d(reference, example.scale), reference) for _, reference in pairs)
+        return (
+            (functional.avg_pool2d(reference, example.scale), reference) for _, reference in pairs
+        )
     return ((image, reference) for image, reference in pairs)
 
 
 def bright(reference: Tensor) -> Tensor:
-    """The class of each pixel, (N, H, W): 1 where the reference (N, 1, H, W) is bright around it, else 0."""
-    mean = functional.avg_pool2d(reference, AROUND_PX, stride=1, padding=AROUND_PX // 2, count_include_pad=False)
+    """The class of each pixel, (N, H, W): 1 where the reference (N, 1, H, W) is bright around it,
+    else 0.
+    """
+    mean = functional.avg_pool2d(
+        reference, AROUND_PX, stride=1, padding=AROUND_PX // 2, count_include_pad=False
+    )
     return (mean[:, 0] > BRIGHT).long()
 
 
 def gratings(generator: torch.Generator, side_px: int) -> Iterator[Batch]:
-    """Endless batches of gratings of ten kinds under noise, (N, 1, side_px, side_px), and their classes (N,)."""
+    """Endless batches of gratings of ten kinds under noise, (N, 1, side_px, side_px), and their
+    classes (N,).
+    """
 
     def uniform(low: float, high: float) -> Tensor:
         return low + (high - low) * torch.rand(BATCH, 1, 1, 1, generator=generator)
@@ -80,21 +98,35 @@ def gratings(generator: torch.Generator, side_px: int) -> Iterator[Batch]:
         kind = torch.randint(len(CYCLES) * ANGLES, (BATCH,), generator=generator)
         angle = (kind % ANGLES).view(-1, 1, 1, 1) * math.pi / ANGLES + uniform(-TURN_RAD, TURN_RAD)
         cycles = torch.tensor(CYCLES)[kind // ANGLES].view(-1, 1, 1, 1)
-        phase = math.tau * (cycles * (columns * angle.cos() + rows * angle.sin()) + uniform(0.0, 1.0))
+        phase = math.tau * (
+            cycles * (columns * angle.cos() + rows * angle.sin()) + uniform(0.0, 1.0)
+        )
         noise = NOISE * torch.randn(BATCH, 1, side_px, side_px, generator=generator)
         yield (uniform(0.3, 0.7) + uniform(0.1, 0.3) * phase.sin() + noise).clamp(0.0, 1.0), kind
 
 
 def banded(scenes: Sequence[Scene], generator: np.random.Generator) -> Iterator[Batch]:
-    """Endless batches of pairs of four bands, (N, 4, P, P): one ground and phase, each band its gain and noise."""
+    """Endless batches of pairs of four bands, (N, 4, P, P): one ground and phase, each band its
+    gain and noise.
+    """
     ready = [prepare(scene, math.lcm(*RECIPE.oversamplings)) for scene in scenes]
-    passes = [(scene, ratio) for scene in ready for ratio in RECIPE.oversamplings if _fits(scene, ratio)]
+    passes = [
+        (scene, ratio) for scene in ready for ratio in RECIPE.oversamplings if _fits(scene, ratio)
+    ]
     if not passes:
         expected = f"images that hold a patch of {PATCH_PX} target pixels"
-        raise ImageError("training images", expected=expected, got="none large enough", remedy="give larger images")
+        raise ImageError(
+            "training images",
+            expected=expected,
+            got="none large enough",
+            remedy="give larger images",
+        )
     while True:
         drawn = [passes[generator.integers(len(passes))] for _ in range(MIXED)]
-        pieces = [_mixed(_acquire_bands(scene, ratio, generator), generator)[:MOST] for scene, ratio in drawn]
+        pieces = [
+            _mixed(_acquire_bands(scene, ratio, generator), generator)[:MOST]
+            for scene, ratio in drawn
+        ]
         for patches in torch.split(_mixed(torch.cat(pieces), generator), BATCH):
             yield patches[:, : len(GAINS)], patches[:, len(GAINS) :]
 
@@ -109,15 +141,21 @@ def _mixed(patches: Tensor, generator: np.random.Generator) -> Tensor:
 
 
 def _acquire_bands(scene: Visited, ratio: int, generator: np.random.Generator) -> Tensor:
-    """The patches of one pass over a scene, (N, 8, P, P) in [0, 1]: four degraded bands, then their references."""
+    """The patches of one pass over a scene, (N, 8, P, P) in [0, 1]: four degraded bands, then their
+    references.
+    """
     phase_y, phase_x = (float(offset) for offset in generator.uniform(-ratio / 2, ratio / 2, 2))
     look = Look(float(generator.uniform(*RECIPE.looks.exposures)))
     sensors = RECIPE.degraded.draw(generator), RECIPE.reference.draw(generator)
-    signals = folded_signals(scene, sensors, Pass(ratio, (phase_y, phase_x), look, RECIPE.margin_px))
+    signals = folded_signals(
+        scene, sensors, Pass(ratio, (phase_y, phase_x), look, RECIPE.margin_px)
+    )
     images = []
     for signal, sensor, role in zip(signals, sensors, ("degraded", "reference"), strict=True):
         images += [detected(signal * gain, sensor, role, generator) for gain in GAINS]
-    return turned(cut(torch.stack(images), PATCH_PX, generator), *draw_turn(generator, quarters=True))
+    return turned(
+        cut(torch.stack(images), PATCH_PX, generator), *draw_turn(generator, quarters=True)
+    )
 
 
 def batches_of(name: str, folder: Path | None, seed: int) -> Iterator[Batch]:
@@ -145,20 +183,30 @@ def reported(work: Callable[[], None]) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Draw, write, say so; the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("network", choices=NETWORKS)
     parser.add_argument("--count", type=positive, default=64, metavar="N")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
-    parser.add_argument("--images", type=Path, metavar="DIR", help="photographs in place of drawn scenes")
+    parser.add_argument(
+        "--images", type=Path, metavar="DIR", help="photographs in place of drawn scenes"
+    )
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)
-    return reported(lambda: write_samples(given.network, given.count, given.out, given.images, given.seed))
+    return reported(
+        lambda: write_samples(given.network, given.count, given.out, given.images, given.seed)
+    )
 
 
 def write_samples(name: str, count: int, out: Path, folder: Path | None, seed: int) -> None:
-    """Write so many samples of the network of that name; references beside them where it restores."""
+    """Write so many samples of the network of that name; references beside them
+    where it restores.
+    """
     if out.suffix != ".npz":
-        raise OptionError("--out", expected="a name that ends in .npz", got=out.name, remedy="choose such a name")
+        raise OptionError(
+            "--out", expected="a name that ends in .npz", got=out.name, remedy="choose such a name"
+        )
     require_writable(out)
     drawn = list(islice(batches_of(name, folder, seed), -(-count // BATCH)))
     image, wanted = (torch.cat(tensors)[:count].numpy() for tensors in zip(*drawn, strict=True))

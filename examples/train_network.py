@@ -1,9 +1,10 @@
-"""Train one of the example networks on simulated images: minutes make it mean something, none of them is a product.
+"""Train one of the example networks on simulated images: minutes make it mean something, none of
+them is a product.
 
     python -m examples.train_network unet --steps 2000 --out unet.onnx
 
-What each learns from stands in `examples.samples`. Writes FILE.onnx, its weights beside it as FILE.safetensors, and
-says what came out on scenes that were not trained on.
+What each learns from stands in `examples.samples`. Writes FILE.onnx, its weights beside it as
+FILE.safetensors, and says what came out on scenes that were not trained on.
 """
 
 import argparse
@@ -32,7 +33,9 @@ LEARNING_RATE = 2e-3
 
 
 def train(name: str, source: Iterator[Batch], count: int, seed: int) -> nn.Module:
-    """The network of that name after `count` steps of Adam over batches of `source`, in evaluation mode."""
+    """The network of that name after `count` steps of Adam over batches of `source`, in evaluation
+    mode.
+    """
     network, error = build(name, torch.Generator().manual_seed(seed)), criterion(name)
     optimiser = torch.optim.Adam(network.parameters(), lr=LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, count)
@@ -50,22 +53,30 @@ def train(name: str, source: Iterator[Batch], count: int, seed: int) -> nn.Modul
 
 
 def criterion(name: str) -> Callable[[Tensor, Tensor], Tensor]:
-    """What training makes small: the mean absolute error of an image, the cross entropy of classes."""
+    """What training makes small: the mean absolute error of an image, the cross
+    entropy of classes.
+    """
     return functional.l1_loss if NETWORKS[name].restores else functional.cross_entropy
 
 
 def judge(name: str, network: nn.Module, source: Iterator[Batch]) -> tuple[float, float, str]:
-    """How good the outputs are on further batches, how good they would be without the network, and the unit.
+    """How good the outputs are on further batches, how good they would be without the network, and
+    the unit.
 
-    For images PSNR in dB over full scale, beside that of the input (enlarged bilinearly where the network enlarges);
-    for classes the percentage that is right, beside that of the class that is most frequent.
+    For images PSNR in dB over full scale, beside that of the input (enlarged bilinearly where the
+    network enlarges); for classes the percentage that is right, beside that of the class that is
+    most frequent.
     """
     with torch.inference_mode():
         found = [(network(image), image, wanted) for image, wanted in islice(source, JUDGED)]
     output, image, wanted = (torch.cat(tensors) for tensors in zip(*found, strict=True))
     if not NETWORKS[name].restores:
         right = (output.argmax(1) == wanted).double().mean()
-        return float(100 * right), float(100 * wanted.flatten().bincount().max() / wanted.numel()), "% right"
+        return (
+            float(100 * right),
+            float(100 * wanted.flatten().bincount().max() / wanted.numel()),
+            "% right",
+        )
     if image.shape != wanted.shape:
         image = functional.interpolate(image, size=wanted.shape[-2:], mode="bilinear")
     trained, before = (psnr_db(each.numpy(), wanted.numpy(), 1.0) for each in (output, image))
@@ -74,13 +85,23 @@ def judge(name: str, network: nn.Module, source: Iterator[Batch]) -> tuple[float
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train, write, report; the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("network", choices=NETWORKS)
     parser.add_argument("--steps", type=positive, default=2000, metavar="N")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.onnx")
-    parser.add_argument("--images", type=Path, metavar="DIR", help="photographs to train on in place of drawn scenes")
     parser.add_argument(
-        "--held-out", type=Path, metavar="DIR", help="photographs to judge on in place of drawn scenes"
+        "--images",
+        type=Path,
+        metavar="DIR",
+        help="photographs to train on in place of drawn scenes",
+    )
+    parser.add_argument(
+        "--held-out",
+        type=Path,
+        metavar="DIR",
+        help="photographs to judge on in place of drawn scenes",
     )
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)
@@ -88,19 +109,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return reported(lambda: run(given.network, given.steps, given.out, folders, given.seed))
 
 
-def run(name: str, count: int, out: Path, folders: tuple[Path | None, Path | None], seed: int) -> None:
-    """Train on the images of the first folder, judge on those of the second, write both files, print one line."""
+def run(
+    name: str, count: int, out: Path, folders: tuple[Path | None, Path | None], seed: int
+) -> None:
+    """Train on the images of the first folder, judge on those of the second, write both files,
+    print one line.
+    """
     if out.suffix != ".onnx":
-        raise OptionError("--out", expected="a name that ends in .onnx", got=out.name, remedy="choose such a name")
+        raise OptionError(
+            "--out", expected="a name that ends in .onnx", got=out.name, remedy="choose such a name"
+        )
     weights = out.with_suffix(".safetensors")
     require_writable(out, weights)
     learnt, judged = (batches_of(name, folder, seed + k) for k, folder in enumerate(folders))
     network = train(name, learnt, count, seed)
     trained, before, unit = judge(name, network, judged)
-    write_tensors(weights, arrays(network.state_dict()), {"network": name, "steps": count, "seed": seed})
+    write_tensors(
+        weights, arrays(network.state_dict()), {"network": name, "steps": count, "seed": seed}
+    )
     with whole_file(out) as temporary:
         onnx.save(to_onnx(name, network), temporary)
-    sys.stdout.write(f"{name}: {trained:.2f} {unit} after {count} steps, {before:.2f} without it (measured): {out}\n")
+    sys.stdout.write(
+        f"{name}: {trained:.2f} {unit} after {count} steps, {before:.2f} without it (measured): "
+        f"{out}\n"
+    )
 
 
 if __name__ == "__main__":

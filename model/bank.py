@@ -1,20 +1,22 @@
 """What a sensor's blur and noise ask for, in closed form: the filters of a network's first layer.
 
-Of a sensor: H(f) its transfer, sigma its noise over full scale at a quarter of full scale, rounding counted. Of the
-reference: T(f). r = |f| / f_Nyquist. Four restorations, each more cautious than the one before, and what lies between
-them and the image itself, cut to 7 x 7:
+Of a sensor: H(f) its transfer, sigma its noise over full scale at a quarter of full scale, rounding
+counted. Of the reference: T(f). r = |f| / f_Nyquist. Four restorations, each more cautious than the
+one before, and what lies between them and the image itself, cut to 7 x 7:
 
     W_k = T conj(H) / (|H|^2 + eps_k r^2),   eps_k = 1.32 sigma 4^(k-1),   k = 0..3,   W_4 = 1
-    D_k = W_k - W_(k+1), of sum 0,           n_k = ||D_k||, the noise that D_k makes of white noise of 1
-    u_k = D_k x / (20 sigma n_k)             four planes in units of the sensor's own noise, of order 1 on edges
+    D_k = W_k - W_(k+1), of sum 0
+    n_k = ||D_k||                    the noise that D_k makes of white noise of 1
+    u_k = D_k x / (20 sigma n_k)     four planes in units of the sensor's own noise, 1 on edges
     y_0 = x + (D_1 + D_2 + D_3) x            the analytic restoration W_1 x
     g   = 20 sigma ||D_1 + D_2 + D_3||       the unit of what a network adds to it
 
-A network that reads x and u and gives `y_0 + g * body` is the same for every sensor. (Wiener filters in front of a
-network: Dong, Roth and Schiele, NeurIPS 2020.) This is NumPy alone, so that a restoration begins without torch.
+A network that reads x and u and gives `y_0 + g * body` is the same for every sensor. (Wiener
+filters in front of a network: Dong, Roth and Schiele, NeurIPS 2020.) This is NumPy alone, so that a
+restoration begins without torch.
 
-Networks of before 7 x 7 kernels were fitted read filters that are cut to that size. They keep them until they are
-trained anew.
+Networks of before 7 x 7 kernels were fitted read filters that are cut to that size. They keep them
+until they are trained anew.
 """
 
 from dataclasses import dataclass, replace
@@ -33,7 +35,9 @@ from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
 
 FILTERS = 4
 SIDE_PX = 7
-"""7 x 7 holds 98.6 to 99.95 % of a filter's energy, and is the largest square that the window of a DPU takes."""
+"""7 x 7 holds 98.6 to 99.95 % of a filter's energy, and is the largest square that the window of a
+DPU takes.
+"""
 
 GRID = 64
 """Frequencies along an axis. Finer ones move no tap by more than 3e-4 of a filter's largest."""
@@ -46,11 +50,14 @@ UNIT = 20.0
 """Standard deviations of noise that make a plane's 1."""
 
 UNIT_STEPS = 24
-"""In which int8 holds a unit: sixteen would hold all that training saw, but their coarser steps cost more than what
-24 clip."""
+"""In which int8 holds a unit: sixteen would hold all that training saw, but their coarser steps
+cost more than what 24 clip.
+"""
 
 LARGEST = 127 / UNIT_STEPS
-"""Planes are held to so many units: few edges leave more, and what no sensor makes, as checkerboards, must not."""
+"""Planes are held to so many units: few edges leave more, and what no sensor makes, as
+checkerboards, must not.
+"""
 
 SIGMA = 0.0016
 """Noise over full scale of sensors with a gain of 1: unseen photographs lost least with it."""
@@ -59,13 +66,17 @@ GAINS = 0.5, 2.0
 """The smallest and the largest: with more, the image itself would not fit int8."""
 
 WIDE = 4
-"""How many times as far the analytic restoration reaches behind fitted kernels: what a network adds to an image must
-not end at a fifth of full scale, as a point of light or the edge of a saturated area asks for more."""
+"""How many times as far the analytic restoration reaches behind fitted kernels: what a network adds
+to an image must not end at a fifth of full scale, as a point of light or the edge of a saturated
+area asks for more.
+"""
 
 
 @dataclass(frozen=True)
 class Bank:
-    """The filters of one sensor: D_k, (4, 7, 7) float64, and its noise over full scale at a quarter of full scale."""
+    """The filters of one sensor: D_k, (4, 7, 7) float64, and its noise over full scale at a quarter
+    of full scale.
+    """
 
     details: NDArray[np.float64]
     sigma: float
@@ -77,14 +88,16 @@ class Bank:
 
     @property
     def gain(self) -> float:
-        """How many times finer than 1/24 of a unit a sensor's steps are, and than 32 the image's: whole eighths.
+        """How many times finer than 1/24 of a unit a sensor's steps are, and than 32 the image's:
+        whole eighths.
 
         The image's one weight, which no copy corrects, is a whole number so.
         """
         return float(np.clip(np.rint(8 * self.sigma / SIGMA) / 8, *GAINS))
 
     def reach(self, kernels: Kernels) -> tuple[float, float]:
-        """The units to which the planes and the analytic restoration are held: as far as int8 holds them.
+        """The units to which the planes and the analytic restoration are held: as far as int8 holds
+        them.
 
         Networks behind cut kernels were trained as if every sensor had a gain of 1.
         """
@@ -121,15 +134,21 @@ class Bank:
 
 
 def network_bank(sensor: Instrument, kernels: Kernels = "fitted") -> Bank:
-    """The filters in front of a network: noise outside the range that was trained counts as the nearest end of it."""
-    return _bank(sensor, float(np.clip(noise_over_full_scale(sensor), *RANGES["sigma_bright"])), kernels)
+    """The filters in front of a network: noise outside the range that was trained counts as the
+    nearest end of it.
+    """
+    return _bank(
+        sensor, float(np.clip(noise_over_full_scale(sensor), *RANGES["sigma_bright"])), kernels
+    )
 
 
 @lru_cache(maxsize=4096)
 def bank_of_vector(vector: tuple[float, ...], kernels: Kernels = "fitted") -> Bank:
     """As `network_bank`, of the sensor that a sensor vector (4,) tells of."""
     ends = zip(vector, RANGES.values(), strict=True)
-    across, along, _, sigma = (low * (high / low) ** ((entry + 1) / 2) for entry, (low, high) in ends)
+    across, along, _, sigma = (
+        low * (high / low) ** ((entry + 1) / 2) for entry, (low, high) in ends
+    )
     axes = replace(_reference(), mtf_nyquist=across, mtf_nyquist_along=along, effects={})
     return _bank(axes, sigma, kernels)
 
@@ -163,11 +182,13 @@ def _bank(sensor: Instrument, sigma: float, kernels: Kernels) -> Bank:
 def fitted_kernel(
     gain: NDArray[np.inexact], power: NDArray[np.float64], r_squared: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The kernel (7, 7) of sum 1 that restores best where a filter of any size restores best with `gain`.
+    """The kernel (7, 7) of sum 1 that restores best where a filter of any size restores best with
+    `gain`.
 
-    Of scenes whose power falls as 1 / r^2, W_k leaves the least error under noise. A kernel K errs by the sum of
-    (|H|^2 + eps_k r^2) / r^2 |K - W_k|^2 more, which is least for the solution of 49 linear equations. Cut to 7 x 7
-    instead, W_k loses up to a tenth of the contrast at low frequencies, by more or less for each curve of the MTF.
+    Of scenes whose power falls as 1 / r^2, W_k leaves the least error under noise. A kernel K errs
+    by the sum of (|H|^2 + eps_k r^2) / r^2 |K - W_k|^2 more, which is least for the solution of 49
+    linear equations. Cut to 7 x 7 instead, W_k loses up to a tenth of the contrast at low
+    frequencies, by more or less for each curve of the MTF.
 
     Args:
         gain: W_k at the frequencies of a grid, (GRID, GRID).
@@ -189,21 +210,28 @@ def fitted_kernel(
 
 
 def in_places(kernels: NDArray[np.float64], scale: int) -> NDArray[np.float64]:
-    """Kernels (K, 7, 7) as the convolution that makes their planes where S x S pixels are the channels of one place.
+    """Kernels (K, 7, 7) as the convolution that makes their planes where S x S pixels are the
+    channels of one place.
 
-    So for kernels of any odd side. Row i of a place reads row i + d of the same plane, d from -3 to 3: it lies in row
-    (i + d) mod S of the place that is floor((i + d) / S) below. So for columns.
+    So for kernels of any odd side. Row i of a place reads row i + d of the same plane, d from -3 to
+    3: it lies in row (i + d) mod S of the place that is floor((i + d) / S) below. So for columns.
 
     Returns:
-        (K S^2, S^2, k, k), k places wide: 7 at scale 1, 5 at scale 2. The channels are ordered as a pixel unshuffle
+        (K S^2, S^2, k, k), k places wide: 7 at scale 1, 5 at scale 2. The channels are ordered as a
+            pixel unshuffle
         of the planes, and of the image, orders them.
     """
     side_px = kernels.shape[-1]
     reach = -(-(side_px // 2) // scale)
     middle = side_px // 2
     found = np.zeros((len(kernels), scale, scale, scale, scale, 2 * reach + 1, 2 * reach + 1))
-    for row, column, down, right in product(range(scale), range(scale), range(side_px), range(side_px)):
-        (place_y, y), (place_x, x) = divmod(row + down - middle, scale), divmod(column + right - middle, scale)
+    for row, column, down, right in product(
+        range(scale), range(scale), range(side_px), range(side_px)
+    ):
+        (place_y, y), (place_x, x) = (
+            divmod(row + down - middle, scale),
+            divmod(column + right - middle, scale),
+        )
         found[:, row, column, y, x, place_y + reach, place_x + reach] = kernels[:, down, right]
     return found.reshape(len(kernels) * scale**2, scale**2, 2 * reach + 1, 2 * reach + 1)
 
@@ -213,15 +241,20 @@ def restoring_gain(
 ) -> NDArray[np.inexact]:
     """T conj(H) / (|H|^2 + epsilon r^2), of arrays of one shape: from a blur H to a target T.
 
-    Weighted by r^2, epsilon leaves the gain at frequency 0 at exactly 1; a constant one would darken the image.
+    Weighted by r^2, epsilon leaves the gain at frequency 0 at exactly 1; a constant one would
+    darken the image.
     """
-    return np.asarray(target * np.conj(blur) / (np.abs(blur) ** 2 + epsilon * np.asarray(r_squared)))
+    return np.asarray(
+        target * np.conj(blur) / (np.abs(blur) ** 2 + epsilon * np.asarray(r_squared))
+    )
 
 
 def cut_filter(whole: NDArray[np.float64], radius_px: int, total: float) -> NDArray[np.float64]:
-    """The middle (2 R + 1, 2 R + 1) of a filter (H, W) around its first pixel, brought to a sum by a smooth hill.
+    """The middle (2 R + 1, 2 R + 1) of a filter (H, W) around its first pixel, brought to a sum by
+    a smooth hill.
 
-    So what is cut off comes back at frequencies near 0 alone; dividing by the sum would raise every other one.
+    So what is cut off comes back at frequencies near 0 alone; dividing by the sum would raise every
+    other one.
     """
     side_px = 2 * radius_px + 1
     kernel = np.roll(whole, (radius_px, radius_px), (0, 1))[:side_px, :side_px]

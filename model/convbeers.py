@@ -1,22 +1,26 @@
-"""ConvBEERS: a residual network without batch normalisation that undoes blur and noise (paper, section 3.1).
+"""ConvBEERS: a residual network without batch normalisation that undoes blur and noise (paper,
+section 3.1).
 
-    image -> head -> [conv, ReLU, conv, +] x blocks -> body end, + head -> tail -> correction, + image
+    image -> head -> [conv, ReLU, conv, +] x blocks -> body end, + head
+    -> tail -> correction, + image
 
-A variant of scale S rearranges the image in front of its head, S x S pixels into channels, and the correction back
-behind its tail (pixel unshuffle and shuffle; Shi et al., CVPR 2016). The host does both; what lies between runs at
-1 / S of the resolution.
+A variant of scale S rearranges the image in front of its head, S x S pixels into channels, and the
+correction back behind its tail (pixel unshuffle and shuffle; Shi et al., CVPR 2016). The host does
+both; what lies between runs at 1 / S of the resolution.
 
-Every convolution is 3 x 3 with stride 1 and zero padding 1. 16 blocks of 64 features make 1.2 M parameters.
+Every convolution is 3 x 3 with stride 1 and zero padding 1. 16 blocks of 64 features make 1.2 M
+parameters.
 
 Behind the bank of its sensor (`model.bank`) the same body is one network for every sensor in range:
 
     restored = x + g (w + body([x - 1/2, u])),   w = (W_1 - 1) x / g
 
-What a sensor changes are the filters that make u and w and the unit g, known in closed form, and the bias of the
-head, which is linear in the sensor vector.
+What a sensor changes are the filters that make u and w and the unit g, known in closed form, and
+the bias of the head, which is linear in the sensor vector.
 
-A larger network can begin where a smaller one stands (`grow`): wider, deeper or coarser, with the same outputs.
-Trained in the end with its maps rounded as its INT8 file rounds them (`Rounding`), a network loses less in INT8.
+A larger network can begin where a smaller one stands (`grow`): wider, deeper or coarser, with the
+same outputs. Trained in the end with its maps rounded as its INT8 file rounds them (`Rounding`), a
+network loses less in INT8.
 """
 
 from collections.abc import Mapping, Sequence
@@ -45,8 +49,13 @@ class ResidualBlock(nn.Module):
         self.first = nn.Conv2d(features, features, kernel_size=3, padding=1)
         self.second = nn.Conv2d(features, features, kernel_size=3, padding=1)
 
-    def forward(self, x: Tensor, step: Tensor | None = None, inner_step: Tensor | None = None) -> Tensor:
-        """Add the block's correction to x (N, F, H, W); the shape is kept. Given steps, the maps are rounded."""
+    def forward(
+        self, x: Tensor, step: Tensor | None = None, inner_step: Tensor | None = None
+    ) -> Tensor:
+        """Add the block's correction to x (N, F, H, W); the shape is kept.
+
+        Given steps, the maps are rounded.
+        """
         inner = torch.relu(self.first(x))
         if step is not None and inner_step is not None:
             return in_steps(x + in_steps(self.second(in_steps(inner, inner_step)), step), step)
@@ -66,9 +75,15 @@ class Layers(nn.Module):
         self.tail = nn.Conv2d(variant.features, variant.pixels, kernel_size=3, padding=1)
 
     def corrected(self, shallow: Tensor, bfloat16: bool, steps: Sequence[Tensor] = ()) -> Tensor:
-        """What the head gave, (N, F, H / S, W / S), to the correction (N, 1, H, W); see `Rounding.steps`."""
+        """What the head gave, (N, F, H / S, W / S), to the correction (N, 1, H, W); see
+        `Rounding.steps`.
+        """
         with torch.autocast(shallow.device.type, dtype=torch.bfloat16, enabled=bfloat16):
-            deep = self._rounded(shallow, *steps) if steps else shallow + self.body_end(self.body(shallow)).float()
+            deep = (
+                self._rounded(shallow, *steps)
+                if steps
+                else shallow + self.body_end(self.body(shallow)).float()
+            )
         return pixel_shuffle(self.tail(deep), self.variant.scale)
 
     def _rounded(self, shallow: Tensor, step: Tensor, *inner: Tensor) -> Tensor:
@@ -80,7 +95,9 @@ class Layers(nn.Module):
 
 
 def in_steps(maps: Tensor, step: Tensor) -> Tensor:
-    """Maps (N, F, H, W) in float32, held to int8 and rounded to whole steps; gradients pass the rounding."""
+    """Maps (N, F, H, W) in float32, held to int8 and rounded to whole steps; gradients pass the
+    rounding.
+    """
     held = maps.float().clamp(-128 * step, 127 * step)
     return held + (torch.round(held / step) * step - held).detach()
 
@@ -98,19 +115,25 @@ class Rounding:
     inner: tuple[Tensor, ...]
 
     def steps(self, gains: Tensor) -> list[Tensor]:
-        """Those of images, each with the gain of its bank (N,): (N, F, 1, 1) of the stream, then of each block."""
+        """Those of images, each with the gain of its bank (N,): (N, F, 1, 1) of the stream, then of
+        each block.
+        """
         return [step.to(gains) / gains[:, None, None, None] for step in (self.stream, *self.inner)]
 
 
 class ConvBEERS(Layers):
-    """The network: (N, 1, H, W) in [0, 1] of full scale to the same, not clipped; H and W multiples of its scale."""
+    """The network: (N, 1, H, W) in [0, 1] of full scale to the same, not clipped; H and W multiples
+    of its scale.
+    """
 
     def __init__(self, variant: Variant) -> None:
         super().__init__(variant, planes=1)
 
     def forward(self, image: Tensor, bfloat16: bool = False) -> Tensor:
         """Image plus correction, (N, 1, H, W); `bfloat16` is for the blocks alone."""
-        return image + self.corrected(self.head(pixel_unshuffle(image, self.variant.scale)), bfloat16)
+        return image + self.corrected(
+            self.head(pixel_unshuffle(image, self.variant.scale)), bfloat16
+        )
 
 
 @dataclass(frozen=True)
@@ -156,7 +179,8 @@ class Told:
 
 
 class BankedConvBEERS(Layers):
-    """Images (N, 1, H, W) in [0, 1] of full scale and what is told of their sensors to (N, 1, H, W), not clipped.
+    """Images (N, 1, H, W) in [0, 1] of full scale and what is told of their sensors to (N, 1, H,
+    W), not clipped.
 
     `kernels` says what banks it was trained behind.
     """
@@ -180,7 +204,8 @@ class BankedConvBEERS(Layers):
             image: (N, 1, H, W).
             told: of the sensor of each.
             bfloat16: for the blocks alone.
-            steps: that the maps are rounded to, see `Rounding.steps`; without any they stay as they are.
+            steps: that the maps are rounded to, see `Rounding.steps`; without any they stay as they
+                are.
         """
         filtered = each_by_its_own(image, told.filters)
         planes, analytic = self._held(filtered, told.gains)
@@ -203,7 +228,8 @@ class BankedConvBEERS(Layers):
 
 
 class OfOneSensor(nn.Module):
-    """A network behind a bank, told one sensor's vector (4,): (N, 1, H, W) in [0, 1] of full scale to the same.
+    """A network behind a bank, told one sensor's vector (4,): (N, 1, H, W) in [0, 1] of full scale
+    to the same.
 
     It shares the network's weights. Without a bank the sensor's is made of the vector.
     """
@@ -228,12 +254,16 @@ Network = ConvBEERS | BankedConvBEERS
 
 
 def told(network: Network, vector: Tensor, bank: Bank | None = None) -> ConvBEERS | OfOneSensor:
-    """A network that takes images alone: one behind a bank told the sensor of a vector (4,), a plain one as it is."""
+    """A network that takes images alone: one behind a bank told the sensor of a vector (4,), a
+    plain one as it is.
+    """
     return OfOneSensor(network, vector, bank) if isinstance(network, BankedConvBEERS) else network
 
 
 def each_by_its_own(image: Tensor, kernels: Tensor) -> Tensor:
-    """Image n of (N, 1, H, W), mirrored at its borders, by kernels n of (N, K, 7, 7): (N, K, H, W)."""
+    """Image n of (N, 1, H, W), mirrored at its borders, by kernels n of (N, K,
+    7, 7): (N, K, H, W).
+    """
     count = len(image)
     radius = SIDE_PX // 2
     wide = pad(image, [radius] * 4, mode="reflect")
@@ -242,10 +272,12 @@ def each_by_its_own(image: Tensor, kernels: Tensor) -> Tensor:
 
 
 def initialise(network: Network, generator: torch.Generator) -> None:
-    """Start as (nearly) the identity: He-normal weights, residual branches and correction scaled down.
+    """Start as (nearly) the identity: He-normal weights, residual branches and correction scaled
+    down.
 
-    Without batch normalisation the stream's variance would otherwise double at each block. The tail is scaled down
-    once more where it writes several pixels: what is an offset of one channel is a pattern of several.
+    Without batch normalisation the stream's variance would otherwise double at each block. The tail
+    is scaled down once more where it writes several pixels: what is an offset of one channel is a
+    pattern of several.
     """
     for name, module in network.named_modules():
         if isinstance(module, nn.Conv2d):
@@ -262,11 +294,13 @@ N = TypeVar("N", bound=Network)
 
 
 def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
-    """A network of `variant` with the outputs of `network`, up to rounding; the same size is copied.
+    """A network of `variant` with the outputs of `network`, up to rounding; the same size is
+    copied.
 
-    Features are copied, and their weights shared out among the copies (Net2Net, Chen et al. 2016). Added blocks lie
-    evenly between the others; their second convolution is zero, so that each hands on what it is given until it has
-    learnt something. At a larger scale each feature becomes one for each pixel of a place (see `_coarser`).
+    Features are copied, and their weights shared out among the copies (Net2Net, Chen et al. 2016).
+    Added blocks lie evenly between the others; their second convolution is zero, so that each hands
+    on what it is given until it has learnt something. At a larger scale each feature becomes one
+    for each pixel of a place (see `_coarser`).
     """
     sources = _sources(network.variant, variant)
     large = type(network)(variant)
@@ -278,23 +312,37 @@ def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
         weight = weights[f"{name}.weight"]
         bias = weights[f"{name}.bias"]
         if source is not None:
-            weight.copy_(_widened(_coarser(small[f"{source}.weight"], factor), weight.shape, generator))
+            weight.copy_(
+                _widened(_coarser(small[f"{source}.weight"], factor), weight.shape, generator)
+            )
             bias.copy_(_repeated(small[f"{source}.bias"], bias.shape, factor))
         elif name.endswith("second"):
             weight.zero_()
     if isinstance(large, BankedConvBEERS):  # its head's bias is told the sensor
-        large.bias.weight.data.copy_(_repeated(small["bias.weight"], large.bias.weight.shape, factor))
+        large.bias.weight.data.copy_(
+            _repeated(small["bias.weight"], large.bias.weight.shape, factor)
+        )
     return large
 
 
 def _sources(small: Variant, large: Variant) -> dict[str, str | None]:
-    """The convolution of the small network that each of the large one's is made from; None for an added one."""
+    """The convolution of the small network that each of the large one's is made from; None for an
+    added one.
+    """
     factor = large.scale // small.scale
     fits = small.scale in (1, large.scale) and large.features % (small.features * factor**2) == 0
     if large.blocks < small.blocks or not fits:
-        expected = f"at most {large.blocks} blocks, of features that divide {large.features} at scale {large.scale}"
+        expected = (
+            f"at most {large.blocks} blocks, of features that divide {large.features} at "
+            f"scale {large.scale}"
+        )
         got = f"{small.blocks} blocks of {small.features} features at scale {small.scale}"
-        raise ModelError("weights to start from", expected=expected, got=got, remedy="start from a smaller network")
+        raise ModelError(
+            "weights to start from",
+            expected=expected,
+            got=got,
+            remedy="start from a smaller network",
+        )
     places = [old * large.blocks // small.blocks for old in range(small.blocks)]
     kept = {f"body.{place}.": f"body.{old}." for old, place in enumerate(places)}
     found: dict[str, str | None] = {}
@@ -312,7 +360,9 @@ def _repeated(rows: Tensor, shape: Sequence[int], factor: int) -> Tensor:
 
 
 def _coarser(weight: Tensor, factor: int) -> Tensor:
-    """(O, I, 3, 3) to (O S^2, I S^2, 3, 3): the same convolution where S x S places are the channels of one."""
+    """(O, I, 3, 3) to (O S^2, I S^2, 3, 3): the same convolution where S x S places are the
+    channels of one.
+    """
     outputs, inputs, places = *weight.shape[:2], factor**2
     coarse = torch.from_numpy(in_places(weight.flatten(0, 1).double().numpy(), factor)).to(weight)
     apart = coarse.view(outputs, inputs, places, places, 3, 3).transpose(1, 2)
@@ -320,7 +370,9 @@ def _coarser(weight: Tensor, factor: int) -> Tensor:
 
 
 def _widened(weight: Tensor, channels: Sequence[int], generator: torch.Generator) -> Tensor:
-    """(O, I, kh, kw) to as many `channels`: copies along both, divided among the copies of an input."""
+    """(O, I, kh, kw) to as many `channels`: copies along both, divided among the copies of an
+    input.
+    """
     copies_out = channels[0] // weight.shape[0]
     copies_in = channels[1] // weight.shape[1]
     shares = torch.rand(channels[0], copies_in, weight.shape[1], 1, 1, generator=generator) + 0.5
@@ -344,7 +396,9 @@ def network_of(weights: Weights) -> Network:
     network: Network = ConvBEERS(weights.variant)
     if weights.conditioned:
         network = BankedConvBEERS(weights.variant, weights.kernels)
-    network.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.tensors.items()})
+    network.load_state_dict(
+        {name: torch.from_numpy(np.array(value)) for name, value in weights.tensors.items()}
+    )
     return network.eval()
 
 

@@ -1,4 +1,5 @@
-"""Curves of the MTF that a training draws, besides the formula's: all instruments of one contrast at Nyquist differ.
+"""Curves of the MTF that a training draws, besides the formula's: all instruments of one contrast
+at Nyquist differ.
 
 A curve is what the optics leave, times sinc(f) of the square detector. Of the optics:
 
@@ -7,8 +8,8 @@ A curve is what the optics leave, times sinc(f) of the square detector. Of the o
     pupil       the autocorrelation of a circular pupil, with or without a central obscuration
     bent        the formula, less or more by a smooth hill at middle frequencies
 
-and along the track any of them times sinc(s f), the motion during an exposure. Each is scaled so that its contrast at
-Nyquist is the one asked for.
+and along the track any of them times sinc(s f), the motion during an exposure. Each is scaled so
+that its contrast at Nyquist is the one asked for.
 """
 
 import math
@@ -67,7 +68,9 @@ def _drawn_optics(generator: np.random.Generator) -> Callable[[float], Curve]:
 
 
 def pupil_contrast(contrast: float, obscuration: float) -> Curve:
-    """The contrast at FREQUENCIES behind a pupil whose cut-off frequency leaves `contrast` at Nyquist."""
+    """The contrast at FREQUENCIES behind a pupil whose cut-off frequency leaves `contrast` at
+    Nyquist.
+    """
     frequency, left = _pupil(obscuration)
     # It falls, but for rounding: read backwards it can be searched.
     at_nyquist = float(np.interp(contrast, left[::-1], frequency[::-1]))
@@ -76,7 +79,9 @@ def pupil_contrast(contrast: float, obscuration: float) -> Curve:
 
 @lru_cache
 def _pupil(obscuration: float) -> tuple[Curve, Curve]:
-    """Frequencies over the cut-off frequency, and the contrast that a pupil with an obscuration leaves there."""
+    """Frequencies over the cut-off frequency, and the contrast that a pupil with an obscuration
+    leaves there.
+    """
     place = (np.arange(2 * PUPIL_GRID) - PUPIL_GRID + 0.5) / (PUPIL_GRID / 2)
     radius = np.hypot(place[:, None], place[None, :])
     pupil = ((radius <= 1) & (radius >= obscuration)).astype(np.float64)

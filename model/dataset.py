@@ -1,7 +1,9 @@
-"""Datasets of simulated pairs: 12-bit TIFF patches and a manifest, in parallel, resumable, the same bytes always.
+"""Datasets of simulated pairs: 12-bit TIFF patches and a manifest, in parallel, resumable, the same
+bytes always.
 
-A patch's pixels depend on the recipe and its number alone, not on the process that makes it. The recipe lies beside
-the pairs, and who takes them learns from it which sensors made them, and of which scenes.
+A patch's pixels depend on the recipe and its number alone, not on the process that makes it. The
+recipe lies beside the pairs, and who takes them learns from it which sensors made them, and of
+which scenes.
 """
 
 import json
@@ -52,20 +54,26 @@ class DatasetRecipe:
     radiance_scale: float = 1.0
     seed: int = 0
     tolerance_dn: float = TOLERANCE_DN
-    scene_scale: float = 1.0  # scenes are resampled by it first, where the wanted ratio is no whole number
+    scene_scale: float = (
+        1.0  # scenes are resampled by it first, where the wanted ratio is no whole number
+    )
 
     def __post_init__(self) -> None:
         require_same_units(self.degraded, self.reference)
 
     def to_json(self) -> dict[str, object]:
         """The recipe as a file keeps it; scenes by name and digest."""
-        scenes = [{"name": p.name, "sha256": sha256(p)} if p else {"name": "drawn"} for p in self.scenes]
+        scenes = [
+            {"name": p.name, "sha256": sha256(p)} if p else {"name": "drawn"} for p in self.scenes
+        ]
         return asdict(self) | {"scenes": scenes}
 
 
 @dataclass(frozen=True)
 class Window:
-    """One patch: its number in the dataset, its scene, and the top left of its margin in scene pixels."""
+    """One patch: its number in the dataset, its scene, and the top left of its margin in scene
+    pixels.
+    """
 
     number: int
     scene: int
@@ -100,7 +108,9 @@ def _scene_windows(recipe: DatasetRecipe, index: int, first: int) -> Iterator[Wi
         return
     side = (recipe.patch_px + 2 * MARGIN_PX) * ratio
     step = recipe.patch_px * ratio
-    corners = [(y, x) for y in range(0, height - side + 1, step) for x in range(0, width - side + 1, step)]
+    corners = [
+        (y, x) for y in range(0, height - side + 1, step) for x in range(0, width - side + 1, step)
+    ]
     for k, (top, left) in enumerate(corners):
         yield Window(first + k, index, f"{stem}-{k:05d}", top, left, side, side)
 
@@ -153,20 +163,26 @@ PLAN = "plan"
 
 
 def _drawn(recipe: DatasetRecipe, window: Window) -> tuple[dict[str, Any], dict[str, Instrument]]:
-    """Return a pair's line of the manifest without its plans, and its sensors by role: no pixel decides them."""
+    """Return a pair's line of the manifest without its plans, and its sensors by role: no pixel
+    decides them.
+    """
     draw = Draw(recipe.seed, window.number)
     line: dict[str, Any] = {"number": window.number, "name": window.name, "seed": recipe.seed}
     line |= {"source": window.name.split("-", 1)[1], "top_px": window.top, "left_px": window.left}
     sensors = {}
     for role, profile in (("degraded", recipe.degraded), ("reference", recipe.reference)):
         sensors[role], rejected = profile.draw_counted(draw.generator(f"sensor-{role}"))
-        drawn = asdict(replace(sensors[role], response=None))  # the same for all: the recipe keeps it
+        drawn = asdict(
+            replace(sensors[role], response=None)
+        )  # the same for all: the recipe keeps it
         line[role] = {"sensor": drawn, "rejected_snr_pairs": rejected}
     return line, sensors
 
 
 def _is_drawn(recipe: DatasetRecipe, window: Window, text: str) -> bool:
-    """Return True if a line of the manifest states what the recipe draws: whoever forges it can make its digest."""
+    """Return True if a line of the manifest states what the recipe draws: whoever forges it can
+    make its digest.
+    """
     line: Any = parse_json(text)
     del line[DIGESTS]
     for role in ROLES:
@@ -192,7 +208,8 @@ def write_dataset(
 ) -> dict[str, float]:
     """Write a dataset of 12-bit TIFF patches and its manifest.
 
-    Pairs of an earlier run stay if they match the digests in their lines of the manifest; others are made again.
+    Pairs of an earlier run stay if they match the digests in their lines of the manifest; others
+    are made again.
 
     Args:
         recipe: what decides the pixels.
@@ -211,7 +228,9 @@ def write_dataset(
     windows = plan_windows(recipe)
     manifest = out / "manifest.jsonl"
     scenes = [list(group) for _, group in groupby(windows, key=lambda w: w.scene)]
-    chunks = [scene[first : first + CHUNK] for scene in scenes for first in range(0, len(scene), CHUNK)]
+    chunks = [
+        scene[first : first + CHUNK] for scene in scenes for first in range(0, len(scene), CHUNK)
+    ]
     parts = {out / "parts" / f"{chunk[0].number:08d}.jsonl": chunk for chunk in chunks}
     lines = _lines_left(recipe, out, windows, parts, log) if resume else {}
     waiting = {path: [w for w in chunk if w.number not in lines] for path, chunk in parts.items()}
@@ -219,8 +238,12 @@ def write_dataset(
     tick(len(lines))
     with ExitStack() as stack:
         if pool is None and workers > 1 and len(waiting) > 1:
-            spawn = multiprocessing.get_context("spawn")  # a forked copy of a library's threads can hang
-            pool = stack.enter_context(ProcessPoolExecutor(min(workers, MOST_PROCESSES), mp_context=spawn))
+            spawn = multiprocessing.get_context(
+                "spawn"
+            )  # a forked copy of a library's threads can hang
+            pool = stack.enter_context(
+                ProcessPoolExecutor(min(workers, MOST_PROCESSES), mp_context=spawn)
+            )
         for path, patches in stack.enter_context(closing(_made(recipe, waiting, workers, pool))):
             for window, patch in zip(waiting[path], patches, strict=True):
                 for role, dn in (("degraded", patch.degraded), ("reference", patch.reference)):
@@ -236,7 +259,9 @@ def write_dataset(
 
 
 def _remove_left_overs(out: Path) -> None:
-    """Delete the files that a run which was killed left half-written: `whole_file` names them so."""
+    """Delete the files that a run which was killed left half-written:
+    `whole_file` names them so.
+    """
     for folder in (out, out / "parts", *(out / role for role in ROLES)):
         for path in folder.glob(".*.[0-9]*.part"):
             if not path.is_dir():
@@ -244,17 +269,30 @@ def _remove_left_overs(out: Path) -> None:
 
 
 def _lines_left(
-    recipe: DatasetRecipe, out: Path, windows: list[Window], parts: Mapping[Path, list[Window]], log: Log
+    recipe: DatasetRecipe,
+    out: Path,
+    windows: list[Window],
+    parts: Mapping[Path, list[Window]],
+    log: Log,
 ) -> dict[int, str]:
-    """Return the lines of the pairs that an earlier run wrote and that match, by number; tell `log` of the others."""
+    """Return the lines of the pairs that an earlier run wrote and that match, by number; tell `log`
+    of the others.
+    """
     manifest = out / "manifest.jsonl"
     found = matching_lines(out, (manifest, *parts))
     known = ((w, found[w.number, w.name]) for w in windows if (w.number, w.name) in found)
     lines = {window.number: text for window, text in known if _is_drawn(recipe, window, text)}
-    stated = windows if manifest.exists() else [w for path, chunk in parts.items() if path.exists() for w in chunk]
+    stated = (
+        windows
+        if manifest.exists()
+        else [w for path, chunk in parts.items() if path.exists() for w in chunk]
+    )
     damaged = sum(window.number not in lines for window in stated)
     if damaged:
-        log(f"{damaged} of {len(stated)} pairs do not match the digests in the manifest: they are made again")
+        log(
+            f"{damaged} of {len(stated)} pairs do not match the digests in the manifest: they "
+            "are made again"
+        )
     return lines
 
 
@@ -290,7 +328,9 @@ def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
     found = path.read_bytes() if path.is_file() else b""
     # An editor or Git may have changed how its lines end.
     if found.replace(b"\r\n", b"\n") != wanted.encode():
-        raise OptionError("out", expected=expected, got="another dataset", remedy="choose another folder")
+        raise OptionError(
+            "out", expected=expected, got="another dataset", remedy="choose another folder"
+        )
     if not resume:
         remedy = "add `resume` or choose another folder"
         raise OptionError("out", expected=expected, got="this dataset", remedy=remedy)
@@ -301,13 +341,21 @@ def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
 def _read_summary(path: Path) -> dict[str, float]:
     """Patches, and the share of SNR pairs that were drawn again."""
     try:
-        lines: list[Any] = [parse_json(line) for line in path.read_text(encoding="utf-8").split("\n") if line]
-        rejected = sum(int(line[role]["rejected_snr_pairs"]) for line in lines for role in ("degraded", "reference"))
+        lines: list[Any] = [
+            parse_json(line) for line in path.read_text(encoding="utf-8").split("\n") if line
+        ]
+        rejected = sum(
+            int(line[role]["rejected_snr_pairs"])
+            for line in lines
+            for role in ("degraded", "reference")
+        )
         return {"patches": len(lines), "rejected_share": rejected / (rejected + 2 * len(lines))}
     except (ArithmeticError, LookupError, OSError, TypeError, ValueError) as error:
         got = " ".join(str(error).split())[:120]
         remedy = "choose another folder"
-        raise OptionError(str(path), expected="a dataset's manifest", got=got, remedy=remedy) from error
+        raise OptionError(
+            str(path), expected="a dataset's manifest", got=got, remedy=remedy
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -319,7 +367,8 @@ class PairsRecipe:
     scenes: tuple[str | None, ...]  # file names in their order; None for a drawn scene
 
     def site(self, stem: str) -> str:
-        """The site of the pair NUMBER-SCENE or NUMBER-SCENE-PATCH: two frames of a site, or two patches, are one.
+        """The site of the pair NUMBER-SCENE or NUMBER-SCENE-PATCH: two frames of a site, or two
+        patches, are one.
 
         A drawn scene is a site of its own.
         """
@@ -340,19 +389,29 @@ def read_pairs_recipe(folder: Path) -> PairsRecipe | None:
         sensors = {role: dict(raw[role]) for role in ("degraded", "reference")}
     except (LookupError, OSError, TypeError, ValueError) as error:
         remedy = "make the pairs anew, or remove it and give `sensor`"
-        raise OptionError(str(path), expected="a dataset's recipe", got="another file", remedy=remedy) from error
+        raise OptionError(
+            str(path), expected="a dataset's recipe", got="another file", remedy=remedy
+        ) from error
     profiles = {role: sensor_from_json(f"{path} {role}", raw) for role, raw in sensors.items()}
     return PairsRecipe(profiles["degraded"], profiles["reference"], scenes)
 
 
 def profiles_for(
-    sensor: SensorLike | None, reference: SensorLike | None, recipe: PairsRecipe | None, say: Callable[[str], None]
+    sensor: SensorLike | None,
+    reference: SensorLike | None,
+    recipe: PairsRecipe | None,
+    say: Callable[[str], None],
 ) -> tuple[Sensor, Sensor]:
-    """The profiles of degraded and reference images: the recipe's where there is one, else those named."""
+    """The profiles of degraded and reference images: the recipe's where there is one, else those
+    named.
+    """
     if recipe is None:
         degraded = Sensor.load(sensor or SENSOR)
         return degraded, reference_beside(degraded, reference, say)
-    named = sensor and Sensor.load(sensor), reference and Sensor.load(reference).in_units_of(recipe.degraded)
+    named = (
+        sensor and Sensor.load(sensor),
+        reference and Sensor.load(reference).in_units_of(recipe.degraded),
+    )
     _require_made_by("sensor", named[0] or None, recipe.degraded)
     _require_made_by("reference", named[1] or None, recipe.reference)
     return recipe.degraded, recipe.reference
@@ -361,4 +420,6 @@ def profiles_for(
 def _require_made_by(option: str, named: Sensor | None, made: Sensor) -> None:
     if named is not None and not same_instrument(named, made):
         expected = f"the sensor that made the pairs, {made.name} with the numbers in recipe.json"
-        raise OptionError(option, expected=expected, got=f"{named.name} with other numbers", remedy="leave it out")
+        raise OptionError(
+            option, expected=expected, got=f"{named.name} with other numbers", remedy="leave it out"
+        )

@@ -4,28 +4,42 @@ import math
 
 import numpy as np
 
-from beers_deploy.model.curves import DEEPEST_BEND, FREQUENCIES, LONGEST_SMEAR_PX, OBSCURATIONS, Curve, pupil_contrast
+from beers_deploy.model.curves import (
+    DEEPEST_BEND,
+    FREQUENCIES,
+    LONGEST_SMEAR_PX,
+    OBSCURATIONS,
+    Curve,
+    pupil_contrast,
+)
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.response import NYQUIST
 from beers_deploy.profiles.sensor import Instrument
 
 MARGIN = 0.05
-"""How far a curve may lie outside those of training, as a share: networks lose 0.1 dB and more from there on
-(measured)."""
+"""How far a curve may lie outside those of training, as a share: networks lose 0.1 dB and more from
+there on (measured).
+"""
 
 
 def departure(sensor: Instrument, kernels: Kernels) -> str:
-    """Say where a sensor's curve departs from the curves that a network was trained on; "" if it does not.
+    """Say where a sensor's curve departs from the curves that a network was trained on; "" if it
+    does not.
 
     Args:
         sensor: its MTF and smear.
-        kernels: of the network's banks: networks of before they were fitted know the formula's curve alone.
+        kernels: of the network's banks: networks of before they were fitted know the formula's
+            curve alone.
     """
     zero = np.zeros((1, 1))
     for axis, contrast in zip(("across", "along"), sensor.mtf_axes, strict=True):
         frequency = FREQUENCIES[None]
-        seen = sensor_mtf(frequency, zero, sensor) if axis == "across" else sensor_mtf(zero, frequency.T, sensor)
+        seen = (
+            sensor_mtf(frequency, zero, sensor)
+            if axis == "across"
+            else sensor_mtf(zero, frequency.T, sensor)
+        )
         curve = np.abs(np.ravel(seen))
         smeared = axis == "along" and bool(sensor.smear_px)
         at_nyquist = float(curve[-1]) if smeared else contrast
@@ -36,15 +50,19 @@ def departure(sensor: Instrument, kernels: Kernels) -> str:
         worst = int(outside[:-1].argmax())
         if outside[worst] > 1:
             return (
-                f"the MTF {axis} the track is {curve[worst]:.3g} at {FREQUENCIES[worst]:.2g} cycles per pixel, where "
-                f"the network was trained on {low[worst]:.3g} to {high[worst]:.3g} for that contrast at Nyquist: it "
+                f"the MTF {axis} the track is {curve[worst]:.3g} at {FREQUENCIES[worst]:.2g} "
+                "cycles per pixel, where "
+                f"the network was trained on {low[worst]:.3g} to {high[worst]:.3g} for that "
+                "contrast at Nyquist: it "
                 "may restore worse than the traditional pipeline"
             )
     return ""
 
 
 def _known_curves(contrast: float, kernels: Kernels) -> list[Curve]:
-    """Curves at FREQUENCIES that hold between them all that training draws for a contrast at Nyquist."""
+    """Curves at FREQUENCIES that hold between them all that training draws for a contrast at
+    Nyquist.
+    """
     detector = np.sinc(FREQUENCIES)
     share = FREQUENCIES / NYQUIST
     if kernels == "cut":
@@ -57,6 +75,11 @@ def _known_curves(contrast: float, kernels: Kernels) -> list[Curve]:
         left = min(contrast / float(kept[-1]), 1.0)
         formula = left**share
         pupils = [pupil_contrast(left, obscuration) for obscuration in OBSCURATIONS]
-        optics = [left ** (share**2), *pupils, formula * (1 - bend), np.minimum(formula * (1 + bend), 1.0)]
+        optics = [
+            left ** (share**2),
+            *pupils,
+            formula * (1 - bend),
+            np.minimum(formula * (1 + bend), 1.0),
+        ]
         curves += [np.asarray(each * kept) for each in optics]
     return curves

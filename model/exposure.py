@@ -1,13 +1,14 @@
-"""Exposure: dark parts of an image are multiplied before a network sees them, and divided afterwards.
+"""Exposure: dark parts of an image are multiplied before a network sees them, and divided
+afterwards.
 
-Inside a network, and in INT8 above all, everything is relative to full scale: its steps add about 2 DN rms at every
-level, so in the dark it hardly denoises. An image of digital numbers times a factor is the image of a sensor of as
-many times the gain, and a network that is conditioned on its sensor can be given just that sensor. So the same
-weights restore dark ground as well as bright ground.
+Inside a network, and in INT8 above all, everything is relative to full scale: its steps add about 2
+DN rms at every level, so in the dark it hardly denoises. An image of digital numbers times a factor
+is the image of a sensor of as many times the gain, and a network that is conditioned on its sensor
+can be given just that sensor. So the same weights restore dark ground as well as bright ground.
 
-A pixel takes the highest factor at which no pixel within the network's receptive radius exceeds HEADROOM of full
-scale. So the choice depends on nothing but the pixels that the network reads anyway, and tiles with an exact halo
-choose as the whole image does.
+A pixel takes the highest factor at which no pixel within the network's receptive radius exceeds
+HEADROOM of full scale. So the choice depends on nothing but the pixels that the network reads
+anyway, and tiles with an exact halo choose as the whole image does.
 """
 
 from collections.abc import Iterable
@@ -24,24 +25,32 @@ FACTORS = (2, 4, 8)
 """Powers of two, by which an image is multiplied without rounding."""
 
 MOST_FACTORS = 2
-"""Only the highest of the possible factors are used: each one that a tile asks for costs one more run of the
-network, and a factor of 2 below 4 and 8 gains less than 0.02 dB (measured on training places)."""
+"""Only the highest of the possible factors are used: each one that a tile asks for costs one more
+run of the network, and a factor of 2 below 4 and 8 gains less than 0.02 dB (measured on training
+places).
+"""
 
 HEADROOM = 0.6
-"""Share of full scale that an image may reach once it was multiplied. Restored edges overshoot the raw image and INT8
-clips large corrections: with the whole of full scale, bright scenes lost 0.2 dB; from 0.4 to 0.8 none lost
-(measured on training places)."""
+"""Share of full scale that an image may reach once it was multiplied.
+
+Restored edges overshoot the raw image and INT8 clips large corrections: with the whole of full
+scale, bright scenes lost 0.2 dB; from 0.4 to 0.8 none lost (measured on training places).
+"""
 
 NOISE_BEYOND = 1.25
-"""How far the noise may lie above what training saw. At 1.25 times the networks still gain 0.1 to 0.8 dB, at 1.4
-times they lose 0.2 dB in some scenes, at twice 4 dB (measured)."""
+"""How far the noise may lie above what training saw.
+
+At 1.25 times the networks still gain 0.1 to 0.8 dB, at 1.4 times they lose 0.2 dB in some scenes,
+at twice 4 dB (measured).
+"""
 
 
 def factors_for(sensor: Instrument) -> tuple[int, ...]:
-    """Return the factors that a network conditioned on `sensor` can use, 1 among them, in rising order.
+    """Return the factors that a network conditioned on `sensor` can use, 1 among them, in rising
+    order.
 
-    A factor raises the noise over full scale. A factor is left out if the noise leaves the range of training by more
-    than NOISE_BEYOND.
+    A factor raises the noise over full scale. A factor is left out if the noise leaves the range of
+    training by more than NOISE_BEYOND.
     """
     usable = [factor for factor in FACTORS if _within_training(sensor, factor)]
     return (1, *usable[-MOST_FACTORS:])
@@ -50,7 +59,9 @@ def factors_for(sensor: Instrument) -> tuple[int, ...]:
 def _within_training(sensor: Instrument, factor: int) -> bool:
     brighter = replace(sensor, gain_dn_per_radiance=sensor.gain_dn_per_radiance * factor)
     values = sensor_values(brighter)
-    return all(values[key] <= NOISE_BEYOND * RANGES[key][1] for key in ("sigma_dark", "sigma_bright"))
+    return all(
+        values[key] <= NOISE_BEYOND * RANGES[key][1] for key in ("sigma_dark", "sigma_bright")
+    )
 
 
 def brightened(sensor: Sensor, factor: int) -> Sensor:
@@ -59,7 +70,11 @@ def brightened(sensor: Sensor, factor: int) -> Sensor:
 
 
 def choose_factors(
-    image: NDArray[np.float32], factors: Iterable[int], radius_px: int, full_scale: float, offset: float
+    image: NDArray[np.float32],
+    factors: Iterable[int],
+    radius_px: int,
+    full_scale: float,
+    offset: float,
 ) -> NDArray[np.int64]:
     """Choose the factor of every pixel.
 
@@ -71,10 +86,13 @@ def choose_factors(
         offset: the pixel value of the dark, which is no light and is not multiplied.
 
     Returns:
-        (h, w) one of `factors` for each pixel; exact where `radius_px` more pixels around it are in `image`.
+        (h, w) one of `factors` for each pixel; exact where `radius_px` more pixels around it are in
+            `image`.
     """
     size = 2 * radius_px + 1
-    brightest = maximum_filter1d(maximum_filter1d(image, size, axis=0, mode="nearest"), size, axis=1, mode="nearest")
+    brightest = maximum_filter1d(
+        maximum_filter1d(image, size, axis=0, mode="nearest"), size, axis=1, mode="nearest"
+    )
     chosen = np.ones(image.shape, np.int64)
     for factor in factors:
         if factor > 1:

@@ -1,8 +1,8 @@
 """The sensors that a network for every sensor is trained on, and what it is told of each.
 
-The network sees images over full scale, so a sensor's noise is stated over full scale too, at 1/16 and at 1/4 of it:
-that is at 25 and at 100 W/m2/sr/um where full scale is 400. This is NumPy alone, so that a restoration begins without
-torch.
+The network sees images over full scale, so a sensor's noise is stated over full scale too, at 1/16
+and at 1/4 of it: that is at 25 and at 100 W/m2/sr/um where full scale is 400. This is NumPy alone,
+so that a restoration begins without torch.
 """
 
 import math
@@ -20,9 +20,10 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "sigma_dark": (0.00056, 0.0072),
     "sigma_bright": (0.0011, 0.0072),
 }
-"""What a network can know of its sensor, in this order: MTF at Nyquist across (horizontal) and along the track
-(vertical), and the noise's standard deviation over full scale at 1/16 and at 1/4 of it. The logarithm of each, -1 to
-1 from end to end, is the sensor vector."""
+"""What a network can know of its sensor, in this order: MTF at Nyquist across (horizontal) and
+along the track (vertical), and the noise's standard deviation over full scale at 1/16 and at 1/4 of
+it. The logarithm of each, -1 to 1 from end to end, is the sensor vector.
+"""
 
 LEAST_ALONG = 0.4
 """The lower MTF of the two axes over the higher one: the least that is trained on."""
@@ -34,7 +35,9 @@ SNR_BRIGHT = (35.0, 220.0)
 """Of the sensors trained on, at 1/4 of full scale; at 1/16 all that physics allows for it."""
 
 EDGE = 0.05
-"""Draws reach this share of a range beyond its ends and are brought back: no draws from outside train the ends."""
+"""Draws reach this share of a range beyond its ends and are brought back: no draws from outside
+train the ends.
+"""
 
 
 @dataclass(frozen=True)
@@ -43,8 +46,8 @@ class SensorVector:
 
     Attributes:
         values: four of them as in `RANGES`, each in [-1, 1].
-        outside: a sentence for each value that lies outside its range, and was moved to the nearest end of it; and
-            one for axes that differ more than any sensor did in training.
+        outside: a sentence for each value that lies outside its range, and was moved to the nearest
+            end of it; and one for axes that differ more than any sensor did in training.
     """
 
     values: tuple[float, ...]
@@ -53,7 +56,8 @@ class SensorVector:
 
 def sensor_values(sensor: Instrument) -> dict[str, float]:
     """The four values of `RANGES`, smear and rounding noise counted."""
-    # A network knows no smear of its own: what that leaves of the contrast along the track is counted there.
+    # A network knows no smear of its own: what that leaves of the contrast along the track is
+    # counted there.
     kept = abs(float(np.sinc(0.5 * sensor.smear_px)))
     sigmas = [noise_over_full_scale(sensor, part) for part in (16, 4)]
     across, along = sensor.mtf_axes
@@ -61,7 +65,9 @@ def sensor_values(sensor: Instrument) -> dict[str, float]:
 
 
 def noise_over_full_scale(sensor: Instrument, part: int = 4) -> float:
-    """Standard deviation of noise at that part of full scale, that of rounding counted, over full scale."""
+    """Standard deviation of noise at that part of full scale, that of rounding counted, over full
+    scale.
+    """
     full_scale = sensor.max_dn / sensor.gain_dn_per_radiance
     rounding = 1 / (12 * sensor.gain_dn_per_radiance**2)
     return math.sqrt(sensor.noise_sigma(full_scale / part) ** 2 + rounding) / full_scale
@@ -76,14 +82,16 @@ def sensor_vector(sensor: Instrument) -> SensorVector:
         inside = min(max(value, low), high)
         if inside != value:
             outside.append(
-                f"{name} {value:.3g} is outside {low:g} to {high:g}, the network is told {inside:g} "
+                f"{name} {value:.3g} is outside {low:g} to {high:g}, the network is told "
+                f"{inside:g} "
                 "and may restore worse than blind"
             )
         entries.append(2 * math.log(inside / low) / math.log(high / low) - 1)
     lower, higher = sorted((values["mtf_across"], values["mtf_along"]))
     if lower < (1 - ROUNDING) * LEAST_ALONG * higher:
         outside.append(
-            f"the lower MTF is {lower / higher:.2g} of the other axis'; {LEAST_ALONG:g} and more was trained"
+            f"the lower MTF is {lower / higher:.2g} of the other axis'; {LEAST_ALONG:g} and "
+            "more was trained"
         )
     return SensorVector(tuple(entries), tuple(outside))
 
@@ -95,7 +103,8 @@ class SensorFamily:
     Attributes:
         like: gives gain and bits; its MTF and noise do not matter.
         snr_bright: at a quarter of full scale.
-        other_curves: share of the sensors whose MTF has another curve than the formula's, see `model.curves`.
+        other_curves: share of the sensors whose MTF has another curve than the formula's, see
+            `model.curves`.
     """
 
     like: Instrument
@@ -109,7 +118,8 @@ class SensorFamily:
         along = max(mtf * LEAST_ALONG ** float(generator.uniform() ** 2), RANGES["mtf_along"][0])
         full_scale = self.like.max_dn / self.like.gain_dn_per_radiance
         sigma = full_scale / 4 / _log_uniform(generator, *self.snr_bright)
-        # Variance alpha L + beta: all of it in alpha halves sigma at a quarter of the radiance, all in beta keeps it.
+        # Variance alpha L + beta: all of it in alpha halves sigma at a quarter of the radiance, all
+        # in beta keeps it.
         dark = sigma * _log_uniform(generator, 0.5, 1.0)
         alpha = max(sigma**2 - dark**2, 0.0) / (full_scale * 3 / 16)
         beta = max(dark**2 - alpha * full_scale / 16, 0.0)

@@ -1,6 +1,8 @@
-"""The manifest of a dataset: a line of JSON for each pair, with the digests of its two images and of the line.
+"""The manifest of a dataset: a line of JSON for each pair, with the digests of its two images and
+of the line.
 
-A dataset that is continued trusts no pair for being there: a pair counts if its line and both images match.
+A dataset that is continued trusts no pair for being there: a pair counts if its line and both
+images match.
 """
 
 import hashlib
@@ -36,7 +38,8 @@ def line_text(out: Path, line: Line) -> str:
 
 
 def matching_lines(out: Path, files: Iterable[Path]) -> dict[tuple[int, str], str]:
-    """Return the lines of some manifests that match their digests and images, by number and name of the pair.
+    """Return the lines of some manifests that match their digests and images, by number and name of
+    the pair.
 
     Args:
         out: the dataset's folder.
@@ -61,7 +64,9 @@ def _matching(out: Path, text: str) -> dict[str, Any] | None:
         digests = dict(line.pop(DIGESTS))
         if digests.pop("line") != _digest(line) or not text.endswith("\n"):
             return None
-        if not (isinstance(line["number"], int) and all(isinstance(line[role], dict) for role in ROLES)):
+        if not (
+            isinstance(line["number"], int) and all(isinstance(line[role], dict) for role in ROLES)
+        ):
             return None
         same = digests == {role: sha256(image_of(out, role, line["name"])) for role in ROLES}
     except (LookupError, OSError, TypeError, ValueError):

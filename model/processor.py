@@ -1,8 +1,8 @@
 """This machine's processor: its name, and what its kernels do, asked of the runtimes that run them.
 
-The name decides nothing. Lists of features would not serve either: an emulator shows its host's, other systems show
-none, and a runtime may not use what is there. So each question is a tiny computation whose right answer is known,
-put once a process, when somebody needs it.
+The name decides nothing. Lists of features would not serve either: an emulator shows its host's,
+other systems show none, and a runtime may not use what is there. So each question is a tiny
+computation whose right answer is known, put once a process, when somebody needs it.
 """
 
 import os
@@ -41,14 +41,17 @@ Convolve = Callable[[bytes, "np.ndarray"], "np.ndarray"]
 
 @lru_cache(maxsize=1)
 def int8_adds_exactly() -> bool:
-    """Whether onnxruntime adds products of uint8 activations and int8 weights without saturation: see `asked`."""
+    """Whether onnxruntime adds products of uint8 activations and int8 weights without saturation:
+    see `asked`.
+    """
     return asked("onnxruntime", _on_onnxruntime)
 
 
 def asked(runtime: str, convolve: Convolve) -> bool:
     """Whether a runtime's integer convolutions add exactly, told by one of the largest numbers.
 
-    x86 kernels without VNNI add pairs of products of uint8 and int8 in saturating int16, and give half of this sum.
+    x86 kernels without VNNI add pairs of products of uint8 and int8 in saturating int16, and give
+    half of this sum.
     """
     import numpy as np
 
@@ -70,17 +73,26 @@ def _on_onnxruntime(model: bytes, image: "np.ndarray") -> "np.ndarray":
 
 
 def _largest_convolution() -> bytes:
-    """An ONNX file: one window over the whole image, all weights the largest, the sum scaled to RESULT."""
+    """An ONNX file: one window over the whole image, all weights the largest, the sum scaled to
+    RESULT.
+    """
     import numpy as np
     from onnx import TensorProto, helper, numpy_helper
 
     weight = np.full((CHANNELS, CHANNELS, SIDE_PX, SIDE_PX), WEIGHT, np.int8)
     scale = np.float32(ACTIVATION * WEIGHT * weight[0].size / RESULT)
-    values = {"one": np.float32(1), "zero": np.uint8(0), "weight": weight, "signed_zero": np.int8(0), "scale": scale}
+    values = {
+        "one": np.float32(1),
+        "zero": np.uint8(0),
+        "weight": weight,
+        "signed_zero": np.int8(0),
+        "scale": scale,
+    }
     feeds = ["image", "one", "zero", "weight", "one", "signed_zero", "scale", "zero"]
     sizes = {"image": SIDE_PX, "result": 1}
     ends = [
-        helper.make_tensor_value_info(name, TensorProto.UINT8, [1, CHANNELS, px, px]) for name, px in sizes.items()
+        helper.make_tensor_value_info(name, TensorProto.UINT8, [1, CHANNELS, px, px])
+        for name, px in sizes.items()
     ]
     constants = [numpy_helper.from_array(np.asarray(value), name) for name, value in values.items()]
     node = helper.make_node("QLinearConv", feeds, ["result"])
@@ -99,8 +111,8 @@ WINDOWS_KEY = r"HARDWARE\DESCRIPTION\System\CentralProcessor\0"
 def processor_name() -> str | None:
     """Such as "AMD EPYC 7763 64-Core Processor" or "Apple M2".
 
-    None where the system tells no name, and under user-mode emulation, where the one it tells is of the processor
-    beneath the emulated one.
+    None where the system tells no name, and under user-mode emulation, where the one it tells is of
+    the processor beneath the emulated one.
     """
     ways = {"Linux": _linux_name, "Darwin": _macos_name, "Windows": _windows_name}
     try:
@@ -117,12 +129,17 @@ def _linux_name() -> str:
     if names := cores.get("model name"):
         return ", ".join(names)
     if parts := cores.get("CPU part"):  # ARM's kernel knows numbers alone
-        return f"ARM part {', '.join(parts)} of implementer {', '.join(cores.get('CPU implementer', ['unknown']))}"
+        return (
+            f"ARM part {', '.join(parts)} of implementer "
+            f"{', '.join(cores.get('CPU implementer', ['unknown']))}"
+        )
     return ""
 
 
 def _fields(cpuinfo: str) -> dict[str, list[str]]:
-    """The different values of each field, in order: large and small cores have names of their own."""
+    """The different values of each field, in order: large and small cores have
+    names of their own.
+    """
     found: dict[str, list[str]] = {}
     for line in cpuinfo.splitlines():
         key, _, value = (part.strip() for part in line.partition(":"))
@@ -133,7 +150,9 @@ def _fields(cpuinfo: str) -> dict[str, list[str]]:
 
 def _macos_name() -> str:
     command = ["/usr/sbin/sysctl", "-n", "machdep.cpu.brand_string"]
-    return subprocess.run(command, capture_output=True, encoding="utf-8", timeout=5, check=True).stdout  # noqa: S603
+    return subprocess.run(  # noqa: S603
+        command, capture_output=True, encoding="utf-8", timeout=5, check=True
+    ).stdout
 
 
 def _windows_name() -> str:
@@ -150,8 +169,12 @@ SEEDS = 2**62
 
 
 def require_cores(option: str, asked: int) -> None:
-    """Refuse more threads or processes than this machine has logical cores; 0 is the option's own default."""
+    """Refuse more threads or processes than this machine has logical cores; 0 is the option's own
+    default.
+    """
     cores = os.cpu_count() or 1
     if not 0 <= asked <= cores:
         expected = f"0 to {cores}, the cores of this machine"
-        raise OptionError(option, expected=expected, got=str(asked), remedy="leave it out for the default")
+        raise OptionError(
+            option, expected=expected, got=str(asked), remedy="leave it out for the default"
+        )

@@ -1,8 +1,8 @@
 """Long work: its progress is shown, and Ctrl-C waits for a good moment.
 
-`steps` is a bar for work whose length is known, `progress` names one step after the other where it is not. On a
-terminal both are rich's, elsewhere plain lines, always on standard error. An interrupt arrives between
-two steps, never within one: a half-made update cannot be resumed.
+`steps` is a bar for work whose length is known, `progress` names one step after the other where it
+is not. On a terminal both are rich's, elsewhere plain lines, always on standard error. An interrupt
+arrives between two steps, never within one: a half-made update cannot be resumed.
 """
 
 import signal
@@ -28,7 +28,9 @@ LINE_EVERY_S = 5.0
 
 @dataclass(frozen=True)
 class Step:
-    """How far a piece of work is: what is done, how many steps of it, and of how many (None where none can say)."""
+    """How far a piece of work is: what is done, how many steps of it, and of how many (None where
+    none can say).
+    """
 
     what: str
     done: int
@@ -36,7 +38,9 @@ class Step:
 
 
 Progress = bool | Callable[[Step], None] | None
-"""How a caller wants to be told: a function, False for not at all, None or True for a bar or plain lines."""
+"""How a caller wants to be told: a function, False for not at all, None or True for a bar or plain
+lines.
+"""
 
 _sink: ContextVar[Progress] = ContextVar("progress", default=None)
 
@@ -62,7 +66,9 @@ def no_log(_: str) -> None:
 
 
 def once(log: Log) -> Log:
-    """Tells each sentence the first time alone: several networks of one sensor have the same to say."""
+    """Tells each sentence the first time alone: several networks of one sensor have the same to
+    say.
+    """
     told = set[str]()
 
     def tell(sentence: str) -> None:
@@ -93,7 +99,9 @@ class Steps:
             sink(Step(shown, self.done, self.total))
         elif self._bar is not None and self._task is not None:
             self._bar.update(self._task, completed=self.done, description=one_line(shown))
-        elif sink is not False and (time.monotonic() - self._printed > LINE_EVERY_S or self.done >= self.total):
+        elif sink is not False and (
+            time.monotonic() - self._printed > LINE_EVERY_S or self.done >= self.total
+        ):
             self._printed = time.monotonic()
             _line(f"{self.label}: {self.done}/{self.total} {note}".rstrip())
 
@@ -104,14 +112,20 @@ def steps(label: str, total: int) -> Iterator[Steps]:
     if _sink.get() not in (None, True) or not _shows_bars():
         yield Steps(label, total, None)
         return
-    columns = (rich_progress.BarColumn(), rich_progress.MofNCompleteColumn(), rich_progress.TimeRemainingColumn())
+    columns = (
+        rich_progress.BarColumn(),
+        rich_progress.MofNCompleteColumn(),
+        rich_progress.TimeRemainingColumn(),
+    )
     with _bar(*columns) as bar:
         yield Steps(label, total, bar)
 
 
 @contextmanager
 def progress(label: str) -> Iterator[Log]:
-    """Show the name of each step that is begun while the block runs, and on a terminal the time since it began."""
+    """Show the name of each step that is begun while the block runs, and on a terminal the time
+    since it began.
+    """
     sink = _sink.get()
     if callable(sink):
         begun = iter(range(sys.maxsize))
@@ -131,7 +145,9 @@ def _line(text: str) -> None:
 
 
 def _bar(*columns: rich_progress.ProgressColumn) -> rich_progress.Progress:
-    words = rich_progress.TextColumn("{task.description}", markup=False)  # a name in brackets is a name
+    words = rich_progress.TextColumn(
+        "{task.description}", markup=False
+    )  # a name in brackets is a name
     return rich_progress.Progress(words, *columns, console=Console(stderr=True), transient=True)
 
 

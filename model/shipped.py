@@ -10,18 +10,24 @@ VARIANT = "convbeers-s"
 
 DETECTOR = SHIPPED / "detector.onnx"
 DETECTOR_INT8 = SHIPPED / "detector-int8.onnx"
-"""What finds vehicles, ships, aircraft and tanks of drawn scenes: in float32, and under the DPU's rules."""
+"""What finds vehicles, ships, aircraft and tanks of drawn scenes: in float32, and under the DPU's
+rules.
+"""
 
 INT8 = "-int8"
 """Behind a network's name: that network in INT8."""
 
 SENSOR = "pleiades-degraded"
-"""The sensor profile of a command that names none: the same for all. (`train` alone defaults to a range of
-sensors, and `restore` to a sensor that is not known.)"""
+"""The sensor profile of a command that names none: the same for all.
+
+(`train` alone defaults to a range of sensors, and `restore` to a sensor that is not known.)
+"""
 
 
 def shipped_names() -> list[str]:
-    """The names of the shipped networks: each the weights of one network for every sensor in range."""
+    """The names of the shipped networks: each the weights of one network for
+    every sensor in range.
+    """
     return sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
 
 

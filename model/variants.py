@@ -1,7 +1,9 @@
-"""The sizes of ConvBEERS by name, and the tensors that each is made of; nothing is loaded to know them.
+"""The sizes of ConvBEERS by name, and the tensors that each is made of; nothing is loaded to know
+them.
 
-The paper's family works at full resolution. A variant of scale 2 sees each square of 2 x 2 pixels as one place of
-four channels, and so works at half resolution: its maps have a quarter of the places.
+The paper's family works at full resolution. A variant of scale 2 sees each square of 2 x 2 pixels
+as one place of four channels, and so works at half resolution: its maps have a quarter of the
+places.
 """
 
 from collections.abc import Mapping
@@ -11,12 +13,16 @@ from typing import Literal
 from beers_deploy.profiles.errors import OptionError
 
 Kernels = Literal["cut", "fitted"]
-"""How the filters in front of a network become kernels of 7 x 7: cut out of the whole, or fitted. Networks behind the
-second kind were trained on many curves of the MTF (`model.curves`)."""
+"""How the filters in front of a network become kernels of 7 x 7: cut out of the whole, or fitted.
+
+Networks behind the second kind were trained on many curves of the MTF (`model.curves`).
+"""
 
 BANK_PLANES = 5
 SENSOR_VALUES = 4
-"""What a head behind a bank reads: the image and four planes of each pixel, and the numbers of a sensor vector."""
+"""What a head behind a bank reads: the image and four planes of each pixel, and the numbers of a
+sensor vector.
+"""
 
 
 @dataclass(frozen=True)
@@ -26,7 +32,8 @@ class Variant:
     Attributes:
         blocks: residual blocks.
         features: channels of the maps between head and tail.
-        scale: side in pixels of the square that is one place of the maps; images have multiples of it as sides.
+        scale: side in pixels of the square that is one place of the maps; images have multiples of
+            it as sides.
     """
 
     blocks: int
@@ -40,7 +47,9 @@ class Variant:
 
     @property
     def convolutions(self) -> Mapping[str, tuple[int, int]]:
-        """(outputs, inputs) of each 3 x 3 convolution by name, in the order in which an image meets them."""
+        """(outputs, inputs) of each 3 x 3 convolution by name, in the order in which an image meets
+        them.
+        """
         inner = [f"body.{k}.{place}" for k in range(self.blocks) for place in ("first", "second")]
         same = (self.features, self.features)
         ends = {"head": (self.features, self.pixels)}, {"tail": (self.pixels, self.features)}
@@ -56,7 +65,9 @@ class Variant:
 
     @property
     def banked_shapes(self) -> dict[str, tuple[int, ...]]:
-        """As `shapes`, behind a bank of four filters: its head reads their planes, and is told a sensor vector."""
+        """As `shapes`, behind a bank of four filters: its head reads their planes, and is told a
+        sensor vector.
+        """
         head = self.features, BANK_PLANES * self.pixels, 3, 3
         return {**self.shapes, "head.weight": head, "bias.weight": (self.features, SENSOR_VALUES)}
 

@@ -1,4 +1,6 @@
-"""Read NumPy's files, which may come from anyone: nothing is unpickled, and any damage is one reason in words."""
+"""Read NumPy's files, which may come from anyone: nothing is unpickled, and any damage is one
+reason in words.
+"""
 
 from pathlib import Path
 
@@ -13,7 +15,8 @@ ALONE = ""
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a .npz file by name, or that of a .npy file, mapped, under the name `ALONE`.
+    """Return the arrays of a .npz file by name, or that of a .npy file, mapped, under the name
+    `ALONE`.
 
     The content tells which of the two a file is, not its name.
 
@@ -28,11 +31,18 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
             archive = stream.read(len(ZIP)) == ZIP
         if not archive:
             return {ALONE: np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))}
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as held:  # NumPy leaves a broken one open
+        with (
+            path.open("rb") as stream,
+            np.load(stream, allow_pickle=False) as held,
+        ):  # NumPy leaves a broken one open
             return {name: np.asarray(held[name]) for name in held.files}
     except (AttributeError, ImportError, NameError):
         raise  # NumPy was called in a way that it does not know, whatever the file holds
     except MemoryError:
         raise ValueError("an array that does not fit into memory") from None
-    except Exception as error:  # each decompressor and the parser of NumPy's header raise classes of their own
-        raise ValueError(f"another file ({type(error).__name__}: {' '.join(str(error).split())[:80]})") from error
+    except (
+        Exception
+    ) as error:  # each decompressor and the parser of NumPy's header raise classes of their own
+        raise ValueError(
+            f"another file ({type(error).__name__}: {' '.join(str(error).split())[:80]})"
+        ) from error

@@ -8,8 +8,9 @@ from typing import Literal, get_args
 from beers_deploy.profiles.errors import ProfileError
 
 Status = Literal["published", "inferred", "measured", "assumed", "stated"]
-"""published: in a document; measured: on the instrument; inferred: computed from such; assumed: our choice; stated:
-the user's own."""
+"""published: in a document; measured: on the instrument; inferred: computed from such; assumed: our
+choice; stated: the user's own.
+"""
 
 Number = float | tuple[float, float]
 
@@ -43,7 +44,9 @@ class Constant:
 
 @dataclass(frozen=True)
 class Words:
-    """A list of names, which may be empty, with its provenance: what an operation can be fused with."""
+    """A list of names, which may be empty, with its provenance: what an operation can be fused
+    with.
+    """
 
     value: tuple[str, ...]
     status: Status
@@ -54,9 +57,13 @@ class Words:
 
 
 def read_words(where: str, raw: object, known: Collection[str] = ()) -> Words:
-    """Read `["ReLU"]` or `{ value = ["ReLU"], status = ..., source = ... }`; of any names where none are known."""
+    """Read `["ReLU"]` or `{ value = ["ReLU"], status = ..., source = ... }`; of any names where
+    none are known.
+    """
     value, status, source = read_stated(where, raw)
-    if not isinstance(value, list) or not all(isinstance(name, str) and name in (known or value) for name in value):
+    if not isinstance(value, list) or not all(
+        isinstance(name, str) and name in (known or value) for name in value
+    ):
         expected = f"a list out of {', '.join(known)}" if known else "a list of names"
         remedy = "correct the names; an empty list stands for none"
         raise ProfileError(where, expected=expected, got=repr(value), remedy=remedy)
@@ -73,7 +80,9 @@ def read_constant(where: str, raw: object) -> Constant:
 
 
 def read_stated(where: str, raw: object) -> tuple[object, Status, str]:
-    """Value, status and source of what a profile states in either way; the value, of any kind, is not checked."""
+    """Value, status and source of what a profile states in either way; the value, of any kind, is
+    not checked.
+    """
     if not isinstance(raw, Mapping):
         return raw, "stated", "stated by the profile without a source"
     check_keys(where, raw, required={"value", "status", "source"})
@@ -84,7 +93,9 @@ def read_stated(where: str, raw: object) -> tuple[object, Status, str]:
         expected = "one of " + ", ".join(get_args(Status))
         raise ProfileError(f"{where}.status", expected=expected, got=repr(status), remedy=remedy)
     if not isinstance(source, str) or not source.strip():
-        raise ProfileError(f"{where}.source", expected="a text naming a document", got=repr(source), remedy=remedy)
+        raise ProfileError(
+            f"{where}.source", expected="a text naming a document", got=repr(source), remedy=remedy
+        )
     return raw["value"], status, source
 
 
@@ -99,18 +110,28 @@ def check_keys(
     for key in raw:
         if key not in allowed:
             raise ProfileError(
-                where, expected=f"the keys {', '.join(sorted(allowed))}", got=f"{key!r}", remedy=_rename(key, allowed)
+                where,
+                expected=f"the keys {', '.join(sorted(allowed))}",
+                got=f"{key!r}",
+                remedy=_rename(key, allowed),
             )
     for key in sorted(required - set(raw)):
         raise ProfileError(
-            where, expected=f"the key {key!r}", got="none", remedy="add it; a shipped profile shows how"
+            where,
+            expected=f"the key {key!r}",
+            got="none",
+            remedy="add it; a shipped profile shows how",
         )
 
 
 def _rename(key: str, allowed: set[str]) -> str:
     """Point at the key that was meant: most often the same one with its unit."""
     meant = sorted(name for name in allowed if name.startswith(key) or key.startswith(name))
-    return f"write {meant[0]!r} (the unit belongs to the name)" if meant else "remove it or correct its spelling"
+    return (
+        f"write {meant[0]!r} (the unit belongs to the name)"
+        if meant
+        else "remove it or correct its spelling"
+    )
 
 
 def _number(where: str, raw: object) -> Number:
@@ -119,10 +140,17 @@ def _number(where: str, raw: object) -> Number:
     if isinstance(raw, list) and len(raw) == 2 and all(map(is_number, raw)) and raw[0] <= raw[1]:
         return (float(raw[0]), float(raw[1]))
     raise ProfileError(
-        where, expected="a finite number or a range [low, high]", got=repr(raw), remedy="give one of the two"
+        where,
+        expected="a finite number or a range [low, high]",
+        got=repr(raw),
+        remedy="give one of the two",
     )
 
 
 def is_number(raw: object) -> bool:
     """Whether a value of a file is a finite number that float64 holds."""
-    return isinstance(raw, int | float) and not isinstance(raw, bool) and abs(raw) <= sys.float_info.max
+    return (
+        isinstance(raw, int | float)
+        and not isinstance(raw, bool)
+        and abs(raw) <= sys.float_info.max
+    )

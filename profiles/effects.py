@@ -1,7 +1,9 @@
-"""The effects that a sensor or a scene may call for beside blur, noise and digitising: one class a TOML table.
+"""The effects that a sensor or a scene may call for beside blur, noise and digitising: one class a
+TOML table.
 
-A profile calls for an effect by having its table. A class has its parameters with their limits, what it does to an
-image, the most that it may change of it, and what that costs. At their neutral values they leave the image as it is.
+A profile calls for an effect by having its table. A class has its parameters with their limits,
+what it does to an image, the most that it may change of it, and what that costs. At their neutral
+values they leave the image as it is.
 """
 
 from abc import ABC, abstractmethod
@@ -18,7 +20,9 @@ if TYPE_CHECKING:
     from beers_deploy.profiles.sensor import Instrument
 
 PATTERN_LIMIT = 4.0
-"""Detectors further out are rejected at the factory: draws are clipped here, so that bounds can be proven."""
+"""Detectors further out are rejected at the factory: draws are clipped here, so that bounds can be
+proven.
+"""
 
 Generator = Callable[[], np.random.Generator]
 """Makes the generator of an effect, for those that draw."""
@@ -44,7 +48,9 @@ class PixelEffect(Effect, ABC):
     acts_on: ClassVar[Literal["radiance", "DN"]]
     cost: ClassVar[str] = "1 pass"
     unseen: ClassVar[str] = ""
-    """Why a scene cannot show it where its bound is zero; without it, its parameters are neutral."""
+    """Why a scene cannot show it where its bound is zero; without it, its
+    parameters are neutral.
+    """
 
     @property
     def growth(self) -> float:
@@ -62,7 +68,9 @@ class PixelEffect(Effect, ABC):
 
 @dataclass(frozen=True)
 class AntiAlias(Effect):
-    """A Gaussian filter of standard deviation sigma_px target pixels, part of the MTF's budget; 0 is none."""
+    """A Gaussian filter of standard deviation sigma_px target pixels, part of the MTF's budget; 0
+    is none.
+    """
 
     sigma_px: Annotated[float, (0.0, 5.0)]
 
@@ -76,7 +84,8 @@ class Smear(Effect):
 
 @dataclass(frozen=True)
 class Haze(PixelEffect):
-    """Haze, table `veil`: transmittance of the atmosphere (1 is clear), path radiance in W/m2/sr/um (0 is none).
+    """Haze, table `veil`: transmittance of the atmosphere (1 is clear), path radiance in W/m2/sr/um
+    (0 is none).
 
     It is the same before and after the blur, whose gain at frequency 0 is 1.
     """
@@ -95,11 +104,12 @@ class Haze(PixelEffect):
 
 @dataclass(frozen=True)
 class FullWell(PixelEffect):
-    """Radiance in W/m2/sr/um at which a detector is full, and the share of the excess that runs along the column.
+    """Radiance in W/m2/sr/um at which a detector is full, and the share of the excess that runs
+    along the column.
 
-    L' = min(L + share * (k * max(L - well, 0)), well). k spreads the excess up and down the column, falling by e
-    every `blooming_px` pixels, and sums to 1 at most (what leaves the image is lost). Below the well nothing changes;
-    share 0 is a plain clip.
+    L' = min(L + share * (k * max(L - well, 0)), well). k spreads the excess up and down the column,
+    falling by e every `blooming_px` pixels, and sums to 1 at most (what leaves the image is lost).
+    Below the well nothing changes; share 0 is a plain clip.
     """
 
     radiance: Annotated[float, (1e-6, 1e6)]
@@ -120,7 +130,9 @@ class FullWell(PixelEffect):
         return np.asarray(np.minimum(image, self.radiance))
 
     def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
-        return sensor.gain_dn_per_radiance * max(high - self.radiance, 0.0)  # what is cut off or spilt
+        return sensor.gain_dn_per_radiance * max(
+            high - self.radiance, 0.0
+        )  # what is cut off or spilt
 
 
 @dataclass(frozen=True)
@@ -168,7 +180,9 @@ class Striping(PixelEffect):
     acts_on = "DN"
 
     def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
-        return image + self.odd_even_dn * (0.5 - (np.arange(image.shape[-1]) % 2).astype(image.dtype))
+        return image + self.odd_even_dn * (
+            0.5 - (np.arange(image.shape[-1]) % 2).astype(image.dtype)
+        )
 
     def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
         return self.odd_even_dn / 2
@@ -230,7 +244,11 @@ TABLES: dict[str, type[Effect]] = {
 def pixel_effects(effects: Mapping[str, Effect], acts_on: str) -> dict[str, PixelEffect]:
     """The effects on radiance, or those on DN, in the order in which they apply."""
     found = ((name, effects.get(name)) for name in TABLES)
-    return {name: effect for name, effect in found if isinstance(effect, PixelEffect) and effect.acts_on == acts_on}
+    return {
+        name: effect
+        for name, effect in found
+        if isinstance(effect, PixelEffect) and effect.acts_on == acts_on
+    }
 
 
 def _columns(image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
@@ -240,7 +258,9 @@ def _columns(image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
 
 
 def _spread(excess: np.ndarray, length_px: float) -> np.ndarray:
-    """Convolve each column of (..., H, W) with the two-sided exponential without its centre, normalised."""
+    """Convolve each column of (..., H, W) with the two-sided exponential without its centre,
+    normalised.
+    """
     radius = min(int(6 * length_px) + 1, excess.shape[-2] - 1)
     if radius < 1:
         return np.zeros_like(excess)
@@ -258,24 +278,34 @@ Table = Mapping[str, Constant]
 
 
 def read_effect(where: str, name: str, raw: object) -> Table:
-    """Read one effect's table of a TOML file: every key of its dataclass and no other, each within its limits."""
+    """Read one effect's table of a TOML file: every key of its dataclass and no other, each within
+    its limits.
+    """
     limits = TABLES[name].limits()
     if not isinstance(raw, Mapping):
-        raise ProfileError(where, expected=f"a table [{name}]", got=repr(raw), remedy="write it as one")
+        raise ProfileError(
+            where, expected=f"a table [{name}]", got=repr(raw), remedy="write it as one"
+        )
     check_keys(where, raw, required=set(limits))
     table = {key: read_constant(f"{where} {key}", raw[key]) for key in limits}
     for key, constant in table.items():
         low, high = limits[key]
         if not low <= constant.low <= constant.high <= high:
             raise ProfileError(
-                f"{where} {key}", expected=f"{low:g} to {high:g}", got=str(constant), remedy="correct the value"
+                f"{where} {key}",
+                expected=f"{low:g} to {high:g}",
+                got=str(constant),
+                remedy="correct the value",
             )
     return table
 
 
 def draw_effect(name: str, table: Table, generator: np.random.Generator) -> Effect:
     """Settle every number of an effect; nothing is drawn where no range is stated."""
-    values = {key: c.low if c.low == c.high else float(generator.uniform(c.low, c.high)) for key, c in table.items()}
+    values = {
+        key: c.low if c.low == c.high else float(generator.uniform(c.low, c.high))
+        for key, c in table.items()
+    }
     return TABLES[name](**values)
 
 

@@ -44,7 +44,8 @@ class BeersError(Exception):
 
     def __init__(self, where: str, *, expected: str, got: str, remedy: str) -> None:
         super().__init__(
-            f"{printable(where)}: expected {printable(expected, 4 * LONGEST)}, got {printable(got)}; {remedy}."
+            f"{printable(where)}: expected {printable(expected, 4 * LONGEST)}, got "
+            f"{printable(got)}; {remedy}."
         )
         self.where = where
         self.expected = expected
@@ -53,7 +54,9 @@ class BeersError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         """How it comes back from a worker process: an exception's own way knows no keywords."""
-        return partial(type(self), expected=self.expected, got=self.got, remedy=self.remedy), (self.where,)
+        return partial(type(self), expected=self.expected, got=self.got, remedy=self.remedy), (
+            self.where,
+        )
 
 
 def printable(text: str, longest: int = LONGEST) -> str:
@@ -64,24 +67,30 @@ def printable(text: str, longest: int = LONGEST) -> str:
 def one_line(text: str) -> str:
     """Return the whole text on one line, with its escape for each character that is not printable.
 
-    Among these are line breaks, control characters, and those that change the direction of writing: a name from a
-    file must not look like another line of a log.
+    Among these are line breaks, control characters, and those that change the direction of writing:
+    a name from a file must not look like another line of a log.
     """
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def encodable(text: str) -> str:
-    """Return the text with an escape for what UTF-8 cannot hold: bytes of a file's name in another encoding."""
+    """Return the text with an escape for what UTF-8 cannot hold: bytes of a file's name in another
+    encoding.
+    """
     return text.encode(errors="backslashreplace").decode()
 
 
 def visible(text: str) -> str:
-    """The text, lines and tabs kept, with each other character that a terminal would obey or hide as its escape."""
+    """The text, lines and tabs kept, with each other character that a terminal would obey or hide
+    as its escape.
+    """
     return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
 
 
 def sizes(*counts_bytes: float) -> list[str]:
-    """Numbers of bytes, each in its own unit, with as many digits (three or more) as tell different ones apart."""
+    """Numbers of bytes, each in its own unit, with as many digits (three or more) as tell different
+    ones apart.
+    """
     for digits in range(3, 17):
         texts = [_size(count, digits) for count in counts_bytes]
         if len(set(texts)) == len(set(counts_bytes)):
@@ -122,13 +131,16 @@ class MissingExtraError(MachineError, ImportError):
 
 
 class OutsideRangeWarning(UserWarning):
-    """A sensor that lies outside the range that a network was trained for; the command line prints it as a line."""
+    """A sensor that lies outside the range that a network was trained for; the command line prints
+    it as a line.
+    """
 
 
 CODE_FAULTS = (AttributeError, ImportError, NameError, TypeError)
 """What code raises that does not fit the version of a library.
 
-A damaged file leads a compiled library to none of them. A library that is written in Python may raise them for both.
+A damaged file leads a compiled library to none of them. A library that is written in Python may
+raise them for both.
 """
 
 
@@ -147,7 +159,9 @@ EXTRAS = {
 
 
 def optional(package: str, where: str) -> Any:
-    """The module of an optional package, imported for `where`, the parameter or verb that needs it."""
+    """The module of an optional package, imported for `where`, the parameter or
+    verb that needs it.
+    """
     try:
         return import_module(package)
     except ImportError as error:  # not there, or there and unable to load what it needs
@@ -161,8 +175,12 @@ def missing_extra(error: ImportError, where: str) -> Exception:
 
 
 def _imported(error: ImportError) -> str | None:
-    """Return the optional package whose import failed, by the module's name or by the code that imported it."""
-    at_import = (frame for frame, _ in walk_tb(error.__traceback__) if frame.f_code.co_name == "<module>")
+    """Return the optional package whose import failed, by the module's name or by the code that
+    imported it.
+    """
+    at_import = (
+        frame for frame, _ in walk_tb(error.__traceback__) if frame.f_code.co_name == "<module>"
+    )
     names = (error.name, *(frame.f_globals.get("__name__") for frame in at_import))
     packages = (str(name).partition(".")[0] for name in names)
     return next((package for package in packages if package in EXTRAS), None)

@@ -1,7 +1,8 @@
-"""What a reported figure is: a number with its unit, its mode and its source; rows of them, and checks of a limit.
+"""What a reported figure is: a number with its unit, its mode and its source; rows of them, and
+checks of a limit.
 
-A figure is measured (here), predicted (by a model, with an interval) or published (by a named document); what could
-not be had is unavailable, with the reason, and never a zero.
+A figure is measured (here), predicted (by a model, with an interval) or published (by a named
+document); what could not be had is unavailable, with the reason, and never a zero.
 """
 
 import math
@@ -53,24 +54,33 @@ class Figure:
             return "unavailable"
         digits = DIGITS[self.mode]
         text = number(self.value, digits)
-        if self.interval is None or self.interval[0] == self.interval[1]:  # plain arithmetic needs no interval
+        if (
+            self.interval is None or self.interval[0] == self.interval[1]
+        ):  # plain arithmetic needs no interval
             return text
         return f"{text} [{number(self.interval[0], digits)}, {number(self.interval[1], digits)}]"
 
 
-def measured(value: float, unit: str, source: str, interval: tuple[float, float] | None = None) -> Figure:
-    """A number that this run observed on this machine, and how far a repetition might lie from it where known.
+def measured(
+    value: float, unit: str, source: str, interval: tuple[float, float] | None = None
+) -> Figure:
+    """A number that this run observed on this machine, and how far a repetition might lie from it
+    where known.
 
     Unavailable where it is NaN or infinite; without an interval where that is.
     """
     if not math.isfinite(value):
         return unavailable(unit, f"{NOT_FINITE} ({float(value)}): {source}")
-    known = interval if interval is not None and all(math.isfinite(end) for end in interval) else None
+    known = (
+        interval if interval is not None and all(math.isfinite(end) for end in interval) else None
+    )
     return Figure(float(value), unit, "measured", source, known)
 
 
 def predicted(value: float, unit: str, interval: tuple[float, float], source: str) -> Figure:
-    """A number that a model computed, and how far off it may be; unavailable where any of them is not finite."""
+    """A number that a model computed, and how far off it may be; unavailable where any of them is
+    not finite.
+    """
     if not all(math.isfinite(number) for number in (value, *interval)):
         return unavailable(unit, f"{NOT_FINITE} ({float(value)}): {source}")
     return Figure(float(value), unit, "predicted", source, (float(interval[0]), float(interval[1])))
@@ -87,7 +97,9 @@ def unavailable(unit: str, reason: str) -> Figure:
 
 
 def number(value: float, digits: int) -> str:
-    """So many significant digits, thousands grouped, no exponent where a person would not write one."""
+    """So many significant digits, thousands grouped, no exponent where a person would not write
+    one.
+    """
     rounded = float(f"{value:.{digits}g}")
     if abs(rounded) < 1000:
         return f"{rounded:.{digits}g}"
@@ -122,15 +134,19 @@ IN_THE_NAME = {"ratio", "node", "layer", "ReLU", "fault", "step", "opset", "size
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that a gate looks at: a value and its limit. The number decides, and NaN keeps no limit.
+    """One thing that a gate looks at: a value and its limit.
+
+    The number decides, and NaN keeps no limit.
 
     Attributes:
         name: what is measured, for example "MAE".
         value: what was found, in `unit`; infinite or NaN where a network gave that.
-        limit: the largest value that passes, or the smallest where `bound` says "at least"; infinity for none.
+        limit: the largest value that passes, or the smallest where `bound` says "at least";
+            infinity for none.
         unit: of both; a count has the name of what is counted, for example "node".
         bound: the side of the limit that passes.
-        detail: where the value was found, or where the limit comes from; empty where there is nothing to add.
+        detail: where the value was found, or where the limit comes from; empty where there is
+            nothing to add.
     """
 
     name: str

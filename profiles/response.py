@@ -1,8 +1,9 @@
-"""The blur of a whole instrument, detector included, where more is known of it than its contrast at Nyquist.
+"""The blur of a whole instrument, detector included, where more is known of it than its contrast at
+Nyquist.
 
-Either a tabulated MTF or a point-spread function, read as a sensor's file states it, and refused where none can be.
-Both are plain values: they compare, hash and travel in JSON. Frequencies are in cycles per target pixel; "across" the
-track is horizontal (fx, along a row), "along" it vertical.
+Either a tabulated MTF or a point-spread function, read as a sensor's file states it, and refused
+where none can be. Both are plain values: they compare, hash and travel in JSON. Frequencies are in
+cycles per target pixel; "across" the track is horizontal (fx, along a row), "along" it vertical.
 """
 
 import base64
@@ -50,10 +51,11 @@ class MtfTable:
     def at(self, fx: Frequencies, fy: Frequencies) -> NDArray[np.float64]:
         """The MTF at fx (1, W) and fy (H, 1): (H, W).
 
-        What the square detector leaves is divided out; -log of the rest is interpolated linearly over the radius r,
-        which gives each axis its gamma(r) = -log / r. Then as the formula's two axes:
-        exp(-sqrt((gamma_x fx)^2 + (gamma_y fy)^2)) sinc(fx) sinc(fy). A table of the formula gives the formula.
-        Beyond the last frequency gamma stays what it was there: contrast falls on.
+        What the square detector leaves is divided out; -log of the rest is interpolated linearly
+        over the radius r, which gives each axis its gamma(r) = -log / r. Then as the formula's two
+        axes: exp(-sqrt((gamma_x fx)^2 + (gamma_y fy)^2)) sinc(fx) sinc(fy). A table of the formula
+        gives the formula. Beyond the last frequency gamma stays what it was there: contrast falls
+        on.
         """
         radius = np.hypot(fx, fy)
         gamma_x, gamma_y = (self._gamma(radius, contrast) for contrast in (self.across, self.along))
@@ -64,12 +66,16 @@ class MtfTable:
         frequency = np.array(self.frequency)
         # max: rounded tables exceed the detector's own contrast by a little at low frequencies
         loss = np.maximum(-np.log(np.array(contrast) / np.sinc(frequency)), 0.0)
-        # Towards 0, where there is nothing to divide by, and beyond the end gamma stays what it was.
+        # Towards 0, where there is nothing to divide by, and beyond the end gamma stays what it
+        # was.
         inside = np.clip(radius, frequency[1], frequency[-1])
         return np.asarray(np.interp(inside, frequency, loss) / inside)
 
     def __str__(self) -> str:
-        return f"MTF table of {len(self.frequency)} frequencies up to {self.frequency[-1]:g} cycles per pixel"
+        return (
+            f"MTF table of {len(self.frequency)} frequencies up to {self.frequency[-1]:g} "
+            "cycles per pixel"
+        )
 
 
 @dataclass(frozen=True)
@@ -94,10 +100,12 @@ class PointSpread:
         return _contrast_at_nyquist(self)
 
     def at(self, fx: Frequencies, fy: Frequencies) -> NDArray[np.complex128]:
-        """Its Fourier transform at fx (1, W) and fy (H, 1), complex (H, W): the sum itself, exact to rounding.
+        """Its Fourier transform at fx (1, W) and fy (H, 1), complex (H, W): the sum itself, exact
+        to rounding.
 
-        Samples are taken at points; their sum counts as 1 and their centroid lies at 0, so that the blur keeps
-        radiance and shifts nothing. Beyond half its sampling frequency a sampled function says nothing: 0 there.
+        Samples are taken at points; their sum counts as 1 and their centroid lies at 0, so that the
+        blur keeps radiance and shifts nothing. Beyond half its sampling frequency a sampled
+        function says nothing: 0 there.
         """
         values, y_px, x_px = _grid(self)
         waves_y, waves_x = (
@@ -109,7 +117,8 @@ class PointSpread:
     def __str__(self) -> str:
         digest = hashlib.sha256(self.samples.encode()).hexdigest()[:12]
         return (
-            f"point-spread function of {self.width} x {self.height} samples, {self.samples_per_px:g} to a pixel "
+            f"point-spread function of {self.width} x {self.height} samples, "
+            f"{self.samples_per_px:g} to a pixel "
             f"({digest})"
         )
 
@@ -119,21 +128,27 @@ Response = MtfTable | PointSpread
 
 def packed(values: NDArray[np.floating]) -> str:
     """Samples of any shape as text: float32, compressed, in base 64."""
-    return base64.b64encode(zlib.compress(np.ascontiguousarray(values, "<f4").tobytes(), 9)).decode()
+    return base64.b64encode(
+        zlib.compress(np.ascontiguousarray(values, "<f4").tobytes(), 9)
+    ).decode()
 
 
 def unpacked(point: PointSpread) -> NDArray[np.float64]:
     """The samples, (height, width)."""
     count_bytes = 4 * point.height * point.width
     try:
-        found = zlib.decompressobj().decompress(base64.b64decode(point.samples, validate=True), count_bytes)
+        found = zlib.decompressobj().decompress(
+            base64.b64decode(point.samples, validate=True), count_bytes
+        )
     except zlib.error as error:
         raise ValueError(str(error)) from None
     return np.frombuffer(found, "<f4").astype(np.float64).reshape(point.height, point.width)
 
 
 def centroid(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Row and column of the centre of gravity of samples (H, W) whose sum is not 0, counted from the middle."""
+    """Row and column of the centre of gravity of samples (H, W) whose sum is not 0, counted from
+    the middle.
+    """
     rows, columns = ((np.arange(size) - (size - 1) / 2) for size in values.shape)
     total = values.sum()
     return float(values.sum(1) @ rows / total), float(values.sum(0) @ columns / total)
@@ -141,7 +156,9 @@ def centroid(values: NDArray[np.float64]) -> tuple[float, float]:
 
 @lru_cache(maxsize=8)
 def _grid(point: PointSpread) -> tuple[NDArray[np.float64], ...]:
-    """Samples of sum 1, and where their rows and columns lie from the centroid, in target pixels."""
+    """Samples of sum 1, and where their rows and columns lie from the centroid,
+    in target pixels.
+    """
     values = unpacked(point)
     places = (
         (np.arange(size) - (size - 1) / 2 - middle) / point.samples_per_px
@@ -154,27 +171,37 @@ def _grid(point: PointSpread) -> tuple[NDArray[np.float64], ...]:
 def _contrast_at_nyquist(response: Response) -> tuple[float, float]:
     none = np.zeros((1, 1))
     nyquist = np.full((1, 1), NYQUIST)
-    across, along = (float(np.abs(response.at(*f)[0, 0])) for f in ((nyquist, none), (none, nyquist)))
+    across, along = (
+        float(np.abs(response.at(*f)[0, 0])) for f in ((nyquist, none), (none, nyquist))
+    )
     return across, along
 
 
 READING = 0.005
-"""How far a table may lie above what the square detector leaves: half the last digit of two. The detector counts."""
+"""How far a table may lie above what the square detector leaves: half the last digit of two.
+
+The detector counts.
+"""
 MOST_FREQUENCIES = 1000
 LEAST_STEP = 1e-4
 SAMPLES_PER_PX = (2.0, 64.0)
-"""With fewer than two, nothing is said of the frequencies that sampling by the sensor folds back."""
+"""With fewer than two, nothing is said of the frequencies that sampling by the
+sensor folds back.
+"""
 FILE_SIDE = 4096
 KEPT_SIDE = 1024
 """Samples a side: of a file, and of what is kept of it, which a recipe holds as text."""
 CUT_SHARE = 1e-6
-"""Of the absolute weight: rows and columns at the rim that hold less are cut. No frequency changes by more than twice
-as much."""
+"""Of the absolute weight: rows and columns at the rim that hold less are cut.
+
+No frequency changes by more than twice as much.
+"""
 OFF_CENTRE_PX = 1.0
 
 
 def read_response(label: str, raw: Mapping[str, Any], folder: Path) -> tuple[Response, Status, str]:
-    """What `[mtf]` states by a table or a point-spread function, and that statement's status and source.
+    """What `[mtf]` states by a table or a point-spread function, and that statement's status and
+    source.
 
     Args:
         label: names the file in errors.
@@ -184,21 +211,32 @@ def read_response(label: str, raw: Mapping[str, Any], folder: Path) -> tuple[Res
     key = "psf" if "psf" in raw else "across"
     _, status, source = read_stated(f"{label} {key}", raw[key])
     stated = {name: read_stated(f"{label} {name}", value)[0] for name, value in raw.items()}
-    response: Response = _point_spread(label, stated, folder) if key == "psf" else _table(label, stated)
+    response: Response = (
+        _point_spread(label, stated, folder) if key == "psf" else _table(label, stated)
+    )
     _require_contrast(f"{label} {key}", response)
     return response, status, source
 
 
 def axes_of(response: Response, status: Status, source: str) -> dict[str, Any]:
-    """The contrasts at Nyquist as a profile's constants; none along the track where it is that across."""
+    """The contrasts at Nyquist as a profile's constants; none along the track where it is that
+    across.
+    """
     across, along = (Constant(value, status, source) for value in response.at_nyquist)
     return {"mtf_nyquist": across, "mtf_nyquist_along": along if along != across else None}
 
 
 def response_from_json(label: str, raw: object) -> Response:
-    """A response from the plain values of its fields, as `dataclasses.asdict` and JSON leave them."""
+    """A response from the plain values of its fields, as `dataclasses.asdict`
+    and JSON leave them.
+    """
     if not isinstance(raw, Mapping):
-        raise ProfileError(label, expected="a table or a point-spread function", got=repr(raw), remedy="make it anew")
+        raise ProfileError(
+            label,
+            expected="a table or a point-spread function",
+            got=repr(raw),
+            remedy="make it anew",
+        )
     if "samples" not in raw:
         check_keys(label, raw, required={"frequency", "across", "along"})
         response: Response = _table(label, raw)
@@ -215,7 +253,9 @@ def _stored_point_spread(label: str, raw: Mapping[str, Any]) -> PointSpread:
     point = PointSpread(raw["height"], raw["width"], per_px, raw["samples"])
     try:
         # Before unpacking: a size of 0 bytes would unpack as much as the text holds.
-        if not all(type(side) is int and 1 <= side <= KEPT_SIDE for side in (point.height, point.width)):
+        if not all(
+            type(side) is int and 1 <= side <= KEPT_SIDE for side in (point.height, point.width)
+        ):
             raise ValueError(f"{point.height!r} x {point.width!r} samples")
         samples = unpacked(point)
         if not (np.isfinite(samples).all() and samples.sum() > 0):
@@ -234,7 +274,8 @@ def _require_contrast(where: str, response: Response) -> None:
         if not 0 < contrast <= limit:
             raise ProfileError(
                 where,
-                expected=f"a contrast at Nyquist above 0 and up to {limit:.4f} (2/pi, the square detector alone)",
+                expected=f"a contrast at Nyquist above 0 and up to {limit:.4f} (2/pi, the "
+                "square detector alone)",
                 got=f"{contrast:.4g} {axis} the track",
                 remedy="describe the whole system, its detector included, in target pixels",
             )
@@ -246,14 +287,20 @@ def _table(label: str, stated: Mapping[str, Any]) -> MtfTable:
     if not rising or frequency[0] != 0 or not NYQUIST <= frequency[-1] < 1:
         raise ProfileError(
             f"{label} frequency",
-            expected="cycles per pixel, ascending from 0 to 0.5 at least and below 1, the detector's first zero",
+            expected="cycles per pixel, ascending from 0 to 0.5 at least and below 1, the "
+            "detector's first zero",
             got=f"{len(frequency)} from {frequency[0]:g} to {frequency[-1]:g}"
             + ("" if rising else ", not ascending"),
-            remedy=f"give them in that order, in cycles per target pixel, {LEAST_STEP:g} apart at least",
+            remedy=f"give them in that order, in cycles per target pixel, {LEAST_STEP:g} apart "
+            "at least",
         )
     across = _contrasts(f"{label} across", stated["across"], frequency)
     given = stated.get("along")
-    return MtfTable(frequency, across, across if given is None else _contrasts(f"{label} along", given, frequency))
+    return MtfTable(
+        frequency,
+        across,
+        across if given is None else _contrasts(f"{label} along", given, frequency),
+    )
 
 
 def _contrasts(where: str, raw: object, frequency: tuple[float, ...]) -> tuple[float, ...]:
@@ -261,16 +308,20 @@ def _contrasts(where: str, raw: object, frequency: tuple[float, ...]) -> tuple[f
     if len(contrast) != len(frequency) or contrast[0] != 1:
         expected = f"{len(frequency)} contrasts, one for each frequency, the first of them 1"
         got = f"{len(contrast)}, the first of them {contrast[0]:g}"
-        raise ProfileError(where, expected=expected, got=got, remedy="divide the table by its value at frequency 0")
+        raise ProfileError(
+            where, expected=expected, got=got, remedy="divide the table by its value at frequency 0"
+        )
     for f, value in zip(frequency, contrast, strict=True):
         detector = float(np.sinc(f))
         if not 0 < value <= detector + READING:
             raise ProfileError(
                 where,
-                expected=f"a contrast above 0 and up to {detector:.4f} at {f:g} cycles per pixel (sinc, the square "
+                expected=f"a contrast above 0 and up to {detector:.4f} at {f:g} cycles per "
+                "pixel (sinc, the square "
                 "detector alone)",
                 got=f"{value:g}",
-                remedy="describe the whole system; zeros and reversed contrast need a point-spread function, psf",
+                remedy="describe the whole system; zeros and reversed contrast need a "
+                "point-spread function, psf",
             )
     return contrast
 
@@ -279,7 +330,9 @@ def _numbers(where: str, raw: object) -> tuple[float, ...]:
     numbers = raw if isinstance(raw, list | tuple) else []
     if not 2 <= len(numbers) <= MOST_FREQUENCIES or not all(map(is_number, numbers)):
         expected = f"a list of 2 to {MOST_FREQUENCIES} finite numbers"
-        raise ProfileError(where, expected=expected, got=repr(raw), remedy="give one for each frequency")
+        raise ProfileError(
+            where, expected=expected, got=repr(raw), remedy="give one for each frequency"
+        )
     return tuple(map(float, numbers))
 
 
@@ -288,7 +341,9 @@ def _point_spread(label: str, stated: Mapping[str, Any], folder: Path) -> PointS
     name = stated["psf"]
     if not isinstance(name, str) or not _lies_within(folder, name):
         expected = "the name of a file beside this one or in a folder beneath"
-        raise ProfileError(f"{label} psf", expected=expected, got=repr(name), remedy="copy it there")
+        raise ProfileError(
+            f"{label} psf", expected=expected, got=repr(name), remedy="copy it there"
+        )
     where = f"{label} psf, {folder / name}"
     return _from_samples(where, _read_samples(where, folder / name), per_px)
 
@@ -304,50 +359,68 @@ def _samples_per_px(where: str, raw: Any) -> float:
     low, high = SAMPLES_PER_PX
     if not is_number(raw) or not low <= raw <= high:
         expected = f"samples that make one target pixel, {low:g} to {high:g}"
-        raise ProfileError(where, expected=expected, got=repr(raw), remedy="resample the point-spread function")
+        raise ProfileError(
+            where, expected=expected, got=repr(raw), remedy="resample the point-spread function"
+        )
     return float(raw)
 
 
 def _from_samples(where: str, samples: NDArray[np.float64], per_px: float) -> PointSpread:
-    """Refuse samples that are no point-spread function; of others, keep what holds nearly all of the weight."""
+    """Refuse samples that are no point-spread function; of others, keep what holds nearly all of
+    the weight.
+    """
     finite = bool(np.isfinite(samples).all())
     samples = samples / max(float(np.abs(samples).max()), 1e-300) if finite else samples
     total = float(samples.sum())
     if not finite or total <= 0:
         got = f"a sum of {total:g}" if finite else "NaN or infinite ones"
         remedy = "correct the file; a background must be taken off first"
-        raise ProfileError(where, expected="finite samples whose sum is above 0", got=got, remedy=remedy)
+        raise ProfileError(
+            where, expected="finite samples whose sum is above 0", got=got, remedy=remedy
+        )
     shift_px = math.hypot(*centroid(samples)) / per_px
     if shift_px > OFF_CENTRE_PX:
         expected = f"a centroid within {OFF_CENTRE_PX:g} target pixel of the middle"
         remedy = "crop it around its centroid, and take its background off"
-        raise ProfileError(where, expected=expected, got=f"one {shift_px:.3g} pixels off", remedy=remedy)
+        raise ProfileError(
+            where, expected=expected, got=f"one {shift_px:.3g} pixels off", remedy=remedy
+        )
     kept = _trimmed(samples / total)
     if max(kept.shape) > KEPT_SIDE:
         expected = f"all but a millionth of the weight within {KEPT_SIDE} x {KEPT_SIDE} samples"
         remedy = "crop it, or sample it more coarsely"
-        raise ProfileError(where, expected=expected, got=f"{kept.shape[1]} x {kept.shape[0]}", remedy=remedy)
+        raise ProfileError(
+            where, expected=expected, got=f"{kept.shape[1]} x {kept.shape[0]}", remedy=remedy
+        )
     return PointSpread(len(kept), kept.shape[1], per_px, packed(kept))
 
 
 def _trimmed(samples: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Without the rows and columns at the rim that hold, all together, less than CUT_SHARE of the weight."""
+    """Without the rows and columns at the rim that hold, all together, less than CUT_SHARE of the
+    weight.
+    """
     weight = np.abs(samples)
     parts = []
     for axis in (1, 0):
         grown = np.cumsum(weight.sum(axis)) / weight.sum()
-        parts.append(slice(*np.searchsorted(grown, (CUT_SHARE / 4, 1 - CUT_SHARE / 4)) + np.array([0, 1])))
+        parts.append(
+            slice(*np.searchsorted(grown, (CUT_SHARE / 4, 1 - CUT_SHARE / 4)) + np.array([0, 1]))
+        )
     return samples[tuple(parts)]
 
 
 def _read_samples(where: str, path: Path) -> NDArray[np.float64]:
     """The samples of a .npy file, (H, W)."""
-    reason = unreadable(path) if path.suffix.lower() == ".npy" else f"one that ends in {path.suffix!r}"
+    reason = (
+        unreadable(path) if path.suffix.lower() == ".npy" else f"one that ends in {path.suffix!r}"
+    )
     if reason:
         remedy = "check the path, which counts from the profile's folder"
         raise ProfileError(where, expected="a .npy file", got=reason, remedy=remedy)
     try:
-        found = np.load(path, mmap_mode="r", allow_pickle=False)  # nothing is read before its shape is known
+        found = np.load(
+            path, mmap_mode="r", allow_pickle=False
+        )  # nothing is read before its shape is known
         if (
             found.ndim != 2
             or found.dtype.kind not in "iuf"

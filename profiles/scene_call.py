@@ -1,4 +1,6 @@
-"""What a scene calls for: light, and effects that it adds to a sensor or forbids (night port, haze over sea, ...)."""
+"""What a scene calls for: light, and effects that it adds to a sensor or forbids (night port, haze
+over sea, ...).
+"""
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -32,46 +34,78 @@ def scene_names() -> list[str]:
 def load_scene_call(name: str) -> SceneCall:
     """Read a shipped scene by name, or the user's own by the path of its .toml file."""
     label, raw = read_toml("scenes", name)
-    check_keys(label, raw, required={"description", "radiance_scale"}, optional={"without", *TABLES})
+    check_keys(
+        label, raw, required={"description", "radiance_scale"}, optional={"without", *TABLES}
+    )
     scale = read_constant(f"{label} radiance_scale", raw["radiance_scale"])
     if scale.low <= 0:
-        raise ProfileError(f"{label} radiance_scale", expected="above 0", got=str(scale), remedy="1 is a clear day")
+        raise ProfileError(
+            f"{label} radiance_scale", expected="above 0", got=str(scale), remedy="1 is a clear day"
+        )
     effects = {key: read_effect(f"{label} [{key}]", key, raw[key]) for key in TABLES if key in raw}
     without = raw.get("without", [])
-    if not isinstance(without, list) or not all(isinstance(w, str) and w in TABLES for w in without):
+    if not isinstance(without, list) or not all(
+        isinstance(w, str) and w in TABLES for w in without
+    ):
         expected = f"a list out of {', '.join(TABLES)}"
-        raise ProfileError(f"{label} without", expected=expected, got=repr(without), remedy="correct the names")
+        raise ProfileError(
+            f"{label} without", expected=expected, got=repr(without), remedy="correct the names"
+        )
     if set(without) & set(effects):
         both = ", ".join(sorted(set(without) & set(effects)))
-        raise ProfileError(label, expected="an effect added or forbidden", got=f"both for {both}", remedy="drop one")
-    return SceneCall(label.removesuffix(".toml"), str(raw["description"]), scale, effects, tuple(without))
+        raise ProfileError(
+            label,
+            expected="an effect added or forbidden",
+            got=f"both for {both}",
+            remedy="drop one",
+        )
+    return SceneCall(
+        label.removesuffix(".toml"), str(raw["description"]), scale, effects, tuple(without)
+    )
 
 
 def typical_effects() -> dict[str, Table]:
-    """Typical values of every optional effect (`profiles/effects.toml`): what `--with NAME` adds."""
+    """Typical values of every optional effect (`profiles/effects.toml`): what
+    `--with NAME` adds.
+    """
     label, raw = read_toml("", str(HERE / "effects.toml"))
     return {name: read_effect(f"{label} [{name}]", name, raw[name]) for name in TABLES}
 
 
 def calling_for(
-    profile: Sensor, scene: SceneCall | None, add: Collection[str] = (), forbid: Collection[str] = ()
+    profile: Sensor,
+    scene: SceneCall | None,
+    add: Collection[str] = (),
+    forbid: Collection[str] = (),
 ) -> Sensor:
-    """The profile with a scene's effects and `add`, without `forbid`; stated values win over typical ones."""
+    """The profile with a scene's effects and `add`, without `forbid`; stated values win over
+    typical ones.
+    """
     for name in (*add, *forbid):
         if name not in TABLES:
             known = ", ".join(TABLES)
-            raise OptionError("effect", expected=f"one of {known}", got=repr(name), remedy="correct the name")
+            raise OptionError(
+                "effect", expected=f"one of {known}", got=repr(name), remedy="correct the name"
+            )
     typical = typical_effects()
     effects = {**profile.effects, **(scene.effects if scene else {})}
     effects |= {name: typical[name] for name in add if name not in effects}
     gone = {*forbid, *(scene.without if scene else ())}
-    return replace(profile, effects={name: effects[name] for name in TABLES if name in effects and name not in gone})
+    return replace(
+        profile,
+        effects={name: effects[name] for name in TABLES if name in effects and name not in gone},
+    )
 
 
 def origins(
-    profile: Sensor, scene: SceneCall | None, add: Collection[str] = (), forbid: Collection[str] = ()
+    profile: Sensor,
+    scene: SceneCall | None,
+    add: Collection[str] = (),
+    forbid: Collection[str] = (),
 ) -> dict[str, str]:
-    """Of each effect of `calling_for`'s profile where it comes from; of one that it lost, who leaves it out."""
+    """Of each effect of `calling_for`'s profile where it comes from; of one that it lost, who
+    leaves it out.
+    """
     found = dict.fromkeys(add, "--with")  # what is stated wins over it
     found |= dict.fromkeys(("mtf", "noise", *profile.effects), f"sensor {profile.name}")
     if scene:

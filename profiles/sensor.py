@@ -1,6 +1,7 @@
 """Sensor profiles: the grid, the MTF, the noise and the digitiser of one instrument.
 
-A profile may state ranges (a family of sensors); `Sensor.draw` picks one physical `Instrument` from it.
+A profile may state ranges (a family of sensors); `Sensor.draw` picks one physical `Instrument` from
+it.
 """
 
 import math
@@ -21,7 +22,10 @@ from beers_deploy.profiles.response import PointSpread, Response
 MAX_DN = 4095
 """The largest digital number of 12 bits: full scale, unless a sensor says otherwise."""
 MTF_NYQUIST_MAX = 2 / math.pi
-"""A perfect lens over a square detector: sinc(0.5). Nothing above it is a blur: its gamma would be negative."""
+"""A perfect lens over a square detector: sinc(0.5).
+
+Nothing above it is a blur: its gamma would be negative.
+"""
 
 MAX_DRAWS = 10_000
 
@@ -38,21 +42,26 @@ ROUNDING = 1e-14
 class Instrument:
     """One instrument, every number settled.
 
-    The noise variance is alpha * L + beta, L in W/m2/sr/um (paper, section 3.3, signal-dependent noise).
+    The noise variance is alpha * L + beta, L in W/m2/sr/um (paper, section 3.3, signal-dependent
+    noise).
 
     Attributes:
-        mtf_nyquist: contrast kept at 0.5 cycles per pixel; across the track where the two axes differ.
+        mtf_nyquist: contrast kept at 0.5 cycles per pixel; across the track where the two axes
+            differ.
         alpha: signal-dependent variance per radiance, in W/m2/sr/um.
         beta: variance in the dark, in (W/m2/sr/um)^2.
         gain_dn_per_radiance: digital numbers per W/m2/sr/um.
         bits: of a digital number.
         effects: beside blur, noise and digitising, by name.
-        mtf_nyquist_along: contrast kept along the track; None where it is that across. A pushbroom's line of
-            detectors lies across the track: image rows are lines in time, so "across" is the horizontal axis (along
-            a row, fx) and "along" the vertical one (down a column, fy).
-        radiance_1: of what is bright in its scenes, in W/m2/sr/um: the brighter point at which its SNR is stated.
-        response: the blur in full, by a table or a point-spread function; its contrasts at Nyquist then stand in
-            `mtf_nyquist` and `mtf_nyquist_along`. None for the formula's blur, which these two settle.
+        mtf_nyquist_along: contrast kept along the track; None where it is that across. A
+            pushbroom's line of detectors lies across the track: image rows are lines in time, so
+            "across" is the horizontal axis (along a row, fx) and "along" the vertical one (down a
+            column, fy).
+        radiance_1: of what is bright in its scenes, in W/m2/sr/um: the brighter point at which its
+            SNR is stated.
+        response: the blur in full, by a table or a point-spread function; its contrasts at Nyquist
+            then stand in `mtf_nyquist` and `mtf_nyquist_along`. None for the formula's blur, which
+            these two settle.
     """
 
     mtf_nyquist: float
@@ -67,25 +76,38 @@ class Instrument:
 
     def __post_init__(self) -> None:
         if self.response is not None and not np.allclose(self.mtf_axes, self.response.at_nyquist):
-            raise ValueError(f"MTF {self.mtf_axes} at Nyquist beside a response of {self.response.at_nyquist}")
+            raise ValueError(
+                f"MTF {self.mtf_axes} at Nyquist beside a response of {self.response.at_nyquist}"
+            )
 
     @property
     def blur(self) -> tuple[float, float] | Response:
-        """What settles the MTF at every frequency: the response where there is one, else the two contrasts."""
+        """What settles the MTF at every frequency: the response where there is one, else the two
+        contrasts.
+        """
         return self.mtf_axes if self.response is None else self.response
 
     @property
     def symmetry(self) -> tuple[bool, bool]:
-        """Whether its images still are images of this sensor when (mirrored, turned by a quarter)."""
+        """Whether its images still are images of this sensor when (mirrored,
+        turned by a quarter).
+        """
         if isinstance(self.response, PointSpread):
             return False, False
-        across, along = (self.response.across, self.response.along) if self.response else self.mtf_axes
+        across, along = (
+            (self.response.across, self.response.along) if self.response else self.mtf_axes
+        )
         return True, across == along
 
     @property
     def mtf_axes(self) -> tuple[float, float]:
-        """Contrast kept at 0.5 cycles per pixel, (across the track, along it): horizontally and vertically."""
-        return self.mtf_nyquist, self.mtf_nyquist if self.mtf_nyquist_along is None else self.mtf_nyquist_along
+        """Contrast kept at 0.5 cycles per pixel, (across the track, along it): horizontally and
+        vertically.
+        """
+        return (
+            self.mtf_nyquist,
+            self.mtf_nyquist if self.mtf_nyquist_along is None else self.mtf_nyquist_along,
+        )
 
     @property
     def max_dn(self) -> int:
@@ -108,9 +130,13 @@ class Instrument:
         return float(getattr(self.effects.get("smear"), "length_px", 0))
 
     def in_units_of(self, other: "Instrument") -> "Instrument":
-        """This sensor's blur and noise in the digital numbers of `other`: its gain, bits and offset."""
+        """This sensor's blur and noise in the digital numbers of `other`: its gain, bits and
+        offset.
+        """
         effects = _with_offset_of(other.effects, self.effects)
-        return replace(self, gain_dn_per_radiance=other.gain_dn_per_radiance, bits=other.bits, effects=effects)
+        return replace(
+            self, gain_dn_per_radiance=other.gain_dn_per_radiance, bits=other.bits, effects=effects
+        )
 
     def noise_sigma(self, radiance: float) -> float:
         """Standard deviation of the noise at `radiance`, both in W/m2/sr/um."""
@@ -121,8 +147,8 @@ class Instrument:
 class Sensor:
     """What one TOML file under `profiles/sensors/` states, each constant with its source.
 
-    Its noise is stated by two SNRs, at `radiance_0` and `radiance_1`, or by `alpha` and `beta`. Its blur is that of a
-    table or a point-spread function where `response` is one.
+    Its noise is stated by two SNRs, at `radiance_0` and `radiance_1`, or by `alpha` and `beta`. Its
+    blur is that of a table or a point-spread function where `response` is one.
 
     Examples:
         >>> sensor = bd.Sensor.load("pleiades-degraded").replace(mtf_nyquist=0.05)
@@ -149,17 +175,21 @@ class Sensor:
 
     @classmethod
     def load(cls, sensor: "Sensor | str | os.PathLike[str]") -> "Sensor":
-        """A shipped sensor by its name, the user's own by the path of its .toml file, or the sensor given.
+        """A shipped sensor by its name, the user's own by the path of its .toml file, or the sensor
+        given.
 
         Raises:
-            ProfileError: unknown name, wrong or missing key, or numbers that no instrument can have.
+            ProfileError: unknown name, wrong or missing key, or numbers that no instrument can
+                have.
         """
         from beers_deploy.profiles.sensor_file import load_sensor  # it reads what this file defines
 
         return sensor if isinstance(sensor, Sensor) else load_sensor(os.fspath(sensor))
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the profile as a TOML file that `load` reads; a point-spread function lies beside it as .npy."""
+        """Write the profile as a TOML file that `load` reads; a point-spread function lies beside
+        it as .npy.
+        """
         from beers_deploy.profiles.sensor_file import save_sensor
 
         return save_sensor(self, Path(path))
@@ -179,30 +209,42 @@ class Sensor:
 
     @property
     def reference(self) -> "Sensor":
-        """The shipped sensor that a restoration of this one's images aims at, in this one's digital numbers."""
+        """The shipped sensor that a restoration of this one's images aims at, in this one's digital
+        numbers.
+        """
         from beers_deploy.profiles.sensor_file import reference_for
 
         return reference_for(self)
 
     def to_radiance(self, pixels: Any) -> Any:
-        """Digital numbers as radiance in W/m2/sr/um: an array of any kind, of the same kind and shape."""
+        """Digital numbers as radiance in W/m2/sr/um: an array of any kind, of the same kind and
+        shape.
+        """
         gain, _, offset_dn = self.units
         return (pixels - offset_dn) / gain
 
     def to_dn(self, radiance: Any) -> Any:
-        """Radiance in W/m2/sr/um as digital numbers, neither rounded nor clipped; an array of any kind."""
+        """Radiance in W/m2/sr/um as digital numbers, neither rounded nor clipped; an array of any
+        kind.
+        """
         gain, _, offset_dn = self.units
         return radiance * gain + offset_dn
 
     def noise(self, radiance: ArrayLike) -> NDArray[np.float64]:
-        """Standard deviation of the noise at some radiances, both in W/m2/sr/um, in the middle of each range."""
+        """Standard deviation of the noise at some radiances, both in W/m2/sr/um, in the middle of
+        each range.
+        """
         alpha, beta = self._middle_noise()
         return np.sqrt(np.maximum(alpha * np.asarray(radiance, np.float64) + beta, 0.0))
 
     def __repr__(self) -> str:
         across = self.mtf_nyquist
         bits = self.bits
-        noise = f"SNR {self.snr_1} at {self.radiance_1} W/m2/sr/um" if self.snr_1 else "noise by alpha and beta"
+        noise = (
+            f"SNR {self.snr_1} at {self.radiance_1} W/m2/sr/um"
+            if self.snr_1
+            else "noise by alpha and beta"
+        )
         more = f", {', '.join(self.effects)}" if self.effects else ""
         return f"Sensor({self.name!r}: {bits} bits, MTF {across} at Nyquist, {noise}{more})"
 
@@ -215,22 +257,29 @@ class Sensor:
     def in_units_of(self, other: "Sensor") -> "Sensor":
         """This profile with the gain, bits and offset of `other`; itself where they are the same.
 
-        Two acquisitions of one scene compare, pixel by pixel, only where a digital number means the same in both.
+        Two acquisitions of one scene compare, pixel by pixel, only where a digital number means the
+        same in both.
         """
         if self.units == other.units:
             return self
         effects = _with_offset_of(other.effects, self.effects)
-        return replace(self, gain_dn_per_radiance=other.gain_dn_per_radiance, bits=other.bits, effects=effects)
+        return replace(
+            self, gain_dn_per_radiance=other.gain_dn_per_radiance, bits=other.bits, effects=effects
+        )
 
     def draw(self, generator: np.random.Generator) -> Instrument:
-        """Pick one sensor from the ranges: MTF uniform, SNR pair uniform over the physically valid pairs."""
+        """Pick one sensor from the ranges: MTF uniform, SNR pair uniform over the physically valid
+        pairs.
+        """
         return self.draw_counted(generator)[0]
 
     def draw_counted(self, generator: np.random.Generator) -> tuple[Instrument, int]:
         """As `draw`, with the number of SNR pairs that were rejected as impossible."""
         mtf_nyquist = _uniform(generator, self.mtf_nyquist)
         (alpha, beta), rejected = self._draw_noise(generator)
-        effects = {name: draw_effect(name, table, generator) for name, table in self.effects.items()}
+        effects = {
+            name: draw_effect(name, table, generator) for name, table in self.effects.items()
+        }
         along = self.mtf_nyquist_along  # drawn last: a profile without it draws what it always drew
         mtf_along = None if along is None else _uniform(generator, along)
         return self._sensor(mtf_nyquist, alpha, beta, effects, mtf_along), rejected
@@ -259,7 +308,9 @@ class Sensor:
             return self.alpha.middle, self.beta.middle
         snr_0, snr_1 = (snr.middle for snr in self.snr_pair)
         low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, snr_1)
-        alpha, beta = noise_from_snr(self.radiance_0.low, min(max(snr_0, low), high), self.radiance_1.low, snr_1)
+        alpha, beta = noise_from_snr(
+            self.radiance_0.low, min(max(snr_0, low), high), self.radiance_1.low, snr_1
+        )
         return max(alpha, 0.0), max(beta, 0.0)
 
     @property
@@ -274,7 +325,12 @@ class Sensor:
         return self.snr_0, self.snr_1
 
     def _sensor(
-        self, mtf: float, alpha: float, beta: float, effects: Mapping[str, Effect], mtf_along: float | None
+        self,
+        mtf: float,
+        alpha: float,
+        beta: float,
+        effects: Mapping[str, Effect],
+        mtf_along: float | None,
     ) -> Instrument:
         gain = self.gain_dn_per_radiance.low
         bits = int(self.bits.low)
@@ -282,12 +338,15 @@ class Sensor:
         return Instrument(mtf, alpha, beta, gain, bits, effects, mtf_along, bright, self.response)
 
     def impossible_snr(self) -> ProfileError:
-        """The error of SNRs that no alpha and beta can have, with the range that the first one must lie in."""
+        """The error of SNRs that no alpha and beta can have, with the range that the first one must
+        lie in.
+        """
         snr_0, snr_1 = self.snr_pair
         low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, snr_1.high)
         return ProfileError(
             f"sensor profile {self.name}: noise.snr_0 and noise.snr_1",
-            expected=f"an SNR of {low:g} to {high:g} at {self.radiance_0} W/m2/sr/um for {snr_1.high:g} at "
+            expected=f"an SNR of {low:g} to {high:g} at {self.radiance_0} W/m2/sr/um for "
+            f"{snr_1.high:g} at "
             f"{self.radiance_1} (variance alpha L + beta with alpha, beta >= 0)",
             got=f"{snr_0}",
             remedy="correct one of the two; both are linear ratios, not dB",
@@ -302,7 +361,9 @@ def _with_offset_of(others: Mapping[str, E], own: Mapping[str, E]) -> dict[str, 
 
 
 def require_same_units(degraded: Sensor, reference: Sensor) -> None:
-    """Refuse a reference that another digitiser made: its images differ from the degraded ones by a factor."""
+    """Refuse a reference that another digitiser made: its images differ from the degraded ones by a
+    factor.
+    """
     if degraded.units != reference.units:
         raise ProfileError(
             f"sensor profile {reference.name}, the reference of {degraded.name}",
@@ -315,13 +376,17 @@ def require_same_units(degraded: Sensor, reference: Sensor) -> None:
 def describe_units(profile: Sensor) -> str:
     """What a digital number of the profile means, in words."""
     gain, bits, offset_dn = profile.units
-    return f"{gain:g} DN per W/m2/sr/um, {bits:g} bits" + (f", {offset_dn:g} DN of offset" if offset_dn else "")
+    return f"{gain:g} DN per W/m2/sr/um, {bits:g} bits" + (
+        f", {offset_dn:g} DN of offset" if offset_dn else ""
+    )
 
 
 def mtf_limit(antialias_sigma_px: float = 0.0) -> float:
-    """The highest MTF at Nyquist, that of a perfect lens: 2 / pi for a square detector, times the filter's gain.
+    """The highest MTF at Nyquist, that of a perfect lens: 2 / pi for a square detector, times the
+    filter's gain.
 
-    A Gaussian filter of sigma target pixels keeps exp(-2 pi^2 sigma^2 f^2) at f = 0.5 cycles per pixel.
+    A Gaussian filter of sigma target pixels keeps exp(-2 pi^2 sigma^2 f^2) at f = 0.5 cycles per
+    pixel.
     """
     return MTF_NYQUIST_MAX * math.exp(-2 * (math.pi * antialias_sigma_px * 0.5) ** 2)
 
@@ -330,10 +395,13 @@ def _uniform(generator: np.random.Generator, constant: Constant) -> float:
     return float(generator.uniform(constant.low, constant.high))
 
 
-def noise_from_snr(radiance_0: float, snr_0: float, radiance_1: float, snr_1: float) -> tuple[float, float]:
+def noise_from_snr(
+    radiance_0: float, snr_0: float, radiance_1: float, snr_1: float
+) -> tuple[float, float]:
     """Solve sigma_i^2 = (L_i / SNR_i)^2 = alpha L_i + beta for (alpha, beta) (paper, section 3.3).
 
-    Either may come out negative: see `snr_0_bounds`. On a bound it is 0, whatever rounding left of it.
+    Either may come out negative: see `snr_0_bounds`. On a bound it is 0, whatever rounding left of
+    it.
     """
     variance_0 = (radiance_0 / snr_0) ** 2
     variance_1 = (radiance_1 / snr_1) ** 2
@@ -366,15 +434,21 @@ TABLES: dict[str, tuple[tuple[tuple[str, ...], tuple[str, ...]], ...]] = {
     ),
     "digitiser": ((("bits", "gain_dn_per_radiance"), ()),),
 }
-"""Every table that a profile has, and the ways to fill it: the keys that each needs, and those that it may have."""
+"""Every table that a profile has, and the ways to fill it: the keys that each needs, and those that
+it may have.
+"""
 
 RESPONSE = ("frequency", "across", "along", "psf", "psf_samples_per_px")
-"""Keys that make up the response; each other key of `TABLES` is a constant, and a field of `Sensor`."""
+"""Keys that make up the response; each other key of `TABLES` is a constant, and a field of
+`Sensor`.
+"""
 
 
 def table_keys(table: str) -> tuple[str, ...]:
     """Every key that a table may have, each once, in the order of its ways."""
-    return tuple(dict.fromkeys(key for required, optional in TABLES[table] for key in required + optional))
+    return tuple(
+        dict.fromkeys(key for required, optional in TABLES[table] for key in required + optional)
+    )
 
 
 def constant_keys(table: str) -> tuple[str, ...]:
@@ -387,15 +461,24 @@ TABLE_OF = {key: table for table in TABLES for key in constant_keys(table)}
 
 
 def same_instrument(one: Sensor, other: Sensor) -> bool:
-    """Whether two profiles state the same numbers, whatever they are called and wherever the numbers come from."""
+    """Whether two profiles state the same numbers, whatever they are called and wherever the
+    numbers come from.
+    """
     return numbers_of(one) == numbers_of(other)
 
 
 def numbers_of(profile: Sensor) -> dict[str, object]:
-    """The low and high end of each constant by name: what of a profile decides what its images are like."""
+    """The low and high end of each constant by name: what of a profile decides what its images are
+    like.
+    """
     constants: dict[str, Constant | None] = {key: getattr(profile, key) for key in TABLE_OF}
-    constants |= {f"{n}.{key}": value for n, table in profile.effects.items() for key, value in table.items()}
+    constants |= {
+        f"{n}.{key}": value for n, table in profile.effects.items() for key, value in table.items()
+    }
     numbers: dict[str, object] = {
         key: constant and (constant.low, constant.high) for key, constant in constants.items()
     }
-    return {**numbers, "response": repr(profile.response)}  # all of it: as text it would be cut short
+    return {
+        **numbers,
+        "response": repr(profile.response),
+    }  # all of it: as text it would be cut short

@@ -13,7 +13,13 @@ from beers_deploy.profiles.constant import Constant, Number, check_keys, read_co
 from beers_deploy.profiles.effects import TABLES as EFFECT_TABLES
 from beers_deploy.profiles.effects import Table, read_effect
 from beers_deploy.profiles.errors import ProfileError
-from beers_deploy.profiles.response import MtfTable, axes_of, read_response, response_from_json, unpacked
+from beers_deploy.profiles.response import (
+    MtfTable,
+    axes_of,
+    read_response,
+    response_from_json,
+    unpacked,
+)
 from beers_deploy.profiles.sensor import (
     MTF_NYQUIST_MAX,
     OFFSET,
@@ -34,7 +40,9 @@ REFERENCE = "pleiades-reference"
 
 
 def reference_for(degraded: Sensor) -> Sensor:
-    """The default reference in the digital numbers of `degraded`: what a restoration of its images is held to."""
+    """The default reference in the digital numbers of `degraded`: what a restoration of its images
+    is held to.
+    """
     return load_sensor(REFERENCE).in_units_of(degraded)
 
 
@@ -49,7 +57,9 @@ BLIND_PROFILE = "pleiades-variable"
 
 
 def load_sensor(name: str) -> Sensor:
-    """Read a shipped sensor profile by name, or the user's own by the path of its .toml file; `blind` is one too."""
+    """Read a shipped sensor profile by name, or the user's own by the path of its .toml file;
+    `blind` is one too.
+    """
     shipped = BLIND_PROFILE if name == BLIND else name
     found = read_sensor(*read_toml("sensors", shipped), profile_path("sensors", shipped).parent)
     return replace(found, name=BLIND) if name == BLIND else found
@@ -65,16 +75,27 @@ def with_numbers(sensor: Sensor, numbers: Mapping[str, Number]) -> Sensor:
             remedy = "correct the name"
             raise ProfileError(where, expected=expected, got=repr(key), remedy=remedy)
         tables[TABLE_OF[key]][key] = list(value) if isinstance(value, tuple) else value
-    for one, other in (({"alpha", "beta"}, {"snr_0", "snr_1"}), ({"snr_0", "snr_1"}, {"alpha", "beta"})):
+    for one, other in (
+        ({"alpha", "beta"}, {"snr_0", "snr_1"}),
+        ({"snr_0", "snr_1"}, {"alpha", "beta"}),
+    ):
         if one & set(numbers):
-            tables["noise"] = {key: value for key, value in tables["noise"].items() if key not in other}
-    found = replace(read_sensor(where, {"description": sensor.description, **tables}), name=sensor.name)
-    keeps_blur = sensor.response is not None and not {"mtf_nyquist", "mtf_nyquist_along"} & set(numbers)
+            tables["noise"] = {
+                key: value for key, value in tables["noise"].items() if key not in other
+            }
+    found = replace(
+        read_sensor(where, {"description": sensor.description, **tables}), name=sensor.name
+    )
+    keeps_blur = sensor.response is not None and not {"mtf_nyquist", "mtf_nyquist_along"} & set(
+        numbers
+    )
     return replace(found, response=sensor.response) if keeps_blur else found
 
 
 def tables_of(sensor: Sensor) -> dict[str, dict[str, object]]:
-    """The tables of a sensor's file as plain values; of a response its contrasts at Nyquist alone."""
+    """The tables of a sensor's file as plain values; of a response its
+    contrasts at Nyquist alone.
+    """
     found: dict[str, dict[str, object]] = {}
     for key, table in TABLE_OF.items():
         constant: Constant | None = getattr(sensor, key)
@@ -92,12 +113,16 @@ def _plain(constant: Constant) -> dict[str, object]:
 
 
 def save_sensor(sensor: Sensor, path: Path) -> Path:
-    """Write a sensor as the TOML file that `load_sensor` reads, and a point-spread function beside it as .npy."""
+    """Write a sensor as the TOML file that `load_sensor` reads, and a point-spread function beside
+    it as .npy.
+    """
     tables = tables_of(sensor)
     response = sensor.response
     about = {"status": sensor.mtf_nyquist.status, "source": sensor.mtf_nyquist.source}
     if isinstance(response, MtfTable):
-        axes = {axis: {"value": list(getattr(response, axis)), **about} for axis in ("across", "along")}
+        axes = {
+            axis: {"value": list(getattr(response, axis)), **about} for axis in ("across", "along")
+        }
         tables["mtf"] = {"frequency": list(response.frequency), **axes}
     elif response is not None:
         samples = path.with_name(f"{path.stem}-psf.npy")
@@ -124,12 +149,21 @@ def _toml(value: object) -> str:
 
 
 def sensor_from_json(label: str, raw: Mapping[str, Any]) -> Sensor:
-    """A profile from the plain values of its fields, as `dataclasses.asdict` and JSON leave them."""
-    check_keys(label, raw, required={"name", "description"}, optional={*TABLE_OF, "effects", "response"})
-    tables = {table: {key: raw[key] for key in constant_keys(table) if raw.get(key) is not None} for table in TABLES}
+    """A profile from the plain values of its fields, as `dataclasses.asdict`
+    and JSON leave them.
+    """
+    check_keys(
+        label, raw, required={"name", "description"}, optional={*TABLE_OF, "effects", "response"}
+    )
+    tables = {
+        table: {key: raw[key] for key in constant_keys(table) if raw.get(key) is not None}
+        for table in TABLES
+    }
     effects = raw.get("effects", {})
     if not isinstance(effects, Mapping):
-        raise ProfileError(label, expected="a table of effects", got=repr(effects), remedy="make it anew")
+        raise ProfileError(
+            label, expected="a table of effects", got=repr(effects), remedy="make it anew"
+        )
     found = read_sensor(label, {"description": raw["description"], **tables, **effects})
     if raw.get("response") is not None:
         response = response_from_json(f"{label} response", raw["response"])
@@ -155,7 +189,11 @@ def read_sensor(label: str, raw: Mapping[str, Any], folder: Path = Path()) -> Se
         for key, value in content.items()
         if key not in RESPONSE
     }
-    effects = {name: read_effect(f"{label} [{name}]", name, raw[name]) for name in EFFECT_TABLES if name in raw}
+    effects = {
+        name: read_effect(f"{label} [{name}]", name, raw[name])
+        for name in EFFECT_TABLES
+        if name in raw
+    }
     _check_single(label, constants, effects)
     _check_each(label, constants)
     # Two radiances that only name where noise is spoken of, unless SNRs are stated there.
@@ -176,7 +214,9 @@ def read_sensor(label: str, raw: Mapping[str, Any], folder: Path = Path()) -> Se
 def _read_table(label: str, table: str, content: object) -> Mapping[str, object]:
     """The content of a table that is filled in one of its ways, and in no other."""
     if not isinstance(content, Mapping):
-        raise ProfileError(label, expected=f"a table [{table}]", got=repr(content), remedy="write it as one")
+        raise ProfileError(
+            label, expected=f"a table [{table}]", got=repr(content), remedy="write it as one"
+        )
     where = f"{label} [{table}]"
     ways = TABLES[table]
     check_keys(where, content, required=set(), optional=set(table_keys(table)))
@@ -196,13 +236,17 @@ SINGLE = ("radiance_0", "radiance_1", "bits", "gain_dn_per_radiance")
 """Constants that define what the others mean: no range to draw from."""
 
 
-def _check_single(label: str, constants: Mapping[str, Constant], effects: Mapping[str, Table]) -> None:
+def _check_single(
+    label: str, constants: Mapping[str, Constant], effects: Mapping[str, Table]
+) -> None:
     single = {key: constants[key] for key in SINGLE if key in constants}
     single |= {f"[{OFFSET}] {key}": constant for key, constant in effects.get(OFFSET, {}).items()}
     for key, constant in single.items():
         if constant.low != constant.high:
             remedy = "write a profile for each"
-            raise ProfileError(f"{label} {key}", expected="one number", got=f"a range, {constant}", remedy=remedy)
+            raise ProfileError(
+                f"{label} {key}", expected="one number", got=f"a range, {constant}", remedy=remedy
+            )
 
 
 Check = tuple[Callable[[float], bool], str, str]
@@ -226,7 +270,11 @@ CHECKS: dict[str, Check] = {
     "radiance_0": (lambda v: v > 0, "W/m2/sr/um above 0", "give the darker of two radiances"),
     "radiance_1": (lambda v: v > 0, "W/m2/sr/um above 0", "give the brighter of two radiances"),
     "alpha": (lambda v: v >= 0, "W/m2/sr/um, 0 or more", "the noise's variance is alpha L + beta"),
-    "beta": (lambda v: v >= 0, "(W/m2/sr/um)^2, 0 or more", "the noise's variance is alpha L + beta"),
+    "beta": (
+        lambda v: v >= 0,
+        "(W/m2/sr/um)^2, 0 or more",
+        "the noise's variance is alpha L + beta",
+    ),
     "bits": (lambda v: v in range(1, 17), "a whole number from 1 to 16", "give the bits per pixel"),
     "gain_dn_per_radiance": (
         lambda v: v > 0,
@@ -244,8 +292,12 @@ def _check_each(label: str, constants: Mapping[str, Constant]) -> None:
     for key, constant in constants.items():
         valid, expected, remedy = CHECKS[key]
         where = f"{label} [{TABLE_OF[key]}] {key}"
-        if any(value and not LEAST <= abs(value) <= MOST for value in (constant.low, constant.high)):
-            raise ProfileError(where, expected=f"{LEAST:g} to {MOST:g}", got=str(constant), remedy=remedy)
+        if any(
+            value and not LEAST <= abs(value) <= MOST for value in (constant.low, constant.high)
+        ):
+            raise ProfileError(
+                where, expected=f"{LEAST:g} to {MOST:g}", got=str(constant), remedy=remedy
+            )
         if not (valid(constant.low) and valid(constant.high)):
             raise ProfileError(where, expected=expected, got=str(constant), remedy=remedy)
 
@@ -262,14 +314,21 @@ def _check_noise(label: str, constants: Mapping[str, Constant]) -> None:
         )
     if "alpha" in constants and constants["alpha"].high == constants["beta"].high == 0:
         remedy = "give the variance of the dark as beta"
-        raise ProfileError(f"{label} [noise] alpha and beta", expected="not both 0", got="0 and 0", remedy=remedy)
+        raise ProfileError(
+            f"{label} [noise] alpha and beta", expected="not both 0", got="0 and 0", remedy=remedy
+        )
 
 
 def _default_radiances(constants: Mapping[str, Constant]) -> dict[str, Constant]:
     """A quarter of full scale, and a quarter of the brighter radiance."""
     full_scale = (2 ** constants["bits"].low - 1) / constants["gain_dn_per_radiance"].low
-    bright = constants.get("radiance_1", Constant(full_scale / 4, "inferred", "a quarter of full scale"))
-    return {"radiance_0": Constant(bright.low / 4, "inferred", "a quarter of radiance_1"), "radiance_1": bright}
+    bright = constants.get(
+        "radiance_1", Constant(full_scale / 4, "inferred", "a quarter of full scale")
+    )
+    return {
+        "radiance_0": Constant(bright.low / 4, "inferred", "a quarter of radiance_1"),
+        "radiance_1": bright,
+    }
 
 
 def _check_budget(label: str, profile: Sensor) -> None:
@@ -287,14 +346,17 @@ def _check_budget(label: str, profile: Sensor) -> None:
         if mtf is not None and mtf.high > limit:
             raise ProfileError(
                 f"{label} [mtf] {key}",
-                expected=f"at most {limit:.4f}, what an anti-alias filter of {sigma.high:g} px leaves",
+                expected=f"at most {limit:.4f}, what an anti-alias filter of {sigma.high:g} px "
+                "leaves",
                 got=str(mtf),
                 remedy="lower one of the two",
             )
 
 
 def _check_snr(profile: Sensor) -> None:
-    """Some pair in the ranges must be physical: the bounds grow with snr_1, so its two ends decide."""
+    """Some pair in the ranges must be physical: the bounds grow with snr_1, so
+    its two ends decide.
+    """
     if profile.snr_0 is None or profile.snr_1 is None:
         return
     radiances = profile.radiance_0.low, profile.radiance_1.low
@@ -307,7 +369,8 @@ def _check_snr(profile: Sensor) -> None:
 def reference_beside(
     degraded: Sensor, named: "Sensor | str | os.PathLike[str] | None", say: Callable[[str], None]
 ) -> Sensor:
-    """The reference profile that a user named, or the default one, in the digital numbers of `degraded`.
+    """The reference profile that a user named, or the default one, in the digital numbers of
+    `degraded`.
 
     One that was named, and states other ones, is converted in sight: `say` is told.
     """

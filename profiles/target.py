@@ -1,7 +1,7 @@
 """Target profiles: what a processing board can do, every constant with its source.
 
-A file may begin with `base = "zcu102"`: what it does not state is then that shipped board's. So a board with a DPU of
-a known kind states its cores, clock and memory, and nothing else.
+A file may begin with `base = "zcu102"`: what it does not state is then that shipped board's. So a
+board with a DPU of a known kind states its cores, clock and memory, and nothing else.
 """
 
 import os
@@ -16,7 +16,9 @@ from beers_deploy.profiles.target_limits import CONFIGURATIONS, check_limits
 from beers_deploy.profiles.toml import profile_path, read_toml, shipped_names
 
 TILE_PX = 640
-"""Side of a tile unless somebody asks for another: what the paper's network was given on the board."""
+"""Side of a tile unless somebody asks for another: what the paper's network was
+given on the board.
+"""
 DEFAULT_TARGET = "vck190"
 """The board of the paper: what a command takes where no board is named."""
 
@@ -26,11 +28,17 @@ MODEL_SUFFIX = "-model"
 FUSED = ("ReLU", "ReLU6", "LeakyReLU", "PReLU", "hard-sigmoid", "hard-swish")
 """The activations that a board's file can list, as its manual names them."""
 PLACES = frozenset({"conv", "depthwise", "pool", "sum", "alone"})
-"""Where: behind a convolution, a depthwise one, a pool, an add or a mul; or by themselves, behind anything."""
+"""Where: behind a convolution, a depthwise one, a pool, an add or a mul; or by themselves, behind
+anything.
+"""
 DOCUMENTS = frozenset({"operators", "numbers", "quantiser"})
-"""Where a DPU's operators are listed, where its numbers are described, and the quantiser that knows their windows."""
+"""Where a DPU's operators are listed, where its numbers are described, and the quantiser that knows
+their windows.
+"""
 NPU = frozenset({"device", "int8", "no_int8"})
-"""Of an NPU in place of a DPU's list: the compiler's name of it, and the operators that it has or lacks in INT8."""
+"""Of an NPU in place of a DPU's list: the compiler's name of it, and the operators that it has or
+lacks in INT8.
+"""
 
 WATTS = "_w"
 """How the names of measured powers end, which no board takes from another."""
@@ -40,10 +48,11 @@ WATTS = "_w"
 class TargetProfile:
     """What one TOML file under `profiles/targets/` states, its base included.
 
-    `tables` maps a topic ("array", "memory", "conv", "power", ...) to its constants; `configurations` maps the name
-    of a build of the accelerator to its constants, and is empty where there is but one. `activations` says what is
-    fused with which operation, `documents` names the manuals; both are empty of a board without a DPU. `npu` says
-    which operators an NPU computes, and is empty of every other board.
+    `tables` maps a topic ("array", "memory", "conv", "power", ...) to its constants;
+    `configurations` maps the name of a build of the accelerator to its constants, and is empty
+    where there is but one. `activations` says what is fused with which operation, `documents` names
+    the manuals; both are empty of a board without a DPU. `npu` says which operators an NPU
+    computes, and is empty of every other board.
     """
 
     name: str
@@ -57,10 +66,14 @@ class TargetProfile:
 
     @classmethod
     def load(cls, board: "TargetProfile | str | os.PathLike[str]") -> Self:
-        """A shipped board by its name, the user's own by the path of its .toml file, or the board given."""
+        """A shipped board by its name, the user's own by the path of its .toml file, or the board
+        given.
+        """
         if isinstance(board, cls):
             return board
-        return cls(**vars(board if isinstance(board, TargetProfile) else load_target(os.fspath(board))))
+        return cls(
+            **vars(board if isinstance(board, TargetProfile) else load_target(os.fspath(board)))
+        )
 
     def __repr__(self) -> str:
         builds = f", {', '.join(self.configurations)}" if self.configurations else ""
@@ -113,17 +126,27 @@ def npu_names() -> list[str]:
 
 
 def _names_with(line: str) -> list[str]:
-    texts = {name: profile_path("targets", name).read_text(encoding="utf-8") for name in target_names()}
+    texts = {
+        name: profile_path("targets", name).read_text(encoding="utf-8") for name in target_names()
+    }
     return [name for name, text in texts.items() if re.search(line, text, re.MULTILINE)]
 
 
 def load_target(name: str) -> TargetProfile:
     """Read a shipped target profile by name, or the user's own by the path of its .toml file.
 
-    A board's cost model has the name of the board: `vck190-model`, as `bench` calls it, is `vck190`.
+    A board's cost model has the name of the board: `vck190-model`, as `bench` calls it, is
+    `vck190`.
     """
     label, raw = _with_base(*read_toml("targets", name.removesuffix(MODEL_SUFFIX)))
-    special = {"description", "default_configuration", "configurations", "activations", "documents", "npu"}
+    special = {
+        "description",
+        "default_configuration",
+        "configurations",
+        "activations",
+        "documents",
+        "npu",
+    }
     check_keys(label, {k: v for k, v in raw.items() if k in special}, {"description"}, special)
     tables = {k: _table(f"{label} [{k}]", k, v) for k, v in raw.items() if k not in special}
     configurations = {
@@ -133,14 +156,19 @@ def load_target(name: str) -> TargetProfile:
     default = raw.get("default_configuration")
     activations = _whole_table(label, raw, "activations", PLACES)
     npu = _whole_table(label, raw, "npu", NPU)
-    documents = _whole_table(label, raw, "documents", frozenset({"quantiser"}) if npu else DOCUMENTS)
+    documents = _whole_table(
+        label, raw, "documents", frozenset({"quantiser"}) if npu else DOCUMENTS
+    )
     profile = TargetProfile(
         label.removesuffix(".toml"),
         str(raw["description"]),
         str(default) if default else None,
         configurations,
         tables,
-        {key: read_words(f"{label} [activations] {key}", value, FUSED) for key, value in activations.items()},
+        {
+            key: read_words(f"{label} [activations] {key}", value, FUSED)
+            for key, value in activations.items()
+        },
         {key: str(value) for key, value in documents.items()},
         {key: read_words(f"{label} [npu] {key}", value) for key, value in npu.items()},
     )
@@ -156,14 +184,27 @@ def _with_base(label: str, raw: dict[str, object]) -> tuple[str, dict[str, objec
         return label, raw
     if base not in target_names():
         known = ", ".join(board_names())
-        raise ProfileError(f"{label} base", expected=f"one of {known}", got=repr(base), remedy="name a shipped board")
+        raise ProfileError(
+            f"{label} base",
+            expected=f"one of {known}",
+            got=repr(base),
+            remedy="name a shipped board",
+        )
     below = _with_base(*read_toml("targets", str(base)))[1]
-    power = {key: value for key, value in _mapping(label, below.get("power", {})).items() if not key.endswith(WATTS)}
+    power = {
+        key: value
+        for key, value in _mapping(label, below.get("power", {})).items()
+        if not key.endswith(WATTS)
+    }
     return label, _over(raw, {**below, "power": power}, depth=1)
 
 
-def _over(above: Mapping[str, object], below: Mapping[str, object], depth: int) -> dict[str, object]:
-    """One table over another: `depth` levels of tables are joined, below them what stands above replaces."""
+def _over(
+    above: Mapping[str, object], below: Mapping[str, object], depth: int
+) -> dict[str, object]:
+    """One table over another: `depth` levels of tables are joined, below them what stands above
+    replaces.
+    """
     joined = dict(below)
     for key, value in above.items():
         under = below.get(key)
@@ -174,7 +215,9 @@ def _over(above: Mapping[str, object], below: Mapping[str, object], depth: int) 
     return joined
 
 
-def _whole_table(label: str, raw: Mapping[str, object], name: str, keys: frozenset[str]) -> Mapping[str, object]:
+def _whole_table(
+    label: str, raw: Mapping[str, object], name: str, keys: frozenset[str]
+) -> Mapping[str, object]:
     """A table that has all of its keys, or is not there at all."""
     if name not in raw:
         return {}
@@ -184,19 +227,25 @@ def _whole_table(label: str, raw: Mapping[str, object], name: str, keys: frozens
 
 
 def _table(where: str, name: str, raw: object) -> dict[str, Constant]:
-    constants = {key: read_constant(f"{where} {key}", value) for key, value in _mapping(where, raw).items()}
+    constants = {
+        key: read_constant(f"{where} {key}", value) for key, value in _mapping(where, raw).items()
+    }
     check_limits(where, name, constants)
     return constants
 
 
 def _mapping(where: str, raw: object) -> Mapping[str, object]:
     if not isinstance(raw, Mapping):
-        raise ProfileError(where, expected="a table of constants", got=repr(raw), remedy="write it as [table]")
+        raise ProfileError(
+            where, expected="a table of constants", got=repr(raw), remedy="write it as [table]"
+        )
     return raw
 
 
 def require_side(tile_px: int) -> int:
     """The side of a tile, refused where it is none."""
     if tile_px < 1:
-        raise OptionError("tile", expected="pixels, 1 or more", got=str(tile_px), remedy="choose another")
+        raise OptionError(
+            "tile", expected="pixels, 1 or more", got=str(tile_px), remedy="choose another"
+        )
     return tile_px

@@ -1,6 +1,8 @@
-"""Which numbers a board can have: limits of every key of a target's file, so that no figure follows from nonsense.
+"""Which numbers a board can have: limits of every key of a target's file, so that no figure follows
+from nonsense.
 
-The limits are wide: they keep out what no board has (no cores, a negative clock, half a kernel), not what is unusual.
+The limits are wide: they keep out what no board has (no cores, a negative clock, half a kernel),
+not what is unusual.
 """
 
 from collections.abc import Mapping
@@ -111,15 +113,23 @@ TABLES: Mapping[str, Mapping[str, Limits]] = {
         "bias_bits": BITS,
         "zero_point": Limits(-128, 255, whole=True),
     },
-    "power": dict.fromkeys(("product_j", "memory_byte_j", "dpu_run_w", "dpu_range_w", "cpu_run_w"), POSITIVE),
+    "power": dict.fromkeys(
+        ("product_j", "memory_byte_j", "dpu_run_w", "dpu_range_w", "cpu_run_w"), POSITIVE
+    ),
     "tile": {"memory_bytes": BYTES},
     "cost": {
-        **dict.fromkeys(("array_efficiency", "memory_efficiency", "overlap", "families_held"), SHARE),
+        **dict.fromkeys(
+            ("array_efficiency", "memory_efficiency", "overlap", "families_held"), SHARE
+        ),
         **dict.fromkeys(("layer_s", "host_image_s", "crowding"), POSITIVE),
-        **dict.fromkeys(("port_bytes_per_cycle", "host_in_bytes_per_s", "host_out_bytes_per_s"), RATE),
+        **dict.fromkeys(
+            ("port_bytes_per_cycle", "host_in_bytes_per_s", "host_out_bytes_per_s"), RATE
+        ),
         **dict.fromkeys(("argmax_values_per_s", "softmax_values_per_s"), RATE),
         **dict.fromkeys(("sort_values_per_s", "image_values_per_s"), RATE),
-        **dict.fromkeys(("width_host", "width_small_maps", "width_large_maps", "width_outside"), POSITIVE),
+        **dict.fromkeys(
+            ("width_host", "width_small_maps", "width_large_maps", "width_outside"), POSITIVE
+        ),
         "pair_width": POSITIVE,
         "fitted_map_bytes": BYTES,
         "fitted_operations": BYTES,
@@ -135,9 +145,20 @@ TABLES: Mapping[str, Mapping[str, Limits]] = {
 """Limits of each key by its table."""
 
 ANY_KEY = dict.fromkeys(
-    ("published_latency_ms", "published_throughput_fps", "array", "memory", "elementwise", "cost", "power"), OPEN
+    (
+        "published_latency_ms",
+        "published_throughput_fps",
+        "array",
+        "memory",
+        "elementwise",
+        "cost",
+        "power",
+    ),
+    OPEN,
 )
-"""Tables in which other keys may stand than are known here, such as a quoted network's name, and their limits."""
+"""Tables in which other keys may stand than are known here, such as a quoted network's name, and
+their limits.
+"""
 
 
 def check_limits(where: str, table: str, constants: Mapping[str, Constant]) -> None:

@@ -22,7 +22,9 @@ QUOTED = 80
 
 def read_toml_text(path: Path) -> dict[str, object]:
     """A TOML file as plain values; it may say inf, nan, or a whole number of any size."""
-    text = read_whole(path, TOML_BYTES).decode("utf-8-sig")  # some editors on Windows begin with a mark
+    text = read_whole(path, TOML_BYTES).decode(
+        "utf-8-sig"
+    )  # some editors on Windows begin with a mark
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -34,7 +36,9 @@ def read_toml_text(path: Path) -> dict[str, object]:
 
 
 def _line_at_fault(text: str, reason: str) -> str:
-    """The line quoted, its number, and tomllib's reason, which ends in "(at line 3, column 9)" or "(at end ...)"."""
+    """The line quoted, its number, and tomllib's reason, which ends in "(at line 3, column 9)" or
+    "(at end ...)".
+    """
     what, _, where = reason.rpartition(" (at ")
     lines = text.rstrip().split("\n")
     number = int(found[1]) if (found := re.match(r"line (\d+)", where)) else len(lines)
@@ -53,7 +57,11 @@ def parse_json(text: str) -> object:
         raise ValueError("an empty file")
     try:
         found: object = json.loads(
-            text, parse_constant=_number, parse_float=_number, parse_int=_whole, object_pairs_hook=_unique
+            text,
+            parse_constant=_number,
+            parse_float=_number,
+            parse_int=_whole,
+            object_pairs_hook=_unique,
         )
         json.dumps(found, ensure_ascii=False).encode()  # half a surrogate pair cannot be printed
     except RecursionError:
@@ -62,7 +70,9 @@ def parse_json(text: str) -> object:
 
 
 def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
-    """Return an object; raise ValueError for a key that stands in it twice, of which readers take either."""
+    """Return an object; raise ValueError for a key that stands in it twice, of which readers take
+    either.
+    """
     found = dict(pairs)
     if len(found) < len(pairs):
         twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
@@ -95,7 +105,8 @@ def read_whole(path: Path, limit_bytes: int) -> bytes:
 def unreadable(path: Path) -> str | None:
     """Why there is no file to be read at a path, in words for its user; None where there is one.
 
-    Git LFS leaves a pointer in place of each large file that was not fetched: 130 bytes of text under its name.
+    Git LFS leaves a pointer in place of each large file that was not fetched: 130 bytes of text
+    under its name.
     """
     try:
         mode = path.stat().st_mode
@@ -139,6 +150,10 @@ def read_toml(kind: str, name: str) -> tuple[str, dict[str, object]]:
         return path.name, read_toml_text(path)
     except OSError as error:
         reason = error.strerror or str(error)
-        raise ProfileError(str(path), expected="a readable file", got=reason, remedy="check the path") from error
+        raise ProfileError(
+            str(path), expected="a readable file", got=reason, remedy="check the path"
+        ) from error
     except ValueError as error:
-        raise ProfileError(str(path), expected="TOML text", got=str(error), remedy="correct that line") from error
+        raise ProfileError(
+            str(path), expected="TOML text", got=str(error), remedy="correct that line"
+        ) from error

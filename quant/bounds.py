@@ -1,4 +1,6 @@
-"""What an INT8 network's integers can be over all images, by interval arithmetic on its own weights."""
+"""What an INT8 network's integers can be over all images, by interval arithmetic on its own
+weights.
+"""
 
 from dataclasses import dataclass
 
@@ -82,7 +84,9 @@ def _accumulated(core: IntCore, op: IntConv | Op, read: list[Range]) -> Accumula
     if isinstance(op, AveragePool):
         assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
         factor, shift = mean_factor(op.kernel)
-        low, high = (op.kernel[0] * op.kernel[1] * factor * end.astype(np.int64) for end in _padded(read[0]))
+        low, high = (
+            op.kernel[0] * op.kernel[1] * factor * end.astype(np.int64) for end in _padded(read[0])
+        )
         return low, high, shift
     low, high = _moved(core, op, read)
     return low, high, 0
@@ -130,7 +134,9 @@ def _conv(core: IntCore, op: IntConv, read: Range) -> Accumulated:
 def _whole_add(core: IntCore, op: Add, read: list[Range]) -> Accumulated:
     finest = max(core.frac_bits[name] for name in op.inputs)
     shifts = [finest - core.frac_bits[name] for name in op.inputs]
-    ends = (sum(r[k].astype(np.int64) << s for r, s in zip(read, shifts, strict=True)) for k in (0, 1))
+    ends = (
+        sum(r[k].astype(np.int64) << s for r, s in zip(read, shifts, strict=True)) for k in (0, 1)
+    )
     (low, finer), (high, _) = (activated(np.asarray(end), op.activation, finest) for end in ends)
     return low, high, finest - core.frac_bits[op.output] + finer
 

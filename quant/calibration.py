@@ -1,7 +1,7 @@
 """Simulated patches for calibration, and for looking at what INT8 changes.
 
-Patches are simulated anew for each pass over them, which costs a tenth of what the network does with them. So memory
-grows neither with their number nor with their size.
+Patches are simulated anew for each pass over them, which costs a tenth of what the network does
+with them. So memory grows neither with their number nor with their size.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +22,13 @@ from beers_deploy.model.training.patches import PatchRecipe, turn
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.profiles.sensor_file import reference_for
-from beers_deploy.quant.lighting import CALIBRATION, JUDGING, Lighting, assign_lightings, full_scale_radiance
+from beers_deploy.quant.lighting import (
+    CALIBRATION,
+    JUDGING,
+    Lighting,
+    assign_lightings,
+    full_scale_radiance,
+)
 from beers_deploy.quant.samples import PATCH_PX, Pair, Patches, Remade
 
 VIEW_CANDIDATES = 8
@@ -75,7 +81,9 @@ class Ground:
 
     def _part(self, step: int) -> np.ndarray:
         side = self.side_px * self.oversampling
-        return self.scene.radiance[self.top : self.top + side : step, self.left : self.left + side : step]
+        return self.scene.radiance[
+            self.top : self.top + side : step, self.left : self.left + side : step
+        ]
 
 
 @dataclass(frozen=True)
@@ -95,7 +103,9 @@ def draw_views(
     A scene at a scale is drawn as often as it holds patches, as training sees it.
     """
     places = _places(scenes, recipe)
-    sides = [[size // ratio - 2 * MARGIN_PX for size in scene.radiance.shape] for scene, ratio in places]
+    sides = [
+        [size // ratio - 2 * MARGIN_PX for size in scene.radiance.shape] for scene, ratio in places
+    ]
     room = np.prod(sides, axis=1)  # target pixels within the margin
     drawn = generator.choice(len(places), VIEW_CANDIDATES * count, p=room / room.sum())
     grounds = [_ground(places[k], recipe, generator) for k in drawn]
@@ -121,7 +131,10 @@ def _blurred_as(sensor: Instrument, other: Instrument) -> Instrument:
 
 
 def stratified(
-    candidates: Sequence[Candidate], key: Callable[[Candidate], float], count: int, generator: np.random.Generator
+    candidates: Sequence[Candidate],
+    key: Callable[[Candidate], float],
+    count: int,
+    generator: np.random.Generator,
 ) -> list[Candidate]:
     """One of each of `count` equal groups of the candidates ordered by `key`, in random order."""
     ranked = sorted(candidates, key=key)
@@ -134,24 +147,39 @@ def _places(scenes: Sequence[Scene], recipe: PatchRecipe) -> list[tuple[Scene, i
     """Scenes, each with every oversampling at which it holds a patch."""
     side_px = recipe.patch_px + 2 * MARGIN_PX
     fitting = [
-        (s, ratio) for s in scenes for ratio in recipe.oversamplings if min(s.radiance.shape) >= side_px * ratio
+        (s, ratio)
+        for s in scenes
+        for ratio in recipe.oversamplings
+        if min(s.radiance.shape) >= side_px * ratio
     ]
     if not fitting:
-        expected = f"scenes that hold a patch of {recipe.patch_px} target pixels and {MARGIN_PX} around it"
+        expected = (
+            f"scenes that hold a patch of {recipe.patch_px} target pixels and {MARGIN_PX} around it"
+        )
         remedy = "give larger images or a smaller patch"
-        raise ImageError("calibration images", expected=expected, got="none large enough", remedy=remedy)
+        raise ImageError(
+            "calibration images", expected=expected, got="none large enough", remedy=remedy
+        )
     return fitting
 
 
-def _ground(place: tuple[Scene, int], recipe: PatchRecipe, generator: np.random.Generator) -> Ground:
+def _ground(
+    place: tuple[Scene, int], recipe: PatchRecipe, generator: np.random.Generator
+) -> Ground:
     scene, oversampling = place
     side_px = recipe.patch_px + 2 * MARGIN_PX
-    top, left = (int(generator.integers(size - side_px * oversampling + 1)) for size in scene.radiance.shape)
-    return Ground(scene, top, left, side_px, oversampling, float(generator.uniform(*recipe.looks.exposures)))
+    top, left = (
+        int(generator.integers(size - side_px * oversampling + 1)) for size in scene.radiance.shape
+    )
+    return Ground(
+        scene, top, left, side_px, oversampling, float(generator.uniform(*recipe.looks.exposures))
+    )
 
 
 ROLES = "degraded", "reference"
-"""Of the sensors of a pair, each with noise of its own: a degraded patch is the same in a pair and alone."""
+"""Of the sensors of a pair, each with noise of its own: a degraded patch is the same in a pair and
+alone.
+"""
 
 
 def draw_patches(
@@ -164,7 +192,8 @@ def draw_patches(
     family: SensorFamily | None = None,
     lightings: Sequence[Lighting] = (),
 ) -> Patches:
-    """Draw patches by sensor profile and seed, spread over the profile's ranges and over brightness.
+    """Draw patches by sensor profile and seed, spread over the profile's ranges and over
+    brightness.
 
     Args:
         scenes: that are seen.
@@ -174,8 +203,8 @@ def draw_patches(
         seed: of everything that is drawn.
         patch_px: side of a patch.
         family: of sensors with the gain and bits of `degraded`.
-        lightings: how the ground is lit, so that the patches cover the sensor's range; without any it is as bright as
-            the scenes show it.
+        lightings: how the ground is lit, so that the patches cover the sensor's range; without any
+            it is as bright as the scenes show it.
 
     Raises:
         ImageError: no scene holds a patch.
@@ -197,19 +226,25 @@ def draw_patches(
     return Patches(views, Remade(pair, count), Remade(alone, count))
 
 
-def relit(views: Sequence[View], lightings: Sequence[Lighting], generator: np.random.Generator) -> list[View]:
+def relit(
+    views: Sequence[View], lightings: Sequence[Lighting], generator: np.random.Generator
+) -> list[View]:
     """Return the same views, their ground lit in the shares of the lightings."""
     assigned = assign_lightings(len(views), lightings, generator)
     result = []
     for view, lighting in zip(views, assigned, strict=True):
         full_scale = full_scale_radiance(view.degraded)
         factor = lighting.factor(view.ground.sampled_radiance, full_scale, generator)
-        result.append(replace(view, ground=replace(view.ground, exposure=factor * view.ground.exposure)))
+        result.append(
+            replace(view, ground=replace(view.ground, exposure=factor * view.ground.exposure))
+        )
     return result
 
 
 def _simulate(ground: Ground, sensors: Sequence[Instrument], draw: Draw) -> list[np.ndarray]:
-    """What the degraded sensor, and the reference if given, make of the same ground: patches (1, 1, P, P)."""
+    """What the degraded sensor, and the reference if given, make of the same ground: patches (1, 1,
+    P, P).
+    """
     radiance = ground.radiance
     spectrum = scene_spectrum(radiance)
     width = radiance.shape[-1]
@@ -255,7 +290,13 @@ class Calibration:
 
     def _draw(self, count: int, seed: int) -> Patches:
         return draw_patches(
-            self._scenes, self.sensor, self._reference, count, seed, self.patch_px, lightings=CALIBRATION
+            self._scenes,
+            self.sensor,
+            self._reference,
+            count,
+            seed,
+            self.patch_px,
+            lightings=CALIBRATION,
         )
 
     @cached_property

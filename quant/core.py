@@ -1,7 +1,8 @@
-"""The integer core: int8 weights and bias, and a power-of-two scale for every tensor, as the DPU demands.
+"""The integer core: int8 weights and bias, and a power-of-two scale for every tensor, as the DPU
+demands.
 
-A tensor with n fractional bits holds whole multiples of 2^-n, its scale, in [-128, 127] times that (UG1414 3.5,
-vai_q). `frac_bits` is n everywhere; a finer scale has more of them.
+A tensor with n fractional bits holds whole multiples of 2^-n, its scale, in [-128, 127] times that
+(UG1414 3.5, vai_q). `frac_bits` is n everywhere; a finer scale has more of them.
 """
 
 import math
@@ -13,7 +14,17 @@ import numpy as np
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.ends import Ends
-from beers_deploy.quant.graph import PLANES, Activation, Add, Conv, Graph, Mul, Op, Window, ties_scales
+from beers_deploy.quant.graph import (
+    PLANES,
+    Activation,
+    Add,
+    Conv,
+    Graph,
+    Mul,
+    Op,
+    Window,
+    ties_scales,
+)
 from beers_deploy.quant.graph.operations import SIX, OneInput
 
 INT8_MIN = -128
@@ -23,7 +34,9 @@ CANDIDATES = 6
 
 
 def quantise(values: np.ndarray, frac_bits: int) -> np.ndarray:
-    """Whole numbers in [-128, 127], rounded half away from zero as the DPU does for weights and bias."""
+    """Whole numbers in [-128, 127], rounded half away from zero as the DPU does for weights and
+    bias.
+    """
     scaled = np.asarray(values, dtype=np.float64) * 2.0**frac_bits
     rounded = np.sign(scaled) * np.floor(np.abs(scaled) + 0.5)
     return np.asarray(np.clip(rounded, INT8_MIN, INT8_MAX).astype(np.int8))
@@ -35,7 +48,9 @@ def unclipped_frac_bits(max_abs: float) -> int:
 
 
 def squared_errors(values: np.ndarray, first: int) -> np.ndarray:
-    """Sum of squared rounding and clipping errors with first .. first + CANDIDATES - 1 fractional bits, float64."""
+    """Sum of squared rounding and clipping errors with first .. first + CANDIDATES - 1 fractional
+    bits, float64.
+    """
     errors = np.empty(CANDIDATES)
     for k in range(CANDIDATES):
         scale = np.float32(2.0 ** (first + k))
@@ -53,14 +68,17 @@ def best_frac_bits(values: np.ndarray) -> int:
 
 @dataclass(frozen=True)
 class Shifts:
-    """The shift windows of the DPU's arithmetic (UG1414 3.5 and the quantiser's source, Vitis-AI 3.0).
+    """The shift windows of the DPU's arithmetic (UG1414 3.5 and the quantiser's source, Vitis-AI
+    3.0).
 
     They are what the quantiser writes within; what any file is checked against stands in
-    `deploy.dpu.checker.number_rules`, which allows a little more (a bias finer than the accumulator).
+    `deploy.dpu.checker.number_rules`, which allows a little more (a bias finer than the
+    accumulator).
 
     Attributes:
         cut: fractional bits of a convolution's weight and input less those of its result.
-        bias: those of weight and input less those of the int8 bias; below 0 it would be finer than the accumulator.
+        bias: those of weight and input less those of the int8 bias; below 0 it would be finer than
+            the accumulator.
         read: by how many fractional bits the inputs of an add may differ.
         write: those of an add's coarsest input less those of its result.
     """
@@ -91,12 +109,16 @@ def clamp(value: int, window: tuple[int, int]) -> int:
 
 
 ROUNDS = 8
-"""An add may move a tensor that was written long before, whose writer must then follow; two rounds do, if any."""
+"""An add may move a tensor that was written long before, whose writer must then follow; two rounds
+do, if any.
+"""
 
 
 @dataclass(frozen=True)
 class IntConv(OneInput):
-    """int8 convolution: sum of products, plus bias << shift_bias, activation, shifted right by shift_cut, clipped."""
+    """int8 convolution: sum of products, plus bias << shift_bias, activation, shifted right by
+    shift_cut, clipped.
+    """
 
     weight: np.ndarray  # (O, I / groups, kh, kw) int8
     weight_frac_bits: int
@@ -115,7 +137,9 @@ class IntConv(OneInput):
 
 @dataclass(frozen=True)
 class IntCore:
-    """Operations in order, convolutions in whole numbers; the scale of every tensor; and the host's part around."""
+    """Operations in order, convolutions in whole numbers; the scale of every tensor; and the host's
+    part around.
+    """
 
     ops: tuple[IntConv | Op, ...]
     frac_bits: Mapping[str, int]
@@ -140,7 +164,9 @@ def dequantised(op: Conv, whole: IntConv) -> Conv:
 def rounded_to(values: np.ndarray, frac_bits: int) -> np.ndarray:
     """To whole multiples of 2^-n, half up, and clipped, as the DPU does."""
     scale = np.float32(2.0**frac_bits)
-    return np.asarray(np.clip(np.floor(values * scale + np.float32(0.5)), INT8_MIN, INT8_MAX) / scale)
+    return np.asarray(
+        np.clip(np.floor(values * scale + np.float32(0.5)), INT8_MIN, INT8_MAX) / scale
+    )
 
 
 def build_core(
@@ -155,18 +181,24 @@ def build_core(
         ends: what the host does around; by default an image of one channel and a correction of it.
     """
     lowered = {op.output: op.offset for op in graph if isinstance(op, Conv) and op.offset}
-    legal = dict(frac_bits) | {name: round(math.log2(-INT8_MIN / offset)) for name, offset in lowered.items()}
+    legal = dict(frac_bits) | {
+        name: round(math.log2(-INT8_MIN / offset)) for name, offset in lowered.items()
+    }
     for _ in range(ROUNDS):
         core = _in_one_round(graph, legal, shifts, ends or Ends())
         faults = shift_faults(core, shifts)
         if not faults:
             return _with_biases_left(core, graph)
     remedy = "look for weights that are far too large or small"
-    raise ModelError("float model", expected="values that the DPU's shifts reach", got=faults[0], remedy=remedy)
+    raise ModelError(
+        "float model", expected="values that the DPU's shifts reach", got=faults[0], remedy=remedy
+    )
 
 
 def _with_biases_left(core: IntCore, graph: Graph) -> IntCore:
-    """What rounding the last bias leaves is known, and where a result comes in windows the host adds it."""
+    """What rounding the last bias leaves is known, and where a result comes in windows the host
+    adds it.
+    """
     last = graph[-1]
     whole = core.ops[-1]
     if not (core.ends.offsets and isinstance(last, Conv) and isinstance(whole, IntConv)):
@@ -176,14 +208,20 @@ def _with_biases_left(core: IntCore, graph: Graph) -> IntCore:
 
 
 def nearest_bias(op: Conv, weight: np.ndarray, weight_frac_bits: int, graph: Graph) -> np.ndarray:
-    """(O,) the bias to be rounded, beside weights (O, I, kh, kw) that each are rounded to the nearest whole number.
+    """(O,) the bias to be rounded, beside weights (O, I, kh, kw) that each are rounded to the
+    nearest whole number.
 
-    Where what it reads is stored less an offset, those weights give back another amount than the float ones.
+    Where what it reads is stored less an offset, those weights give back another amount than the
+    float ones.
     """
-    offset = next((each.offset for each in graph if isinstance(each, Conv) and each.output == op.input), 0.0)
+    offset = next(
+        (each.offset for each in graph if isinstance(each, Conv) and each.output == op.input), 0.0
+    )
     if not offset:
         return op.stored_bias
-    return np.asarray(op.stored_bias + offset * (weight * 2.0**-weight_frac_bits - op.weight).sum((1, 2, 3)))
+    return np.asarray(
+        op.stored_bias + offset * (weight * 2.0**-weight_frac_bits - op.weight).sum((1, 2, 3))
+    )
 
 
 def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends: Ends) -> IntCore:
@@ -205,29 +243,43 @@ def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends:
 
 
 def _quantise_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts, graph: Graph) -> IntConv:
-    finest = shifts.cut[1] + frac_bits[op.output] - frac_bits[op.input]  # finer weights would make the result clip
+    finest = (
+        shifts.cut[1] + frac_bits[op.output] - frac_bits[op.input]
+    )  # finer weights would make the result clip
     weight_frac_bits = min(best_frac_bits(op.weight), finest)
-    if op.ceiling is not None or op.offset:  # the result keeps its scale, for it clips where int8 ends
+    if (
+        op.ceiling is not None or op.offset
+    ):  # the result keeps its scale, for it clips where int8 ends
         weight_frac_bits = max(weight_frac_bits, frac_bits[op.output] - frac_bits[op.input])
     product = weight_frac_bits + frac_bits[op.input]
     cut = clamp(product - frac_bits[op.output], shifts.cut)
     frac_bits[op.output] = product - cut
     weight = quantise(op.weight, weight_frac_bits)
-    bias, bias_frac_bits = quantise_bias(nearest_bias(op, weight, weight_frac_bits, graph), product, shifts)
+    bias, bias_frac_bits = quantise_bias(
+        nearest_bias(op, weight, weight_frac_bits, graph), product, shifts
+    )
     kind = (_activation(op, frac_bits[op.output]), op.window, op.groups, op.transposed)
-    return IntConv(op.name, op.input, op.output, weight, weight_frac_bits, bias, bias_frac_bits, *kind)
+    return IntConv(
+        op.name, op.input, op.output, weight, weight_frac_bits, bias, bias_frac_bits, *kind
+    )
 
 
 def _activation(op: Conv, frac_bits: int) -> Activation:
-    """Of whole numbers: ReLU6 is ReLU where int8 ends no later than the six, as it does once `equalise` scaled."""
+    """Of whole numbers: ReLU6 is ReLU where int8 ends no later than the six, as it does once
+    `equalise` scaled.
+    """
     if op.offset:
         return Activation.saturated_relu
     ends_first = op.ceiling is not None or INT8_MAX * 2.0**-frac_bits <= SIX
     return Activation.relu if op.activation is Activation.relu6 and ends_first else op.activation
 
 
-def quantise_bias(bias: np.ndarray, product: int, shifts: Shifts = SHIFTS) -> tuple[np.ndarray, int]:
-    """An int8 bias (O,) and its scale, within reach of the accumulator's `product` fractional bits."""
+def quantise_bias(
+    bias: np.ndarray, product: int, shifts: Shifts = SHIFTS
+) -> tuple[np.ndarray, int]:
+    """An int8 bias (O,) and its scale, within reach of the accumulator's
+    `product` fractional bits.
+    """
     wanted = best_frac_bits(bias) if bias.any() else product
     frac_bits = product - clamp(product - wanted, shifts.bias)
     return quantise(bias, frac_bits), frac_bits
@@ -241,7 +293,9 @@ def _move_add(op: Add, frac_bits: dict[str, int], shifts: Shifts) -> None:
 
 
 def _tie(op: Op, frac_bits: dict[str, int]) -> None:
-    """One scale for what it reads and writes: the coarsest that one of them needs; that of the planes is fixed."""
+    """One scale for what it reads and writes: the coarsest that one of them needs; that of the
+    planes is fixed.
+    """
     names = (*op.inputs, op.output)
     shared = frac_bits[PLANES] if PLANES in names else min(frac_bits[name] for name in names)
     frac_bits.update(dict.fromkeys(names, shared))
@@ -274,4 +328,7 @@ def op_shifts(
     if not isinstance(op, IntConv):
         return []
     product = op.weight_frac_bits + inputs[0]
-    return [("shift_cut", product - output, shifts.cut), ("shift_bias", product - op.bias_frac_bits, shifts.bias)]
+    return [
+        ("shift_cut", product - output, shifts.cut),
+        ("shift_bias", product - op.bias_frac_bits, shifts.bias),
+    ]

@@ -1,8 +1,8 @@
 """Whose operator a node is: ONNX knows an operator by its domain and its name together.
 
-A `Relu` of another domain, or of a function that the file itself defines, may compute anything. So wherever nodes are
-told apart by a name, it is `operator_name`: ONNX's own operators have their bare names, and all others have their
-domain in front of it, so that no table of ours holds them.
+A `Relu` of another domain, or of a function that the file itself defines, may compute anything. So
+wherever nodes are told apart by a name, it is `operator_name`: ONNX's own operators have their bare
+names, and all others have their domain in front of it, so that no table of ours holds them.
 """
 
 from collections.abc import Collection
@@ -14,17 +14,28 @@ MICROSOFT = "com.microsoft"
 SEPARATOR = "::"
 
 INTEGER_OPERATORS = {
-    "DequantizeLinear", "QLinearAdd", "QLinearAveragePool", "QLinearConcat", "QLinearGlobalAveragePool",
-    "QLinearLeakyRelu", "QLinearMul", "QLinearReduceMean", "QLinearSigmoid", "QLinearSoftmax", "QLinearWhere",
+    "DequantizeLinear",
+    "QLinearAdd",
+    "QLinearAveragePool",
+    "QLinearConcat",
+    "QLinearGlobalAveragePool",
+    "QLinearLeakyRelu",
+    "QLinearMul",
+    "QLinearReduceMean",
+    "QLinearSigmoid",
+    "QLinearSoftmax",
+    "QLinearWhere",
     "QuantizeLinear",
-}  # fmt: skip
-"""Of onnxruntime's domain: what ONNX lacks, and the pair that ONNX has too, with the same meaning for int8 and uint8.
-Not its QLinearConv, which may read (N, H, W, C)."""
+}
+"""Of onnxruntime's domain: what ONNX lacks, and the pair that ONNX has too, with the same meaning
+for int8 and uint8. Not its QLinearConv, which may read (N, H, W, C).
+"""
 
 INLINE = "inline its functions first: onnx.inliner.inline_local_functions(model)"
 QDQ = "write the file with QuantizeLinear and DequantizeLinear (QDQ format)"
 UNOPTIMISED = (
-    "give the file that onnxruntime read, because what it saves after its optimisation has operators of its own "
+    "give the file that onnxruntime read, because what it saves after its optimisation has "
+    "operators of its own "
     "(ORT_ENABLE_BASIC adds none)"
 )
 OTHERS = "export the network with operators of ONNX itself"
@@ -40,7 +51,8 @@ def functions_of(model: ModelProto) -> Functions:
 
 
 def operator_name(node: NodeProto, functions: Functions = ()) -> str:
-    """Return an operator's name, with its domain in front unless it is ONNX's or onnxruntime's on integers.
+    """Return an operator's name, with its domain in front unless it is ONNX's or onnxruntime's on
+    integers.
 
     Args:
         node: of a file.
@@ -48,7 +60,9 @@ def operator_name(node: NodeProto, functions: Functions = ()) -> str:
     """
     if (node.domain, node.op_type) in functions:
         return f"{node.domain}{SEPARATOR}{node.op_type}"
-    transposed = any(attribute.name == "channels_last" and attribute.i for attribute in node.attribute)
+    transposed = any(
+        attribute.name == "channels_last" and attribute.i for attribute in node.attribute
+    )
     integer = node.domain == MICROSOFT and node.op_type in INTEGER_OPERATORS and not transposed
     if node.domain in STANDARD or integer:
         return str(node.op_type)

@@ -1,6 +1,8 @@
-"""What the host does around the integer core, in numpy and as ONNX: planes in front, the result made behind.
+"""What the host does around the integer core, in numpy and as ONNX: planes in front, the result
+made behind.
 
-image -> pixel unshuffle -> planes -> core -> one correction of its gains or windows -> pixel shuffle -> + image
+image -> pixel unshuffle -> planes -> core -> one correction of its gains or windows -> pixel
+shuffle -> + image
 """
 
 import math
@@ -11,7 +13,14 @@ from onnx import TensorProto, helper
 
 from beers_deploy.model.bank import SIDE_PX, UNIT_STEPS, WIDE
 from beers_deploy.profiles.sensor import MAX_DN
-from beers_deploy.quant.banked.filters import ANALYTIC_COPIES, BITS, MIDDLE_DN, PART, STEP_DN, split_planes
+from beers_deploy.quant.banked.filters import (
+    ANALYTIC_COPIES,
+    BITS,
+    MIDDLE_DN,
+    PART,
+    STEP_DN,
+    split_planes,
+)
 from beers_deploy.quant.graph import (
     COARSE_MAX,
     CORRECTION,
@@ -41,20 +50,24 @@ FINE_MAX = 126
 class Ends:
     """The host's part of an INT8 network.
 
-    What does not stand here is as in `quant.graph.Network`; a sum with the image is clipped to [0, 1].
+    What does not stand here is as in `quant.graph.Network`; a sum with the image is clipped to [0,
+    1].
 
     Attributes:
         channels: of the core's image, behind `front`.
         planes: of int8 that each channel becomes.
-        banked: whether the core begins with the bank of a sensor (`quant.banked`): the image's borders are mirrored,
-            the planes are the bank's, and the analytic restoration comes in copies behind the correction's gains.
+        banked: whether the core begins with the bank of a sensor (`quant.banked`): the image's
+            borders are mirrored, the planes are the bank's, and the analytic restoration comes in
+            copies behind the correction's gains.
         unit: the share of full scale that is 1 in the core's result.
-        wide: whether the last copy of the analytic restoration is coarse by `WIDE`, for what the others clip.
-        direct: whether the image is planes already, whole multiples of 1/128: what follows a bank by itself.
+        wide: whether the last copy of the analytic restoration is coarse by `WIDE`, for what the
+            others clip.
+        direct: whether the image is planes already, whole multiples of 1/128: what follows a bank
+            by itself.
         gains: 2 where the correction's channels come twice, fine and coarse by `GAIN`.
         outputs: channels of the correction, gains and windows not counted.
-        offsets: what each window has taken off each channel, (windows, outputs): the channels come coarse
-            by `GAIN` first, then once for each window.
+        offsets: what each window has taken off each channel, (windows, outputs): the channels come
+            coarse by `GAIN` first, then once for each window.
     """
 
     channels: int = 1
@@ -105,7 +118,9 @@ class Ends:
         return split_planes(image) if self.banked else split(image, self.planes)
 
     def merge(self, correction: np.ndarray, scale: float) -> np.ndarray:
-        """One correction (N, C, H, W) of full scale from its gains or windows: (N, copies C, H, W) of `scale`."""
+        """One correction (N, C, H, W) of full scale from its gains or windows: (N, copies C, H, W)
+        of `scale`.
+        """
         if self.offsets:
             return self._of_windows(correction, scale)
         if self.gains == 1:
@@ -127,7 +142,9 @@ class Ends:
         return ANALYTIC_COPIES - self.wide
 
     def analytic_gain(self, scale: float) -> float:
-        """What the sum of the fine analytic copies is multiplied with, where one step is said to be `scale`."""
+        """What the sum of the fine analytic copies is multiplied with, where one step is said to be
+        `scale`.
+        """
         return 1 / (UNIT_STEPS * self.fine_copies * scale)
 
     def coarse_gain(self, scale: float) -> float:
@@ -135,7 +152,9 @@ class Ends:
         return WIDE / (UNIT_STEPS * scale) if self.wide else 0.0
 
     def whole(self, correction: np.ndarray) -> np.ndarray:
-        """One correction from all its copies in float, which rounding has not touched: (N, C, H, W)."""
+        """One correction from all its copies in float, which rounding has not touched: (N, C, H,
+        W).
+        """
         first = correction[:, : self.outputs]
         return first * np.float32(GAIN) if self.offsets else first
 
@@ -148,10 +167,14 @@ class Ends:
         return value
 
     def moved(self, left: np.ndarray) -> "Ends":
-        """With what rounding left of the biases of all channels, (copies outputs,), put into the windows' offsets."""
+        """With what rounding left of the biases of all channels, (copies outputs,), put into the
+        windows' offsets.
+        """
         windows = np.asarray(left[self.outputs :]).reshape(-1, self.outputs)
         offsets = np.array(self.offsets) + windows
-        return replace(self, offsets=tuple(tuple(float(each) for each in window) for window in offsets))
+        return replace(
+            self, offsets=tuple(tuple(float(each) for each in window) for window in offsets)
+        )
 
     @property
     def copies(self) -> int:
@@ -178,11 +201,15 @@ class Ends:
 
     @property
     def is_image(self) -> bool:
-        """Whether the result is an image, and nothing but moved values and a sum away from the core's."""
+        """Whether the result is an image, and nothing but moved values and a sum away from the
+        core's.
+        """
         return not (self.softmax or self.flat or self.tail)
 
     def correction_of(self, image: np.ndarray, result: np.ndarray) -> np.ndarray:
-        """The correction from which `finished` makes that result (N, C, H, W), in [0, 1] where the image is added."""
+        """The correction from which `finished` makes that result (N, C, H, W), in [0, 1] where the
+        image is added.
+        """
         for shuffle in reversed(self.last):
             result = shuffle.inverse(result)
         result = result - image if self.adds_image else result
@@ -191,7 +218,9 @@ class Ends:
         return np.ascontiguousarray(result)
 
     def clipped(self, result: np.ndarray) -> np.ndarray:
-        """A float network's result as the host would clip its own: to [0, 1] where the image is added."""
+        """A float network's result as the host would clip its own: to [0, 1] where the image is
+        added.
+        """
         return np.clip(result, 0, 1) if self.adds_image else result
 
 
@@ -201,7 +230,14 @@ ONE_CHANNEL = Ends()
 
 def ends_of(network: Network, gains: int = 1) -> Ends:
     """The ends of a network whose correction comes in so many gains."""
-    kept = network.front, network.back, network.adds_image, network.last, network.flat, network.softmax
+    kept = (
+        network.front,
+        network.back,
+        network.adds_image,
+        network.last,
+        network.flat,
+        network.softmax,
+    )
     outputs = channels_of(network.graph, {IMAGE: network.core_channels})[CORRECTION]
     return Ends(network.core_channels, COUNT, *kept, gains, outputs)
 
@@ -221,7 +257,9 @@ class HostWriter(GraphWriter):
 
 
 def write_front(w: HostWriter, ends: Ends) -> None:
-    """Write the host's nodes in front of the core, image to uint8 planes: `Ends.split` as operators."""
+    """Write the host's nodes in front of the core, image to uint8 planes: `Ends.split` as
+    operators.
+    """
     if ends.direct:
         w.node("Mul", "host_front.scale", [IMAGE, w.scalar("units", 2.0**BITS)])
         w.node("Round", "host_front.planes", ["host_front.scale"])
@@ -239,15 +277,23 @@ def write_front(w: HostWriter, ends: Ends) -> None:
     step, part = (STEP_DN, PART) if ends.banked else (STEP, QUARTER)
     w.node("Mul", "host_front.scale", [image, w.scalar("max_dn", MAX_DN)])
     w.node("Round", "host_front.round", ["host_front.scale"])
-    dn = w.node("Clip", "host_front.dn", ["host_front.round", w.scalar("zero", 0), w.scalar("max_dn", MAX_DN)])
+    dn = w.node(
+        "Clip",
+        "host_front.dn",
+        ["host_front.round", w.scalar("zero", 0), w.scalar("max_dn", MAX_DN)],
+    )
     if ends.banked:
         dn = w.node("Sub", "host_front.centred", [dn, w.scalar("middle", MIDDLE_DN)])
     w.node("Mul", "host_front.steps", [dn, w.scalar("one_step", 1 / step)])
     w.node("Round", "host_front.whole_steps", ["host_front.steps"])
-    w.node("Min", "host_front.coarse", ["host_front.whole_steps", w.scalar("coarse_max", COARSE_MAX)])
+    w.node(
+        "Min", "host_front.coarse", ["host_front.whole_steps", w.scalar("coarse_max", COARSE_MAX)]
+    )
     w.node("Mul", "host_front.coarse_dn", ["host_front.coarse", w.scalar("step", step)])
     w.node("Sub", "host_front.remainder", [dn, "host_front.coarse_dn"])
-    w.node("Mul", "host_front.quarters", ["host_front.remainder", w.scalar("one_quarter", 1 / part)])
+    w.node(
+        "Mul", "host_front.quarters", ["host_front.remainder", w.scalar("one_quarter", 1 / part)]
+    )
     w.node("Round", "host_front.quarter", ["host_front.quarters"])
     coarse = ["host_front.coarse"] * (2 if ends.banked else 1)
     planes = [*coarse, "host_front.remainder", "host_front.quarter"]
@@ -289,7 +335,9 @@ def write_back(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> Non
     elif ends.tail:
         ends.tail.write(w, result)
     else:
-        w.node("Flatten" if ends.flat else "Identity", "restored", [result], name="host_back.result")
+        w.node(
+            "Flatten" if ends.flat else "Identity", "restored", [result], name="host_back.result"
+        )
 
 
 def _write_one(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> str:
@@ -309,7 +357,9 @@ def _write_windows(w: HostWriter, ends: Ends, scale: float) -> None:
     """Write the nodes that find each value in the window that holds it."""
     names = [f"host_back.window_{k}" for k in range(ends.copies)]
     each = w.constant("channels_each", np.full(ends.copies, ends.outputs))
-    w.nodes.append(helper.make_node("Split", ["host_back.all", each], names, axis=1, name="host_back.split"))
+    w.nodes.append(
+        helper.make_node("Split", ["host_back.all", each], names, axis=1, name="host_back.split")
+    )
     value = w.node("Mul", "host_back.wide", [names[0], w.scalar("gain", GAIN)])
     limit = w.scalar("fine_max", (FINE_MAX + 0.5) * scale)
     for k, (name, offset) in enumerate(zip(names[1:], ends.offsets, strict=True)):
@@ -323,19 +373,29 @@ def _write_windows(w: HostWriter, ends: Ends, scale: float) -> None:
 
 def _write_merge(w: HostWriter, ends: Ends, scale: float) -> None:
     """Write the nodes that make one correction of two gains: `Ends.merge` as operators."""
-    each = w.constant("one_each" if ends.outputs == 1 else "channels_each", np.full(ends.copies, ends.outputs))
+    each = w.constant(
+        "one_each" if ends.outputs == 1 else "channels_each", np.full(ends.copies, ends.outputs)
+    )
     analytic = [f"host_back.analytic_{k}" for k in range(ends.copies - 2)]
     names = ["host_back.fine", "host_back.coarse", *analytic]
     w.nodes.append(helper.make_node("Split", ["host_back.both", each], names, axis=1))
     w.nodes[-1].name = "host_back.split"
     w.node("Mul", "host_back.wide", ["host_back.coarse", w.scalar("gain", GAIN)])
     w.node("Abs", "host_back.size", ["host_back.fine"])
-    w.node("LessOrEqual", "host_back.fits", ["host_back.size", w.scalar("fine_max", (FINE_MAX + 0.5) * scale)])
+    w.node(
+        "LessOrEqual",
+        "host_back.fits",
+        ["host_back.size", w.scalar("fine_max", (FINE_MAX + 0.5) * scale)],
+    )
     chosen = "host_back.chosen" if analytic else "host_back.correction"
     w.node("Where", chosen, ["host_back.fits", "host_back.fine", "host_back.wide"])
     if analytic:
         w.node("Sum", "host_back.analytic", analytic[: ends.fine_copies])
-        w.node("Mul", "host_back.added", ["host_back.analytic", w.scalar("analytic_gain", ends.analytic_gain(scale))])
+        w.node(
+            "Mul",
+            "host_back.added",
+            ["host_back.analytic", w.scalar("analytic_gain", ends.analytic_gain(scale))],
+        )
         added = _write_wide(w, ends, analytic, scale) if ends.wide else "host_back.added"
         w.node("Add", "host_back.correction", [chosen, added])
 
@@ -346,4 +406,8 @@ def _write_wide(w: HostWriter, ends: Ends, analytic: list[str], scale: float) ->
     limit = w.scalar("analytic_max", (FINE_MAX + 0.5) * scale)
     w.node("LessOrEqual", "host_back.analytic_fits", ["host_back.analytic_size", limit])
     w.node("Mul", "host_back.far", [analytic[-1], w.scalar("coarse_gain", ends.coarse_gain(scale))])
-    return w.node("Where", "host_back.reached", ["host_back.analytic_fits", "host_back.added", "host_back.far"])
+    return w.node(
+        "Where",
+        "host_back.reached",
+        ["host_back.analytic_fits", "host_back.added", "host_back.far"],
+    )

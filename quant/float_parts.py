@@ -1,7 +1,8 @@
 """What an INT8 file computes in float.
 
-Such a file may hold a whole float network in front of its integer core or behind it: then the two networks agree and
-the gate would pass what no DPU computes. Its metadata cannot be asked, because the judged file wrote them.
+Such a file may hold a whole float network in front of its integer core or behind it: then the two
+networks agree and the gate would pass what no DPU computes. Its metadata cannot be asked, because
+the judged file wrote them.
 """
 
 import onnx
@@ -36,10 +37,16 @@ LAYERS = {
 
 
 def float_nodes(model: onnx.ModelProto) -> list[Node]:
-    """Return the nodes that compute in float: all but those on integers and those that only say how to read them."""
+    """Return the nodes that compute in float: all but those on integers and those that only say how
+    to read them.
+    """
     graph = OnnxGraph(model)
     integers = Integers(graph)
-    return [node for node in graph.nodes if not integers.is_integer(node) and not integers.is_notation(node)]
+    return [
+        node
+        for node in graph.nodes
+        if not integers.is_integer(node) and not integers.is_notation(node)
+    ]
 
 
 def float_layers_check(model: onnx.ModelProto) -> Check:
@@ -51,13 +58,21 @@ def float_layers_check(model: onnx.ModelProto) -> Check:
 def float_note(model: onnx.ModelProto) -> list[str]:
     """Return a note that names the float operators of another quantiser's file.
 
-    In a file of ours they are the host part, which `encoding_faults` compares with the integers node by node.
+    In a file of ours they are the host part, which `encoding_faults` compares with the integers
+    node by node.
     """
     try:
         read_core(model)
     except ModelError:
-        kinds = sorted({node.op_type for node in float_nodes(model)} - {"QuantizeLinear", "DequantizeLinear"})
+        kinds = sorted(
+            {node.op_type for node in float_nodes(model)} - {"QuantizeLinear", "DequantizeLinear"}
+        )
         if kinds:
             names = ", ".join(kinds)
-            return [f"the INT8 file computes {names} in float, which the board's processor has to compute alike"]
+            return [
+                (
+                    f"the INT8 file computes {names} in float, which the board's processor has to "
+                    "compute alike"
+                )
+            ]
     return []

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 
 
 Parts = tuple[np.ndarray, np.ndarray]
-"""Numerators and denominators of one sample, for each class or for one: both are added up over the samples."""
+"""Numerators and denominators of one sample, for each class or for one: both are added up over the
+samples.
+"""
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,9 @@ def _alone(value: float) -> Parts:
 
 
 def _similarity(result: np.ndarray, reference: np.ndarray) -> Parts:
-    return _alone(float(np.mean([ssim(*pair, 1.0) for pair in zip(result[0], reference[0], strict=True)])))
+    return _alone(
+        float(np.mean([ssim(*pair, 1.0) for pair in zip(result[0], reference[0], strict=True)]))
+    )
 
 
 def _hits(result: np.ndarray, reference: np.ndarray) -> Parts:
@@ -57,14 +61,24 @@ def _hits(result: np.ndarray, reference: np.ndarray) -> Parts:
 
 def _overlap(result: np.ndarray, reference: np.ndarray) -> Parts:
     """Of every class, the pixels that both say and those that one of them says."""
-    said, meant = (np.arange(result.shape[1])[:, None] == each.ravel() for each in (result.argmax(1), reference))
+    said, meant = (
+        np.arange(result.shape[1])[:, None] == each.ravel()
+        for each in (result.argmax(1), reference)
+    )
     return (said & meant).sum(1), (said | meant).sum(1)
 
 
 METRICS: Mapping[str, Metric] = {
-    "psnr": Metric("dB", True, False, lambda result, reference: _alone(psnr_db(result, reference, 1.0))),
+    "psnr": Metric(
+        "dB", True, False, lambda result, reference: _alone(psnr_db(result, reference, 1.0))
+    ),
     "ssim": Metric("ratio", True, False, _similarity),
-    "mae": Metric("of full scale", False, False, lambda result, reference: _alone(np.abs(result - reference).mean())),
+    "mae": Metric(
+        "of full scale",
+        False,
+        False,
+        lambda result, reference: _alone(np.abs(result - reference).mean()),
+    ),
     "top1": Metric("ratio", True, True, _hits),
     "iou": Metric("ratio", True, True, _overlap),
 }
@@ -79,7 +93,9 @@ def parts_of(name: str, result: np.ndarray, reference: np.ndarray) -> Parts:
         kind = "numbers of classes" if metric.of_classes else "references"
         expected = f"{kind} of {times(wanted)}"
         got = f"{times(reference.shape)} for results of {times(result.shape)}"
-        raise OptionError("metric", expected=expected, got=got, remedy="give these, or another metric")
+        raise OptionError(
+            "metric", expected=expected, got=got, remedy="give these, or another metric"
+        )
     return metric.parts(result, reference)
 
 
@@ -93,13 +109,15 @@ def value_of(parts: Sequence[Parts]) -> float:
 
 @dataclass(frozen=True)
 class GateResult:
-    """Differences in [0, 1] of full scale over all pixels; PSNRs over full scale, in dB, NaN without references.
+    """Differences in [0, 1] of full scale over all pixels; PSNRs over full scale, in dB, NaN
+    without references.
 
-    `same_class` is the share of results whose largest channel is the same: of networks that tell classes, else NaN.
-    `metric` is what the user measures results by, `metric_float` and `metric_int8` what was found of the two.
-    `worst_drop_db` is what the patch loses that loses most. `input_change` is the mean absolute difference of the
-    float results from their inputs, NaN where these have another shape. `contrast` is the mean absolute deviation of
-    the float results from their own means. `sample_range` says which part of the range the samples cover.
+    `same_class` is the share of results whose largest channel is the same: of networks that tell
+    classes, else NaN. `metric` is what the user measures results by, `metric_float` and
+    `metric_int8` what was found of the two. `worst_drop_db` is what the patch loses that loses
+    most. `input_change` is the mean absolute difference of the float results from their inputs, NaN
+    where these have another shape. `contrast` is the mean absolute deviation of the float results
+    from their own means. `sample_range` says which part of the range the samples cover.
     """
 
     mae: float
@@ -130,7 +148,11 @@ class GateResult:
     @property
     def source(self) -> str:
         """Where the figures come from."""
-        return f"{self.patches} simulated patches of 128 x 128" if self.simulated else f"{self.patches} samples"
+        return (
+            f"{self.patches} simulated patches of 128 x 128"
+            if self.simulated
+            else f"{self.patches} samples"
+        )
 
     @property
     def drop_db(self) -> float:
@@ -144,12 +166,17 @@ class GateResult:
 
     @property
     def drop_share(self) -> float:
-        """PSNR lost over PSNR gained by the float network; NaN where that gains nothing, or without references."""
+        """PSNR lost over PSNR gained by the float network; NaN where that gains nothing, or without
+        references.
+        """
         return self.drop_db / self.gain_db if self.gain_db > 0 else math.nan
 
     @property
     def std_over_mae(self) -> float:
-        """1.25 for rounding, which is Gaussian in the end; clipping drives it up. 0 where nothing differs."""
+        """1.25 for rounding, which is Gaussian in the end; clipping drives it up.
+
+        0 where nothing differs.
+        """
         return 0.0 if self.mae == 0 else self.std / self.mae
 
 
@@ -161,9 +188,11 @@ def compare(
     metric: str | None = None,
     names: Sequence[str] = (),
 ) -> GateResult:
-    """Run both networks on (degraded, reference) pairs of (1, C, H, W) in [0, 1]; images clipped as a file would.
+    """Run both networks on (degraded, reference) pairs of (1, C, H, W) in [0, 1]; images clipped as
+    a file would.
 
-    Without references, or where they have another size than what is compared, the PSNRs to them are NaN.
+    Without references, or where they have another size than what is compared, the PSNRs to them are
+    NaN.
 
     Args:
         float_session: the float network's.
@@ -175,7 +204,8 @@ def compare(
 
     Raises:
         ModelError: results of different shapes.
-        ImageError: a reference of the results' size outside [0, 1], or a sample without one where others have it.
+        ImageError: a reference of the results' size outside [0, 1], or a sample without one where
+            others have it.
         OptionError: references that the metric does not take.
     """
     differences = []
@@ -192,11 +222,24 @@ def compare(
         if results[0].shape != results[1].shape:
             expected, got = (times(result.shape) for result in results)
             remedy = "give the INT8 file that was made of this float network"
-            raise ModelError("INT8 network", expected=f"results of {expected}, as in float", got=got, remedy=remedy)
+            raise ModelError(
+                "INT8 network",
+                expected=f"results of {expected}, as in float",
+                got=got,
+                remedy=remedy,
+            )
         classes = [result.argmax(1) for result in results]
-        agreeing.append((classes[0] == classes[1]).mean() if results[0].shape[1] > degraded.shape[1] else math.nan)
+        agreeing.append(
+            (classes[0] == classes[1]).mean()
+            if results[0].shape[1] > degraded.shape[1]
+            else math.nan
+        )
         inside = ((results[0] >= 0) & (results[0] <= 1)).mean()
-        is_image = results[0].ndim == 4 and results[0].shape[1] == degraded.shape[1] and bool(inside >= MOST)
+        is_image = (
+            results[0].ndim == 4
+            and results[0].shape[1] == degraded.shape[1]
+            and bool(inside >= MOST)
+        )
         in_float, in_int8 = (_as_in_a_file(result, is_image) for result in results)
         differences.append((in_int8 - in_float).ravel())
         same_shape = in_float.shape == degraded.shape
@@ -209,7 +252,9 @@ def compare(
             _require_full_scale(name, reference)
         errors.append([_psnr_db(image, reference) for image in (degraded, in_float, in_int8)])
         if metric is not None:
-            measured_by.append([parts_of(metric, result, reference) for result in (in_float, in_int8)])
+            measured_by.append(
+                [parts_of(metric, result, reference) for result in (in_float, in_int8)]
+            )
     some_have_one = not np.isnan([in_float for _, in_float, _ in errors]).all()
     if lacking and some_have_one:
         # A mean over some of them would be NaN, and its check left out.
@@ -249,11 +294,16 @@ def _require_full_scale(name: str, reference: np.ndarray) -> None:
 
 
 def unfit_reference(name: str, shape: Sequence[int], wanted: str) -> ImageError:
-    """Return the error of a reference of another size than the network's results, which `wanted` needs."""
+    """Return the error of a reference of another size than the network's results, which `wanted`
+    needs.
+    """
     expected = f"a reference of the results' size for {wanted}"
     got = times(shape[1:]) if math.prod(shape) else "none"
     return ImageError(
-        name, expected=expected, got=got, remedy="give references of that size for all samples, or none"
+        name,
+        expected=expected,
+        got=got,
+        remedy="give references of that size for all samples, or none",
     )
 
 
@@ -262,7 +312,9 @@ MOST = 0.5
 
 
 def _as_in_a_file(result: np.ndarray, is_image: bool) -> np.ndarray:
-    """An image clipped to [0, 1], anything else as it is; NaN where infinite, which no clipping makes a pixel."""
+    """An image clipped to [0, 1], anything else as it is; NaN where infinite, which no clipping
+    makes a pixel.
+    """
     return np.where(np.isinf(result), np.nan, np.clip(result, 0, 1) if is_image else result)
 
 
@@ -281,10 +333,14 @@ def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None)
     ]
     if result.gain_db > 0:  # without references it is NaN
         gained = f"the float network gains {result.gain_db:.2f} dB"
-        checks.append(_at_most("PSNR drop over gain", result.drop_share, limits.drop_share, "ratio", gained))
+        checks.append(
+            _at_most("PSNR drop over gain", result.drop_share, limits.drop_share, "ratio", gained)
+        )
     if limits.metric_loss is not None and result.metric:
         unit = METRICS[result.metric].unit
-        checks.append(_at_most(f"{result.metric} lost", result.metric_loss, limits.metric_loss, unit))
+        checks.append(
+            _at_most(f"{result.metric} lost", result.metric_loss, limits.metric_loss, unit)
+        )
     if limits.min_psnr_float_int8_db is not None:
         least = limits.min_psnr_float_int8_db
         checks.append([Check("PSNR float-INT8", result.psnr_between_db, least, "dB", "at least")])
@@ -297,12 +353,18 @@ def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None)
 
 
 def judge_saturation(shares: Mapping[str, float], limits: Limits) -> list[Check]:
-    """The layer that saturates most, against the limit if there is one; where nothing is 8-bit none is kept."""
-    layer, share = max(shares.items(), key=lambda item: item[1], default=("any layer: none is 8-bit", math.nan))
+    """The layer that saturates most, against the limit if there is one; where nothing is 8-bit none
+    is kept.
+    """
+    layer, share = max(
+        shares.items(), key=lambda item: item[1], default=("any layer: none is 8-bit", math.nan)
+    )
     return _at_most("saturated results", share, limits.saturated, "of a layer's", f"in {layer}")
 
 
-def _at_most(name: str, value: float, limit: float | None, unit: str, detail: str = "") -> list[Check]:
+def _at_most(
+    name: str, value: float, limit: float | None, unit: str, detail: str = ""
+) -> list[Check]:
     return [] if limit is None else [Check(name, value, limit, unit, detail=detail)]
 
 
@@ -323,14 +385,23 @@ def gate_row(result: GateResult) -> Row:
     if not math.isnan(result.same_class):
         figures["same class"] = _figure(100 * result.same_class, "%", result)
     if result.metric:
-        values = {"float": result.metric_float, "INT8": result.metric_int8, "lost": result.metric_loss}
+        values = {
+            "float": result.metric_float,
+            "INT8": result.metric_int8,
+            "lost": result.metric_loss,
+        }
         unit = METRICS[result.metric].unit
-        figures |= {f"{result.metric} {name}": _figure(value, unit, result) for name, value in values.items()}
+        figures |= {
+            f"{result.metric} {name}": _figure(value, unit, result)
+            for name, value in values.items()
+        }
     return Row("gate", "INT8 against float", figures)
 
 
 def verdict_row(result: GateResult, shares: Mapping[str, float]) -> Row:
-    """The figures of a gate: those of `gate_row`, the PSNR lost to the reference, the worst layer's saturation."""
+    """The figures of a gate: those of `gate_row`, the PSNR lost to the reference, the worst layer's
+    saturation.
+    """
     row = gate_row(result)
     drop = _figure(result.drop_db, "dB", result)
     worst = saturation_figure(shares, result.source)
@@ -341,7 +412,9 @@ def _figure(value: float, unit: str, result: GateResult) -> Figure:
     if math.isinf(value):
         return unavailable(unit, "infinite: the two images are identical")
     if math.isnan(value):
-        return unavailable(unit, "a network gave NaN" if math.isnan(result.mae) else "no reference of that size")
+        return unavailable(
+            unit, "a network gave NaN" if math.isnan(result.mae) else "no reference of that size"
+        )
     return measured(value, unit, result.source)
 
 

@@ -1,17 +1,22 @@
 """INT8 operators that add exactly, also on processors whose fast kernels do not.
 
-x86 processors without VNNI multiply unsigned activations by signed weights and add neighbouring products in
-saturating int16 (`vpmaddubsw`). What lies beyond is clipped without a word, which gives other numbers than the
-DPU's. There a session computes each operator in the fastest way that is proven exact, chosen as the file is opened:
+x86 processors without VNNI multiply unsigned activations by signed weights and add neighbouring
+products in saturating int16 (`vpmaddubsw`). What lies beyond is clipped without a word, which gives
+other numbers than the DPU's. There a session computes each operator in the fastest way that is
+proven exact, chosen as the file is opened:
 
-1. SIGNED: weights stay as they are, for no two neighbouring products can leave int16, whatever the activations.
-   a. A tensor behind a ReLU is stored as 128..255 around 128. Moved down to 0..127 around 0, no weights saturate.
-   b. Otherwise all pairs of weights that a kernel may form are looked at.
-2. UNSIGNED: weights stored as uint8, 128 higher and around 128. These kernels add in int32, at half the speed.
-3. CONVERTED: the same for signed activations, which are moved to uint8 before the operator, and back behind it.
+1. SIGNED: weights stay as they are, for no two neighbouring products can leave int16, whatever the
+  activations. a. A tensor behind a ReLU is stored as 128..255 around 128. Moved down to 0..127
+  around 0, no weights saturate. b. Otherwise all pairs of weights that a kernel may form are looked
+  at.
+2. UNSIGNED: weights stored as uint8, 128 higher and around 128. These kernels add in int32, at half
+  the speed.
+3. CONVERTED: the same for signed activations, which are moved to uint8 before the operator, and
+  back behind it.
 
-Each is the same sum of the same whole numbers, so the results are those of an exact processor, bit for bit. Float
-operators between 8-bit tensors (QDQ), of which onnxruntime makes integer ones, are looked at as what they become.
+Each is the same sum of the same whole numbers, so the results are those of an exact processor, bit
+for bit. Float operators between 8-bit tensors (QDQ), of which onnxruntime makes integer ones, are
+looked at as what they become.
 """
 
 import hashlib
@@ -43,7 +48,9 @@ class Way(StrEnum):
 
 @dataclass(frozen=True)
 class Places:
-    """Where an operator holds its activations' zero point, its weights, their zero point and its result's."""
+    """Where an operator holds its activations' zero point, its weights, their zero point and its
+    result's.
+    """
 
     zero: int
     weight: int
@@ -57,17 +64,24 @@ OPERATORS = {
     "ConvInteger": Places(2, 1, 3, None),
     "MatMulInteger": Places(2, 1, 3, None),
 }
-"""ONNX's operators whose kernels multiply 8-bit numbers. Activations are the first input; a None result is int32."""
+"""ONNX's operators whose kernels multiply 8-bit numbers.
+
+Activations are the first input; a None result is int32.
+"""
 
 FLOAT_OPERATORS = {"Conv": "QLinearConv", "MatMul": "QLinearMatMul", "Gemm": "QLinearMatMul"}
 """Operators on dequantised tensors (QDQ), and which integer operator onnxruntime makes of each."""
 
 REQUANTISING = {"QLinearConv": 7, "QLinearAdd": 7}
-"""What may write a tensor behind which a ReLU is moved down, and where it holds its result's zero point."""
+"""What may write a tensor behind which a ReLU is moved down, and where it holds its result's zero
+point.
+"""
 
 
 def made_exact(model: onnx.ModelProto) -> tuple[onnx.ModelProto, dict[str, Way]]:
-    """The model with the same results on kernels that add exactly, and the way of each operator by its name."""
+    """The model with the same results on kernels that add exactly, and the way of each operator by
+    its name.
+    """
     work = _Rewriting(model)
     for node in [each for each in work.model.graph.node if each.op_type == "Max"]:
         work.move_relu_down(node)
@@ -78,7 +92,8 @@ def made_exact(model: onnx.ModelProto) -> tuple[onnx.ModelProto, dict[str, Way]]
 
 
 def cannot_saturate(kind: str, weight: np.ndarray, largest: int) -> bool:
-    """Whether no pair of neighbouring products can leave int16, for any activations from 0 to `largest`.
+    """Whether no pair of neighbouring products can leave int16, for any activations from 0 to
+    `largest`.
 
     Args:
         kind: the ONNX operator.
@@ -86,7 +101,8 @@ def cannot_saturate(kind: str, weight: np.ndarray, largest: int) -> bool:
         largest: the largest activation as it is stored.
     """
     rows = _rows(kind, weight)
-    # Pairs begin at even places. Where an odd number of channels lets them straddle taps, all neighbours count.
+    # Pairs begin at even places. Where an odd number of channels lets them straddle taps, all
+    # neighbours count.
     step = 2 if kind == "QLinearConv" and weight.shape[1] % 2 == 0 else 1
     first = rows[:, :-1:step]
     second = rows[:, 1::step]
@@ -121,7 +137,8 @@ class _Rewriting:
         self.moved: set[str] = set()
 
     def move_relu_down(self, relu: onnx.NodeProto) -> None:
-        """Store what is behind max(result, its zero point) around 0: min(result moved down, what is left of 255).
+        """Store what is behind max(result, its zero point) around 0: min(result moved down, what is
+        left of 255).
 
         Left as it is where anything but the operators above would notice.
         """
@@ -132,8 +149,14 @@ class _Rewriting:
         if middle is None or middle.dtype != np.uint8 or middle.size != 1 or writer is None:
             return
         own = len(self.readers[source]) == 1 and not self.kept & {source, result}
-        written = writer.op_type in REQUANTISING and self._holds(writer, REQUANTISING[writer.op_type], middle)
-        if not own or not written or not all(self._reads(node, result, middle) for node in self.readers[result]):
+        written = writer.op_type in REQUANTISING and self._holds(
+            writer, REQUANTISING[writer.op_type], middle
+        )
+        if (
+            not own
+            or not written
+            or not all(self._reads(node, result, middle) for node in self.readers[result])
+        ):
             return
         zero, self.largest[result] = self._constant(np.uint8(0)), UINT8_MAX - int(middle.ravel()[0])
         writer.input[REQUANTISING[writer.op_type]] = zero
@@ -142,13 +165,23 @@ class _Rewriting:
             reader.input[OPERATORS[reader.op_type].zero] = zero
 
     def _reads(self, node: onnx.NodeProto, name: str, zero: np.ndarray) -> bool:
-        """Whether a node is an operator that reads the tensor as its activations, around this zero point."""
+        """Whether a node is an operator that reads the tensor as its activations, around this zero
+        point.
+        """
         places = OPERATORS.get(node.op_type)
-        return places is not None and list(node.input).count(name) == 1 and self._holds(node, places.zero, zero)
+        return (
+            places is not None
+            and list(node.input).count(name) == 1
+            and self._holds(node, places.zero, zero)
+        )
 
     def _holds(self, node: onnx.NodeProto, place: int, value: np.ndarray) -> bool:
         held = self.arrays.get(node.input[place]) if place < len(node.input) else None
-        return held is not None and held.dtype == value.dtype and held.ravel().tolist() == value.ravel().tolist()
+        return (
+            held is not None
+            and held.dtype == value.dtype
+            and held.ravel().tolist() == value.ravel().tolist()
+        )
 
     def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
         """The node computed in an exact way, with what converts before and behind it."""
@@ -161,7 +194,9 @@ class _Rewriting:
         if weight is None:
             got = f"{node.op_type} {node.name or node.output[0]!r} with computed weights"
             remedy = "store its weights as constants, or run it on a processor with VNNI"
-            raise refused("INT8 model", "weights that are constants, which this processor needs", got, remedy)
+            raise refused(
+                "INT8 model", "weights that are constants, which this processor needs", got, remedy
+            )
         if weight.dtype != np.int8:
             return [node]
         name = node.name or node.output[0]
@@ -175,13 +210,21 @@ class _Rewriting:
         return self._converted(node, places) if signed else [node]
 
     def _between(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
-        """A float operator whose weights are dequantised int8, and what dequantises them from uint8 if need be."""
+        """A float operator whose weights are dequantised int8, and what dequantises them from uint8
+        if need be.
+        """
         source = self.writers.get(node.input[1])
-        weight = self.arrays.get(source.input[0]) if source and source.op_type == "DequantizeLinear" else None
+        weight = (
+            self.arrays.get(source.input[0])
+            if source and source.op_type == "DequantizeLinear"
+            else None
+        )
         if source is None or weight is None or weight.dtype != np.int8:
             return [node]
         turned = any(each.name == "transB" and each.i for each in node.attribute)
-        if cannot_saturate(FLOAT_OPERATORS[node.op_type], weight.T if turned else weight, UINT8_MAX):
+        if cannot_saturate(
+            FLOAT_OPERATORS[node.op_type], weight.T if turned else weight, UINT8_MAX
+        ):
             self.ways[node.name or node.output[0]] = Way.signed
             return [node]
         self.ways[node.name or node.output[0]] = Way.unsigned
@@ -194,11 +237,15 @@ class _Rewriting:
         """Store int8 constants as uint8, 128 higher."""
         for place in places:
             node.input.extend([""] * (place + 1 - len(node.input)))
-            value = self.arrays.get(node.input[place], np.zeros((), np.int8))  # a zero point that is left out
+            value = self.arrays.get(
+                node.input[place], np.zeros((), np.int8)
+            )  # a zero point that is left out
             node.input[place] = self._constant((value.astype(np.int16) + MIDDLE).astype(np.uint8))
 
     def _converted(self, node: onnx.NodeProto, places: Places) -> list[onnx.NodeProto]:
-        """The node on uint8 activations, between what moves them up and, where it is of 8 bits, its result down."""
+        """The node on uint8 activations, between what moves them up and, where it is of 8 bits, its
+        result down.
+        """
         self._lift(node, places.zero)
         before, node.input[0] = self._moved(node.input[0], MIDDLE, TensorProto.UINT8)
         if places.result_zero is None:
@@ -209,8 +256,12 @@ class _Rewriting:
         behind, _ = self._moved(node.output[0], -MIDDLE, TensorProto.INT8, result)
         return [*before, node, *behind]
 
-    def _moved(self, source: str, by: int, kind: int, result: str = "") -> tuple[list[onnx.NodeProto], str]:
-        """An 8-bit tensor as another type of 8 bits, its numbers that much higher; made once for all its readers."""
+    def _moved(
+        self, source: str, by: int, kind: int, result: str = ""
+    ) -> tuple[list[onnx.NodeProto], str]:
+        """An 8-bit tensor as another type of 8 bits, its numbers that much higher; made once for
+        all its readers.
+        """
         result = result or f"{source}.unsigned"
         if result in self.moved:
             return [], result
@@ -242,7 +293,9 @@ FIRST_OPSET = 11
 
 
 def filled(model: onnx.ModelProto) -> onnx.ModelProto:
-    """The model with the same results, its integer convolutions no narrower than suits onnxruntime."""
+    """The model with the same results, its integer convolutions no narrower
+    than suits onnxruntime.
+    """
     if opset_of(model) < FIRST_OPSET:
         return model
     wider = deepcopy(model)
@@ -282,7 +335,9 @@ class _ChannelPadding:
         return middle is not None and not middle.any() and not grouped
 
     def _widen(self, node: onnx.NodeProto, outputs: int, inputs: int) -> None:
-        """Weights of zero; scales and zero points that are a channel's own get more, which matter to nobody."""
+        """Weights of zero; scales and zero points that are a channel's own get more, which matter
+        to nobody.
+        """
         name = node.output[0]
         narrow = self.arrays[node.input[3]]
         wide = np.pad(narrow, [(0, outputs), (0, inputs), (0, 0), (0, 0)])
@@ -299,14 +354,21 @@ class _ChannelPadding:
             return []
         self.wide_inputs.add(source)
         pads = self._constant(f"{source}.padded.pads", np.array([0, 0, 0, 0, 0, count, 0, 0]))
-        return [helper.make_node("Pad", [source, pads], [f"{source}.padded"], name=f"{source}.padded")]
+        return [
+            helper.make_node("Pad", [source, pads], [f"{source}.padded"], name=f"{source}.padded")
+        ]
 
     def _cut(self, node: onnx.NodeProto, count: int) -> list[onnx.NodeProto]:
         name = node.output[0]
         node.output[0] = f"{name}.filled"
-        ends = [self._constant(f"{name}.filled.{k}", np.array([value])) for k, value in (("from", 0), ("to", count))]
+        ends = [
+            self._constant(f"{name}.filled.{k}", np.array([value]))
+            for k, value in (("from", 0), ("to", count))
+        ]
         axis = self._constant("filled.channels", np.array([1]))
-        return [helper.make_node("Slice", [f"{name}.filled", *ends, axis], [name], name=f"{name}.cut")]
+        return [
+            helper.make_node("Slice", [f"{name}.filled", *ends, axis], [name], name=f"{name}.cut")
+        ]
 
     def _constant(self, name: str, value: np.ndarray) -> str:
         if name not in self.arrays:

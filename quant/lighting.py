@@ -1,8 +1,10 @@
-"""How brightly the ground of calibration and gate patches is lit, so that together they cover the sensor's range.
+"""How brightly the ground of calibration and gate patches is lit, so that together they cover the
+sensor's range.
 
-Scenes as they are drawn leave most of the range empty: 2 pixels in 100 000 lie above 0.7 of full scale. A network
-that clips bright ground then passes the gate, and a network calibrated on them does clip it. So a stated share of
-the patches is lit as on a dark day, up to full scale, and beyond it.
+Scenes as they are drawn leave most of the range empty: 2 pixels in 100 000 lie above 0.7 of full
+scale. A network that clips bright ground then passes the gate, and a network calibrated on them
+does clip it. So a stated share of the patches is lit as on a dark day, up to full scale, and beyond
+it.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,7 +36,8 @@ class Lighting:
     Attributes:
         name: of the lighting.
         share: of the patches that are lit so.
-        factor: returns the factor on the radiance (h, w) in W/m2/sr/um, given the radiance at full scale.
+        factor: returns the factor on the radiance (h, w) in W/m2/sr/um, given the radiance at full
+            scale.
     """
 
     name: str
@@ -42,21 +45,31 @@ class Lighting:
     factor: Callable[[NDArray[np.floating], float, np.random.Generator], float]
 
 
-def _as_drawn(radiance: NDArray[np.floating], full_scale: float, generator: np.random.Generator) -> float:
+def _as_drawn(
+    radiance: NDArray[np.floating], full_scale: float, generator: np.random.Generator
+) -> float:
     del radiance, full_scale, generator
     return 1.0
 
 
-def _dark(radiance: NDArray[np.floating], full_scale: float, generator: np.random.Generator) -> float:
+def _dark(
+    radiance: NDArray[np.floating], full_scale: float, generator: np.random.Generator
+) -> float:
     del radiance, full_scale
     return float(np.exp(generator.uniform(np.log(DARKEST), np.log(DARK))))
 
 
-def _bright(radiance: NDArray[np.floating], full_scale: float, generator: np.random.Generator) -> float:
-    return _factor_to(float(np.quantile(radiance, BRIGHTEST_PIXELS)), full_scale * generator.uniform(*BRIGHT))
+def _bright(
+    radiance: NDArray[np.floating], full_scale: float, generator: np.random.Generator
+) -> float:
+    return _factor_to(
+        float(np.quantile(radiance, BRIGHTEST_PIXELS)), full_scale * generator.uniform(*BRIGHT)
+    )
 
 
-def _saturated(radiance: NDArray[np.floating], full_scale: float, generator: np.random.Generator) -> float:
+def _saturated(
+    radiance: NDArray[np.floating], full_scale: float, generator: np.random.Generator
+) -> float:
     return _factor_to(float(np.quantile(radiance, 1 - generator.uniform(*SATURATED))), full_scale)
 
 
@@ -70,10 +83,11 @@ CALIBRATION = (
     Lighting("bright", 2 / 16, _bright),
     Lighting("dark", 1 / 16, _dark),
 )
-"""Up to full scale, but not beyond: at the edge of a saturated area a network corrects much and in vain, because the
-result is clipped, and steps that hold such corrections are coarser everywhere. With a sixteenth of saturated patches
-a DnCNN lost 0.2 dB more on photographs; with a quarter of bright and an eighth of saturated ones a U-Net lost 0.41 dB
-instead of 0.17 (measured)."""
+"""Up to full scale, but not beyond: at the edge of a saturated area a network corrects much and in
+vain, because the result is clipped, and steps that hold such corrections are coarser everywhere.
+With a sixteenth of saturated patches a DnCNN lost 0.2 dB more on photographs; with a quarter of
+bright and an eighth of saturated ones a U-Net lost 0.41 dB instead of 0.17 (measured).
+"""
 
 JUDGING = (
     Lighting("as drawn", 12 / 16, _as_drawn),
@@ -84,7 +98,9 @@ JUDGING = (
 """The gate also looks at the surroundings of saturated areas."""
 
 
-def assign_lightings(count: int, lightings: Sequence[Lighting], generator: np.random.Generator) -> list[Lighting]:
+def assign_lightings(
+    count: int, lightings: Sequence[Lighting], generator: np.random.Generator
+) -> list[Lighting]:
     """Return a lighting for each of `count` patches, in random order, in their shares."""
     ends = np.cumsum([lighting.share for lighting in lightings])
     middles = (np.arange(count) + 0.5) / count

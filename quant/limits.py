@@ -1,4 +1,6 @@
-"""The limits of the gate, by name: their defaults, the values that make sense, and the TOML file that sets them."""
+"""The limits of the gate, by name: their defaults, the values that make sense, and the TOML file
+that sets them.
+"""
 
 import os
 from collections.abc import Mapping
@@ -18,18 +20,21 @@ class Limits:
     """The largest values allowed; None for no limit. Differences and shares in [0, 1], PSNRs in dB.
 
     Attributes:
-        mae: mean absolute difference of INT8 from float. The default suits networks that change an image as little
-            as ConvBEERS does (0.01 of full scale).
+        mae: mean absolute difference of INT8 from float. The default suits networks that change an
+            image as little as ConvBEERS does (0.01 of full scale).
         p999: 99.9th percentile of the size of the difference.
-        std_over_mae: standard deviation of the difference over the MAE. Rounding alone gives 1.25 in one image and
-            up to 2.3 over images of all brightnesses, a few clipped edges give 4; clipped ground drives it up.
-        drop_share: PSNR lost against the reference, as a share of what the float network gains over its input. It
-            applies where the float network gains anything and where the references have the size of the results.
+        std_over_mae: standard deviation of the difference over the MAE. Rounding alone gives 1.25
+            in one image and up to 2.3 over images of all brightnesses, a few clipped edges give 4;
+            clipped ground drives it up.
+        drop_share: PSNR lost against the reference, as a share of what the float network gains over
+            its input. It applies where the float network gains anything and where the references
+            have the size of the results.
         psnr_drop_db: PSNR lost against the reference.
         min_psnr_float_int8_db: smallest PSNR of INT8 against float.
         metric_loss: what INT8 loses by the metric that is chosen.
         saturated: share of a layer's results at the ends of 8 bits, of the layer with most.
-        mae_growth: how many times a stored baseline's MAE; 1.05 where there is a baseline and no such limit.
+        mae_growth: how many times a stored baseline's MAE; 1.05 where there is a baseline and no
+            such limit.
 
     Examples:
         >>> bd.Limits(psnr_drop_db=0.2).mae
@@ -58,12 +63,16 @@ BREAKABLE = {
     "saturated": (0.0, 0.5),
     "mae_growth": (0.0, 10.0),
 }
-"""The values that a limit may have. A network that returns a black image has an MAE of 0.15 to 0.3 on usual scenes
-and loses 20 to 40 dB: it has to break every limit."""
+"""The values that a limit may have.
+
+A network that returns a black image has an MAE of 0.15 to 0.3 on usual scenes and loses 20 to 40
+dB: it has to break every limit.
+"""
 
 
 def limits_of(
-    given: "Limits | Mapping[str, float] | str | os.PathLike[str] | None", max_mae: float | None = None
+    given: "Limits | Mapping[str, float] | str | os.PathLike[str] | None",
+    max_mae: float | None = None,
 ) -> Limits:
     """Return the limits of a TOML file or a mapping; what they leave out has its default.
 
@@ -80,7 +89,9 @@ def limits_of(
         limits = _named("limits", given)
     else:
         limits = _require_breakable("limits", given or Limits())
-    return limits if max_mae is None else _require_breakable("max_mae", replace(limits, mae=max_mae))
+    return (
+        limits if max_mae is None else _require_breakable("max_mae", replace(limits, mae=max_mae))
+    )
 
 
 def _require_breakable(where: str, limits: Limits) -> Limits:
@@ -90,7 +101,10 @@ def _require_breakable(where: str, limits: Limits) -> Limits:
         if value is not None and not low <= value <= high:
             expected = f"{name} of {low:g} to {high:g}"
             raise OptionError(
-                where, expected=expected, got=f"{value:g}", remedy="set one that a broken network would not keep"
+                where,
+                expected=expected,
+                got=f"{value:g}",
+                remedy="set one that a broken network would not keep",
             )
     return limits
 
@@ -114,7 +128,9 @@ def _named(where: str, raw: Mapping[str, object]) -> Limits:
     for name, value in raw.items():
         if name not in names or not _is_limit(value):
             expected = f"numbers from 0 on named {', '.join(names)}"
-            raise OptionError(where, expected=expected, got=f"{name} = {value!r}", remedy="correct that line")
+            raise OptionError(
+                where, expected=expected, got=f"{name} = {value!r}", remedy="correct that line"
+            )
     values: dict[str, Any] = dict(raw)
     return _require_breakable(where, Limits(**values))
 

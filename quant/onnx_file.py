@@ -1,7 +1,8 @@
-"""ONNX files, read and written without trusting them: one sentence for whatever is not a sound model.
+"""ONNX files, read and written without trusting them: one sentence for whatever is not a sound
+model.
 
-Also what a network's file says of itself: its metadata, and the tile that it is fixed to. How an image may be cut
-into tiles for it is `quant.tiling`'s matter.
+Also what a network's file says of itself: its metadata, and the tile that it is fixed to. How an
+image may be cut into tiles for it is `quant.tiling`'s matter.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,18 +29,20 @@ REMEDY = "give an ONNX file, as 'beers-deploy export', 'beers-deploy quantize' o
 
 
 def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
-    """Read an ONNX model, with weights that it keeps beside it: the one way by which a file comes in.
+    """Read an ONNX model, with weights that it keeps beside it: the one way by which a file comes
+    in.
 
-    A float network comes as its simplest equal (`quant.reading.folding`), an INT8 one as it is. One that no runtime
-    may get comes as it is too, where it is only looked at.
+    A float network comes as its simplest equal (`quant.reading.folding`), an INT8 one as it is. One
+    that no runtime may get comes as it is too, where it is only looked at.
 
     Args:
         path: the file.
-        to_run: whether a runtime may get it; False where its nodes are only looked at, whosever they are.
+        to_run: whether a runtime may get it; False where its nodes are only looked at, whosever
+            they are.
 
     Raises:
-        ModelError: missing, empty, not ONNX, of weights that are not finite, or not to be trusted (see
-            `quant.untrusted`).
+        ModelError: missing, empty, not ONNX, of weights that are not finite, or not to be trusted
+            (see `quant.untrusted`).
     """
     try:
         content = read_whole(path, FILE_BYTES)
@@ -67,8 +70,12 @@ def _simplest(model: onnx.ModelProto, where: str, to_run: bool) -> onnx.ModelPro
         return model
 
 
-def parse_onnx(content: bytes, where: str, to_run: bool = True, path: Path | None = None) -> onnx.ModelProto:
-    """As `load_onnx`, of a file's bytes, and what is read stays as it is; with a path weights may lie beside it."""
+def parse_onnx(
+    content: bytes, where: str, to_run: bool = True, path: Path | None = None
+) -> onnx.ModelProto:
+    """As `load_onnx`, of a file's bytes, and what is read stays as it is; with a path weights may
+    lie beside it.
+    """
     if not content:
         raise ModelError(where, expected="an ONNX file", got="an empty file", remedy=REMEDY)
     if other := other_format(content[:HEAD_BYTES]):
@@ -78,7 +85,9 @@ def parse_onnx(content: bytes, where: str, to_run: bool = True, path: Path | Non
         model.ParseFromString(content)
         if path is not None:
             take_in(model, path)
-        check_content(model, where)  # before the checker, which looks for files that weights are said to be in
+        check_content(
+            model, where
+        )  # before the checker, which looks for files that weights are said to be in
         onnx.checker.check_model(model)
     except BeersError:
         raise
@@ -101,7 +110,9 @@ def require_onnx_name(*paths: Path | None) -> None:
     for path in paths:
         if path is not None and path.suffix.lower() != ".onnx":
             remedy = "name it so"
-            raise OptionError(str(path), expected="a name that ends in .onnx", got=path.name, remedy=remedy)
+            raise OptionError(
+                str(path), expected="a name that ends in .onnx", got=path.name, remedy=remedy
+            )
 
 
 def save_onnx(model: onnx.ModelProto, path: Path) -> None:
@@ -116,11 +127,15 @@ def metadata(model: onnx.ModelProto) -> dict[str, str]:
     return {item.key: item.value for item in model.metadata_props}
 
 
-def make_model(graph: onnx.GraphProto, about: dict[str, str], microsoft: bool = False) -> onnx.ModelProto:
+def make_model(
+    graph: onnx.GraphProto, about: dict[str, str], microsoft: bool = False
+) -> onnx.ModelProto:
     """A model of our opset around a graph; `microsoft` adds onnxruntime's own operator domain."""
     opsets = [onnx.helper.make_opsetid("", OPSET)]
     opsets += [onnx.helper.make_opsetid("com.microsoft", 1)] if microsoft else []
-    model = onnx.helper.make_model(graph, opset_imports=opsets, ir_version=IR_VERSION, producer_name="beers-deploy")
+    model = onnx.helper.make_model(
+        graph, opset_imports=opsets, ir_version=IR_VERSION, producer_name="beers-deploy"
+    )
     onnx.helper.set_model_props(model, about)
     return model
 
@@ -144,9 +159,15 @@ class GraphWriter:
         domain: str | None = None,
         **attributes: int | float | str | list[int],
     ) -> str:
-        """Append an operator of one result, named as its result unless it has a name; returns the result's."""
-        node = onnx.helper.make_node(kind, inputs, [output], name=name or output, domain=domain or self.domain)
-        node.attribute.extend(onnx.helper.make_attribute(key, value) for key, value in attributes.items())
+        """Append an operator of one result, named as its result unless it has a name; returns the
+        result's.
+        """
+        node = onnx.helper.make_node(
+            kind, inputs, [output], name=name or output, domain=domain or self.domain
+        )
+        node.attribute.extend(
+            onnx.helper.make_attribute(key, value) for key, value in attributes.items()
+        )
         self.nodes.append(node)
         return output
 
@@ -163,12 +184,16 @@ class GraphWriter:
         self, name: str, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
     ) -> onnx.GraphProto:
         """The ONNX graph of the nodes and constants collected so far."""
-        return onnx.helper.make_graph(self.nodes, name, inputs, outputs, list(self.weights.values()))
+        return onnx.helper.make_graph(
+            self.nodes, name, inputs, outputs, list(self.weights.values())
+        )
 
 
 def image_info(name: str, channels: int, tile_px: int | None) -> onnx.ValueInfoProto:
     """An (N, channels, H, W) tensor: a fixed tile of one image, or any number and size."""
-    shape: list[str | int | None] = [1, channels, tile_px, tile_px] if tile_px else ["N", channels, "H", "W"]
+    shape: list[str | int | None] = (
+        [1, channels, tile_px, tile_px] if tile_px else ["N", channels, "H", "W"]
+    )
     return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape)
 
 
@@ -177,7 +202,9 @@ def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.Model
     extended = deepcopy(model)
     own = {value.name for value in extended.graph.output}
     extended.graph.output.extend(
-        onnx.helper.make_tensor_value_info(name, kind, None) for name, kind in kinds.items() if name not in own
+        onnx.helper.make_tensor_value_info(name, kind, None)
+        for name, kind in kinds.items()
+        if name not in own
     )
     return extended
 
@@ -195,7 +222,11 @@ def constants(model: onnx.ModelProto) -> dict[str, np.ndarray]:
 
 def fixed_tile_px(model: onnx.ModelProto) -> int | None:
     """The tile side that a model is fixed to, or None when it takes any size."""
-    sizes = [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim] if model.graph.input else []
+    sizes = (
+        [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim]
+        if model.graph.input
+        else []
+    )
     if len(model.graph.input) != 1 or len(sizes) != 4 or sizes[2] != sizes[3]:
         raise ModelError(
             "ONNX model",
@@ -207,12 +238,16 @@ def fixed_tile_px(model: onnx.ModelProto) -> int | None:
 
 
 def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
-    """A network of convolutions that is fixed to one tile, for images of any size; any other as it is."""
+    """A network of convolutions that is fixed to one tile, for images of any size; any other as it
+    is.
+    """
     if fixed_tile_px(model) is None:
         return model
     free = deepcopy(model)
     for value in (*free.graph.input, *free.graph.output):
-        if len(value.type.tensor_type.shape.dim) != 4:  # such as a classifier's, which has one size of image
+        if (
+            len(value.type.tensor_type.shape.dim) != 4
+        ):  # such as a classifier's, which has one size of image
             return model
         for side, name in zip(value.type.tensor_type.shape.dim[2:], ("H", "W"), strict=True):
             side.dim_param = name
@@ -238,12 +273,16 @@ def faults_named(label: str) -> Iterator[None]:
     except ModelError as error:
         if error.where not in NAMELESS:
             raise
-        raise ModelError(label, expected=error.expected, got=error.got, remedy=error.remedy) from error
+        raise ModelError(
+            label, expected=error.expected, got=error.got, remedy=error.remedy
+        ) from error
 
 
 def require_quantised(model: onnx.ModelProto, name: str, wanted: bool) -> None:
     """Refuse the float network in the place of the INT8 one, and the other way round."""
     if is_quantised(model) != wanted:
-        expected, got = ("an INT8 network", "a float one") if wanted else ("a float network", "an INT8 one")
+        expected, got = (
+            ("an INT8 network", "a float one") if wanted else ("a float network", "an INT8 one")
+        )
         remedy = "give the float model first, the INT8 model second"
         raise ModelError(name, expected=expected, got=got, remedy=remedy)

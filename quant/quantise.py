@@ -1,4 +1,6 @@
-"""Static INT8 in one call: float ONNX and calibration patches in, the integer core and its file for the host out."""
+"""Static INT8 in one call: float ONNX and calibration patches in, the integer core and its file for
+the host out.
+"""
 
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -68,17 +70,28 @@ from beers_deploy.quant.passes.stream import (
 from beers_deploy.quant.sample_range import KEY as CALIBRATION_RANGE
 from beers_deploy.quant.sample_range import range_of
 from beers_deploy.quant.samples import Patches, Remade
-from beers_deploy.quant.session import TILE_PX, crops, halo_of, open_session, result_of, tensor_values, values_of
+from beers_deploy.quant.session import (
+    TILE_PX,
+    crops,
+    halo_of,
+    open_session,
+    result_of,
+    tensor_values,
+    values_of,
+)
 
 if TYPE_CHECKING:
     from beers_deploy.quant.passes.tune import Tuning
 
 SEARCH_CROPS = 16
-"""What the equalisation is searched on, a quarter of them with the strongest edges: there int8 clips. Small crops say
-less each, so more of them are taken."""
+"""What the equalisation is searched on, a quarter of them with the strongest edges: there int8
+clips. Small crops say less each, so more of them are taken.
+"""
 MOST_CROPS = 64
 LEAST_CHANGE = 1e-4
-"""Of full scale, added to what a network changes in a crop: a crop that it leaves as it is must not decide alone."""
+"""Of full scale, added to what a network changes in a crop: a crop that it leaves as it is must not
+decide alone.
+"""
 
 STREAM_STEP = 2.0**-STREAM_FRAC_BITS
 """The value of one unit of the streams' tensors."""
@@ -87,14 +100,21 @@ FINER = GAIN.bit_length() - 1
 """Fractional bits by which a window is finer than the result's own scale."""
 
 
-PASSES = "fine_planes, least_squares, shared_residual_scale, equalise, half_lsb_pair, fit_weights, dual_gain"
+PASSES = (
+    "fine_planes, least_squares, shared_residual_scale, equalise, half_lsb_pair, "
+    "fit_weights, dual_gain"
+)
 LOWERED = "full_range_relu"
-"""What a file says was done beyond rounding each tensor: see `quant.passes`, `quant.graph` and `quant.core`."""
+"""What a file says was done beyond rounding each tensor: see `quant.passes`, `quant.graph` and
+`quant.core`.
+"""
 
 
 @dataclass(frozen=True)
 class Quantised:
-    """One network in whole numbers, also as the host's file; `graph` is the float one that was rounded."""
+    """One network in whole numbers, also as the host's file; `graph` is the float one that was
+    rounded.
+    """
 
     host: onnx.ModelProto
     core: IntCore
@@ -106,9 +126,9 @@ class Quantised:
 class Plan:
     """What is to be quantised: the graph that reads the planes; the host's part; streams.
 
-    `chain` is what is levelled besides the streams, or where there are none. What is calibrated and searched is the
-    map in front of the network's `tail`, which is put behind it in the end: values of boxes that no object has would
-    outweigh all others.
+    `chain` is what is levelled besides the streams, or where there are none. What is calibrated and
+    searched is the map in front of the network's `tail`, which is put behind it in the end: values
+    of boxes that no object has would outweigh all others.
     """
 
     graph: Graph
@@ -119,9 +139,11 @@ class Plan:
     passes: Passes = ALL
 
     def with_windows(self, frac_bits: int, images: Iterable[np.ndarray]) -> "Plan":
-        """The result in windows over all that it is in float, finer by GAIN than its own scale of so many bits.
+        """The result in windows over all that it is in float, finer by GAIN than its own scale of
+        so many bits.
 
-        Itself where something is added to the result, or no convolution writes it, or one of too many channels.
+        Itself where something is added to the result, or no convolution writes it, or one of too
+        many channels.
         """
         alone = self.ends.gains == 1 and not self.ends.adds_image
         finer = self.passes.dual_range and takes_gains(self.graph)
@@ -137,7 +159,9 @@ class Plan:
         return replace(self, ends=replace(self.ends, offsets=found))
 
     def without_large_sums(self, frac_bits: Mapping[str, int]) -> "Plan":
-        """Without the streams in which sums exceed a ReLU6's six, where int8 could not end for both."""
+        """Without the streams in which sums exceed a ReLU6's six, where int8 could not end for
+        both.
+        """
         kept = [stream for stream in self.streams if not exceeds_six(self.graph, stream, frac_bits)]
         if len(kept) == len(self.streams):
             return self
@@ -145,7 +169,11 @@ class Plan:
 
     def paired(self, graph: Graph) -> Graph:
         """The graph with the half-LSB pair where that is wanted and possible; else itself."""
-        return half_lsb_pair(graph, STREAM_STEP) if self.passes.half_lsb_pair and self.streams else graph
+        return (
+            half_lsb_pair(graph, STREAM_STEP)
+            if self.passes.half_lsb_pair and self.streams
+            else graph
+        )
 
     def ended(self, graph: Graph) -> Graph:
         """The graph with windows or two gains where the result has them."""
@@ -154,7 +182,9 @@ class Plan:
         return two_gains(graph) if self.ends.gains == 2 else graph
 
     def core(self, final: Graph, frac_bits: Mapping[str, int]) -> IntCore:
-        """The integer core of a graph, paired and ended, whose tensors have these least-squares scales."""
+        """The integer core of a graph, paired and ended, whose tensors have these least-squares
+        scales.
+        """
         shared = [name for stream in streams(final) for name in stream] if self.streams else []
         chosen = {**frac_bits, **dict.fromkeys([*shared, *self.chain.tensors], STREAM_FRAC_BITS)}
         if self.ends.offsets:
@@ -166,7 +196,9 @@ class Plan:
 
 
 def _chain(graph: Graph, ends: Ends, streams: list[Stream]) -> Chain:
-    """What is levelled besides these streams: nothing where there are some, and no depthwise convolutions."""
+    """What is levelled besides these streams: nothing where there are some, and no depthwise
+    convolutions.
+    """
     widths = channels_of(graph, {PLANES: ends.planes * ends.channels})
     depthwise = any(isinstance(op, Conv) and op.groups > 1 for op in graph)
     alone = lone_tensors(graph) if depthwise or not streams else []
@@ -182,16 +214,19 @@ def quantise_model(
     passes: Passes = ALL,
     log: Log = no_log,
 ) -> Quantised:
-    """Quantise a float network under the DPU's rules: int8, symmetric, per tensor, power-of-two scales.
+    """Quantise a float network under the DPU's rules: int8, symmetric, per tensor, power-of-two
+    scales.
 
-    The global add, where there is one, stays on the host, in 12 bits: only the correction is computed in int8.
+    The global add, where there is one, stays on the host, in 12 bits: only the correction is
+    computed in int8.
 
     Args:
         model: the float network.
         patches: that it is calibrated on.
         about: metadata of the files.
         shifts: the windows of the target.
-        tuning: on what, how long and how fast the whole numbers are trained at last; None leaves them.
+        tuning: on what, how long and how fast the whole numbers are trained at last; None leaves
+            them.
         passes: that reduce the error.
         log: is told each step.
 
@@ -219,7 +254,9 @@ def quantise_model(
         CALIBRATION_RANGE: covered,
         **about,
     }
-    about["passes"] = f"{PASSES}, {LOWERED}" if any(getattr(op, "offset", 0.0) for op in final) else PASSES
+    about["passes"] = (
+        f"{PASSES}, {LOWERED}" if any(getattr(op, "offset", 0.0) for op in final) else PASSES
+    )
     if tuning:
         about["finetune"] = f"{steps} steps on {len(tuning.pairs)} patches"
     return Quantised(host_model(core, about, fixed_tile_px(model)), core, relu_count(graph), final)
@@ -228,16 +265,21 @@ def quantise_model(
 def choose_frac_bits(
     graph: Graph, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL, least_squares: bool = True
 ) -> dict[str, int]:
-    """Least-squares scale of every tensor of a plane-reading graph over images (1, C, H, W) in [0, 1].
+    """Least-squares scale of every tensor of a plane-reading graph over images (1, C, H, W) in [0,
+    1].
 
-    Tensors that must share a scale (`quant.graph.tied`) get that of least error in all of them together.
+    Tensors that must share a scale (`quant.graph.tied`) get that of least error in all of them
+    together.
 
-    Two passes, so images that can be passed over twice: the largest values, then the squared errors of the scales
-    around them. Without `least_squares` the scales of the first pass stay, in which nothing is clipped.
+    Two passes, so images that can be passed over twice: the largest values, then the squared errors
+    of the scales around them. Without `least_squares` the scales of the first pass stay, in which
+    nothing is clipped.
     """
     names = tensors(graph)
     shared = tied(graph)
-    groups = np.array([names.index(shared[name]) if shared[name] in names else -1 for name in names])
+    groups = np.array(
+        [names.index(shared[name]) if shared[name] in names else -1 for name in names]
+    )
 
     def together(of_each: np.ndarray, join: Callable[..., np.ndarray]) -> np.ndarray:
         return np.stack([join(of_each[groups == group], axis=0) for group in groups])
@@ -257,13 +299,19 @@ def choose_frac_bits(
 
 
 def _errors(tensor: np.ndarray, first: int) -> np.ndarray:
-    """The squared errors of (C, H, W), a few channels at a time: within the cache it is three times faster."""
+    """The squared errors of (C, H, W), a few channels at a time: within the cache it is three times
+    faster.
+    """
     parts = np.array_split(tensor, -(-len(tensor) // 4))
     return np.asarray(np.sum([squared_errors(part, first) for part in parts], axis=0))
 
 
-def rounded(plan: Plan, images: Remade[np.ndarray], log: Log = no_log) -> tuple[IntCore, Graph, frozenset[str]]:
-    """A plan's graph in whole numbers, the float graph that was rounded, and the tensors of its last sum."""
+def rounded(
+    plan: Plan, images: Remade[np.ndarray], log: Log = no_log
+) -> tuple[IntCore, Graph, frozenset[str]]:
+    """A plan's graph in whole numbers, the float graph that was rounded, and the tensors of its
+    last sum.
+    """
     log("scale of each tensor")
     frac_bits = choose_frac_bits(plan.graph, images, plan.ends, plan.passes.least_squares)
     plan = plan.without_large_sums(frac_bits).with_windows(frac_bits[CORRECTION], images)
@@ -284,9 +332,11 @@ def _fitted(plan: Plan, graph: Graph, core: IntCore, images: Remade[np.ndarray])
 
 
 def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], log: Log) -> Graph:
-    """The plan's graph, its streams equalised, its chain levelled, and what gains by it stored from -128 on.
+    """The plan's graph, its streams equalised, its chain levelled, and what gains by it stored from
+    -128 on.
 
-    Where the image itself passes through, also with copies in its dead channels, if that costs less.
+    Where the image itself passes through, also with copies in its dead channels, if that costs
+    less.
     """
     if not (plan.streams or plan.chain.tensors):
         return plan.graph
@@ -313,14 +363,22 @@ def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray],
     if plan.ends.offsets and plan.passes.copies:
         other, copies = with_copies(plan.graph, plan.chain.tensors, images, plan.ends)
         if copies:
-            graph = min((graph, searched(other, copies)), key=lambda tried: float(fitted(tried)(None).sum()))
+            graph = min(
+                (graph, searched(other, copies)), key=lambda tried: float(fitted(tried)(None).sum())
+            )
     return graph
 
 
-def _levelled(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], log: Log, copies: Copies) -> Graph:
-    """The graph, its chain levelled; what the image itself passes through clips nothing that calibration sees."""
+def _levelled(
+    graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], log: Log, copies: Copies
+) -> Graph:
+    """The graph, its chain levelled; what the image itself passes through clips nothing that
+    calibration sees.
+    """
     log(f"equalising the channels of {len(plan.chain.tensors)} tensors")
-    ranges = ranges_apart(chain_ranges(graph, plan.chain, images, plan.ends), plan.chain.parts, copies)
+    ranges = ranges_apart(
+        chain_ranges(graph, plan.chain, images, plan.ends), plan.chain.parts, copies
+    )
     graph = plan.chain.scaled(graph, level(graph, plan.chain, ranges, np.ones(len(ranges)), trial))
     if not plan.ends.offsets:
         return graph
@@ -328,7 +386,9 @@ def _levelled(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray]
     return plan.chain.scaled(graph, FULL / np.maximum(largest, FULL))
 
 
-def _equalised(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], log: Log) -> Graph:
+def _equalised(
+    graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], log: Log
+) -> Graph:
     """Stream after stream, the others levelled by a first guess until their turn comes."""
     ranges = [channel_ranges(plan.graph, stream, images, plan.ends) for stream in plan.streams]
     for stream, of_it in list(zip(plan.streams, ranges, strict=True))[1:]:
@@ -364,22 +424,29 @@ def search_targets(graph: Graph, ends: Ends, images: Remade[np.ndarray]) -> Targ
         result = restored(crop)
         return float(np.abs(result - crop if result.shape == crop.shape else result).max())
 
-    sizes = {(k, n): size(crop) for k, image in enumerate(images) for n, crop in enumerate(crops(image, halo_px))}
+    sizes = {
+        (k, n): size(crop)
+        for k, image in enumerate(images)
+        for n, crop in enumerate(crops(image, halo_px))
+    }
     order = sorted(sizes, key=lambda place: sizes[place], reverse=True)
     height, width = map(int, crops(images[0], halo_px)[0].shape[2:])
     count = min(max(SEARCH_CROPS * TILE_PX**2 // (height * width), SEARCH_CROPS), MOST_CROPS)
     hard = count // 4
     others = order[hard :: max((len(order) - hard) // (count - hard), 1)]
-    chosen = [crops(images[k], halo_px)[n].copy() for k, n in (*order[:hard], *others[: count - hard])]
+    chosen = [
+        crops(images[k], halo_px)[n].copy() for k, n in (*order[:hard], *others[: count - hard])
+    ]
     return [(crop, restored(crop)) for crop in chosen]
 
 
 def crop_costs(model: onnx.ModelProto, targets: Targets) -> Costs:
     """Root mean squared difference of an integer network from the float one, by crop.
 
-    Squared, because clipping is rare and must count; its root, so that no single crop that clips decides alone. It is
-    relative to what the float network changes in the crop: a loss of PSNR is relative too, and in absolute terms
-    bright crops with large corrections would outweigh the dark ones, where the same step costs most.
+    Squared, because clipping is rare and must count; its root, so that no single crop that clips
+    decides alone. It is relative to what the float network changes in the crop: a loss of PSNR is
+    relative too, and in absolute terms bright crops with large corrections would outweigh the dark
+    ones, where the same step costs most.
     """
     session = open_session(model, threads=1)
 
@@ -391,10 +458,13 @@ def crop_costs(model: onnx.ModelProto, targets: Targets) -> Costs:
         return float(np.sqrt(np.square(values, dtype=np.float64).mean()))
 
     same_size = all(image.shape == wanted.shape for image, wanted in targets)
-    changes = [rms(wanted - image) + LEAST_CHANGE if same_size else 1.0 for image, wanted in targets]
+    changes = [
+        rms(wanted - image) + LEAST_CHANGE if same_size else 1.0 for image, wanted in targets
+    ]
 
     def of(crops: np.ndarray | None) -> np.ndarray:
-        # Small crops keep cores busier one to each than all on one: threads that share a crop wait for each other.
+        # Small crops keep cores busier one to each than all on one: threads that share a crop wait
+        # for each other.
         with ThreadPoolExecutor(os.cpu_count()) as cores:
             return np.array(list(cores.map(cost, range(len(targets)) if crops is None else crops)))
 

@@ -1,7 +1,7 @@
 """Which part of a sensor's range a set of samples covers.
 
-A limit says nothing of brightness that no sample has. So `quantize` records the range of the samples that a network
-was calibrated on, and the gate prints the range of those that it judged by.
+A limit says nothing of brightness that no sample has. So `quantize` records the range of the
+samples that a network was calibrated on, and the gate prints the range of those that it judged by.
 """
 
 import json
@@ -19,7 +19,10 @@ KEY = "calibration_range"
 """Of the metadata of an INT8 file."""
 
 BINS = 4096
-"""Of the histogram over [0, 1]: one for each digital number of 12 bits. Pixels in the last one are saturated."""
+"""Of the histogram over [0, 1]: one for each digital number of 12 bits.
+
+Pixels in the last one are saturated.
+"""
 
 PERCENTS = (1, 50, 99, 99.9)
 """The percentiles of a range."""
@@ -30,7 +33,9 @@ COVERED = 0.9
 
 @dataclass(frozen=True)
 class SampleRange:
-    """Percentiles of all pixels of a set of samples, over full scale, and the share of pixels that are saturated."""
+    """Percentiles of all pixels of a set of samples, over full scale, and the share of pixels that
+    are saturated.
+    """
 
     p1: float
     p50: float
@@ -44,8 +49,13 @@ class SampleRange:
         return self.p99_9 >= COVERED
 
     def __str__(self) -> str:
-        shares = f"1, 50, 99 and 99.9 % of the pixels lie below {self.p1:.3f}, {self.p50:.3f}, {self.p99:.3f} and"
-        return f"{shares} {self.p99_9:.3f} of full scale, {100 * self.saturated:.2g} % are saturated"
+        shares = (
+            f"1, 50, 99 and 99.9 % of the pixels lie below {self.p1:.3f}, {self.p50:.3f}, "
+            f"{self.p99:.3f} and"
+        )
+        return (
+            f"{shares} {self.p99_9:.3f} of full scale, {100 * self.saturated:.2g} % are saturated"
+        )
 
     def to_words(self) -> str:
         """Return the range as it stands in the metadata of an INT8 file."""
@@ -67,7 +77,9 @@ class RangeCounts:
     def range(self) -> SampleRange:
         """The range of what was added."""
         shares = np.cumsum(self._counts) / max(int(self._counts.sum()), 1)
-        p1, p50, p99, p99_9 = (float(np.searchsorted(shares, each / 100)) / (BINS - 1) for each in PERCENTS)
+        p1, p50, p99, p99_9 = (
+            float(np.searchsorted(shares, each / 100)) / (BINS - 1) for each in PERCENTS
+        )
         saturated = float(self._counts[-1] / max(int(self._counts.sum()), 1))
         return SampleRange(p1, p50, p99, p99_9, saturated)
 
@@ -81,9 +93,11 @@ def range_of(samples: Iterable[np.ndarray]) -> SampleRange:
 
 
 def recorded_range(about: Mapping[str, str]) -> SampleRange | None:
-    """Return the range that the metadata of an INT8 file records; None if it records none that makes sense.
+    """Return the range that the metadata of an INT8 file records; None if it records none that
+    makes sense.
 
-    It is the file's own claim, which nothing verifies: it may be shown, but no check may depend on it.
+    It is the file's own claim, which nothing verifies: it may be shown, but no check may depend on
+    it.
     """
     try:
         values: Any = parse_json(about.get(KEY, ""))
@@ -91,7 +105,9 @@ def recorded_range(about: Mapping[str, str]) -> SampleRange | None:
     except (ValueError, TypeError, AttributeError):
         return None
     in_order = [found.p1, found.p50, found.p99, found.p99_9]
-    plausible = all(math.isfinite(value) and 0 <= value <= 1 for value in (*in_order, found.saturated))
+    plausible = all(
+        math.isfinite(value) and 0 <= value <= 1 for value in (*in_order, found.saturated)
+    )
     return found if plausible and in_order == sorted(in_order) else None
 
 
@@ -112,13 +128,20 @@ def uncovered(judged: SampleRange, calibrated: SampleRange | None) -> str:
 
     Args:
         judged: the range of the gate's samples.
-        calibrated: the range that the INT8 file claims for its calibration, None if it records none.
+        calibrated: the range that the INT8 file claims for its calibration, None if it records
+            none.
     """
     if judged.reaches_full_scale:
         return ""
-    sentence = f"the samples reach {judged.p99_9:.2f} of full scale (99.9th percentile): nothing brighter was judged"
+    sentence = (
+        f"the samples reach {judged.p99_9:.2f} of full scale (99.9th percentile): "
+        "nothing brighter was judged"
+    )
     if calibrated is None:
         return f"{sentence}, and the INT8 file does not record what its calibration covered"
     if not calibrated.reaches_full_scale:
-        return f"{sentence}, and by the INT8 file's own record its calibration reached {calibrated.p99_9:.2f}"
+        return (
+            f"{sentence}, and by the INT8 file's own record its calibration reached "
+            f"{calibrated.p99_9:.2f}"
+        )
     return sentence

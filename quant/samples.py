@@ -1,8 +1,9 @@
-"""Images of a user's own, as their network reads them: what any network is calibrated and judged on.
+"""Images of a user's own, as their network reads them: what any network is calibrated and judged
+on.
 
-One .npy or .npz file of a batch (N, C, H, W), or a folder of images and .npy files of one image each, (C, H, W).
-Values are in [0, 1] of full scale: of pixels of 8 bits 255, of more 4095. A .npz file may hold what the network
-should give beside what it reads, as `image` and `reference`.
+One .npy or .npz file of a batch (N, C, H, W), or a folder of images and .npy files of one image
+each, (C, H, W). Values are in [0, 1] of full scale: of pixels of 8 bits 255, of more 4095. A .npz
+file may hold what the network should give beside what it reads, as `image` and `reference`.
 """
 
 import hashlib
@@ -90,16 +91,24 @@ FULL_SCALE_8 = 255
 REMEDY = "see docs/reference/any-network.md for how samples are given"
 
 
-def read_samples(given: Path | Sequence[Pair], channels: int, fixed_px: int | None, multiple_px: int = 1) -> Patches:
-    """The samples of a file, a folder or arrays, cut to what the network takes: each (1, C, h, w) float32 in [0, 1].
+def read_samples(
+    given: Path | Sequence[Pair], channels: int, fixed_px: int | None, multiple_px: int = 1
+) -> Patches:
+    """The samples of a file, a folder or arrays, cut to what the network takes: each (1, C, h, w)
+    float32 in [0, 1].
 
     Args:
         given: the file or folder, or the samples (C, H, W) with their references.
         channels: that the network reads.
-        fixed_px: side of the image that the network is fixed to; None cuts large samples to patches.
+        fixed_px: side of the image that the network is fixed to; None cuts large samples to
+            patches.
         multiple_px: what sides must be multiples of; the rest is cut off.
     """
-    named = _samples(given) if isinstance(given, Path) else ((f"{IN_MEMORY}[{k}]", *p) for k, p in enumerate(given))
+    named = (
+        _samples(given)
+        if isinstance(given, Path)
+        else ((f"{IN_MEMORY}[{k}]", *p) for k, p in enumerate(given))
+    )
     found = list[Named]()
     for name, image, reference in named:
         seen = _sound(name, image, channels)
@@ -115,33 +124,48 @@ IN_MEMORY = "samples"
 
 
 def samples_in(given: object) -> list[Pair]:
-    """The samples in an array, in a pair of arrays (images, references), or in what gives such one after the other.
+    """The samples in an array, in a pair of arrays (images, references), or in what gives such one
+    after the other.
 
     Args:
-        given: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch and in [0, 1]; a tuple of two; a
-            simulated pair, which knows its full scale; or an iterable of any of these, such as a DataLoader.
+        given: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch and in [0, 1]; a
+            tuple of two; a simulated pair, which knows its full scale; or an iterable of any of
+            these, such as a DataLoader.
     """
     if hasattr(given, "degraded") and hasattr(given, "reference"):
         pair: Any = given
         largest = np.float32(pair.sensor.max_dn)
-        images = [np.asarray(image, np.float32)[None] / largest for image in (pair.degraded, pair.reference)]
+        images = [
+            np.asarray(image, np.float32)[None] / largest
+            for image in (pair.degraded, pair.reference)
+        ]
         return [(images[0], images[1])]
     if hasattr(given, "ndim"):
         return [(image, NO_REFERENCE) for image in _batch(given)]
-    if isinstance(given, tuple) and len(given) == 2 and all(hasattr(each, "ndim") for each in given):
+    if (
+        isinstance(given, tuple)
+        and len(given) == 2
+        and all(hasattr(each, "ndim") for each in given)
+    ):
         # a reference may be a class, or a class for each pixel
         seen = _batch(given[0])
         meant = _plain(given[1])
         meant = meant[None] if np.ndim(given[0]) == 3 else meant
         if meant.ndim == 0 or len(seen) != len(meant):
             got = f"images of {times(seen.shape)} and references of {_shape(meant)}"
-            raise ImageError(IN_MEMORY, expected="a reference for each image", got=got, remedy=REMEDY)
+            raise ImageError(
+                IN_MEMORY, expected="a reference for each image", got=got, remedy=REMEDY
+            )
         return list(zip(seen, meant, strict=True))
     if not isinstance(given, Iterable) or isinstance(given, str | bytes | Mapping):
         got = type(given).__name__
-        raise ImageError(IN_MEMORY, expected="arrays (N, C, H, W), or a path", got=got, remedy=REMEDY)
+        raise ImageError(
+            IN_MEMORY, expected="arrays (N, C, H, W), or a path", got=got, remedy=REMEDY
+        )
     items = (tuple(item) if isinstance(item, list) and len(item) == 2 else item for item in given)
-    items = (item[0] if isinstance(item, list | tuple) and len(item) == 1 else item for item in items)
+    items = (
+        item[0] if isinstance(item, list | tuple) and len(item) == 1 else item for item in items
+    )
     return [sample for item in items for sample in samples_in(item)]
 
 
@@ -149,7 +173,9 @@ def _batch(array: Any) -> np.ndarray:
     """One image or a batch of NumPy or torch as (N, C, H, W)."""
     found = _plain(array)
     if found.ndim not in (3, 4):
-        raise ImageError(IN_MEMORY, expected="a batch of (N, C, H, W)", got=times(found.shape), remedy=REMEDY)
+        raise ImageError(
+            IN_MEMORY, expected="a batch of (N, C, H, W)", got=times(found.shape), remedy=REMEDY
+        )
     return found if found.ndim == 4 else found[None]
 
 
@@ -163,7 +189,9 @@ NO_REFERENCE = np.empty(0, np.float32)
 def _patches(samples: Sequence[Named]) -> Patches:
     names = tuple(name for name, _ in samples)
     pairs = [pair for _, pair in samples]
-    return Patches([], Remade(lambda k: pairs[k], len(pairs)), Remade(lambda k: pairs[k][0], len(pairs)), names)
+    return Patches(
+        [], Remade(lambda k: pairs[k], len(pairs)), Remade(lambda k: pairs[k][0], len(pairs)), names
+    )
 
 
 def _named(samples: Patches) -> list[Named]:
@@ -177,23 +205,33 @@ DIGEST_DIGITS = 16
 
 def digest_of(sample: np.ndarray) -> str:
     """A sample (1, C, h, w), told from any other."""
-    return hashlib.sha256(np.ascontiguousarray(sample, np.float32).tobytes()).hexdigest()[:DIGEST_DIGITS]
+    return hashlib.sha256(np.ascontiguousarray(sample, np.float32).tobytes()).hexdigest()[
+        :DIGEST_DIGITS
+    ]
 
 
 def split_samples(samples: Patches) -> tuple[Patches, Patches]:
-    """What to calibrate on, and every fourth sample to look at what INT8 changes; of fewer both are all."""
+    """What to calibrate on, and every fourth sample to look at what INT8 changes; of fewer both are
+    all.
+    """
     pairs = _named(samples)
     held_out = pairs[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY]
     if not held_out:
         return samples, samples
-    return _patches([pair for k, pair in enumerate(pairs) if (k + 1) % HELD_OUT_EVERY]), _patches(held_out)
+    return _patches([pair for k, pair in enumerate(pairs) if (k + 1) % HELD_OUT_EVERY]), _patches(
+        held_out
+    )
 
 
 def sample_files(path: Path) -> list[Path]:
-    """Return the files that samples are read from: those of a folder in their order, or the file itself."""
+    """Return the files that samples are read from: those of a folder in their order, or the file
+    itself.
+    """
     if not path.is_dir():
         return [path]
-    return sorted(file for file in path.iterdir() if file.suffix.lower() in {ARRAY_SUFFIX, *IMAGE_SUFFIXES})
+    return sorted(
+        file for file in path.iterdir() if file.suffix.lower() in {ARRAY_SUFFIX, *IMAGE_SUFFIXES}
+    )
 
 
 def _samples(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
@@ -207,7 +245,9 @@ def _samples(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
             continue
         image, _ = _stored(file)
         if image.ndim != 3:
-            raise ImageError(str(file), expected="one image (C, H, W)", got=_shape(image), remedy=REMEDY)
+            raise ImageError(
+                str(file), expected="one image (C, H, W)", got=_shape(image), remedy=REMEDY
+            )
         yield file.name, image, NO_REFERENCE
 
 
@@ -215,16 +255,25 @@ def _batch_in(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield the samples of one file, as `_samples` does."""
     images, references = _stored(path)
     if images.ndim != 4:
-        raise ImageError(str(path), expected="a batch of (N, C, H, W)", got=_shape(images), remedy=REMEDY)
+        raise ImageError(
+            str(path), expected="a batch of (N, C, H, W)", got=_shape(images), remedy=REMEDY
+        )
     if references.ndim == 0 or (references is not NO_REFERENCE and len(references) != len(images)):
         expected = f"as many references as images ({len(images)})"
-        raise ImageError(str(path), expected=expected, got=f"references of {_shape(references)}", remedy=REMEDY)
+        raise ImageError(
+            str(path), expected=expected, got=f"references of {_shape(references)}", remedy=REMEDY
+        )
     for number, image in enumerate(images):
-        yield f"{path.name}[{number}]", image, references[number] if references.size else NO_REFERENCE
+        yield (
+            f"{path.name}[{number}]",
+            image,
+            references[number] if references.size else NO_REFERENCE,
+        )
 
 
 def _stored(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The array of a .npy file, mapped rather than read; of a .npz file `image` and `reference`, or its only array.
+    """The array of a .npy file, mapped rather than read; of a .npz file `image` and `reference`, or
+    its only array.
 
     Nothing is unpickled.
     """
@@ -237,17 +286,23 @@ def _stored(path: Path) -> tuple[np.ndarray, np.ndarray]:
     image = next(iter(arrays)) if len(arrays) == 1 else "image"
     if image not in arrays:
         got = ", ".join(arrays) or "no array"
-        raise ImageError(str(path), expected="arrays named image and reference", got=got, remedy=REMEDY)
+        raise ImageError(
+            str(path), expected="arrays named image and reference", got=got, remedy=REMEDY
+        )
     return arrays[image], arrays.get("reference", NO_REFERENCE)
 
 
 def _bands_first(path: Path, pixels: np.ndarray) -> np.ndarray:
-    """(H, W) or (H, W, bands) as stored to (C, H, W) of full scale; floats are of full scale already."""
+    """(H, W) or (H, W, bands) as stored to (C, H, W) of full scale; floats are of full scale
+    already.
+    """
     bands = pixels[None] if pixels.ndim == 2 else np.moveaxis(pixels, -1, 0)
     if bands.dtype.kind == "f":
         return bands
     if bands.dtype.kind not in "ui":
-        raise ImageError(str(path), expected="pixels that are numbers", got=f"{bands.dtype}", remedy=REMEDY)
+        raise ImageError(
+            str(path), expected="pixels that are numbers", got=f"{bands.dtype}", remedy=REMEDY
+        )
     return bands / np.float32(FULL_SCALE_8 if bands.dtype.itemsize == 1 else MAX_DN)
 
 
@@ -258,7 +313,8 @@ def _shape(array: np.ndarray) -> str:
 def _sound_reference(name: str, reference: np.ndarray) -> np.ndarray:
     """Return a reference as float32; raise ImageError if it is not made of real, finite numbers.
 
-    Whether it must be an image in [0, 1] of the result's size depends on what is measured: `quant.gate.compare`.
+    Whether it must be an image in [0, 1] of the result's size depends on what is measured:
+    `quant.gate.compare`.
     """
     if reference.dtype.kind not in "fuib":
         got = f"{reference.dtype}"
@@ -281,8 +337,14 @@ def _sound(name: str, image: np.ndarray, channels: int) -> np.ndarray:
     values = np.asarray(image, np.float32)
     low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
     if not (low >= 0 and high <= LARGEST):
-        remedy = "divide them by full scale" if np.isfinite(high) else "leave out samples with missing pixels"
-        raise ImageError(name, expected="values in [0, 1]", got=f"{low:.4g} to {high:.4g}", remedy=remedy)
+        remedy = (
+            "divide them by full scale"
+            if np.isfinite(high)
+            else "leave out samples with missing pixels"
+        )
+        raise ImageError(
+            name, expected="values in [0, 1]", got=f"{low:.4g} to {high:.4g}", remedy=remedy
+        )
     return np.minimum(values, 1)
 
 
@@ -293,7 +355,9 @@ def _cut(
     height, width = image.shape[1:]
     if fixed_px is not None and (height, width) != (fixed_px, fixed_px) and reference.size:
         got = times((height, width))
-        raise ImageError(name, expected=f"images of {fixed_px} x {fixed_px} pixels", got=got, remedy=REMEDY)
+        raise ImageError(
+            name, expected=f"images of {fixed_px} x {fixed_px} pixels", got=got, remedy=REMEDY
+        )
     if reference.size and (height % multiple_px or width % multiple_px):
         expected = f"images of multiples of {multiple_px} pixels beside a reference"
         got = times((height, width))
@@ -305,10 +369,15 @@ def _cut(
     sizes = [side if n >= side else n // multiple_px * multiple_px for n in (height, width)]
     if 0 in sizes or (fixed_px is not None and sizes != [side, side]):
         expected = f"images of at least {fixed_px or multiple_px} pixels a side"
-        raise ImageError(name, expected=expected, got=times((height, width)), remedy="give larger ones")
+        raise ImageError(
+            name, expected=expected, got=times((height, width)), remedy="give larger ones"
+        )
     for top in range(0, height - sizes[0] + 1, sizes[0]):
         for left in range(0, width - sizes[1] + 1, sizes[1]):
-            yield np.ascontiguousarray(image[None, :, top : top + sizes[0], left : left + sizes[1]]), NO_REFERENCE
+            yield (
+                np.ascontiguousarray(image[None, :, top : top + sizes[0], left : left + sizes[1]]),
+                NO_REFERENCE,
+            )
 
 
 @dataclass(frozen=True)
@@ -322,12 +391,19 @@ class OwnSamples:
 
     @cached_property
     def all(self) -> Patches:
-        """Every sample with contrast: any network keeps what is constant, and a mean over such hides errors."""
+        """Every sample with contrast: any network keeps what is constant, and a mean over such
+        hides errors.
+        """
         found = read_samples(self.given, self.channels, self.fixed_px, self.multiple_px)
         kept = [(name, pair) for name, pair in _named(found) if np.ptp(pair[0]) >= LEAST_CONTRAST]
         if not kept:
             name = str(self.given) if isinstance(self.given, Path) else IN_MEMORY
-            raise ImageError(name, expected="samples with contrast", got="constant ones", remedy="give real images")
+            raise ImageError(
+                name,
+                expected="samples with contrast",
+                got="constant ones",
+                remedy="give real images",
+            )
         return _patches(kept)
 
     @property
@@ -349,7 +425,10 @@ class OwnSamples:
     def about(self) -> dict[str, str]:
         """What the file says of it."""
         name = self.given.name if isinstance(self.given, Path) else IN_MEMORY
-        return {"calibration_data": name, CALIBRATED_ON: " ".join(map(digest_of, self.drawn.degraded))}
+        return {
+            "calibration_data": name,
+            CALIBRATED_ON: " ".join(map(digest_of, self.drawn.degraded)),
+        }
 
 
 def samples_of(model: onnx.ModelProto, given: object) -> OwnSamples | None:
@@ -363,7 +442,11 @@ def samples_of(model: onnx.ModelProto, given: object) -> OwnSamples | None:
     if channels != 1 or multiple_px is None or PATCH_PX % multiple_px:
         what = f"images of {fixed_px} x {fixed_px} pixels alone"
         if multiple_px is not None:
-            what = f"{channels} channels" if channels != 1 else f"images of multiples of {multiple_px} pixels"
+            what = (
+                f"{channels} channels"
+                if channels != 1
+                else f"images of multiples of {multiple_px} pixels"
+            )
         expected = f"samples for a network of {what}: simulated patches are others"
         remedy = "give a .npy or .npz file of (N, C, H, W) in [0, 1], or a folder of images"
         raise OptionError("samples", expected=expected, got="none", remedy=remedy)

@@ -1,8 +1,8 @@
 """Which layer costs what: each one in int8 while all others stay in float.
 
-A convolution errs by its int8 weights and bias, and by rounding and clipping its result. An add errs by what it does
-to sums of whole numbers: in a stream of one scale nothing, but where it saturates. What a layer's inputs had
-already lost is not held against it.
+A convolution errs by its int8 weights and bias, and by rounding and clipping its result. An add
+errs by what it does to sums of whole numbers: in a stream of one scale nothing, but where it
+saturates. What a layer's inputs had already lost is not held against it.
 """
 
 import math
@@ -34,10 +34,20 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.quantise import Quantised
 from beers_deploy.quant.samples import Patches
-from beers_deploy.quant.session import few_crops, halo_of, open_session, planes_of, result_of, run, tensor_values
+from beers_deploy.quant.session import (
+    few_crops,
+    halo_of,
+    open_session,
+    planes_of,
+    result_of,
+    run,
+    tensor_values,
+)
 
 IN_INT8 = ".in_int8"
-"""Behind the name of a tensor: as int8 weights and bias make it of float inputs, not yet rounded."""
+"""Behind the name of a tensor: as int8 weights and bias make it of float
+inputs, not yet rounded.
+"""
 
 WORST = 4
 BEYOND_DN = (1, 2, 4, 8, 16, 32, 64)
@@ -63,8 +73,14 @@ class Loss:
 
     @property
     def sqnr_db(self) -> float:
-        """10 log10 of the signal's energy over that of the difference; infinite where nothing is lost."""
-        return 10 * math.log10(self._signal / self._noise) if self._noise and self._signal else math.inf
+        """10 log10 of the signal's energy over that of the difference; infinite where nothing is
+        lost.
+        """
+        return (
+            10 * math.log10(self._signal / self._noise)
+            if self._noise and self._signal
+            else math.inf
+        )
 
     @property
     def mae(self) -> float:
@@ -92,15 +108,19 @@ class LayerError:
     network: Loss
 
 
-def layer_errors(graph: Graph, core: IntCore, crops: Iterable[np.ndarray]) -> tuple[list[LayerError], Loss]:
-    """What each layer of a network loses, and what all lose together, over crops (1, 1, H, W) in [0, 1].
+def layer_errors(
+    graph: Graph, core: IntCore, crops: Iterable[np.ndarray]
+) -> tuple[list[LayerError], Loss]:
+    """What each layer of a network loses, and what all lose together, over crops (1, 1, H, W) in
+    [0, 1].
 
     Args:
         graph: plane-reading, in float: what the core was rounded from.
         core: the same operations in whole numbers.
         crops: each passes through the network once for every layer.
     """
-    # The same convolutions, by their side, with the values that their int8 weights and biases stand for.
+    # The same convolutions, by their side, with the values that their int8 weights and biases stand
+    # for.
     twins = tuple(
         replace(dequantised(op, whole), name=op.name + IN_INT8, output=op.output + IN_INT8)
         for op, whole in zip(graph, core.ops, strict=True)
@@ -111,7 +131,11 @@ def layer_errors(graph: Graph, core: IntCore, crops: Iterable[np.ndarray]) -> tu
     halo_px = None if halo_of(graph) is None else 0
     exact = open_session(graph_to_onnx((*graph, *twins), names, width))
     int8 = open_session(host_model(core, {}))
-    rests = {name: open_session(_rest(graph, name, width)) for name in tensors(graph) if name != CORRECTION}
+    rests = {
+        name: open_session(_rest(graph, name, width))
+        for name in tensors(graph)
+        if name != CORRECTION
+    }
     layers = [LayerError(op.name, Loss(), Loss()) for op in graph]
     together = Loss()
     scale = core.scale(CORRECTION)
@@ -123,11 +147,15 @@ def layer_errors(graph: Graph, core: IntCore, crops: Iterable[np.ndarray]) -> tu
         for op, layer in zip(graph, layers, strict=True):
             result = _in_int8(op, core, wanted)
             meant = wanted[op.output]
-            if op.output == CORRECTION:  # of two gains one is coarse and the other clipped: together they count
+            if (
+                op.output == CORRECTION
+            ):  # of two gains one is coarse and the other clipped: together they count
                 result = core.ends.merge(result, scale)
                 meant = core.ends.whole(meant)
             layer.alone.add(result, meant)
-            result = result - (result - meant).mean((2, 3), keepdims=True)  # for which the next bias makes up
+            result = result - (result - meant).mean(
+                (2, 3), keepdims=True
+            )  # for which the next bias makes up
             if op.output == CORRECTION:
                 found = core.ends.finished(crop, result)
             else:
@@ -141,7 +169,9 @@ def layer_errors(graph: Graph, core: IntCore, crops: Iterable[np.ndarray]) -> tu
 def _rest(graph: Graph, given: str, width: int) -> onnx.ModelProto:
     """The float network from one of its tensors, given beside the planes, to the correction."""
     model = graph_to_onnx(tuple(op for op in graph if op.output != given), [CORRECTION], width)
-    model.graph.input.append(helper.make_tensor_value_info(given, TensorProto.FLOAT, ["N", "C", None, None]))
+    model.graph.input.append(
+        helper.make_tensor_value_info(given, TensorProto.FLOAT, ["N", "C", None, None])
+    )
     return model
 
 
@@ -154,7 +184,9 @@ def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarr
     if not isinstance(op, Add):
         return rounded_to(exact[op.output], core.frac_bits[op.output])
     left, right = (rounded_to(exact[name], core.frac_bits[name]) for name in op.inputs)
-    return np.asarray(exact[op.output] + (rounded_to(left + right, core.frac_bits[op.output]) - (left + right)))
+    return np.asarray(
+        exact[op.output] + (rounded_to(left + right, core.frac_bits[op.output]) - (left + right))
+    )
 
 
 @dataclass(frozen=True)
@@ -188,16 +220,22 @@ class Spread:
 
 
 def spread_of(
-    float_session: ort.InferenceSession, int8_session: ort.InferenceSession, images: Iterable[np.ndarray]
+    float_session: ort.InferenceSession,
+    int8_session: ort.InferenceSession,
+    images: Iterable[np.ndarray],
 ) -> Spread:
     """Run both networks on images (1, 1, H, W) in [0, 1], one at a time."""
     counts = np.zeros(2 * MAX_DN + 1, np.int64)
     mae = []
     largest = []
     for image in images:
-        in_float, in_int8 = (np.clip(run(session, image), 0, 1) for session in (float_session, int8_session))
+        in_float, in_int8 = (
+            np.clip(run(session, image), 0, 1) for session in (float_session, int8_session)
+        )
         difference = (in_int8 - in_float).ravel()
-        counts += np.bincount(np.rint(difference * MAX_DN).astype(np.int64) + MAX_DN, minlength=len(counts))
+        counts += np.bincount(
+            np.rint(difference * MAX_DN).astype(np.int64) + MAX_DN, minlength=len(counts)
+        )
         mae.append(float(np.abs(difference).mean()))
         largest.append(float(np.abs(difference).max()))
     return Spread(counts, np.array(mae), np.array(largest))
@@ -212,13 +250,18 @@ def layer_error_rows(result: Quantised, patches: Patches) -> list[Row]:
     rows = []
     for layer in layers:
         figures = {"SQNR alone": _sqnr(layer.alone, source), **_network(layer.network, source)}
-        figures["share of squared error"] = measured(100 * layer.network.squared / whole if whole else 0, "%", source)
+        figures["share of squared error"] = measured(
+            100 * layer.network.squared / whole if whole else 0, "%", source
+        )
         rows.append(Row("layers", layer.name, figures))
     return [*rows, Row("layers", "all layers", _network(together, f"{len(seen)} patches"))]
 
 
 def _network(loss: Loss, source: str) -> dict[str, Figure]:
-    return {"SQNR of the network": _sqnr(loss, source), "MAE": measured(loss.mae, "of full scale", source)}
+    return {
+        "SQNR of the network": _sqnr(loss, source),
+        "MAE": measured(loss.mae, "of full scale", source),
+    }
 
 
 def _sqnr(loss: Loss, source: str) -> Figure:
@@ -231,11 +274,15 @@ def worst_row(number: int, patches: Patches, spread: Spread) -> Row:
     """The errors of a patch; of a simulated one also what it shows through which sensor."""
     errors = {"MAE": spread.mae[number], "max": spread.largest[number]}
     kind = "simulated patch" if patches.views else "sample"
-    figures = {key: measured(float(value), "of full scale", f"one {kind}") for key, value in errors.items()}
+    figures = {
+        key: measured(float(value), "of full scale", f"one {kind}") for key, value in errors.items()
+    }
     if not patches.views:
         return Row("worst samples", f"sample {number}", figures)
     view = patches.views[number]
-    figures["mean radiance"] = measured(view.ground.brightness, "W/m2/sr/um", "of the simulated ground")
+    figures["mean radiance"] = measured(
+        view.ground.brightness, "W/m2/sr/um", "of the simulated ground"
+    )
     words = {
         "scene": view.ground.scene.name,
         "MTF at Nyquist, drawn from the profile": _mtf(view.degraded),
@@ -245,7 +292,9 @@ def worst_row(number: int, patches: Patches, spread: Spread) -> Row:
 
 
 def _mtf(sensor: Instrument) -> str:
-    """One value, or two where the sensor's axes differ: what the profile gave to this patch, measured nowhere."""
+    """One value, or two where the sensor's axes differ: what the profile gave to this patch,
+    measured nowhere.
+    """
     across, along = (f"{100 * value:.3g} %" for value in sensor.mtf_axes)
     return across if across == along else f"{across} across the track, {along} along it"
 
@@ -253,7 +302,9 @@ def _mtf(sensor: Instrument) -> str:
 def sizes_row(spread: Spread) -> Row:
     """How many pixels differ by more than a few DN, and by more than many."""
     source = f"{len(spread.mae)} patches"
-    figures = {f"beyond {dn} DN": measured(100 * spread.share_beyond(dn), "%", source) for dn in BEYOND_DN}
+    figures = {
+        f"beyond {dn} DN": measured(100 * spread.share_beyond(dn), "%", source) for dn in BEYOND_DN
+    }
     return Row("error sizes", "INT8 against float", figures)
 
 
@@ -263,9 +314,14 @@ SAME_CLASS = 0.99
 
 
 def losses(result: Quantised, gate: GateResult, patches: Patches) -> str:
-    """What INT8 costs, on the worst patch too; where that is much, which tensors cost most and what to try."""
+    """What INT8 costs, on the worst patch too; where that is much, which tensors cost most and what
+    to try.
+    """
     if not math.isnan(gate.drop_db):
-        worst = f"{gate.drop_db:.2f} dB of {gate.psnr_float_db:.2f}, and {gate.worst_drop_db:.2f} dB where most"
+        worst = (
+            f"{gate.drop_db:.2f} dB of {gate.psnr_float_db:.2f}, and "
+            f"{gate.worst_drop_db:.2f} dB where most"
+        )
         said = f"INT8 loses {worst}"
         much = gate.drop_db > MUCH_DB
     elif not math.isnan(gate.same_class):
@@ -276,8 +332,14 @@ def losses(result: Quantised, gate: GateResult, patches: Patches) -> str:
         much = False
     if not much:
         return f"{said} ({gate.source})"
-    named = ", ".join(f"{name} ({share:.0f} %)" for name, share in _costliest(layer_error_rows(result, patches)))
-    add = "" if result.core.ends.adds_image else ", or a network that ends with a global add, of which INT8 errs less"
+    named = ", ".join(
+        f"{name} ({share:.0f} %)" for name, share in _costliest(layer_error_rows(result, patches))
+    )
+    add = (
+        ""
+        if result.core.ends.adds_image
+        else ", or a network that ends with a global add, of which INT8 errs less"
+    )
     return f"{said} ({gate.source}): most of it in {named}; try --finetune auto{add}"
 
 
@@ -286,7 +348,9 @@ MOST = 3
 
 
 def _costliest(layers: list[Row]) -> list[tuple[str, float]]:
-    """The layers that make most of the squared error, with their shares in per cent; the last row is of all."""
+    """The layers that make most of the squared error, with their shares in per cent; the last row
+    is of all.
+    """
     shares = {row.name: row.figures["share of squared error"].value or 0 for row in layers[:-1]}
     return sorted(shares.items(), key=lambda share: share[1], reverse=True)[:MOST]
 
@@ -297,7 +361,8 @@ def headline(gate: GateResult, layers: list[Row]) -> str:
     drop = "" if math.isnan(gate.drop_db) else f" and costs {gate.drop_db:.2f} dB"
     return (
         f"INT8 differs from float by {gate.mae:.2g} of full scale on average{drop} "
-        f"(measured). {kind_of_error(gate.std_over_mae)} Most of the squared error comes from: {named}."
+        f"(measured). {kind_of_error(gate.std_over_mae)} Most of the squared error comes from: "
+        f"{named}."
     )
 
 

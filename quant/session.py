@@ -1,4 +1,5 @@
-"""Networks run on onnxruntime: a session, set up once for the whole project, and large images in tiles.
+"""Networks run on onnxruntime: a session, set up once for the whole project, and large images in
+tiles.
 
 Looking at every tensor of a network at once costs memory that grows with the image; tiles do not.
 """
@@ -14,7 +15,18 @@ import onnxruntime as ort
 from beers_deploy.model.processor import int8_adds_exactly
 from beers_deploy.profiles.errors import CODE_FAULTS, ModelError
 from beers_deploy.quant.ends import ONE_CHANNEL, Ends
-from beers_deploy.quant.graph import PLANES, PLANES_FRAC_BITS, Add, Concat, Conv, Graph, Mul, Op, Pointwise, same
+from beers_deploy.quant.graph import (
+    PLANES,
+    PLANES_FRAC_BITS,
+    Add,
+    Concat,
+    Conv,
+    Graph,
+    Mul,
+    Op,
+    Pointwise,
+    same,
+)
 from beers_deploy.quant.graph.writer import graph_to_onnx
 from beers_deploy.quant.kernels import filled, made_exact
 from beers_deploy.quant.onnx_file import any_size, fixed_tile_px, is_quantised, load_onnx
@@ -22,9 +34,13 @@ from beers_deploy.quant.untrusted import contradictions, times
 
 
 def open_session(
-    model: Path | onnx.ModelProto, threads: int = 0, optimise: bool = True, exact: bool | None = None
+    model: Path | onnx.ModelProto,
+    threads: int = 0,
+    optimise: bool = True,
+    exact: bool | None = None,
 ) -> ort.InferenceSession:
-    """Open a model on the CPU, such that its integers are added exactly whatever the processor (`quant.kernels`).
+    """Open a model on the CPU, such that its integers are added exactly whatever the processor
+    (`quant.kernels`).
 
     Args:
         model: a file or a model in memory.
@@ -37,9 +53,12 @@ def open_session(
     """
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
-    options.enable_mem_pattern = False  # a plan of the memory takes up to 40 % more of it, and saves no time
+    options.enable_mem_pattern = (
+        False  # a plan of the memory takes up to 40 % more of it, and saves no time
+    )
     options.log_severity_level = 4  # what fails is raised, and said once
-    # Threads that wait for this session's next run take a core from whoever runs meanwhile, for tens of milliseconds.
+    # Threads that wait for this session's next run take a core from whoever runs meanwhile, for
+    # tens of milliseconds.
     options.add_session_config_entry("session.force_spinning_stop", "1")
     if not optimise:
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
@@ -52,13 +71,17 @@ def open_session(
         if exact and is_quantised(known):
             known, _ = made_exact(known)
     try:
-        return ort.InferenceSession(known.SerializeToString(), options, providers=["CPUExecutionProvider"])
+        return ort.InferenceSession(
+            known.SerializeToString(), options, providers=["CPUExecutionProvider"]
+        )
     except CODE_FAULTS:
         raise
     except Exception as error:  # onnxruntime raises a class of its own for each status code
         got = " ".join(str(error).split())[:160]
         remedy = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
-        raise ModelError(name, expected="a model that onnxruntime runs", got=got, remedy=remedy) from error
+        raise ModelError(
+            name, expected="a model that onnxruntime runs", got=got, remedy=remedy
+        ) from error
 
 
 def open_any_size(model: onnx.ModelProto, optimise: bool = True) -> ort.InferenceSession:
@@ -83,10 +106,14 @@ def result_of(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
     return tensors_of(session, None, image)[0]
 
 
-def tensors_of(session: ort.InferenceSession, names: list[str] | None, image: np.ndarray) -> list[np.ndarray]:
+def tensors_of(
+    session: ort.InferenceSession, names: list[str] | None, image: np.ndarray
+) -> list[np.ndarray]:
     """The named outputs, or all, for an image (N, 1, H, W) float32 in [0, 1]."""
     try:
-        return [np.asarray(value) for value in session.run(names, {session.get_inputs()[0].name: image})]
+        return [
+            np.asarray(value) for value in session.run(names, {session.get_inputs()[0].name: image})
+        ]
     except CODE_FAULTS:
         raise
     except Exception as error:  # as above
@@ -94,15 +121,23 @@ def tensors_of(session: ort.InferenceSession, names: list[str] | None, image: np
 
 
 def require_finite(values: Iterable[np.ndarray], where: str) -> None:
-    """Refuse what a network computed of an image in [0, 1], where its weights are finite and that is not."""
+    """Refuse what a network computed of an image in [0, 1], where its weights are finite and that
+    is not.
+    """
     if not all(np.isfinite((value.min(), value.max())).all() for value in values):
-        remedy = "its sums overflow: train it again with a lower learning rate, or scale its weights"
-        raise ModelError(where, expected="finite values for an image", got="NaN or infinity", remedy=remedy)
+        remedy = (
+            "its sums overflow: train it again with a lower learning rate, or scale its weights"
+        )
+        raise ModelError(
+            where, expected="finite values for an image", got="NaN or infinity", remedy=remedy
+        )
 
 
 def _unfit(got: str) -> ModelError:
     remedy = "export it for images of any size, or check its sizes"
-    return ModelError("ONNX model", expected="one that restores an image to its own size", got=got, remedy=remedy)
+    return ModelError(
+        "ONNX model", expected="one that restores an image to its own size", got=got, remedy=remedy
+    )
 
 
 TILE_PX = 128
@@ -110,7 +145,8 @@ TILE_PX = 128
 
 
 def crops(image: np.ndarray, halo_px: int | None = 0) -> list[np.ndarray]:
-    """Crops (1, C, h, w) of at most TILE_PX a side that tile an image (1, C, H, W): small images by themselves.
+    """Crops (1, C, h, w) of at most TILE_PX a side that tile an image (1, C, H, W): small images by
+    themselves.
 
     Where the network has no halo, None, the image is left whole: as `tensor_values` does.
     """
@@ -118,13 +154,18 @@ def crops(image: np.ndarray, halo_px: int | None = 0) -> list[np.ndarray]:
 
 
 def tensor_values(
-    session: ort.InferenceSession, names: list[str], image: np.ndarray, halo_px: int | None, ends: Ends = ONE_CHANNEL
+    session: ort.InferenceSession,
+    names: list[str],
+    image: np.ndarray,
+    halo_px: int | None,
+    ends: Ends = ONE_CHANNEL,
 ) -> Iterator[list[np.ndarray]]:
-    """The named tensors (1, C, h, w) of a plane-reading float network, tile by tile of an image (1, C', H, W).
+    """The named tensors (1, C, h, w) of a plane-reading float network, tile by tile of an image (1,
+    C', H, W).
 
-    Each tile is computed with a halo of the pixels that its values depend on, which is then cut off: together the
-    tiles hold what the whole image would have given, its zero-padded borders included. Without a halo (None) the
-    image is one tile.
+    Each tile is computed with a halo of the pixels that its values depend on, which is then cut
+    off: together the tiles hold what the whole image would have given, its zero-padded borders
+    included. Without a halo (None) the image is one tile.
     """
     for (top, bottom), (left, right) in _places(image, halo_px):
         around_px = halo_px or 0
@@ -149,16 +190,21 @@ def values_of(
 
 
 def planes_of(image: np.ndarray, ends: Ends = ONE_CHANNEL) -> np.ndarray:
-    """An image (N, C, H, W) in [0, 1] as a plane-reading float network takes it: (N, P, H, W) float32."""
+    """An image (N, C, H, W) in [0, 1] as a plane-reading float network takes it: (N, P, H, W)
+    float32.
+    """
     return ends.split(image).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)
 
 
 def halo_of(graph: Graph) -> int | None:
-    """Pixels on each side that a value can depend on: no path passes more than all of the convolutions.
+    """Pixels on each side that a value can depend on: no path passes more than all of the
+    convolutions.
 
     None where values are not on the image's own lattice, or windows do not keep it.
     """
-    if not all(isinstance(op, Add | Mul | Concat | Pointwise) or _keeps_lattice(op) for op in graph):
+    if not all(
+        isinstance(op, Add | Mul | Concat | Pointwise) or _keeps_lattice(op) for op in graph
+    ):
         return None
     return sum(max(op.window.pads) for op in graph if isinstance(op, Conv))
 
@@ -167,10 +213,17 @@ def _keeps_lattice(op: Op) -> bool:
     return isinstance(op, Conv) and not op.transposed and op.window == same(op.weight)
 
 
-def _places(image: np.ndarray, halo_px: int | None) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
-    """(top, bottom) and (left, right) of every tile, all about equally large; without a halo the one that is all."""
+def _places(
+    image: np.ndarray, halo_px: int | None
+) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
+    """(top, bottom) and (left, right) of every tile, all about equally large; without a halo the
+    one that is all.
+    """
     counts = [-(-size // TILE_PX) if halo_px is not None else 1 for size in image.shape[-2:]]
-    edges = [[size * k // n for k in range(n + 1)] for size, n in zip(image.shape[-2:], counts, strict=True)]
+    edges = [
+        [size * k // n for k in range(n + 1)]
+        for size, n in zip(image.shape[-2:], counts, strict=True)
+    ]
     return product(*map(pairwise, edges))
 
 
@@ -178,6 +231,8 @@ LAYER_PATCHES = 4
 
 
 def few_crops(images: Iterable[np.ndarray], model: onnx.ModelProto) -> list[np.ndarray]:
-    """One crop of each of the first few images: what is looked at layer by layer; all of it where a size is fixed."""
+    """One crop of each of the first few images: what is looked at layer by layer; all of it where a
+    size is fixed.
+    """
     whole = fixed_tile_px(any_size(model)) is not None
     return [crops(image, None if whole else 0)[0] for image in islice(images, LAYER_PATCHES)]

@@ -1,9 +1,11 @@
-"""What an INT8 file itself shows: results that come to the ends of 8 bits, lost ReLUs, faults of its encoding.
+"""What an INT8 file itself shows: results that come to the ends of 8 bits, lost ReLUs, faults of
+its encoding.
 
-Saturation: whatever a node rounds to 8 bits is looked at, in any encoding (integer kernels or QDQ), as the graph is
-written; what lies beyond the ends is clipped, and lost. Two ends are no loss: the lower one where it stands for zero
-or where a ReLU reads it, for that is the ReLU, and those of the fine gain, which the coarse one is there for
-(`quant.passes.stream`). ReLUs are counted because quantisers have been seen to drop them without a word.
+Saturation: whatever a node rounds to 8 bits is looked at, in any encoding (integer kernels or QDQ),
+as the graph is written; what lies beyond the ends is clipped, and lost. Two ends are no loss: the
+lower one where it stands for zero or where a ReLU reads it, for that is the ReLU, and those of the
+fine gain, which the coarse one is there for (`quant.passes.stream`). ReLUs are counted because
+quantisers have been seen to drop them without a word.
 """
 
 from collections.abc import Iterable
@@ -40,7 +42,8 @@ class Rounded:
 
     Attributes:
         low_is_relu: whether what is clipped at the lower end would have become zero anyway.
-        counted: which channels count: of a result in gains or windows the coarse ones, which hold what others clip.
+        counted: which channels count: of a result in gains or windows the coarse ones, which hold
+            what others clip.
     """
 
     name: str
@@ -56,19 +59,25 @@ class Rounded:
     def at_ends(self, values: np.ndarray) -> np.ndarray:
         """Which of its values (N, C, H, W) lie at an end."""
         kept = values[:, self.counted] if values.ndim > 1 else values
-        low = (kept == self.lowest) & (not self.low_is_relu and self.lowest not in self.scale.zero_points)
+        low = (kept == self.lowest) & (
+            not self.low_is_relu and self.lowest not in self.scale.zero_points
+        )
         return np.asarray((kept == self.lowest + 255) | low)
 
 
 def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> dict[str, float]:
-    """The share, in [0, 1], of each 8-bit tensor's values that lie at an end, over images (N, 1, H, W) in [0, 1].
+    """The share, in [0, 1], of each 8-bit tensor's values that lie at an end, over images (N, 1, H,
+    W) in [0, 1].
 
     Empty where no node rounds to 8 bits.
     """
     looked_at = rounded_tensors(model)
     if not looked_at:
         return {}
-    kinds = {t.name: onnx.helper.np_dtype_to_tensor_dtype(np.dtype(t.scale.integer_type)) for t in looked_at}
+    kinds = {
+        t.name: onnx.helper.np_dtype_to_tensor_dtype(np.dtype(t.scale.integer_type))
+        for t in looked_at
+    }
     session = open_session(with_outputs(any_size(model), kinds), optimise=False)
     ends = np.zeros(len(looked_at))
     counts = np.zeros(len(looked_at))
@@ -102,20 +111,34 @@ def _saturated_relus(core: IntCore | None) -> set[str]:
 
 def _rounded(graph: OnnxGraph, core: IntCore | None) -> list[Rounded]:
     coarse = _coarse(core.ends) if core else slice(None)
-    read_as = {node.outputs[0]: node.inputs[0] for node in graph.nodes if node.op_type == "DequantizeLinear"}
-    relus = _saturated_relus(core) | {name for node in graph.nodes if node.op_type in RELUS for name in node.inputs}
+    read_as = {
+        node.outputs[0]: node.inputs[0]
+        for node in graph.nodes
+        if node.op_type == "DequantizeLinear"
+    }
+    relus = _saturated_relus(core) | {
+        name for node in graph.nodes if node.op_type in RELUS for name in node.inputs
+    }
     relus |= {read_as[name] for name in relus & set(read_as)}
     found = []
     for node in graph.nodes:
         name = node.outputs[0]
         scale = dict(stated(node, graph)).get(name)
-        if scale is not None and scale.integer_type in BYTES and node.inputs[0] not in graph.constants:
-            found.append(Rounded(name, scale, name in relus, coarse if name == CORRECTION else slice(None)))
+        if (
+            scale is not None
+            and scale.integer_type in BYTES
+            and node.inputs[0] not in graph.constants
+        ):
+            found.append(
+                Rounded(name, scale, name in relus, coarse if name == CORRECTION else slice(None))
+            )
     return found
 
 
 def _coarse(ends: Ends) -> slice:
-    """The correction's coarse channels, as `quant.ends` lays them out; all where there are no finer ones."""
+    """The correction's coarse channels, as `quant.ends` lays them out; all where there are no finer
+    ones.
+    """
     if ends.offsets:
         return slice(0, ends.outputs)
     return slice(ends.outputs, None) if ends.gains == 2 else slice(None)
@@ -127,8 +150,8 @@ class Relus:
 
     Attributes:
         explicit: nodes that are one: Relu, or the larger of a value and zero.
-        folded: convolutions whose 8 bits begin at zero, which is a ReLU, unless their results were never below zero;
-            and those of which our file says that saturation is their ReLU.
+        folded: convolutions whose 8 bits begin at zero, which is a ReLU, unless their results were
+            never below zero; and those of which our file says that saturation is their ReLU.
     """
 
     explicit: int
@@ -139,7 +162,11 @@ class Relus:
         return max(wanted - self.explicit - self.folded, self.explicit - wanted, 0)
 
     def __str__(self) -> str:
-        return f"{self.explicit}, and up to {self.folded} as 8 bits from zero" if self.folded else str(self.explicit)
+        return (
+            f"{self.explicit}, and up to {self.folded} as 8 bits from zero"
+            if self.folded
+            else str(self.explicit)
+        )
 
 
 def count_relus(model: onnx.ModelProto) -> Relus:
@@ -148,29 +175,41 @@ def count_relus(model: onnx.ModelProto) -> Relus:
         graph = OnnxGraph(model)
         core = _own_core(model)
         rounded = {tensor.name: tensor for tensor in _rounded(graph, core)}
-        convolved = {name for node in graph.nodes if "Conv" in node.op_type for name in node.outputs}
+        convolved = {
+            name for node in graph.nodes if "Conv" in node.op_type for name in node.outputs
+        }
         explicit = sum(_is_relu(node, graph, rounded) for node in graph.nodes)
         folded = sum(_begins_at_zero(node, rounded, convolved) for node in graph.nodes)
         return Relus(explicit, folded + len(_saturated_relus(core)))
 
 
 def _is_relu(node: Node, graph: OnnxGraph, rounded: dict[str, Rounded]) -> bool:
-    """Whether it is one, ReLU6, a Max with zero, which in 8 bits is a zero point, or a table of one."""
+    """Whether it is one, ReLU6, a Max with zero, which in 8 bits is a zero point, or a table of
+    one.
+    """
     known = [graph.constants[name] for name in node.inputs if name in graph.constants]
     if node.op_type == "Clip":
         return [float(limit) for limit in known if limit.size == 1] == [0.0, 6.0]
     if node.op_type == "Max" and known:
-        zeros = [rounded[name].scale.zero_points for name in node.inputs if name in rounded] or [(0,)]
+        zeros = [rounded[name].scale.zero_points for name in node.inputs if name in rounded] or [
+            (0,)
+        ]
         return bool((known[0] == np.array(zeros[0])).all())
-    return node.op_type == "Relu" or (node.op_type == "Gather" and _is_table_of_relu(graph.value(node, 0)))
+    return node.op_type == "Relu" or (
+        node.op_type == "Gather" and _is_table_of_relu(graph.value(node, 0))
+    )
 
 
 def _is_table_of_relu(table: np.ndarray | None) -> bool:
-    """Whether it is what our files keep a ReLU behind other than a convolution as: nothing below zero."""
+    """Whether it is what our files keep a ReLU behind other than a convolution as: nothing below
+    zero.
+    """
     if table is None or table.shape != (TABLE,) or table.dtype != np.uint8:
         return False
     values = table.astype(np.int16) - ZERO
-    return bool((values[:ZERO] == 0).all() and (np.diff(values[ZERO:]) >= 0).all() and values[-1] > 0)
+    return bool(
+        (values[:ZERO] == 0).all() and (np.diff(values[ZERO:]) >= 0).all() and values[-1] > 0
+    )
 
 
 def _begins_at_zero(node: Node, rounded: dict[str, Rounded], convolved: set[str]) -> bool:
@@ -181,14 +220,17 @@ def _begins_at_zero(node: Node, rounded: dict[str, Rounded], convolved: set[str]
     return set(value.scale.zero_points) == {value.lowest}
 
 
-def structure_checks(float_model: onnx.ModelProto, int8: onnx.ModelProto, must_describe: bool = False) -> list[Check]:
-    """Check that the INT8 file keeps its ReLUs, is encoded as meant, and does not depend on optimisations.
+def structure_checks(
+    float_model: onnx.ModelProto, int8: onnx.ModelProto, must_describe: bool = False
+) -> list[Check]:
+    """Check that the INT8 file keeps its ReLUs, is encoded as meant, and does not depend on
+    optimisations.
 
     Args:
         float_model: the float network.
         int8: the INT8 network.
-        must_describe: whether a file that does not describe its integers fails; otherwise their encoding is left out,
-            because files of other quantisers have no description.
+        must_describe: whether a file that does not describe its integers fails; otherwise their
+            encoding is left out, because files of other quantisers have no description.
     """
     image = np.random.default_rng(0).random(_odd_size(int8), dtype=np.float32)
     plain, optimised = (result_of(open_any_size(int8, optimise=o), image) for o in (False, True))
@@ -208,8 +250,13 @@ def structure_checks(float_model: onnx.ModelProto, int8: onnx.ModelProto, must_d
 
 
 def _odd_size(model: onnx.ModelProto) -> tuple[int, int, int, int]:
-    """Of an image that the network takes, on the lattice of its strides, its sides otherwise odd."""
+    """Of an image that the network takes, on the lattice of its strides, its
+    sides otherwise odd.
+    """
     sizes = [side.dim_value for side in model.graph.input[0].type.tensor_type.shape.dim]
     lattice_px = 1 if sizes[2] else tiling_of(model).lattice_px
-    rows, columns = (fixed or -(-n // lattice_px) * lattice_px for fixed, n in zip(sizes[2:], (97, 101), strict=True))
+    rows, columns = (
+        fixed or -(-n // lattice_px) * lattice_px
+        for fixed, n in zip(sizes[2:], (97, 101), strict=True)
+    )
     return 1, sizes[1] or 1, rows, columns

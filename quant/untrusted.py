@@ -20,7 +20,9 @@ RANK = 16
 FLOATS = (TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.FLOAT16, TensorProto.BFLOAT16)
 VALUE_BYTES: dict[int, int] = {
     **dict.fromkeys((TensorProto.BOOL, TensorProto.INT8, TensorProto.UINT8), 1),
-    **dict.fromkeys((TensorProto.FLOAT16, TensorProto.BFLOAT16, TensorProto.INT16, TensorProto.UINT16), 2),
+    **dict.fromkeys(
+        (TensorProto.FLOAT16, TensorProto.BFLOAT16, TensorProto.INT16, TensorProto.UINT16), 2
+    ),
     **dict.fromkeys((TensorProto.FLOAT, TensorProto.INT32, TensorProto.UINT32), 4),
     **dict.fromkeys((TensorProto.DOUBLE, TensorProto.INT64, TensorProto.UINT64), 8),
 }
@@ -32,7 +34,9 @@ def check_content(model: onnx.ModelProto, where: str) -> None:
     graph = model.graph
     held = {tensor.name for tensor in graph.initializer}
     if all(value.name in held for value in graph.input) or not graph.output:
-        raise refused(where, "a network with an input and an output", "none", "export the network again")
+        raise refused(
+            where, "a network with an input and an output", "none", "export the network again"
+        )
     for value in (*graph.input, *graph.output, *graph.value_info):
         check_size(value.name, [d.dim_value for d in value.type.tensor_type.shape.dim], where)
     for tensor in held_tensors(graph):
@@ -41,14 +45,24 @@ def check_content(model: onnx.ModelProto, where: str) -> None:
 
 @contextmanager
 def contradictions(where: str) -> Iterator[None]:
-    """One sentence for whatever a graph leads to whose nodes lack inputs, or have sizes that cannot be."""
+    """One sentence for whatever a graph leads to whose nodes lack inputs, or have sizes that cannot
+    be.
+    """
     try:
         yield
     except BeersError:
         raise
-    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:
         if isinstance(getattr(error, "obj", None), ModuleType):
-            raise  # the installed version of a library lacks what this program calls, whatever the file holds
+            # The installed library lacks what this program calls, whatever the file holds.
+            raise
         got = f"nodes that contradict it ({' '.join(str(error).split())[:80]})"
         remedy = "check the file with onnx.checker, and export it again"
         raise refused(where, "nodes as ONNX defines them", got, remedy) from error
@@ -58,7 +72,9 @@ def check_size(name: str, sizes: Iterable[float], where: str) -> None:
     """Refuse a tensor that a file sizes beyond reason; 0 and -1 stand for sizes left open."""
     sizes = list(sizes)
     rank = len(sizes) <= RANK
-    if not (rank and min(sizes, default=0) >= -1 and math.prod(max(size, 1) for size in sizes) <= VALUES):
+    if not (
+        rank and min(sizes, default=0) >= -1 and math.prod(max(size, 1) for size in sizes) <= VALUES
+    ):
         got = f"{name!r} of {times(sizes)}"
         raise refused(where, f"tensors of at most {VALUES} values", got, "export the network again")
 
@@ -102,7 +118,9 @@ def _check_tensor(tensor: TensorProto, where: str) -> None:
 
 
 def _check_finite(tensor: TensorProto, where: str) -> None:
-    """Of a plain number infinity may be meant, as a bound of Clip; of weights nothing that is not finite."""
+    """Of a plain number infinity may be meant, as a bound of Clip; of weights nothing that is not
+    finite.
+    """
     if tensor.data_type not in FLOATS:
         return
     values = numpy_helper.to_array(tensor)
@@ -114,13 +132,21 @@ def _check_finite(tensor: TensorProto, where: str) -> None:
 
 def _check_place_and_type(tensor: TensorProto, where: str) -> None:
     if tensor.data_location == TensorProto.EXTERNAL or tensor.external_data:
-        place = next((entry.value for entry in tensor.external_data if entry.key == "location"), "no place")
+        place = next(
+            (entry.value for entry in tensor.external_data if entry.key == "location"), "no place"
+        )
         got = f"{tensor.name!r} kept in another file, {place!r}"
         raise refused(where, "one self-contained ONNX file", got, "save it as one file")
     if tensor.data_type not in VALUE_BYTES:
         known = TensorProto.DataType.values()
-        kind = TensorProto.DataType.Name(tensor.data_type) if tensor.data_type in known else f"{tensor.data_type}"
-        raise refused(where, "weights of plain numbers", f"{tensor.name!r} of type {kind}", "convert them")
+        kind = (
+            TensorProto.DataType.Name(tensor.data_type)
+            if tensor.data_type in known
+            else f"{tensor.data_type}"
+        )
+        raise refused(
+            where, "weights of plain numbers", f"{tensor.name!r} of type {kind}", "convert them"
+        )
 
 
 WINDOW_PX = 1024
@@ -135,9 +161,18 @@ SIZES = {"CenterCropPad": (1,), "Expand": (1,), "MaxUnpool": (2,), "OneHot": (1,
 FACTORS = {"Pad": (1,), "Resize": (2,), "Tile": (1,), "Upsample": (1,)}
 """The same, of an input that says by how much larger."""
 KEEPING = {
-    "Cast", "Constant", "DequantizeLinear", "Identity", "Neg", "QuantizeLinear", "Reshape", "Sqrt", "Squeeze",
-    "Transpose", "Unsqueeze",
-}  # fmt: skip
+    "Cast",
+    "Constant",
+    "DequantizeLinear",
+    "Identity",
+    "Neg",
+    "QuantizeLinear",
+    "Reshape",
+    "Sqrt",
+    "Squeeze",
+    "Transpose",
+    "Unsqueeze",
+}
 """What may be computed of constants alone: no result of these is larger than what they read."""
 
 
@@ -149,7 +184,8 @@ def check_runnable(model: onnx.ModelProto, where: str) -> None:
     if model.graph.sparse_initializer:
         raise refused(where, "plain weights", "sparse ones", "export it without them")
     constants = _Constants(model, where)
-    # What follows from the image is sized by it; what follows from constants alone may have any size.
+    # What follows from the image is sized by it; what follows from constants alone may have any
+    # size.
     of_image = {value.name for value in model.graph.input} - set(constants.values)
     for node in model.graph.node:
         _check_operator(node, where)
@@ -162,7 +198,9 @@ def check_runnable(model: onnx.ModelProto, where: str) -> None:
 
 
 class _Constants:
-    """What is computed of constants alone: its values, where they are a short list, and how much there is of it."""
+    """What is computed of constants alone: its values, where they are a short list, and how much
+    there is of it.
+    """
 
     def __init__(self, model: onnx.ModelProto, where: str) -> None:
         self.values = {tensor.name: tensor for tensor in model.graph.initializer}
@@ -173,7 +211,9 @@ class _Constants:
 
     def follow(self, node: NodeProto) -> None:
         """Note a node that reads no image."""
-        stored = [a.t for a in node.attribute if a.name == "value"] if node.op_type == "Constant" else []
+        stored = (
+            [a.t for a in node.attribute if a.name == "value"] if node.op_type == "Constant" else []
+        )
         if stored:
             self.values[node.output[0]] = stored[0]
             return
@@ -184,12 +224,18 @@ class _Constants:
             self.values[node.output[0]] = numpy_helper.from_array(result, node.output[0])
         elif node.op_type not in KEEPING | {"ConstantOfShape"}:
             got = f"{named(node)} of constants alone"
-            raise refused(self._where, "operators that work on the image", got, "fold its constants")
+            raise refused(
+                self._where, "operators that work on the image", got, "fold its constants"
+            )
 
     def _array(self, name: str) -> np.ndarray | None:
         """A short list, None where it is none."""
         tensor = self.values.get(name)
-        if name not in self._arrays and tensor is not None and math.prod(tensor.dims) <= LIST_VALUES:
+        if (
+            name not in self._arrays
+            and tensor is not None
+            and math.prod(tensor.dims) <= LIST_VALUES
+        ):
             self._arrays[name] = numpy_helper.to_array(tensor)
         return self._arrays.get(name)
 
@@ -198,7 +244,12 @@ class _Constants:
         if node.op_type != "ConstantOfShape":
             return
         if len(arrays) != 1 or arrays[0] is None:
-            raise refused(self._where, "sizes that the file states", f"a computed one in {named(node)}", "fold it")
+            raise refused(
+                self._where,
+                "sizes that the file states",
+                f"a computed one in {named(node)}",
+                "fold it",
+            )
         sizes = [int(size) for size in arrays[0].ravel()[: RANK + 1]]
         check_size(named(node), sizes, self._where)
         self._made += math.prod(max(size, 0) for size in sizes)
@@ -209,17 +260,35 @@ LIST_VALUES = 4096
 """Of one list; a runtime that computes with such ones is done in a moment."""
 
 COMPUTED = {
-    "Add", "Cast", "Concat", "ConstantOfShape", "Div", "Gather", "Identity", "Mul", "Neg", "Reshape", "Shape",
-    "Slice", "Sqrt", "Squeeze", "Sub", "Transpose", "Unsqueeze",
-}  # fmt: skip
+    "Add",
+    "Cast",
+    "Concat",
+    "ConstantOfShape",
+    "Div",
+    "Gather",
+    "Identity",
+    "Mul",
+    "Neg",
+    "Reshape",
+    "Shape",
+    "Slice",
+    "Sqrt",
+    "Squeeze",
+    "Sub",
+    "Transpose",
+    "Unsqueeze",
+}
 
 
-def _computed(node: NodeProto, values: Sequence[np.ndarray | None], opset: int) -> np.ndarray | None:
-    """What a node computes of short lists, None where that is no short list of numbers or not computed here.
+def _computed(
+    node: NodeProto, values: Sequence[np.ndarray | None], opset: int
+) -> np.ndarray | None:
+    """What a node computes of short lists, None where that is no short list of numbers or not
+    computed here.
 
-    Exporters leave a dozen nodes to state four sizes. They are computed by onnx's reference in Python, before a
-    runtime has the file: so the sizes that follow are looked at like those that a file states.
-    The caller has bounded what ConstantOfShape makes.
+    Exporters leave a dozen nodes to state four sizes. They are computed by onnx's reference in
+    Python, before a runtime has the file: so the sizes that follow are looked at like those that a
+    file states. The caller has bounded what ConstantOfShape makes.
     """
     short = all(value is not None and value.size <= LIST_VALUES for value in values)
     if node.op_type not in COMPUTED or not short:
@@ -238,7 +307,9 @@ def _computed(node: NodeProto, values: Sequence[np.ndarray | None], opset: int) 
 
 def opset_of(model: onnx.ModelProto) -> int:
     """The version of ONNX's own operators."""
-    return max((opset.version for opset in model.opset_import if opset.domain in STANDARD), default=1)
+    return max(
+        (opset.version for opset in model.opset_import if opset.domain in STANDARD), default=1
+    )
 
 
 def named(node: NodeProto) -> str:
@@ -252,30 +323,49 @@ def _check_operator(node: NodeProto, where: str) -> None:
         remedy = foreign_remedy(node.domain, node.op_type)
         raise refused(where, "operators of ONNX itself", got, remedy)
     if any(a.HasField("g") or a.graphs or a.HasField("sparse_tensor") for a in node.attribute):
-        raise refused(where, "nodes that run once", f"{named(node)} with a graph within", "unroll it")
+        raise refused(
+            where, "nodes that run once", f"{named(node)} with a graph within", "unroll it"
+        )
 
 
 def _check_windows(node: NodeProto, where: str) -> None:
     for attribute in node.attribute:
-        if attribute.name in WINDOWS and attribute.type in (AttributeProto.INT, AttributeProto.INTS):
+        if attribute.name in WINDOWS and attribute.type in (
+            AttributeProto.INT,
+            AttributeProto.INTS,
+        ):
             largest = max(map(abs, (attribute.i, *attribute.ints)))
             if largest > WINDOW_PX:
                 got = f"{attribute.name} of {largest} in {named(node)}"
-                raise refused(where, f"windows of at most {WINDOW_PX} pixels", got, "export the network again")
+                raise refused(
+                    where, f"windows of at most {WINDOW_PX} pixels", got, "export the network again"
+                )
         elif attribute.name in ("shape", "output_shape"):
             check_size(named(node), attribute.ints, where)
 
 
-def _check_growth(node: NodeProto, constants: dict[str, TensorProto], of_image: set[str], where: str) -> None:
-    """A size that the file holds is looked at; one of the image's own is its matter; any other could be anything."""
+def _check_growth(
+    node: NodeProto, constants: dict[str, TensorProto], of_image: set[str], where: str
+) -> None:
+    """A size that the file holds is looked at; one of the image's own is its matter; any other
+    could be anything.
+    """
     for places, absolute in ((SIZES, True), (FACTORS, False)):
         for name in (node.input[i] for i in places.get(node.op_type, ()) if i < len(node.input)):
             if not name or name in of_image:
                 continue
             if name not in constants:
-                raise refused(where, "sizes that the file states", f"a computed one in {named(node)}", "fold it")
+                raise refused(
+                    where,
+                    "sizes that the file states",
+                    f"a computed one in {named(node)}",
+                    "fold it",
+                )
             # At most one more than any list of sizes has.
-            values = [float(value) for value in numpy_helper.to_array(constants[name]).ravel()[: 2 * RANK + 1]]
+            values = [
+                float(value)
+                for value in numpy_helper.to_array(constants[name]).ravel()[: 2 * RANK + 1]
+            ]
             if absolute:
                 check_size(named(node), values, where)
             elif not max(map(abs, values), default=0) <= WINDOW_PX:

@@ -1,6 +1,9 @@
-"""Machines are shared: no property test is judged by its time. Real images lie beside the repository, or nowhere.
+"""Machines are shared: no property test is judged by its time.
 
-What many tests need and no test changes is made once a process: the tree of commands and the drawn scenes.
+Real images lie beside the repository, or nowhere.
+
+What many tests need and no test changes is made once a process: the tree of commands and the drawn
+scenes.
 """
 
 import os
@@ -8,7 +11,8 @@ import sys
 from functools import cache, lru_cache
 from pathlib import Path
 
-# Before any test is imported, and so before torch is: the suite runs in several processes, a core each.
+# Before any test is imported, and so before torch is: the suite runs in several processes, a core
+# each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
@@ -26,7 +30,9 @@ SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 @pytest.fixture(scope="session", autouse=True)
 def scenes_drawn_once() -> None:
-    """Keep the drawn scenes, where a test's imports reach them: an emulated processor is spared Pillow and SciPy."""
+    """Keep the drawn scenes, where a test's imports reach them: an emulated processor is spared
+    Pillow and SciPy.
+    """
     if drawing := sys.modules.get("beers_deploy.model.simulator.procedural"):
         drawing.draw_scenes = lru_cache(maxsize=4)(drawing.draw_scenes)  # type: ignore[attr-defined]
 
@@ -41,12 +47,16 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one small drawn scene: to draw those that a command takes of itself is most of its time."""
+    """A folder with one small drawn scene: to draw those that a command takes of itself is most of
+    its time.
+    """
     import numpy as np
     import tifffile
 
     from beers_deploy.model.simulator.procedural import procedural_scene
 
     folder = tmp_path_factory.mktemp("scenes")
-    tifffile.imwrite(folder / "drawn.tif", procedural_scene(900, 900, np.random.default_rng(77)).radiance)
+    tifffile.imwrite(
+        folder / "drawn.tif", procedural_scene(900, 900, np.random.default_rng(77)).radiance
+    )
     return folder

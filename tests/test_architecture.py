@@ -15,7 +15,9 @@ MOST_MODULES = 18
 
 def test_no_module_imports_itself_by_a_detour() -> None:
     known = modules()
-    order = TopologicalSorter({name: imports_of(path, known, late=False) for name, path in known.items()})
+    order = TopologicalSorter(
+        {name: imports_of(path, known, late=False) for name, path in known.items()}
+    )
     assert len(list(order.static_order())) == len(known)  # a circle raises, and names its modules
 
 
@@ -28,7 +30,9 @@ def test_packages_stay_small_enough_to_look_through_and_say_what_is_inside() -> 
 
 def test_the_page_names_files_that_are_there() -> None:
     page = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
-    named = {word for word in page.split("`") if word.startswith(tuple(f"{each}/" for each in PACKAGES))}
+    named = {
+        word for word in page.split("`") if word.startswith(tuple(f"{each}/" for each in PACKAGES))
+    }
     assert len(named) > 40
     assert not [word for word in named if not (ROOT / word).exists()]
 
@@ -40,10 +44,20 @@ def test_the_picture_is_drawn_from_the_imports_of_today() -> None:
 
 
 def listed(docstring: str) -> set[str]:
-    """The modules that a list in a package's docstring is about: those before a colon, or the first of a clause."""
-    clauses = [part for line in docstring.splitlines() if line.startswith("- ") for part in line[2:].split("; ")]
+    """The modules that a list in a package's docstring is about: those before a colon, or the first
+    of a clause.
+    """
+    clauses = [
+        part
+        for line in docstring.splitlines()
+        if line.startswith("- ")
+        for part in line[2:].split("; ")
+    ]
     quoted = [clause.split(": ")[0].split("`")[1::2] for clause in clauses]
-    about = [words if ": " in clause else words[:1] for clause, words in zip(clauses, quoted, strict=True)]
+    about = [
+        words if ": " in clause else words[:1]
+        for clause, words in zip(clauses, quoted, strict=True)
+    ]
     return {word for words in about for word in words if word.isidentifier()}
 
 

@@ -6,10 +6,16 @@ import sys
 import beers_deploy as bd
 
 NAMES = (
-    "BeersError Board Limits Network Pair Sensor Table boards characterize check compare evaluate gate networks "
+    "BeersError Board Limits Network Pair Sensor Table boards characterize check compare "
+    "evaluate gate networks "
     "predict quantize restore sensors simulate tradeoff"
 )
-LIGHT = ("beers_deploy", "beers_deploy.profiles", "beers_deploy.model.io.images", "beers_deploy.quant")
+LIGHT = (
+    "beers_deploy",
+    "beers_deploy.profiles",
+    "beers_deploy.model.io.images",
+    "beers_deploy.quant",
+)
 """Looked at by commands that need no torch."""
 
 

@@ -1,7 +1,7 @@
 """A network written down layer by layer: shapes and bytes of weights, no values.
 
-Every method appends one operation and returns its result. Batch norms and activations right behind a convolution are
-fused into it by the DPU's compiler, so they are not written down.
+Every method appends one operation and returns its result. Batch norms and activations right behind
+a convolution are fused into it by the DPU's compiler, so they are not written down.
 """
 
 from collections.abc import Mapping
@@ -31,7 +31,9 @@ class Tensor:
 
 @dataclass(frozen=True)
 class Written:
-    """A network that was written down, and how many bytes of which results the host reads for one image."""
+    """A network that was written down, and how many bytes of which results the host reads for one
+    image.
+    """
 
     network: Network
     read_bytes: Mapping[str, int]
@@ -46,7 +48,15 @@ class Builder:
         self._read_bytes: dict[str, int] = {}
 
     def conv(
-        self, x: Tensor, channels: int, kernel: Size = 3, stride: Size = 1, *, d: int = 1, g: int = 1, valid: int = 0
+        self,
+        x: Tensor,
+        channels: int,
+        kernel: Size = 3,
+        stride: Size = 1,
+        *,
+        d: int = 1,
+        g: int = 1,
+        valid: int = 0,
     ) -> Tensor:
         """A convolution.
 
@@ -64,14 +74,20 @@ class Builder:
         window = _window(kernel, stride, valid, d)
         weights = channels * (x.channels // g) * window.kernel[0] * window.kernel[1]
         shape = (channels, *_slide(x.shape, window, valid))
-        return self._append("Conv", "grouped conv" if g > 1 else "conv", (x,), shape, window, weights)
+        return self._append(
+            "Conv", "grouped conv" if g > 1 else "conv", (x,), shape, window, weights
+        )
 
-    def depthwise(self, x: Tensor, kernel: Size = 3, stride: Size = 1, *, d: int = 1, m: int = 1) -> Tensor:
+    def depthwise(
+        self, x: Tensor, kernel: Size = 3, stride: Size = 1, *, d: int = 1, m: int = 1
+    ) -> Tensor:
         """Each channel by itself, or into `m` channels; `d` is the dilation."""
         window = _window(kernel, stride, 0, d)
         channels = x.channels * m
         weights = channels * window.kernel[0] * window.kernel[1]
-        return self._append("Conv", "depthwise", (x,), (channels, *_slide(x.shape, window, 0)), window, weights)
+        return self._append(
+            "Conv", "depthwise", (x,), (channels, *_slide(x.shape, window, 0)), window, weights
+        )
 
     def transposed(self, x: Tensor, channels: int, kernel: int, stride: int) -> Tensor:
         """A transposed convolution that enlarges by its stride."""
@@ -79,19 +95,32 @@ class Builder:
         pads = (cut // 2, cut // 2, cut - cut // 2, cut - cut // 2)
         window = Window((kernel, kernel), (stride, stride), pads)
         shape = (channels, x.shape[1] * stride, x.shape[2] * stride)
-        return self._append("ConvTranspose", "transposed", (x,), shape, window, channels * x.channels * kernel**2)
+        return self._append(
+            "ConvTranspose", "transposed", (x,), shape, window, channels * x.channels * kernel**2
+        )
 
     def pool(
-        self, x: Tensor, kernel: Size, stride: Size, *, valid: int = 0, ceil: int = 0, op_type: str = "MaxPool"
+        self,
+        x: Tensor,
+        kernel: Size,
+        stride: Size,
+        *,
+        valid: int = 0,
+        ceil: int = 0,
+        op_type: str = "MaxPool",
     ) -> Tensor:
-        """The largest value of a window, or its mean; `ceil` counts windows that only begin inside a bare image."""
+        """The largest value of a window, or its mean; `ceil` counts windows that only begin inside
+        a bare image.
+        """
         window = _window(kernel, stride, valid or ceil, 1)
         seen = x.shape
         if ceil:  # as much padding behind the image as may be lost to a stride
             behind = window.stride[0] - 1, window.stride[1] - 1
             window = replace(window, pads=(0, 0, *behind))
             seen = (x.channels, x.shape[1] + behind[0], x.shape[2] + behind[1])
-        return self._append(op_type, "pool", (x,), (x.channels, *_slide(seen, window, valid or ceil)), window)
+        return self._append(
+            op_type, "pool", (x,), (x.channels, *_slide(seen, window, valid or ceil)), window
+        )
 
     def global_mean(self, x: Tensor) -> Tensor:
         """The mean of each channel."""
@@ -125,11 +154,17 @@ class Builder:
         return self._append("Slice", "other", (x,), (count, *x.shape[1:]))
 
     def resize(self, x: Tensor, to: int | Tensor = 2, *, linear: bool = False) -> Tensor:
-        """Larger by a whole factor, or as large as another result: nearest neighbour, or bilinear."""
-        height, width = to.shape[1:] if isinstance(to, Tensor) else (x.shape[1] * to, x.shape[2] * to)
+        """Larger by a whole factor, or as large as another result: nearest
+        neighbour, or bilinear.
+        """
+        height, width = (
+            to.shape[1:] if isinstance(to, Tensor) else (x.shape[1] * to, x.shape[2] * to)
+        )
         corners = {"mode": "linear", "coordinate_transformation_mode": "asymmetric"}
         attributes = corners if linear else {"mode": "nearest"}
-        return self._append("Resize", "resize", (x,), (x.channels, height, width), attributes=attributes)
+        return self._append(
+            "Resize", "resize", (x,), (x.channels, height, width), attributes=attributes
+        )
 
     def shuffle(self, x: Tensor, block: int = 2) -> Tensor:
         """Channels become blocks of pixels (pixel shuffle)."""
@@ -148,7 +183,9 @@ class Builder:
         return self._append(op_type, "activation", (x,), x.shape)
 
     def out(self, x: Tensor, channels: int | None = None) -> Tensor:
-        """Make a result one of the network's; the host reads `channels` of it, all if not stated."""
+        """Make a result one of the network's; the host reads `channels` of it,
+        all if not stated.
+        """
         read = x.channels if channels is None else channels
         if read > x.channels:
             raise ValueError(f"{read} of {x.channels} channels read")
@@ -160,7 +197,9 @@ class Builder:
         if not self._read_bytes:
             self.out(last)
         names = tuple(self._read_bytes)
-        net = Network(tuple(self._operations), {self.image.name: self.image.shape}, names, quantised=False)
+        net = Network(
+            tuple(self._operations), {self.image.name: self.image.shape}, names, quantised=False
+        )
         return Written(net, self._read_bytes)
 
     def _append(
@@ -189,7 +228,10 @@ class Builder:
                 channels=(inputs[0].channels, shape[0]),
                 weight_bytes=weights,
                 attributes=attributes,
-                follows=next((op.kind for op in reversed(self._operations) if inputs[0].name in op.outputs), None),
+                follows=next(
+                    (op.kind for op in reversed(self._operations) if inputs[0].name in op.outputs),
+                    None,
+                ),
             )
         )
         return result
@@ -203,7 +245,9 @@ def _require_same(one: tuple[int, ...], other: tuple[int, ...]) -> None:
 def _window(kernel: Size, stride: Size, valid: int, dilation: int) -> Window:
     height, width = _pair(kernel)
     rows, columns = (0, 0) if valid else ((height - 1) * dilation // 2, (width - 1) * dilation // 2)
-    return Window((height, width), _pair(stride), (rows, columns, rows, columns), (dilation, dilation))
+    return Window(
+        (height, width), _pair(stride), (rows, columns, rows, columns), (dilation, dilation)
+    )
 
 
 def _pair(size: Size) -> tuple[int, int]:
@@ -211,7 +255,13 @@ def _pair(size: Size) -> tuple[int, int]:
 
 
 def _slide(shape: Shape, window: Window, valid: int) -> tuple[int, int]:
-    """Size / stride rounded up, of the whole input or of the positions where a window fits into it."""
-    lost = [(k - 1) * d if valid else 0 for k, d in zip(window.kernel, window.dilation, strict=True)]
-    height, width = (-(-(s - n) // t) for s, n, t in zip(shape[1:], lost, window.stride, strict=True))
+    """Size / stride rounded up, of the whole input or of the positions where a
+    window fits into it.
+    """
+    lost = [
+        (k - 1) * d if valid else 0 for k, d in zip(window.kernel, window.dilation, strict=True)
+    ]
+    height, width = (
+        -(-(s - n) // t) for s, n, t in zip(shape[1:], lost, window.stride, strict=True)
+    )
     return height, width

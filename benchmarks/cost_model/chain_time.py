@@ -1,11 +1,13 @@
-"""Time of the traditional pipeline on each board's own processor: `python -m benchmarks.cost_model.chain_time`.
+"""Time of the traditional pipeline on each board's own processor: `python -m
+benchmarks.cost_model.chain_time`.
 
-Prints `chain_s_per_mpx` for the [cpu] of every board. CPU time of one core here is split by kind of work
-(`chain_work` counts it, `measured_rates` tells how fast this processor does each). A kind is slower there by the
-ratio of what bounds it: products of matrices, bytes moved or plain instructions, as measured here and as published
-for the board's cores. Where either of two may bound it, the interval holds both. What the kinds do not explain may be
-of any kind. Short kernels of the library calls and shapes of `model.traditional`, timed in CPU time and interleaved,
-tell how fast this processor is; resources are measured as published benchmarks measure them.
+Prints `chain_s_per_mpx` for the [cpu] of every board. CPU time of one core here is split by kind of
+work (`chain_work` counts it, `measured_rates` tells how fast this processor does each). A kind is
+slower there by the ratio of what bounds it: products of matrices, bytes moved or plain
+instructions, as measured here and as published for the board's cores. Where either of two may bound
+it, the interval holds both. What the kinds do not explain may be of any kind. Short kernels of the
+library calls and shapes of `model.traditional`, timed in CPU time and interleaved, tell how fast
+this processor is; resources are measured as published benchmarks measure them.
 """
 
 import lzma
@@ -35,7 +37,9 @@ CLOCK = time.perf_counter if os.name == "nt" else time.thread_time
 """Others' turns on the core do not count, but where the system counts in ticks of 16 ms."""
 
 SEVEN_ZIP_DECODER = 1.09
-"""How much faster 7-zip's decoder in C was than Python's, 1.04 to 1.12 on six texts (Zen 4, measured)."""
+"""How much faster 7-zip's decoder in C was than Python's, 1.04 to 1.12 on six texts (Zen 4,
+measured).
+"""
 
 
 @dataclass(frozen=True)
@@ -44,8 +48,9 @@ class Rates:
 
     Attributes:
         kinds: amount a second of each kind of `chain_work`.
-        resources: what kinds are scaled by, a second: floating-point operations of large float32 "products", bytes
-            moved in order in "memory", and "integers" by 7-zip's rating of LZMA decoding: branches, dependent loads.
+        resources: what kinds are scaled by, a second: floating-point operations of large float32
+            "products", bytes moved in order in "memory", and "integers" by 7-zip's rating of LZMA
+            decoding: branches, dependent loads.
     """
 
     kinds: Mapping[str, float]
@@ -76,7 +81,8 @@ def measured_rates() -> Rates:
 def _rates(kernels: Mapping[str, Kernel]) -> dict[str, float]:
     """Amount a second of each, from the median of ROUNDS turns.
 
-    Each is called once a turn: it finds the caches full of the others' arrays, as it does in the chain.
+    Each is called once a turn: it finds the caches full of the others' arrays, as it does in the
+    chain.
     """
     taken_s: dict[str, list[float]] = {name: [] for name in kernels}
     for _ in range(ROUNDS + 1):
@@ -84,7 +90,10 @@ def _rates(kernels: Mapping[str, Kernel]) -> dict[str, float]:
             start_s = CLOCK()
             kernel.call()
             taken_s[name].append(CLOCK() - start_s)
-    return {name: kernel.amount / statistics.median(taken_s[name][1:]) for name, kernel in kernels.items()}
+    return {
+        name: kernel.amount / statistics.median(taken_s[name][1:])
+        for name, kernel in kernels.items()
+    }
 
 
 REFERENCES = 24
@@ -126,12 +135,17 @@ def _group_products(generator: torch.Generator) -> Kernel:
 def _factorisations(generator: torch.Generator) -> Kernel:
     patches = torch.rand(GROUPS, MEMBERS, PIXELS, generator=generator)
     matrices = patches.mT @ patches + torch.eye(PIXELS)
-    return Kernel(lambda: torch.cholesky_inverse(torch.linalg.cholesky_ex(matrices)[0]), GROUPS * PIXELS**3)
+    return Kernel(
+        lambda: torch.cholesky_inverse(torch.linalg.cholesky_ex(matrices)[0]), GROUPS * PIXELS**3
+    )
 
 
 def _selection(generator: torch.Generator) -> Kernel:
     distances = torch.rand(GROUPS, WINDOW_PX**2, generator=generator).numpy()
-    ends = [MEMBERS - 1, MEMBERS - 1]  # as the chain asks: numpy has a faster way for one place alone
+    ends = [
+        MEMBERS - 1,
+        MEMBERS - 1,
+    ]  # as the chain asks: numpy has a faster way for one place alone
     return Kernel(lambda: np.argpartition(distances, ends, axis=1), distances.size)
 
 
@@ -197,14 +211,20 @@ FARTHEST_BITS = 17
 
 
 def _decoding(_: torch.Generator) -> Kernel:
-    """7-zip counts 200 instructions for each packed byte that it decodes, and 4 for each that comes out (16.02)."""
+    """7-zip counts 200 instructions for each packed byte that it decodes, and 4 for each that comes
+    out (16.02).
+    """
     text = _compressible(np.random.default_rng(0))
     packed = lzma.compress(text, format=lzma.FORMAT_ALONE)
-    return Kernel(lambda: lzma.decompress(packed), SEVEN_ZIP_DECODER * (200 * len(packed) + 4 * len(text)))
+    return Kernel(
+        lambda: lzma.decompress(packed), SEVEN_ZIP_DECODER * (200 * len(packed) + 4 * len(text))
+    )
 
 
 def _compressible(generator: np.random.Generator) -> bytes:
-    """Fresh bytes and copies of earlier ones by turns, packed to a quarter; 7-zip's own test data to a third."""
+    """Fresh bytes and copies of earlier ones by turns, packed to a quarter; 7-zip's own test data
+    to a third.
+    """
     text = bytearray(generator.bytes(1024))
     while len(text) < TEXT_BYTES:
         text += generator.bytes(int(generator.integers(0, 5)))
@@ -247,12 +267,17 @@ BOUND_BY = {
     "gathers": ("memory", "integers"),
     "calls": ("memory", "integers"),
 }
-"""What bounds each kind. Matrices of 25 x 25 are too small to be products alone: held to vectors a quarter as wide,
-this processor factorised them as fast (measured). Patches lie in pieces of five numbers, and calls miss caches."""
+"""What bounds each kind.
+
+Matrices of 25 x 25 are too small to be products alone: held to vectors a quarter as wide, this
+processor factorised them as fast (measured). Patches lie in pieces of five numbers, and calls miss
+caches.
+"""
 
 SERIAL = (0.02, 0.04)
-"""Share of the pipeline's CPU time outside its pool of tiles, which one core spends while the others wait: 2.1 and
-3.5 % of images of 256 x 768 and 256 x 256 (measured)."""
+"""Share of the pipeline's CPU time outside its pool of tiles, which one core spends while the
+others wait: 2.1 and 3.5 % of images of 256 x 768 and 256 x 256 (measured).
+"""
 
 Interval = tuple[float, float]
 
@@ -267,7 +292,9 @@ def main() -> None:
 
 
 def measured_here() -> tuple[float, Mapping[str, float], Rates]:
-    """CPU time of one core here for 10^6 pixels, in s; the share of it that each kind explains; the rates."""
+    """CPU time of one core here for 10^6 pixels, in s; the share of it that each kind explains; the
+    rates.
+    """
     sensors = load_sensor(SENSOR), load_sensor(REFERENCE)
     scene = drawn_acquisition(Swath(CROPS * CROP_PX, CROP_PX), *sensors)
     crops = [scene[:, k * CROP_PX : (k + 1) * CROP_PX] for k in range(CROPS)]
@@ -279,7 +306,11 @@ def measured_here() -> tuple[float, Mapping[str, float], Rates]:
     explained = math.fsum(rates.times_s(chain_work(CROP_PX, CROP_PX, quality)).values()) / cpu_s
     times_s = rates.times_s(chain_work(HEIGHT_PX, WIDTH_PX, quality))
     scale = min(explained, 1.0) / math.fsum(times_s.values())
-    return 1e6 * cpu_s / CROP_PX**2, {kind: scale * time_s for kind, time_s in times_s.items()}, rates
+    return (
+        1e6 * cpu_s / CROP_PX**2,
+        {kind: scale * time_s for kind, time_s in times_s.items()},
+        rates,
+    )
 
 
 def _cpu_s(dn: np.ndarray, chain: Chain) -> float:
@@ -288,15 +319,22 @@ def _cpu_s(dn: np.ndarray, chain: Chain) -> float:
     return time.process_time() - start_s
 
 
-def s_per_mpx(cpu_s: float, shares: Mapping[str, float], rates: Rates, board: TargetProfile) -> Interval:
-    """Time of 10^6 pixels on all the board's cores, least and most: one core's shared by Amdahl's law."""
+def s_per_mpx(
+    cpu_s: float, shares: Mapping[str, float], rates: Rates, board: TargetProfile
+) -> Interval:
+    """Time of 10^6 pixels on all the board's cores, least and most: one core's shared by Amdahl's
+    law.
+    """
     by_kind = slowdowns(board, rates)
     cores = board.value("cpu", "cores")
     unknown = _hull(list(by_kind.values()))
     rest = 1 - math.fsum(shares.values())
     low, high = (
         cpu_s
-        * (math.fsum(share * by_kind[kind][end] for kind, share in shares.items()) + rest * unknown[end])
+        * (
+            math.fsum(share * by_kind[kind][end] for kind, share in shares.items())
+            + rest * unknown[end]
+        )
         * (SERIAL[end] + (1 - SERIAL[end]) / cores)
         for end in (0, 1)
     )
@@ -307,7 +345,12 @@ def slowdowns(board: TargetProfile, rates: Rates) -> dict[str, Interval]:
     """How many times longer a core of the board takes for each kind of work: lowest, highest."""
     clock, products, moved, integers = (
         board.constant("cpu", key)
-        for key in ("clock_ghz", "product_flops_per_cycle", "moved_bytes_per_s", "decoding_mips_per_ghz")
+        for key in (
+            "clock_ghz",
+            "product_flops_per_cycle",
+            "moved_bytes_per_s",
+            "decoding_mips_per_ghz",
+        )
     )
     there = {
         "products": (1e9 * clock.low * products.low, 1e9 * clock.high * products.high),

@@ -1,8 +1,9 @@
 """What the denoise-first chain computes, counted by kind from the image's size and the settings.
 
-A kind is work that one resource of a processor bounds, done by one family of library calls. The counts follow the
-shapes in `nl_bayes` and `compensate`; they suppose no flat group, no missing pixel, and groups of the usual number:
-on drawn scenes and photographs at the working noise this holds for all but a few groups in a hundred (measured).
+A kind is work that one resource of a processor bounds, done by one family of library calls. The
+counts follow the shapes in `nl_bayes` and `compensate`; they suppose no flat group, no missing
+pixel, and groups of the usual number: on drawn scenes and photographs at the working noise this
+holds for all but a few groups in a hundred (measured).
 """
 
 import math
@@ -12,7 +13,13 @@ from dataclasses import dataclass
 from scipy.fft import next_fast_len
 
 from beers_deploy.model.traditional.compensate import BLOCK_PX, RADIUS_PX
-from beers_deploy.model.traditional.nl_bayes import PassSettings, Quality, first_pass, reference_runs, second_pass
+from beers_deploy.model.traditional.nl_bayes import (
+    PassSettings,
+    Quality,
+    first_pass,
+    reference_runs,
+    second_pass,
+)
 from beers_deploy.model.traditional.pipeline import WORKING_SIGMA
 
 UNITS = {
@@ -28,9 +35,12 @@ UNITS = {
 }
 """The kinds and what each is counted in.
 
-- box sums: two matrix products for each row of a search window, which add up squared differences at the references.
-- group products: batched products of a group's patches: covariances, estimates, the noise's covariance.
-- factorisations: Cholesky factor and inverse of a covariance, n^3 operations (n^3 / 3 and 2 n^3 / 3).
+- box sums: two matrix products for each row of a search window, which add up squared differences at
+  the references.
+- group products: batched products of a group's patches: covariances, estimates, the noise's
+  covariance.
+- factorisations: Cholesky factor and inverse of a covariance, n^3 operations (n^3 / 3 and 2 n^3 /
+  3).
 - selection: distances among which the nearest are found (numpy's argpartition).
 - transforms: FFTs of real images, 2.5 n log2 n operations for n pixels.
 - passes: bytes read and written by operations that go through arrays in order.
@@ -46,12 +56,15 @@ FLOAT_BYTES = 4
 CALLS_A_TILE = 150
 CALLS_A_WINDOW_ROW = 12
 CALLS_A_PATCH_PIXEL = 10
-"""Operations of `nl_bayes._tile`, of a turn of `window_distances`, and of two turns of `overlap_add`."""
+"""Operations of `nl_bayes._tile`, of a turn of `window_distances`, and of two turns of
+`overlap_add`.
+"""
 MATRIX_PASSES = 8
 MATRIX_GATHERS = 4
 IMAGE_PASSES = 30
-"""Readings and writings of a group's covariance outside its factorisation, in order and where it was chosen by a
-mask, and of the image outside NL-Bayes."""
+"""Readings and writings of a group's covariance outside its factorisation, in order and where it
+was chosen by a mask, and of the image outside NL-Bayes.
+"""
 
 
 @dataclass(frozen=True)
@@ -69,7 +82,9 @@ class Tile:
 
     def covered_px(self, side_px: int) -> tuple[int, int]:
         """Rows and columns of pixels that squares of `side_px` at every reference cover."""
-        return (self.rows - 1) * self.stride_px + side_px, (self.columns - 1) * self.stride_px + side_px
+        return (self.rows - 1) * self.stride_px + side_px, (
+            self.columns - 1
+        ) * self.stride_px + side_px
 
 
 def chain_work(height: int, width: int, quality: Quality) -> Work:
@@ -87,7 +102,9 @@ def chain_work(height: int, width: int, quality: Quality) -> Work:
 def _tiles(height: int, width: int, stride_px: int) -> Counter[Tile]:
     """The tiles of a pass, by their size: at most four sizes, however large the image."""
     rows, columns = (Counter(map(len, reference_runs(size, stride_px))) for size in (height, width))
-    return Counter({Tile(r, c, stride_px): n * m for r, n in rows.items() for c, m in columns.items()})
+    return Counter(
+        {Tile(r, c, stride_px): n * m for r, n in rows.items() for c, m in columns.items()}
+    )
 
 
 def tile_work(tile: Tile, settings: PassSettings) -> Work:
@@ -105,7 +122,10 @@ def _search(tile: Tile, settings: PassSettings) -> Work:
     return Work(
         {
             "box sums": 2 * window * sums,
-            "passes": 5 * FLOAT_BYTES * window * squares,  # two read and one written, then squared in place
+            "passes": 5
+            * FLOAT_BYTES
+            * window
+            * squares,  # two read and one written, then squared in place
             "strided": 2 * FLOAT_BYTES * window * distances,
             "selection": tile.groups * window**2 if settings.similar < window**2 else 0,
             "calls": CALLS_A_WINDOW_ROW * window,
@@ -123,7 +143,8 @@ def _estimates(tile: Tile, settings: PassSettings) -> Work:
             "group products": 2 * (images + 1) * members * n**2 + 2 * tile.groups * n**3,
             "factorisations": tile.groups * n**3,
             # Picked; read, added and written; and the covariances of the groups that are not flat.
-            "gathers": FLOAT_BYTES * (members * n * (2 * images + 3) + MATRIX_GATHERS * tile.groups * n**2),
+            "gathers": FLOAT_BYTES
+            * (members * n * (2 * images + 3) + MATRIX_GATHERS * tile.groups * n**2),
             "passes": FLOAT_BYTES * (4 * images * members * n + MATRIX_PASSES * tile.groups * n**2),
         }
     )

@@ -1,9 +1,10 @@
 """Fit the constants of the cost model to published rates.
 
-Least squares on ln(FPS) with a soft L1 loss (a rate far off counts linearly), each network weighing the same, by
-damped Gauss-Newton steps on the logarithms of the constants. Rates with several threads tell how much the DPU and the
-host get done side by side; those with one thread, which weigh ALONE as much, how long they take one after the other.
-A weak prior pulls each logarithm to its start. No array does more than its peak, so its efficiency ends at 1.
+Least squares on ln(FPS) with a soft L1 loss (a rate far off counts linearly), each network weighing
+the same, by damped Gauss-Newton steps on the logarithms of the constants. Rates with several
+threads tell how much the DPU and the host get done side by side; those with one thread, which weigh
+ALONE as much, how long they take one after the other. A weak prior pulls each logarithm to its
+start. No array does more than its peak, so its efficiency ends at 1.
 """
 
 from collections import Counter
@@ -18,10 +19,14 @@ from beers_deploy.dpu.cost.model import NAMES, Array, Constants, Layers, Structu
 from benchmarks.cost_model.published import Case
 
 START = Constants(0.8, 40, 0.55, 6e-6, 5e-5, 0.4e9, 0.8e9, 0.3e9, 30e6, 60e6, 1.3e9)
-"""Where the fit begins: the right orders of magnitude; a pixel of an image takes the host a clock cycle."""
+"""Where the fit begins: the right orders of magnitude; a pixel of an image takes the host a clock
+cycle.
+"""
 SPREAD = np.array([0.3, 1, 0.2, 1, 1, 0.7, 0.7, 0.7, 1, 1, 0.5])
-"""How far each logarithm may lie from its start, a standard deviation: shares less than times and rates. Few
-networks tell what the VCK190's memory reaches, and they differ by 1.7: the other boards' 0.5 to 0.65 count too."""
+"""How far each logarithm may lie from its start, a standard deviation: shares less than times and
+rates. Few networks tell what the VCK190's memory reaches, and they differ by 1.7: the other boards'
+0.5 to 0.65 count too.
+"""
 SOFT = 0.1
 """Residual in ln(FPS) from where a rate counts linearly."""
 ALONE = 0.25
@@ -29,13 +34,15 @@ PEAK = NAMES.index("array_efficiency")
 STEP = 1e-5
 """Of a logarithm, for slopes."""
 SHIFTS = np.outer((0.0, -0.4, 0.4), np.eye(len(NAMES))[NAMES.index("memory_efficiency")])
-"""Where the fit begins, from the start: where one part of a layer outruns another the cost has kinks, and the nearest
-low point need not be the lowest."""
+"""Where the fit begins, from the start: where one part of a layer outruns another the cost has
+kinks, and the nearest low point need not be the lowest.
+"""
 ENOUGH = 1e-5
 STUCK = 1e5
 MOST = 200
-"""A step that gains less than this share of the cost is the last, and so is one that needs this much damping, or the
-one with this number: along a kink steps grow ever smaller."""
+"""A step that gains less than this share of the cost is the last, and so is one that needs this
+much damping, or the one with this number: along a kink steps grow ever smaller.
+"""
 
 
 def logs_of(constants: Constants) -> Array:
@@ -55,7 +62,9 @@ def rounded(constants: Constants) -> Constants:
 
 @dataclass(frozen=True)
 class Times:
-    """Seconds of one image, (n,) each: the DPU with all its cores, with one core alone, one core of the host."""
+    """Seconds of one image, (n,) each: the DPU with all its cores, with one core alone, one core of
+    the host.
+    """
 
     dpu_s: Array
     alone_s: Array
@@ -73,7 +82,12 @@ class Cases:
     def layers(self) -> Layers:
         """All layers, one network behind the other."""
         parts = [row.layers for row in self.rows]
-        return Layers(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Layers)))
+        return Layers(
+            *(
+                np.concatenate([getattr(part, field.name) for part in parts])
+                for field in fields(Layers)
+            )
+        )
 
     @cached_property
     def _starts(self) -> NDArray[np.int64]:
@@ -101,7 +115,9 @@ class Cases:
     @cached_property
     def observed_single(self) -> Array:
         """Mean ln(FPS) with one thread, (n,); NaN where there is none."""
-        return np.array([np.log(row.fps_single).mean() if row.fps_single else np.nan for row in self.rows])
+        return np.array(
+            [np.log(row.fps_single).mean() if row.fps_single else np.nan for row in self.rows]
+        )
 
     @cached_property
     def weights(self) -> Array:
@@ -112,7 +128,9 @@ class Cases:
 
     def times(self, constants: Constants) -> Times:
         """What an image takes."""
-        handlers, cores = (of_layers[self._starts] for of_layers in (self.layers.handlers, self.layers.cores))
+        handlers, cores = (
+            of_layers[self._starts] for of_layers in (self.layers.handlers, self.layers.cores)
+        )
         shared = self._core_s(constants, alone=False)
         alone = shared if cores.max() == 1 else self._core_s(constants, alone=True)
         host_s: Array = self._host @ constants.host_s_per_unit
@@ -131,7 +149,9 @@ class Cases:
         return -np.logaddexp(q * dpu, q * host) / q
 
     def residuals(self, constants: Constants) -> Array:
-        """ln(predicted / observed) with several and with one thread, (2 n,); 0 where nothing was observed."""
+        """ln(predicted / observed) with several and with one thread, (2 n,); 0 where nothing was
+        observed.
+        """
         times = self.times(constants)
         single = -np.log(times.alone_s + times.host_s) - self.observed_single
         return np.concatenate([self.predicted(times) - self.observed, np.nan_to_num(single)])
@@ -141,17 +161,23 @@ class Cases:
         return self.residuals(constants)[: len(self.rows)]
 
     def rate_errors(self, errors: Array) -> list[Array]:
-        """ln(predicted / rate) of each case's rates with several threads, from the `errors` of their means (n,)."""
+        """ln(predicted / rate) of each case's rates with several threads, from the `errors` of
+        their means (n,).
+        """
         centres = errors + self.observed
         return [centre - np.log(row.fps) for centre, row in zip(centres, self.rows, strict=True)]
 
     def only(self, keep: Sequence[bool] | NDArray[np.bool_]) -> "Cases":
         """The rows where `keep` (n,) is true."""
-        return Cases(tuple(row for row, kept in zip(self.rows, keep, strict=True) if kept), self.structure)
+        return Cases(
+            tuple(row for row, kept in zip(self.rows, keep, strict=True) if kept), self.structure
+        )
 
 
 def fit(cases: Cases, near: Constants | None = None) -> Constants:
-    """The constants that come nearest to the rates; `near` is where to begin, if not around START."""
+    """The constants that come nearest to the rates; `near` is where to begin,
+    if not around START.
+    """
     begins = [logs_of(near)] if near else [logs_of(START) + shift for shift in SHIFTS]
     found = [_descend(cases, logs) for logs in begins]
     return from_logs(min(found, key=lambda end: end[1])[0])

@@ -1,27 +1,29 @@
 """Networks as text: the notation of the `.net` files in `zoo/`, and its reader.
 
-    block basic c                          # a block has parameters, some with defaults: block down c s=2
-        conv c | conv c | add x            # a line is steps, each reading the result of the step before
+    block basic c                  # a block has parameters, some with defaults: block down c s=2
+        conv c | conv c | add x    # a line is steps, each reading the result of the step before
 
     network small
         family resnet                      # networks of one family resemble one another
-        host   argmax                      # what the host does with the results: copy argmax softmax sort image, or
-                                           # none, where the rates are the DPU's alone
-        gop    1.2                         # published operations (two a product), in 10^9
-        source He et al. 2015, table 1     # where the layers are written
-        image  224 224                     # height, width, and channels if not 3
+        host   argmax              # what the host does with the results: copy argmax softmax
+                                   # sort image, or none, where the rates are the DPU's alone
+        gop    1.2                 # published operations (two a product), in 10^9
+        source He et al. 2015      # where the layers are written
+        image  224 224             # height, width, and channels if not 3
         conv 64 7 2 | pool 3 2
-        y = basic 64 *2                    # twice; the result is kept as y, and x stays what it was
-        conv 64 1 | add y                  # this result is x, where the next line starts
-        y | conv 32 | out                  # a line may start from a kept result
+        y = basic 64 *2            # twice; the result is kept as y, and x stays what it was
+        conv 64 1 | add y          # this result is x, where the next line starts
+        y | conv 32 | out          # a line may start from a kept result
         global | fc 1000
 
-`x` is where a line starts: the result of the last line without a name. `ch` is its number of channels. A number may
-be a sum, difference, product or exact quotient of numbers, parameters and `ch`, without spaces: `4*c`, `ch/2`. A size
-is one number or HEIGHTxWIDTH: `1x7`. A parameter of a block may also stand for a kept result. In a block, x is what
-the block was called on, and its last x is what it returns.
+`x` is where a line starts: the result of the last line without a name. `ch` is its number of
+channels. A number may be a sum, difference, product or exact quotient of numbers, parameters and
+`ch`, without spaces: `4*c`, `ch/2`. A size is one number or HEIGHTxWIDTH: `1x7`. A parameter of a
+block may also stand for a kept result. In a block, x is what the block was called on, and its last
+x is what it returns.
 
-    conv C [K=3 [S=1]] [d=1] [g=1] [valid]    convolution into C channels, kernel, stride, dilation, groups
+    conv C [K=3 [S=1]] [d=1] [g=1] [valid]    convolution into C channels: kernel, stride,
+                                              dilation, groups
     dw [K=3 [S=1]] [d=1] [m=1]                depthwise, into m times the channels
     transposed C K S                          transposed convolution, S times as large
     fc C                                      fully connected
@@ -29,18 +31,19 @@ the block was called on, and its last x is what it returns.
     mean K S [valid|ceil]                     mean of a window
     global                                    mean of each channel
     scale                                     batch norm that no convolution can take in
-    resize [N=2|NAME]                         N times as large, or as a kept result: nearest neighbour
-    bilinear [N=2|NAME]                       the same, bilinear
+    resize [N=2|NAME]                         N times as large, or as a kept result
+    bilinear [N=2|NAME]                       the same, bilinear instead of nearest neighbour
     shuffle [N=2]    unshuffle [N=2]          channels to N x N pixels and back
     add NAME...      concat NAME...           joins the result so far with kept ones
     mul NAME                                  the same, a product
     slice FIRST COUNT                         some of the channels
     hsigmoid         hswish                   an activation that is a step of its own
-    out [CHANNELS]                            a result of the network, of which the host reads so many channels
+    out [CHANNELS]                            a result, of which the host reads so many channels
 
-Sizes are divided by a stride and rounded up, unless `valid` (no padding) or `ceil` (no padding before an image, as
-much as needed behind it). A network without `out` has one result, its last x, read whole. Batch norms and activations
-behind a convolution are fused into it and not written. Every file knows the blocks of all files.
+Sizes are divided by a stride and rounded up, unless `valid` (no padding) or `ceil` (no padding
+before an image, as much as needed behind it). A network without `out` has one result, its last x,
+read whole. Batch norms and activations behind a convolution are fused into it and not written.
+Every file knows the blocks of all files.
 """
 
 import ast
@@ -139,14 +142,22 @@ class Library:
         """One network, layer by layer.
 
         Raises:
-            ValueError: a line that cannot be understood, or shapes that do not fit; it names file and line.
+            ValueError: a line that cannot be understood, or shapes that do not fit; it names file
+                and line.
         """
         entry = self.networks[name]
         scope = _Scope(self.blocks, Builder(*map(int, entry.header["image"].split())), {})
         for place, line in entry.lines:
             try:
                 scope.run(line)
-            except (ArithmeticError, AssertionError, LookupError, SyntaxError, TypeError, ValueError) as error:
+            except (
+                ArithmeticError,
+                AssertionError,
+                LookupError,
+                SyntaxError,
+                TypeError,
+                ValueError,
+            ) as error:
                 raise ValueError(f"{place}: {line} ({error})") from error
         return scope.builder.written(scope.x)
 
@@ -179,7 +190,9 @@ def read_library(paths: Sequence[Path]) -> Library:
 class _Scope:
     """A network or a block while its lines are read."""
 
-    def __init__(self, blocks: Mapping[str, Block], builder: Builder, names: Mapping[str, Value]) -> None:
+    def __init__(
+        self, blocks: Mapping[str, Block], builder: Builder, names: Mapping[str, Value]
+    ) -> None:
         self.blocks = blocks
         self.builder = builder
         self.names: dict[str, Value] = {"x": builder.image, **names}
@@ -210,11 +223,19 @@ class _Scope:
     def _call(self, x: Tensor, word: str, arguments: list[str]) -> Tensor:
         if word in STEPS:
             options = [text.partition("=") for text in arguments if "=" in text or text in FLAGS]
-            values = [self._value(text) for text in arguments if "=" not in text and text not in FLAGS]
-            return STEPS[word](self.builder, x, *values, **{k: self._number(text or "1") for k, _, text in options})
+            values = [
+                self._value(text) for text in arguments if "=" not in text and text not in FLAGS
+            ]
+            return STEPS[word](
+                self.builder, x, *values, **{k: self._number(text or "1") for k, _, text in options}
+            )
         block = self.blocks[word]
         texts = {**block.parameters, **dict(zip(block.parameters, arguments, strict=False))}
-        scope = _Scope(self.blocks, self.builder, {**{k: self._value(str(v)) for k, v in texts.items()}, "x": x})
+        scope = _Scope(
+            self.blocks,
+            self.builder,
+            {**{k: self._value(str(v)) for k, v in texts.items()}, "x": x},
+        )
         for _, line in block.lines:
             scope.run(line)
         return scope.x
@@ -232,14 +253,18 @@ class _Scope:
         return self._evaluate(ast.parse(text, mode="eval").body)
 
     def _evaluate(self, node: ast.expr) -> int:
-        """A whole number, a name of one, or a sum, difference, product or exact quotient of such."""
+        """A whole number, a name of one, or a sum, difference, product or exact
+        quotient of such.
+        """
         if isinstance(node, ast.BinOp):
             left = self._evaluate(node.left)
             right = self._evaluate(node.right)
             if isinstance(node.op, ast.Div) and left % right:
                 raise ValueError(f"{left} / {right} is not exact")
             return SIGNS[type(node.op)](left, right)
-        value: object = self.names.get(node.id) if isinstance(node, ast.Name) else ast.literal_eval(node)
+        value: object = (
+            self.names.get(node.id) if isinstance(node, ast.Name) else ast.literal_eval(node)
+        )
         if not isinstance(value, int):
             raise ValueError(f"no number: {ast.unparse(node)}")
         return value

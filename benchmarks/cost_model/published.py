@@ -1,22 +1,26 @@
 """The published networks and their published rates, as cases for the fit.
 
-Layers stand in the `.net` files under `zoo/` (see `notation`), rates in `zoo/published.csv`: tables of AMD's model
-zoo (github.com/Xilinx/Vitis-AI), each row with the release and the line, row or record that prints it. A rate
-contains the host: images lie decoded in memory, then each thread runs mean and scale, DPU and post-processing for a
-batch (src/vai_library/benchmark). How many threads `fps` took is not stated; `fps_single` took one.
+Layers stand in the `.net` files under `zoo/` (see `notation`), rates in `zoo/published.csv`: tables
+of AMD's model zoo (github.com/Xilinx/Vitis-AI), each row with the release and the line, row or
+record that prints it. A rate contains the host: images lie decoded in memory, then each thread runs
+mean and scale, DPU and post-processing for a batch (src/vai_library/benchmark). How many threads
+`fps` took is not stated; `fps_single` took one.
 
 What a host does follows from the post-processing in src/vai_library/xnnpp/src:
 
-- softmax: exponentials of every class, then the best few (classification.cpp, ultrafast_postimp.cpp);
+- softmax: exponentials of every class, then the best few (classification.cpp,
+  ultrafast_postimp.cpp);
 - argmax: the largest channel of every pixel (segmentation.cpp);
-- sort: scores above a threshold, their boxes, then non-maximum suppression. YOLO reads one score a box and skips the
-  rest (yolov3.cpp, yolovx.cpp), SSD every score of every class (tfssd_detector.cpp), DenseBox and RetinaFace every
-  score (facedetect.cpp, retinaface_detector.cpp); the boxes of the few that pass are not counted;
+- sort: scores above a threshold, their boxes, then non-maximum suppression. YOLO reads one score a
+  box and skips the rest (yolov3.cpp, yolovx.cpp), SSD every score of every class
+  (tfssd_detector.cpp), DenseBox and RetinaFace every score (facedetect.cpp,
+  retinaface_detector.cpp); the boxes of the few that pass are not counted;
 - image: every value becomes a pixel of an image (rcan.cpp, medicalsegcell_imp.cpp);
 - copy: every value is read once, little else (reid.cpp, facequality.cpp).
 
-A row of the tables is left out: ResNet-152 on the KV260 in release 2.0 repeats the rates of ResNet-101. Where a table
-prints another number of operations for the same rates, the `.net` file says so.
+A row of the tables is left out: ResNet-152 on the KV260 in release 2.0 repeats the rates of
+ResNet-101. Where a table prints another number of operations for the same rates, the `.net` file
+says so.
 """
 
 import csv
@@ -78,8 +82,10 @@ def published_rates() -> list[dict[str, str]]:
 
 
 SLOWER = {"kv260": ("1.4", "2.0")}
-"""Releases whose image moved maps more slowly on a board: RCAN, SESR and ENet gained 27 to 42 % with the next, on the
-ZCU102 1 to 9 %. Who installs a board today meets the later ones, so these rates are in no fit."""
+"""Releases whose image moved maps more slowly on a board: RCAN, SESR and ENet gained 27 to 42 %
+with the next, on the ZCU102 1 to 9 %. Who installs a board today meets the later ones, so these
+rates are in no fit.
+"""
 
 
 @cache
@@ -90,13 +96,17 @@ def boards() -> tuple[str, ...]:
 
 @cache
 def host_cores(board: str) -> int:
-    """Cores of a board's processor: four Cortex-A53 of the Zynq boards, two Cortex-A72 of the Versal boards."""
+    """Cores of a board's processor: four Cortex-A53 of the Zynq boards, two Cortex-A72 of the
+    Versal boards.
+    """
     return load_dpu(board).whole("cpu", "cores")
 
 
 @cache
 def published_cases(board: str, *, slower: bool = False) -> tuple[Case, ...]:
-    """The published rates of a board, or those of its SLOWER releases; one case a network and configuration."""
+    """The published rates of a board, or those of its SLOWER releases; one case a network and
+    configuration.
+    """
     found = defaultdict(list)
     for rate in published_rates():
         if rate["board"] == board and (rate["release"] in SLOWER.get(board, ())) is slower:
@@ -112,7 +122,9 @@ def published_cases(board: str, *, slower: bool = False) -> tuple[Case, ...]:
     )
 
 
-def network_case(name: str, dpu: Dpu, fps: tuple[float, ...], fps_single: tuple[float, ...] = ()) -> Case:
+def network_case(
+    name: str, dpu: Dpu, fps: tuple[float, ...], fps_single: tuple[float, ...] = ()
+) -> Case:
     """One of NETWORKS on a configuration, with its rates."""
     net = written(name).network
     entry = NETWORKS[name]

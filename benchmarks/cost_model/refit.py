@@ -1,7 +1,9 @@
-"""Refit the cost model: `python -m benchmarks.cost_model.refit` writes [cost] of every board with published rates.
+"""Refit the cost model: `python -m benchmarks.cost_model.refit` writes [cost] of every board with
+published rates.
 
 It prints what a family that the fit has not seen is off by, on each board: the table of
-docs/explanation/cost-model.md. `--check` writes nothing and says whether the profiles hold what the fit finds.
+docs/explanation/cost-model.md. `--check` writes nothing and says whether the profiles hold what the
+fit finds.
 """
 
 import argparse
@@ -33,7 +35,10 @@ from benchmarks.cost_model.validation import (
 TARGETS = Path(__file__).parents[2] / "profiles" / "targets"
 HEADER = "[cost] # written by benchmarks/cost_model/refit.py; the formula: deploy/dpu/cost/model.py"
 CHOSEN = "the choice of least error on families left out: benchmarks/cost_model/validation.py"
-FITTED = "fit to the published rates of {rows} networks and configurations, benchmarks/cost_model/zoo/published.csv"
+FITTED = (
+    "fit to the published rates of {rows} networks and configurations, "
+    "benchmarks/cost_model/zoo/published.csv"
+)
 
 
 def with_cost(profile: str, board: str) -> str:
@@ -44,7 +49,9 @@ def with_cost(profile: str, board: str) -> str:
         for key, value, status, source in cost_table(board)
     ]
     block = "\n".join(lines) + "\n"
-    return re.sub(r"^\[cost].*?\n(?=\n|\Z)", lambda _: block, profile, flags=re.DOTALL | re.MULTILINE)
+    return re.sub(
+        r"^\[cost].*?\n(?=\n|\Z)", lambda _: block, profile, flags=re.DOTALL | re.MULTILINE
+    )
 
 
 def cost_table(board: str) -> Iterator[tuple[str, str, str, str]]:
@@ -53,21 +60,41 @@ def cost_table(board: str) -> Iterator[tuple[str, str, str, str]]:
     source = FITTED.format(rows=len(found.cases.rows))
     for key, value in asdict(rounded(fit(found.cases))).items():
         yield key, f"{value:.4g}", "inferred", source
-    yield "overlap", f"{found.cases.structure.overlap:g}", "assumed", "benchmarks/cost_model/validation.py, OVERLAP"
+    yield (
+        "overlap",
+        f"{found.cases.structure.overlap:g}",
+        "assumed",
+        "benchmarks/cost_model/validation.py, OVERLAP",
+    )
     yield "crowding", f"{found.cases.structure.crowding:g}", "inferred", CHOSEN
     families = len(set(found.cases.families))
-    left_out = f"|ln(predicted / published)| that nine of ten families keep to, from {families}, each left out once"
+    left_out = (
+        "|ln(predicted / published)| that nine of ten families keep to, from "
+        f"{families}, each left out once"
+    )
     for kind, width in found.widths.items():
         yield WIDTHS[kind], f"{width:.3f}", "inferred", f"{left_out}; {kind}"
-    held = "share of the families, each left out of fit and widths, that their intervals held with every rate"
+    held = (
+        "share of the families, each left out of fit and widths, that their intervals held "
+        "with every rate"
+    )
     yield "families_held", f"{coverage(found.rows)[1]:.2f}", "inferred", held
     widest = max(*found.widths.values(), outside_width(found.cases))
-    far = "the widest, or the error of networks with the largest maps, predicted from those with a quarter"
+    far = (
+        "the widest, or the error of networks with the largest maps, predicted from those "
+        "with a quarter"
+    )
     yield WIDTHS["outside"], f"{widest:.3f}", "inferred", far
     pairs = (
-        "|ln of the ratio of two rates, predicted / published| that nine of ten pairs of a family's networks keep to"
+        "|ln of the ratio of two rates, predicted / published| that nine of ten pairs of a "
+        "family's networks keep to"
     )
-    yield "pair_width", f"{pair_width(board):.3f}", "inferred", f"{pairs}, each network left out once"
+    yield (
+        "pair_width",
+        f"{pair_width(board):.3f}",
+        "inferred",
+        f"{pairs}, each network left out once",
+    )
     for key, (low, high) in fitted_ranges(found).items():
         range_of = "range of the fitted networks that the DPU bounds"
         yield f"fitted_{key}", f"[{low:.4g}, {high:.4g}]", "inferred", range_of
@@ -90,12 +117,30 @@ def accuracy() -> Iterator[tuple[object, ...]]:
         off = by_network((row.network for row in found.rows), (row.rates for row in found.rows))
         held, whole = coverage(found.rows)
         counts = len(off), len(set(found.cases.families)), sum(len(row.rates) for row in found.rows)
-        yield board, *counts, *_spread(off), f"{rank_correlation(found):.3f}", _percent(held), _percent(whole)
+        yield (
+            board,
+            *counts,
+            *_spread(off),
+            f"{rank_correlation(found):.3f}",
+            _percent(held),
+            _percent(whole),
+        )
 
 
 def by_kind() -> Iterator[tuple[object, ...]]:
     """A row a board and kind of network: errors of networks whose family was left out."""
-    yield "board", "kind", "networks", "rates", "median", "mean", "bias", "largest", "rates inside", "families"
+    yield (
+        "board",
+        "kind",
+        "networks",
+        "rates",
+        "median",
+        "mean",
+        "bias",
+        "largest",
+        "rates inside",
+        "families",
+    )
     for board in boards():
         for kind in dict.fromkeys(KINDS.values()):
             rows = [row for row in nested(board).rows if NETWORKS[row.network].kind == kind]
@@ -104,8 +149,20 @@ def by_kind() -> Iterator[tuple[object, ...]]:
             errors = [row.network for row in rows], [row.rates for row in rows]
             off = by_network(*errors)
             bias = by_network(*errors, signed=True).mean()
-            counts, (median, mean, largest) = (len(off), sum(len(row.rates) for row in rows)), _spread(off)
-            yield board, kind, *counts, median, mean, f"{100 * bias:+.1f} %", largest, *map(_percent, coverage(rows))
+            counts, (median, mean, largest) = (
+                (len(off), sum(len(row.rates) for row in rows)),
+                _spread(off),
+            )
+            yield (
+                board,
+                kind,
+                *counts,
+                median,
+                mean,
+                f"{100 * bias:+.1f} %",
+                largest,
+                *map(_percent, coverage(rows)),
+            )
 
 
 def owners() -> Iterator[tuple[object, ...]]:
@@ -139,13 +196,17 @@ def _percent(share: float) -> str:
 def table(rows: Iterable[Iterable[object]]) -> str:
     """A Markdown table, its head first."""
     head, *lines = [list(map(str, row)) for row in rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *lines)) + "\n"
+    return (
+        "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *lines)) + "\n"
+    )
 
 
 def main() -> int:
     """Write or check [cost] of all boards; 1 where `--check` finds another."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--check", action="store_true", help="write nothing, and say which profile differs")
+    parser.add_argument(
+        "--check", action="store_true", help="write nothing, and say which profile differs"
+    )
     check = parser.parse_args().check
     stale = []
     for board in boards():

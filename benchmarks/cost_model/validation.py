@@ -1,9 +1,11 @@
-"""How wrong the cost model is about networks that its fit has not seen, and the intervals that follow.
+"""How wrong the cost model is about networks that its fit has not seen, and the intervals that
+follow.
 
-Networks of one family resemble one another, so a family is left out as a whole. What is chosen and what is judged
-are kept apart by two rounds (nested cross-validation): for each family left out, `crowding` is chosen, and the width
-of the interval made, from errors on others of the families that remain. Boards of one processor share `crowding`.
-`nested` is what the errors of the documents and the widths of [cost] come from.
+Networks of one family resemble one another, so a family is left out as a whole. What is chosen and
+what is judged are kept apart by two rounds (nested cross-validation): for each family left out,
+`crowding` is chosen, and the width of the interval made, from errors on others of the families that
+remain. Boards of one processor share `crowding`. `nested` is what the errors of the documents and
+the widths of [cost] come from.
 """
 
 from collections import Counter
@@ -26,15 +28,23 @@ from benchmarks.cost_model.published import boards, host_cores, published_cases
 CROWDINGS = (2.0, 4.0)
 """What the cross-validation chooses from."""
 OVERLAP = {"DPUCZDX8G": 1.0, "DPUCVDX8G": 0.5, "DPUCV2DX8G": 0.5}
-"""By DPU. The first does 94 % of its array's peak on a network of large maps (SESR, KV260), so its memory is hidden.
-Rates of the others do not tell: from 0 to 1, the error of families left out changes by 0.1 points."""
+"""By DPU.
+
+The first does 94 % of its array's peak on a network of large maps (SESR, KV260), so its memory is
+hidden. Rates of the others do not tell: from 0 to 1, the error of families left out changes by 0.1
+points.
+"""
 FOLDS = 5
 SHARE = 0.9
 """Of left-out families that the intervals hold."""
 CONFIDENCE = 0.75
-"""That they do: of some thirty families the luck of who is among them moves a mere quantile by several."""
+"""That they do: of some thirty families the luck of who is among them moves a mere quantile by
+several.
+"""
 SHRINK = 3
-"""A regime's typical error counts this many families of all regimes' typical error besides its own."""
+"""A regime's typical error counts this many families of all regimes' typical
+error besides its own.
+"""
 
 Widths = Mapping[Regime, float]
 """Half the width of an interval, in ln(FPS), by regime."""
@@ -79,7 +89,9 @@ class Nested:
 
 @cache
 def nested(board: str) -> Nested:
-    """Leave each family out; choose and make widths from the others alone; predict what was left out."""
+    """Leave each family out; choose and make widths from the others alone; predict what was left
+    out.
+    """
     names = _trial(board, chosen(board)).names
     found = [row for name in names for row in _trial(board, chosen(board, name)).left_out(name)]
     cases = _trial(board, chosen(board)).cases
@@ -91,15 +103,23 @@ def nested(board: str) -> Nested:
 
 @cache
 def chosen(board: str, left_out: str = "", *, seen: bool = True) -> float:
-    """The crowding of least mean error over the boards of a board's processor, all families but one.
+    """The crowding of least mean error over the boards of a board's processor, all families but
+    one.
 
     Args:
         board: its name.
         left_out: a family.
         seen: whether the board's own rates count.
     """
-    alike = [each for each in boards() if host_cores(each) == host_cores(board) and (seen or each != board)]
-    scores = [np.mean([_trial(each, crowding).score(left_out) for each in alike]) for crowding in CROWDINGS]
+    alike = [
+        each
+        for each in boards()
+        if host_cores(each) == host_cores(board) and (seen or each != board)
+    ]
+    scores = [
+        np.mean([_trial(each, crowding).score(left_out) for each in alike])
+        for crowding in CROWDINGS
+    ]
     return CROWDINGS[int(np.argmin(scores))]
 
 
@@ -123,7 +143,9 @@ class Trial:
         """The constants that the other families give."""
         key = frozenset(unseen) & frozenset(self.names)
         if key not in self._fits:
-            self._fits[key] = fit(self.cases.only(~np.isin(self.cases.families, list(key))), near=self.near)
+            self._fits[key] = fit(
+                self.cases.only(~np.isin(self.cases.families, list(key))), near=self.near
+            )
         return self._fits[key]
 
     def left_out(self, name: str) -> list[LeftOut]:
@@ -134,8 +156,12 @@ class Trial:
         errors = tested.errors(constants)
         regimes = regimes_of(tested, constants)
         return [
-            LeftOut(row.network, row.family, row.configuration, kind, float(error), rates, widths[kind])
-            for row, kind, error, rates in zip(tested.rows, regimes, errors, tested.rate_errors(errors), strict=True)
+            LeftOut(
+                row.network, row.family, row.configuration, kind, float(error), rates, widths[kind]
+            )
+            for row, kind, error, rates in zip(
+                tested.rows, regimes, errors, tested.rate_errors(errors), strict=True
+            )
         ]
 
     def inner(self, left_out: str) -> tuple[Array, Cases, list[Regime]]:
@@ -160,9 +186,9 @@ class Trial:
 def widths_of(errors: Array, cases: Cases, regimes: Sequence[Regime]) -> Widths:
     """Widths that SHARE of the families lie inside with every rate of all their networks.
 
-    What counts of a case is its rate that lies farthest off. A regime's scale is the mean over families of its mean
-    (drawn to that of all regimes); a family's score is its largest error over scale; the widths are the scales times
-    the score that SHARE of all families keep to.
+    What counts of a case is its rate that lies farthest off. A regime's scale is the mean over
+    families of its mean (drawn to that of all regimes); a family's score is its largest error over
+    scale; the widths are the scales times the score that SHARE of all families keep to.
     """
     families = cases.families
     kinds = np.array(regimes)
@@ -191,22 +217,26 @@ def family_mean(sizes: Array, families: NDArray[np.str_]) -> float:
 
 
 def family_quantile(errors: Array, families: NDArray[np.str_]) -> float:
-    """The size of error that SHARE of all families keep to with every one of theirs, at CONFIDENCE."""
+    """The size of error that SHARE of all families keep to with every one of
+    theirs, at CONFIDENCE.
+    """
     largest = sorted(np.abs(errors)[families == name].max() for name in set(families))
     return float(largest[tolerance_rank(len(largest)) - 1])
 
 
 def tolerance_rank(count: int) -> int:
-    """Which of `count` scores, sorted, SHARE of all families stay below, at CONFIDENCE; or the last.
+    """Which of `count` scores, sorted, SHARE of all families stay below, at CONFIDENCE; or the
+    last.
 
-    The k-th of n does if fewer than k of n draws fall among that share: at a binomial probability (S. S. Wilks, 1941,
-    doi:10.1214/aoms/1177731788).
+    The k-th of n does if fewer than k of n draws fall among that share: at a binomial probability
+    (S. S. Wilks, 1941, doi:10.1214/aoms/1177731788).
     """
     return min(int(binom.ppf(CONFIDENCE, count, SHARE)) + 1, count)
 
 
 def pair_width(board: str) -> float:
-    """What ln of the ratio of two published rates was off by, at most, in SHARE of pairs of one family.
+    """What ln of the ratio of two published rates was off by, at most, in SHARE of pairs of one
+    family.
 
     Each network predicted without itself; only rates that the DPU bounds.
     """
@@ -215,11 +245,17 @@ def pair_width(board: str) -> float:
     names = np.array([row.network for row in trial.cases.rows])
     errors = np.zeros(len(names))
     for name in dict.fromkeys(names):
-        errors[names == name] = cases.only(names == name).errors(fit(cases.only(names != name), near=trial.near))
+        errors[names == name] = cases.only(names == name).errors(
+            fit(cases.only(names != name), near=trial.near)
+        )
     kinds = regimes_of(cases, trial.near)
-    kept = [(row, e) for row, e, kind in zip(cases.rows, errors, kinds, strict=True) if kind != "host"]
+    kept = [
+        (row, e) for row, e, kind in zip(cases.rows, errors, kinds, strict=True) if kind != "host"
+    ]
     apart = [
-        abs(x - y) for (a, x), (b, y) in combinations(kept, 2) if a.family == b.family and a.network != b.network
+        abs(x - y)
+        for (a, x), (b, y) in combinations(kept, 2)
+        if a.family == b.family and a.network != b.network
     ]
     return float(np.quantile(apart, SHARE))
 
@@ -227,7 +263,8 @@ def pair_width(board: str) -> float:
 def outside_width(cases: Cases, share: float = 0.25) -> float:
     """The error of the networks with the largest maps, predicted from the others.
 
-    The largest: above `share` of the largest map of a network that the DPU bounds. Only such are predicted.
+    The largest: above `share` of the largest map of a network that the DPU bounds. Only such are
+    predicted.
     """
     bound = np.array([kind != "host" for kind in regimes_of(cases, fit(cases))])
     sizes = np.array([row.map_bytes for row in cases.rows])
@@ -237,7 +274,9 @@ def outside_width(cases: Cases, share: float = 0.25) -> float:
 
 
 def by_network(names: Iterable[str], errors: Iterable[Array], *, signed: bool = False) -> Array:
-    """Mean |predicted / published - 1| of each network, or with its sign, over its configurations and rates."""
+    """Mean |predicted / published - 1| of each network, or with its sign, over its configurations
+    and rates.
+    """
     found: dict[str, list[float]] = {}
     for name, each in zip(names, errors, strict=True):
         off = np.expm1(each)
@@ -246,11 +285,15 @@ def by_network(names: Iterable[str], errors: Iterable[Array], *, signed: bool = 
 
 
 def coverage(rows: Sequence[LeftOut]) -> tuple[float, float]:
-    """Share of published rates inside their intervals, each network weighing the same; share of families whole."""
+    """Share of published rates inside their intervals, each network weighing the same; share of
+    families whole.
+    """
     counts = Counter(row.network for row in rows)
     networks = sum(row.held / counts[row.network] for row in rows) / len(counts)
     families = {row.family for row in rows}
-    return networks, float(np.mean([all(row.held == 1 for row in rows if row.family == name) for name in families]))
+    return networks, float(
+        np.mean([all(row.held == 1 for row in rows if row.family == name) for name in families])
+    )
 
 
 def rank_correlation(found: Nested) -> float:
@@ -275,10 +318,12 @@ def one_thread(board: str) -> tuple[list[str], list[Array]]:
 
 
 def owner_errors(board: str, *, slower: bool = False) -> list[float]:
-    """Mean |predicted / published - 1| with no run of an owner, with one, and with one that is wholly believed.
+    """Mean |predicted / published - 1| with no run of an owner, with one, and with one that is
+    wholly believed.
 
-    Each case in turn is the owner's run and corrects all others of its part (DPU or host), each family predicted
-    without itself; only other families count. `slower` takes an owner whose board has one of SLOWER's images.
+    Each case in turn is the owner's run and corrects all others of its part (DPU or host), each
+    family predicted without itself; only other families count. `slower` takes an owner whose board
+    has one of SLOWER's images.
     """
     trial = _trial(board, chosen(board))
     cases = Cases(published_cases(board, slower=slower), trial.cases.structure)
@@ -291,11 +336,16 @@ def owner_errors(board: str, *, slower: bool = False) -> list[float]:
         on_host[mine] = [kind == "host" for kind in regimes_of(cases.only(mine), constants)]
     owners = errors[:, None] * (on_host[:, None] == on_host)
     others = cases.families[:, None] != cases.families
-    return [float(np.abs(np.expm1(errors - share * owners))[others].mean()) for share in (0, 1 / (1 + SCATTER), 1)]
+    return [
+        float(np.abs(np.expm1(errors - share * owners))[others].mean())
+        for share in (0, 1 / (1 + SCATTER), 1)
+    ]
 
 
 def transferred(source: str, target: str) -> tuple[list[str], list[Array]]:
-    """Names and errors of a board's cases with constants fitted to another's rates, without the family of each."""
+    """Names and errors of a board's cases with constants fitted to another's rates, without the
+    family of each.
+    """
     crowding = chosen(target, seen=False)
     wanted = _trial(target, crowding).cases
     trial = _trial(source, crowding)

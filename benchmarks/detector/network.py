@@ -1,10 +1,12 @@
-"""A detector of 100 k parameters from convolutions, ReLU, an enlargement and a concatenation, and its ONNX file.
+"""A detector of 100 k parameters from convolutions, ReLU, an enlargement and a concatenation, and
+its ONNX file.
 
-    image -> 2 strided convolutions -> fine (stride 4) -> strided -> coarse (stride 8) -> enlarged, + fine -> head
+    image -> 2 strided convolutions -> fine (stride 4)
+    fine -> strided -> coarse (stride 8) -> enlarged, + fine -> head
 
-Every cell of 4 x 4 input pixels says, for an object whose centre it may be, the centre and the size of its box, and
-how likely each class is: anchor-free, as CenterNet (Zhou et al., 2019, arXiv 1904.07850). All of it but the decoding
-of the last map is legal on a DPU.
+Every cell of 4 x 4 input pixels says, for an object whose centre it may be, the centre and the size
+of its box, and how likely each class is: anchor-free, as CenterNet (Zhou et al., 2019, arXiv
+1904.07850). All of it but the decoding of the last map is legal on a DPU.
 """
 
 import io
@@ -26,11 +28,15 @@ PRIOR = 0.02
 
 
 class DetectorNetwork(nn.Module):
-    """Images (N, 3, H, W) RGB in [0, 1] to a map (N, 4 + classes, H / 4, W / 4) that `decoded` reads."""
+    """Images (N, 3, H, W) RGB in [0, 1] to a map (N, 4 + classes, H / 4, W / 4) that `decoded`
+    reads.
+    """
 
     def __init__(self, classes: int) -> None:
         super().__init__()
-        self.fine = nn.Sequential(_conv(3, 16, stride=2), _conv(16, 24, stride=2), _conv(24, 24), _conv(24, 24))
+        self.fine = nn.Sequential(
+            _conv(3, 16, stride=2), _conv(16, 24, stride=2), _conv(24, 24), _conv(24, 24)
+        )
         self.coarse = nn.Sequential(_conv(24, 48, stride=2), *(_conv(48, 48) for _ in range(3)))
         self.join = nn.Sequential(_conv(24 + 48, 32), _conv(32, 32))
         self.tail = nn.Conv2d(32, 4 + classes, 1)
@@ -44,7 +50,8 @@ class DetectorNetwork(nn.Module):
 
 
 def decoded(boxes: Tensor) -> Tensor:
-    """Boxes in input pixels from the first four channels of the map: (N, 4, h, w) to cx, cy, w, h of that shape.
+    """Boxes in input pixels from the first four channels of the map: (N, 4, h, w) to cx, cy, w, h
+    of that shape.
 
     The centre is told from the middle of the cell, in cells; the size as the logarithm of cells.
     """
@@ -55,7 +62,9 @@ def decoded(boxes: Tensor) -> Tensor:
 
 
 class Decoding(nn.Module):
-    """As a file holds it: (N, 3, H, W) to (N, 4 + classes, A), which are cx, cy, w, h in input pixels and scores."""
+    """As a file holds it: (N, 3, H, W) to (N, 4 + classes, A), which are cx, cy, w, h in input
+    pixels and scores.
+    """
 
     def __init__(self, network: DetectorNetwork) -> None:
         super().__init__()
@@ -68,7 +77,9 @@ class Decoding(nn.Module):
 
 
 def initialise(network: DetectorNetwork, generator: torch.Generator) -> None:
-    """He-normal weights; small ones at the end, where every class starts out as unlikely as it is."""
+    """He-normal weights; small ones at the end, where every class starts out as
+    unlikely as it is.
+    """
     for module in network.modules():
         if isinstance(module, nn.Conv2d):
             nn.init.kaiming_normal_(module.weight, nonlinearity="relu", generator=generator)
@@ -88,11 +99,13 @@ def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
 def detector_to_onnx(
     network: DetectorNetwork, names: Sequence[str], side_px: int, about: Mapping[str, str]
 ) -> onnx.ModelProto:
-    """A detector as ONNX: `images` (1, 3, S, S) RGB in [0, 1] to `output0` (1, 4 + classes, S * S / 16).
+    """A detector as ONNX: `images` (1, 3, S, S) RGB in [0, 1] to `output0` (1, 4 + classes, S * S /
+    16).
 
-    Layout and metadata are those of Ultralytics' exporter (ultralytics/engine/exporter.py, read for its format; no
-    code is taken from it). A column of the output holds cx, cy, w, h in input pixels, then a score in [0, 1] for
-    each class. Batch normalisation is folded into the convolutions.
+    Layout and metadata are those of Ultralytics' exporter (ultralytics/engine/exporter.py, read for
+    its format; no code is taken from it). A column of the output holds cx, cy, w, h in input
+    pixels, then a score in [0, 1] for each class. Batch normalisation is folded into the
+    convolutions.
 
     Args:
         network: trained.
@@ -116,8 +129,14 @@ def detector_to_onnx(
         )
     model: onnx.ModelProto = onnx.ModelProto.FromString(buffer.getvalue())
     stated = {
-        "task": "detect", "stride": MULTIPLE_PX, "batch": 1, "imgsz": [side_px, side_px], "channels": 3,
+        "task": "detect",
+        "stride": MULTIPLE_PX,
+        "batch": 1,
+        "imgsz": [side_px, side_px],
+        "channels": 3,
         "names": dict(enumerate(names)),
-    }  # fmt: skip
-    onnx.helper.set_model_props(model, {**{key: str(value) for key, value in stated.items()}, **about})
+    }
+    onnx.helper.set_model_props(
+        model, {**{key: str(value) for key, value in stated.items()}, **about}
+    )
     return model

@@ -1,10 +1,11 @@
-"""The paper's protocol: the embedded detector is trained for each row anew, on that row's own pictures.
+"""The paper's protocol: the embedded detector is trained for each row anew, on that row's own
+pictures.
 
     OMP_NUM_THREADS=1 python -m benchmarks.detector.retrain retrained/
 
-Five rows: the reference, and degraded and restored images of two sensors. Each is trained from drawn weights on
-synthetic scenes that no study looks at, with several seeds, and scored on its own row's images of other scenes. A
-detector whose file lies in the folder is not trained again.
+Five rows: the reference, and degraded and restored images of two sensors. Each is trained from
+drawn weights on synthetic scenes that no study looks at, with several seeds, and scored on its own
+row's images of other scenes. A detector whose file lies in the folder is not trained again.
 """
 
 import argparse
@@ -43,7 +44,12 @@ SIDE_PX = 256
 RECIPE = DetectorRecipe(steps=600, batch=8, precision="bfloat16")
 FIRST = 1_000_000
 """Number of the first scene of training: no study draws so many."""
-KEYS = {"mAP50": "mAP50", "mAP50-95": "mAP50-95", "precision": "own precision", "recall": "own recall"}
+KEYS = {
+    "mAP50": "mAP50",
+    "mAP50-95": "mAP50-95",
+    "precision": "own precision",
+    "recall": "own recall",
+}
 
 
 @dataclass(frozen=True)
@@ -86,7 +92,9 @@ def main() -> None:
     rows = conditions(given.sensor.split(","), given.method)
     files = train_missing(rows, recipes, given.scenes, given.seed, given.folder)
     scenes, _ = synthetic_scenes(given.drawn, given.seed, CLASSES, {})
-    scored = {row.name: [row.scores(file, scenes, given.seed) for file in files[row.name]] for row in rows}
+    scored = {
+        row.name: [row.scores(file, scenes, given.seed) for file in files[row.name]] for row in rows
+    }
     made = retrained_rows(scored)
     print_rows(TABLE, made)
     Table("retrain", vars(given), (), tuple(made)).save(given.folder / "figures.json")
@@ -106,7 +114,11 @@ def conditions(sensors: Sequence[str], method: str) -> list[Condition]:
 
 
 def train_missing(
-    rows: Sequence[Condition], recipes: Sequence[DetectorRecipe], scenes: int, seed: int, folder: Path
+    rows: Sequence[Condition],
+    recipes: Sequence[DetectorRecipe],
+    scenes: int,
+    seed: int,
+    folder: Path,
 ) -> dict[str, list[Path]]:
     """The files of all detectors, by row, after the training of those that are not in the folder.
 
@@ -118,7 +130,8 @@ def train_missing(
         folder: of the files.
     """
     files = {
-        row.name: [folder / f"{row.name.replace(', ', '-')}-{each.seed}.onnx" for each in recipes] for row in rows
+        row.name: [folder / f"{row.name.replace(', ', '-')}-{each.seed}.onnx" for each in recipes]
+        for row in rows
     }
     missing = [
         (row, recipe, file)
@@ -130,12 +143,16 @@ def train_missing(
     pictures = training_pictures(list(wanted.values()), scenes if wanted else 0, seed)
     with steps("training detectors", sum(recipe.steps for _, recipe, _ in missing)) as bar:
         for row, recipe, file in missing:
-            network = train_detector(pictures[row.name], len(CLASSES), recipe, lambda _: bar.advance())
+            network = train_detector(
+                pictures[row.name], len(CLASSES), recipe, lambda _: bar.advance()
+            )
             save_onnx(detector_to_onnx(network, CLASSES, SIDE_PX, {"row": row.name}), file)
     return files
 
 
-def training_pictures(rows: Sequence[Condition], scenes: int, seed: int) -> dict[str, list[Picture]]:
+def training_pictures(
+    rows: Sequence[Condition], scenes: int, seed: int
+) -> dict[str, list[Picture]]:
     """What the detectors are trained on, by row: each scene is drawn once for all."""
     found: dict[str, list[Picture]] = {row.name: [] for row in rows}
     with steps("drawing scenes to train on", scenes) as bar:
@@ -149,19 +166,24 @@ def training_pictures(rows: Sequence[Condition], scenes: int, seed: int) -> dict
 
 
 def picture_from(seen: AcquiredScene, method: Method | None) -> Picture:
-    """What a detector is trained on: an image as it would be shown, in its square input, and the boxes on it."""
+    """What a detector is trained on: an image as it would be shown, in its square input, and the
+    boxes on it.
+    """
     rgb = seen.shown(method)
     truth = seen.scene.truth
     height, width, _ = rgb.shape
     box = Letterbox(height, width, SIDE_PX)
-    return picture_of(box.image(rgb), box.to_input(truth.corners / seen.sensors.oversampling), truth.classes)
+    return picture_of(
+        box.image(rgb), box.to_input(truth.corners / seen.sensors.oversampling), truth.classes
+    )
 
 
 def retrained_rows(scored: Mapping[str, Sequence[Mapping[str, float]]]) -> list[Row]:
     """Means over seeds, their spread as the interval; gains and shares of rows that were restored.
 
     Args:
-        scored: by row, reference first, then a degraded and a restored one for each sensor; figures of each seed.
+        scored: by row, reference first, then a degraded and a restored one for each sensor; figures
+            of each seed.
     """
     ap50 = {name: np.array([one["mAP50"] for one in each]) for name, each in scored.items()}
     names = list(scored)

@@ -1,8 +1,8 @@
 """Training of the small detector: the pictures, what its map should say of them, and the steps.
 
-The same seed and pictures give the same weights on one machine. Centres are Gaussian bumps, as wide as the object;
-the boxes of all cells within a bump are held to the object's, each weighed by the bump: it is what makes training
-quick (TTFNet: Liu et al., AAAI 2020, arXiv 1909.00700).
+The same seed and pictures give the same weights on one machine. Centres are Gaussian bumps, as wide
+as the object; the boxes of all cells within a bump are held to the object's, each weighed by the
+bump: it is what makes training quick (TTFNet: Liu et al., AAAI 2020, arXiv 1909.00700).
 """
 
 import math
@@ -50,7 +50,9 @@ def picture_of(rgb: np.ndarray, corners: np.ndarray, classes: np.ndarray) -> Pic
 
 
 def drawn_picture(side_px: int, seed: int, number: int) -> Picture:
-    """The synthetic scene of a number as the reference sensor sees it, stretched by itself, `side_px` a side."""
+    """The synthetic scene of a number as the reference sensor sees it, stretched by itself,
+    `side_px` a side.
+    """
     side = side_px * OVERSAMPLING
     sensor = load_sensor(REFERENCE).nominal()
     radiance, truth = synthetic_scene(np.random.default_rng([STREAM, seed, number]), side, side)
@@ -69,15 +71,20 @@ BOX_WEIGHT = 5.0
 
 @dataclass(frozen=True)
 class Targets:
-    """For a batch: bumps (N, classes, h, w) in [0, 1], boxes (N, 4, h, w) in input pixels, weights (N, 1, h, w)."""
+    """For a batch: bumps (N, classes, h, w) in [0, 1], boxes (N, 4, h, w) in input pixels, weights
+    (N, 1, h, w).
+    """
 
     bumps: Tensor
     boxes: Tensor
     weights: Tensor
 
 
-def targets_of(corners: np.ndarray, classes: np.ndarray, count: int, height: int, width: int) -> list[np.ndarray]:
-    """The targets of one image of height x width cells with boxes (N, 4) in its pixels: bumps, boxes, weights.
+def targets_of(
+    corners: np.ndarray, classes: np.ndarray, count: int, height: int, width: int
+) -> list[np.ndarray]:
+    """The targets of one image of height x width cells with boxes (N, 4) in its pixels: bumps,
+    boxes, weights.
 
     Where two objects claim a cell, the smaller one has its box.
     """
@@ -90,15 +97,20 @@ def targets_of(corners: np.ndarray, classes: np.ndarray, count: int, height: int
         place = bumps[classes[k], rows, columns]
         np.maximum(place, bump, out=place)
         inside = bump > 0
-        boxes[:, rows, columns] = np.where(inside, corners[k][:, None, None], boxes[:, rows, columns])
-        # Every object counts the same in all, and a larger one a little more: the logarithm of its area, in pixels.
+        boxes[:, rows, columns] = np.where(
+            inside, corners[k][:, None, None], boxes[:, rows, columns]
+        )
+        # Every object counts the same in all, and a larger one a little more: the logarithm of its
+        # area, in pixels.
         share = bump / bump.sum() * np.log(max(sizes[k], 2.0))
         weights[0, rows, columns] = np.where(inside, share, weights[0, rows, columns])
     return [bumps, boxes, weights]
 
 
 def _bump(corners: np.ndarray, height: int, width: int) -> tuple[tuple[slice, slice], np.ndarray]:
-    """The cells around the centre of a box in cells, and the Gaussian there: 1 in the cell that holds the centre."""
+    """The cells around the centre of a box in cells, and the Gaussian there: 1 in the cell that
+    holds the centre.
+    """
     middle = (corners[:2] + corners[2:]) / 2
     half = SPREAD * (corners[2:] - corners[:2]) / 2
     column, row = (int(v) for v in np.clip(np.floor(middle), 0, (width - 1, height - 1)))
@@ -126,7 +138,9 @@ def focal_loss(logits: Tensor, bumps: Tensor) -> Tensor:
 
 
 def box_loss(boxes: Tensor, targets: Targets) -> Tensor:
-    """1 less the generalised overlap (GIoU: Rezatofighi et al., 2019, arXiv 1902.09630), weighed."""
+    """1 less the generalised overlap (GIoU: Rezatofighi et al., 2019, arXiv
+    1902.09630), weighed.
+    """
     centre, size = torch.tensor_split(decoded(boxes), 2, dim=1)
     found = torch.cat([centre - size / 2, centre + size / 2], dim=1)
     overlap = generalised_iou(found, targets.boxes)
@@ -139,7 +153,9 @@ def generalised_iou(one: Tensor, other: Tensor) -> Tensor:
     high = torch.minimum(one[:, 2:], other[:, 2:])
     shared = (high - low).clamp(min=0).prod(1, keepdim=True)
     areas = sum((each[:, 2:] - each[:, :2]).prod(1, keepdim=True) for each in (one, other))
-    hull = (torch.maximum(one[:, 2:], other[:, 2:]) - torch.minimum(one[:, :2], other[:, :2])).prod(1, keepdim=True)
+    hull = (torch.maximum(one[:, 2:], other[:, 2:]) - torch.minimum(one[:, :2], other[:, :2])).prod(
+        1, keepdim=True
+    )
     union = areas - shared
     result: Tensor = shared / union.clamp(min=1e-6) - (hull - union) / hull.clamp(min=1e-6)
     return result
@@ -152,7 +168,8 @@ class DetectorRecipe:
     Attributes:
         steps: of the optimiser, AdamW.
         batch: pictures a step.
-        learning_rate: at its height, behind a twentieth of the steps of warm-up and before a cosine to zero.
+        learning_rate: at its height, behind a twentieth of the steps of warm-up and before a cosine
+            to zero.
         weight_decay: AdamW's.
         seed: of the weights, and of the order and the turning of the pictures.
         precision: of the convolutions; the losses are in float32.
@@ -168,7 +185,9 @@ class DetectorRecipe:
     def rate_at(self, step: int) -> float:
         """The learning rate of a step."""
         warm = max(self.steps // 20, 1)
-        return self.learning_rate * min((step + 1) / warm, 0.5 + 0.5 * math.cos(math.pi * step / self.steps))
+        return self.learning_rate * min(
+            (step + 1) / warm, 0.5 + 0.5 * math.cos(math.pi * step / self.steps)
+        )
 
 
 def train_detector(
@@ -210,7 +229,11 @@ def train_detector(
 
 
 def _step(
-    network: DetectorNetwork, optimiser: torch.optim.Optimizer, images: Tensor, targets: Targets, precision: str
+    network: DetectorNetwork,
+    optimiser: torch.optim.Optimizer,
+    images: Tensor,
+    targets: Targets,
+    precision: str,
 ) -> float:
     with torch.autocast("cpu", dtype=torch.bfloat16, enabled=precision == "bfloat16"):
         found = network(images)
@@ -237,13 +260,19 @@ def _average(average: dict[str, Tensor], network: DetectorNetwork, step: int) ->
 def _batch(
     pictures: Sequence[Picture], classes: int, count: int, generator: np.random.Generator
 ) -> tuple[Tensor, Targets]:
-    """Pictures drawn with replacement, each in one of the square's eight symmetries, a little lighter or darker."""
-    chosen = [turned(pictures[int(k)], generator) for k in generator.integers(len(pictures), size=count)]
+    """Pictures drawn with replacement, each in one of the square's eight symmetries, a little
+    lighter or darker.
+    """
+    chosen = [
+        turned(pictures[int(k)], generator) for k in generator.integers(len(pictures), size=count)
+    ]
     images = np.stack([_lit(picture.image, generator) for picture in chosen])
     height, width = (side // STRIDE_PX for side in images.shape[2:])
     each = [targets_of(p.corners, p.classes, classes, height, width) for p in chosen]
     bumps, boxes, weights = (torch.from_numpy(np.stack(kind)) for kind in zip(*each, strict=True))
-    return torch.from_numpy(images).contiguous(memory_format=torch.channels_last), Targets(bumps, boxes, weights)
+    return torch.from_numpy(images).contiguous(memory_format=torch.channels_last), Targets(
+        bumps, boxes, weights
+    )
 
 
 def _lit(image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
@@ -259,10 +288,14 @@ def turned(picture: Picture, generator: np.random.Generator) -> Picture:
     height, width = image.shape[1:]
     if generator.random() < 0.5:
         image = image[..., ::-1]
-        corners = np.stack([width - corners[:, 2], corners[:, 1], width - corners[:, 0], corners[:, 3]], axis=1)
+        corners = np.stack(
+            [width - corners[:, 2], corners[:, 1], width - corners[:, 0], corners[:, 3]], axis=1
+        )
     if generator.random() < 0.5:
         image = image[:, ::-1]
-        corners = np.stack([corners[:, 0], height - corners[:, 3], corners[:, 2], height - corners[:, 1]], axis=1)
+        corners = np.stack(
+            [corners[:, 0], height - corners[:, 3], corners[:, 2], height - corners[:, 1]], axis=1
+        )
     if generator.random() < 0.5 and height == width:
         image = image.transpose(0, 2, 1)
         corners = corners[:, [1, 0, 3, 2]]

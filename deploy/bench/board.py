@@ -1,7 +1,8 @@
-"""A swath on a board or on all, predicted, beside the traditional pipeline on the board's processor and the paper's.
+"""A swath on a board or on all, predicted, beside the traditional pipeline on the board's processor
+and the paper's.
 
-One configuration and one tile size are predicted layer by layer; several are swept. Networks that cannot be tiled are
-predicted by the frame.
+One configuration and one tile size are predicted layer by layer; several are swept. Networks that
+cannot be tiled are predicted by the frame.
 """
 
 import os
@@ -52,7 +53,8 @@ FACE = {"throughput": "fps", "latency": "swath"}
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Predicted(Table):
-    """A network's speed, power and energy on boards, each figure with its interval: a row a configuration.
+    """A network's speed, power and energy on boards, each figure with its interval: a row a
+    configuration.
 
     Attributes:
         layers: where the time goes, layer by layer, of one configuration; empty of several.
@@ -75,7 +77,8 @@ def predict(
 ) -> Predicted:
     """Predict a network on boards by the cost model; nothing is measured.
 
-    A network that cannot be tiled is predicted by the frame: then there is no swath, power nor energy of one.
+    A network that cannot be tiled is predicted by the frame: then there is no swath, power nor
+    energy of one.
 
     Args:
         network: float or INT8.
@@ -105,7 +108,9 @@ def predict(
         raise OptionError("host_task", expected=expected, got=repr(host_task), remedy="choose one")
     found = Network.load(network, sensor=SENSOR, to_run=False)
     boards, corrected = _boards(board, dpu, None if measured is None else Path(measured))
-    width_px, height_px = parse_size("x".join(map(str, size)) if isinstance(size, tuple | list) else str(size))
+    width_px, height_px = parse_size(
+        "x".join(map(str, size)) if isinstance(size, tuple | list) else str(size)
+    )
     try:
         tiling = found.tiling
     except ModelError:
@@ -115,14 +120,24 @@ def predict(
         halo_px = parse_halo(str(halo), tiling.halo_px)
         takes_step = consistency and keeps_pixels(tiling)
         swath = Swath(width_px, height_px, tile, halo_px, consistency=takes_step)
-        predictions, notes = _predictions(found.file, found.model, boards, tile, host_task, swath.step_px)
+        predictions, notes = _predictions(
+            found.file, found.model, boards, tile, host_task, swath.step_px
+        )
         rows = [swath_row(prediction, swath) for prediction in predictions]
     layers = layer_rows(predictions[0]) if len(boards) == 1 else []
     names = ", ".join(each.target.name for each in boards)
-    arguments: dict[str, object] = {"target": names, "dpu": dpu, "size": f"{width_px}x{height_px}", "tile": tile}
+    arguments: dict[str, object] = {
+        "target": names,
+        "dpu": dpu,
+        "size": f"{width_px}x{height_px}",
+        "tile": tile,
+    }
     arguments |= {"halo": halo, "measured": measured, "host_task": host_task}
     shown = [row for _, part in corrected for row in part]
-    shown += [replace(row, figures={FACE.get(key, key): each for key, each in row.figures.items()}) for row in rows]
+    shown += [
+        replace(row, figures={FACE.get(key, key): each for key, each in row.figures.items()})
+        for row in rows
+    ]
     about = ("predict", arguments, (found.input,))
     return Predicted(*about, tuple(shown), notes=tuple(notes), layers=Table(*about, tuple(layers)))
 
@@ -135,13 +150,17 @@ def _predictions(
     task: Task | None,
     step_px: float = 0.0,
 ) -> tuple[list[Prediction], list[str]]:
-    """A network on each board, of its own size where it is fixed to one; and what to say of its host."""
+    """A network on each board, of its own size where it is fixed to one; and what to say of its
+    host.
+    """
     size_px = None if own_tile_px(model) else tile_px
     found = [predict_file(file, dpu, size_px, task, step_px) for dpu in boards]
     return found, [*dict.fromkeys(words for each in found for words in host_words(each))]
 
 
-TRAFFIC = "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch"
+TRAFFIC = (
+    "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch"
+)
 Tables = list[tuple[str, list[Row]]]
 """Rows by the title of their table."""
 
@@ -194,7 +213,8 @@ def bench_board(
         model: ONNX file.
         target: the board, or "all".
         image: the swath; None for a drawn one of `size`.
-        full_scale: the image's pixel value that is full scale; None lets its type and values decide.
+        full_scale: the image's pixel value that is full scale; None lets its type and values
+            decide.
         size: WIDTHxHEIGHT in pixels; None for the paper's.
         tiles_px: tile sides.
         halo: "exact" or a number of pixels.
@@ -202,7 +222,8 @@ def bench_board(
         measured: runs of the user's board, by which the cost model is corrected.
         within_s: what the swath may take; None does not ask.
         host_task: what the host does with the results; None for what the file tells.
-        sensor: that a shipped network is conditioned on: the exposures of `image` are counted; None counts none.
+        sensor: that a shipped network is conditioned on: the exposures of `image` are counted; None
+            counts none.
         consistency: whether the host takes the consistency step.
     """
     network = load_onnx(model)
@@ -214,7 +235,9 @@ def bench_board(
             raise
         return _frames(model, network, boards, corrected, error, host_task)
     dn = read_acquisition(image, full_scale, None) if image else None
-    width_px, height_px = (dn.shape[1], dn.shape[0]) if dn is not None else parse_size(size or PAPER_SIZE)
+    width_px, height_px = (
+        (dn.shape[1], dn.shape[0]) if dn is not None else parse_size(size or PAPER_SIZE)
+    )
     halo_px = parse_halo(halo, tiling.halo_px)
     takes_step = consistency and keeps_pixels(tiling)
     swath = Swath(width_px, height_px, tiles_px[0], halo_px, consistency=takes_step)
@@ -222,7 +245,9 @@ def bench_board(
     if dn is not None and sensor is not None:
         plan = make_plan((1, height_px, width_px), tiles_px[0], halo_px, tiling)
         # `dn` is in 0..MAX_DN whatever the bits of the sensor.
-        counts = tiles_by_factor(dn, plan, factors_for(sensor.nominal()), MAX_DN, offset_of(sensor, MAX_DN))
+        counts = tiles_by_factor(
+            dn, plan, factors_for(sensor.nominal()), MAX_DN, offset_of(sensor, MAX_DN)
+        )
         swath = replace(swath, runs=sum(counts.values()) / plan.tiles)
     targets = list({dpu.target.name: dpu.target for dpu in boards}.values())
     papers = published_rows() if any(each.name == PAPER_TARGET for each in targets) else []
@@ -250,12 +275,19 @@ def exposure_words(counts: Mapping[int, int]) -> list[str]:
         return []
     total = sum(counts.values())
     shares = ", ".join(f"x{factor} {count / total:.0%}" for factor, count in counts.items())
-    return [f"runs of the network by exposure (measured on the image's pixels): {shares}; one tile may need several"]
+    return [
+        (
+            f"runs of the network by exposure (measured on the image's pixels): {shares}; one tile "
+            "may need several"
+        )
+    ]
 
 
 def _layers(model: Path, prediction: Prediction) -> tuple[str, list[Row]]:
     dpu = prediction.dpu
-    return f"{model.name}, one batch on {dpu.target.name} {dpu.name}; {TRAFFIC}", layer_rows(prediction)
+    return f"{model.name}, one batch on {dpu.target.name} {dpu.name}; {TRAFFIC}", layer_rows(
+        prediction
+    )
 
 
 def _frames(
@@ -273,13 +305,17 @@ def _frames(
     size = " x ".join(str(side.dim_value or TILE_PX) for side in sides)
     layers = [_layers(model, predictions[0])] if len(boards) == 1 else []
     whole = f"not tiled, but run on whole images: expected {why.expected}, got {why.got}"
-    return BoardBench([*corrected, (f"{model.name}, frames of {size}", rows)], [whole, *notes], layers)
+    return BoardBench(
+        [*corrected, (f"{model.name}, frames of {size}", rows)], [whole, *notes], layers
+    )
 
 
 def _boards(
     target: BoardLike | Sequence[BoardLike], config: str | None, measured: Path | None
 ) -> tuple[list[Dpu], Tables]:
-    """The configurations asked for; corrected by runs where they are given, and the tables that say so."""
+    """The configurations asked for; corrected by runs where they are given, and the tables that say
+    so.
+    """
     if target == ALL and config not in (None, ALL):
         expected = "'all' or none beside all boards"
         remedy = "leave it out, or name the board"
@@ -289,7 +325,11 @@ def _boards(
         remedy = "name the board that the runs are of"
         raise OptionError("target", expected=expected, got=repr(target), remedy=remedy)
     targets = boards_of(target)
-    boards = [dpu_of(each, name) for each in targets for name in (each.configurations if config == ALL else [config])]
+    boards = [
+        dpu_of(each, name)
+        for each in targets
+        for name in (each.configurations if config == ALL else [config])
+    ]
     if measured is None:
         return boards, []
     found = read_own_runs(measured, boards[0])

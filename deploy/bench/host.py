@@ -38,8 +38,12 @@ class Timed:
     held_bytes: int = 0
 
 
-def time_networks(runs: Sequence[Timed], tile_px: int, threads: int, min_time_s: float, min_runs: int) -> None:
-    """Time each for a grey tile, interleaved, until all have run for `min_time_s` and `min_runs` times."""
+def time_networks(
+    runs: Sequence[Timed], tile_px: int, threads: int, min_time_s: float, min_runs: int
+) -> None:
+    """Time each for a grey tile, interleaved, until all have run for `min_time_s` and `min_runs`
+    times.
+    """
     calls = []
     for run in runs:
         shapes = inputs_of(run.model, tile_px, run.name)
@@ -82,26 +86,31 @@ def _mean_power(run: Timed) -> Figure:
     missing = next((power for power in run.powers if power.value is None), None)
     if missing is not None:
         return unavailable("W", missing.reason)
-    energy_j = sum((power.value or 0.0) * time_s for power, time_s in zip(run.powers, run.times_s, strict=True))
+    energy_j = sum(
+        (power.value or 0.0) * time_s for power, time_s in zip(run.powers, run.times_s, strict=True)
+    )
     return measured(energy_j / sum(run.times_s), "W", run.powers[0].source)
 
 
 def host_rows(
     model: Path, target: TargetProfile, tile_px: int, threads: int = 0, sensor: Sensor | None = None
 ) -> list[Row]:
-    """A network's time for one tile through onnxruntime, float32 and INT8 interleaved, and how much faster INT8 is.
+    """A network's time for one tile through onnxruntime, float32 and INT8 interleaved, and how much
+    faster INT8 is.
 
     With a `sensor` the time of the consistency step is a row too.
 
-    Each runs for the target's minimum time and count, one run for warm-up left out. Its pair in the other
-    precision is the shipped network of the same variant; without one it runs alone.
+    Each runs for the target's minimum time and count, one run for warm-up left out. Its pair in the
+    other precision is the shipped network of the same variant; without one it runs alone.
     """
     require_cores("threads", threads)
     given = load_onnx(model)
     other = other_precision(given)
     runs = [Timed(model.stem, given)]
     if other is not None:
-        runs.append(Timed(f"{'INT8' if is_quantised(other) else 'float32'} of the same shape", other))
+        runs.append(
+            Timed(f"{'INT8' if is_quantised(other) else 'float32'} of the same shape", other)
+        )
     min_time_s = target.value("measurement", "min_time_s")
     min_runs = int(target.value("measurement", "min_runs"))
     cpu_load()
@@ -117,13 +126,21 @@ def step_row(sensor: Sensor, tile_px: int, min_time_s: float, min_runs: int) -> 
     """Time the consistency step on one thread here, on a tile of noise."""
     instrument = sensor.nominal()
     step = Consistency.of(instrument, sensor.reference.nominal())
-    raw = np.random.default_rng(0).uniform(0, instrument.max_dn / 2, (tile_px, tile_px)).astype(np.float32)
+    raw = (
+        np.random.default_rng(0)
+        .uniform(0, instrument.max_dn / 2, (tile_px, tile_px))
+        .astype(np.float32)
+    )
     side = Placed(tile_px, 0, 0, tile_px)
     call = partial(step.correction, raw, raw, side, side, (0, 0))
     call()
-    times_ms = np.array([1e3 * time_s for time_s, _ in interleaved([call], min_runs, min_time_s)[0]])
+    times_ms = np.array(
+        [1e3 * time_s for time_s, _ in interleaved([call], min_runs, min_time_s)[0]]
+    )
     source = f"{len(times_ms)} runs on one thread after one for warm-up"
-    figures = {f"p{p}": measured(float(np.percentile(times_ms, p)), "ms/tile", source) for p in (50, 90)}
+    figures = {
+        f"p{p}": measured(float(np.percentile(times_ms, p)), "ms/tile", source) for p in (50, 90)
+    }
     return Row("host", f"consistency step, {tile_px} x {tile_px}", figures)
 
 

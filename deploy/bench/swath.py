@@ -1,4 +1,6 @@
-"""The image that a benchmark is about, the tiles that it is cut into, and the figures that are predicted of it."""
+"""The image that a benchmark is about, the tiles that it is cut into, and the figures that are
+predicted of it.
+"""
 
 import math
 from dataclasses import dataclass
@@ -31,7 +33,8 @@ class Swath:
         height_px: of the image.
         tile_px: side of a tile.
         halo_px: context around what is kept of a tile.
-        runs: how often the network runs on a tile, once for each exposure that its pixels ask for; a mean.
+        runs: how often the network runs on a tile, once for each exposure that its pixels ask for;
+            a mean.
         consistency: whether the host takes the consistency step.
     """
 
@@ -49,42 +52,59 @@ class Swath:
 
     @property
     def frames(self) -> float:
-        """Tiles as the paper counts: pixels of the image over pixels of a tile, a fraction, without halo.
+        """Tiles as the paper counts: pixels of the image over pixels of a tile, a fraction, without
+        halo.
 
-        13600 x 9016 at 640 is 299.4; at the published 7.2 frames a second that is the published 42 s.
+        13600 x 9016 at 640 is 299.4; at the published 7.2 frames a second that is the published 42
+        s.
         """
         return self.pixels / self.tile_px**2
 
     @property
     def tiles(self) -> int:
-        """Whole tiles of the grid, the last row and column moved inward: 384 of the paper's swath, halo 35."""
-        rows, columns = (plan_side(side, self.tile_px, self.halo_px) for side in (self.height_px, self.width_px))
+        """Whole tiles of the grid, the last row and column moved inward: 384 of the paper's swath,
+        halo 35.
+        """
+        rows, columns = (
+            plan_side(side, self.tile_px, self.halo_px) for side in (self.height_px, self.width_px)
+        )
         return len(rows) * len(columns)
 
     @property
     def step_px(self) -> float:
-        """Pixels of the image for which the host takes the consistency step, for each run of the network."""
+        """Pixels of the image for which the host takes the consistency step, for each run of the
+        network.
+        """
         return self.pixels / (self.tiles * self.runs) if self.consistency else 0.0
 
 
 def predict_file(
-    model: Path, dpu: Dpu, tile_px: int | None = TILE_PX, task: Task | None = None, step_px: float = 0.0
+    model: Path,
+    dpu: Dpu,
+    tile_px: int | None = TILE_PX,
+    task: Task | None = None,
+    step_px: float = 0.0,
 ) -> Prediction:
-    """What the cost model says of an ONNX file, for tiles of that side or, with None, for the size it is fixed to.
+    """What the cost model says of an ONNX file, for tiles of that side or, with None, for the size
+    it is fixed to.
 
     The `task` of the host is what the file tells, if none is given; `step_px` as of `predict`.
     """
     return predict(place(read_network(model, tile_px), dpu), dpu, task, step_px)
 
 
-def swath_figures(prediction: Prediction, swath: Swath, frames: float, batches: float) -> dict[str, Figure]:
+def swath_figures(
+    prediction: Prediction, swath: Swath, frames: float, batches: float
+) -> dict[str, Figure]:
     """Return the figures of a swath that takes `frames` tiles in `batches` batches."""
     power = dpu_power(prediction.dpu)
     latency = swath_latency(prediction, batches)
     step = {"consistency step": step_time(prediction, swath)} if swath.consistency else {}
     return {
         "tiles": exact(frames, "tile", ARITHMETIC),
-        "network runs": exact(swath.runs, "run/tile", "exposures that the image's tiles ask for; 1 without an image"),
+        "network runs": exact(
+            swath.runs, "run/tile", "exposures that the image's tiles ask for; 1 without an image"
+        ),
         "work factor": exact(frames * swath.tile_px**2 / swath.pixels, "px/px", ARITHMETIC),
         "latency": latency,
         "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
@@ -96,10 +116,15 @@ def swath_figures(prediction: Prediction, swath: Swath, frames: float, batches: 
 
 
 def step_time(prediction: Prediction, swath: Swath) -> Figure:
-    """Time of the consistency step for the swath on the host's cores, in s; it runs while the DPU works."""
+    """Time of the consistency step for the swath on the host's cores, in s; it runs while the DPU
+    works.
+    """
     runs = swath.tiles * swath.runs
     low_s, high_s = (end_s * runs for end_s in prediction.step_s)
-    source = "counted work of the step at the rates of the board's processor, from the best published to plain code"
+    source = (
+        "counted work of the step at the rates of the board's processor, from the best "
+        "published to plain code"
+    )
     return predicted(between((low_s, high_s)), "s", (low_s, high_s), source)
 
 
@@ -110,11 +135,15 @@ def host_time(prediction: Prediction, unit: str) -> Figure:
 
 
 def one_thread_latency(prediction: Prediction) -> Figure:
-    """From image to result where one thread runs one core's batch and does the host's work itself, in ms."""
+    """From image to result where one thread runs one core's batch and does the host's work itself,
+    in ms.
+    """
     low_s, high_s = prediction.latency_interval_s
     handlers = prediction.dpu.handlers
     images = f"a batch of {handlers}" if handlers > 1 else "one image"
-    source = f"{COST_SOURCE}, its fit to rates with one thread: {images} through one core, then the host"
+    source = (
+        f"{COST_SOURCE}, its fit to rates with one thread: {images} through one core, then the host"
+    )
     return predicted(1e3 * prediction.latency_s, "ms/batch", (1e3 * low_s, 1e3 * high_s), source)
 
 
@@ -126,10 +155,16 @@ def swath_latency(prediction: Prediction, batches: float) -> Figure:
 
 
 def fitted_range(prediction: Prediction) -> str:
-    """Whether the fitted networks speak for this one, and how often the board's intervals held, if too rarely."""
+    """Whether the fitted networks speak for this one, and how often the board's intervals held, if
+    too rarely.
+    """
     found = f"outside: {'; '.join(prediction.outside)}" if prediction.outside else "inside"
     share = prediction.dpu.value("cost", "families_held")
-    return found if share >= HELD else f"{found}; intervals held {100 * share:.0f} % of families left out"
+    return (
+        found
+        if share >= HELD
+        else f"{found}; intervals held {100 * share:.0f} % of families left out"
+    )
 
 
 def energy(latency: Figure, power: Figure) -> Figure:
@@ -142,7 +177,9 @@ def energy(latency: Figure, power: Figure) -> Figure:
 
 
 def efficiency(pixels: int, latency: Figure, power: Figure) -> Figure:
-    """Pixels a second and watt; its interval pairs the slowest run with the highest power and the reverse."""
+    """Pixels a second and watt; its interval pairs the slowest run with the highest power and the
+    reverse.
+    """
     unit = "px/s/W"
     if power.value is None or latency.value is None:
         return unavailable(unit, power.reason or latency.reason)
@@ -162,23 +199,31 @@ def interval_ends(figure: Figure) -> Interval:
 def chain_rate(swath: Swath, latency: Figure) -> Figure:
     """Tiles a second, as the paper counts them, of a predicted latency of the swath."""
     low, high = (swath.frames / end_s for end_s in reversed(interval_ends(latency)))
-    return predicted(swath.frames / (latency.value or math.inf), "frame/s", (low, high), latency.source)
+    return predicted(
+        swath.frames / (latency.value or math.inf), "frame/s", (low, high), latency.source
+    )
 
 
-def exact(value: float, unit: str, source: str = "arithmetic of the graph's shapes, one image") -> Figure:
+def exact(
+    value: float, unit: str, source: str = "arithmetic of the graph's shapes, one image"
+) -> Figure:
     """A number that follows from shapes alone."""
     return predicted(value, unit, (value, value), source)
 
 
 def scaled(value: float, unit: str, prediction: Prediction) -> Figure:
     """A part of the prediction, with the relative error of the whole."""
-    return predicted(value, unit, (value / prediction.spread, value * prediction.spread), COST_SOURCE)
+    return predicted(
+        value, unit, (value / prediction.spread, value * prediction.spread), COST_SOURCE
+    )
 
 
 def parse_size(text: str) -> tuple[int, int]:
     """WIDTHxHEIGHT in pixels as (width, height)."""
     parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isdecimal() and 0 < int(part[:9]) <= SIDE_PX for part in parts):
+    if len(parts) != 2 or not all(
+        part.isdecimal() and 0 < int(part[:9]) <= SIDE_PX for part in parts
+    ):
         expected = f"WIDTHxHEIGHT of 1 to {SIDE_PX} pixels"
         remedy = f"write it as {PAPER_SIZE}"
         raise OptionError("size", expected=expected, got=repr(text), remedy=remedy)

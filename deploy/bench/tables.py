@@ -1,7 +1,7 @@
 """The rows of the bench that need no measurement here.
 
-These are a network on the DPU and the traditional pipeline on the board's own processor, both predicted, and the
-paper's figures.
+These are a network on the DPU and the traditional pipeline on the board's own processor, both
+predicted, and the paper's figures.
 """
 
 import math
@@ -71,18 +71,24 @@ def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]
 
 
 QUOTED = {"latency": "ms", "throughput": "fps"}
-"""Of the tables [published_latency_ms] and [published_throughput_fps]: the figure's name and unit."""
+"""Of the tables [published_latency_ms] and [published_throughput_fps]: the
+figure's name and unit.
+"""
 
 
 def quoted_rows(network: str, target: TargetProfile) -> list[Row]:
-    """A network on a board without a cost model, unavailable; and what the board's maker prints of other networks."""
+    """A network on a board without a cost model, unavailable; and what the board's maker prints of
+    other networks.
+    """
     reason = f"too few rates of {target.name} are published to fit a cost model"
     own = {key: unavailable(unit, reason) for key, unit in QUOTED.items()}
     own["power"] = unavailable("W", f"no power of {target.name} is published")
     rows = [Row(TABLE, f"{network} on {target.name}", own)]
     for key, unit in QUOTED.items():
         for name, constant in target.tables.get(f"published_{key}_{unit}", {}).items():
-            rows.append(Row(TABLE, f"quoted: {name}", {key: published(constant.low, unit, constant.source)}))
+            rows.append(
+                Row(TABLE, f"quoted: {name}", {key: published(constant.low, unit, constant.source)})
+            )
     return rows
 
 
@@ -94,13 +100,19 @@ def published_rows() -> list[Row]:
     }
     units = {"latency": "s", "throughput": "frame/s", "power": "W", "efficiency": "px/s/W"}
     return [
-        Row(TABLE, name, {k: published(v, units[k], PAPER) for k, v in zip(units, values, strict=True)})
+        Row(
+            TABLE,
+            name,
+            {k: published(v, units[k], PAPER) for k, v in zip(units, values, strict=True)},
+        )
         for name, values in runs.items()
     ]
 
 
 def processor_row(swath: Swath, board: TargetProfile) -> Row:
-    """The traditional pipeline on the board's own processor, from the time of 10^6 pixels that its file states."""
+    """The traditional pipeline on the board's own processor, from the time of 10^6 pixels that its
+    file states.
+    """
     cpu = board.tables.get("cpu", {})
     mpx = swath.pixels / 1e6
     watts = board.tables.get("power", {}).get("cpu_run_w")
@@ -128,11 +140,15 @@ def processor_row(swath: Swath, board: TargetProfile) -> Row:
 def layer_rows(prediction: Prediction) -> list[Row]:
     """One row a layer; their times add up to that of a batch, the last row.
 
-    The columns are those of AMD's vaitrace, with what bounds the layer; bytes and energy are those of one image.
+    The columns are those of AMD's vaitrace, with what bounds the layer; bytes and energy are those
+    of one image.
     """
     rows = [_layer_row(layer, prediction) for layer in prediction.layers]
     total = f"sum: one batch of {prediction.batch}"
-    return [*rows, Row(LAYERS, total, {"time": scaled(1e3 * prediction.batch_time_s, "ms/batch", prediction)})]
+    return [
+        *rows,
+        Row(LAYERS, total, {"time": scaled(1e3 * prediction.batch_time_s, "ms/batch", prediction)}),
+    ]
 
 
 def _layer_row(layer: LayerCost, prediction: Prediction) -> Row:
@@ -146,12 +162,26 @@ def _layer_row(layer: LayerCost, prediction: Prediction) -> Row:
         "work": exact(work.operations / 1e9, "GOP"),
         "time": scaled(1e3 * layer.time_s, "ms/batch", prediction),
         "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction),
-        "LdFM": exact(work.load_map_bytes / 1e6, "MB", "feature maps that an image loads, by the graph's shapes"),
-        "LdWB": exact(work.weight_bytes / 1e6, "MB", "weights and biases that a batch loads, by the graph's shapes"),
-        "StFM": exact(work.store_map_bytes / 1e6, "MB", "feature maps that an image stores, by the graph's shapes"),
+        "LdFM": exact(
+            work.load_map_bytes / 1e6,
+            "MB",
+            "feature maps that an image loads, by the graph's shapes",
+        ),
+        "LdWB": exact(
+            work.weight_bytes / 1e6,
+            "MB",
+            "weights and biases that a batch loads, by the graph's shapes",
+        ),
+        "StFM": exact(
+            work.store_map_bytes / 1e6,
+            "MB",
+            "feature maps that an image stores, by the graph's shapes",
+        ),
         "bandwidth": scaled(moved / seconds / 1e9, "GB/s", prediction),
         "array use": exact(100 * work.array_use, "%"),
-        "energy": predicted(500 * (low_j + high_j), "mJ", (1e3 * low_j, 1e3 * high_j), energy_source(dpu)),
+        "energy": predicted(
+            500 * (low_j + high_j), "mJ", (1e3 * low_j, 1e3 * high_j), energy_source(dpu)
+        ),
     }
     return Row(LAYERS, work.name, figures, {"bound": layer.bound})
 
@@ -161,7 +191,11 @@ MOST_TILE_PX = 8192
 
 
 def sweep_rows(
-    model: Path, swath: Swath, boards: Sequence[Dpu], tiles_px: Sequence[int], task: Task | None = None
+    model: Path,
+    swath: Swath,
+    boards: Sequence[Dpu],
+    tiles_px: Sequence[int],
+    task: Task | None = None,
 ) -> list[Row]:
     """A row a configuration and tile size, for whole tiles with the swath's halo."""
     rows = []
@@ -191,9 +225,11 @@ def _named(prediction: Prediction) -> str:
 
 
 def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) -> str:
-    """Which DPU, the one of the lowest peak, meets a time for the swath: surely, probably, or only at best.
+    """Which DPU, the one of the lowest peak, meets a time for the swath: surely, probably, or only
+    at best.
 
-    One that does so surely is not named again for what is less. Peaks stand for prices, which no file states.
+    One that does so surely is not named again for what is less. Peaks stand for prices, which no
+    file states.
 
     Args:
         rows: those of `sweep_rows`, the boards' one behind the other, as many of each.
@@ -209,7 +245,11 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
         "at best": lambda latency: interval_ends(latency)[0],
     }
     for how, end in ends.items():
-        fits = [(peak, row) for peak, row in placed if (end(row.figures["latency"]) or math.inf) <= within_s]
+        fits = [
+            (peak, row)
+            for peak, row in placed
+            if (end(row.figures["latency"]) or math.inf) <= within_s
+        ]
         if fits:
             peak, row = min(fits, key=lambda fit: fit[0])
             found.setdefault(f"{row.name} ({peak / 1e12:.3g} TOPS)", how)
@@ -235,13 +275,17 @@ def frame_row(prediction: Prediction) -> Row:
 
 
 def host_words(prediction: Prediction) -> list[str]:
-    """What was assumed of the file, and what the processor runs because the DPU refuses it; a sentence each."""
+    """What was assumed of the file, and what the processor runs because the DPU refuses it; a
+    sentence each.
+    """
     found = [prediction.note] if prediction.note else []
     if prediction.refused:
         low_ms, high_ms = (1e3 * end_s for end_s in prediction.refused_s)
         found.append(
-            f"the processor of {prediction.dpu.target.name} runs what its DPU refuses ('beers-deploy check' says "
-            f"why): {', '.join(prediction.refused)}; {number(low_ms, 2)} to {number(high_ms, 2)} ms an image, from "
+            f"the processor of {prediction.dpu.target.name} runs what its DPU refuses "
+            "('beers-deploy check' says "
+            f"why): {', '.join(prediction.refused)}; {number(low_ms, 2)} to "
+            f"{number(high_ms, 2)} ms an image, from "
             "the best that is published of its cores to plain code"
         )
     return found
@@ -250,9 +294,14 @@ def host_words(prediction: Prediction) -> list[str]:
 def parse_tiles(text: str) -> list[int]:
     """Tile sides in pixels, with commas between them."""
     parts = [part.strip() for part in text.split(",")]
-    if not all(part.isdecimal() and len(part) < 6 and 16 <= int(part) <= MOST_TILE_PX for part in parts):
+    if not all(
+        part.isdecimal() and len(part) < 6 and 16 <= int(part) <= MOST_TILE_PX for part in parts
+    ):
         remedy = "write one size, or several as 640,256,128"
         raise OptionError(
-            "tile", expected=f"tile sides of 16 to {MOST_TILE_PX} pixels", got=repr(text), remedy=remedy
+            "tile",
+            expected=f"tile sides of 16 to {MOST_TILE_PX} pixels",
+            got=repr(text),
+            remedy=remedy,
         )
     return [int(part) for part in parts]

@@ -16,7 +16,9 @@ Result = TypeVar("Result")
 
 
 def timed(work: Callable[[], Result], powercap: Path = POWERCAP) -> tuple[Result, float, Figure]:
-    """Do some work; return its result, its wall time in seconds, and the processor packages' mean power."""
+    """Do some work; return its result, its wall time in seconds, and the processor packages' mean
+    power.
+    """
     before = _read(powercap)
     start = time.perf_counter()
     result = work()
@@ -34,17 +36,26 @@ def _power(before: dict[Path, int] | str, after: dict[Path, int] | str, elapsed_
 
 
 def _advance(domain: Path, before: int, after: int) -> int:
-    """Counts between two readings of a counter that starts again at its range; one turn at most (minutes)."""
-    range_uj = 0 if after >= before else int((domain / "max_energy_range_uj").read_text(encoding="utf-8"))
+    """Counts between two readings of a counter that starts again at its range; one turn at most
+    (minutes).
+    """
+    range_uj = (
+        0 if after >= before else int((domain / "max_energy_range_uj").read_text(encoding="utf-8"))
+    )
     return after - before + range_uj
 
 
 def _read(powercap: Path) -> dict[Path, int] | str:
     """Counters of the packages in microjoules, or why there are none."""
     try:
-        names = {domain: (domain / "name").read_text(encoding="utf-8") for domain in powercap.glob("*rapl*:*")}
+        names = {
+            domain: (domain / "name").read_text(encoding="utf-8")
+            for domain in powercap.glob("*rapl*:*")
+        }
         packages = [domain for domain, name in names.items() if name.startswith("package")]
-        counters = {domain: int((domain / "energy_uj").read_text(encoding="utf-8")) for domain in packages}
+        counters = {
+            domain: int((domain / "energy_uj").read_text(encoding="utf-8")) for domain in packages
+        }
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "no number in it"
         return f"RAPL energy counters cannot be read here ({reason})"
@@ -65,7 +76,10 @@ def interleaved(
         Of each call, round by round.
     """
     found: list[list[tuple[float, Figure]]] = [[] for _ in calls]
-    while len(found[0]) < rounds or min(sum(time_s for time_s, _ in taken) for taken in found) < least_s:
+    while (
+        len(found[0]) < rounds
+        or min(sum(time_s for time_s, _ in taken) for taken in found) < least_s
+    ):
         for call, taken in zip(calls, found, strict=True):
             taken.append(timed(call)[1:])
     return found

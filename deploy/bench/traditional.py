@@ -1,4 +1,6 @@
-"""The traditional pipeline on this processor: measured on crops of an image, extrapolated by the pixel."""
+"""The traditional pipeline on this processor: measured on crops of an image, extrapolated by the
+pixel.
+"""
 
 import statistics
 import time
@@ -67,7 +69,9 @@ def measure_chain(dn: np.ndarray, degraded: Sensor, reference: Sensor) -> ChainT
     times_s, _, power = timed(lambda: [_time_s(crop, chain) for crop in crops])
     per_mpx = [1e6 * time_s / crop.numel() for time_s, crop in zip(times_s, crops, strict=True)]
     height, width = crops[0].shape
-    return ChainTime(per_mpx, power, conditions_of(torch.get_num_threads()), f"{width} x {height} pixels")
+    return ChainTime(
+        per_mpx, power, conditions_of(torch.get_num_threads()), f"{width} x {height} pixels"
+    )
 
 
 def _time_s(dn: torch.Tensor, chain: Chain) -> float:
@@ -76,7 +80,9 @@ def _time_s(dn: torch.Tensor, chain: Chain) -> float:
     return time.perf_counter() - start_s
 
 
-def drawn_acquisition(swath: Swath, degraded: Sensor, reference: Sensor, seed: int = 0) -> np.ndarray:
+def drawn_acquisition(
+    swath: Swath, degraded: Sensor, reference: Sensor, seed: int = 0
+) -> np.ndarray:
     """Digital numbers of a drawn scene, as large as the swath but no larger than the crops need."""
     ratio = int(degraded.oversampling.low)
     sides = min(swath.height_px, CROP_PX), min(swath.width_px, CROPS * CROP_PX)
@@ -90,5 +96,8 @@ def _crops(dn: np.ndarray) -> Iterator[np.ndarray]:
     """Square crops along the image's diagonal, or the image where it is no larger."""
     height, width = (min(CROP_PX, side) for side in dn.shape)
     for k in range(CROPS):
-        top, left = ((side - crop) * k // (CROPS - 1) for side, crop in zip(dn.shape, (height, width), strict=True))
+        top, left = (
+            (side - crop) * k // (CROPS - 1)
+            for side, crop in zip(dn.shape, (height, width), strict=True)
+        )
         yield dn[top : top + height, left : left + width]

@@ -1,4 +1,6 @@
-"""`beers-deploy bench`: time, throughput, power and efficiency; predicted, measured and published side by side."""
+"""`beers-deploy bench`: time, throughput, power and efficiency; predicted, measured and published
+side by side.
+"""
 
 from enum import StrEnum
 from functools import partial
@@ -40,13 +42,17 @@ HOST_ONLY = ("threads",)
 BOARD = f"{DEFAULT_TARGET}{MODEL_SUFFIX}"
 HOSTS = ("host", "host-cpu")
 BOARDS = ", ".join(board_names())
-PREDICTED = "No board was used: the DPU's figures come from a cost model, its power from an assumption."
+PREDICTED = (
+    "No board was used: the DPU's figures come from a cost model, its power from an assumption."
+)
 LAYERS = "--layers shows where the time goes, layer by layer; --json holds it always."
 NO_PROXY = "Time on this CPU is no proxy for the DPU: here INT8 may even run slower than float."
 
 
 class HostTask(StrEnum):
-    """What the host does with a network's results; the names are those of `deploy.dpu.cost.model`."""
+    """What the host does with a network's results; the names are those of
+    `deploy.dpu.cost.model`.
+    """
 
     copy = "copy"
     argmax = "argmax"
@@ -58,53 +64,80 @@ class HostTask(StrEnum):
 def bench(
     context: typer.Context,
     model: Annotated[
-        Path | None, typer.Argument(metavar="[MODEL]", help="ONNX network; the shipped INT8 one if none.")
+        Path | None,
+        typer.Argument(metavar="[MODEL]", help="ONNX network; the shipped INT8 one if none."),
     ] = None,
     target: Annotated[
         str,
         typer.Option(
-            help=f"The modelled board ({BOARDS}, or your .toml file), with or without -model behind its name; "
-            f"'all' of them; host, this machine; or {', '.join(npu_names())}, of which figures are quoted alone."
+            help=f"The modelled board ({BOARDS}, or your .toml file), with or without -model "
+            "behind its name; "
+            f"'all' of them; host, this machine; or {', '.join(npu_names())}, of which figures "
+            "are quoted alone."
         ),
     ] = BOARD,
     sensor: Annotated[
         str, typer.Option(help="Sensor of a shipped network: a profile, your .toml file, or blind.")
     ] = SENSOR,
-    image: Annotated[Path | None, typer.Option(help="Mono image of at most 12 bits: the swath.")] = None,
+    image: Annotated[
+        Path | None, typer.Option(help="Mono image of at most 12 bits: the swath.")
+    ] = None,
     full_scale: Annotated[
         float | None, typer.Option(help="Pixel value of --image that is full scale; 4095 if none.")
     ] = None,
     size: Annotated[
-        str | None, typer.Option(help=f"Width x height of the swath in pixels; {PAPER_SIZE} if none.")
+        str | None,
+        typer.Option(help=f"Width x height of the swath in pixels; {PAPER_SIZE} if none."),
     ] = None,
-    tile: Annotated[str, typer.Option(help="Tile side in pixels; several with commas are swept.")] = "640",
-    halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
+    tile: Annotated[
+        str, typer.Option(help="Tile side in pixels; several with commas are swept.")
+    ] = "640",
+    halo: Annotated[
+        str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")
+    ] = "exact",
     dpu: Annotated[
         str | None, typer.Option(help="DPU configuration, such as C32B3; 'all' sweeps the board's.")
     ] = None,
     host_task: Annotated[
         HostTask | None,
         typer.Option(
-            help="What the host does with the results where the file does not tell: read them (copy), the best of "
+            help="What the host does with the results where the file does not tell: read them "
+            "(copy), the best of "
             "classes (argmax, softmax), boxes (sort), an image."
         ),
     ] = None,
     measured: Annotated[
-        Path | None, typer.Option(help="JSON list of your board's runs: the cost model is corrected by them first.")
+        Path | None,
+        typer.Option(
+            help="JSON list of your board's runs: the cost model is corrected by them first."
+        ),
     ] = None,
     no_traditional: Annotated[
-        bool, typer.Option("--no-traditional", help="Do not measure the traditional pipeline on this processor.")
+        bool,
+        typer.Option(
+            "--no-traditional", help="Do not measure the traditional pipeline on this processor."
+        ),
     ] = False,
     within: Annotated[
         float | None,
-        typer.Option(min=0, help="Seconds that the swath may take: which is the smallest DPU that meets them?"),
+        typer.Option(
+            min=0,
+            help="Seconds that the swath may take: which is the smallest DPU that meets them?",
+        ),
     ] = None,
     consistency: Annotated[
         bool,
-        typer.Option("--consistency/--no-consistency", help="Count the consistency step on the board's processor."),
+        typer.Option(
+            "--consistency/--no-consistency",
+            help="Count the consistency step on the board's processor.",
+        ),
     ] = True,
-    layers: Annotated[bool, typer.Option("--layers", help="Show where the time goes, layer by layer.")] = False,
-    threads: Annotated[int, typer.Option(min=0, help="Threads of the host's runtime; 0 takes every core.")] = 0,
+    layers: Annotated[
+        bool, typer.Option("--layers", help="Show where the time goes, layer by layer.")
+    ] = False,
+    threads: Annotated[
+        int, typer.Option(min=0, help="Threads of the host's runtime; 0 takes every core.")
+    ] = 0,
     json: Json = None,
 ) -> None:
     """Compare a network on the DPU with the traditional pipeline and with the paper's figures."""
@@ -132,9 +165,17 @@ def bench(
             print_rows(f"{path.name} on this machine: {table}", part)
         say(NO_PROXY)
     elif board != ALL and (profile := load_target(board)).npu:
-        refuse(context, BOARD_ONLY, expected=f"none with {profile.name}, for which nothing is predicted", got="one")
+        refuse(
+            context,
+            BOARD_ONLY,
+            expected=f"none with {profile.name}, for which nothing is predicted",
+            got="one",
+        )
         rows = quoted_rows(path.stem, profile)
-        print_rows(f"{path.name} on {profile.name}: nothing is predicted; published are other networks", rows)
+        print_rows(
+            f"{path.name} on {profile.name}: nothing is predicted; published are other networks",
+            rows,
+        )
     else:
         task = next((name for name in TASKS if name == host_task), None)
         found = bench_board(
@@ -162,7 +203,10 @@ def bench(
                 rows = [*rows, _traditional_row(found.dn, found.swath)]
                 print_rows("the traditional pipeline, measured on crops here", rows[-1:])
             except ImportError as error:
-                say(f"The traditional pipeline is not measured here: {missing_extra(error, 'bench')}")
+                say(
+                    "The traditional pipeline is not measured here: "
+                    f"{missing_extra(error, 'bench')}"
+                )
     require_same(read, path, image, measured)
     save(Table("bench", arguments(), read, tuple(rows)), json)
 
@@ -175,11 +219,15 @@ def _required_layers(found: "BoardBench") -> "Tables":
 
 
 def _traditional_row(dn: "np.ndarray | None", swath: "Swath") -> "Row":
-    """Measured here: seconds, and torch is loaded for it; so it comes when all predictions have been shown."""
+    """Measured here: seconds, and torch is loaded for it; so it comes when all predictions have
+    been shown.
+    """
     from beers_deploy.bench.traditional import drawn_acquisition, measure_chain
 
     sensors = load_sensor(SENSOR), load_sensor(REFERENCE)
-    return measure_chain(drawn_acquisition(swath, *sensors) if dn is None else dn, *sensors).row(swath)
+    return measure_chain(drawn_acquisition(swath, *sensors) if dn is None else dn, *sensors).row(
+        swath
+    )
 
 
 def _refuse_unused(context: typer.Context, here: bool) -> None:
@@ -187,11 +235,23 @@ def _refuse_unused(context: typer.Context, here: bool) -> None:
     wanted = "the modelled board" if here else "--target host"
     expected = f"{wanted} beside it"
     remedy = f"leave it out, or take {wanted}"
-    refuse(context, BOARD_ONLY if here else HOST_ONLY, expected=expected, got="the other target", remedy=remedy)
+    refuse(
+        context,
+        BOARD_ONLY if here else HOST_ONLY,
+        expected=expected,
+        got="the other target",
+        remedy=remedy,
+    )
     if context.params["image"] is None:
         refuse(context, ["full_scale"], expected="--image beside it")
     else:
-        refuse(context, ["size"], expected="none with --image", got="both", remedy="give one of the two")
+        refuse(
+            context,
+            ["size"],
+            expected="none with --image",
+            got="both",
+            remedy="give one of the two",
+        )
 
 
 def _single(tiles: list[int]) -> int:

@@ -1,4 +1,7 @@
-"""`beers-deploy check`: can the DPU run this network? Each node, the rules it breaks, and what to change."""
+"""`beers-deploy check`: can the DPU run this network?
+
+Each node, the rules it breaks, and what to change.
+"""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,23 +17,30 @@ def check(
     model: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[MODEL]", help="ONNX network: float, INT8 or board core, anyone's; the shipped INT8 one if none."
+            metavar="[MODEL]",
+            help="ONNX network: float, INT8 or board core, anyone's; the shipped INT8 one if none.",
         ),
     ] = None,
-    target: Annotated[str, typer.Option(help=f"Profile of a board with a DPU or NPU: {RULED}.")] = DEFAULT_TARGET,
+    target: Annotated[
+        str, typer.Option(help=f"Profile of a board with a DPU or NPU: {RULED}.")
+    ] = DEFAULT_TARGET,
     dpu: Annotated[
-        str | None, typer.Option(help="DPU configuration that the profile lists; the target's own if none.")
+        str | None,
+        typer.Option(help="DPU configuration that the profile lists; the target's own if none."),
     ] = None,
     tile: Annotated[
         int | None,
-        typer.Option(min=1, max=8192, help="Tile side in pixels; the network's own if it has one, else 640."),
+        typer.Option(
+            min=1, max=8192, help="Tile side in pixels; the network's own if it has one, else 640."
+        ),
     ] = None,
     picture: Annotated[
-        Path | None, typer.Option(help="Draw the graph here, coloured by device: a .svg or .html file.")
+        Path | None,
+        typer.Option(help="Draw the graph here, coloured by device: a .svg or .html file."),
     ] = None,
     json: Json = None,
 ) -> None:
-    """Place every node of a network on the host, the DPU or the CPU; exit code 1 if the DPU cannot run its part.
+    """Place every node on the host, the DPU or the CPU; exit code 1 if the DPU cannot run its part.
 
     Of an NPU, whose limits nobody publishes, nodes are placed by AMD's table of operators alone.
     """

@@ -6,7 +6,17 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import Classes, Detector, Json, Reference, Seed, arguments, refuse, save, say
+from beers_deploy.commands.shared import (
+    Classes,
+    Detector,
+    Json,
+    Reference,
+    Seed,
+    arguments,
+    refuse,
+    save,
+    say,
+)
 from beers_deploy.profiles.figures import by_table
 
 SENSORS = "dior-medium,dior-high"
@@ -18,32 +28,48 @@ DRAWN = 24
 def detect(
     context: typer.Context,
     images: Annotated[
-        Path | None, typer.Option(help="Folder of labelled pictures, DIOR's among them; synthetic scenes if none.")
+        Path | None,
+        typer.Option(
+            help="Folder of labelled pictures, DIOR's among them; synthetic scenes if none."
+        ),
     ] = None,
     labels: Annotated[
-        Path | None, typer.Option(help="Folder of their labels (VOC, YOLO) or COCO's .json; beside them if none.")
+        Path | None,
+        typer.Option(
+            help="Folder of their labels (VOC, YOLO) or COCO's .json; beside them if none."
+        ),
     ] = None,
-    split: Annotated[str | None, typer.Option(help="Pictures that a list of the folder names, such as test.")] = None,
+    split: Annotated[
+        str | None, typer.Option(help="Pictures that a list of the folder names, such as test.")
+    ] = None,
     detector: Detector = None,
     sensor: Annotated[
         str, typer.Option(help="Profiles of the degraded images, names or .toml files with commas.")
     ] = SENSORS,
     reference: Reference = None,
-    methods: Annotated[str, typer.Option(help="Names, with commas; degraded is always a row.")] = METHODS,
+    methods: Annotated[
+        str, typer.Option(help="Names, with commas; degraded is always a row.")
+    ] = METHODS,
     side: Annotated[
         int | None,
-        typer.Option(min=32, max=4096, help="Side of the detector's input, where its file leaves it open."),
+        typer.Option(
+            min=32, max=4096, help="Side of the detector's input, where its file leaves it open."
+        ),
     ] = None,
     classes: Classes = None,
-    drawn: Annotated[int, typer.Option(min=2, max=10_000, help="Synthetic scenes, without --images.")] = DRAWN,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for report.html.")] = Path("detection"),
+    drawn: Annotated[
+        int, typer.Option(min=2, max=10_000, help="Synthetic scenes, without --images.")
+    ] = DRAWN,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for report.html.")] = Path(
+        "detection"
+    ),
     seed: Seed = 0,
     json: Json = None,
 ) -> None:
-    """Show a detector the same scenes as the reference sees them, degraded and restored, and score what it finds.
+    """Score what a detector finds in scenes as the reference sees them, degraded and restored.
 
-    Average precision, precision and recall with intervals over sites, and the share of the loss that restoration
-    regains. The detector is fixed, as one in service is.
+    Average precision, precision and recall with intervals over sites, and the share of the loss
+    that restoration regains. The detector is fixed, as one in service is.
     """
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.shipped import DETECTOR
@@ -52,7 +78,13 @@ def detect(
     from beers_deploy.studies.detection.detector import open_detector, parse_classes
     from beers_deploy.studies.detection.page import write_page
     from beers_deploy.studies.detection.study import labelled_scenes, run_study, synthetic_scenes
-    from beers_deploy.studies.detection.tables import MAIN, PAPER_TABLE, detection_rows, headline, paper_rows
+    from beers_deploy.studies.detection.tables import (
+        MAIN,
+        PAPER_TABLE,
+        detection_rows,
+        headline,
+        paper_rows,
+    )
 
     if images is None:
         refuse(context, ["labels", "split"], expected="--images beside it")

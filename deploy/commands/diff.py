@@ -12,15 +12,20 @@ if TYPE_CHECKING:
 
 
 def diff(
-    before: Annotated[Path, typer.Argument(metavar="A.json", help="What a command wrote with --json.")],
+    before: Annotated[
+        Path, typer.Argument(metavar="A.json", help="What a command wrote with --json.")
+    ],
     after: Annotated[Path, typer.Argument(metavar="B.json", help="What it wrote later.")],
     fail_on: Annotated[
         list[str] | None,
-        typer.Option(metavar="CHANGE", help="NAME>CHANGE or NAME<CHANGE, in the figure's unit or in %; repeatable."),
+        typer.Option(
+            metavar="CHANGE",
+            help="NAME>CHANGE or NAME<CHANGE, in the figure's unit or in %; repeatable.",
+        ),
     ] = None,
     json: Json = None,
 ) -> None:
-    """Show which figures of two results documents differ; exit code 1 if one changed more than --fail-on allows.
+    """Show which figures of two results documents differ; exit code 1 beyond --fail-on.
 
     A figure named by --fail-on that the second document lacks fails too.
     """

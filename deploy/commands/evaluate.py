@@ -1,4 +1,6 @@
-"""`beers-deploy evaluate`: several restorations on the same pairs, judged by the same instruments."""
+"""`beers-deploy evaluate`: several restorations on the same pairs, judged by
+the same instruments.
+"""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,44 +17,63 @@ def evaluate(
         Path | None, typer.Option(help="Folder of scenes to simulate from; drawn ones if none.")
     ] = None,
     pairs: Annotated[
-        Path | None, typer.Option(help="Folder with degraded/ and reference/, as 'simulate' writes.")
+        Path | None,
+        typer.Option(help="Folder with degraded/ and reference/, as 'simulate' writes."),
     ] = None,
     sensor: Annotated[
         str | None,
-        typer.Option(help=f"Profile of the degraded images; of pairs the recipe's, else {SENSOR} if none."),
+        typer.Option(
+            help=f"Profile of the degraded images; of pairs the recipe's, else {SENSOR} if none."
+        ),
     ] = None,
     reference: Reference = None,
     methods: Annotated[
         str, typer.Option(help="Names, separated by commas.")
     ] = "degraded,traditional,deconvolve-first,convbeers-s,convbeers-s-int8",
     lpips: Lpips = None,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for report.html and pictures.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder for report.html and pictures.")
+    ] = None,
     sweep: Annotated[
-        bool, typer.Option("--sweep", help="Also under 16 sensors known as they are, and 7 known wrongly.")
+        bool,
+        typer.Option(
+            "--sweep", help="Also under 16 sensors known as they are, and 7 known wrongly."
+        ),
     ] = False,
     brightness: Annotated[
-        str | None, typer.Option(help="Also with the scenes' radiance times these factors: 0.25,0.05.")
+        str | None,
+        typer.Option(help="Also with the scenes' radiance times these factors: 0.25,0.05."),
     ] = None,
     consistency: Annotated[
         bool,
-        typer.Option("--consistency/--no-consistency", help="Networks that know the sensor take the step."),
+        typer.Option(
+            "--consistency/--no-consistency", help="Networks that know the sensor take the step."
+        ),
     ] = True,
     exposure: Annotated[
         bool,
-        typer.Option("--exposure/--no-exposure", help="Shipped networks restore dark parts at a higher exposure."),
+        typer.Option(
+            "--exposure/--no-exposure",
+            help="Shipped networks restore dark parts at a higher exposure.",
+        ),
     ] = True,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Refuse pairs whose pixels contradict the sensor, instead of saying so.")
+        bool,
+        typer.Option(
+            "--strict",
+            help="Refuse pairs whose pixels contradict the sensor, instead of saying so.",
+        ),
     ] = False,
     seed: Seed = 0,
     json: Json = None,
 ) -> None:
-    """Compare restorations with the reference, on average and by site; the degraded input is always a row.
+    """Compare restorations with the reference, on average and by site, beside the degraded input.
 
-    PSNR leaves out clipped pixels; of simulated pairs it is also taken against the reference without its noise. Inner
-    PSNR leaves out a border of 57 pixels. MTF and SNR are measured on restored slanted edges and flat fields; the
-    table of targets has the flux of points and the contrast of faint bars and zone plates. Traditional methods and
-    shipped networks know the sensors' nominal figures; NAME@blind is told no sensor, NAME@SENSOR another one.
+    PSNR leaves out clipped pixels; of simulated pairs it is also taken against the reference
+    without its noise. Inner PSNR leaves out a border of 57 pixels. MTF and SNR are measured on
+    restored slanted edges and flat fields; the table of targets has the flux of points and the
+    contrast of faint bars and zone plates. Traditional methods and shipped networks know the
+    sensors' nominal figures; NAME@blind is told no sensor, NAME@SENSOR another one.
     """
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.io.images import list_images
@@ -70,9 +91,16 @@ def evaluate(
         list_images(images)  # an empty folder is refused before torch is loaded
     from beers_deploy.studies.evaluation.run import evaluate as compared
 
-    about: dict[str, Any] = {"sensor": sensor, "reference": reference, "lpips": lpips, "brightness": factors}
+    about: dict[str, Any] = {
+        "sensor": sensor,
+        "reference": reference,
+        "lpips": lpips,
+        "brightness": factors,
+    }
     about |= {"consistency": consistency, "exposure": exposure}
-    found = compared(names, pairs, images=images, sweep=sweep, strict=strict, seed=seed, log=say, **about)
+    found = compared(
+        names, pairs, images=images, sweep=sweep, strict=strict, seed=seed, log=say, **about
+    )
     for title, rows in {found.title: found.mean, **found.more}.items():
         print_rows(title, rows)
     for note in found.notes:

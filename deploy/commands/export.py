@@ -23,44 +23,58 @@ def export(
     network: Annotated[
         Path,
         typer.Option(
-            help="A shipped name, also with -int8; your own weights (.safetensors); or an INT8 file that 'quantize' "
+            help="A shipped name, also with -int8; your own weights (.safetensors); or an INT8 "
+            "file that 'quantize' "
             "made of weights of 'train --conditioned'."
         ),
     ] = Path(VARIANT),
     sensor: Annotated[
         str | None,
-        typer.Option(help=f"Sensor of the network: a profile, your .toml file, or blind; {SENSOR} if none."),
+        typer.Option(
+            help=f"Sensor of the network: a profile, your .toml file, or blind; {SENSOR} if none."
+        ),
     ] = None,
     tile: Annotated[
-        int | None, typer.Option(min=16, max=8192, help="Fix the input to one tile of this side, 640 for a board.")
+        int | None,
+        typer.Option(
+            min=16, max=8192, help="Fix the input to one tile of this side, 640 for a board."
+        ),
     ] = None,
     board_file: Annotated[
-        Path | None, typer.Option(help="Of an INT8 file: also write its integers in the board's encoding.")
+        Path | None,
+        typer.Option(help="Of an INT8 file: also write its integers in the board's encoding."),
     ] = None,
     target: Annotated[
-        str | None, typer.Option(help=f"Whose encoding --board-file has, QDQ ONNX or an NPU's VINT8: {RULED}.")
+        str | None,
+        typer.Option(help=f"Whose encoding --board-file has, QDQ ONNX or an NPU's VINT8: {RULED}."),
     ] = None,
     delta: Annotated[
         Path | None,
         typer.Option(
-            help="Of an INT8 file: also write what the sensor changes in it, 1 to 3 kB; for the exposures of "
+            help="Of an INT8 file: also write what the sensor changes in it, 1 to 3 kB; for the "
+            "exposures of "
             "'restore', -x4 and so on before the suffix."
         ),
     ] = None,
     apply: Annotated[
-        Path | None, typer.Option(help="Of an INT8 file: tell it the sensor of this delta, in place of --sensor.")
+        Path | None,
+        typer.Option(
+            help="Of an INT8 file: tell it the sensor of this delta, in place of --sensor."
+        ),
     ] = None,
 ) -> None:
     """Write the network as ONNX, any height and width unless --tile fixes them.
 
-    Weights of your own are checked against torch; the project's tests do that with all shipped ones. Conditioned
-    weights, as all shipped ones are, become the network of one sensor: of a profile with ranges, for the middle of
-    each. A value outside the trained range is taken as the nearest end of it, with a warning.
+    Weights of your own are checked against torch; the project's tests do that with all shipped
+    ones. Conditioned weights, as all shipped ones are, become the network of one sensor: of a
+    profile with ranges, for the middle of each. A value outside the trained range is taken as the
+    nearest end of it, with a warning.
 
-    An INT8 file of conditioned weights (--network FILE.onnx) is told another sensor without being calibrated anew.
-    --delta writes what the sensor changes, and --apply makes the file of any sensor that sensor's, to the byte.
-    'restore' restores dark parts at higher exposures, by the network of a sensor of 2, 4 or 8 times the gain. So
-    --delta my.delta also writes my-x4.delta and my-x8.delta: one file for each factor that the sensor's noise allows.
+    An INT8 file of conditioned weights (--network FILE.onnx) is told another sensor without being
+    calibrated anew. --delta writes what the sensor changes, and --apply makes the file of any
+    sensor that sensor's, to the byte. 'restore' restores dark parts at higher exposures, by the
+    network of a sensor of 2, 4 or 8 times the gain. So --delta my.delta also writes my-x4.delta and
+    my-x8.delta: one file for each factor that the sensor's noise allows.
     """
     from beers_deploy.export import about, float_for, to_onnx
     from beers_deploy.model.io.files import require_writable
@@ -78,7 +92,9 @@ def export(
     if board_file is None:
         refuse(context, ["target"], expected="--board-file beside it")
     if path.suffix != ".onnx":
-        remedy = "give one that 'quantize' made of weights of 'train --conditioned', or leave it out"
+        remedy = (
+            "give one that 'quantize' made of weights of 'train --conditioned', or leave it out"
+        )
         asked = ["board_file", "delta", "apply"]
         refuse(context, asked, expected="an INT8 --network", got=str(network), remedy=remedy)
     require_onnx_name(out, board_file)
@@ -93,7 +109,9 @@ def export(
     elif sensor is not None:
         expected = "weights of 'train --conditioned'"
         remedy = "leave --sensor out, or give such weights"
-        raise ModelError(str(path), expected=expected, got="those of a plain network", remedy=remedy)
+        raise ModelError(
+            str(path), expected=expected, got="those of a plain network", remedy=remedy
+        )
     else:
         weights = read_plain(path)
         model = to_onnx(weights, about(path.stem, weights.recipe), tile)
@@ -101,21 +119,32 @@ def export(
         save_onnx(model, out)
         say(f"wrote {out}")
         return
-    from beers_deploy.parity import require_parity, torch_network  # it takes torch, which shipped ones do without
+    from beers_deploy.parity import (
+        require_parity,
+        torch_network,
+    )  # it takes torch, which shipped ones do without
 
-    difference = require_parity(torch_network(path, known.nominal() if known else None), model, tile or 97)
+    difference = require_parity(
+        torch_network(path, known.nominal() if known else None), model, tile or 97
+    )
     save_onnx(model, out)
     say(f"wrote {out}: largest difference from torch {difference:.2g} of full scale (measured)")
 
 
 def _delta_files(delta: Path | None, sensor: str | None) -> dict[int, Path]:
-    """Return the files that --delta writes by factor: the one named at 1, and one for each higher exposure."""
+    """Return the files that --delta writes by factor: the one named at 1, and one for each higher
+    exposure.
+    """
     from beers_deploy.model.exposure import factors_for
 
     if delta is None:
         return {}
     factors = factors_for(load_sensor(sensor or SENSOR).nominal())
-    higher = {factor: delta.with_name(f"{delta.stem}-x{factor}{delta.suffix}") for factor in factors if factor > 1}
+    higher = {
+        factor: delta.with_name(f"{delta.stem}-x{factor}{delta.suffix}")
+        for factor in factors
+        if factor > 1
+    }
     return {1: delta, **higher}
 
 
@@ -147,7 +176,9 @@ def _export_int8(
 
     if apply is not None and (sensor or deltas):
         remedy = "leave one out: the delta brings its sensor"
-        raise OptionError("--apply", expected="no --sensor or --delta beside it", got="one", remedy=remedy)
+        raise OptionError(
+            "--apply", expected="no --sensor or --delta beside it", got="one", remedy=remedy
+        )
     model = load_onnx(path)
     if apply is not None:
         made = told_by_delta(model, apply)
@@ -167,13 +198,16 @@ def _export_int8(
 
 
 def _save_delta(made: "onnx.ModelProto", sensor: Sensor, factor: int, delta: Path) -> None:
-    """Write the delta of an INT8 network that is conditioned on a sensor, at one of its exposures."""
+    """Write the delta of an INT8 network that is conditioned on a sensor, at
+    one of its exposures.
+    """
     from beers_deploy.model.exposure import brightened
     from beers_deploy.model.io.files import whole_file
     from beers_deploy.network_files import told_int8
     from beers_deploy.quant.banked.family import delta_of_file
 
-    # The other exposures of a sensor are no user's choice: what of them lies outside the trained range is not told.
+    # The other exposures of a sensor are no user's choice: what of them lies outside the trained
+    # range is not told.
     model = made if factor == 1 else told_int8(made, brightened(sensor, factor))
     packed = delta_of_file(model)
     with whole_file(delta) as temporary:

@@ -37,36 +37,62 @@ def gate(
     float_model: FloatModel = None,
     int8_model: Int8Model = None,
     max_mae: Annotated[
-        float | None, typer.Option(help="Largest mean absolute difference, of full scale; 0.0007 if none.")
+        float | None,
+        typer.Option(help="Largest mean absolute difference, of full scale; 0.0007 if none."),
     ] = None,
-    limits: Annotated[Path | None, typer.Option(help="TOML file of limits; see docs/how-to/gate.md.")] = None,
-    baseline: Annotated[Path | None, typer.Option(help="What 'gate --json' wrote before: MAE may not grow.")] = None,
+    limits: Annotated[
+        Path | None, typer.Option(help="TOML file of limits; see docs/how-to/gate.md.")
+    ] = None,
+    baseline: Annotated[
+        Path | None, typer.Option(help="What 'gate --json' wrote before: MAE may not grow.")
+    ] = None,
     target: Annotated[
         str, typer.Option(help=f"Board whose rules the INT8 file must keep: {RULED}.")
     ] = DEFAULT_TARGET,
-    sensor: Annotated[str, typer.Option(help="Sensor of the test patches and of a shipped network.")] = SENSOR,
-    images: Annotated[Path | None, typer.Option(help="Folder of scenes; drawn ones if none.")] = None,
+    sensor: Annotated[
+        str, typer.Option(help="Sensor of the test patches and of a shipped network.")
+    ] = SENSOR,
+    images: Annotated[
+        Path | None, typer.Option(help="Folder of scenes; drawn ones if none.")
+    ] = None,
     samples: Annotated[
         Path | None,
-        typer.Option(help="Your own samples in their place: .npy or .npz (N, C, H, W), or a folder of images."),
+        typer.Option(
+            help="Your own samples in their place: .npy or .npz (N, C, H, W), or a folder of "
+            "images."
+        ),
     ] = None,
-    patches: Annotated[int, typer.Option(min=1, max=100_000, help="Test patches of 128 x 128.")] = 32,
+    patches: Annotated[
+        int, typer.Option(min=1, max=100_000, help="Test patches of 128 x 128.")
+    ] = 32,
     metric: Annotated[
-        str | None, typer.Option(help="Hold results against references too: psnr, ssim, mae, top1 or iou.")
+        str | None,
+        typer.Option(help="Hold results against references too: psnr, ssim, mae, top1 or iou."),
     ] = None,
     seed: Seed = 0,
     junit: Annotated[Path | None, typer.Option(help="Write the verdict here as JUnit XML.")] = None,
     record: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder for a record of evidence: JSON, a page and an ML-BOM.")
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Folder for a record of evidence: JSON, a page and an ML-BOM."
+        ),
     ] = None,
     json: Json = None,
 ) -> None:
     """Compare a float and an INT8 network on simulated pairs neither was calibrated on.
 
-    Also checked: what saturates inside, the DPU's rules, that no ReLU was lost, and that onnxruntime's optimisations
-    change no bit.
+    Also checked: what saturates inside, the DPU's rules, that no ReLU was lost, and that
+    onnxruntime's optimisations change no bit.
     """
-    read = (float_model, int8_model, limits, baseline, images, samples, *map(Path, (target, sensor)))
+    read = (
+        float_model,
+        int8_model,
+        limits,
+        baseline,
+        images,
+        samples,
+        *map(Path, (target, sensor)),
+    )
     try:
         _clear((json, junit, *_record_files(record)), read, record)
         # Loaded only now: if a library fails, no older verdict is left either.
@@ -76,7 +102,12 @@ def gate(
         from beers_deploy.verdict import gate as judged
 
         if samples is not None:
-            refuse(context, ("images", "patches", "seed"), expected="none together with --samples", got="one")
+            refuse(
+                context,
+                ("images", "patches", "seed"),
+                expected="none together with --samples",
+                got="one",
+            )
         against, int8 = pair_of(float_model, int8_model)
         allowed = limits_of(limits, max_mae)
         verdict = judged(
@@ -93,7 +124,9 @@ def gate(
             metric=metric,
         )
         _show(verdict)
-        if record is not None:  # first: its library may fail, and then no verdict may stand in the other files
+        if (
+            record is not None
+        ):  # first: its library may fail, and then no verdict may stand in the other files
             from beers_deploy.kit.record import write_record
 
             compared = verdict.comparison
@@ -118,8 +151,12 @@ def _record_files(folder: Path | None) -> list[Path]:
     return recorded(folder)
 
 
-def _clear(outputs: Sequence[Path | None], inputs: Sequence[Path | None], record: Path | None) -> None:
-    """Delete older outputs, and require that new ones can be written: a refused gate leaves no verdict behind."""
+def _clear(
+    outputs: Sequence[Path | None], inputs: Sequence[Path | None], record: Path | None
+) -> None:
+    """Delete older outputs, and require that new ones can be written: a refused gate leaves no
+    verdict behind.
+    """
     from beers_deploy.model.io.files import require_writable
 
     for path in outputs:
@@ -129,7 +166,12 @@ def _clear(outputs: Sequence[Path | None], inputs: Sequence[Path | None], record
                 path.unlink(missing_ok=True)
     _, junit, *_ = outputs
     if junit == STDOUT:
-        raise OptionError("--junit", expected="a file", got="-", remedy="name one: standard output is for --json -")
+        raise OptionError(
+            "--junit",
+            expected="a file",
+            got="-",
+            remedy="name one: standard output is for --json -",
+        )
     require_writable(*outputs, inputs=inputs, folders=(record,))
     if record is not None:
         from beers_deploy.kit.record import require_library
@@ -138,9 +180,14 @@ def _clear(outputs: Sequence[Path | None], inputs: Sequence[Path | None], record
 
 
 def _explain(
-    error: BeersError, junit: Path | None, others: Sequence[Path | None], inputs: Sequence[Path | None]
+    error: BeersError,
+    junit: Path | None,
+    others: Sequence[Path | None],
+    inputs: Sequence[Path | None],
 ) -> None:
-    """Write the reason why nothing could be judged to the JUnit file, if there is one that may be written."""
+    """Write the reason why nothing could be judged to the JUnit file, if there is one that may be
+    written.
+    """
     from beers_deploy.model.io.files import require_writable, write_text
     from beers_deploy.verdict import junit_error
 

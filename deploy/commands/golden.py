@@ -1,4 +1,6 @@
-"""`beers-deploy golden`: the integers that every layer must write on a board, and what is wrong where it does not."""
+"""`beers-deploy golden`: the integers that every layer must write on a board, and what is wrong
+where it does not.
+"""
 
 from pathlib import Path
 from typing import Annotated, cast
@@ -14,22 +16,30 @@ def golden(
     context: typer.Context,
     given: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help="INT8 ONNX or a shipped name; with --compare the results."),
+        typer.Argument(
+            metavar="FILE", help="INT8 ONNX or a shipped name; with --compare the results."
+        ),
     ],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write the vectors to.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write the vectors to.")
+    ] = None,
     compare: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder of vectors: hold a board's results against them.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder of vectors: hold a board's results against them."),
     ] = None,
     tile: Annotated[
-        int | None, typer.Option(min=1, max=4096, help="Tile side in pixels; the network's own, else 64.")
+        int | None,
+        typer.Option(min=1, max=4096, help="Tile side in pixels; the network's own, else 64."),
     ] = None,
-    target: Annotated[str, typer.Option(help=f"Whose way to round ties is taken: {BOARDS}.")] = DEFAULT_TARGET,
+    target: Annotated[
+        str, typer.Option(help=f"Whose way to round ties is taken: {BOARDS}.")
+    ] = DEFAULT_TARGET,
     json: Json = None,
 ) -> None:
-    """Write the inputs and the exact int8 tensors of every layer, or compare with them what a board wrote.
+    """Write inputs and the exact int8 tensors of every layer, or compare what a board wrote.
 
-    A comparison names the first layer that differs, by how much and where, and the fault that gives just these
-    numbers. Any subset of the layers will do. Exit code 1 if a layer differs.
+    A comparison names the first layer that differs, by how much and where, and the fault that gives
+    just these numbers. Any subset of the layers will do. Exit code 1 if a layer differs.
     """
     from beers_deploy.kit.golden import compare_golden, write_golden
     from beers_deploy.model.io.files import require_writable
@@ -39,7 +49,9 @@ def golden(
     inputs = given, compare, Path(target)
     require_writable(json, out / "golden.json" if out else None, inputs=inputs, folders=(out,))
     if compare is None:
-        refuse(context, ("json",), expected="--compare beside it", remedy="leave it out, or compare")
+        refuse(
+            context, ("json",), expected="--compare beside it", remedy="leave it out, or compare"
+        )
     if (out is None) == (compare is None):
         expected = "one of --out and --compare"
         remedy = "give the folder to write, or the folder to compare with"

@@ -14,13 +14,19 @@ from beers_deploy.restoration.options import Options
 
 
 def info(
-    image: Annotated[Path, typer.Argument(metavar="FILE", help="Image, or the index of its tiles.")],
+    image: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Image, or the index of its tiles.")
+    ],
     network: Restoring = None,
     sensor: Annotated[
-        str | None, typer.Option(help="The sensor of FILE, a profile's name or your .toml file; blind if none.")
+        str | None,
+        typer.Option(
+            help="The sensor of FILE, a profile's name or your .toml file; blind if none."
+        ),
     ] = None,
     full_scale: Annotated[
-        float | None, typer.Option(help="Pixel value that is full scale; else what FILE or --sensor states.")
+        float | None,
+        typer.Option(help="Pixel value that is full scale; else what FILE or --sensor states."),
     ] = None,
     tile: Tile = TILE_PX,
     target: Annotated[
@@ -28,17 +34,22 @@ def info(
     ] = DEFAULT_TARGET,
     trust_index: TrustIndex = False,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Refuse FILE whose pixels contradict --sensor, instead of saying so.")
+        bool,
+        typer.Option(
+            "--strict", help="Refuse FILE whose pixels contradict --sensor, instead of saying so."
+        ),
     ] = False,
-    measure: Annotated[bool, typer.Option("--measure", help="Time some tiles here, and predict the whole.")] = False,
+    measure: Annotated[
+        bool, typer.Option("--measure", help="Time some tiles here, and predict the whole.")
+    ] = False,
     json: Json = None,
 ) -> None:
     """Say what an image is, how it would be cut and how long that would take.
 
-    Shows size, type, full scale and who states it, place on Earth, missing pixels, and the plan of `restore`.
-    Strips of FILE are searched for stripes, dead and hot columns and pixels. --sensor reads windows of FILE and holds
-    their noise and edges against what the sensor states. No other pixel is read, but of PNG, JPEG and TIFFs of
-    several pages.
+    Shows size, type, full scale and who states it, place on Earth, missing pixels, and the plan of
+    `restore`. Strips of FILE are searched for stripes, dead and hot columns and pixels. --sensor
+    reads windows of FILE and holds their noise and edges against what the sensor states. No other
+    pixel is read, but of PNG, JPEG and TIFFs of several pages.
     """
     from beers_deploy.info import info_row
     from beers_deploy.model.io.files import require_writable
@@ -47,11 +58,15 @@ def info(
     from beers_deploy.results import Table, print_rows
 
     tiles = index_files(image, trust_index)
-    require_writable(json, inputs=(image, *tiles, network, Path(sensor) if sensor else None, Path(target)))
+    require_writable(
+        json, inputs=(image, *tiles, network, Path(sensor) if sensor else None, Path(target))
+    )
     known = load_sensor(sensor or BLIND)
     path = network_file(network, known, partial(say, err=True))
     told = {"": known} if sensor else {}
-    options = Options(path, tile, full_scale=full_scale, trust_index=trust_index, sensors=told, strict=strict)
+    options = Options(
+        path, tile, full_scale=full_scale, trust_index=trust_index, sensors=told, strict=strict
+    )
     row = info_row(image, options, load_target(target), measure, say)
     print_rows(str(image), [row])
     # No digest of FILE: it would be read whole.

@@ -1,4 +1,6 @@
-"""`beers-deploy profiles` shows sensors, scenes and boards; `characterise` makes a sensor of raw images."""
+"""`beers-deploy profiles` shows sensors, scenes and boards; `characterise` makes a sensor of raw
+images.
+"""
 
 import math
 from collections.abc import Mapping
@@ -25,7 +27,9 @@ def profiles(
     name: Annotated[
         str | None, typer.Argument(help="A shipped profile, or a .toml file; none lists them all.")
     ] = None,
-    toml: Annotated[bool, typer.Option("--toml", help="Print the file itself, to start one's own from.")] = False,
+    toml: Annotated[
+        bool, typer.Option("--toml", help="Print the file itself, to start one's own from.")
+    ] = False,
 ) -> None:
     """List sensors, scenes and targets, or show one: every constant, its status and its source.
 
@@ -41,12 +45,16 @@ def profiles(
 
     if name is None:
         table = Table("name", "kind", "what it is", title_justify="left")
-        rows: list[Row] = [(each, "sensor", load_sensor(each).description) for each in sensor_names()]
+        rows: list[Row] = [
+            (each, "sensor", load_sensor(each).description) for each in sensor_names()
+        ]
         rows += [(each, "scene", load_scene_call(each).description) for each in scene_names()]
         rows += [(each, "target", load_target(each).description) for each in target_names()]
     else:
         title, rows = _shown(name)
-        table = Table("constant", "value", "status", "source", title=plain(title), title_justify="left")
+        table = Table(
+            "constant", "value", "status", "source", title=plain(title), title_justify="left"
+        )
     for row in rows:
         table.add_row(*map(plain, row))
     default_console().print(table)
@@ -56,7 +64,9 @@ def _file_text(name: str | None) -> str:
     """The TOML of a profile that can be read as one."""
     if name is None:
         remedy = f"name one, such as {SENSOR}"
-        raise OptionError("--toml", expected="the name of a profile beside it", got="none", remedy=remedy)
+        raise OptionError(
+            "--toml", expected="the name of a profile beside it", got="none", remedy=remedy
+        )
     _shown(name)
     kind = "targets"
     if name in sensor_names():
@@ -67,11 +77,17 @@ def _file_text(name: str | None) -> str:
 
 
 def _shown(name: str) -> tuple[str, list[Row]]:
-    """Title and rows (constant, value, status, source) of a sensor, a scene or a target, tried in that order."""
-    if name in sensor_names() or (name.endswith(".toml") and "mtf" in read_toml("sensors", name)[1]):
+    """Title and rows (constant, value, status, source) of a sensor, a scene or a target, tried in
+    that order.
+    """
+    if name in sensor_names() or (
+        name.endswith(".toml") and "mtf" in read_toml("sensors", name)[1]
+    ):
         sensor = load_sensor(name)
         return f"{sensor.name}: {sensor.description}", _sensor_rows(sensor)
-    if name in scene_names() or (name.endswith(".toml") and "radiance_scale" in read_toml("scenes", name)[1]):
+    if name in scene_names() or (
+        name.endswith(".toml") and "radiance_scale" in read_toml("scenes", name)[1]
+    ):
         scene = load_scene_call(name)
         rows = [_row("radiance_scale", scene.radiance_scale), *_effects(scene.effects)]
         return f"{scene.name}: {scene.description}", rows
@@ -82,11 +98,18 @@ def _shown(name: str) -> tuple[str, list[Row]]:
             **{f"configurations.{k}": v for k, v in target.configurations.items()},
         }
         groups |= {"activations": target.activations, "npu": target.npu}
-        rows = [_row(f"{group}.{key}", value) for group, table in groups.items() for key, value in table.items()]
+        rows = [
+            _row(f"{group}.{key}", value)
+            for group, table in groups.items()
+            for key, value in table.items()
+        ]
         return f"{target.name}: {target.description}", rows
     known = ", ".join([*sensor_names(), *scene_names(), *target_names()])
     raise OptionError(
-        "profile", expected=f"one of {known}", got=repr(name), remedy="choose one, or give a .toml file"
+        "profile",
+        expected=f"one of {known}",
+        got=repr(name),
+        remedy="choose one, or give a .toml file",
     )
 
 
@@ -108,11 +131,18 @@ def _response(sensor: Sensor) -> list[Row]:
     if not isinstance(response, MtfTable):
         return [("mtf.psf", str(response), *said)]
     columns = {"frequency": response.frequency, "across": response.across, "along": response.along}
-    return [(f"mtf.{key}", ", ".join(f"{v:g}" for v in values), *said) for key, values in columns.items()]
+    return [
+        (f"mtf.{key}", ", ".join(f"{v:g}" for v in values), *said)
+        for key, values in columns.items()
+    ]
 
 
 def _effects(effects: Mapping[str, Table]) -> list[Row]:
-    return [_row(f"{name}.{key}", constant) for name, table in effects.items() for key, constant in table.items()]
+    return [
+        _row(f"{name}.{key}", constant)
+        for name, table in effects.items()
+        for key, constant in table.items()
+    ]
 
 
 def _row(key: str, constant: Constant | Words) -> Row:
@@ -121,33 +151,48 @@ def _row(key: str, constant: Constant | Words) -> Row:
 
 def characterise(
     images: Annotated[
-        list[Path], typer.Argument(help="Raw images of one sensor, or folders of them: whole numbers, one band.")
+        list[Path],
+        typer.Argument(
+            help="Raw images of one sensor, or folders of them: whole numbers, one band."
+        ),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="The sensor profile, a TOML file.")],
     edge: Annotated[
         list[str] | None,
-        typer.Option(metavar="FILE:X,Y,WIDTH,HEIGHT", help="A box with one straight edge; searched for if none."),
+        typer.Option(
+            metavar="FILE:X,Y,WIDTH,HEIGHT",
+            help="A box with one straight edge; searched for if none.",
+        ),
     ] = None,
     mtf: Annotated[
         str | None,
-        typer.Option(metavar="ACROSS[,ALONG]", help="MTF at Nyquist if you know it, 0.07 is 7 %; measured if none."),
+        typer.Option(
+            metavar="ACROSS[,ALONG]",
+            help="MTF at Nyquist if you know it, 0.07 is 7 %; measured if none.",
+        ),
     ] = None,
     black_level: Annotated[
-        float | None, typer.Option(help="Value of the dark in the images; 0 counts as dark if none.")
+        float | None,
+        typer.Option(help="Value of the dark in the images; 0 counts as dark if none."),
     ] = None,
     bits: Annotated[
-        int | None, typer.Option(min=1, max=16, help="Bits of a pixel; found from clipped pixels if none.")
+        int | None,
+        typer.Option(min=1, max=16, help="Bits of a pixel; found from clipped pixels if none."),
     ] = None,
     gain: Annotated[
-        float | None, typer.Option(help="DN per W/m2/sr/um; full scale is taken for 400 W/m2/sr/um if none.")
+        float | None,
+        typer.Option(help="DN per W/m2/sr/um; full scale is taken for 400 W/m2/sr/um if none."),
     ] = None,
-    gsd: Annotated[float | None, typer.Option(help="Ground sampling distance in m; no pixel depends on it.")] = None,
+    gsd: Annotated[
+        float | None, typer.Option(help="Ground sampling distance in m; no pixel depends on it.")
+    ] = None,
     json: Json = None,
 ) -> None:
     """Measure MTF and noise on raw images and write them as a sensor profile, for every --sensor.
 
-    The MTF needs straight edges: a target, roofs, kerbs, shadows. Where they give none, --mtf or an assumption takes
-    its place. The noise needs raw pixels: what was denoised, sharpened or resampled is refused.
+    The MTF needs straight edges: a target, roofs, kerbs, shadows. Where they give none, --mtf or an
+    assumption takes its place. The noise needs raw pixels: what was denoised, sharpened or
+    resampled is refused.
     """
     from beers_deploy.model.io.files import require_writable, write_text
     from beers_deploy.results import Table as Results
@@ -168,7 +213,9 @@ def characterise(
 
 
 def _contrasts(words: str | None) -> tuple[float, float] | None:
-    """The contrast at Nyquist across and along the track that --mtf states, one number for both or two."""
+    """The contrast at Nyquist across and along the track that --mtf states, one number for both or
+    two.
+    """
     if words is None:
         return None
     try:
@@ -177,5 +224,7 @@ def _contrasts(words: str | None) -> tuple[float, float] | None:
         across = along = math.nan
     if words.count(",") > 1 or not (0 < across <= MTF_NYQUIST_MAX and 0 < along <= MTF_NYQUIST_MAX):
         expected = f"one or two ratios above 0 and up to {MTF_NYQUIST_MAX:.4f}"
-        raise OptionError("mtf", expected=expected, got=repr(words), remedy="write 0.07 for 7 %, or 0.09,0.05")
+        raise OptionError(
+            "mtf", expected=expected, got=repr(words), remedy="write 0.07 for 7 %, or 0.09,0.05"
+        )
     return across, along

@@ -5,7 +5,17 @@ from typing import Annotated, Any
 
 import typer
 
-from beers_deploy.commands.shared import RULED, Json, Seed, arguments, board_for, refuse, save, save_core, say
+from beers_deploy.commands.shared import (
+    RULED,
+    Json,
+    Seed,
+    arguments,
+    board_for,
+    refuse,
+    save,
+    save_core,
+    say,
+)
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.sensor import Sensor
@@ -22,42 +32,63 @@ TITLES = {
 def quantize(
     context: typer.Context,
     model: Annotated[
-        Path, typer.Argument(help="Float ONNX or weights, or a shipped network's name, then for --sensor.")
+        Path,
+        typer.Argument(
+            help="Float ONNX or weights, or a shipped network's name, then for --sensor."
+        ),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="INT8 ONNX for stock onnxruntime.")],
     target: Annotated[str, typer.Option(help=f"Whose rules to obey: {RULED}.")] = DEFAULT_TARGET,
-    sensor: Annotated[str, typer.Option(help="Profile that calibration patches are drawn from.")] = SENSOR,
+    sensor: Annotated[
+        str, typer.Option(help="Profile that calibration patches are drawn from.")
+    ] = SENSOR,
     board_file: Annotated[
-        Path | None, typer.Option(help="Also write the core in the board's encoding: QDQ ONNX, of an NPU VINT8.")
+        Path | None,
+        typer.Option(
+            help="Also write the core in the board's encoding: QDQ ONNX, of an NPU VINT8."
+        ),
     ] = None,
     tile: Annotated[
         int | None,
-        typer.Option(min=16, max=8192, help="Fix --board-file to one tile of this side, as an NPU's must be."),
+        typer.Option(
+            min=16, max=8192, help="Fix --board-file to one tile of this side, as an NPU's must be."
+        ),
     ] = None,
-    images: Annotated[Path | None, typer.Option(help="Folder of scenes for calibration; drawn ones if none.")] = None,
+    images: Annotated[
+        Path | None, typer.Option(help="Folder of scenes for calibration; drawn ones if none.")
+    ] = None,
     samples: Annotated[
         Path | None,
-        typer.Option(help="Your own samples in place of simulated patches: .npy or .npz (N, C, H, W), or a folder."),
+        typer.Option(
+            help="Your own samples in place of simulated patches: .npy or .npz (N, C, H, W), or "
+            "a folder."
+        ),
     ] = None,
     patches: Annotated[int, typer.Option(min=1, max=100_000, help="Calibration patches.")] = 64,
-    patch: Annotated[int, typer.Option(min=32, max=2048, help="Side of a calibration patch in pixels.")] = 128,
+    patch: Annotated[
+        int, typer.Option(min=32, max=2048, help="Side of a calibration patch in pixels.")
+    ] = 128,
     report: Annotated[
         Path | None,
-        typer.Option(help="Folder for report.html and report.json: which layers and patches err, and how."),
+        typer.Option(
+            help="Folder for report.html and report.json: which layers and patches err, and how."
+        ),
     ] = None,
     finetune: Annotated[
         str,
         typer.Option(
-            help="Steps that train the INT8 numbers on --images or --samples; 'auto': minutes, while it helps."
+            help="Steps that train the INT8 numbers on --images or --samples; 'auto': minutes, "
+            "while it helps."
         ),
     ] = "0",
     seed: Seed = 0,
     json: Json = None,
 ) -> None:
-    """Quantise to int8 with power-of-two scales: the correction on the DPU, the 12-bit add on the host.
+    """Quantise to int8 with power-of-two scales: the correction on the DPU, the add on the host.
 
-    Taken is any network that a DPU computes; see docs/reference/any-network.md, and ask 'check' about a float file.
-    Prints each integer layer: bits of its accumulator, seen and proven, and the share of saturated results.
+    Taken is any network that a DPU computes; see docs/reference/any-network.md, and ask 'check'
+    about a float file. Prints each integer layer: bits of its accumulator, seen and proven, and the
+    share of saturated results.
     """
     from beers_deploy.baseline import data_inputs
     from beers_deploy.model.io.files import require_writable
@@ -98,7 +129,9 @@ def quantize(
         say(f"wrote {page}: {written.headline}")
         rows = [*found, *rows]
     origin = made.origin.input if made.origin else model
-    document = Table("quantize", arguments(), (origin, out, *data_inputs(images, samples)), tuple(rows))
+    document = Table(
+        "quantize", arguments(), (origin, out, *data_inputs(images, samples)), tuple(rows)
+    )
     for path in (figures, json):
         save(document, path)
 

@@ -9,7 +9,16 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import Json, Restoring, Tile, TrustIndex, arguments, refuse, save, say
+from beers_deploy.commands.shared import (
+    Json,
+    Restoring,
+    Tile,
+    TrustIndex,
+    arguments,
+    refuse,
+    save,
+    say,
+)
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.figures import Row
@@ -44,7 +53,10 @@ class Method(StrEnum):
 
 def restore(
     context: typer.Context,
-    image: Annotated[Path, typer.Argument(metavar="IN", help="Image: TIFF or what GDAL reads, of any size, or PNG.")],
+    image: Annotated[
+        Path,
+        typer.Argument(metavar="IN", help="Image: TIFF or what GDAL reads, of any size, or PNG."),
+    ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="TIFF to write, of the type of IN.")],
     network: Restoring = None,
     method: Annotated[
@@ -53,41 +65,66 @@ def restore(
     sensor: Annotated[
         str | None,
         typer.Option(
-            help="The sensor of IN, a profile's name or your .toml file: shipped networks and the consistency step "
+            help="The sensor of IN, a profile's name or your .toml file: shipped networks and "
+            "the consistency step "
             "use it; B0=a.toml,B1=b.toml for each band; blind if none."
         ),
     ] = None,
     tile: Tile = TILE_PX,
-    halo: Annotated[str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")] = "exact",
+    halo: Annotated[
+        str, typer.Option(help="Context around a tile: 'exact' (no seams) or pixels.")
+    ] = "exact",
     full_scale: Annotated[
         float | None,
         typer.Option(
-            help="Pixel value that is full scale; else what IN states, the bits of --sensor, or 12 bits. "
+            help="Pixel value that is full scale; else what IN states, the bits of --sensor, or "
+            "12 bits. "
             "8-bit and 0..1 pixels need it."
         ),
     ] = None,
     runtime: Annotated[Runtime, typer.Option(help="What runs the network.")] = Runtime.onnxruntime,
     threads: Annotated[
-        int, typer.Option(min=0, help="Threads; 0 takes every core, or one for each thread of a scheduler's workers.")
+        int,
+        typer.Option(
+            min=0,
+            help="Threads; 0 takes every core, or one for each thread of a scheduler's workers.",
+        ),
     ] = 0,
-    compression: Annotated[Compression, typer.Option(help="Of the output, lossless.")] = Compression.zlib,
+    compression: Annotated[
+        Compression, typer.Option(help="Of the output, lossless.")
+    ] = Compression.zlib,
     memory: Annotated[
-        float | None, typer.Option(min=0, help="Budget of this process in GB; what is free if none.")
+        float | None,
+        typer.Option(min=0, help="Budget of this process in GB; what is free if none."),
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(help="Dask scheduler whose workers run the network, such as tcp://host:8786.")
+        str | None,
+        typer.Option(help="Dask scheduler whose workers run the network, such as tcp://host:8786."),
     ] = None,
     cog: Annotated[
-        bool, typer.Option("--cog", help="Write OUT as a Cloud-Optimised GeoTIFF: tiles, overviews, what was done.")
+        bool,
+        typer.Option(
+            "--cog", help="Write OUT as a Cloud-Optimised GeoTIFF: tiles, overviews, what was done."
+        ),
     ] = False,
-    stac: Annotated[Path | None, typer.Option(help="Write a STAC item of OUT here; with --cog.")] = None,
+    stac: Annotated[
+        Path | None, typer.Option(help="Write a STAC item of OUT here; with --cog.")
+    ] = None,
     trust_index: TrustIndex = False,
-    again: Annotated[bool, typer.Option("--again", help="Restore an image that 'restore' has written.")] = False,
+    again: Annotated[
+        bool, typer.Option("--again", help="Restore an image that 'restore' has written.")
+    ] = False,
     any_result: Annotated[
-        bool, typer.Option("--any-result", help="Write OUT even if it is clipped, constant or far from IN's mean.")
+        bool,
+        typer.Option(
+            "--any-result", help="Write OUT even if it is clipped, constant or far from IN's mean."
+        ),
     ] = False,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Refuse IN whose pixels contradict --sensor, instead of saying so.")
+        bool,
+        typer.Option(
+            "--strict", help="Refuse IN whose pixels contradict --sensor, instead of saying so."
+        ),
     ] = False,
     consistency: Annotated[
         bool,
@@ -98,28 +135,36 @@ def restore(
     ] = True,
     exposure: Annotated[
         bool,
-        typer.Option("--exposure/--no-exposure", help="Restore dark parts at a higher exposure (shipped networks)."),
+        typer.Option(
+            "--exposure/--no-exposure",
+            help="Restore dark parts at a higher exposure (shipped networks).",
+        ),
     ] = True,
     fix_detectors: Annotated[
         str | None,
         typer.Option(
-            help="Interpolate faulty pixels before restoration: 'found', which writes their list beside OUT as "
-            "NAME.detectors.csv, or such a list: lines column,row, with * as the row for a whole column."
+            help="Interpolate faulty pixels before restoration: 'found', which writes their "
+            "list beside OUT as "
+            "NAME.detectors.csv, or such a list: lines column,row, with * as the row for a "
+            "whole column."
         ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped or killed.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a run that was stopped or killed.")
+    ] = False,
     json: Json = None,
 ) -> None:
-    """Restore an image tile by tile; with the exact halo the result is the whole image's, bit for bit.
+    """Restore an image tile by tile, bit for bit as if it were restored whole.
 
-    The image is read and written by rows, so memory does not grow with its height. OUT has the scale of IN. Bands are
-    restored one by one. Georeference, RPCs, missing pixels (NaN, the nodata value, or a mask) and alpha are kept.
-    A shipped network, in float32 (NAME) or INT8 (NAME-int8), is conditioned on --sensor, and without it on the middle
-    of its range. IN's own noise and edges are compared with --sensor, and
-    stripes, dead and hot columns and pixels are warned of. The consistency step keeps the mean and the
-    flux of points; exposure lets INT8 restore dark parts as well as bright ones.
-    --method traditional restores one band, about a minute a megapixel on two cores, and is not resumable.
-    JPEG 2000, NITF, HFA, VRT and DIMAP need the extra 'gdal'. Until OUT is finished its rows lie in .OUT.part.
+    The image is read and written by rows, so memory does not grow with its height. OUT has the
+    scale of IN. Bands are restored one by one. Georeference, RPCs, missing pixels (NaN, the nodata
+    value, or a mask) and alpha are kept. A shipped network, in float32 (NAME) or INT8 (NAME-int8),
+    is conditioned on --sensor, and without it on the middle of its range. IN's own noise and edges
+    are compared with --sensor, and stripes, dead and hot columns and pixels are warned of. The
+    consistency step keeps the mean and the flux of points; exposure lets INT8 restore dark parts as
+    well as bright ones. --method traditional restores one band, about a minute a megapixel on two
+    cores, and is not resumable. JPEG 2000, NITF, HFA, VRT and DIMAP need the extra 'gdal'. Until
+    OUT is finished its rows lie in .OUT.part.
     """
     from beers_deploy.model.io.files import require_writable, sha256
     from beers_deploy.model.io.images import require_image_file
@@ -166,18 +211,28 @@ def restore(
     known = {band: load_sensor(each) for band, each in sensors.items()}
     require_image_file(image)
     if found := conditioned(network):
-        told = f"told {sensor}" if sensor else "told no sensor (blind): --sensor tells it yours, and restores better"
+        told = (
+            f"told {sensor}"
+            if sensor
+            else "told no sensor (blind): --sensor tells it yours, and restores better"
+        )
         name = network.name if network else f"{found.name}{INT8}"
         say(f"network: {name}, {told}")
-    paths = {band: network_file(network, each, partial(say, err=True)) for band, each in known.items()}
-    brighter = {band: brighter_files(network, each) for band, each in known.items()} if exposure else {}
+    paths = {
+        band: network_file(network, each, partial(say, err=True)) for band, each in known.items()
+    }
+    brighter = (
+        {band: brighter_files(network, each) for band, each in known.items()} if exposure else {}
+    )
     if sensor and not found:
         _look_at_network(network, paths, known)
     path = next(iter(paths.values()))
     bits = {int(each.bits.low) for each in known.values()}
     if len(bits) > 1 and full_scale is None:
         remedy = "give --full-scale, or restore such bands apart"
-        raise OptionError("--sensor", expected="sensors of equal bits", got=f"{sorted(bits)}", remedy=remedy)
+        raise OptionError(
+            "--sensor", expected="sensors of equal bits", got=f"{sorted(bits)}", remedy=remedy
+        )
     how = replace(
         how,
         model=path,
@@ -186,12 +241,18 @@ def restore(
         brighter={band: files for band, files in brighter.items() if files},
     )
     # Before the run, which may take hours: it refuses a file that is replaced while it is read.
-    networks = [Input(f"{path.name}, {band}" if band else path.name, sha256(path)) for band, path in paths.items()]
+    networks = [
+        Input(f"{path.name}, {band}" if band else path.name, sha256(path))
+        for band, path in paths.items()
+    ]
     row = restore_file(image, out, how, say, (json, stac, found_list))
     if stac is not None:
         write_item(out, stac)
     print_rows(f"wrote {out}", [row])
-    save(Table("restore", arguments(sensor=sensor or BLIND), (*networks, image, *lists), (row,)), json)
+    save(
+        Table("restore", arguments(sensor=sensor or BLIND), (*networks, image, *lists), (row,)),
+        json,
+    )
 
 
 def _require_item(stac: Path | None, cog: bool) -> None:
@@ -199,27 +260,44 @@ def _require_item(stac: Path | None, cog: bool) -> None:
     if stac is None:
         return
     if not cog:
-        raise OptionError("--stac", expected="--cog beside it", got="none", remedy="add it, or leave --stac out")
+        raise OptionError(
+            "--stac", expected="--cog beside it", got="none", remedy="add it, or leave --stac out"
+        )
     optional("pystac", "--stac")
 
 
-def _look_at_network(network: Path | None, paths: Mapping[str, Path], known: Mapping[str, Sensor]) -> None:
-    """Refuse sensors by band for a network that is for one; say where it was made for another sensor."""
+def _look_at_network(
+    network: Path | None, paths: Mapping[str, Path], known: Mapping[str, Sensor]
+) -> None:
+    """Refuse sensors by band for a network that is for one; say where it was made for another
+    sensor.
+    """
     from beers_deploy.network_files import other_sensor
     from beers_deploy.quant.onnx_file import load_onnx
 
     if len(known) > 1:
         expected = "a shipped network, or weights of 'train --conditioned'"
         remedy = "give one sensor for all bands"
-        raise OptionError("--sensor", expected=expected, got=f"{network} with a sensor for each band", remedy=remedy)
+        raise OptionError(
+            "--sensor",
+            expected=expected,
+            got=f"{network} with a sensor for each band",
+            remedy=remedy,
+        )
     if doubt := other_sensor(load_onnx(paths[""]), known[""]):
         say(doubt, err=True)
 
 
-def _by_the_chain(image: Path, out: Path, sensor: str | None, how: Options, beside: Sequence[Path | None]) -> Row:
+def _by_the_chain(
+    image: Path, out: Path, sensor: str | None, how: Options, beside: Sequence[Path | None]
+) -> Row:
     from beers_deploy.restoration.traditional import restore_file_traditionally
 
     if sensor is None:
         remedy = "name a profile ('beers-deploy profiles' lists them) or give your .toml file"
-        raise OptionError("--sensor", expected="the sensor that acquired IN", got="none", remedy=remedy)
-    return restore_file_traditionally(image, out, replace(how, sensors={"": load_sensor(sensor)}), say, beside)
+        raise OptionError(
+            "--sensor", expected="the sensor that acquired IN", got="none", remedy=remedy
+        )
+    return restore_file_traditionally(
+        image, out, replace(how, sensors={"": load_sensor(sensor)}), say, beside
+    )

@@ -1,4 +1,6 @@
-"""What commands share: options that several take, lines they print, how they refuse what does nothing."""
+"""What commands share: options that several take, lines they print, how they refuse what does
+nothing.
+"""
 
 import json
 import sys
@@ -20,41 +22,67 @@ if TYPE_CHECKING:
     from beers_deploy.results import Table
 
 OR_YOURS = "or your .toml file"
-BOARDS, RULED = (", ".join([*names, OR_YOURS]) for names in (board_names(), board_names() + npu_names()))
-"""What --target takes, for its help: where something is predicted, and where rules alone are asked for."""
+BOARDS, RULED = (
+    ", ".join([*names, OR_YOURS]) for names in (board_names(), board_names() + npu_names())
+)
+"""What --target takes, for its help: where something is predicted, and where rules alone are asked
+for.
+"""
 
-Json = Annotated[Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")]
+Json = Annotated[
+    Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")
+]
 Seed = Annotated[int, typer.Option(min=0, max=SEEDS, help="Seed of every random draw.")]
 Tile = Annotated[int, typer.Option(min=16, help="Longest side of a tile in pixels.")]
 Restoring = Annotated[
-    Path | None, typer.Option(help="ONNX network, or a shipped one's name; convbeers-s-int8 if none.")
+    Path | None,
+    typer.Option(help="ONNX network, or a shipped one's name; convbeers-s-int8 if none."),
 ]
 TrustIndex = Annotated[
-    bool, typer.Option("--trust-index", help="Let a VRT or DIMAP name tiles outside its folder and at URLs.")
+    bool,
+    typer.Option(
+        "--trust-index", help="Let a VRT or DIMAP name tiles outside its folder and at URLs."
+    ),
 ]
 FloatModel = Annotated[
     Path | None,
-    typer.Argument(metavar="[FLOAT]", help="Float ONNX or weights; or a shipped name, convbeers-s if none."),
+    typer.Argument(
+        metavar="[FLOAT]", help="Float ONNX or weights; or a shipped name, convbeers-s if none."
+    ),
 ]
 Int8Model = Annotated[
-    Path | None, typer.Argument(metavar="[INT8]", help="Its INT8 ONNX; that of a shipped name if none.")
+    Path | None,
+    typer.Argument(metavar="[INT8]", help="Its INT8 ONNX; that of a shipped name if none."),
 ]
 Reference = Annotated[
-    str | None, typer.Option(help="Profile of the reference images, in the sensor's DN; pleiades-reference if none.")
+    str | None,
+    typer.Option(
+        help="Profile of the reference images, in the sensor's DN; pleiades-reference if none."
+    ),
 ]
 Lpips = Annotated[
-    Path | None, typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.")
+    Path | None,
+    typer.Option(help="Weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones."),
 ]
-Detector = Annotated[Path | None, typer.Option(help="ONNX as Ultralytics exports it; the embedded one if none.")]
+Detector = Annotated[
+    Path | None, typer.Option(help="ONNX as Ultralytics exports it; the embedded one if none.")
+]
 Classes = Annotated[
-    str | None, typer.Option(help="Labelled classes under the detector's names: car=vehicle,minibus=vehicle.")
+    str | None,
+    typer.Option(help="Labelled classes under the detector's names: car=vehicle,minibus=vehicle."),
 ]
 
 
 def refuse(
-    context: typer.Context, names: Iterable[str], *, expected: str, got: str = "none", remedy: str = "leave it out"
+    context: typer.Context,
+    names: Iterable[str],
+    *,
+    expected: str,
+    got: str = "none",
+    remedy: str = "leave it out",
 ) -> None:
-    """Refuse the first of these parameters to which the command line gives a value; 0 asks for nothing.
+    """Refuse the first of these parameters to which the command line gives a value; 0 asks for
+    nothing.
 
     A switch with a name for off, such as --no-exposure, is refused under either name.
 
@@ -107,21 +135,31 @@ def running(given: Mapping[str, object]) -> Iterator[None]:
 
 
 def arguments(**settled: object) -> dict[str, object]:
-    """What the command line gave, for its results; and what the command settled on where nothing was given."""
-    plain = {name: ", ".join(map(str, v)) if isinstance(v, list) else v for name, v in _given.get().items()}
+    """What the command line gave, for its results; and what the command settled on where nothing
+    was given.
+    """
+    plain = {
+        name: ", ".join(map(str, v)) if isinstance(v, list) else v
+        for name, v in _given.get().items()
+    }
     return {name: value for name, value in {**plain, **settled}.items() if name not in OUTPUTS}
 
 
 def save(table: "Table", path: Path | None) -> None:
-    """Write results where --json asked for them: to a file, to standard output for `-`, nowhere for None."""
+    """Write results where --json asked for them: to a file, to standard output for `-`, nowhere for
+    None.
+    """
     if path == STDOUT:
         (_results.get() or sys.stdout).write(json.dumps(table.to_dict(), indent=1) + "\n")
     elif path is not None:
         table.save(path)
 
 
-def board_for(target: str, core: Path | None, tile: int | None, inputs: Iterable[Path | None]) -> TargetProfile:
-    """The board of a core that is to be written: of an NPU a tile is asked for, and room for what its compiler reads.
+def board_for(
+    target: str, core: Path | None, tile: int | None, inputs: Iterable[Path | None]
+) -> TargetProfile:
+    """The board of a core that is to be written: of an NPU a tile is asked for, and room for what
+    its compiler reads.
 
     Args:
         target: as --target names it.
@@ -140,7 +178,9 @@ def board_for(target: str, core: Path | None, tile: int | None, inputs: Iterable
 
 
 def save_core(core: "Network | None", path: Path | None, board: TargetProfile) -> None:
-    """Write a network's core for a board, where one is wanted, and beside it what the compiler of an NPU reads."""
+    """Write a network's core for a board, where one is wanted, and beside it what the compiler of
+    an NPU reads.
+    """
     from beers_deploy.quant.encodings import save_config
 
     if core is None or path is None:
@@ -152,5 +192,7 @@ def save_core(core: "Network | None", path: Path | None, board: TargetProfile) -
 
 
 def say(text: str, err: bool = False) -> None:
-    """Print one line on standard output, or on standard error; a terminal shows its characters and obeys none."""
+    """Print one line on standard output, or on standard error; a terminal shows its characters and
+    obeys none.
+    """
     typer.echo(one_line(text), err=err)

@@ -1,4 +1,6 @@
-"""`beers-deploy simulate`: what two sensors would see of a scene, as 12-bit TIFF pairs; or why, with --explain."""
+"""`beers-deploy simulate`: what two sensors would see of a scene, as 12-bit TIFF pairs; or why,
+with --explain.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,7 +29,9 @@ PRESETS = {
     "dior-medium": ("dior-medium", 256),
     "dior-high": ("dior-high", 256),
 }
-"""The paper's datasets (table 1, and the table of DIOR parameters): sensor, and patch side in pixels."""
+"""The paper's datasets (table 1, and the table of DIOR parameters): sensor, and patch side in
+pixels.
+"""
 
 
 def simulate(
@@ -36,39 +40,58 @@ def simulate(
         list[Path] | None, typer.Argument(help="Images: 8-bit, 16-bit DN, float; drawn if none.")
     ] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder of the dataset.")] = None,
-    sensor: Annotated[str | None, typer.Option(help=f"Profile of the degraded images; {SENSOR} if none.")] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help=f"Profile of the degraded images; {SENSOR} if none.")
+    ] = None,
     reference: Reference = None,
-    preset: Annotated[str | None, typer.Option(help=f"A dataset of the paper: {', '.join(PRESETS)}.")] = None,
+    preset: Annotated[
+        str | None, typer.Option(help=f"A dataset of the paper: {', '.join(PRESETS)}.")
+    ] = None,
     patch: Annotated[
-        int | None, typer.Option(min=8, max=8192, help="Patch side in pixels; whole scenes if none.")
+        int | None,
+        typer.Option(min=8, max=8192, help="Patch side in pixels; whole scenes if none."),
     ] = None,
     oversampling: Annotated[
-        float | None, typer.Option(min=1, max=64, help="Scene pixels per pixel, whole or not; the profile's if none.")
+        float | None,
+        typer.Option(
+            min=1, max=64, help="Scene pixels per pixel, whole or not; the profile's if none."
+        ),
     ] = None,
     scene: Annotated[
-        str | None, typer.Option(help="What the scene calls for: night-port, snow, ..., or a .toml.")
+        str | None,
+        typer.Option(help="What the scene calls for: night-port, snow, ..., or a .toml."),
     ] = None,
-    add: Annotated[list[str] | None, typer.Option("--with", help="Effect to add, at typical values.")] = None,
-    forbid: Annotated[list[str] | None, typer.Option("--without", help="Effect to leave out.")] = None,
+    add: Annotated[
+        list[str] | None, typer.Option("--with", help="Effect to add, at typical values.")
+    ] = None,
+    forbid: Annotated[
+        list[str] | None, typer.Option("--without", help="Effect to leave out.")
+    ] = None,
     explain: Annotated[
         bool, typer.Option("--explain", help="Show for each effect what is decided, and why.")
     ] = False,
-    tolerance: Annotated[float, typer.Option(min=0, help="DN by which skipping may change a pixel.")] = 0.25,
+    tolerance: Annotated[
+        float, typer.Option(min=0, help="DN by which skipping may change a pixel.")
+    ] = 0.25,
     workers: Annotated[int, typer.Option(min=0, help="Processes; 0 takes every core.")] = 0,
     scheduler: Annotated[
-        str | None, typer.Option(help="Dask scheduler whose workers simulate, such as tcp://host:8786.")
+        str | None,
+        typer.Option(help="Dask scheduler whose workers simulate, such as tcp://host:8786."),
     ] = None,
     seed: Seed = 0,
     resume: Annotated[
         bool,
         typer.Option(
-            "--resume", help="Go on with an unfinished dataset; pairs that do not match the manifest are made again."
+            "--resume",
+            help="Go on with an unfinished dataset; pairs that do not match the manifest are "
+            "made again.",
         ),
     ] = False,
 ) -> None:
-    """Write degraded/NAME.tif and reference/NAME.tif for each scene or patch; the same bytes for the same seed.
+    """Write pairs of images, degraded/NAME.tif and reference/NAME.tif, of scenes or patches.
 
-    The workers of a scheduler must find the same scenes under the same paths; only this process writes.
+    The workers of a scheduler must find the same scenes under the same paths; only this process
+    writes.
     """
     import math
     import os
@@ -84,7 +107,13 @@ def simulate(
         remedy = "leave it out, or give a folder"
         refuse(context, ["workers", "scheduler", "resume"], expected=expected, remedy=remedy)
     if scheduler is not None:
-        refuse(context, ["workers"], expected="none beside --scheduler", got="some", remedy="leave one of them out")
+        refuse(
+            context,
+            ["workers"],
+            expected="none beside --scheduler",
+            got="some",
+            remedy="leave one of them out",
+        )
     require_cores("--workers", workers)
     if out is not None:
         read = (*(scenes or ()), *(Path(name) for name in (sensor, reference, scene) if name))
@@ -108,27 +137,39 @@ def simulate(
         ratio / wanted,
     )
     if ratio < MIN_RATIO:
-        say(f"note: at {ratio} scene pixel a pixel the blur itself rings near sharp edges", err=True)
+        say(
+            f"note: at {ratio} scene pixel a pixel the blur itself rings near sharp edges", err=True
+        )
     if out is None and not explain:
-        raise OptionError("--out", expected="a folder", got="none", remedy="give one, or ask for --explain alone")
+        raise OptionError(
+            "--out", expected="a folder", got="none", remedy="give one, or ask for --explain alone"
+        )
     if explain:
         _explain(recipe, origins(own, call, add or (), forbid or ()))
     if out is None:
         return
     with open_cluster(scheduler) as cluster, steps("simulating", len(plan_windows(recipe))) as bar:
-        count, pool = (cluster.slots, cluster.pool) if cluster else (workers or os.cpu_count() or 1, None)
+        count, pool = (
+            (cluster.slots, cluster.pool) if cluster else (workers or os.cpu_count() or 1, None)
+        )
         summary = write_dataset(recipe, out, count, resume, bar.advance, pool, say)
-    rejected = f"; {summary['rejected_share']:.1%} of the drawn SNR pairs were impossible and drawn again"
+    rejected = (
+        f"; {summary['rejected_share']:.1%} of the drawn SNR pairs were impossible and drawn again"
+    )
     pairs = f"{summary['patches']:.0f} pair{'' if summary['patches'] == 1 else 's'}"
     say(f"wrote {pairs} to {out}" + (rejected if summary["rejected_share"] else ""))
 
 
 def _preset(name: str | None) -> tuple[str, int | None]:
-    """The sensor and the patch side of a dataset of the paper; of none the sensor of all commands, and no side."""
+    """The sensor and the patch side of a dataset of the paper; of none the sensor of all commands,
+    and no side.
+    """
     if name is None:
         return SENSOR, None
     if name not in PRESETS:
-        raise OptionError("--preset", expected=f"one of {', '.join(PRESETS)}", got=repr(name), remedy="choose one")
+        raise OptionError(
+            "--preset", expected=f"one of {', '.join(PRESETS)}", got=repr(name), remedy="choose one"
+        )
     return PRESETS[name]
 
 
@@ -146,9 +187,22 @@ def _explain(recipe: "DatasetRecipe", origins: Mapping[str, str]) -> None:
         scene = load(recipe, index)
         stats = prepare_scene(scene.radiance, recipe.oversampling).stats
         sensor = recipe.degraded.draw(Draw(recipe.seed, index).generator("sensor-degraded"))
-        title = plain(f"{scene.name}: {stats.low:.1f} to {stats.high:.1f} W/m2/sr/um, {recipe.degraded.name}")
-        table = Table("effect", "from", "decision", "why", "bound DN", "cost", title=title, title_justify="left")
+        title = plain(
+            f"{scene.name}: {stats.low:.1f} to {stats.high:.1f} W/m2/sr/um, {recipe.degraded.name}"
+        )
+        table = Table(
+            "effect",
+            "from",
+            "decision",
+            "why",
+            "bound DN",
+            "cost",
+            title=title,
+            title_justify="left",
+        )
         for d in make_plan(sensor, stats, recipe.tolerance_dn).decisions:
             bound = "" if d.bound_dn is None else f"{d.bound_dn:.3g}"
-            table.add_row(*map(plain, (d.effect, origins.get(d.effect, ""), d.choice, d.why, bound, d.cost)))
+            table.add_row(
+                *map(plain, (d.effect, origins.get(d.effect, ""), d.choice, d.why, bound, d.cost))
+            )
         default_console().print(table)

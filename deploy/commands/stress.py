@@ -1,4 +1,7 @@
-"""`beers-deploy stress`: hard cases and bit flips against a network. Exit code 1 when something fails."""
+"""`beers-deploy stress`: hard cases and bit flips against a network.
+
+Exit code 1 when something fails.
+"""
 
 from collections.abc import Sequence
 from functools import partial
@@ -7,7 +10,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from beers_deploy.commands.shared import BOARDS, FloatModel, Int8Model, Json, Seed, arguments, refuse, save, say
+from beers_deploy.commands.shared import (
+    BOARDS,
+    FloatModel,
+    Int8Model,
+    Json,
+    Seed,
+    arguments,
+    refuse,
+    save,
+    say,
+)
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.profiles.sensor_file import load_sensor
@@ -25,43 +38,67 @@ def stress(
     context: typer.Context,
     float_model: FloatModel = None,
     int8_model: Int8Model = None,
-    cases: Annotated[str | None, typer.Option(help="Only these cases, with commas: 'night,snow'.")] = None,
-    stages: Annotated[str | None, typer.Option(help="Only these stages, with commas: 'float32,INT8'.")] = None,
+    cases: Annotated[
+        str | None, typer.Option(help="Only these cases, with commas: 'night,snow'.")
+    ] = None,
+    stages: Annotated[
+        str | None, typer.Option(help="Only these stages, with commas: 'float32,INT8'.")
+    ] = None,
     side: Annotated[
-        int, typer.Option(min=16, max=4096, help="Side in pixels, where a case has none of its own.")
+        int,
+        typer.Option(min=16, max=4096, help="Side in pixels, where a case has none of its own."),
     ] = 96,
     seed: Seed = 0,
     bit_flips: Annotated[
         bool,
-        typer.Option("--bit-flips", help="Inject bit flips into the INT8 network instead of running hard cases."),
+        typer.Option(
+            "--bit-flips",
+            help="Inject bit flips into the INT8 network instead of running hard cases.",
+        ),
     ] = False,
     draws: Annotated[
-        int, typer.Option(min=1, max=10_000, help="Injections into each memory at each rate, with --bit-flips.")
+        int,
+        typer.Option(
+            min=1, max=10_000, help="Injections into each memory at each rate, with --bit-flips."
+        ),
     ] = 6,
     sensor: Annotated[
         str, typer.Option(help="Sensor of a shipped network; with --bit-flips also of the patches.")
     ] = SENSOR,
     images: Annotated[
         Path | None,
-        typer.Option(help="Folder of aerial images for the patches, with --bit-flips; else drawn scenes."),
+        typer.Option(
+            help="Folder of aerial images for the patches, with --bit-flips; else drawn scenes."
+        ),
     ] = None,
     target: Annotated[
         str, typer.Option(help=f"Board that prices the guards, with --bit-flips: {BOARDS}.")
     ] = DEFAULT_TARGET,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Tables as Markdown; with --bit-flips the curves beside it.")
+        Path | None,
+        typer.Option(
+            "-o", "--out", help="Tables as Markdown; with --bit-flips the curves beside it."
+        ),
     ] = None,
     json: Json = None,
 ) -> None:
     """Run hard cases through a network in float32, in INT8, in whole numbers alone and in tiles.
 
-    Prints what holds, the worst measures, the known limitations met, and which sums are proven not to overflow.
-    --bit-flips: what flips in weights, shifts, maps and the image cost, and what guards gain and cost on the board.
+    Prints what holds, the worst measures, the known limitations met, and which sums are proven not
+    to overflow. --bit-flips: what flips in weights, shifts, maps and the image cost, and what
+    guards gain and cost on the board.
     """
     from beers_deploy.model.io.files import require_writable, write_text
     from beers_deploy.quant.calibration import Calibration
     from beers_deploy.results import Table, inputs_of, print_rows, require_same
-    from beers_deploy.studies.stress.battery import TITLES, chosen, finding_rows, markdown, run_battery, shown_rows
+    from beers_deploy.studies.stress.battery import (
+        TITLES,
+        chosen,
+        finding_rows,
+        markdown,
+        run_battery,
+        shown_rows,
+    )
     from beers_deploy.studies.stress.bit_flips import flip_curves_svg, flip_rows
     from beers_deploy.studies.stress.cases import CASES
     from beers_deploy.studies.stress.networks import STAGES, open_subject
@@ -76,9 +113,13 @@ def stress(
     inputs = inputs_of(*subject.paths) if json else ()
     if bit_flips:
         results = []
-        shown = flip_rows(subject, Calibration(load_sensor(sensor), images, draws, side, seed), target)
+        shown = flip_rows(
+            subject, Calibration(load_sensor(sensor), images, draws, side, seed), target
+        )
     else:
-        results = run_battery(subject, [case for case in CASES if case.name in names], wanted, seed, side)
+        results = run_battery(
+            subject, [case for case in CASES if case.name in names], wanted, seed, side
+        )
         shown = shown_rows(subject, results)
     for table, rows in by_table(shown).items():
         print_rows(TITLES[table], rows)
@@ -99,10 +140,15 @@ def _judge(shown: Sequence[Row], results: "Sequence[StageResult]") -> None:
     failed = [result for result in results if result.failed]
     for result in failed:
         say(f"FAILED {result.case.name}, {result.stage}: {result.verdict.removeprefix('FAILED: ')}")
-    safe = all(row.text["can it overflow int32"] == "no" for row in shown if row.table == "integer layers")
+    safe = all(
+        row.text["can it overflow int32"] == "no" for row in shown if row.table == "integer layers"
+    )
     if not safe:
         say("FAILED: an int32 accumulator might overflow, see the integer layers")
-    say(f"stress {'passed' if not failed and safe else 'FAILED'}: {len(results)} looks, {len(failed)} failed")
+    say(
+        f"stress {'passed' if not failed and safe else 'FAILED'}: {len(results)} looks, "
+        f"{len(failed)} failed"
+    )
     if failed or not safe:
         raise typer.Exit(1)
 

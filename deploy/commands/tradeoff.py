@@ -6,7 +6,17 @@ from typing import Annotated
 
 import typer
 
-from beers_deploy.commands.shared import Classes, Detector, Json, Lpips, Reference, Seed, refuse, save, say
+from beers_deploy.commands.shared import (
+    Classes,
+    Detector,
+    Json,
+    Lpips,
+    Reference,
+    Seed,
+    refuse,
+    save,
+    say,
+)
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor, reference_beside
 from beers_deploy.profiles.target import DEFAULT_TARGET, board_names
@@ -17,34 +27,45 @@ BOARDS = ", ".join(board_names())
 
 def tradeoff(
     context: typer.Context,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of page, figures and measurements.")],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder of page, figures and measurements.")
+    ],
     images: Annotated[
-        Path | None, typer.Option(help="Folder of held-out scenes to simulate from; drawn ones if none.")
+        Path | None,
+        typer.Option(help="Folder of held-out scenes to simulate from; drawn ones if none."),
     ] = None,
     sensor: Annotated[str, typer.Option(help="Profile of the degraded images.")] = SENSOR,
     reference: Reference = None,
     network: Annotated[
         list[str] | None,
         typer.Option(
-            help="A shipped name, float ONNX or safetensors, quantised on the way, or an INT8 file as it is; may be "
+            help="A shipped name, float ONNX or safetensors, quantised on the way, or an INT8 "
+            "file as it is; may be "
             "given again, and 'all' stands for the shipped ones, as if none is given."
         ),
     ] = None,
     budget: Annotated[
         str | None,
-        typer.Option(help="What you can afford: 'latency<=20s', 'latency<=9s,power<=20W'. Best PSNR wins."),
+        typer.Option(
+            help="What you can afford: 'latency<=20s', 'latency<=9s,power<=20W'. Best PSNR wins."
+        ),
     ] = None,
     need: Annotated[
-        str | None, typer.Option(help="What you must reach: 'psnr>=44'. Without a budget the least latency wins.")
+        str | None,
+        typer.Option(
+            help="What you must reach: 'psnr>=44'. Without a budget the least latency wins."
+        ),
     ] = None,
     lpips: Lpips = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="Folder of scenes to quantise your networks on; drawn ones if none.")
+        Path | None,
+        typer.Option(help="Folder of scenes to quantise your networks on; drawn ones if none."),
     ] = None,
     labelled: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of labelled pictures, as detect reads them: what a detector finds is a figure too."
+            help="Folder of labelled pictures, as detect reads them: what a detector finds is a "
+            "figure too."
         ),
     ] = None,
     detector: Detector = None,
@@ -52,7 +73,8 @@ def tradeoff(
     target: Annotated[
         str,
         typer.Option(
-            help=f"The modelled board: {BOARDS}, or your .toml file; several with commas, or 'all'. Several are "
+            help=f"The modelled board: {BOARDS}, or your .toml file; several with commas, or "
+            "'all'. Several are "
             "compared, and one is recommended."
         ),
     ] = DEFAULT_TARGET,
@@ -60,11 +82,12 @@ def tradeoff(
     seed: Seed = 0,
     json: Json = None,
 ) -> None:
-    """Measure networks and traditional pipelines on the same images, predict board runs, and recommend a point.
+    """Measure networks and pipelines on the same images, predict board runs, recommend a point.
 
-    All boards of --target are compared, whatever their order; for each that is not recommended a line says why.
-    Measurements are kept: a second run, or one that was stopped, measures only what is missing. Exit code 1 where no
-    point keeps --budget and --need; the page is written all the same.
+    All boards of --target are compared, whatever their order; for each that is not recommended a
+    line says why. Measurements are kept: a second run, or one that was stopped, measures only what
+    is missing. Exit code 1 where no point keeps --budget and --need; the page is written all the
+    same.
     """
     from beers_deploy.dpu.board import ALL
     from beers_deploy.model.io.files import require_writable
@@ -76,17 +99,36 @@ def tradeoff(
     from beers_deploy.studies.tradeoff.run import tradeoff as measured
 
     log = partial(say, err=True)
-    limits = {name: parse_constraints(name, text) for name, text in (("budget", budget), ("need", need))}
+    limits = {
+        name: parse_constraints(name, text) for name, text in (("budget", budget), ("need", need))
+    }
     if labelled is None:
         named = [name for name, asked in limits.items() if any(each.key == MAP50 for each in asked)]
         remedy = "give labelled pictures, or leave it out"
-        refuse(context, ["detector", "classes", *named], expected="--labelled beside it", remedy=remedy)
-    names = [name for each in network or [ALL] for name in (shipped_names() if each == ALL else [each])]
+        refuse(
+            context, ["detector", "classes", *named], expected="--labelled beside it", remedy=remedy
+        )
+    names = [
+        name for each in network or [ALL] for name in (shipped_names() if each == ALL else [each])
+    ]
     aim = reference or REFERENCE
     boards = parse_targets(target)
     tree = labelled.rglob("*") if labelled else ()
-    read = (images, calibration, lpips, labelled, detector, *tree, *map(Path, (sensor, aim, *boards, *names)))
-    written = (out / "tradeoff.json", *(out / name for name in FILES), out / "measurements.json", json)
+    read = (
+        images,
+        calibration,
+        lpips,
+        labelled,
+        detector,
+        *tree,
+        *map(Path, (sensor, aim, *boards, *names)),
+    )
+    written = (
+        out / "tradeoff.json",
+        *(out / name for name in FILES),
+        out / "measurements.json",
+        json,
+    )
     require_writable(*written, inputs=read, folders=(out / "int8",))
     reference_beside(load_sensor(sensor), reference, say)
     study = measured(

@@ -22,61 +22,90 @@ class Precision(StrEnum):
 
 def train(
     context: typer.Context,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of checkpoint, logs, pictures and weights.")],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder of checkpoint, logs, pictures and weights.")
+    ],
     recipe: Annotated[
         str | None,
-        typer.Option(help="Make a shipped network: its name, or a recipe of your own (.toml), which says all else."),
+        typer.Option(
+            help="Make a shipped network: its name, or a recipe of your own (.toml), which says "
+            "all else."
+        ),
     ] = None,
     images: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder of sharp aerial images (8-bit RGB, or 16-bit mono) to simulate from; several if repeated."
+            help="Folder of sharp aerial images (8-bit RGB, or 16-bit mono) to simulate from; "
+            "several if repeated."
         ),
     ] = None,
-    pairs: Annotated[Path | None, typer.Option(help="Folder of pairs that 'simulate' wrote, instead.")] = None,
+    pairs: Annotated[
+        Path | None, typer.Option(help="Folder of pairs that 'simulate' wrote, instead.")
+    ] = None,
     variant: Annotated[str, typer.Option(help="Size of the network.")] = "convbeers-s",
     sensor: Annotated[
         str | None,
-        typer.Option(help=f"Profile of the degraded input; of pairs their recipe's, else {RANGE} if none."),
+        typer.Option(
+            help=f"Profile of the degraded input; of pairs their recipe's, else {RANGE} if none."
+        ),
     ] = None,
     conditioned: Annotated[
         bool,
-        typer.Option("--conditioned", help="Draw sensors of a wide range with that gain, and condition on each."),
+        typer.Option(
+            "--conditioned",
+            help="Draw sensors of a wide range with that gain, and condition on each.",
+        ),
     ] = False,
     reference: Reference = None,
-    drawn: Annotated[int, typer.Option(min=0, max=1000, help="Drawn scenes to add to the images.")] = 0,
+    drawn: Annotated[
+        int, typer.Option(min=0, max=1000, help="Drawn scenes to add to the images.")
+    ] = 0,
     steps: Annotated[int, typer.Option(min=1, help="Gradient steps.")] = 20_000,
     batch: Annotated[int, typer.Option(min=1, max=4096, help="Patches a step and worker.")] = 8,
     patch: Annotated[int, typer.Option(min=17, max=2048, help="Patch side in pixels.")] = 96,
     learning_rate: Annotated[float, typer.Option(min=0, help="Highest learning rate.")] = 1e-3,
     l1_weight: Annotated[float, typer.Option(min=0, help="Weight of L1 in the loss.")] = 1.0,
     lpips_weight: Annotated[float, typer.Option(min=0, help="Weight of LPIPS in the loss.")] = 0.5,
-    fft_weight: Annotated[float, typer.Option(min=0, help="Weight of the L1 of spectra in the loss.")] = 0.1,
+    fft_weight: Annotated[
+        float, typer.Option(min=0, help="Weight of the L1 of spectra in the loss.")
+    ] = 0.1,
     psnr_weight: Annotated[
-        float, typer.Option(min=0, help="Weight of the patches' mean PSNR in the loss; 0.01 without L1.")
+        float,
+        typer.Option(min=0, help="Weight of the patches' mean PSNR in the loss; 0.01 without L1."),
     ] = 0.0,
     lpips: Lpips = None,
     start: Annotated[
         Path | None, typer.Option(help="Weights to go on from; those of a smaller network grow.")
     ] = None,
     rounding: Annotated[
-        Path | None, typer.Option(help="INT8 file of the --start weights: trains with the maps rounded as there.")
+        Path | None,
+        typer.Option(
+            help="INT8 file of the --start weights: trains with the maps rounded as there."
+        ),
     ] = None,
-    validate_every: Annotated[int, typer.Option(min=0, help="Steps between validations; 0 for none.")] = 1000,
+    validate_every: Annotated[
+        int, typer.Option(min=0, help="Steps between validations; 0 for none.")
+    ] = 1000,
     seed: Seed = 0,
     device: Annotated[str, typer.Option(help="cpu, or cuda.")] = "cpu",
     precision: Annotated[
-        Precision, typer.Option(help="Of the body's convolutions; bfloat16 is faster where there are units for it.")
+        Precision,
+        typer.Option(
+            help="Of the body's convolutions; bfloat16 is faster where there are units for it."
+        ),
     ] = Precision.float32,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the run's checkpoint.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the run's checkpoint.")
+    ] = False,
 ) -> None:
-    """Train a network on pairs simulated on the fly, or stored; resumable, the same weights for the same seed.
+    """Train a network on simulated or stored pairs; resumable, the same weights for the same seed.
 
-    The loss is the paper's: 1.0 L1 + 0.5 LPIPS + 0.1 L1 of spectra; without weights for LPIPS that term is left out,
-    which is said and kept in the recipe. A twentieth of the images, whole sites, is held out for validation. Several
-    GPUs: start it with torchrun. --conditioned weights become the network of any sensor in range; --start then takes
-    such weights, and plain ones without. --rounding prepares such weights for INT8: quantised anew they lose less.
-    --recipe runs all stages of a shipped network, or of your own recipe, to weights, INT8 file and model card.
+    The loss is the paper's: 1.0 L1 + 0.5 LPIPS + 0.1 L1 of spectra; without weights for LPIPS that
+    term is left out, which is said and kept in the recipe. A twentieth of the images, whole sites,
+    is held out for validation. Several GPUs: start it with torchrun. --conditioned weights become
+    the network of any sensor in range; --start then takes such weights, and plain ones without.
+    --rounding prepares such weights for INT8: quantised anew they lose less. --recipe runs all
+    stages of a shipped network, or of your own recipe, to weights, INT8 file and model card.
     """
     from beers_deploy.model.dataset import profiles_for, read_pairs_recipe
     from beers_deploy.model.family import SensorFamily
@@ -101,13 +130,17 @@ def train(
         raise OptionError("--pairs", expected=expected, got="both", remedy=remedy)
     if conditioned and pairs is not None:
         remedy = "leave one out: stored pairs do not say what sensor each had"
-        raise OptionError("--conditioned", expected="no --pairs beside it", got="both", remedy=remedy)
+        raise OptionError(
+            "--conditioned", expected="no --pairs beside it", got="both", remedy=remedy
+        )
     if rounding is not None and not (conditioned and start):
         expected = "--conditioned and --start beside it"
         remedy = "give both, or leave it out"
         raise OptionError("--rounding", expected=expected, got="not both", remedy=remedy)
     _refuse_unused(context)
-    stored = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else list(folders)
+    stored = (
+        [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else list(folders)
+    )
     start = weights_file(start) if start else None
     rounding = weights_file(rounding) if rounding else None
     read = (*stored, lpips, start, rounding, *(Path(name) for name in (sensor, reference) if name))
@@ -180,7 +213,13 @@ def _refuse_unused(context: typer.Context) -> None:
     remedy = "leave it out, or give what it needs"
     if not context.params["images"]:
         expected = "--images, of which whole sites are held out, beside it"
-        refuse(context, ["validate_every"], expected=expected, got="no images: nothing to validate on", remedy=remedy)
+        refuse(
+            context,
+            ["validate_every"],
+            expected=expected,
+            got="no images: nothing to validate on",
+            remedy=remedy,
+        )
     if not context.params["lpips_weight"]:
         expected = "a weight of LPIPS in the loss"
         got = "--lpips-weight 0"

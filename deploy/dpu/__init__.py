@@ -1,4 +1,5 @@
-"""The DPUCVDX8G from the outside: what it can run, where each node goes, how long it takes, at what power.
+"""The DPUCVDX8G from the outside: what it can run, where each node goes, how long it takes, at what
+power.
 
 - `board`: a configuration with its constants; `graph`: a network as the DPU sees it;
 - `reading`: an ONNX file becomes such a graph;

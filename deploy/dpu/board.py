@@ -30,15 +30,19 @@ def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
 REQUIRED = ("cores", "batch_handlers", "cpb", "peak_tops")
 """What every configuration states."""
 SIZED = ("array", "memory", "elementwise")
-"""Tables whose constants a configuration may state for itself, by their names: a smaller array has smaller banks."""
+"""Tables whose constants a configuration may state for itself, by their names: a smaller array has
+smaller banks.
+"""
 
 
 @dataclass(frozen=True)
 class Dpu:
-    """A DPU configuration: C32B3 has 3 batch handlers, each of 32 AI engines and 32 output channels at a time.
+    """A DPU configuration: C32B3 has 3 batch handlers, each of 32 AI engines and 32 output channels
+    at a time.
 
-    A board may hold several cores of it, which share its memory and nothing else: three of the ZCU102's B4096, each
-    with one batch handler, run three images at once and load the weights three times.
+    A board may hold several cores of it, which share its memory and nothing else: three of the
+    ZCU102's B4096, each with one batch handler, run three images at once and load the weights three
+    times.
     """
 
     target: TargetProfile
@@ -49,7 +53,8 @@ class Dpu:
     def tables(self) -> dict[str, dict[str, Constant]]:
         """The target's tables, with what the configuration states in place of theirs."""
         sized = {
-            name: {k: self.constants.get(k, v) for k, v in self.target.tables.get(name, {}).items()} for name in SIZED
+            name: {k: self.constants.get(k, v) for k, v in self.target.tables.get(name, {}).items()}
+            for name in SIZED
         }
         return {**self.target.tables, **{name: table for name, table in sized.items() if table}}
 
@@ -98,8 +103,12 @@ class Dpu:
 
     @property
     def lane_steps_per_s(self) -> float:
-        """Values a second that an engine in programmable logic takes in: channels x pixels x its clock."""
-        lanes = self.value("elementwise", "channels_per_cycle") * self.value("elementwise", "pixels_per_cycle")
+        """Values a second that an engine in programmable logic takes in: channels x pixels x its
+        clock.
+        """
+        lanes = self.value("elementwise", "channels_per_cycle") * self.value(
+            "elementwise", "pixels_per_cycle"
+        )
         return lanes * self.value("array", "pl_clock_hz")
 
     def limit(self, table: str, key: str) -> Constant:
@@ -122,10 +131,14 @@ def load_dpu(target: str, configuration: str | None = None) -> Dpu:
 
 
 def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
-    """As `load_dpu`, of a target that has been read: of a user's file its name alone would not be found."""
+    """As `load_dpu`, of a target that has been read: of a user's file its name alone would not be
+    found.
+    """
     if not profile.configurations:
         expected = f"a target with a DPU: {', '.join(board_names())}"
-        raise OptionError("target", expected=expected, got=repr(profile.name), remedy="choose another")
+        raise OptionError(
+            "target", expected=expected, got=repr(profile.name), remedy="choose another"
+        )
     name, constants = profile.configuration(configuration)
     for key in (key for key in REQUIRED if key not in constants):
         where = f"{profile.name} [configurations.{name}] {key}"
@@ -138,7 +151,9 @@ def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
 
 
 def ruled(profile: TargetProfile, configuration: str | None = None) -> Dpu:
-    """What a network is held against: as `dpu_of`, or an NPU, which has rules and nothing that predicts."""
+    """What a network is held against: as `dpu_of`, or an NPU, which has rules and nothing that
+    predicts.
+    """
     if not profile.npu:
         return dpu_of(profile, configuration)
     if configuration is not None:

@@ -1,4 +1,6 @@
-"""A network as the DPU sees it: a short list of operations, whatever encoding its ONNX file is written in."""
+"""A network as the DPU sees it: a short list of operations, whatever encoding its ONNX file is
+written in.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,7 +20,8 @@ CONVOLUTIONS = frozenset({"conv", "grouped conv", "depthwise", "transposed"})
 class Operation:
     """One node: what it computes, on which activations, with which numbers.
 
-    `inputs` and `outputs` name activations; `integer` says that the file already computes it on integers.
+    `inputs` and `outputs` name activations; `integer` says that the file already computes it on
+    integers.
     """
 
     name: str
@@ -35,9 +38,15 @@ class Operation:
     attributes: Mapping[str, object] = field(default_factory=dict)
     follows: Kind | None = None  # what computes the first input
     integer: bool = False
-    scales: Mapping[str, Scale] = field(default_factory=dict)  # of "input 0", ..., "weight", "bias", "output"
-    disputed: Mapping[str, tuple[Scale, ...]] = field(default_factory=dict)  # where the file gives several
-    constants: Mapping[str, np.ndarray | None] = field(default_factory=dict, compare=False)  # None: computed
+    scales: Mapping[str, Scale] = field(
+        default_factory=dict
+    )  # of "input 0", ..., "weight", "bias", "output"
+    disputed: Mapping[str, tuple[Scale, ...]] = field(
+        default_factory=dict
+    )  # where the file gives several
+    constants: Mapping[str, np.ndarray | None] = field(
+        default_factory=dict, compare=False
+    )  # None: computed
 
     @property
     def output(self) -> str:
@@ -46,11 +55,15 @@ class Operation:
 
     @property
     def operations(self) -> int:
-        """int8 operations for one image: 2 kh kw ic oc h w, per group; 0 where no product is summed."""
+        """int8 operations for one image: 2 kh kw ic oc h w, per group; 0 where no product is
+        summed.
+        """
         if self.kind not in CONVOLUTIONS:
             return 0
         shape = self.in_shapes[0] if self.kind == "transposed" else self.out_shape
-        return 2 * self.weight_bytes * _pixels(self.name, shape)  # a weight has one byte, and is used once a pixel
+        return (
+            2 * self.weight_bytes * _pixels(self.name, shape)
+        )  # a weight has one byte, and is used once a pixel
 
     @property
     def out_bytes(self) -> int:
@@ -71,5 +84,10 @@ class Network:
 def _pixels(name: str, shape: Shape | None) -> int:
     if shape is None:
         remedy = "replace the node before it that hides the shape"
-        raise ModelError(name, expected="a shape that can be computed from the input's", got="none", remedy=remedy)
+        raise ModelError(
+            name,
+            expected="a shape that can be computed from the input's",
+            got="none",
+            remedy=remedy,
+        )
     return shape[1] * shape[2]

@@ -1,9 +1,10 @@
 """From an ONNX file to the DPU's short list of operations, whichever of three encodings it uses.
 
 1. float: Conv, Relu, Add.
-2. integer kernels: QLinearConv, com.microsoft QLinearAdd, Relu (or Max with the zero point), float host nodes around.
-3. QDQ: QuantizeLinear and DequantizeLinear around float operators. The pairs are notation: they are dissolved, and
-   only those at the border, which really convert, stay as operations.
+2. integer kernels: QLinearConv, com.microsoft QLinearAdd, Relu (or Max with the zero point), float
+  host nodes around.
+3. QDQ: QuantizeLinear and DequantizeLinear around float operators. The pairs are notation: they are
+  dissolved, and only those at the border, which really convert, stay as operations.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,24 +24,32 @@ from beers_deploy.quant.onnx_file import load_onnx, metadata
 from beers_deploy.quant.untrusted import contradictions
 
 BANK_GAINS = np.arange(8 * GAINS[0], 8 * GAINS[1] + 1) / 8
-BANK_REACHES = np.outer([LARGEST, WIDE * LARGEST], 1 / BANK_GAINS).astype(np.float32).ravel().tolist()
+BANK_REACHES = (
+    np.outer([LARGEST, WIDE * LARGEST], 1 / BANK_GAINS).astype(np.float32).ravel().tolist()
+)
 BANK_ENDS = [[-reach, reach] for reach in BANK_REACHES]
-"""Of the planes, and of the analytic restoration, of a float network behind a bank, for each gain of a sensor."""
+"""Of the planes, and of the analytic restoration, of a float network behind a bank, for each gain
+of a sensor.
+"""
 
 PLACE_MAX_PX = 64
 """Beyond what any network rearranges: a place of more pixels is a damaged file."""
 
 
 def read_network(path: Path, tile_px: int | None = 640) -> Network:
-    """Read an ONNX file as a network for one image with sides of `tile_px`; None is the size that it is fixed to.
+    """Read an ONNX file as a network for one image with sides of `tile_px`; None is the size that
+    it is fixed to.
 
-    The image is the whole network's: of a core that reads places of 2 x 2 pixels, planes have half of its sides.
+    The image is the whole network's: of a core that reads places of 2 x 2 pixels, planes have half
+    of its sides.
     """
     return network_of(load_onnx(path, to_run=False), tile_px, str(path))
 
 
 def own_tile_px(model: onnx.ModelProto) -> int | None:
-    """The side of the tile that a network is fixed to, in pixels of the image; None where it takes any."""
+    """The side of the tile that a network is fixed to, in pixels of the image; None where it takes
+    any.
+    """
     dims = model.graph.input[0].type.tensor_type.shape.dim
     side = max((d.dim_value for d in dims[2:]), default=0)
     if not side:
@@ -50,8 +59,12 @@ def own_tile_px(model: onnx.ModelProto) -> int | None:
 
 
 def _places(model: onnx.ModelProto) -> tuple[int, int]:
-    """What a board's file says of its planes: a place's side in pixels, and how far they reach beyond the image."""
-    place_px, border_px = (int(metadata(model).get(key, least)) for key, least in ((PLACE_PX, 1), (BORDER_PX, 0)))
+    """What a board's file says of its planes: a place's side in pixels, and how far they reach
+    beyond the image.
+    """
+    place_px, border_px = (
+        int(metadata(model).get(key, least)) for key, least in ((PLACE_PX, 1), (BORDER_PX, 0))
+    )
     if not (1 <= place_px <= PLACE_MAX_PX and 0 <= border_px <= PLACE_MAX_PX):
         raise ValueError(f"places of {place_px} px, {border_px} px around")
     return place_px, border_px
@@ -62,23 +75,34 @@ def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX m
     model = as_on_board(model)
     if not model.graph.node:
         remedy = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
-        raise ModelError(where, expected="a network", got="an ONNX file without nodes", remedy=remedy)
+        raise ModelError(
+            where, expected="a network", got="an ONNX file without nodes", remedy=remedy
+        )
     with contradictions(where):
         graph = with_shuffles(model)
         return _Reader(graph, _inputs(graph, tile_px, _places(model), where)).network()
 
 
 def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str) -> dict[str, Shape]:
-    """The inputs of a file as it stands, by name: (C, H, W) in places, for a tile or as the file states them."""
+    """The inputs of a file as it stands, by name: (C, H, W) in places, for a tile or as the file
+    states them.
+    """
     return _inputs(OnnxGraph(model), tile_px, _places(model), where)
 
 
-def _inputs(graph: OnnxGraph, tile_px: int | None, places: tuple[int, int], where: str) -> dict[str, Shape]:
-    return {name: _input_shape(name, sizes, tile_px, places, where) for name, sizes in graph.inputs.items()}
+def _inputs(
+    graph: OnnxGraph, tile_px: int | None, places: tuple[int, int], where: str
+) -> dict[str, Shape]:
+    return {
+        name: _input_shape(name, sizes, tile_px, places, where)
+        for name, sizes in graph.inputs.items()
+    }
 
 
 class _Reader:
-    """Walks the nodes once, in their topological order, carrying shapes and number formats along."""
+    """Walks the nodes once, in their topological order, carrying shapes and
+    number formats along.
+    """
 
     def __init__(self, graph: OnnxGraph, inputs: dict[str, Shape]) -> None:
         self.graph = graph
@@ -128,14 +152,22 @@ class _Reader:
         )
 
     def _is_activation(self, node: Node) -> bool:
-        """max(q, zero point), the ReLU of integers; Clip from 0 to 6, ReLU6; and a bank's, where int8 saturates."""
-        known = [value for k in range(1, len(node.inputs)) if (value := self.graph.value(node, k)) is not None]
+        """max(q, zero point), the ReLU of integers; Clip from 0 to 6, ReLU6; and a bank's, where
+        int8 saturates.
+        """
+        known = [
+            value
+            for k in range(1, len(node.inputs))
+            if (value := self.graph.value(node, k)) is not None
+        ]
         if node.op_type == "Max":
             return self.integers.is_integer(node) and len(known) == len(node.inputs) - 1 == 1
         limits = [float(value.ravel()[0]) for value in known if value.size == 1]
         return node.op_type == "Clip" and limits in ([0.0, 6.0], *BANK_ENDS)
 
-    def _constant_shape(self, node: Node, kind: Kind, inputs: Sequence[str]) -> tuple[int, ...] | None:
+    def _constant_shape(
+        self, node: Node, kind: Kind, inputs: Sequence[str]
+    ) -> tuple[int, ...] | None:
         """Shape of the constant operand of an element-wise operator."""
         if len(inputs) != 1 or (kind not in ("add", "mul") and node.op_type not in ("Sub", "Div")):
             return None
@@ -150,7 +182,9 @@ def _window(node: Node, weight: np.ndarray | None, shapes: Sequence[Shape | None
     return node.window(() if weight is None else weight.shape[2:], size) or Window()
 
 
-def _channels(node: Node, weight: np.ndarray | None, shapes: Sequence[Shape | None]) -> tuple[int, int]:
+def _channels(
+    node: Node, weight: np.ndarray | None, shapes: Sequence[Shape | None]
+) -> tuple[int, int]:
     if weight is None:
         channels = shapes[0][0] if shapes and shapes[0] else 0
         return channels, channels
@@ -159,8 +193,11 @@ def _channels(node: Node, weight: np.ndarray | None, shapes: Sequence[Shape | No
     return (first, second) if node.op_type == "ConvTranspose" else (second, first)
 
 
-def _input_shape(name: str, sizes: Sequence[int], tile_px: int | None, places: tuple[int, int], where: str) -> Shape:
-    """(C, tile, tile) of an input (N, C, H, W), in places; without a tile (C, H, W) as the file states them.
+def _input_shape(
+    name: str, sizes: Sequence[int], tile_px: int | None, places: tuple[int, int], where: str
+) -> Shape:
+    """(C, tile, tile) of an input (N, C, H, W), in places; without a tile (C, H, W) as the file
+    states them.
 
     Args:
         name: the input's.
@@ -175,10 +212,14 @@ def _input_shape(name: str, sizes: Sequence[int], tile_px: int | None, places: t
         raise ModelError(where, expected="inputs (N, C, H, W)", got=got, remedy=remedy)
     if sizes[0] > 1:
         remedy = "export it for any number of images, or for one"
-        raise ModelError(where, expected="an input of one image", got=f"{name} of {sizes[0]}", remedy=remedy)
+        raise ModelError(
+            where, expected="an input of one image", got=f"{name} of {sizes[0]}", remedy=remedy
+        )
     if tile_px is None:
         if not all(sizes[2:]):
-            raise ModelError(where, expected="an input of a stated size", got="any size", remedy="give `tile`")
+            raise ModelError(
+                where, expected="an input of a stated size", got="any size", remedy="give `tile`"
+            )
         return sizes[1], sizes[2], sizes[3]
     place_px, border_px = places
     side, beyond = divmod(tile_px + 2 * border_px, place_px)

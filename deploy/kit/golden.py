@@ -1,8 +1,10 @@
-"""Golden vectors: what every layer of an INT8 network must write on a board, and what is wrong where one does not.
+"""Golden vectors: what every layer of an INT8 network must write on a board, and what is wrong
+where one does not.
 
-A folder holds the network (int8.onnx), golden.json and, for each case, its image and the int8 tensors of all layers
-as .npy files (N, C, H, W), numbered in the order in which they are computed. What a board wrote are files of the same
-names in folders of the same names, as many of them as it can hand out.
+A folder holds the network (int8.onnx), golden.json and, for each case, its image and the int8
+tensors of all layers as .npy files (N, C, H, W), numbered in the order in which they are computed.
+What a board wrote are files of the same names in folders of the same names, as many of them as it
+can hand out.
 """
 
 import hashlib
@@ -79,14 +81,25 @@ def write_golden(
         if case in images:
             save_array(folder / case / PICTURE, images[case])
     network.save(folder / NETWORK)
-    index = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "tool_version": __version__, "cases": digests}
-    index |= {"network": network.input._asdict(), "half_even": half_even, "layers": _layers(core, names)}
+    index = {
+        "schema": SCHEMA,
+        "schema_version": SCHEMA_VERSION,
+        "tool_version": __version__,
+        "cases": digests,
+    }
+    index |= {
+        "network": network.input._asdict(),
+        "half_even": half_even,
+        "layers": _layers(core, names),
+    }
     write_text(folder / INDEX, json.dumps(index, indent=1) + "\n")
     return folder
 
 
 def _remove_older(folder: Path) -> None:
-    """Delete the golden vectors that a folder holds: files of layers that are not written again would stay."""
+    """Delete the golden vectors that a folder holds: files of layers that are not written again
+    would stay.
+    """
     index = folder / INDEX
     if not index.is_file():
         return
@@ -101,12 +114,16 @@ def _remove_older(folder: Path) -> None:
 def files_of(core: IntCore) -> dict[str, str]:
     """The file of every tensor of a core, in the order in which they are computed."""
     tensors = [PLANES, *(op.output for op in core.ops)]
-    return {name: f"{k:02d}-{re.sub(r'[^A-Za-z0-9._-]+', '_', name)}.npy" for k, name in enumerate(tensors)}
+    return {
+        name: f"{k:02d}-{re.sub(r'[^A-Za-z0-9._-]+', '_', name)}.npy"
+        for k, name in enumerate(tensors)
+    }
 
 
 def _layers(core: IntCore, names: Mapping[str, str]) -> list[dict[str, object]]:
     said: dict[str, dict[str, object]] = {
-        op.output: {"layer": op.name, "operator": type(op).__name__, "reads": list(op.inputs)} for op in core.ops
+        op.output: {"layer": op.name, "operator": type(op).__name__, "reads": list(op.inputs)}
+        for op in core.ops
     }
     said[PLANES] = {"layer": "the planes that the core reads", "operator": "", "reads": []}
     return [
@@ -128,7 +145,11 @@ def _images(
     lattice_px = fixed_px or network.tiling.lattice_px
     side = fixed_px or tile or -(-TILE_PX // lattice_px) * lattice_px
     if (tile or side) != side or side < 1 or side % lattice_px:
-        expected = f"{fixed_px} px, to which the network is fixed" if fixed_px else f"a multiple of {lattice_px} px"
+        expected = (
+            f"{fixed_px} px, to which the network is fixed"
+            if fixed_px
+            else f"a multiple of {lattice_px} px"
+        )
         raise OptionError("tile", expected=expected, got=f"{tile} px", remedy="choose another")
     shape = 1, channels, side, side
     steps = np.indices((side, side)).sum(0) // 8 % 2
@@ -147,7 +168,9 @@ def _images(
 
 
 def _scene(channels: int, rows: int, columns: int, generator: np.random.Generator) -> np.ndarray:
-    """A drawn scene (1, C, rows, columns) in [0, 1], each channel a little darker than the one before."""
+    """A drawn scene (1, C, rows, columns) in [0, 1], each channel a little darker than the one
+    before.
+    """
     from beers_deploy.model.simulator.procedural import procedural_scene  # SciPy
 
     drawn = procedural_scene(SCENE_PX * rows, SCENE_PX * columns, generator).radiance
@@ -185,10 +208,12 @@ class Golden:
 
 
 def read_golden(folder: Path) -> Golden:
-    """Read a folder that `write_golden` made; its tensors are computed again and compared with their digests.
+    """Read a folder that `write_golden` made; its tensors are computed again and compared with
+    their digests.
 
     Raises:
-        OptionError: a folder without an index, with a damaged one, or with other numbers than were written.
+        OptionError: a folder without an index, with a damaged one, or with other numbers than were
+            written.
     """
     digests, half_even = _index(folder / INDEX)
     network = Network.load(folder / NETWORK)
@@ -204,10 +229,14 @@ def read_golden(folder: Path) -> Golden:
             got = f"{times(planes.shape)} in {case}"
             expected = "planes of a size that the network takes"
             raise OptionError(str(folder), expected=expected, got=got, remedy=REMEDY) from error
-        wrong = [file for name, file in names.items() if files.get(file) != _digest(cases[case][name])]
+        wrong = [
+            file for name, file in names.items() if files.get(file) != _digest(cases[case][name])
+        ]
         if wrong:
             got = f"other numbers in {case}/{wrong[0]}"
-            raise OptionError(str(folder), expected="the vectors that were written", got=got, remedy=REMEDY)
+            raise OptionError(
+                str(folder), expected="the vectors that were written", got=got, remedy=REMEDY
+            )
     return Golden(core, half_even, cases, network.input)
 
 
@@ -227,7 +256,10 @@ def _index(path: Path) -> tuple[dict[str, dict[str, str]], bool]:
             raise ValueError(f"the case {foreign[0]!r}")
         return digests, bool(said["half_even"])
     except (AttributeError, LookupError, OSError, TypeError, ValueError) as error:
-        got = unreadable(path) or f"a damaged one ({type(error).__name__}: {' '.join(str(error).split())[:80]})"
+        got = (
+            unreadable(path)
+            or f"a damaged one ({type(error).__name__}: {' '.join(str(error).split())[:80]})"
+        )
         expected = f"the index of a folder of golden vectors ({INDEX})"
         raise OptionError(str(path), expected=expected, got=got, remedy=REMEDY) from error
 
@@ -236,9 +268,16 @@ def _planes(path: Path, core: IntCore) -> np.ndarray:
     """Read the planes that a core reads, (N, C, H, W) int8."""
     planes = _array(path)
     channels = core.ends.planes * core.ends.channels
-    if planes.dtype != np.int8 or planes.ndim != 4 or planes.shape[1] != channels or not planes.size:
+    if (
+        planes.dtype != np.int8
+        or planes.ndim != 4
+        or planes.shape[1] != channels
+        or not planes.size
+    ):
         got = f"{planes.dtype} of shape {planes.shape}"
-        raise ImageError(str(path), expected=f"int8 planes (N, {channels}, H, W)", got=got, remedy=REMEDY)
+        raise ImageError(
+            str(path), expected=f"int8 planes (N, {channels}, H, W)", got=got, remedy=REMEDY
+        )
     return planes
 
 
@@ -249,7 +288,9 @@ def _array(path: Path) -> np.ndarray:
             raise ValueError("an archive of arrays")
     except ValueError as error:
         remedy = "write it with numpy.save"
-        raise ImageError(str(path), expected="an array (.npy)", got=str(error), remedy=remedy) from error
+        raise ImageError(
+            str(path), expected="an array (.npy)", got=str(error), remedy=remedy
+        ) from error
     return arrays[ALONE]
 
 
@@ -258,8 +299,8 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
 
     Args:
         folder: of the golden vectors.
-        results: folders of the cases' names with files of the layers' names, any of them: int8, uint8 around 128,
-            or float multiples of the tensor's scale; channels first, or last.
+        results: folders of the cases' names with files of the layers' names, any of them: int8,
+            uint8 around 128, or float multiples of the tensor's scale; channels first, or last.
     """
     golden = read_golden(Path(folder))
     given = Path(results)
@@ -267,19 +308,29 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
     wrong = [name for name, cases in seen.items() if _differing(name, cases)]
     verdict = _verdict(golden.core, seen, wrong[0], golden.half_even) if wrong else ""
     first = {wrong[0]: {"first": verdict}} if wrong else {}
-    rows = tuple(_row(golden.core, name, cases, first.get(name, {})) for name, cases in seen.items())
+    rows = tuple(
+        _row(golden.core, name, cases, first.get(name, {})) for name, cases in seen.items()
+    )
     checks = (Check("layers that differ", len(wrong), 0, "layer", detail=verdict),)
-    return Table("golden", {"results": given.name}, (golden.network, Path(folder) / INDEX), rows, checks)
+    return Table(
+        "golden", {"results": given.name}, (golden.network, Path(folder) / INDEX), rows, checks
+    )
 
 
 Results = Mapping[str, list[Seen]]
-"""Of each tensor that a board handed out, in the order in which they are computed, what it wrote in each case."""
+"""Of each tensor that a board handed out, in the order in which they are computed, what it wrote in
+each case.
+"""
 
 
 def _results(golden: Golden, given: Path) -> Results:
     files = files_of(golden.core)
     paths = [path for path in given.glob("*/*.npy") if path.name != PICTURE]
-    unknown = [path for path in paths if path.parent.name not in golden.cases or path.name not in files.values()]
+    unknown = [
+        path
+        for path in paths
+        if path.parent.name not in golden.cases or path.name not in files.values()
+    ]
     if unknown or not paths:
         got = f"{unknown[0].parent.name}/{unknown[0].name}" if unknown else "none"
         expected = "results as CASE/LAYER.npy"
@@ -301,7 +352,11 @@ def _differing(name: str, cases: list[Seen]) -> list[Seen]:
 def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
     """What a board wrote of a tensor as int16 (N, C, H, W)."""
     values = _array(path)
-    if values.shape != shape and values.ndim == len(shape) and np.moveaxis(values, -1, 1).shape == shape:
+    if (
+        values.shape != shape
+        and values.ndim == len(shape)
+        and np.moveaxis(values, -1, 1).shape == shape
+    ):
         values = np.moveaxis(values, -1, 1)
     if values.shape != shape:
         got = f"{values.shape}"
@@ -317,7 +372,9 @@ def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
         whole *= 2.0**frac_bits
     if not (np.abs(whole - np.rint(whole)) < 1e-3).all() or np.abs(whole).max(initial=0) > 128:
         expected = f"int8, or its values as whole multiples of 2^{-frac_bits}"
-        raise ImageError(str(path), expected=expected, got=f"other {values.dtype} numbers", remedy="write these")
+        raise ImageError(
+            str(path), expected=expected, got=f"other {values.dtype} numbers", remedy="write these"
+        )
     return np.rint(whole).astype(np.int16)
 
 
@@ -325,7 +382,9 @@ def _verdict(core: IntCore, seen: Results, name: str, half_even: bool) -> str:
     """The first layer that differs, and the fault that gives just that."""
     between = _unseen_before(core, name, seen)
     fault = explain(core, between, _differing(name, seen[name]), half_even)
-    unseen = f" ({len(between) - 1} layers before it were not handed out)" if len(between) > 1 else ""
+    unseen = (
+        f" ({len(between) - 1} layers before it were not handed out)" if len(between) > 1 else ""
+    )
     why = f"as if {fault}" if fault else "by no fault that is known"
     return f"the first to differ is {_layer(core, name)}{unseen}, {why}"
 
@@ -335,7 +394,9 @@ def _layer(core: IntCore, name: str) -> str:
 
 
 def _unseen_before(core: IntCore, name: str, seen: Collection[str]) -> list[IntConv | Op]:
-    """The operations between tensors that a board handed out and the one of that name, which is the last."""
+    """The operations between tensors that a board handed out and the one of that name, which is the
+    last.
+    """
     wanted = {name}
     found = list[IntConv | Op]()
     for op in reversed(core.ops):
@@ -350,10 +411,14 @@ def _row(core: IntCore, name: str, cases: list[Seen], first: dict[str, str]) -> 
     values = sum(each.size for each in by)
     source = f"{len(by)} cases, {values} values, against the integer reference"
     figures = {
-        "differing": measured(100 * sum(int((each > 0).sum()) for each in by) / values, "%", source),
+        "differing": measured(
+            100 * sum(int((each > 0).sum()) for each in by) / values, "%", source
+        ),
         "at most by": measured(max(int(each.max()) for each in by), "LSB", source),
     }
     wrong = _differing(name, cases)
-    alike = [(case.seen, case.tensors[name]) for case in wrong if case.seen.shape == wrong[0].seen.shape]
+    alike = [
+        (case.seen, case.tensors[name]) for case in wrong if case.seen.shape == wrong[0].seen.shape
+    ]
     text = {"where": where(*map(np.concatenate, zip(*alike, strict=True)))} if wrong else {}
     return Row("golden", _layer(core, name), figures, text | first)

@@ -1,13 +1,17 @@
 #!/usr/bin/env python3
-"""The host's part of a network on a board: python3 host.py image.npy restored.npy, float32 (C, H, W) in [0, 1].
+"""The host's part of a network on a board: python3 host.py image.npy restored.npy, float32 (C, H,
+W) in [0, 1].
 
-The script needs NumPy, host.json and, for the cores, onnxruntime. On a board, replace the runners in `cores`.
+The script needs NumPy, host.json and, for the cores, onnxruntime. On a board, replace the runners
+in `cores`.
 
-1. Each tile goes to one core or several (`factors`, `exposed`): core.onnx restores the tile as it is. Where host.json
-   has exposures, core-x4.onnx restores the dark pixels of a tile that was multiplied by 4, and so on.
-2. Around a core (`restored`), the host splits the tile into int8 planes and adds the core's result to the tile.
-3. After the last tile, the consistency step (`consistent`) makes the restored image agree with the raw one at low
-   spatial frequencies, if host.json has its weights.
+1. Each tile goes to one core or several (`factors`, `exposed`): core.onnx restores the tile as it
+  is. Where host.json has exposures, core-x4.onnx restores the dark pixels of a tile that was
+  multiplied by 4, and so on.
+2. Around a core (`restored`), the host splits the tile into int8 planes and adds the core's result
+  to the tile.
+3. After the last tile, the consistency step (`consistent`) makes the restored image agree with the
+  raw one at low spatial frequencies, if host.json has its weights.
 """
 
 from __future__ import annotations
@@ -23,7 +27,9 @@ F = np.float32
 HERE = Path(__file__).parent
 BLOCK = 8
 NEAR = 8
-"""Pixels: the side of a block of the consistency step, and the radius of the near part of its blur."""
+"""Pixels: the side of a block of the consistency step, and the radius of the
+near part of its blur.
+"""
 S = json.loads((HERE / "host.json").read_text(encoding="utf-8"))
 UNITS = {1: S["unit"], **{int(factor): unit for factor, unit in S["exposures"].items()}}
 """The unit of each core's result, by the factor that the core's tile is multiplied by."""
@@ -33,36 +39,61 @@ def shuffled(x: np.ndarray, r: int, up: bool) -> np.ndarray:
     """Pixels (1, C, H, W) into r^2 times the channels; `up`, back."""
     _, c, h, w = x.shape
     if up:
-        return x.reshape(c // r**2, r, r, h, w).transpose(0, 3, 1, 4, 2).reshape(1, c // r**2, h * r, w * r)
-    return x.reshape(c, h // r, r, w // r, r).transpose(0, 2, 4, 1, 3).reshape(1, c * r**2, h // r, w // r)
+        return (
+            x.reshape(c // r**2, r, r, h, w)
+            .transpose(0, 3, 1, 4, 2)
+            .reshape(1, c // r**2, h * r, w * r)
+        )
+    return (
+        x.reshape(c, h // r, r, w // r, r)
+        .transpose(0, 2, 4, 1, 3)
+        .reshape(1, c * r**2, h // r, w // r)
+    )
 
 
 def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
-    """A tile (1, C, h, w): planes in whole multiples of 1/128 to the core, its result merged, added and clipped."""
+    """A tile (1, C, h, w): planes in whole multiples of 1/128 to the core, its result merged, added
+    and clipped.
+    """
     wide = np.pad(image, ((0, 0), (0, 0), *[(S["border_px"],) * 2] * 2), "reflect")
-    dn = np.clip(np.rint(shuffled(wide, S["front"], up=False) * F(4095)), 0, F(4095)) - F(S["middle"])
+    dn = np.clip(np.rint(shuffled(wide, S["front"], up=False) * F(4095)), 0, F(4095)) - F(
+        S["middle"]
+    )
     coarse = np.minimum(np.rint(dn * F(1 / S["step"])), F(127))
     rest = dn - coarse * F(S["step"])
-    result = run(np.concatenate([coarse] * S["coarse"] + [rest, np.rint(rest * F(1 / S["part"]))], 1) / F(128))
+    result = run(
+        np.concatenate([coarse] * S["coarse"] + [rest, np.rint(rest * F(1 / S["part"]))], 1)
+        / F(128)
+    )
     value, *others = np.split(result, S["copies"], 1)
     if S["offsets"]:  # coarse, and windows that hold fine what lies within them
         value = value * F(8)
         for window, offset in zip(others, S["offsets"]):  # noqa: B905 - a board's Python may be old
-            value = np.where(np.abs(window) <= F(S["fine_max"]), window + np.array(offset, F)[:, None, None], value)
+            value = np.where(
+                np.abs(window) <= F(S["fine_max"]),
+                window + np.array(offset, F)[:, None, None],
+                value,
+            )
     elif others:  # fine, coarse, and the copies of the analytic restoration
         value = np.where(np.abs(value) <= F(S["fine_max"]), value, others[0] * F(8))
         if others[1:]:
             fine = others[1 : 1 + S["fine_copies"]]
             added = np.sum(fine, 0) * F(S["analytic"])
             if S["coarse_analytic"]:  # the last copy reaches farther, for what the others clip
-                added = np.where(np.abs(fine[0]) <= F(S["fine_max"]), added, others[-1] * F(S["coarse_analytic"]))
+                added = np.where(
+                    np.abs(fine[0]) <= F(S["fine_max"]), added, others[-1] * F(S["coarse_analytic"])
+                )
             value = value + added
     value = shuffled(value, S["back"], up=True) * F(unit)
-    return shuffled(np.asarray(np.clip(image + value, 0, 1) if S["adds_image"] else value), S["last"], up=True)
+    return shuffled(
+        np.asarray(np.clip(image + value, 0, 1) if S["adds_image"] else value), S["last"], up=True
+    )
 
 
 def exposed(factor: int, image: np.ndarray, run: Any) -> np.ndarray:
-    """Multiply the light of a tile by a factor, restore the tile by the core of that factor, and divide it again."""
+    """Multiply the light of a tile by a factor, restore the tile by the core of that factor, and
+    divide it again.
+    """
     if factor == 1:
         return restored(image, run, UNITS[1])
     dark = F(S["offset"])
@@ -73,7 +104,8 @@ def exposed(factor: int, image: np.ndarray, run: Any) -> np.ndarray:
 def factors(tile: np.ndarray) -> np.ndarray:
     """Choose the factor of every pixel (h, w) of a tile (1, C, h, w).
 
-    A pixel gets the largest factor at which no pixel within the network's receptive radius exceeds `headroom`.
+    A pixel gets the largest factor at which no pixel within the network's receptive radius exceeds
+    `headroom`.
     """
     chosen = np.ones(tile.shape[2:], int)
     if len(UNITS) == 1:
@@ -91,7 +123,9 @@ def brightest_around(pixels: np.ndarray, radius: int) -> np.ndarray:
     for _ in range(2):  # down, then across
         pixels = np.pad(pixels, [(radius, radius), (0, 0)], "edge")
         length = 1
-        while length < size:  # the maximum of two windows that touch or overlap is that of a window twice as long
+        while (
+            length < size
+        ):  # the maximum of two windows that touch or overlap is that of a window twice as long
             step = min(length, size - length)
             pixels = np.maximum(pixels[:-step], pixels[step:])
             length = length + step
@@ -102,18 +136,20 @@ def brightest_around(pixels: np.ndarray, radius: int) -> np.ndarray:
 def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return x + G (raw - H x) of one band (H, W), clipped to [0, 1].
 
-    H is the sensor's blur relative to the reference. G takes the means of blocks and interpolates between their
-    centres, which keeps low spatial frequencies only.
+    H is the sensor's blur relative to the reference. G takes the means of blocks and interpolates
+    between their centres, which keeps low spatial frequencies only.
     """
     rows, columns, far, means, excess = (
-        np.array(S["consistency"][name], F) for name in ("rows", "columns", "far", "means", "excess")
+        np.array(S["consistency"][name], F)
+        for name in ("rows", "columns", "far", "means", "excess")
     )
     # The near part of H x is a sum of separable filters, computed for the means of blocks alone.
     near = extended(x, NEAR)
     blurred = sum(summed(near, row, column) for row, column in zip(rows, columns))  # noqa: B905 - as above
     blurred = blurred + around(block_means(extended(x, BLOCK * (len(far) // 2))), far)
     own = block_means(extended(raw, 0))
-    # The converter clips noise at zero, which raises the means of dark blocks. This is no error of x.
+    # The converter clips noise at zero, which raises the means of dark blocks. This is no error of
+    # x.
     clipped = np.interp(own, means, excess, right=0.0).astype(F)
     residual = own - np.minimum(clipped, np.maximum(own, F(0))) - blurred
     # Blocks that a saturated pixel reaches through the near part of H are left out.
@@ -123,12 +159,16 @@ def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
         return np.asarray(np.clip(x + interpolated(residual, x.shape), 0, F(1)))
     usable = (~reached).astype(F)
     # Where few of the blocks around are usable, the correction fades out.
-    change = interpolated(residual * usable, x.shape) / np.maximum(interpolated(usable, x.shape), F(0.25))
+    change = interpolated(residual * usable, x.shape) / np.maximum(
+        interpolated(usable, x.shape), F(0.25)
+    )
     return np.asarray(np.clip(x + change, 0, F(1)))
 
 
 def extended(x: np.ndarray, margin: int) -> np.ndarray:
-    """Mirror an image (H, W) beyond its borders: to whole blocks, and `margin` pixels more on every side."""
+    """Mirror an image (H, W) beyond its borders: to whole blocks, and `margin` pixels more on every
+    side.
+    """
     for axis, size in enumerate(x.shape):
         places = np.arange(-margin, -(-size // BLOCK) * BLOCK + margin) % (2 * size)
         x = x.take(np.minimum(places, 2 * size - 1 - places), axis)
@@ -136,7 +176,9 @@ def extended(x: np.ndarray, margin: int) -> np.ndarray:
 
 
 def summed(x: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """Compute the weighted sum of a window of each block: rows weighted by `row`, columns by `column`."""
+    """Compute the weighted sum of a window of each block: rows weighted by `row`, columns by
+    `column`.
+    """
     for weights in (row, column):
         end = x.shape[0] - len(weights) + 1
         x = sum(x[place : place + end : BLOCK] * weight for place, weight in enumerate(weights)).T
@@ -150,7 +192,9 @@ def block_means(x: np.ndarray) -> np.ndarray:
 
 
 def around(means: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Compute the far part of H x: the sum of the block means around each block, weighted by `far`."""
+    """Compute the far part of H x: the sum of the block means around each
+    block, weighted by `far`.
+    """
     height, width = (size - len(far) + 1 for size in means.shape)
     total = np.zeros((height, width), F)
     for y, weights in enumerate(far):
@@ -162,8 +206,8 @@ def around(means: np.ndarray, far: np.ndarray) -> np.ndarray:
 def interpolated(blocks: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Interpolate bilinearly between the centres of blocks.
 
-    Blocks at the image's border are left out, because H brings light into them that the image does not show. Nearer
-    to the border the nearest block inside counts.
+    Blocks at the image's border are left out, because H brings light into them that the image does
+    not show. Nearer to the border the nearest block inside counts.
     """
     for size in shape:
         place = np.arange(size) - BLOCK // 2
@@ -177,18 +221,29 @@ def interpolated(blocks: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
-    """Of each tile along a side: where it begins, and the first and last of the pixels that are kept of it."""
+    """Of each tile along a side: where it begins, and the first and last of the pixels that are
+    kept of it.
+    """
     starts = [*range(0, size - tile, tile - 2 * halo), size - tile]
-    return [(s, s and s + halo, starts[k + 1] + halo if s < size - tile else size) for k, s in enumerate(starts)]
+    return [
+        (s, s and s + halo, starts[k + 1] + halo if s < size - tile else size)
+        for k, s in enumerate(starts)
+    ]
 
 
 def main(source: str, target: str, runs: dict[int, Any]) -> None:
-    """Restore an image of at least a tile, tile by tile. `runs` has the core of each factor: planes to result."""
+    """Restore an image of at least a tile, tile by tile.
+
+    `runs` has the core of each factor: planes to result.
+    """
     image = np.load(source).astype(F)
     t = S["tile_px"]
     r = S["scale"]
     if image.ndim != 3 or min(image.shape[1:]) < t or not np.isfinite(image).all():
-        sys.exit(f"{source}: expected finite values (C, H, W) of at least {t} x {t} pixels, got shape {image.shape}")
+        sys.exit(
+            f"{source}: expected finite values (C, H, W) of at least {t} x {t} pixels, got "
+            f"shape {image.shape}"
+        )
     wide = np.pad(image, [(0, 0)] + [(0, -n % S["lattice_px"]) for n in image.shape[1:]], "edge")
     down, across = (spans(n, t, S["halo_px"]) for n in wide.shape[1:])
     out = np.empty((S["bands"], *(n * r for n in wide.shape[1:])), F)
@@ -211,7 +266,9 @@ def cores() -> dict[int, Any]:
     import onnxruntime as ort
 
     plain = ort.SessionOptions()
-    plain.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL  # fused kernels may saturate
+    plain.graph_optimization_level = (
+        ort.GraphOptimizationLevel.ORT_DISABLE_ALL
+    )  # fused kernels may saturate
 
     def opened(factor: int) -> Any:
         name = "core.onnx" if factor == 1 else f"core-x{factor}.onnx"

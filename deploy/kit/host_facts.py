@@ -1,4 +1,6 @@
-"""What `host.py` must know of a network: its pre- and post-processing, its exposures and the consistency step."""
+"""What `host.py` must know of a network: its pre- and post-processing, its exposures and the
+consistency step.
+"""
 
 from collections.abc import Mapping
 
@@ -20,9 +22,13 @@ Facts = dict[str, object]
 
 
 def host_facts(
-    network: Network, tile_px: int, sensor: Sensor | None = None, brighter: Mapping[int, Network] | None = None
+    network: Network,
+    tile_px: int,
+    sensor: Sensor | None = None,
+    brighter: Mapping[int, Network] | None = None,
 ) -> Facts | None:
-    """Return the content of host.json; None for a network whose host part is not what `host.py` computes.
+    """Return the content of host.json; None for a network whose host part is not what `host.py`
+    computes.
 
     Args:
         network: in INT8.
@@ -50,15 +56,25 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
     """Return the constants of the host's part around one core.
 
     Returns:
-        None for a network whose result is no image, or whose pixels are rearranged in another way than in `host.py`.
+        None for a network whose result is no image, or whose pixels are rearranged in another way
+            than in `host.py`.
     """
     core = read_core(network.model)
     ends = core.ends
     outputs = {"back": (ends.back, ends.outputs), "last": (ends.last, ends.outputs)}
     shuffles = {"front": (ends.front, ends.channels), **outputs}
     # Of one band ONNX's order of the channels is that of torch, which host.py takes.
-    plain = all(each.columns_first or wide == each.block**2 for found, wide in shuffles.values() for each in found)
-    if not ends.is_image or ends.direct or not plain or any(len(found) > 1 for found, _ in shuffles.values()):
+    plain = all(
+        each.columns_first or wide == each.block**2
+        for found, wide in shuffles.values()
+        for each in found
+    )
+    if (
+        not ends.is_image
+        or ends.direct
+        or not plain
+        or any(len(found) > 1 for found, _ in shuffles.values())
+    ):
         return None
     tiling = network.tiling
     scale = core.scale(CORRECTION)
@@ -87,7 +103,9 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
 
 
 def _unit(facts: Facts, brighter: Network, tile_px: int) -> object:
-    """Return the unit of the network for another exposure, in which nothing else of the host's part may differ."""
+    """Return the unit of the network for another exposure, in which nothing else of the host's part
+    may differ.
+    """
     own = host_constants(brighter, tile_px)
     assert own is not None  # noqa: S101 - the same network for another sensor
     assert {**own, UNIT: None} == {**facts, UNIT: None}  # noqa: S101 - host.json has one value for all exposures
@@ -95,7 +113,9 @@ def _unit(facts: Facts, brighter: Network, tile_px: int) -> object:
 
 
 def exposure_facts(sensor: Sensor | None, units: Mapping[str, object]) -> Facts:
-    """Return the unit of each factor above 1, and what decides which factor a pixel gets; shares of full scale."""
+    """Return the unit of each factor above 1, and what decides which factor a pixel gets; shares of
+    full scale.
+    """
     known = None if sensor is None or sensor.name == BLIND else sensor.nominal()
     offset = known.offset_dn / known.max_dn if known else 0.0
     return {"exposures": dict(units), "headroom": HEADROOM, "offset": offset}
@@ -105,12 +125,19 @@ def consistency_facts(network: Network, sensor: Sensor) -> Facts | None:
     """Return the weights of the consistency step for pixels that are shares of full scale.
 
     Returns:
-        None where no sensor is known, or where the network makes other pixels or bands: `restore` leaves the step
+        None where no sensor is known, or where the network makes other pixels or bands: `restore`
+            leaves the step
         out there too.
     """
     tiling = network.tiling
     if sensor.name == BLIND or not keeps_pixels(tiling):
         return None
     step = Consistency.of(sensor.nominal(), sensor.reference.nominal(), full_scale=1.0)
-    arrays = {"rows": step.rows, "columns": step.columns, "far": step.far, "means": step.means, "excess": step.excess}
+    arrays = {
+        "rows": step.rows,
+        "columns": step.columns,
+        "far": step.far,
+        "means": step.means,
+        "excess": step.excess,
+    }
     return {name: values.tolist() for name, values in arrays.items()}

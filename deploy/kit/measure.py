@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
 """Measure a network on a board, and write what `beers-deploy bench --measured board.json` reads.
 
-Needs Python 3.8, numpy and onnxruntime with the board's execution provider; nothing of beers-deploy. Copy this file
-and the model to the board, then:
+Needs Python 3.8, numpy and onnxruntime with the board's execution provider; nothing of
+beers-deploy. Copy this file and the model to the board, then:
 
-    python3 measure.py core.onnx --provider VitisAIExecutionProvider --option config_file=/usr/bin/vaip_config.json \
+    python3 measure.py core.onnx --provider VitisAIExecutionProvider \
+        --option config_file=/usr/bin/vaip_config.json \
         --configuration C32B3 --frames 300 --threads 3 --out board.json
 
 It has been run with onnxruntime's CPU provider only, never on a board: see docs/how-to/board.md.
@@ -23,7 +24,9 @@ from pathlib import Path
 
 import numpy as np
 
-os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # before it is loaded: from 1.29 on it reports its use
+os.environ.setdefault(
+    "ORT_DISABLE_TELEMETRY", "1"
+)  # before it is loaded: from 1.29 on it reports its use
 import onnxruntime as ort
 
 POWER_SAMPLE_S = 0.05
@@ -46,12 +49,20 @@ def main() -> int:
 
 def arguments() -> argparse.Namespace:
     """What the user asks for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     add = parser.add_argument
     add("model", type=Path, help="QDQ ONNX: the file of 'beers-deploy quantize --board-file'")
     add("--out", type=Path, default=Path("board.json"), help="JSON list; a new run is added to it")
     add("--provider", default="VitisAIExecutionProvider", help="onnxruntime's execution provider")
-    add("--option", action="append", default=[], metavar="KEY=VALUE", help="of the provider; repeatable")
+    add(
+        "--option",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="of the provider; repeatable",
+    )
     add("--configuration", default="C32B3", help="DPU in the board's bitstream, C32B1 to C64B5")
     add("--tile", type=int, default=640, help="tile side in pixels")
     add("--batch", type=int, default=1, help="tiles in one call")
@@ -65,16 +76,26 @@ def arguments() -> argparse.Namespace:
 
 def measure(given: argparse.Namespace) -> dict[str, object]:
     """One run, as an entry of the list."""
-    session = open_session(given.model, given.provider, dict(option.split("=", 1) for option in given.option))
+    session = open_session(
+        given.model, given.provider, dict(option.split("=", 1) for option in given.option)
+    )
     feed = make_feed(session, given.batch, given.tile)
     if not given.no_compare:
         compare(given.model, session, feed)
     stamps, _ = run_threads(session, feed, 1 + WARM_UP_CALLS + LATENCY_CALLS, 1, [])
     latency_ms = 1e3 * statistics.median(np.diff(stamps)[WARM_UP_CALLS:])
-    print(f"latency of a call of {given.batch}: median {latency_ms:.2f} ms over {LATENCY_CALLS} calls, one thread")
-    stamps, power_w = run_threads(session, feed, -(-given.frames // given.batch), given.threads, given.power_file)
+    print(
+        f"latency of a call of {given.batch}: median {latency_ms:.2f} ms over {LATENCY_CALLS} "
+        "calls, one thread"
+    )
+    stamps, power_w = run_threads(
+        session, feed, -(-given.frames // given.batch), given.threads, given.power_file
+    )
     fps = throughput(stamps, given.batch)
-    print(f"throughput: {fps:.3f} frame/s over {len(stamps) * given.batch} frames, {given.threads} threads")
+    print(
+        f"throughput: {fps:.3f} frame/s over {len(stamps) * given.batch} frames, "
+        f"{given.threads} threads"
+    )
     entry: dict[str, object] = {"model": given.model.name, "configuration": given.configuration}
     entry.update(tile_px=given.tile, fps=round(fps, 4), provider=given.provider)
     if power_w:
@@ -89,30 +110,47 @@ def open_session(model: Path, provider: str, options: dict[str, str]) -> ort.Inf
         ValueError: the provider is not there, or onnxruntime fell back to another.
     """
     if provider not in ort.get_available_providers():
-        raise ValueError(f"expected the provider {provider}, got only {', '.join(ort.get_available_providers())}")
+        raise ValueError(
+            f"expected the provider {provider}, got only {', '.join(ort.get_available_providers())}"
+        )
     if not model.is_file():
         raise ValueError(f"{model}: expected an ONNX file, got no such file")
     session = ort.InferenceSession(str(model), providers=[provider], provider_options=[options])
     if session.get_providers()[0] != provider:
-        raise ValueError(f"{provider} did not take the model: onnxruntime fell back to {session.get_providers()[0]}")
+        raise ValueError(
+            f"{provider} did not take the model: onnxruntime fell back to "
+            f"{session.get_providers()[0]}"
+        )
     return session
 
 
 def make_feed(session: ort.InferenceSession, batch: int, tile_px: int) -> dict[str, np.ndarray]:
-    """Noise that survives quantisation unchanged: multiples of 2^-7, or int8 itself; the same at every run."""
+    """Noise that survives quantisation unchanged: multiples of 2^-7, or int8 itself; the same at
+    every run.
+    """
     random = np.random.default_rng(0)
     feed = {}
     for tensor in session.get_inputs():
         shape = [batch, tensor.shape[1], tile_px, tile_px]
-        if any(isinstance(size, int) and size != wanted for size, wanted in zip(tensor.shape, shape)):  # noqa: B905
-            raise ValueError(f"{tensor.name} is fixed to {tensor.shape}, not {shape}: give its --tile and --batch")
+        if any(
+            isinstance(size, int) and size != wanted
+            for size, wanted in zip(tensor.shape, shape)  # noqa: B905
+        ):
+            raise ValueError(
+                f"{tensor.name} is fixed to {tensor.shape}, not {shape}: give its --tile and "
+                "--batch"
+            )
         values = random.integers(-100, 100, shape)
-        feed[tensor.name] = values.astype(np.int8) if "int8" in tensor.type else (values / 128).astype(np.float32)
+        feed[tensor.name] = (
+            values.astype(np.int8) if "int8" in tensor.type else (values / 128).astype(np.float32)
+        )
     return feed
 
 
 def compare(model: Path, session: ort.InferenceSession, feed: dict[str, np.ndarray]) -> None:
-    """Print how far the outputs lie from the CPU provider's: what compiles may still compute other numbers."""
+    """Print how far the outputs lie from the CPU provider's: what compiles may still compute other
+    numbers.
+    """
     expected = ort.InferenceSession(str(model), providers=["CPUExecutionProvider"]).run(None, feed)
     for tensor, ours, reference in zip(session.get_outputs(), session.run(None, feed), expected):  # noqa: B905
         difference = np.abs(ours.astype(np.float64) - reference)
@@ -123,9 +161,15 @@ def compare(model: Path, session: ort.InferenceSession, feed: dict[str, np.ndarr
 
 
 def run_threads(
-    session: ort.InferenceSession, feed: dict[str, np.ndarray], calls: int, threads: int, power_files: list[Path]
+    session: ort.InferenceSession,
+    feed: dict[str, np.ndarray],
+    calls: int,
+    threads: int,
+    power_files: list[Path],
 ) -> tuple[list[float], list[float]]:
-    """When each of so many calls ended, in seconds, several in flight at a time; and watts meanwhile."""
+    """When each of so many calls ended, in seconds, several in flight at a time; and watts
+    meanwhile.
+    """
     stamps: list[float] = []
     numbers = iter(range(calls))  # one step of it is not interrupted by another thread
 
@@ -161,7 +205,9 @@ def write_entry(entry: dict[str, object], path: Path) -> None:
     """Add a run to the list in a file."""
     runs = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
     if not isinstance(runs, list):
-        raise ValueError(f"{path}: expected a JSON list of runs, got {type(runs).__name__}: give another --out")
+        raise ValueError(
+            f"{path}: expected a JSON list of runs, got {type(runs).__name__}: give another --out"
+        )
     path.write_text(json.dumps([*runs, entry], indent=1) + "\n", encoding="utf-8")
 
 

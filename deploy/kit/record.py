@@ -1,4 +1,6 @@
-"""A record of evidence: what a network is, what made it, and what was checked, as JSON, a page and an ML-BOM."""
+"""A record of evidence: what a network is, what made it, and what was checked, as JSON, a page and
+an ML-BOM.
+"""
 
 import hashlib
 import json
@@ -28,9 +30,15 @@ SCHEMA = "beers-deploy/record"
 SCHEMA_VERSION = 1
 NAMES = "record.json", "record.html", "record.cdx.json"
 LIMITATIONS = (
-    "Nothing here has run on a board: figures of a board are predicted by a cost model, or published.",
+    (
+        "Nothing here has run on a board: figures of a board are predicted by a cost model, or "
+        "published."
+    ),
     "INT8 is judged on onnxruntime; a DPU rounds ties up, which moves single results by one unit.",
-    "Images that no sensor in range makes (restored, resampled or compressed ones) were not judged.",
+    (
+        "Images that no sensor in range makes (restored, resampled or compressed ones) were not "
+        "judged."
+    ),
 )
 BULKY = {KEY, FAMILY}
 """Of what a file says of itself: numbers, not words."""
@@ -42,14 +50,17 @@ def recorded(folder: Path) -> list[Path]:
 
 
 def require_library() -> None:
-    """Raise MissingExtraError if the library that writes the bill of materials is missing or does not load."""
+    """Raise MissingExtraError if the library that writes the bill of materials is missing or does
+    not load.
+    """
     optional("cyclonedx.output.json", "record")
 
 
 def write_record(
     judged: Table, network: Network, sensor: Sensor, folder: Path, floating: Network | None = None
 ) -> None:
-    """Write what is known of a network, and what a verb found of it, as JSON, a page and CycloneDX 1.6.
+    """Write what is known of a network, and what a verb found of it, as JSON, a page and CycloneDX
+    1.6.
 
     Args:
         judged: figures and checks, with the inputs that they rest on.
@@ -65,15 +76,22 @@ def write_record(
         write_text(path, text)
 
 
-def record_of(judged: Table, network: Network, sensor: Sensor, floating: Network | None = None) -> dict[str, Any]:
+def record_of(
+    judged: Table, network: Network, sensor: Sensor, floating: Network | None = None
+) -> dict[str, Any]:
     """Return the record as one document; what is not known is null.
 
-    The INT8 file may claim anything: its claims stand under "says". Weights, their training, their licence and the
-    range of sensors that they were trained on are stated only where the weights are verified.
+    The INT8 file may claim anything: its claims stand under "says". Weights, their training, their
+    licence and the range of sensors that they were trained on are stated only where the weights are
+    verified.
     """
     about = metadata(network.model)
     weights = _verified_weights(network, sensor, floating)
-    in_range = {key: list(ends) for key, ends in RANGES.items()} if weights and _has_family(network) else None
+    in_range = (
+        {key: list(ends) for key, ends in RANGES.items()}
+        if weights and _has_family(network)
+        else None
+    )
     return {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
@@ -91,7 +109,9 @@ def record_of(judged: Table, network: Network, sensor: Sensor, floating: Network
 
 
 def _has_family(network: Network) -> bool:
-    """Return True if the file holds what conditions it on other sensors; a damaged one conditions it on none."""
+    """Return True if the file holds what conditions it on other sensors; a damaged one conditions
+    it on none.
+    """
     try:
         return family_of(network.model) is not None
     except ModelError:
@@ -108,9 +128,13 @@ def code_sha256() -> str:
 
 
 def _verified_weights(network: Network, sensor: Sensor, floating: Network | None) -> Path | None:
-    """Return the shipped weights that an INT8 file claims, if its float network or its integers are made of them."""
+    """Return the shipped weights that an INT8 file claims, if its float network or its integers are
+    made of them.
+    """
     claimed = metadata(network.model).get(WEIGHTS)
-    name = next((name for name in shipped_names() if sha256(shipped_weights(name)) == claimed), None)
+    name = next(
+        (name for name in shipped_names() if sha256(shipped_weights(name)) == claimed), None
+    )
     if name is None:
         return None
     path = shipped_weights(name)
@@ -124,23 +148,34 @@ def _page(judged: Table, said: dict[str, Any]) -> Report:
     known = ("weights_sha256", "training", "sensors_in_range", "licence")
     facts = said["network"] | {key: said[key] for key in known}
     rows = [Row("network", key, {}, {"value": str(value)}) for key, value in facts.items()]
-    claims = [Row("claims", key, {}, {"claim": printable(value)}) for key, value in said["says"].items()]
+    claims = [
+        Row("claims", key, {}, {"claim": printable(value)}) for key, value in said["says"].items()
+    ]
     checks = [
-        Row("checks", each.name, {}, {"found": each.found, "allowed": each.allowed, "passed": str(each.passed)})
+        Row(
+            "checks",
+            each.name,
+            {},
+            {"found": each.found, "allowed": each.allowed, "passed": str(each.passed)},
+        )
         for each in judged.checks
     ]
     tables = [
         Section("What it is", rows),
         Section("Checks", checks),
         Section("Figures", judged.rows),
-        Section("What the file says of itself", claims, "Its own metadata, which nothing verifies."),
+        Section(
+            "What the file says of itself", claims, "Its own metadata, which nothing verifies."
+        ),
     ]
     verdict = "All checks passed." if judged else "A check failed."
     return Report(f"Record of {said['network']['name']}", verdict, tables, [], said["limitations"])
 
 
 def bill_of(said: dict[str, Any]) -> str:
-    """A bill of materials in CycloneDX 1.6; the library has no model cards yet, so facts are properties."""
+    """A bill of materials in CycloneDX 1.6; the library has no model cards yet, so facts are
+    properties.
+    """
     from cyclonedx.model import HashAlgorithm, HashType, Property
     from cyclonedx.model.bom import Bom
     from cyclonedx.model.component import Component, ComponentType
@@ -150,22 +185,33 @@ def bill_of(said: dict[str, Any]) -> str:
         hashes = [HashType(alg=HashAlgorithm.SHA_256, content=digest)]
         shown = one_line(name)  # of a file: a reader of the bill may print it as it is
         # Two files may have one name, and a reference must be unique.
-        return Component(type=kind, name=shown, bom_ref=f"{kind.value}:{shown}:{digest}", hashes=hashes, **more)
+        return Component(
+            type=kind, name=shown, bom_ref=f"{kind.value}:{shown}:{digest}", hashes=hashes, **more
+        )
 
     network = said["network"]
     tool = said["tool"]
     bom = Bom(serial_number=uuid5(NAMESPACE_URL, json.dumps(said)))
     facts = said["says"] | {
-        key: said[key] for key in ("training", "sensors_in_range", "limitations", "passed", "licence")
+        key: said[key]
+        for key in ("training", "sensors_in_range", "limitations", "passed", "licence")
     }
     properties = [
-        Property(name=one_line(f"beers-deploy:{key}"), value=json.dumps(value)) for key, value in facts.items()
+        Property(name=one_line(f"beers-deploy:{key}"), value=json.dumps(value))
+        for key, value in facts.items()
     ]
     kind = ComponentType.MACHINE_LEARNING_MODEL
-    bom.metadata.component = component(kind, network["name"], network["sha256"], properties=properties)
-    maker = component(ComponentType.APPLICATION, tool["name"], tool["code_sha256"], version=tool["version"])
+    bom.metadata.component = component(
+        kind, network["name"], network["sha256"], properties=properties
+    )
+    maker = component(
+        ComponentType.APPLICATION, tool["name"], tool["code_sha256"], version=tool["version"]
+    )
     bom.metadata.tools.components.add(maker)
-    files = [component(ComponentType.FILE, each["name"], each["sha256"]) for each in said["results"]["inputs"]]
+    files = [
+        component(ComponentType.FILE, each["name"], each["sha256"])
+        for each in said["results"]["inputs"]
+    ]
     bom.components.update(files)
     bom.register_dependency(bom.metadata.component, files)
     return str(JsonV1Dot6(bom).output_as_string(indent=1)) + "\n"

@@ -1,4 +1,6 @@
-"""Render a report: tables of rows and pictures, in one HTML file that asks the network for nothing."""
+"""Render a report: tables of rows and pictures, in one HTML file that asks the
+network for nothing.
+"""
 
 import re
 from collections.abc import Sequence
@@ -20,9 +22,15 @@ INTERVAL = re.compile(r"\[[^\[\]]*\]")
 def _template() -> jinja2.Template:
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     strict = jinja2.StrictUndefined
-    # Autoescape deals with markup; `finalize` sees every value that is written, and escapes what is not printable.
+    # Autoescape deals with markup; `finalize` sees every value that is written, and escapes what is
+    # not printable.
     made = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True, finalize=_shown
+        loader=loader,
+        autoescape=True,
+        undefined=strict,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=_shown,
     )
     made.filters["unbroken"] = _unbroken
     return made.get_template("report.html")
@@ -30,7 +38,9 @@ def _template() -> jinja2.Template:
 
 def _unbroken(text: str) -> Markup:
     """Return the text as markup, with each interval in brackets on one line."""
-    kept = INTERVAL.sub(lambda found: found[0].replace(" ", "\N{NO-BREAK SPACE}"), str(escape(visible(text))))
+    kept = INTERVAL.sub(
+        lambda found: found[0].replace(" ", "\N{NO-BREAK SPACE}"), str(escape(visible(text)))
+    )
     return Markup(kept)  # noqa: S704 - escaped above
 
 
@@ -86,13 +96,18 @@ def write_report(report: Report, path: Path) -> None:
 
 
 def _grid(table: Section, *, upright: bool) -> dict[str, object]:
-    """Header and lines of a table; unless it stays upright, rows and columns change places where that fits better."""
+    """Header and lines of a table; unless it stays upright, rows and columns change places where
+    that fits better.
+    """
     rows = list(table.rows)
     figures = list(dict.fromkeys(key for row in rows for key in row.figures))
     words = list(dict.fromkeys(key for row in rows for key in row.text))
-    columns = [_head(key, unit_of(key, rows)) for key in figures] + [_head(word, word=True) for word in words]
+    columns = [_head(key, unit_of(key, rows)) for key in figures] + [
+        _head(word, word=True) for word in words
+    ]
     cells = [
-        [_cell(row.figures.get(key)) for key in figures] + [_word(row.text.get(word, "")) for word in words]
+        [_cell(row.figures.get(key)) for key in figures]
+        + [_word(row.text.get(word, "")) for word in words]
         for row in rows
     ]
     heads = [_head(row.name) for row in rows]
@@ -120,4 +135,9 @@ def _cell(figure: Figure | None) -> dict[str, str]:
         return {"text": "", "mode": "", "title": "", "value": ""}
     if figure.value is None:
         return {"text": "-", "mode": "unavailable", "title": figure.reason, "value": ""}
-    return {"text": str(figure), "mode": figure.mode, "title": figure.source, "value": repr(figure.value)}
+    return {
+        "text": str(figure),
+        "mode": figure.mode,
+        "title": figure.source,
+        "value": repr(figure.value),
+    }

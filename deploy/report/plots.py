@@ -1,7 +1,8 @@
 """Plots by matplotlib in one look, as SVG files that are light or dark as the reader's screen is.
 
-Figures are drawn in the colours LIGHT and measured in pixels, 72 of them an inch, so that matplotlib's points are
-pixels too. In the SVG each colour becomes a variable that a style sheet sets for light and for dark screens.
+Figures are drawn in the colours LIGHT and measured in pixels, 72 of them an inch, so that
+matplotlib's points are pixels too. In the SVG each colour becomes a variable that a style sheet
+sets for light and for dark screens.
 """
 
 import base64
@@ -32,21 +33,38 @@ FONT_PX = 13
 TITLE_PX = 15
 
 LIGHT = {
-    "ink": "#1b1f24", "soft": "#5b6470", "line": "#d5dae0", "page": "#ffffff",
-    "mark0": "#0072b2", "mark1": "#d55e00", "mark2": "#008a64", "mark3": "#b4558d", "mark4": "#a87000",
-}  # fmt: skip
-"""Colours by what they are for; the marks' are Okabe and Ito's, darkened where white would swallow them."""
+    "ink": "#1b1f24",
+    "soft": "#5b6470",
+    "line": "#d5dae0",
+    "page": "#ffffff",
+    "mark0": "#0072b2",
+    "mark1": "#d55e00",
+    "mark2": "#008a64",
+    "mark3": "#b4558d",
+    "mark4": "#a87000",
+}
+"""Colours by what they are for; the marks' are Okabe and Ito's, darkened where white would swallow
+them.
+"""
 
 DARK = {
-    "ink": "#e7eaee", "soft": "#9aa4b0", "line": "#39414b", "page": "#14171b",
-    "mark0": "#56b4e9", "mark1": "#e8711a", "mark2": "#1fb88a", "mark3": "#cc79a7", "mark4": "#e69f00",
-}  # fmt: skip
+    "ink": "#e7eaee",
+    "soft": "#9aa4b0",
+    "line": "#39414b",
+    "page": "#14171b",
+    "mark0": "#56b4e9",
+    "mark1": "#e8711a",
+    "mark2": "#1fb88a",
+    "mark3": "#cc79a7",
+    "mark4": "#e69f00",
+}
 SERIES = ("mark0", "mark1", "mark2", "mark3", "mark4", "ink")
 """The colours that series of points take in turn."""
 
 LOOK = {
     "svg.fonttype": "none",
-    "svg.hashsalt": "beers-deploy",  # ids follow from what they name: the same figure, the same bytes
+    # Ids follow from what they name: the same figure gives the same bytes.
+    "svg.hashsalt": "beers-deploy",
     "text.parse_math": False,  # a dollar in a file's name is a dollar
     "font.size": FONT_PX,
     "text.color": LIGHT["ink"],
@@ -74,7 +92,9 @@ LOOK = {
 
 @contextmanager
 def look() -> Iterator[None]:
-    """What is drawn and saved within has the look of our plots, whatever the user set for matplotlib's own."""
+    """What is drawn and saved within has the look of our plots, whatever the user set for
+    matplotlib's own.
+    """
     from matplotlib import style
 
     with warnings.catch_warnings(), style.context(["default", LOOK]):
@@ -95,7 +115,9 @@ LEAST_TICKS = 3
 
 
 def set_ticks(axis: "Axis", most: int) -> None:
-    """Put at most so many ticks at round values within an axis' limits, and write the values beside them."""
+    """Put at most so many ticks at round values within an axis' limits, and write the values beside
+    them.
+    """
     low, high = sorted(axis.get_view_interval())
     values = round_values(low, high, most, logarithmic=axis.get_scale() == "log")
     axis.set_ticks(values, labels=[number(value, 12) for value in values])
@@ -103,13 +125,23 @@ def set_ticks(axis: "Axis", most: int) -> None:
 
 
 def round_values(low: float, high: float, most: int, *, logarithmic: bool) -> list[float]:
-    """Round values from `low` to `high`, at most `most`; evenly spaced where a logarithmic axis holds too few."""
+    """Round values from `low` to `high`, at most `most`; evenly spaced where a logarithmic axis
+    holds too few.
+    """
     from matplotlib.ticker import LogLocator, MaxNLocator
 
-    logs = [LogLocator(subs=subs, numticks=most + 2) for subs in SUBDIVISIONS] if logarithmic else []
-    evens = [MaxNLocator(count, steps=[1, 2, 5, 10], min_n_ticks=1) for count in range(most + 1, 0, -1)]
+    logs = (
+        [LogLocator(subs=subs, numticks=most + 2) for subs in SUBDIVISIONS] if logarithmic else []
+    )
+    evens = [
+        MaxNLocator(count, steps=[1, 2, 5, 10], min_n_ticks=1) for count in range(most + 1, 0, -1)
+    ]
     for locator in (*logs, *evens):
-        values = [float(f"{value:.12g}") for value in locator.tick_values(low, high) if low <= value <= high]
+        values = [
+            float(f"{value:.12g}")
+            for value in locator.tick_values(low, high)
+            if low <= value <= high
+        ]
         if (LEAST_TICKS if locator in logs else 1) <= len(values) <= most:
             break
     return values
@@ -129,7 +161,9 @@ def svg_of(figure: "Figure", name: str, titles: Mapping[str, str] | None = None)
     """
     stream = io.BytesIO()
     with look():
-        figure.savefig(stream, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+        figure.savefig(
+            stream, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        )
     ET.register_namespace("", SVG)
     ET.register_namespace("xlink", XLINK)
     text = re.sub(r' transform="rotate\(-0 [^"]*"', "", printable(stream.getvalue().decode()))
@@ -137,7 +171,12 @@ def svg_of(figure: "Figure", name: str, titles: Mapping[str, str] | None = None)
         text = text.replace(colour, f"var(--{key})")
     root = ET.fromstring(text)  # noqa: S314 - our own
     width, height = root.get("viewBox", "").split()[2:]
-    root.attrib |= {"width": width, "height": height, "role": "group", "aria-label": printable(name)}
+    root.attrib |= {
+        "width": width,
+        "height": height,
+        "role": "group",
+        "aria-label": printable(name),
+    }
     style = ET.Element(f"{{{SVG}}}style")
     style.text = plot_style()
     root.insert(0, style)
@@ -158,17 +197,26 @@ def _name(group: ET.Element, titles: Mapping[str, str]) -> None:
 
 
 def printable(text: str) -> str:
-    """Return a text with a mark in the place of each control character and each letter that XML forbids.
+    """Return a text with a mark in the place of each control character and each letter that XML
+    forbids.
 
     Names come from files: some characters would also turn the direction of the words behind them.
     """
-    return "".join(letter if letter.isprintable() or letter in "\t\n" else "\ufffd" for letter in text)
+    return "".join(
+        letter if letter.isprintable() or letter in "\t\n" else "\ufffd" for letter in text
+    )
 
 
 def plot_style() -> str:
     """The style sheet of plots: their colours, light and dark."""
-    light, dark = (" ".join(f"--{name}: {colour};" for name, colour in colours.items()) for colours in (LIGHT, DARK))
-    return f":root {{ {light} }}\n@media screen and (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n"
+    light, dark = (
+        " ".join(f"--{name}: {colour};" for name, colour in colours.items())
+        for colours in (LIGHT, DARK)
+    )
+    return (
+        f":root {{ {light} }}\n@media screen and (prefers-color-scheme: dark) {{ :root {{ "
+        f"{dark} }} }}\n"
+    )
 
 
 def data_url(svg: str) -> str:
@@ -178,7 +226,9 @@ def data_url(svg: str) -> str:
 
 @dataclass(frozen=True)
 class Curve:
-    """Points (x, y), x above 0 on a logarithmic axis; curves of one name look alike in all panels."""
+    """Points (x, y), x above 0 on a logarithmic axis; curves of one name look
+    alike in all panels.
+    """
 
     name: str
     colour: int
@@ -199,7 +249,11 @@ LEGEND_ROW_PX = 22
 
 
 def curves_svg(
-    panels: Sequence[tuple[str, Sequence[Curve]]], x_title: str, y_title: str, *, logarithmic: bool = True
+    panels: Sequence[tuple[str, Sequence[Curve]]],
+    x_title: str,
+    y_title: str,
+    *,
+    logarithmic: bool = True,
 ) -> str:
     """Panels side by side that share the axis upwards, each with an axis of its own to the right.
 
@@ -207,7 +261,8 @@ def curves_svg(
         panels: curves that share axes, under a title.
         x_title: of the axis to the right.
         y_title: of the axis upwards.
-        logarithmic: whether the axis to the right is, with a dot at each point; else lines alone are drawn.
+        logarithmic: whether the axis to the right is, with a dot at each point; else lines alone
+            are drawn.
 
     Returns:
         An SVG file, light or dark as its reader's screen is.
@@ -216,7 +271,10 @@ def curves_svg(
     width_px = CURVES_PX[0]
     more_px = (rows - 1) * LEGEND_ROW_PX
     height_px = CURVES_PX[1] + more_px
-    frame = CURVES_FRAME | {"top": 1 - ABOVE_PX / height_px, "bottom": (BELOW_PX + more_px) / height_px}
+    frame = CURVES_FRAME | {
+        "top": 1 - ABOVE_PX / height_px,
+        "bottom": (BELOW_PX + more_px) / height_px,
+    }
     with look():
         figure = new_figure(width_px, height_px)
         all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False, gridspec_kw=frame)[0]
@@ -227,10 +285,14 @@ def curves_svg(
             for curve in curves:
                 style = {"color": LIGHT[SERIES[curve.colour]], "ls": "--" if curve.dashed else "-"}
                 style["marker"] = "o" if logarithmic else ""
-                named[curve.name] = axes.plot(*zip(*curve.points, strict=True), **style, ms=5, lw=2, gid="curve")[0]
+                named[curve.name] = axes.plot(
+                    *zip(*curve.points, strict=True), **style, ms=5, lw=2, gid="curve"
+                )[0]
             set_ticks(axes.xaxis, 5)
         set_ticks(all_axes[0].yaxis, 8)
-        figure.supxlabel(x_title, size=FONT_PX, color=LIGHT["soft"], y=(X_TITLE_PX + more_px) / height_px)
+        figure.supxlabel(
+            x_title, size=FONT_PX, color=LIGHT["soft"], y=(X_TITLE_PX + more_px) / height_px
+        )
         figure.supylabel(y_title, size=FONT_PX, color=LIGHT["soft"])
         columns = math.ceil(len(named) / rows)
         at = (0.5, LEGEND_PX / height_px)
@@ -239,14 +301,18 @@ def curves_svg(
 
 
 HISTOGRAM_PX = (358, 240)
-"""No wider than a telephone shows: a wider picture would be scaled down there, its labels with it."""
+"""No wider than a telephone shows: a wider picture would be scaled down there,
+its labels with it.
+"""
 HISTOGRAM_FRAME = (0.225, 0.2, 0.72, 0.77)
 LABELS = 5
 MOST_BARS = 81
 
 
 def histogram_url(spread: "Spread") -> str:
-    """Shares of pixels by error, on a logarithmic scale, and a Gaussian of the same deviation, as a data: address."""
+    """Shares of pixels by error, on a logarithmic scale, and a Gaussian of the same deviation, as a
+    data: address.
+    """
     centres, shares, wide = bins(spread)
     decades = math.ceil(math.log10(spread.counts.sum()))
     std_dn = max(spread.std_dn, 1e-9)
@@ -261,14 +327,18 @@ def histogram_url(spread: "Spread") -> str:
         axes.plot(centres[inside], np.minimum(gauss[inside], 1), color=LIGHT["mark1"], lw=2)
         set_ticks(axes.xaxis, LABELS)
         rows = range(1, decades)
-        axes.yaxis.set_ticks([10.0**-d for d in rows], labels=[f"{100 * 10.0**-d:.{max(d - 2, 0)}f} %" for d in rows])
+        axes.yaxis.set_ticks(
+            [10.0**-d for d in rows], labels=[f"{100 * 10.0**-d:.{max(d - 2, 0)}f} %" for d in rows]
+        )
         axes.yaxis.set_ticks([], minor=True)
         axes.grid(visible=False, axis="x")
         return data_url(svg_of(figure, "Share of the pixels by the difference of INT8 from float"))
 
 
 def bins(spread: "Spread") -> tuple[np.ndarray, np.ndarray, int]:
-    """Centres in DN, shares of the pixels, and the width in DN of at most MOST_BARS bins that hold every error."""
+    """Centres in DN, shares of the pixels, and the width in DN of at most MOST_BARS bins that hold
+    every error.
+    """
     farthest = int(np.abs(np.flatnonzero(spread.counts) - MAX_DN).max())
     wide = 1
     while 2 * (reach := -(-max(farthest - wide // 2, 0) // wide)) + 1 > MOST_BARS:
@@ -276,5 +346,7 @@ def bins(spread: "Spread") -> tuple[np.ndarray, np.ndarray, int]:
     half = reach * wide + wide // 2
     middle = MAX_DN + wide
     padded = np.pad(spread.counts, wide)
-    shares = padded[middle - half : middle + half + 1].reshape(-1, wide).sum(1) / spread.counts.sum()
+    shares = (
+        padded[middle - half : middle + half + 1].reshape(-1, wide).sum(1) / spread.counts.sum()
+    )
     return np.arange(-reach, reach + 1) * wide, shares, wide

@@ -18,11 +18,18 @@ Sessions = tuple[ort.InferenceSession, ort.InferenceSession]
 
 ZOOM = 2
 WHITE_SHARE = 0.999
-"""The size of error shown white, the same in all patches, is the one that this share of all pixels stays below."""
+"""The size of error shown white, the same in all patches, is the one that this share of all pixels
+stays below.
+"""
 
 
 def sensitivity_page(
-    headline: str, rows: Sequence[Row], spread: Spread, patches: Patches, sessions: Sessions, worst: Sequence[int]
+    headline: str,
+    rows: Sequence[Row],
+    spread: Spread,
+    patches: Patches,
+    sessions: Sessions,
+    worst: Sequence[int],
 ) -> Report:
     """The histogram, the worst patches, and every table.
 
@@ -36,19 +43,29 @@ def sensitivity_page(
     """
     white_dn = next(dn for dn in range(1, MAX_DN + 1) if spread.share_beyond(dn) <= 1 - WHITE_SHARE)
     pictures = [Picture("Errors by size", histogram_url(spread), HISTOGRAM_CAPTION)]
-    pictures += [worst_picture(number, patches.degraded[number], sessions, white_dn) for number in worst]
-    tables = [Section(name.capitalize(), found, CAPTIONS.get(name, "")) for name, found in by_table(rows).items()]
+    pictures += [
+        worst_picture(number, patches.degraded[number], sessions, white_dn) for number in worst
+    ]
+    tables = [
+        Section(name.capitalize(), found, CAPTIONS.get(name, ""))
+        for name, found in by_table(rows).items()
+    ]
     return Report("Where INT8 errs", headline, tables, pictures, NOTES)
 
 
-def worst_picture(number: int, degraded: np.ndarray, sessions: Sessions, white_dn: float) -> Picture:
+def worst_picture(
+    number: int, degraded: np.ndarray, sessions: Sessions, white_dn: float
+) -> Picture:
     """A patch as it is given, in float, in INT8, and the size of the difference."""
-    in_float, in_int8 = (np.clip(run(session, degraded), 0, 1)[0, 0] * MAX_DN for session in sessions)
+    in_float, in_int8 = (
+        np.clip(run(session, degraded), 0, 1)[0, 0] * MAX_DN for session in sessions
+    )
     images = {"degraded": degraded[0, 0] * MAX_DN, "float": in_float, "INT8": in_int8}
     difference = np.abs(in_int8 - in_float)
     cells = [*strip_row(images.values(), stretch_of(in_float)), *error_row([difference], white_dn)]
     caption = (
-        f"MAE {difference.mean():.2f} DN, at most {difference.max():.0f} DN. The images share one grey scale; "
+        f"MAE {difference.mean():.2f} DN, at most {difference.max():.0f} DN. The images share "
+        "one grey scale; "
         f"differences: black none, white {white_dn:.0f} DN and more."
     )
     picture = np.asarray(grid([*images, "|difference|"], [cells], ZOOM))
@@ -56,21 +73,35 @@ def worst_picture(number: int, degraded: np.ndarray, sessions: Sessions, white_d
 
 
 HISTOGRAM_CAPTION = (
-    "Share of the pixels by the difference of INT8 from float, on a logarithmic scale. The line is a Gaussian of the "
+    "Share of the pixels by the difference of INT8 from float, on a logarithmic scale. The line "
+    "is a Gaussian of the "
     "same standard deviation: rounding follows it, clipping leaves bars beside it."
 )
 CAPTIONS = {
-    "layers": "Each layer in int8 by itself, all others in float. Alone: its own result, given float inputs. The "
-    "other columns: what that does to the restored image, SQNR against the network's correction. The adds of a "
+    "layers": "Each layer in int8 by itself, all others in float. Alone: its own result, given "
+    "float inputs. The "
+    "other columns: what that does to the restored image, SQNR against the network's "
+    "correction. The adds of a "
     "stream that shares one scale lose nothing but what saturates.",
     "worst patches": "The patches of the largest MAE, of those that calibration did not see.",
     "error sizes": "Share of the pixels that differ by more than so many DN.",
-    "integer layers": "Accumulators as seen and as proven for any input, and what is left of 24 bits; results at "
-    "int8's ends; sums whose rounding depends on the rule for ties; the integer reference beside onnxruntime, with "
+    "integer layers": "Accumulators as seen and as proven for any input, and what is left of 24 "
+    "bits; results at "
+    "int8's ends; sums whose rounding depends on the rule for ties; the integer reference "
+    "beside onnxruntime, with "
     "onnxruntime's rule and with the DPU's.",
 }
 NOTES = (
-    "SQNR is 10 log10 of the signal's energy over the error's; differences are of full scale, 0.001 is 4 DN.",
-    "Squared errors of layers nearly add up, as independent errors do: the shares say where an effort would pay.",
-    "All figures are of patches that calibration did not see; onnxruntime, which ran INT8, rounds ties to even.",
+    (
+        "SQNR is 10 log10 of the signal's energy over the error's; differences are of full scale, "
+        "0.001 is 4 DN."
+    ),
+    (
+        "Squared errors of layers nearly add up, as independent errors do: the shares say where an "
+        "effort would pay."
+    ),
+    (
+        "All figures are of patches that calibration did not see; onnxruntime, which ran INT8, "
+        "rounds ties to even."
+    ),
 )

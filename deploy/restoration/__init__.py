@@ -19,8 +19,8 @@ An image passes, in this order:
     output       finished rows in a checkpoint, the lock, the TIFF
     cog          the finished TIFF cloud-optimised, by GDAL; its STAC item for a catalogue
     run          all of this for one file: `restore_file`
-    traditional  a file by the traditional pipeline instead of a network: `restore_file_traditionally`
+    traditional  a file by the traditional pipeline: `restore_file_traditionally`
 
-`deploy.library.restore` is the same for notebooks. Nothing is imported here, so that `--help` stays quick; none of
-these but `traditional` loads torch.
+`deploy.library.restore` is the same for notebooks. Nothing is imported here, so that `--help` stays
+quick; none of these but `traditional` loads torch.
 """

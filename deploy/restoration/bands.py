@@ -1,7 +1,7 @@
 """Bands of several sensors: `B0=a.toml,B1=b.toml` gives each band a network of its own.
 
-Where the image names its bands, each is found by its name; else by the number that names end in, or in the order
-given.
+Where the image names its bands, each is found by its name; else by the number that names end in, or
+in the order given.
 """
 
 import re
@@ -19,11 +19,15 @@ from beers_deploy.restoration.source import Raster
 Each = TypeVar("Each")
 
 METADATA_TAG = 42112
-"""GDAL's own of a TIFF, where bands' names stand (https://gdal.org/en/stable/drivers/raster/gtiff.html)."""
+"""GDAL's own of a TIFF, where bands' names stand
+(https://gdal.org/en/stable/drivers/raster/gtiff.html).
+"""
 
 
 def parse_sensors(text: str) -> dict[str, str]:
-    """A profile for each band by the band's name; under no name at all where one is for all bands."""
+    """A profile for each band by the band's name; under no name at all where
+    one is for all bands.
+    """
     if "=" not in text or Path(text).is_file():
         return {"": text}
     pairs = [part.partition("=") for part in text.split(",")]
@@ -41,19 +45,27 @@ def band_names(raster: Raster) -> tuple[str, ...]:
         root = parse_xml(text)
     except (ValueError, LookupError, RecursionError):
         return ()
-    found = {item.get("sample"): item.text or "" for item in root.iter("Item") if item.get("role") == "description"}
+    found = {
+        item.get("sample"): item.text or ""
+        for item in root.iter("Item")
+        if item.get("role") == "description"
+    }
     names = tuple(found.get(str(band), "") for band in range(raster.bands))
     return names if all(names) else ()
 
 
 def in_order(given: Mapping[str, Each], raster: Raster) -> list[Each]:
-    """What was given for each band, in the order of the image's bands; what is for all of them alone."""
+    """What was given for each band, in the order of the image's bands; what is for all of them
+    alone.
+    """
     if "" in given:
         return [given[""]]
     named = band_names(raster)
     names = named or _by_number(given)
     if len(given) != raster.bands or set(names) != set(given):
-        expected = f"a sensor for each of {raster.bands} bands" + (f": {', '.join(named)}" if named else "")
+        expected = f"a sensor for each of {raster.bands} bands" + (
+            f": {', '.join(named)}" if named else ""
+        )
         remedy = "name every band of the image; pansharpening is out of scope"
         raise OptionError("sensor", expected=expected, got=", ".join(given), remedy=remedy)
     return [given[name] for name in names]
@@ -63,13 +75,19 @@ def _by_number(names: Iterable[str]) -> tuple[str, ...]:
     """Names that end in a number, such as B2, in the order of these; others as they are given."""
     numbers = {name: re.fullmatch(r"\D*(\d{1,6})", name) for name in names}
     found = {name: int(match[1]) for name, match in numbers.items() if match}
-    return tuple(sorted(found, key=lambda name: found[name]) if len(found) == len(numbers) else numbers)
+    return tuple(
+        sorted(found, key=lambda name: found[name]) if len(found) == len(numbers) else numbers
+    )
 
 
 def require_alike(networks: Sequence[onnx.ModelProto], paths: Sequence[Path]) -> None:
-    """That networks of several bands are met alike by an image: one plan of tiles serves them all."""
+    """That networks of several bands are met alike by an image: one plan of
+    tiles serves them all.
+    """
     tilings = [tiling_of(network, str(path)) for network, path in zip(networks, paths, strict=True)]
     if len(networks) > 1 and (len(set(map(repr, tilings))) > 1 or tilings[0].channels_in != 1):
         remedy = "give one network for all bands"
         got = "networks of several bands, or of different halos"
-        raise ModelError("sensor", expected="networks of one band, alike but for weights", got=got, remedy=remedy)
+        raise ModelError(
+            "sensor", expected="networks of one band, alike but for weights", got=got, remedy=remedy
+        )

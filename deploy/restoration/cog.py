@@ -1,8 +1,10 @@
-"""A finished TIFF as a Cloud-Optimised GeoTIFF, with tiles, overviews and a head that says where they lie.
+"""A finished TIFF as a Cloud-Optimised GeoTIFF, with tiles, overviews and a head that says where
+they lie.
 
-GDAL's driver COG writes it, of the package rasterio (https://gdal.org/en/stable/drivers/raster/cog.html). What was
-done to the image goes into its metadata, beside what the image said of itself. The item is of STAC 1.1
-(https://stacspec.org) without extensions, so that it is judged by the core schema alone.
+GDAL's driver COG writes it, of the package rasterio
+(https://gdal.org/en/stable/drivers/raster/cog.html). What was done to the image goes into its
+metadata, beside what the image said of itself. The item is of STAC 1.1 (https://stacspec.org)
+without extensions, so that it is judged by the core schema alone.
 """
 
 import json
@@ -26,15 +28,27 @@ from beers_deploy.restoration.output import padded_px
 from beers_deploy.restoration.radiometry import FullScale
 from beers_deploy.restoration.source import RESTORED_BY
 
-CODECS = {Compression.none: "NONE", Compression.zlib: "DEFLATE", Compression.zstd: "ZSTD", Compression.lzw: "LZW"}
+CODECS = {
+    Compression.none: "NONE",
+    Compression.zlib: "DEFLATE",
+    Compression.zstd: "ZSTD",
+    Compression.lzw: "LZW",
+}
 BLOCK_PX = 512
 
 LONGITUDE_LATITUDE = "EPSG:4326"
-WHEN = "datetime is the time of the restoration: the image states no time of acquisition that is known here"
+WHEN = (
+    "datetime is the time of the restoration: the image states no time of acquisition that "
+    "is known here"
+)
 
 
-def what_was_done(networks: Sequence[onnx.ModelProto], digests: str, scale: FullScale) -> dict[str, str]:
-    """The run as an image's metadata: tool, networks in the order of the bands, their sensors and full scale."""
+def what_was_done(
+    networks: Sequence[onnx.ModelProto], digests: str, scale: FullScale
+) -> dict[str, str]:
+    """The run as an image's metadata: tool, networks in the order of the bands, their sensors and
+    full scale.
+    """
     said = [metadata(network) for network in networks]
     return {
         RESTORED_BY: f"beers-deploy {version('beers-deploy')}",
@@ -46,9 +60,11 @@ def what_was_done(networks: Sequence[onnx.ModelProto], digests: str, scale: Full
 
 
 def disk_bytes(shape: tuple[int, int, int], itemsize: int) -> int:
-    """Disk that writing a COG of an image (bands, height, width) takes, as if nothing could be packed.
+    """Disk that writing a COG of an image (bands, height, width) takes, as if nothing could be
+    packed.
 
-    The driver halves the image until it is one block, and writes these overviews into a file of their own first.
+    The driver halves the image until it is one block, and writes these overviews into a file of
+    their own first.
     """
     bands, height, width = shape
     full = padded_px(shape, BLOCK_PX)
@@ -61,11 +77,15 @@ def disk_bytes(shape: tuple[int, int, int], itemsize: int) -> int:
 
 
 def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[str, str]) -> None:
-    """Write the TIFF `plain` as the Cloud-Optimised GeoTIFF `cog`, with `about` among its metadata."""
+    """Write the TIFF `plain` as the Cloud-Optimised GeoTIFF `cog`, with `about`
+    among its metadata.
+    """
     rasterio: Any = import_module("rasterio")
     options: dict[str, Any] = {
         "COMPRESS": CODECS[compression],
-        "PREDICTOR": "NO" if compression is Compression.none else "YES",  # the horizontal one of integers
+        "PREDICTOR": "NO"
+        if compression is Compression.none
+        else "YES",  # the horizontal one of integers
         "BLOCKSIZE": BLOCK_PX,
         "BIGTIFF": "IF_SAFER",
         "RESAMPLING": "AVERAGE",  # of known pixels, and no overshoot beyond them
@@ -97,7 +117,9 @@ def write_item(image: Path, path: Path) -> None:
         rasterio.open(image, driver="GTiff") as file,
     ):
         corners = _corners(file) if file.crs and not file.transform.is_identity else []
-        done = {key.lower(): text for key, text in file.tags().items() if key.startswith("RESTORED_")}
+        done = {
+            key.lower(): text for key, text in file.tags().items() if key.startswith("RESTORED_")
+        }
         bands = [{"name": name or f"{k}"} for k, name in enumerate(file.descriptions, 1)]
     sides = list(zip(*corners, strict=True))
     item = pystac.Item(
@@ -108,14 +130,23 @@ def write_item(image: Path, path: Path) -> None:
         properties={"description": f"restored by beers-deploy; {WHEN}", **done},
     )
     href = Path(os.path.relpath(image, path.parent)).as_posix()
-    asset = pystac.Asset(href, media_type=pystac.MediaType.COG, roles=["data"], extra_fields={"bands": bands})
+    asset = pystac.Asset(
+        href, media_type=pystac.MediaType.COG, roles=["data"], extra_fields={"bands": bands}
+    )
     item.add_asset("restored", asset)
-    write_text(path, json.dumps(item.to_dict(include_self_link=False, transform_hrefs=False), indent=1) + "\n")
+    write_text(
+        path,
+        json.dumps(item.to_dict(include_self_link=False, transform_hrefs=False), indent=1) + "\n",
+    )
 
 
 def _corners(file: Any) -> list[tuple[float, float]]:
-    """Longitude and latitude of the four corners of the first and last pixels, in degrees, counter-clockwise."""
+    """Longitude and latitude of the four corners of the first and last pixels, in degrees,
+    counter-clockwise.
+    """
     places = [(0, 0), (0, file.height), (file.width, file.height), (file.width, 0)]
     x, y = zip(*(file.transform @ place for place in places), strict=True)
-    longitudes, latitudes = import_module("rasterio.warp").transform(file.crs, LONGITUDE_LATITUDE, x, y)
+    longitudes, latitudes = import_module("rasterio.warp").transform(
+        file.crs, LONGITUDE_LATITUDE, x, y
+    )
     return list(zip(longitudes, latitudes, strict=True))

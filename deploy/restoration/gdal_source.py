@@ -1,7 +1,9 @@
-"""What GDAL reads, by windows: JPEG 2000, NITF, HFA, and the indexes VRT and DIMAP that make one image of many tiles.
+"""What GDAL reads, by windows: JPEG 2000, NITF, HFA, and the indexes VRT and DIMAP that make one
+image of many tiles.
 
-GDAL comes with rasterio, an optional package. It is given one driver for one file, sees no file beside it and no
-network unless the user trusts the index, and keeps a cache of blocks that counts as memory of the run.
+GDAL comes with rasterio, an optional package. It is given one driver for one file, sees no file
+beside it and no network unless the user trusts the index, and keeps a cache of blocks that counts
+as memory of the run.
 """
 
 import io
@@ -37,14 +39,18 @@ from beers_deploy.restoration.source import (
 
 LEAST_CACHE_BYTES = 1 << 26
 ENVIRONMENT = {
-    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",  # no file beside it: what is beside was not looked at
+    # No file beside it: what is beside was not looked at.
+    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
     "GDAL_PAM_ENABLED": "NO",
     "GDAL_VRT_ENABLE_PYTHON": "NO",
-    "CPL_LOG": os.devnull,  # threads that decode print their errors, which come back as one exception as well
+    # Threads that decode print their errors, which come back as one exception as well.
+    "CPL_LOG": os.devnull,
 }
 OFFLINE = {"CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "{none}"}
 
-logging.getLogger("rasterio").addHandler(logging.NullHandler())  # who asks for its remarks still has them
+logging.getLogger("rasterio").addHandler(
+    logging.NullHandler()
+)  # who asks for its remarks still has them
 
 
 @contextmanager
@@ -62,7 +68,8 @@ def open_gdal(path: Path, trusted: bool = False) -> Iterator[Source]:
     with _damage_in_a_sentence(path), rasterio.Env(**environment):
         dataset = rasterio.open(path.resolve(), driver=GDAL_DRIVERS[path.suffix.lower()])
         block_px = _block_px(dataset)
-        if tiles:  # a mosaic states blocks of its own, and decodes those of its tiles, which are mostly alike
+        # A mosaic states blocks of its own, and decodes those of its tiles, which are mostly alike.
+        if tiles:
             with rasterio.open(tiles[0]) as tile:
                 block_px = max(block_px, _block_px(tile))
     with dataset:
@@ -104,7 +111,9 @@ class GdalSource:
 
     veil: Plane | None = None
 
-    def __init__(self, files: tuple[Path, ...], dataset: Any, block_px: int, environment: dict[str, Any]) -> None:
+    def __init__(
+        self, files: tuple[Path, ...], dataset: Any, block_px: int, environment: dict[str, Any]
+    ) -> None:
         self.files = files
         self._path = files[0]
         self._dataset = dataset
@@ -124,8 +133,13 @@ class GdalSource:
     def _read(self, read: Callable[..., Any], start: int, stop: int) -> np.ndarray:
         rasterio: Any = import_module("rasterio")
         environment = self._environment | {"GDAL_CACHEMAX": self.held_bytes(stop - start)}
-        with _damage_in_a_sentence(self._path, f"rows {start} to {stop - 1}"), rasterio.Env(**environment):
-            return np.asarray(read(window=rasterio.windows.Window(0, start, self.raster.width_px, stop - start)))
+        with (
+            _damage_in_a_sentence(self._path, f"rows {start} to {stop - 1}"),
+            rasterio.Env(**environment),
+        ):
+            return np.asarray(
+                read(window=rasterio.windows.Window(0, start, self.raster.width_px, stop - start))
+            )
 
     def held_bytes(self, rows_px: int) -> int:
         """GDAL's cache: the blocks around the rows, so that none is decoded for two strips."""
@@ -136,19 +150,25 @@ class GdalSource:
 def _raster(path: Path, dataset: Any) -> Raster:
     """What GDAL says of an image, before any pixel is read."""
     if dataset.count == 0:
-        remedy = "give the file of one of them" + (f", as {dataset.subdatasets[0]}" if dataset.subdatasets else "")
+        remedy = "give the file of one of them" + (
+            f", as {dataset.subdatasets[0]}" if dataset.subdatasets else ""
+        )
         raise ImageError(str(path), expected="one image", got="several, or none", remedy=remedy)
     for kind, each in (("types", dataset.dtypes), ("nodata values", dataset.nodatavals)):
         if len({str(one) for one in each}) > 1:
             got = ", ".join(str(one) for one in each)
-            raise ImageError(str(path), expected=f"bands of equal {kind}", got=got, remedy="split the bands")
+            raise ImageError(
+                str(path), expected=f"bands of equal {kind}", got=got, remedy="split the bands"
+            )
     name = str(path)
     dtype = require_numbers(str(path), np.dtype(dataset.dtypes[0]))
     require_size(name, dataset.count, dataset.height, dataset.width)
     colours = [each.name for each in dataset.colorinterp]
     if "palette" in colours:
         remedy = "convert it with 'gdal_translate -expand'"
-        raise ImageError(name, expected="pixels where more is brighter", got="a palette", remedy=remedy)
+        raise ImageError(
+            name, expected="pixels where more is brighter", got="a palette", remedy=remedy
+        )
     for offset, scale in zip(dataset.offsets, dataset.scales, strict=True):
         require_small_offset(name, offset, scale)
     nodata = usable_nodata(name, dataset.nodatavals[0], dtype)
@@ -160,9 +180,11 @@ def _raster(path: Path, dataset: Any) -> Raster:
 
 
 def _bits(path: Path, dataset: Any) -> int | None:
-    """The bits per pixel that the file states, the largest of its bands'; None where any band states none.
+    """The bits per pixel that the file states, the largest of its bands'; None where any band
+    states none.
 
-    A DIMAP says it of the product; of other files what fills the type is a container, as in a plain TIFF.
+    A DIMAP says it of the product; of other files what fills the type is a container, as in a plain
+    TIFF.
     """
     if (of_product := dimap_bits(path)) is not None:
         return of_product
@@ -174,12 +196,22 @@ def _bits(path: Path, dataset: Any) -> int | None:
 
 
 def _tags(dataset: Any, nodata: float | None) -> tuple[Tag, ...]:
-    """Georeference, RPCs, names and gains of bands as TIFF tags: those of a file of one pixel that GDAL writes."""
-    profile = {"driver": "GTiff", "width": 1, "height": 1, "count": dataset.count, "dtype": dataset.dtypes[0]}
+    """Georeference, RPCs, names and gains of bands as TIFF tags: those of a file of one pixel that
+    GDAL writes.
+    """
+    profile = {
+        "driver": "GTiff",
+        "width": 1,
+        "height": 1,
+        "count": dataset.count,
+        "dtype": dataset.dtypes[0],
+    }
     profile |= {} if nodata is None else {"nodata": nodata}
     with import_module("rasterio.io").MemoryFile() as memory:
         with memory.open(**profile, **_place(dataset)) as small:
-            small.update_tags(**{key: value for key, value in dataset.tags().items() if key == "AREA_OR_POINT"})
+            small.update_tags(
+                **{key: value for key, value in dataset.tags().items() if key == "AREA_OR_POINT"}
+            )
             if dataset.rpcs is not None:
                 small.rpcs = dataset.rpcs
             small.descriptions = dataset.descriptions
@@ -194,7 +226,9 @@ def _tags(dataset: Any, nodata: float | None) -> tuple[Tag, ...]:
 
 
 def _place(dataset: Any) -> dict[str, Any]:
-    """Where an image lies, as rasterio takes it: by a transform or by ground control points; empty for none."""
+    """Where an image lies, as rasterio takes it: by a transform or by ground control points; empty
+    for none.
+    """
     points, points_crs = dataset.gcps
     if points:
         return {"gcps": points, "crs": points_crs}

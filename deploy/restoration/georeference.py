@@ -1,7 +1,9 @@
-"""Where an image lies on Earth, carried to one of more pixels: TIFF's tags of geography, scaled; and files beside it.
+"""Where an image lies on Earth, carried to one of more pixels: TIFF's tags of geography, scaled;
+and files beside it.
 
-A pixel's corner at (column, row) comes to `scale` times both. Tags that say what a pixel's middle is (rational
-polynomials, and GeoTIFF's where the raster is of points) move by the half pixel between the two.
+A pixel's corner at (column, row) comes to `scale` times both. Tags that say what a pixel's middle
+is (rational polynomials, and GeoTIFF's where the raster is of points) move by the half pixel
+between the two.
 """
 
 import math
@@ -29,16 +31,22 @@ SCALES = (7, 8)
 
 
 def enlarged_tags(tags: tuple[Tag, ...], scale: int) -> tuple[Tag, ...]:
-    """An image's tags for one of `scale` times the pixels along either side; the same where that is 1."""
+    """An image's tags for one of `scale` times the pixels along either side; the same where that is
+    1.
+    """
     if scale == 1:
         return tags
     values = {tag[0]: tag[3] for tag in tags}
     points = geo_keys(values.get(KEYS, ())).get(RASTER_TYPE) == POINTS
-    return tuple((tag[0], tag[1], tag[2], _enlarged(tag[0], tag[3], scale, points), tag[4]) for tag in tags)
+    return tuple(
+        (tag[0], tag[1], tag[2], _enlarged(tag[0], tag[3], scale, points), tag[4]) for tag in tags
+    )
 
 
 def geo_keys(keys: Sequence[int]) -> dict[int, int]:
-    """GeoTIFF's keys: a head of four numbers, and four for each: code, place of the value, count, value."""
+    """GeoTIFF's keys: a head of four numbers, and four for each: code, place of the value, count,
+    value.
+    """
     return {keys[k]: keys[k + 3] for k in range(4, len(keys) - 3, 4)}
 
 
@@ -50,13 +58,19 @@ def _enlarged(code: int, value: Any, scale: int, points: bool) -> Any:
     if code == TRANSFORMATION and len(value) == 16:
         return _transformation(value, scale, points)
     if code == POLYNOMIALS:
-        places = dict.fromkeys(OFFSETS, _middle) | dict.fromkeys(SCALES, lambda number, by: number * by)
-        return tuple(places[k](number, scale) if k in places else number for k, number in enumerate(value))
+        places = dict.fromkeys(OFFSETS, _middle) | dict.fromkeys(
+            SCALES, lambda number, by: number * by
+        )
+        return tuple(
+            places[k](number, scale) if k in places else number for k, number in enumerate(value)
+        )
     return value
 
 
 def _middle(place: float, scale: int) -> float:
-    """Where the middle of a pixel at this place comes to, counted from the middle of the first one."""
+    """Where the middle of a pixel at this place comes to, counted from the
+    middle of the first one.
+    """
     return (place + 0.5) * scale - 0.5
 
 
@@ -87,7 +101,9 @@ def sidecar_of(path: Path) -> Path:
 
 
 def of_sidecar(path: Path, raster: Raster) -> Raster:
-    """The raster with the nodata value that GDAL keeps in IMAGE.aux.xml, where the image has none of its own."""
+    """The raster with the nodata value that GDAL keeps in IMAGE.aux.xml, where the image has none
+    of its own.
+    """
     beside = sidecar_of(path)
     if not beside.is_file():
         return raster
@@ -95,23 +111,35 @@ def of_sidecar(path: Path, raster: Raster) -> Raster:
     name = str(beside)
     bands = list(root.iter("PAMRasterBand"))
     for band in bands:
-        offset, scale = (number_of(band.findtext(key, ""), usual) for key, usual in (("Offset", 0), ("Scale", 1)))
+        offset, scale = (
+            number_of(band.findtext(key, ""), usual) for key, usual in (("Offset", 0), ("Scale", 1))
+        )
         require_small_offset(name, offset, scale)
     stated = {band.findtext("NoDataValue", "").strip() for band in bands} - {""}
     if len(stated) > 1:
-        raise ImageError(name, expected="one nodata value", got=", ".join(sorted(stated)), remedy="split the bands")
+        raise ImageError(
+            name,
+            expected="one nodata value",
+            got=", ".join(sorted(stated)),
+            remedy="split the bands",
+        )
     found = [number_of(text, math.nan) for text in stated] if raster.nodata is None else []
     nodata = usable_nodata(name, found[0], raster.dtype) if found else None
     if nodata is None:
         return raster
-    return replace(raster, nodata=nodata, tags=(*raster.tags, (NODATA_TAG, 2, 0, f"{nodata:.17g}", True)))
+    return replace(
+        raster, nodata=nodata, tags=(*raster.tags, (NODATA_TAG, 2, 0, f"{nodata:.17g}", True))
+    )
 
 
 def unread_places(path: Path, raster: Raster) -> list[str]:
-    """A sentence for each file beside an image that says where it lies, which itself does not; they are not read."""
+    """A sentence for each file beside an image that says where it lies, which itself does not; they
+    are not read.
+    """
     if {tag[0] for tag in raster.tags} & {PIXEL_SCALE, TRANSFORMATION, KEYS, POLYNOMIALS}:
         return []
     found = [each for end in UNREAD if (each := path.with_name(f"{path.stem}{end}")).is_file()]
     return [
-        f"{each.name} is not read: keep it beside the result, or write its place into the image" for each in found
+        f"{each.name} is not read: keep it beside the result, or write its place into the image"
+        for each in found
     ]

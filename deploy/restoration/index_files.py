@@ -1,9 +1,11 @@
-"""Untrusted indexes: an XML file that names an image's tiles is read here before GDAL follows it anywhere.
+"""Untrusted indexes: an XML file that names an image's tiles is read here before GDAL follows it
+anywhere.
 
-Whatever a VRT or a DIMAP names must be an image that lies in its folder or below, unless the user trusts it. Code in
-Python is never run: GDAL is told so when it opens one.
+Whatever a VRT or a DIMAP names must be an image that lies in its folder or below, unless the user
+trusts it. Code in Python is never run: GDAL is told so when it opens one.
 
-Sources: https://gdal.org/en/stable/drivers/raster/vrt.html, and GDAL's frmts/dimap/dimapdataset.cpp.
+Sources: https://gdal.org/en/stable/drivers/raster/vrt.html, and GDAL's
+frmts/dimap/dimapdataset.cpp.
 """
 
 import xml.etree.ElementTree as ET
@@ -33,7 +35,9 @@ DIMAP_PATHS = {PIXELS, "component_path"}
 
 
 class _NoDoctype(ET.TreeBuilder):
-    """A tree of untrusted XML: entities are declared in a document type; with none, nothing can be expanded."""
+    """A tree of untrusted XML: entities are declared in a document type; with none, nothing can be
+    expanded.
+    """
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:  # noqa: ARG002
         """Refuse it."""
@@ -63,7 +67,9 @@ def read_xml(path: Path, limit_bytes: int, expected: str, remedy: str) -> ET.Ele
     try:
         return parse_xml(read_whole(path, limit_bytes))
     except (ValueError, LookupError, OSError, RecursionError) as error:  # lookup: of an encoding
-        raise _refused(path, expected, getattr(error, "strerror", None) or str(error), remedy) from error
+        raise _refused(
+            path, expected, getattr(error, "strerror", None) or str(error), remedy
+        ) from error
 
 
 def is_index(path: Path) -> bool:
@@ -72,11 +78,13 @@ def is_index(path: Path) -> bool:
 
 
 def index_files(path: Path, trusted: bool = False) -> tuple[Path, ...]:
-    """The files that an index, and the indexes it names, make an image of; none for a file that is no index.
+    """The files that an index, and the indexes it names, make an image of; none for a file that is
+    no index.
 
     Args:
         path: of any image.
-        trusted: whether tiles may lie outside the index's folder; what lies at a URL is then not looked at.
+        trusted: whether tiles may lie outside the index's folder; what lies at a URL is then not
+            looked at.
     """
     if not is_index(path):
         return ()
@@ -109,7 +117,12 @@ def _named(index: Path, home: Path, trusted: bool) -> Iterator[Path]:
 def _require_pixels(index: Path, text: str, file: Path) -> None:
     """That a tile is there, and is an image or a VRT."""
     if not (text and file.is_file()):
-        raise _refused(index, f"the tile {text or '(no name)'}", "no such file", "fetch it or make the index anew")
+        raise _refused(
+            index,
+            f"the tile {text or '(no name)'}",
+            "no such file",
+            "fetch it or make the index anew",
+        )
     with file.open("rb") as stream:
         known = stream.read(16).startswith(MAGIC)
     if not known and file.suffix.lower() != ".vrt":
@@ -145,13 +158,18 @@ def _of_dimap(path: Path, root: ET.Element) -> Named:
     for element in root.iter():
         name = element.tag.rpartition("}")[2].lower()
         if name in DIMAP_PATHS:
-            for key, text in (*element.attrib.items(), *((child.tag, child.text or "") for child in element)):
+            for key, text in (
+                *element.attrib.items(),
+                *((child.tag, child.text or "") for child in element),
+            ):
                 if key.rpartition("}")[2].lower() == "href":
                     yield text.strip(), path.parent, name == PIXELS
 
 
 def _is_elsewhere(text: str) -> bool:
-    """Whether GDAL would take it for more than a path: a URL, a virtual file, XML itself, a part of a file."""
+    """Whether GDAL would take it for more than a path: a URL, a virtual file, XML itself, a part of
+    a file.
+    """
     return "://" in text or text.startswith(("/vsi", "<")) or (":" in text and not Path(text).drive)
 
 
@@ -161,11 +179,15 @@ def _located(index: Path, text: str, folder: Path, home: Path | None) -> Path:
         file = (folder / text).resolve()
         file.is_file()  # whether the system takes such a name
     except (OSError, RuntimeError, ValueError) as error:
-        raise _refused(index, "names of tiles", f"no path, {text}", "make the index anew") from error
+        raise _refused(
+            index, "names of tiles", f"no path, {text}", "make the index anew"
+        ) from error
     elsewhere = _is_elsewhere(text)
     if elsewhere or (home is not None and not file.is_relative_to(home)):
         remedy = "put its tiles beside it, or trust it with `trust_index`"
-        raise _refused(index, "tiles in its own folder", f"one at {text if elsewhere else file}", remedy)
+        raise _refused(
+            index, "tiles in its own folder", f"one at {text if elsewhere else file}", remedy
+        )
     return file
 
 
@@ -176,7 +198,8 @@ def _refused(path: Path, expected: str, got: str, remedy: str) -> ImageError:
 def dimap_bits(path: Path) -> int | None:
     """The bits per pixel of a DIMAP's product; None where it states none, or is none.
 
-    Dynamic_Range/PRODUCT_RANGE, else Raster_Encoding/NBITS, as Airbus' Pleiades Imagery User Guide has them.
+    Dynamic_Range/PRODUCT_RANGE, else Raster_Encoding/NBITS, as Airbus' Pleiades Imagery User Guide
+    has them.
     """
     if path.suffix.lower() != ".xml":
         return None

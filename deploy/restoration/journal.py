@@ -1,7 +1,8 @@
-"""The journal of a restoration: which job it belongs to, and the size and digest of each finished row of tiles.
+"""The journal of a restoration: which job it belongs to, and the size and digest of each finished
+row of tiles.
 
-A run that goes on with `resume` trusts nothing that it finds on the disk. The journal has a digest of its own, and
-each row of tiles is compared with what the journal states of it (`Checkpoint`).
+A run that goes on with `resume` trusts nothing that it finds on the disk. The journal has a digest
+of its own, and each row of tiles is compared with what the journal states of it (`Checkpoint`).
 """
 
 import hashlib
@@ -66,7 +67,9 @@ def read_journal(path: Path, job: Mapping[str, object]) -> list[FinishedRow]:
         raise ValueError("damaged")
     if content["job"] != job:
         raise ValueError("another job")
-    finished = [FinishedRow(**{**row, "tally": Tally(**row["tally"])}) for row in content["finished"]]
+    finished = [
+        FinishedRow(**{**row, "tally": Tally(**row["tally"])}) for row in content["finished"]
+    ]
     if not all(map(_possible, finished)):
         raise ValueError("impossible counts")
     return finished

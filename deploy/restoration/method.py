@@ -1,4 +1,5 @@
-"""A network as a method that restores images in memory, with the steps around it: what studies compare.
+"""A network as a method that restores images in memory, with the steps around it: what studies
+compare.
 
 The pixels are those that `restore` writes.
 """
@@ -25,7 +26,9 @@ Restore = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Around:
-    """Which steps around a network are taken where they can be: the consistency step, and exposure."""
+    """Which steps around a network are taken where they can be: the consistency
+    step, and exposure.
+    """
 
     consistency: bool = True
     exposure: bool = True
@@ -48,14 +51,18 @@ def network_method(
     Args:
         model: the network.
         max_dn: the largest digital number.
-        brighter: the same network for sensors of so many times the gain, by factor; none leaves exposure out.
+        brighter: the same network for sensors of so many times the gain, by factor; none leaves
+            exposure out.
         sensor: that acquired the images; None leaves the consistency step out.
         reference: that the restoration aims at; needed with `sensor`.
     """
     infer, _ = open_runtime(Runtime.onnxruntime, model, threads=0)
     tiling = tiling_of(model)
     others = {} if brighter is None else brighter
-    packed = {factor: Packed(each.SerializeToString(), Runtime.onnxruntime, 0) for factor, each in others.items()}
+    packed = {
+        factor: Packed(each.SerializeToString(), Runtime.onnxruntime, 0)
+        for factor, each in others.items()
+    }
     offset = sensor.offset_dn if sensor else 0.0
     network = ExposedNetwork({1: infer, **packed}, tiling.halo_px, offset)
     consistency = (Consistency.of(sensor, reference, max_dn),) if sensor and reference else ()

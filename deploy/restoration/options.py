@@ -1,4 +1,7 @@
-"""How an image is to be restored: what a user can choose. It loads nothing, so that '--help' stays quick."""
+"""How an image is to be restored: what a user can choose.
+
+It loads nothing, so that '--help' stays quick.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -34,21 +37,26 @@ class Options:
         model: the network's file; none of the traditional pipeline.
         tile_px: longest side of a tile.
         halo: 'exact', or pixels of context around a tile.
-        full_scale: the pixel value that is 1.0 to the network; None leaves it to deploy.restoration.radiometry.
+        full_scale: the pixel value that is 1.0 to the network; None leaves it to
+            deploy.restoration.radiometry.
         runtime: what runs the network.
-        threads: of the runtime; 0 takes every core, or one for each call that a scheduler's workers run at once.
+        threads: of the runtime; 0 takes every core, or one for each call that a scheduler's workers
+            run at once.
         compression: of the output.
         memory_bytes: budget of this process; None is what is free.
         resume: go on with a stopped run.
         scheduler: address of a Dask scheduler whose workers run the network; None runs it here.
         again: whether an image may be one that was restored already.
         any_result: whether a result is written that no restoration has.
-        bands: networks of single bands by their names, each for its own sensor; empty where `model` is for all.
-        brighter: the network for sensors of so many times the gain, by band and factor; empty where none is.
+        bands: networks of single bands by their names, each for its own sensor; empty where `model`
+            is for all.
+        brighter: the network for sensors of so many times the gain, by band and factor; empty where
+            none is.
         consistency: whether the consistency step is taken where the sensor is known.
         fix_detectors: the list of faulty detectors to replace, or 'found'; empty to replace none.
         cog: whether the output is a Cloud-Optimised GeoTIFF.
-        sensors: that the user named, by band; under no name where one is for all, empty where none was named.
+        sensors: that the user named, by band; under no name where one is for all, empty where none
+            was named.
         strict: whether an image is refused that contradicts its sensor.
         trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
     """
@@ -87,4 +95,6 @@ def parse_halo(text: str, radius_px: int) -> int:
     if text.isdecimal():
         return int(text)
     remedy = f"{radius_px} is exact for this network"
-    raise OptionError("halo", expected="'exact' or a number of pixels", got=repr(text), remedy=remedy)
+    raise OptionError(
+        "halo", expected="'exact' or a number of pixels", got=repr(text), remedy=remedy
+    )

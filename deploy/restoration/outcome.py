@@ -1,7 +1,8 @@
-"""What comes out of a restoration, held against what went in: a network of another scale writes no white image.
+"""What comes out of a restoration, held against what went in: a network of another scale writes no
+white image.
 
-A restoration keeps the mean, most of the contrast, and leaves few pixels at an end of full scale. Small departures
-are told, those that no restoration has are refused.
+A restoration keeps the mean, most of the contrast, and leaves few pixels at an end of full scale.
+Small departures are told, those that no restoration has are refused.
 """
 
 import math
@@ -19,35 +20,42 @@ MANY_AT_ENDS = 0.9
 FAR = 0.5
 FLAT = 0.001
 FEW = 1000
-"""Refused: more of the results at an end of full scale, a mean moved by more of it, less contrast left; of fewer
-pixels nothing is."""
+"""Refused: more of the results at an end of full scale, a mean moved by more of it, less contrast
+left; of fewer pixels nothing is.
+"""
 SOME_AT_ENDS = 0.05
 """Told: more of the results at an end."""
 MEAN_KEPT = 0.015
 LEAST_MOVE = 0.0003
 SCATTER = 2.0
 DARK_MOVE = RANGES["sigma_dark"][1] / 2
-"""Told: a mean moved by more than the sum of these shares: of itself; of full scale (1 DN of 12 bits); of the
-standard error of the mean, since a border of zeros changes a small image; and of full scale, for the dark part.
+"""Told: a mean moved by more than the sum of these shares: of itself; of full scale (1 DN of 12
+bits); of the standard error of the mean, since a border of zeros changes a small image; and of full
+scale, for the dark part.
 
-A detector stores no value below 0, which raises the mean of a dark, noisy image, and a network adds up to half a
-standard deviation of the noise to that. Of 443 restorations by the shipped networks, of 24 px and more a side, at 1
-to 1/500 of the light, none reached 0.75 of the bound (measured)."""
+A detector stores no value below 0, which raises the mean of a dark, noisy image, and a network adds
+up to half a standard deviation of the noise to that. Of 443 restorations by the shipped networks,
+of 24 px and more a side, at 1 to 1/500 of the light, none reached 0.75 of the bound (measured).
+"""
 DARK = 3 * RANGES["sigma_dark"][1]
-"""Of full scale: within three standard deviations of the loudest sensor's noise, which clipping at 0 can reach."""
+"""Of full scale: within three standard deviations of the loudest sensor's noise, which clipping at
+0 can reach.
+"""
 LEAST_SPREAD = 1e-6
 """Of an image that is constant but for rounding, in shares of full scale."""
 
 
 @dataclass(frozen=True)
 class Tally:
-    """What was seen of an image and of its result where both are known: counts, and sums in shares of full scale.
+    """What was seen of an image and of its result where both are known: counts, and sums in shares
+    of full scale.
 
     Attributes:
         known: results that are no missing pixels.
         clipped: pixels of the image above full scale.
         at_ends: results that came to 0 or to full scale where the image lay between.
-        compared: pixels of the image that the sums count; none where the network makes other bands of them.
+        compared: pixels of the image that the sums count; none where the network makes other bands
+            of them.
         before: sum of these pixels.
         before_squared: of their squares.
         after: sum of the results.
@@ -56,8 +64,9 @@ class Tally:
         runs: of the network, one for each exposure that a tile asks for.
         brightened: results that were restored at an exposure above 1.
         change_squared: sum of the squares of what the consistency step changed.
-        network_at_ends: as `at_ends`, of what the network gave. The consistency step would hide a network that does
-            not fit, since it gives nearly any image the mean and the coarse structure of the raw one.
+        network_at_ends: as `at_ends`, of what the network gave. The consistency step would hide a
+            network that does not fit, since it gives nearly any image the mean and the coarse
+            structure of the raw one.
         network_after: as `after`, of what the network gave.
         network_after_squared: as `after_squared`, of what the network gave.
         dark: pixels of the image that noise may take to 0.
@@ -82,13 +91,18 @@ class Tally:
 
     @classmethod
     def of(
-        cls, stored: np.ndarray, restored: np.ndarray, seen: np.ndarray | None, known: np.ndarray | None
+        cls,
+        stored: np.ndarray,
+        restored: np.ndarray,
+        seen: np.ndarray | None,
+        known: np.ndarray | None,
     ) -> "Tally":
         """Of a part of an image.
 
         Args:
             stored: its pixels (bands, h, w), in shares of full scale.
-            restored: its results, of as many or other bands, of so many times as many rows and columns.
+            restored: its results, of as many or other bands, of so many times as many rows and
+                columns.
             seen: which pixels are known; None for all.
             known: which results are; None for all.
         """
@@ -123,7 +137,9 @@ class Tally:
         )
 
     def changed_from(self, network: "Tally", change_squared: float) -> "Tally":
-        """Return this tally of pixels that the consistency step made of those that `network` is the tally of."""
+        """Return this tally of pixels that the consistency step made of those that `network` is the
+        tally of.
+        """
         return replace(
             self,
             change_squared=change_squared,
@@ -171,9 +187,13 @@ class Tally:
     @property
     def spreads(self) -> tuple[float, float]:
         """Standard deviation before and after, in shares of full scale."""
-        squares = self.before_squared / max(self.compared, 1), self.after_squared / max(self.known, 1)
+        squares = (
+            self.before_squared / max(self.compared, 1),
+            self.after_squared / max(self.known, 1),
+        )
         before, after = (
-            math.sqrt(max(square - mean**2, 0)) for square, mean in zip(squares, self.means, strict=True)
+            math.sqrt(max(square - mean**2, 0))
+            for square, mean in zip(squares, self.means, strict=True)
         )
         return before, after
 
@@ -189,7 +209,9 @@ class Tally:
         ends = "results at 0 or full scale where the image is not"
         mean = "mean of the known pixels, after less before"
         return {
-            "clipped pixels": measured(self.clipped, "1", "pixels of the image above its full scale"),
+            "clipped pixels": measured(
+                self.clipped, "1", "pixels of the image above its full scale"
+            ),
             "results at ends": measured(100 * self.share_at_ends, "%", ends),
             "mean moved": measured(100 * self.moved, "% of full scale", mean),
         }
@@ -214,7 +236,9 @@ class Tally:
 
     @property
     def doubts(self) -> list[str]:
-        """What a user should look at, a clause each; of the network's results, before the consistency step."""
+        """What a user should look at, a clause each; of the network's results, before the
+        consistency step.
+        """
         found = []
         given = self.network
         before = "before the consistency step, " if self.change_squared else ""
@@ -224,7 +248,9 @@ class Tally:
             share = f"{given.share_at_ends:.0%} of the results"
             found.append(f"{before}{share} are 0 or full scale where the image is not")
         if abs(given.moved) > given.mean_bound:
-            found.append(before + "the mean went from {:.3g} to {:.3g} of full scale".format(*given.means))
+            found.append(
+                before + "the mean went from {:.3g} to {:.3g} of full scale".format(*given.means)
+            )
         if given.flat:
             found.append(f"{before}the results are constant and the image is not")
         return found
@@ -233,10 +259,13 @@ class Tally:
         """Refuse what no restoration gives of an image, `name` in messages."""
         given = self.network
         impossible = given.share_at_ends > MANY_AT_ENDS or abs(given.moved) > FAR or given.flat
-        if self.known >= FEW and (impossible or self.clipped > MANY_AT_ENDS * max(self.compared, 1)):
+        if self.known >= FEW and (
+            impossible or self.clipped > MANY_AT_ENDS * max(self.compared, 1)
+        ):
             expected = "a network that restores this image"
             got = "; ".join(self.doubts)
             remedy = (
-                "check its scale with 'gate' and the image's `full_scale`, or write it all the same: `any_result`"
+                "check its scale with 'gate' and the image's `full_scale`, or write it all "
+                "the same: `any_result`"
             )
             raise ImageError(name, expected=expected, got=got, remedy=remedy)

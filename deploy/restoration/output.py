@@ -1,4 +1,6 @@
-"""What a run leaves: finished rows in a checkpoint, so that one killed at any moment goes on; at the end one TIFF."""
+"""What a run leaves: finished rows in a checkpoint, so that one killed at any moment goes on; at
+the end one TIFF.
+"""
 
 import hashlib
 import io
@@ -18,7 +20,13 @@ from isal import isal_zlib
 from beers_deploy.model.io.files import TIFF_SUFFIXES, require_regular
 from beers_deploy.model.io.lock import part_folder
 from beers_deploy.model.io.tiff import MASK
-from beers_deploy.profiles.errors import ImageError, MachineError, MissingExtraError, OptionError, sizes
+from beers_deploy.profiles.errors import (
+    ImageError,
+    MachineError,
+    MissingExtraError,
+    OptionError,
+    sizes,
+)
 from beers_deploy.restoration.georeference import enlarged_tags
 from beers_deploy.restoration.journal import FinishedRow, journal_text, read_journal
 from beers_deploy.restoration.options import Compression
@@ -31,12 +39,14 @@ ROWS_FILES = ("journal.json", "journal.new", "rows.raw")
 
 
 class Checkpoint:
-    """The finished rows of a restored image (bands, height, width), from the top, and a journal of their digests.
+    """The finished rows of a restored image (bands, height, width), from the top, and a journal of
+    their digests.
 
     Attributes:
         rows: how many are finished.
         tally: what was seen of them.
-        damaged_rows: how many an earlier run finished that no longer match its journal, and those below them.
+        damaged_rows: how many an earlier run finished that no longer match its journal, and those
+            below them.
     """
 
     def __init__(
@@ -58,7 +68,8 @@ class Checkpoint:
             job: all that decides the pixels; a run is resumed only by one of the same job.
             resume: go on; where nothing was left, begin.
             cog_bytes: of disk that the output takes beside the rows and the plain TIFF.
-            row_ends: at which row of pixels each row of tiles ends; a journal of other rows is refused.
+            row_ends: at which row of pixels each row of tiles ends; a journal of other rows is
+                refused.
         """
         self.out = out
         self.shape = shape
@@ -95,15 +106,21 @@ class Checkpoint:
                 stream.flush()
                 os.fsync(stream.fileno())
             rows_px = row.pixels.shape[1]
-            self._finished.append(FinishedRow(rows_px, row.pixels.nbytes, digest.hexdigest(), row.tally))
+            self._finished.append(
+                FinishedRow(rows_px, row.pixels.nbytes, digest.hexdigest(), row.tally)
+            )
             self.rows = self.rows + rows_px
             self.tally = self.tally + row.tally
             self._write_journal()
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
-        """Finished rows `start` to `stop` (excluded) of one band, (rows, width) as they will be written."""
+        """Finished rows `start` to `stop` (excluded) of one band, (rows, width) as they will be
+        written.
+        """
         count = (stop - start) * self.shape[2]
-        pixels = np.fromfile(self.folder / "rows.raw", self.dtype, count, offset=self._offset(band, start))
+        pixels = np.fromfile(
+            self.folder / "rows.raw", self.dtype, count, offset=self._offset(band, start)
+        )
         return pixels.reshape(-1, self.shape[2])
 
     def require_known(self, name: str) -> None:
@@ -132,7 +149,9 @@ class Checkpoint:
             )
             remedy = f"correct that, and {kept}"
             got = error.strerror or str(error)
-            raise MachineError(str(self.out), expected="a disk to write to", got=got, remedy=remedy) from error
+            raise MachineError(
+                str(self.out), expected="a disk to write to", got=got, remedy=remedy
+            ) from error
 
     def _left(self) -> list[FinishedRow]:
         """Return the rows of tiles that an earlier run of this job finished, by its journal."""
@@ -151,7 +170,9 @@ class Checkpoint:
         raise OptionError("resume", expected=expected, got=got, remedy=remedy)
 
     def _matching(self, finished: list[FinishedRow]) -> list[FinishedRow]:
-        """Return the rows of tiles down to the first one whose pixels are not those that the journal states."""
+        """Return the rows of tiles down to the first one whose pixels are not those that the
+        journal states.
+        """
         matching = list[FinishedRow]()
         top = 0
         for row in finished:
@@ -162,7 +183,9 @@ class Checkpoint:
         return matching
 
     def _stored(self, top: int, rows_px: int) -> tuple[int, str]:
-        """Return the size in bytes and the digest of rows of pixels that are stored; fewer bytes where it ends."""
+        """Return the size in bytes and the digest of rows of pixels that are stored; fewer bytes
+        where it ends.
+        """
         size_bytes = 0
         digest = hashlib.sha256()
         with suppress(OSError), (self.folder / "rows.raw").open("rb") as stream:
@@ -214,20 +237,28 @@ def sync_folder(folder: Path) -> None:
 
 TILE_PX = 256
 PLAIN_LIMIT_BYTES = 4_000_000_000
-"""Offsets of a plain TIFF end at 2^32; above this many bytes of pixels, compressed or not, it is a BigTIFF."""
+"""Offsets of a plain TIFF end at 2^32; above this many bytes of pixels, compressed or not, it is a
+BigTIFF.
+"""
 BUFFER_BYTES = 1 << 25
 FAST_LEVEL = 1
 HORIZONTAL = 2
-"""TIFF's predictor of integers: what is packed is each pixel's difference from the one on its left."""
+"""TIFF's predictor of integers: what is packed is each pixel's difference from
+the one on its left.
+"""
 
 
 def require_tiff_name(path: Path) -> None:
     """Refuse a name under which no program would look for a TIFF."""
     if path.suffix.lower() not in TIFF_SUFFIXES | BIG_TIFF_SUFFIXES:
         remedy = "name it so; other programs turn a TIFF into what you need"
-        raise OptionError("OUT", expected="a TIFF's name, such as restored.tif", got=path.name, remedy=remedy)
+        raise OptionError(
+            "OUT", expected="a TIFF's name, such as restored.tif", got=path.name, remedy=remedy
+        )
     if (mask := path.with_name(f"{path.name}.msk")).exists():
-        remedy = "remove it, or choose another name: readers would take it for the mask of the new image"
+        remedy = (
+            "remove it, or choose another name: readers would take it for the mask of the new image"
+        )
         raise OptionError("OUT", expected="no mask of that name", got=mask.name, remedy=remedy)
 
 
@@ -240,7 +271,9 @@ def require_codec(compression: Compression) -> None:
             raise  # a fault of the writer, whatever is installed
         got = " ".join(str(error).split())
         remedy = "pip install 'beers-deploy[codecs]' or use zlib"
-        raise MissingExtraError("compression", expected="an installed codec", got=got, remedy=remedy) from error
+        raise MissingExtraError(
+            "compression", expected="an installed codec", got=got, remedy=remedy
+        ) from error
 
 
 PLAIN = "out.tif"
@@ -271,11 +304,15 @@ def write_output(
         with tifffile.TiffWriter(fresh, bigtiff=plain_bytes > PLAIN_LIMIT_BYTES) as file:
             file.write(
                 shape=(planes, *checkpoint.shape[1:]) if planes > 1 else checkpoint.shape[1:],
-                photometric="rgb" if source.raster.colour and bands == len(RGB_BANDS) else "minisblack",
+                photometric="rgb"
+                if source.raster.colour and bands == len(RGB_BANDS)
+                else "minisblack",
                 planarconfig="separate" if planes > 1 else None,
                 extrasamples=(source.raster.veil,) if source.raster.has_alpha else None,
                 software=RESTORED,
-                extratags=enlarged_tags(source.raster.tags, checkpoint.shape[2] // source.raster.width_px),
+                extratags=enlarged_tags(
+                    source.raster.tags, checkpoint.shape[2] // source.raster.width_px
+                ),
                 **_squares_of(_strips(checkpoint, source), checkpoint.dtype, compression),
             )
             if source.raster.veil == "mask":
@@ -292,11 +329,15 @@ def write_output(
         checkpoint.remove()
 
 
-def _squares_of(rows: Iterator[np.ndarray], dtype: np.dtype[Any], compression: Compression) -> dict[str, Any]:
+def _squares_of(
+    rows: Iterator[np.ndarray], dtype: np.dtype[Any], compression: Compression
+) -> dict[str, Any]:
     """What tifffile is told of a page's pixels, given as rows of squares."""
     by_zlib = compression is Compression.zlib and dtype.kind != "b"  # whose bits tifffile packs
     return {
-        "data": _packed(rows) if by_zlib else (square for strip in rows for square in _squares(strip)),
+        "data": _packed(rows)
+        if by_zlib
+        else (square for strip in rows for square in _squares(strip)),
         "dtype": dtype,
         "tile": (TILE_PX, TILE_PX),
         "compression": compression.value,
@@ -315,7 +356,8 @@ def _packed(rows: Iterator[np.ndarray]) -> Iterator[bytes]:
 
 
 def _pack(square: np.ndarray) -> bytes:
-    """Integers as differences, packed by ISA-L: six times as fast as zlib's fastest way, and no larger (measured).
+    """Integers as differences, packed by ISA-L: six times as fast as zlib's fastest way, and no
+    larger (measured).
 
     On a noisy 12-bit photograph differences take 6 % less than the numbers themselves (measured).
     """
@@ -338,7 +380,9 @@ def _strips(checkpoint: Checkpoint, source: Source) -> Iterator[np.ndarray]:
 
 
 def _veil(checkpoint: Checkpoint, source: Source) -> Iterator[np.ndarray]:
-    """Rows of squares of the image's alpha as stored, or of its mask as bool, enlarged with the image."""
+    """Rows of squares of the image's alpha as stored, or of its mask as bool, enlarged with the
+    image.
+    """
     scale = checkpoint.shape[2] // source.raster.width_px
     read = source.veil
     if read is None:
@@ -346,7 +390,9 @@ def _veil(checkpoint: Checkpoint, source: Source) -> Iterator[np.ndarray]:
     for top, bottom in strips(checkpoint.shape[1], TILE_PX):
         plane = read(top // scale, -(-bottom // scale))
         plane = plane.repeat(scale, axis=0)[top % scale :][: bottom - top].repeat(scale, axis=1)
-        yield _whole_squares(plane != 0 if source.raster.veil == "mask" else plane.astype(checkpoint.dtype))
+        yield _whole_squares(
+            plane != 0 if source.raster.veil == "mask" else plane.astype(checkpoint.dtype)
+        )
 
 
 def _whole_squares(rows: np.ndarray) -> np.ndarray:

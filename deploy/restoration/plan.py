@@ -1,9 +1,10 @@
 """How an image is cut into tiles with exact seams, and what that costs: known before the run.
 
-A tile is read with a halo of `halo_px` pixels around what is kept of it. Where the halo is the network's receptive
-radius, the result is the whole image's, bit for bit (`quant.tiling`). A network with strides is given tiles that
-begin and end at multiples of its lattice; the last ones reach beyond an image that is no multiple of it, which is
-extended there by copies of its last row and column. Whether a run fits into memory is looked at before it begins.
+A tile is read with a halo of `halo_px` pixels around what is kept of it. Where the halo is the
+network's receptive radius, the result is the whole image's, bit for bit (`quant.tiling`). A network
+with strides is given tiles that begin and end at multiples of its lattice; the last ones reach
+beyond an image that is no multiple of it, which is extended there by copies of its last row and
+column. Whether a run fits into memory is looked at before it begins.
 """
 
 from collections.abc import Iterator
@@ -21,7 +22,8 @@ from beers_deploy.restoration.source import Source
 
 @dataclass(frozen=True)
 class Span:
-    """One side of a tile: what it reads, and the part of it that is kept, in image pixels (end excluded).
+    """One side of a tile: what it reads, and the part of it that is kept, in image pixels (end
+    excluded).
 
     What it reads may end beyond the image, by less than the network's lattice.
     """
@@ -32,8 +34,11 @@ class Span:
     keep_stop: int
 
 
-def plan_side(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1, least_px: int = 1) -> list[Span]:
-    """The spans along one side of `size_px` pixels, each of `tile_px`, or one of all where that is less.
+def plan_side(
+    size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1, least_px: int = 1
+) -> list[Span]:
+    """The spans along one side of `size_px` pixels, each of `tile_px`, or one of all where that is
+    less.
 
     Args:
         size_px: of the image.
@@ -48,7 +53,9 @@ def plan_side(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1, lea
         remedy = "take larger tiles or a smaller halo"
         raise OptionError("tile", expected=expected, got=f"{tile_px} px", remedy=remedy)
     whole_px = _up(max(size_px, least_px), lattice_px)
-    return list(_spans(size_px, whole_px, min(tile_px // lattice_px * lattice_px, whole_px), halo_px))
+    return list(
+        _spans(size_px, whole_px, min(tile_px // lattice_px * lattice_px, whole_px), halo_px)
+    )
 
 
 def _up(size_px: int, lattice_px: int) -> int:
@@ -78,7 +85,8 @@ class Plan:
     """Rows and columns of tiles over an image of `bands` bands.
 
     Attributes:
-        bands: of the image, each cut alike and restored by itself, or all together as the network takes them.
+        bands: of the image, each cut alike and restored by itself, or all together as the network
+            takes them.
         height_px: of the image.
         width_px: of the image.
         tile_px: no tile is longer.
@@ -115,7 +123,11 @@ class Plan:
     @property
     def out_shape(self) -> tuple[int, int, int]:
         """Of the restored image: (bands, H, W)."""
-        return self.groups * self.tiling.channels_out, self.height_px * self.scale, self.width_px * self.scale
+        return (
+            self.groups * self.tiling.channels_out,
+            self.height_px * self.scale,
+            self.width_px * self.scale,
+        )
 
     @property
     def tile_shape(self) -> tuple[int, int]:
@@ -135,12 +147,16 @@ class Plan:
     @property
     def work_factor(self) -> float:
         """Pixels that the network sees over pixels of the image."""
-        seen = sum(r.stop - r.start for r in self.rows) * sum(c.stop - c.start for c in self.columns)
+        seen = sum(r.stop - r.start for r in self.rows) * sum(
+            c.stop - c.start for c in self.columns
+        )
         return seen / (self.height_px * self.width_px)
 
     @property
     def strip_rows_px(self) -> int:
-        """Most rows that are read at once: a tile's, and those that missing pixels are filled from."""
+        """Most rows that are read at once: a tile's, and those that missing
+        pixels are filled from.
+        """
         return min(self.tile_shape[0] + 2 * self.radius_px, self.height_px)
 
     @property
@@ -159,7 +175,8 @@ class Plan:
         rows_px, columns_px = self.tile_shape
         tiles = "1 tile" if self.tiles == 1 else f"{self.tiles} tiles"
         return (
-            f"plan: {self.width_px} x {self.height_px} pixels{bands}; {tiles} of {columns_px} x {rows_px}, "
+            f"plan: {self.width_px} x {self.height_px} pixels{bands}; {tiles} of {columns_px} x "
+            f"{rows_px}, "
             f"halo {self.halo_words}, work factor {self.work_factor:.2f}{larger}"
         )
 
@@ -167,8 +184,12 @@ class Plan:
 def plan_for(network: onnx.ModelProto, shape: tuple[int, int, int], options: Options) -> Plan:
     """How an image of `shape` (bands, H, W) is cut for a network, as a user's options ask."""
     tiling, (_, height_px, width_px) = tiling_of(network, str(options.model)), shape
-    if tiling.fixed_px is not None and (tiling.fixed_px != options.tile_px or min(shape[1:]) < tiling.fixed_px):
-        expected = f"{tiling.fixed_px}, the size the model is fixed to, and an image at least as large"
+    if tiling.fixed_px is not None and (
+        tiling.fixed_px != options.tile_px or min(shape[1:]) < tiling.fixed_px
+    ):
+        expected = (
+            f"{tiling.fixed_px}, the size the model is fixed to, and an image at least as large"
+        )
         got = f"tile {options.tile_px}, image {width_px} x {height_px}"
         remedy = "take a network of free sizes"
         raise OptionError("tile", expected=expected, got=got, remedy=remedy)
@@ -178,17 +199,24 @@ def plan_for(network: onnx.ModelProto, shape: tuple[int, int, int], options: Opt
 def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling) -> Plan:
     """The plan of an image of `shape` (bands, H, W).
 
-    Tiles are as even as can be, of at most `tile_px` a side; of just that where the network is fixed to it.
+    Tiles are as even as can be, of at most `tile_px` a side; of just that where the network is
+    fixed to it.
     """
     bands, height_px, width_px = shape
     _require_fit(bands, halo_px, tiling)
 
     def side(size_px: int) -> tuple[Span, ...]:
         lattice_px = tiling.lattice_px
-        longest_px = even_side_px(size_px, tile_px, halo_px, lattice_px) if tiling.fixed_px is None else tile_px
+        longest_px = (
+            even_side_px(size_px, tile_px, halo_px, lattice_px)
+            if tiling.fixed_px is None
+            else tile_px
+        )
         return tuple(plan_side(size_px, longest_px, halo_px, lattice_px, tiling.least_px))
 
-    return Plan(bands, height_px, width_px, tile_px, halo_px, tiling, side(height_px), side(width_px))
+    return Plan(
+        bands, height_px, width_px, tile_px, halo_px, tiling, side(height_px), side(width_px)
+    )
 
 
 def _require_fit(bands: int, halo_px: int, tiling: Tiling) -> None:
@@ -196,10 +224,17 @@ def _require_fit(bands: int, halo_px: int, tiling: Tiling) -> None:
     if tiling.scale.denominator != 1:
         got = f"one of {tiling.scale} of it"
         remedy = "add what enlarges it to the network"
-        raise ModelError("tiled model", expected="a result of the image's size or a multiple", got=got, remedy=remedy)
+        raise ModelError(
+            "tiled model",
+            expected="a result of the image's size or a multiple",
+            got=got,
+            remedy=remedy,
+        )
     if tiling.channels_in not in (1, bands):
         expected = f"an image of {tiling.channels_in} bands, as the network takes them"
-        raise OptionError("network", expected=expected, got=f"{bands}", remedy="choose bands, or another network")
+        raise OptionError(
+            "network", expected=expected, got=f"{bands}", remedy="choose bands, or another network"
+        )
     if halo_px % tiling.lattice_px:
         expected = f"a multiple of {tiling.lattice_px} px, after which the network's strides repeat"
         remedy = f"{tiling.halo_px} is exact for this network"
@@ -212,10 +247,10 @@ FLOAT_BYTES = np.dtype(np.float32).itemsize
 def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
     """Memory that rows of the image will take beyond what is held now.
 
-    Three strips as read: two in work and one on its way. Three rows of tiles in float32, as the network gave them:
-    one waits for the row below it, and one more is begun. Two finished rows, and what the source holds. Once the run
-    has `begun`, the first strip and the source's share are there already. Where pixels may be missing, each has a
-    flag, and one more while flags are made.
+    Three strips as read: two in work and one on its way. Three rows of tiles in float32, as the
+    network gave them: one waits for the row below it, and one more is begun. Two finished rows, and
+    what the source holds. Once the run has `begun`, the first strip and the source's share are
+    there already. Where pixels may be missing, each has a flag, and one more while flags are made.
     """
     raster = source.raster
     row_px = raster.bands * raster.width_px
@@ -241,7 +276,11 @@ def check_memory(rows: int, budget_bytes: int | None, bulky: bool) -> int:
     if held + rows <= allowed:
         return held + rows
     limit, before, rows_size = sizes(allowed, held, rows)
-    smaller = "rewrite the image in tiles (gdal_translate -co TILED=YES)" if bulky else "take a smaller `tile`"
+    smaller = (
+        "rewrite the image in tiles (gdal_translate -co TILED=YES)"
+        if bulky
+        else "take a smaller `tile`"
+    )
     remedy = f"{smaller} or give it more" if held < allowed else f"give it more than {before}"
     got = f"{before} before and {rows_size} for rows of the image"
     raise MachineError("memory", expected=f"a run within {limit}", got=got, remedy=remedy)

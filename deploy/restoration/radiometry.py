@@ -1,7 +1,8 @@
-"""Which pixel value is full scale, and who says so: the user, the file, the sensor's profile, or nobody.
+"""Which pixel value is full scale, and who says so: the user, the file, the sensor's profile, or
+nobody.
 
-What nobody states is assumed in sight: 12 bits. Values above a stated full scale are clipped, counted and told; above
-an assumed one they show that the assumption is wrong, and are refused.
+What nobody states is assumed in sight: 12 bits. Values above a stated full scale are clipped,
+counted and told; above an assumed one they show that the assumption is wrong, and are refused.
 """
 
 from collections.abc import Iterable
@@ -17,7 +18,9 @@ from beers_deploy.restoration.source import Raster
 
 @dataclass(frozen=True)
 class FullScale:
-    """The pixel value that is full scale, in words where it is from, and whether that is an assumption."""
+    """The pixel value that is full scale, in words where it is from, and whether that is an
+    assumption.
+    """
 
     value: float
     source: str
@@ -35,7 +38,11 @@ class FullScale:
 
 
 def full_scale_of(
-    name: str, raster: Raster, extents: Iterable[Extent], asked: float | None = None, bits: int | None = None
+    name: str,
+    raster: Raster,
+    extents: Iterable[Extent],
+    asked: float | None = None,
+    bits: int | None = None,
 ) -> FullScale:
     """The full scale of an image.
 
@@ -53,9 +60,15 @@ def full_scale_of(
     if raster.bits is not None:
         return FullScale(2**raster.bits - 1, f"{raster.bits} bits, as the file states")
     if bits is None or (raster.dtype.kind != "f" and 2**bits - 1 > np.iinfo(raster.dtype).max):
-        return FullScale(settled_scale(name, raster.dtype, extents), f"assumed: {MAX_DN.bit_length()} bits", True)
+        return FullScale(
+            settled_scale(name, raster.dtype, extents), f"assumed: {MAX_DN.bit_length()} bits", True
+        )
     usual = 2**bits - 1
-    value = settled_scale(name, raster.dtype, extents, usual=usual) if raster.dtype.kind == "f" else usual
+    value = (
+        settled_scale(name, raster.dtype, extents, usual=usual)
+        if raster.dtype.kind == "f"
+        else usual
+    )
     return FullScale(value, f"{bits} bits, of the sensor")
 
 

@@ -1,10 +1,10 @@
 """One image file restored into another: what the command `restore` does with a network.
 
-open -> plan -> full scale -> open the network, here or on a cluster -> rows that a checkpoint lacks -> the TIFF
--> figures
+open -> plan -> full scale -> open the network, here or on a cluster -> rows that a checkpoint lacks
+-> the TIFF -> figures
 
-One row is written while the next is made. Whatever stops a run, the output is the old one or the new one; finished
-rows stay in the checkpoint where a later run can go on.
+One row is written while the next is made. Whatever stops a run, the output is the old one or the
+new one; finished rows stay in the checkpoint where a later run can go on.
 """
 
 import time
@@ -39,7 +39,12 @@ from beers_deploy.restoration.detectors.fix import faults_of, fixed
 from beers_deploy.restoration.detectors.words import warn_of_detectors
 from beers_deploy.restoration.georeference import unread_places
 from beers_deploy.restoration.options import Compression, Options
-from beers_deploy.restoration.output import Checkpoint, require_codec, require_tiff_name, write_output
+from beers_deploy.restoration.output import (
+    Checkpoint,
+    require_codec,
+    require_tiff_name,
+    write_output,
+)
 from beers_deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
 from beers_deploy.restoration.runtime import Infer, Packed, infer_on, open_runtime, tiles_at_once
@@ -53,7 +58,8 @@ from beers_deploy.restoration.tiles.rows import RestoredRow, restore_rows, rows_
 RUNS_UNTIL_STEADY = 2
 """Of each tile in work at a time: then a runtime takes no more memory."""
 CHECKED = (
-    "the comparison of the image's own noise and edges with its sensor, and the look for faults of detectors: "
+    "the comparison of the image's own noise and edges with its sensor, and the look for faults "
+    "of detectors: "
     "no part of time and throughput"
 )
 MANY = 0.05
@@ -67,8 +73,8 @@ def restore_file(
 
     Args:
         image: a TIFF of any size, a PNG, a JPEG, or what GDAL reads (deploy.restoration.source).
-        out: a TIFF of the type `Raster.out_dtype`, in the scale of the image; larger by the network's
-            factor where it has one, and in its place on Earth.
+        out: a TIFF of the type `Raster.out_dtype`, in the scale of the image; larger by the
+            network's factor where it has one, and in its place on Earth.
         options: what the user chose.
         log: is told the plan, the memory, and how to go on after a stop.
         beside: other files that the caller will write.
@@ -98,23 +104,36 @@ def restore_file(
         exposed, at_once, runtime = _opened(networks, source, plan, options, cluster, scale.value)
         steps_taken, words = consistency_steps(options, raster, plan.tiling, scale.value)
         clips = not scale.assumed
-        restorer = Restorer(raster, exposed, scale.value, plan.tiling, str(image), clips, steps_taken)
+        restorer = Restorer(
+            raster, exposed, scale.value, plan.tiling, str(image), clips, steps_taken
+        )
         figures = seam_figures(source, plan, restorer)
         job = job_of(source, digests, plan, runtime, scale.value, options, bool(steps_taken))
         job["detectors"] = faults.sha256
         cog_bytes = disk_bytes(plan.out_shape, raster.out_dtype.itemsize) if options.cog else 0
         ends = [row.keep_stop * plan.scale for row in plan.rows]
-        checkpoint = Checkpoint(out, plan.out_shape, raster.out_dtype, job, options.resume, cog_bytes, ends)
+        checkpoint = Checkpoint(
+            out, plan.out_shape, raster.out_dtype, job, options.resume, cog_bytes, ends
+        )
         if checkpoint.damaged_rows:
-            log(f"{checkpoint.damaged_rows} finished rows do not match their digests: they are made again")
+            log(
+                f"{checkpoint.damaged_rows} finished rows do not match their digests: they are "
+                "made again"
+            )
         done_rows = checkpoint.rows // plan.scale
         _finish_rows(checkpoint, source, plan, restorer, at_once, options, log)
         with _kept_for_resuming(checkpoint, log):
             require_unchanged(source, str(image), begun_with, job["image"])
         with held_back():  # a stop now would save nothing
             about = what_was_done(networks, digests, scale)
-            to_cog = partial(write_cog, compression=options.compression, about=about) if options.cog else None
-            write_output(checkpoint, source, Compression.none if to_cog else options.compression, to_cog)
+            to_cog = (
+                partial(write_cog, compression=options.compression, about=about)
+                if options.cog
+                else None
+            )
+            write_output(
+                checkpoint, source, Compression.none if to_cog else options.compression, to_cog
+            )
             write_list(faults, list_beside(out, options.fix_detectors))
     time_s = time.perf_counter() - started - check_s
     tally = checkpoint.tally
@@ -133,7 +152,12 @@ def restore_file(
 
 
 def check_sensor(
-    source: Source, networks: Sequence[onnx.ModelProto], options: Options, full_scale: float, name: str, log: Log
+    source: Source,
+    networks: Sequence[onnx.ModelProto],
+    options: Options,
+    full_scale: float,
+    name: str,
+    log: Log,
 ) -> SensorCheck:
     """Look for faults of detectors, and compare an image with the sensor that the user named.
 
@@ -164,8 +188,11 @@ def timed(work: Callable[[], SensorCheck]) -> tuple[SensorCheck, float]:
 
 
 @contextmanager
-def begun(image: Path, out: Path, options: Options, beside: Sequence[Path | None]) -> Iterator[Source]:
-    """The open image of the only run on an output, once what is known before is found to be as it must.
+def begun(
+    image: Path, out: Path, options: Options, beside: Sequence[Path | None]
+) -> Iterator[Source]:
+    """The open image of the only run on an output, once what is known before is found to be as it
+    must.
 
     Args:
         image: as of `restore_file`.
@@ -194,9 +221,11 @@ def _opened(
     cluster: Cluster | None,
     full_scale: float,
 ) -> tuple[tuple[ExposedNetwork, ...], int, str]:
-    """The networks ready to run, how many tiles are in work at a time, and the runtime's name and version.
+    """The networks ready to run, how many tiles are in work at a time, and the runtime's name and
+    version.
 
-    A cluster is given two tiles for each call that it runs at once, of the two rows of tiles that are in work.
+    A cluster is given two tiles for each call that it runs at once, of the two rows of tiles that
+    are in work.
     """
     threads = 1 if cluster else options.threads
     at_once = tiles_at_once(threads, plan.tiles)
@@ -207,7 +236,9 @@ def _opened(
     def at_first_call(network: onnx.ModelProto) -> Infer:
         if cluster is None:
             return Packed(network.SerializeToString(), options.runtime, threads, at_once)
-        return infer_on(cluster, Packed(network.SerializeToString(), options.runtime, options.threads or 1))
+        return infer_on(
+            cluster, Packed(network.SerializeToString(), options.runtime, options.threads or 1)
+        )
 
     if cluster is not None:
         infers = [at_first_call(network) for network in networks]
@@ -219,17 +250,28 @@ def _opened(
 
 
 def scale_of(source: Source, plan: Plan, options: Options, name: str) -> FullScale:
-    """The pixel value that is full scale; float images are read to their first bright row of tiles to know it."""
-    extents = (source.raster.extent(source.read(row.keep_start, row.keep_stop)) for row in plan.rows)
+    """The pixel value that is full scale; float images are read to their first bright row of tiles
+    to know it.
+    """
+    extents = (
+        source.raster.extent(source.read(row.keep_start, row.keep_stop)) for row in plan.rows
+    )
     return full_scale_of(name, source.raster, extents, options.full_scale, options.sensor_bits)
 
 
 def job_of(
-    source: Source, digests: str, plan: Plan, runtime: str, full_scale: float, options: Options, steps: bool
+    source: Source,
+    digests: str,
+    plan: Plan,
+    runtime: str,
+    full_scale: float,
+    options: Options,
+    steps: bool,
 ) -> dict[str, object]:
     """Return all that decides the pixels; who computes, on how many machines, is no part of it.
 
-    Another version of this program or of the runtime might give other bits: rows of one are not finished by another.
+    Another version of this program or of the runtime might give other bits: rows of one are not
+    finished by another.
 
     Args:
         source: the image.
@@ -241,7 +283,10 @@ def job_of(
         steps: whether the consistency step is taken.
     """
     brighter = [path for files in options.brighter.values() for path in files.values()]
-    sensors = {band: [numbers_of(each), numbers_of(each.reference)] for band, each in options.sensors.items()}
+    sensors = {
+        band: [numbers_of(each), numbers_of(each.reference)]
+        for band, each in options.sensors.items()
+    }
     return {
         "program": version("beers-deploy"),
         "image": fingerprint(source.files),
@@ -269,7 +314,9 @@ def read_network(path: Path) -> tuple[onnx.ModelProto, str]:
     return network, digest
 
 
-def require_unchanged(source: Source, name: str, before: Sequence[tuple[int, int, int]], digest: object) -> None:
+def require_unchanged(
+    source: Source, name: str, before: Sequence[tuple[int, int, int]], digest: object
+) -> None:
     """Refuse an image, `name` in messages, that was replaced while its rows were read.
 
     Args:
@@ -282,25 +329,41 @@ def require_unchanged(source: Source, name: str, before: Sequence[tuple[int, int
     if stamps(source.files) != before and fingerprint(source.files) != digest:
         remedy = "wait until it is written, then restore it again"
         raise ImageError(
-            name, expected="an image that stays as it is", got="a change while it was read", remedy=remedy
+            name,
+            expected="an image that stays as it is",
+            got="a change while it was read",
+            remedy=remedy,
         )
 
 
 def _finish_rows(
-    checkpoint: Checkpoint, source: Source, plan: Plan, restorer: Restorer, at_once: int, options: Options, log: Log
+    checkpoint: Checkpoint,
+    source: Source,
+    plan: Plan,
+    restorer: Restorer,
+    at_once: int,
+    options: Options,
+    log: Log,
 ) -> None:
     """Restore the rows that a checkpoint lacks, and keep each in it while the next is made."""
     rows = [row for row in plan.rows if row.keep_start * plan.scale >= checkpoint.rows]
     tiles = len(rows_to_run(plan, restorer, rows)) * plan.row_tiles
     steady = min(RUNS_UNTIL_STEADY * at_once, tiles)
-    with _kept_for_resuming(checkpoint, log), steps("restoring", tiles) as bar, held_back() as interrupt:
+    with (
+        _kept_for_resuming(checkpoint, log),
+        steps("restoring", tiles) as bar,
+        held_back() as interrupt,
+    ):
 
         def tick() -> None:
             bar.advance()
             if bar.done == steady:
                 needed = rows_bytes(source, plan, begun=True)
                 most = check_memory(needed, options.memory_bytes, is_bulky(source, plan))
-                log(f"memory: about {most / 1e9:.2f} GB (measured after the first tiles, and the rows to come)")
+                log(
+                    f"memory: about {most / 1e9:.2f} GB (measured after the first tiles, and "
+                    "the rows to come)"
+                )
             if interrupt.asked:
                 raise KeyboardInterrupt
 
@@ -315,11 +378,16 @@ def _finish_rows(
 
 @contextmanager
 def _kept_for_resuming(checkpoint: Checkpoint, log: Log) -> Iterator[None]:
-    """Finished rows outlive a stop and a full disk, not an image or a network that no later run could finish."""
+    """Finished rows outlive a stop and a full disk, not an image or a network that no later run
+    could finish.
+    """
     try:
         yield
     except KeyboardInterrupt:
-        log(f"stopped at row {checkpoint.rows} of {checkpoint.shape[1]}; the same command with --resume goes on")
+        log(
+            f"stopped at row {checkpoint.rows} of {checkpoint.shape[1]}; the same command with "
+            "--resume goes on"
+        )
         raise
     except BeersError as error:
         if not checkpoint.rows or not isinstance(error, MachineError):
@@ -343,13 +411,16 @@ def plan_figures(plan: Plan) -> dict[str, Figure]:
     """How an image is cut: known, but not measured."""
     numbers = {"tiles": plan.tiles, "work factor": plan.work_factor}
     source = "arithmetic on the plan of tiles"
-    return {key: predicted(number, "1", (number, number), source) for key, number in numbers.items()}
+    return {
+        key: predicted(number, "1", (number, number), source) for key, number in numbers.items()
+    }
 
 
 def seam_figures(source: Source, plan: Plan, restorer: Restorer) -> dict[str, Figure]:
     """The error of seams, where the halo leaves any: of a tile in the middle, in digital numbers.
 
-    The same kept pixels are restored twice: from the tile's own window, and from one with the whole radius around.
+    The same kept pixels are restored twice: from the tile's own window, and from one with the whole
+    radius around.
     """
     keys = "seam error max", "seam error mean"
     if plan.halo_px >= plan.radius_px or len(plan.rows) == len(plan.columns) == 1:
@@ -360,20 +431,29 @@ def seam_figures(source: Source, plan: Plan, restorer: Restorer) -> dict[str, Fi
     rows = plan.rows[len(plan.rows) // 2]
     columns = plan.columns[len(plan.columns) // 2]
     ends_px = plan.rows[-1].stop, plan.columns[-1].stop
-    wide = [_widened(span, plan.radius_px, end_px) for span, end_px in zip((rows, columns), ends_px, strict=True)]
+    wide = [
+        _widened(span, plan.radius_px, end_px)
+        for span, end_px in zip((rows, columns), ends_px, strict=True)
+    ]
     strip = restorer.read(source, min(rows.start, wide[0].start), max(rows.stop, wide[0].stop))
-    cheap, exact = (restorer.tile(strip, 0, *spans).pixels.astype(np.float64) for spans in ((rows, columns), wide))
+    cheap, exact = (
+        restorer.tile(strip, 0, *spans).pixels.astype(np.float64)
+        for spans in ((rows, columns), wide)
+    )
     error = np.abs(np.nan_to_num(cheap) - np.nan_to_num(exact))
     how = f"the tile in the middle with a halo of {plan.halo_px} px against {plan.radius_px} px"
     return {
-        key: measured(float(each), "DN", how) for key, each in zip(keys, (error.max(), error.mean()), strict=True)
+        key: measured(float(each), "DN", how)
+        for key, each in zip(keys, (error.max(), error.mean()), strict=True)
     }
 
 
 def _widened(span: Span, radius_px: int, size_px: int) -> Span:
-    """The same kept pixels with the whole radius around them, as far as the image goes, with its extension.
+    """The same kept pixels with the whole radius around them, as far as the image goes, with its
+    extension.
 
-    What is kept ends on the network's lattice, or with the image: then what is read ends with the extension too.
+    What is kept ends on the network's lattice, or with the image: then what is read ends with the
+    extension too.
     """
     start = max(span.keep_start - radius_px, 0)
     stop = min(span.keep_stop + radius_px, size_px)
@@ -396,10 +476,14 @@ def run_row(
     source = f"from opening the image to the finished file without the sensor check, {runtime}"
     figures = {
         "time": measured(time_s, "s", source),
-        "throughput": measured(useful_px / time_s / 1e6, "Mpx/s", f"the image's own pixels, {source}"),
+        "throughput": measured(
+            useful_px / time_s / 1e6, "Mpx/s", f"the image's own pixels, {source}"
+        ),
         **plan_figures(plan),
         "peak memory": peak_memory(),
         **more,
     }
     workers = {"workers": options.scheduler} if options.scheduler else {}
-    return Row("restore", name, figures, {"halo": plan.halo_words, **text, "runtime": runtime, **workers})
+    return Row(
+        "restore", name, figures, {"halo": plan.halo_words, **text, "runtime": runtime, **workers}
+    )

@@ -1,4 +1,6 @@
-"""What runs a network: onnxruntime by default, OpenVINO as an option, with the same int8 numbers."""
+"""What runs a network: onnxruntime by default, OpenVINO as an option, with the
+same int8 numbers.
+"""
 
 import os
 from collections.abc import Callable
@@ -22,7 +24,9 @@ from beers_deploy.quant.session import open_session, tensors_of
 from beers_deploy.restoration.options import Runtime
 
 Infer = Callable[[np.ndarray], np.ndarray]
-"""A network ready to run: (1, C, h, w) float32 in [0, 1] to what it makes of it, of the shape that its file says."""
+"""A network ready to run: (1, C, h, w) float32 in [0, 1] to what it makes of it, of the shape that
+its file says.
+"""
 
 LOWEST = "openvino.lowest_uint8"
 
@@ -30,10 +34,15 @@ LOWEST = "openvino.lowest_uint8"
 def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tuple[Infer, str]:
     """As `open_runtime`."""
     openvino = optional("openvino", "runtime")
-    openvino.Type.f32.to_dtype()  # fills a table: two threads that are its first callers lock each other up (2026.4)
+    # Fills a table: two threads that are its first callers lock each other up (2026.4).
+    openvino.Type.f32.to_dtype()
     core = openvino.Core()
     # Said aloud: where the processor has bfloat16 units, OpenVINO would round to it unasked.
-    options = {"INFERENCE_PRECISION_HINT": "f32", "NUM_STREAMS": str(at_once), "ENABLE_CPU_PINNING": False}
+    options = {
+        "INFERENCE_PRECISION_HINT": "f32",
+        "NUM_STREAMS": str(at_once),
+        "ENABLE_CPU_PINNING": False,
+    }
     options |= {"INFERENCE_NUM_THREADS": str(threads)} if threads else {}
     exact = model if not is_quantised(model) or _adds_exactly(core) else made_exact(model)[0]
     content = saturating_adds(exact).SerializeToString()
@@ -47,7 +56,9 @@ def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tup
         except RuntimeError as error:
             got = " ".join(str(error).split())[:160]
             remedy = "take `runtime` onnxruntime"
-            raise ModelError("ONNX model", expected="one that OpenVINO runs", got=got, remedy=remedy) from error
+            raise ModelError(
+                "ONNX model", expected="one that OpenVINO runs", got=got, remedy=remedy
+            ) from error
 
     compiling = Lock()
 
@@ -65,7 +76,11 @@ def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tup
 @lru_cache(maxsize=1)
 def _adds_exactly(core: Any) -> bool:
     def convolve(model: bytes, image: np.ndarray) -> np.ndarray:
-        return np.asarray(core.compile_model(core.read_model(model), "CPU").create_infer_request().infer([image])[0])
+        return np.asarray(
+            core.compile_model(core.read_model(model), "CPU")
+            .create_infer_request()
+            .infer([image])[0]
+        )
 
     return asked("openvino", convolve)
 
@@ -73,9 +88,10 @@ def _adds_exactly(core: Any) -> bool:
 def saturating_adds(model: onnx.ModelProto) -> onnx.ModelProto:
     """The model with every QLinearAdd written as dequantise, add, quantise.
 
-    OpenVINO's own QLinearAdd wraps around where it should saturate (256 becomes 0). Written out it saturates, but a
-    convolution before it is fused with it, and the rounding between the two is lost; taking the larger of the value
-    and 0, which changes no uint8, keeps them apart. Measured: equal to onnxruntime bit for bit.
+    OpenVINO's own QLinearAdd wraps around where it should saturate (256 becomes 0). Written out it
+    saturates, but a convolution before it is fused with it, and the rounding between the two is
+    lost; taking the larger of the value and 0, which changes no uint8, keeps them apart. Measured:
+    equal to onnxruntime bit for bit.
     """
     written = onnx.ModelProto()
     written.CopyFrom(model)
@@ -100,16 +116,25 @@ def _written_out(add: onnx.NodeProto) -> list[onnx.NodeProto]:
 
 
 AT_ONCE = 4
-"""Most tiles in work at a time. Each needs the memory of a network's maps, and some 4 % are gained by it."""
+"""Most tiles in work at a time.
+
+Each needs the memory of a network's maps, and some 4 % are gained by it.
+"""
 
 
 def tiles_at_once(threads: int, tiles: int) -> int:
-    """How many tiles are restored at a time, such that each has as many threads; 0 threads takes every core."""
+    """How many tiles are restored at a time, such that each has as many threads; 0 threads takes
+    every core.
+    """
     cores = threads or os.cpu_count() or 1
-    return max(count for count in range(1, AT_ONCE + 1) if cores % count == 0 and count <= max(tiles, 1))
+    return max(
+        count for count in range(1, AT_ONCE + 1) if cores % count == 0 and count <= max(tiles, 1)
+    )
 
 
-def open_runtime(runtime: Runtime, model: onnx.ModelProto, threads: int, at_once: int = 1) -> tuple[Infer, str]:
+def open_runtime(
+    runtime: Runtime, model: onnx.ModelProto, threads: int, at_once: int = 1
+) -> tuple[Infer, str]:
     """A network ready to run, and the runtime's name and version.
 
     Args:
@@ -126,7 +151,9 @@ def open_runtime(runtime: Runtime, model: onnx.ModelProto, threads: int, at_once
 
 
 def session_threads(threads: int, at_once: int) -> int:
-    """What to ask onnxruntime for: its n are n - 1 of its own, which all callers share, and each caller."""
+    """What to ask onnxruntime for: its n are n - 1 of its own, which all callers share, and each
+    caller.
+    """
     return (threads or os.cpu_count() or 1) - at_once + 1 if at_once > 1 else threads
 
 
@@ -159,10 +186,14 @@ _opening = Lock()
 
 @lru_cache(maxsize=NETWORKS_KEPT)
 def _opened(packed: Packed) -> Infer:
-    return open_runtime(packed.runtime, parse_onnx(packed.content, "network"), packed.threads, packed.at_once)[0]
+    return open_runtime(
+        packed.runtime, parse_onnx(packed.content, "network"), packed.threads, packed.at_once
+    )[0]
 
 
 def infer_on(cluster: Cluster, packed: Packed) -> Infer:
-    """A network that is run by the workers of a cluster: each call sends a tile and waits for its result."""
+    """A network that is run by the workers of a cluster: each call sends a tile and waits for its
+    result.
+    """
     shared = cluster.share(packed)
     return lambda image: cluster.result(cluster.pool.submit(Packed.__call__, shared, image))

@@ -1,12 +1,15 @@
-"""An image held against the sensor it is said to be from: its noise and its blur, by its own pixels alone.
+"""An image held against the sensor it is said to be from: its noise and its blur, by its own pixels
+alone.
 
 Windows spread over the image give a noise line (`model.metrics.noise_line`) and straight edges
-(`model.metrics.edge_blur`). Where their 95 % intervals lie off what the profile states, a sentence says what was seen
-and what was told. Texture without edges tells no blur, a scene without even ground no noise: then nothing is said.
+(`model.metrics.edge_blur`). Where their 95 % intervals lie off what the profile states, a sentence
+says what was seen and what was told. Texture without edges tells no blur, a scene without even
+ground no noise: then nothing is said.
 
-Without a named sensor `restored_already` compares the noise with that of the quietest sensor in range. Satellite
-products are mostly denoised and sharpened before they are delivered; a network that is not given their sensor takes
-them for images of a middling one, and sharpens them a second time.
+Without a named sensor `restored_already` compares the noise with that of the quietest sensor in
+range. Satellite products are mostly denoised and sharpened before they are delivered; a network
+that is not given their sensor takes them for images of a middling one, and sharpens them a second
+time.
 """
 
 import math
@@ -48,14 +51,19 @@ EDGES = 20
 STEP_PX = 4
 CELL_PX = (8, 4)
 FEW_WINDOWS = 4
-"""Every so many rows are searched for edges, by such cells; an image of few windows may have few: it is searched as
-thoroughly as by `characterise`."""
+"""Every so many rows are searched for edges, by such cells; an image of few windows may have few:
+it is searched as thoroughly as by `characterise`.
+"""
 CANDIDATES = 6000
 CANDIDATES_OF_WINDOW = 400
-"""Steepest places along an axis that are compared with plain edges, of all windows and of each at least."""
+"""Steepest places along an axis that are compared with plain edges, of all windows and of each at
+least.
+"""
 FITS = 128
 FITS_OF_WINDOW = 8
-"""Squares along an axis that are fitted, of all windows and of each at least: 1 ms each (measured)."""
+"""Squares along an axis that are fitted, of all windows and of each at least: 1
+ms each (measured).
+"""
 WINDOWS_AT_ONCE = 4
 """Whose squares are fitted together: fewer at a time take longer."""
 DRAWS = 20
@@ -63,10 +71,15 @@ SEED = 0
 """Of sensors from a profile with ranges."""
 NOISE_KEPT = 1.25
 BLUR_KEPT = 1.15
-"""Factors of the noise's variance, and of the MTF, that an interval may lie off by before anything is said."""
+"""Factors of the noise's variance, and of the MTF, that an interval may lie off by before anything
+is said.
+"""
 SMOOTH = 0.45
 QUIET_PERCENT = 10.0
-"""Of the noise told: less in a tenth of the blocks is the work of a filter. By chance they hold 0.6 of it."""
+"""Of the noise told: less in a tenth of the blocks is the work of a filter.
+
+By chance they hold 0.6 of it.
+"""
 ABOVE = 0.001
 """Share of pixels above full scale that no image of the sensor has."""
 FILTERED = ": restored, resampled or compressed before, or of another gain"
@@ -74,14 +87,18 @@ AXES = ("across", "along")
 
 
 class Told(NamedTuple):
-    """What a profile states, in the image's numbers: variance at a value, and the MTF at Nyquist of both axes."""
+    """What a profile states, in the image's numbers: variance at a value, and the MTF at Nyquist of
+    both axes.
+    """
 
     instruments: Sequence[Instrument]
     unit: float
 
     def variances(self, value: np.ndarray | float) -> np.ndarray:
         """Of the noise at pixel values, without rounding, of each instrument: (I, ...)."""
-        return np.stack([self.variance(each, np.asarray(value, np.float64)) for each in self.instruments])
+        return np.stack(
+            [self.variance(each, np.asarray(value, np.float64)) for each in self.instruments]
+        )
 
     def variance(self, sensor: Instrument, value: np.ndarray) -> np.ndarray:
         """Of the noise at pixel values, of one instrument."""
@@ -127,14 +144,21 @@ class SensorCheck:
         """
         if self.doubts and strict:
             remedy = "name its own sensor, measure it with 'characterise', or leave `strict` out"
-            raise ImageError(name, expected=f"an image of {sensor}", got="; ".join(self.doubts), remedy=remedy)
+            raise ImageError(
+                name, expected=f"an image of {sensor}", got="; ".join(self.doubts), remedy=remedy
+            )
         for doubt in self.doubts:
             log(f"look at the sensor: {doubt}")
         return self
 
 
 def told_sensor(
-    source: Source, sensors: Mapping[str, Sensor], full_scale: float, name: str, strict: bool, log: Log
+    source: Source,
+    sensors: Mapping[str, Sensor],
+    full_scale: float,
+    name: str,
+    strict: bool,
+    log: Log,
 ) -> SensorCheck:
     """Hold an image against the sensor that a user named, and say where it contradicts it.
 
@@ -163,26 +187,44 @@ def check_source(source: Source, sensors: Sequence[Sensor], full_scale: float) -
     """
     bands = source.raster.bands
     windows = band_windows(source)
-    found = [held_against(seen, sensors[band % len(sensors)], full_scale) for band, seen in enumerate(windows)]
+    found = [
+        held_against(seen, sensors[band % len(sensors)], full_scale)
+        for band, seen in enumerate(windows)
+    ]
     if bands == 1:
         return found[0]
     named = {f"band {n}: ": each for n, each in enumerate(found, 1)}
-    figures = {f"{band}{name}": figure for band, each in named.items() for name, figure in each.figures.items()}
-    return SensorCheck(figures, tuple(f"{band}{doubt}" for band, each in named.items() for doubt in each.doubts))
+    figures = {
+        f"{band}{name}": figure
+        for band, each in named.items()
+        for name, figure in each.figures.items()
+    }
+    return SensorCheck(
+        figures, tuple(f"{band}{doubt}" for band, each in named.items() for doubt in each.doubts)
+    )
 
 
 def band_windows(source: Source) -> list[list[np.ndarray]]:
-    """Return windows (h, w) of each band, spread evenly over an image, 0 where pixels are missing."""
+    """Return windows (h, w) of each band, spread evenly over an image, 0 where
+    pixels are missing.
+    """
     return [list(windows) for windows in zip(*_windows(source), strict=True)]
 
 
 def integer_step(windows: Sequence[np.ndarray]) -> int | None:
-    """Return the largest integer of which all pixels are multiples; None if they are no integers."""
+    """Return the largest integer of which all pixels are multiples; None if
+    they are no integers.
+    """
     if any(window.dtype.kind == "f" for window in windows) and not all(
         (np.isfinite(window) & (window == np.rint(window))).all() for window in windows
     ):
         return None
-    return max(int(np.gcd.reduce([np.gcd.reduce(window.astype(np.int64), axis=None) for window in windows])), 1)
+    return max(
+        int(
+            np.gcd.reduce([np.gcd.reduce(window.astype(np.int64), axis=None) for window in windows])
+        ),
+        1,
+    )
 
 
 def _windows(source: Source) -> Iterator[np.ndarray]:
@@ -191,7 +233,9 @@ def _windows(source: Source) -> Iterator[np.ndarray]:
     for down in _spread(raster.height_px):
         rows = source.read(down.start, down.stop)
         missing = raster.missing(rows) if raster.may_miss else None
-        known = np.ma.getdata(rows) if missing is None else np.where(missing, 0, np.ma.getdata(rows))
+        known = (
+            np.ma.getdata(rows) if missing is None else np.where(missing, 0, np.ma.getdata(rows))
+        )
         for across in _spread(raster.width_px):
             yield known[:, :, across]
 
@@ -200,7 +244,10 @@ def _spread(size_px: int) -> list[slice]:
     """Windows along a side, evenly from end to end and none over another."""
     count = min(ACROSS, -(-size_px // WINDOW_PX))
     side_px = min(WINDOW_PX, size_px // count)
-    return [slice(int(start), int(start) + side_px) for start in np.linspace(0, size_px - side_px, count)]
+    return [
+        slice(int(start), int(start) + side_px)
+        for start in np.linspace(0, size_px - side_px, count)
+    ]
 
 
 def held_against(windows: Sequence[np.ndarray], sensor: Sensor, full_scale: float) -> SensorCheck:
@@ -213,7 +260,10 @@ def held_against(windows: Sequence[np.ndarray], sensor: Sensor, full_scale: floa
     """
     step = integer_step(windows)
     if step is None:
-        reason = "the pixels are not whole numbers: they were scaled, and the noise of rounding is not known"
+        reason = (
+            "the pixels are not whole numbers: they were scaled, and the noise of rounding "
+            "is not known"
+        )
         blurs = {f"MTF {axis} seen": unavailable("%", reason) for axis in AXES}
         return SensorCheck({"SNR seen": unavailable("ratio", reason), **blurs})
     pixels = [window / step for window in windows]
@@ -238,8 +288,12 @@ def _told(sensor: Sensor, clipped_at: float) -> Told:
     return Told([first, *(each for each in drawn if each != first)], clipped_at / first.max_dn)
 
 
-def _noise(line: NoiseModel | Refusal, blocks: Blocks, told: Told) -> tuple[dict[str, Figure], list[str]]:
-    """The SNR in the middle of what was measured, and a sentence where it contradicts what was told."""
+def _noise(
+    line: NoiseModel | Refusal, blocks: Blocks, told: Told
+) -> tuple[dict[str, Figure], list[str]]:
+    """The SNR in the middle of what was measured, and a sentence where it contradicts what was
+    told.
+    """
     if isinstance(line, Refusal):
         return {"SNR seen": unavailable("ratio", line.reason)}, _smoothed(blocks, told)
     value = math.sqrt(math.prod(line.measured_dn))
@@ -252,8 +306,14 @@ def _noise(line: NoiseModel | Refusal, blocks: Blocks, told: Told) -> tuple[dict
     low, snr, high, stated = (signal / math.sqrt(v) if v > 0 else math.inf for v in variances)
     words = f"at {radiance:.3g} W/m2/sr/um, {line.blocks} blocks of 16 x 16; told {stated:.3g}"
     figures = {"SNR seen": measured(snr, "ratio", words, (low, high))}
-    if seen.interval[0] > expected.max() * NOISE_KEPT or seen.interval[1] < expected.min() / NOISE_KEPT:
-        what = f"noise at {radiance:.3g} W/m2/sr/um looks like SNR {snr:.3g}, the profile says {stated:.3g}"
+    if (
+        seen.interval[0] > expected.max() * NOISE_KEPT
+        or seen.interval[1] < expected.min() / NOISE_KEPT
+    ):
+        what = (
+            f"noise at {radiance:.3g} W/m2/sr/um looks like SNR {snr:.3g}, the profile says "
+            f"{stated:.3g}"
+        )
         return figures, [f"{what}{FILTERED}" if snr > stated else what]
     return figures, _smoothed(blocks, told)
 
@@ -278,18 +338,30 @@ def _blur(
         return told.variance(told.instruments[0], values) + ROUNDING
 
     total = noise if isinstance(line, Refusal) else line.total
-    edges = [_edges(turned, total, clipped_at) for turned in (pixels, [window.T for window in pixels])]
+    edges = [
+        _edges(turned, total, clipped_at) for turned in (pixels, [window.T for window in pixels])
+    ]
     for axis, own, others in zip(AXES, edges, edges[::-1], strict=True):
         if len(own) < edge_blur.MIN_FOUND:
-            yield unavailable("%", f"{len(own)} straight edges, {edge_blur.MIN_FOUND} are needed"), []
+            yield (
+                unavailable("%", f"{len(own)} straight edges, {edge_blur.MIN_FOUND} are needed"),
+                [],
+            )
             continue
         seen, (least, most) = edge_blur.combine(own, others), told.mtf(axis)
         low, high = seen.interval
-        figure = measured(100 * seen.mtf_nyquist, "%", f"{seen.edges} edges", (100 * low, 100 * high))
-        # Of few and soft edges the shape of the curve is a guess: the profile's own shape must be off as well.
-        off = min(low, seen.nearest) > most * BLUR_KEPT or max(high, seen.nearest) < least / BLUR_KEPT
+        figure = measured(
+            100 * seen.mtf_nyquist, "%", f"{seen.edges} edges", (100 * low, 100 * high)
+        )
+        # Of few and soft edges the shape of the curve is a guess: the profile's own shape must be
+        # off as well.
+        off = (
+            min(low, seen.nearest) > most * BLUR_KEPT or max(high, seen.nearest) < least / BLUR_KEPT
+        )
         stated = most if low > most else least
-        what = f"MTF {axis} the track looks like {seen.mtf_nyquist:.2%}, the profile says {stated:.2%}"
+        what = (
+            f"MTF {axis} the track looks like {seen.mtf_nyquist:.2%}, the profile says {stated:.2%}"
+        )
         yield figure, [what] if off else []
 
 
@@ -306,7 +378,9 @@ def _edges(windows: Sequence[np.ndarray], noise: Noise, clipped_at: float) -> li
     for first in range(0, count, WINDOWS_AT_ONCE):
         if len(found) < EDGES:
             several = windows[first : first + WINDOWS_AT_ONCE]
-            squares = [edge_blur.plain_squares(window, noise, clipped_at, effort) for window in several]
+            squares = [
+                edge_blur.plain_squares(window, noise, clipped_at, effort) for window in several
+            ]
             found += edge_blur.blurs_of(np.concatenate(squares), noise)
     return found[:EDGES]
 
@@ -314,9 +388,10 @@ def _edges(windows: Sequence[np.ndarray], noise: Noise, clipped_at: float) -> li
 FAR_BELOW = 0.4
 """Of the variance that the quietest sensor has, in a tenth of the blocks: less is no raw image.
 
-Four Pleiades products hold 0.01 to 0.04 of it. Of images simulated by sensors of the range, at 1, 1/4 and 1/20 of the
-light, the lowest holds 0.76, and chance alone may leave 0.6. An 11-bit image taken for one of 12 bits keeps half of
-it."""
+Four Pleiades products hold 0.01 to 0.04 of it. Of images simulated by sensors of the range, at 1,
+1/4 and 1/20 of the light, the lowest holds 0.76, and chance alone may leave 0.6. An 11-bit image
+taken for one of 12 bits keeps half of it.
+"""
 OFFSET = 0.01
 """Of full scale, the largest value of the dark that an image may have."""
 SEEN = 3 * ROUNDING
@@ -330,7 +405,8 @@ def restored_already(source: Source, networks: Sequence[onnx.ModelProto], full_s
 
     Args:
         source: the image.
-        networks: that are to restore it; the range is known of networks that state their sensor, "blind" included.
+        networks: that are to restore it; the range is known of networks that state their sensor,
+            "blind" included.
         full_scale: the pixel value that is 1.0 to them.
     """
     if not all(metadata(network).get("sensor") for network in networks):
@@ -342,14 +418,17 @@ def restored_already(source: Source, networks: Sequence[onnx.ModelProto], full_s
     least = min(share for share in shares if share is not None)
     some = "" if len(quiet) == len(shares) else f" in band {', '.join(map(str, quiet))}"
     return (
-        f"look at the image: it looks restored already{some}, with {least:.0%} of the noise variance of the quietest "
-        f"sensor that the network knows at full scale {full_scale:g}; a restoration over-sharpens it: give the raw "
+        f"look at the image: it looks restored already{some}, with {least:.0%} of the noise "
+        "variance of the quietest "
+        f"sensor that the network knows at full scale {full_scale:g}; a restoration "
+        "over-sharpens it: give the raw "
         "image, or its own sensor or full scale"
     )
 
 
 def _noise_share(windows: Sequence[np.ndarray], full_scale: float) -> float | None:
-    """Return the noise's variance over the least of any sensor in range, in quiet blocks; None if it is not seen.
+    """Return the noise's variance over the least of any sensor in range, in quiet blocks; None if
+    it is not seen.
 
     Args:
         windows: (h, w) each, raw values; 0 where pixels are missing.
@@ -368,10 +447,12 @@ def _noise_share(windows: Sequence[np.ndarray], full_scale: float) -> float | No
 
 
 def _least_variance(values: np.ndarray, full_scale: float) -> np.ndarray:
-    """Return the least variance of the noise at pixel values, of any sensor that the networks were trained for.
+    """Return the least variance of the noise at pixel values, of any sensor that the networks were
+    trained for.
 
-    It is stated at 1/16 and at 1/4 of full scale. A straight line through 0 and the first, and a constant from the
-    second on, lie below the noise line of every sensor of the range, also where the dark is above 0.
+    It is stated at 1/16 and at 1/4 of full scale. A straight line through 0 and the first, and a
+    constant from the second on, lie below the noise line of every sensor of the range, also where
+    the dark is above 0.
     """
     light = np.maximum(values / full_scale - OFFSET, 0)
     dark = RANGES["sigma_dark"][0] ** 2

@@ -1,7 +1,8 @@
-"""An image as a source of rows: what is known before its pixels are read, and only what is touched is decoded.
+"""An image as a source of rows: what is known before its pixels are read, and only what is touched
+is decoded.
 
-A `Raster` holds size, type, nodata value and the tags that place the image on Earth. A TIFF page is a stream of rows;
-whatever else, and arrays, lie in memory.
+A `Raster` holds size, type, nodata value and the tags that place the image on Earth. A TIFF page is
+a stream of rows; whatever else, and arrays, lie in memory.
 """
 
 import hashlib
@@ -29,35 +30,45 @@ from beers_deploy.quant.untrusted import times
 
 NODATA_TAG = 42113
 CARRIED_TAGS = (33550, 33922, 34264, 34735, 34736, 34737, 42112, NODATA_TAG, 50844)
-"""GeoTIFF's scale, tie points, transformation and keys; GDAL's metadata and nodata; rational polynomials."""
+"""GeoTIFF's scale, tie points, transformation and keys; GDAL's metadata and nodata; rational
+polynomials.
+"""
 
 RESTORED = "beers-deploy restore"
 RESTORED_BY = "RESTORED_BY"
-"""What a restored image names as its software, and the item of its metadata where it is cloud-optimised."""
+"""What a restored image names as its software, and the item of its metadata where it is
+cloud-optimised.
+"""
 RGB = 2
 RGB_BANDS = ("red", "green", "blue")
 """TIFF's photometric interpretation of bands of these colours."""
 
 SIDE_PX = 1 << 22
 BANDS = 1 << 12
-"""An image has a plan of its tiles before any pixel is read: a header alone must not make that large."""
+"""An image has a plan of its tiles before any pixel is read: a header alone must not make that
+large.
+"""
 
 Tag = tuple[int, int, int, Any, bool]
 """Code, type, count, value, once: what tifffile takes as an extra tag."""
 
 
 Veil = Literal["", "mask", "unassalpha", "assocalpha"]
-"""What hides pixels beside the bands: nothing, a mask, or alpha, which a colour may have been multiplied by."""
+"""What hides pixels beside the bands: nothing, a mask, or alpha, which a colour may have been
+multiplied by.
+"""
 ALPHAS: dict[int, Veil] = {1: "assocalpha", 2: "unassalpha"}
 """By TIFF's ExtraSamples."""
 
 
 @dataclass(frozen=True)
 class Raster:
-    """An image as stored: `bands` planes of (height_px, width_px), of so many `bits` where the file says it.
+    """An image as stored: `bands` planes of (height_px, width_px), of so many `bits` where the file
+    says it.
 
-    `veil` is what hides pixels besides NaN and the nodata value: where its plane is 0 they are missing. `colour` says
-    that the bands are red, green and blue, `restored` that `restore` has written them.
+    `veil` is what hides pixels besides NaN and the nodata value: where its plane is 0 they are
+    missing. `colour` says that the bands are red, green and blue, `restored` that `restore` has
+    written them.
     """
 
     bands: int
@@ -78,13 +89,17 @@ class Raster:
 
     @property
     def out_dtype(self) -> np.dtype[Any]:
-        """Of the restored image: float32 of floats, uint8 of uint8, uint16 of all other integers."""
+        """Of the restored image: float32 of floats, uint8 of uint8, uint16 of
+        all other integers.
+        """
         if self.dtype.kind == "f":
             return np.dtype(np.float32)
         return np.dtype(np.uint8 if self.dtype == np.uint8 else np.uint16)
 
     def missing(self, pixels: np.ndarray) -> np.ndarray:
-        """Where stored pixels hold no measurement: NaN, the nodata value, or masked; bool of the same shape."""
+        """Where stored pixels hold no measurement: NaN, the nodata value, or masked; bool of the
+        same shape.
+        """
         flags = np.ma.getmaskarray(pixels).copy()
         held = np.ma.getdata(pixels)
         if self.dtype.kind == "f":
@@ -122,13 +137,19 @@ def raster_of(path: str, pages: Sequence[tifffile.TiffPage]) -> Raster:
     nodata = _nodata(path, page, dtype)
     tags = tuple(tag for tag in carried_tags(page) if tag[0] != NODATA_TAG or nodata is not None)
     # A container of whole bytes says nothing of the sensor; packed bits were counted by somebody.
-    bits = page.bitspersample if dtype.kind == "u" and page.bitspersample < 8 * dtype.itemsize else None
+    bits = (
+        page.bitspersample
+        if dtype.kind == "u" and page.bitspersample < 8 * dtype.itemsize
+        else None
+    )
     about = bits, _alpha(path, pages), page.photometric == RGB, is_restored(page.software, tags)
     return Raster(bands, height_px, width_px, dtype, nodata, tags, *about)
 
 
 def is_restored(software: str, said: object) -> bool:
-    """Whether an image was written by `restore`, by the software that it names or by its metadata."""
+    """Whether an image was written by `restore`, by the software that it names
+    or by its metadata.
+    """
     return software.startswith(RESTORED) or RESTORED_BY in str(said)
 
 
@@ -142,14 +163,18 @@ def require_raw(name: str, restored: bool, again: bool) -> None:
     """Refuse to restore twice what is `restored`: the second time sharpens what is sharp."""
     if restored and not again:
         remedy = "give the raw one, or restore it once more with `again`"
-        raise ImageError(name, expected="a raw image", got="one that 'restore' has written", remedy=remedy)
+        raise ImageError(
+            name, expected="a raw image", got="one that 'restore' has written", remedy=remedy
+        )
 
 
 def _alpha(path: str, pages: Sequence[tifffile.TiffPage]) -> Veil:
     """The kind of alpha that the last sample of an image is, if any."""
     alphas = [ALPHAS.get(int(code), "") for page in pages for code in page.extrasamples]
     if any(alphas[:-1]) or (any(alphas) and len(pages) > 1):
-        raise ImageError(path, expected="alpha as the last band", got="one before others", remedy="move it there")
+        raise ImageError(
+            path, expected="alpha as the last band", got="one before others", remedy="move it there"
+        )
     return alphas[-1] if alphas else ""
 
 
@@ -171,7 +196,9 @@ def require_numbers(path: str, dtype: np.dtype[Any] | None) -> np.dtype[Any]:
     """The type of the pixels, unless they are complex or packed bits."""
     if dtype is None or dtype.kind not in "uif":
         got = str(dtype or "packed bits")
-        raise ImageError(path, expected="integer or float pixels", got=got, remedy="convert it to uint16")
+        raise ImageError(
+            path, expected="integer or float pixels", got=got, remedy="convert it to uint16"
+        )
     return dtype
 
 
@@ -195,15 +222,22 @@ def usable_nodata(path: str, value: float | None, dtype: np.dtype[Any]) -> float
         return None
     if not 0 <= value <= np.iinfo(np.uint16).max:
         remedy = "give its missing pixels a value of 0 to 65535"
-        raise ImageError(path, expected="a nodata value that uint16 holds", got=f"{value:g}", remedy=remedy)
+        raise ImageError(
+            path, expected="a nodata value that uint16 holds", got=f"{value:g}", remedy=remedy
+        )
     return value
 
 
 BIG_TIFF_SUFFIXES = {".btf", ".tf8"}
 GDAL_DRIVERS = {
-    ".jp2": "JP2OpenJPEG", ".j2k": "JP2OpenJPEG", ".ntf": "NITF", ".nitf": "NITF", ".img": "HFA", ".vrt": "VRT",
+    ".jp2": "JP2OpenJPEG",
+    ".j2k": "JP2OpenJPEG",
+    ".ntf": "NITF",
+    ".nitf": "NITF",
+    ".img": "HFA",
+    ".vrt": "VRT",
     ".xml": "DIMAP",
-}  # fmt: skip
+}
 """By a file's suffix: others of GDAL's drivers open further files, or the network."""
 
 Plane = Callable[[int, int], np.ndarray]
@@ -226,7 +260,9 @@ class Source(Protocol):
     veil: Plane | None
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored; masked where veiled."""
+        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored; masked
+        where veiled.
+        """
 
     def held_bytes(self, rows_px: int) -> int:
         """Memory that reading so many rows at a time takes, besides the rows themselves."""
@@ -272,28 +308,33 @@ class VeiledSource:
         return self._source.held_bytes(rows_px) + self._mask_bytes(rows_px)
 
     def _rows_of_veil(self, start: int, stop: int) -> np.ndarray:
-        rows = self._source.read(start, stop)[-1:] if self._mask is None else self._mask(start, stop)
+        rows = (
+            self._source.read(start, stop)[-1:] if self._mask is None else self._mask(start, stop)
+        )
         return np.asarray(rows[0])
 
 
 def fingerprint(files: Iterable[Path]) -> str:
     """Return one digest of the whole content of some files.
 
-    Size and time alone, or the ends of a file, do not tell two images apart. SHA-256 reads 0.9 GB/s on one core:
-    for a 12-bit image that is 0.2 % of a restoration's processor time (measured).
+    Size and time alone, or the ends of a file, do not tell two images apart. SHA-256 reads 0.9 GB/s
+    on one core: for a 12-bit image that is 0.2 % of a restoration's processor time (measured).
     """
     return hashlib.sha256("".join(map(sha256, files)).encode()).hexdigest()
 
 
 def stamps(files: Iterable[Path]) -> list[tuple[int, int, int]]:
-    """Return size, time of the last change and inode of each file: a quick sign that one may have changed."""
+    """Return size, time of the last change and inode of each file: a quick sign that one may have
+    changed.
+    """
     found = (file.stat() for file in files)
     return [(each.st_size, each.st_mtime_ns, each.st_ino) for each in found]
 
 
 @contextmanager
 def open_source(path: Path, trusted: bool = False) -> Iterator[Source]:
-    """Open an image for reading by rows: pages of a TIFF as streams, PNG and JPEG whole, others by windows of GDAL.
+    """Open an image for reading by rows: pages of a TIFF as streams, PNG and JPEG whole, others by
+    windows of GDAL.
 
     Args:
         path: of the file, or of the index of its tiles.
@@ -310,7 +351,10 @@ def open_source(path: Path, trusted: bool = False) -> Iterator[Source]:
             source = _of_pages(path, stack)
         else:
             source = whole_source(path)
-        from beers_deploy.restoration.georeference import of_sidecar, sidecar_of  # they read what this file defines
+        from beers_deploy.restoration.georeference import (
+            of_sidecar,
+            sidecar_of,
+        )  # they read what this file defines
 
         source.raster = of_sidecar(path, source.raster)
         if sidecar_of(path).is_file():
@@ -344,7 +388,12 @@ def _with_mask(source: Source, mask: "PageRows", files: tuple[Path, ...]) -> Sou
     name = str(mask.path)
     if mask.shape != (1, raster.height_px, raster.width_px) or raster.veil:
         got = "alpha or another mask beside it" if raster.veil else f"one of {times(mask.shape)}"
-        raise ImageError(name, expected=f"one mask of {times(raster.shape[1:])}", got=got, remedy="keep one of them")
+        raise ImageError(
+            name,
+            expected=f"one mask of {times(raster.shape[1:])}",
+            got=got,
+            remedy="keep one of them",
+        )
     return VeiledSource(source, "mask", mask.read, mask.held_bytes, files)
 
 
@@ -357,7 +406,9 @@ def whole_source(path: Path) -> Source:
     planes = bands if alpha is None else np.concatenate([bands, alpha[None]])
     count, height_px, width_px = planes.shape
     source = ArraySource(
-        planes, Raster(count, height_px, width_px, dtype, colour=len(bands) == len(RGB_BANDS)), (path,)
+        planes,
+        Raster(count, height_px, width_px, dtype, colour=len(bands) == len(RGB_BANDS)),
+        (path,),
     )
     return source if alpha is None else VeiledSource(source, "unassalpha")
 
@@ -419,8 +470,11 @@ class PageRows:
         self._down = -(-height_px // self._segment_px)
         self._across = -(-width_px // page.tilewidth) if page.is_tiled else 1
         self._held: dict[int, np.ndarray] = {}  # strips of rows overlap: segments are decoded once
-        # Uncompressed and in one piece, rows lie in the file as they are: no more than those is read.
-        self._flat = page.compression == 1 and page.is_contiguous and page.bitspersample in (8, 16, 32, 64)
+        # Uncompressed and in one piece, rows lie in the file as they are: no more than those is
+        # read.
+        self._flat = (
+            page.compression == 1 and page.is_contiguous and page.bitspersample in (8, 16, 32, 64)
+        )
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), as stored."""
@@ -428,7 +482,9 @@ class PageRows:
             return self._read_flat(start, stop) if self._flat else self._read_segments(start, stop)
 
     def held_bytes(self, rows_px: int) -> int:
-        """Whole segments around the rows, and one row of segments, packed and decoded, while it is read."""
+        """Whole segments around the rows, and one row of segments, packed and decoded, while it is
+        read.
+        """
         if self._flat:
             return 0
         covered = min(rows_px + 2 * self._segment_px, self._down * self._segment_px)
@@ -464,7 +520,11 @@ class PageRows:
         """The strips or tiles at one height, (bands, segment rows, width)."""
         page, (bands, _, width) = self._page, self.shape
         block = np.empty((self._planes, self._samples, self._segment_px, width), self._dtype)
-        wanted = [(p * self._down + row) * self._across + c for p in range(self._planes) for c in range(self._across)]
+        wanted = [
+            (p * self._down + row) * self._across + c
+            for p in range(self._planes)
+            for c in range(self._across)
+        ]
         offsets = [page.dataoffsets[i] for i in wanted]
         counts = [page.databytecounts[i] for i in wanted]
         jpeg = {"jpegtables": page.jpegtables, "jpegheader": page.jpegheader}
@@ -473,5 +533,7 @@ class PageRows:
             rows = min(rows, self._segment_px)
             columns = min(columns, width - left)
             target = block[plane, :, :rows, left : left + columns]
-            target[:] = page.nodata if pixels is None else np.moveaxis(pixels[0, :rows, :columns], 2, 0)
+            target[:] = (
+                page.nodata if pixels is None else np.moveaxis(pixels[0, :rows, :columns], 2, 0)
+            )
         return block.reshape(bands, self._segment_px, width)

@@ -1,7 +1,8 @@
 """The steps around a network that a run takes: its exposures, and the consistency step.
 
-Both depend on what is known of the sensor. Exposures need a network that is conditioned on its sensor; the
-consistency step needs a known sensor, and a network that gives one pixel of the same band for each pixel.
+Both depend on what is known of the sensor. Exposures need a network that is conditioned on its
+sensor; the consistency step needs a known sensor, and a network that gives one pixel of the same
+band for each pixel.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -66,7 +67,8 @@ def offset_of(sensor: Sensor, full_scale: float) -> float:
 def consistency_steps(
     options: Options, raster: Raster, tiling: Tiling, full_scale: float
 ) -> tuple[tuple[Consistency | None, ...], str]:
-    """Build the consistency step, one for all bands or one for each, and say in words whether it is taken.
+    """Build the consistency step, one for all bands or one for each, and say in words whether it is
+    taken.
 
     "blind" is the name of no sensor: a band of that name has None.
     """
@@ -78,12 +80,16 @@ def consistency_steps(
     if not keeps_pixels(tiling):
         return (), OTHER_PIXELS
     sensors = in_order(options.sensors, raster)
-    steps = tuple(None if sensor.name == BLIND else step_for(sensor, full_scale) for sensor in sensors)
+    steps = tuple(
+        None if sensor.name == BLIND else step_for(sensor, full_scale) for sensor in sensors
+    )
     return steps, f"on; {', '.join(blind)} {NO_SENSOR}" if blind else "on"
 
 
 def keeps_pixels(tiling: Tiling) -> bool:
-    """Return True if a network gives one pixel of the same band for each pixel, as the consistency step needs."""
+    """Return True if a network gives one pixel of the same band for each pixel, as the consistency
+    step needs.
+    """
     return tiling.scale == 1 and tiling.channels_in == tiling.channels_out
 
 

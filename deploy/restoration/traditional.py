@@ -1,8 +1,8 @@
 """The traditional pipeline on an image file of any size: what `restore --method traditional` does.
 
-Rows come and go in strips, so that memory grows with the width alone. The pipeline depends on the sensor alone: its
-MTF, noise and gain. The reference it imitates is seen with the sensor's own gain and bits, so that the output has the
-scale of the input.
+Rows come and go in strips, so that memory grows with the width alone. The pipeline depends on the
+sensor alone: its MTF, noise and gain. The reference it imitates is seen with the sensor's own gain
+and bits, so that the output has the scale of the input.
 """
 
 import time
@@ -36,14 +36,17 @@ STRIP_PX = 128
 
 FIXED_BYTES = 100_000_000
 BYTES_PER_COLUMN = 40_000
-"""Of memory that the pipeline takes, and more for each pixel of a row: some 700 rows, in several float32 copies.
-Measured at 400 and 1200 columns: 75 MB and 30 kB."""
+"""Of memory that the pipeline takes, and more for each pixel of a row: some 700 rows, in several
+float32 copies. Measured at 400 and 1200 columns: 75 MB and 30 kB.
+"""
 
 
 def restore_file_traditionally(
     image: Path, out: Path, options: Options, log: Log = no_log, beside: Sequence[Path | None] = ()
 ) -> Row:
-    """As `deploy.restoration.run.restore_file`, of a mono image, by the traditional pipeline of its one sensor."""
+    """As `deploy.restoration.run.restore_file`, of a mono image, by the traditional pipeline of its
+    one sensor.
+    """
     started = time.perf_counter()
     sensor = options.sensors[""]
     chain = Chain(sensor.nominal(), sensor.reference.nominal())
@@ -51,14 +54,18 @@ def restore_file_traditionally(
         raster = stored.raster
         if raster.bands > 1:
             remedy = "extract the band that the profile describes"
-            raise ImageError(str(image), expected="one band", got=f"{raster.bands} bands", remedy=remedy)
+            raise ImageError(
+                str(image), expected="one band", got=f"{raster.bands} bands", remedy=remedy
+            )
         faults = faults_of(stored, options.fix_detectors, str(image), log)
         source = fixed(stored, faults)
         needed = FIXED_BYTES + BYTES_PER_COLUMN * raster.width_px + source.held_bytes(STRIP_PX)
         check_memory(needed, options.memory_bytes, bulky=False)
         extents = (raster.extent(source.read(*rows)) for rows in strips(raster.height_px, STRIP_PX))
         scale = full_scale_of(str(image), raster, extents, options.full_scale, options.sensor_bits)
-        check, check_s = timed(partial(check_sensor, source, (), options, scale.value, name=str(image), log=log))
+        check, check_s = timed(
+            partial(check_sensor, source, (), options, scale.value, name=str(image), log=log)
+        )
         begun_with = stamps(source.files)
         digest = fingerprint(source.files)
         job = {"image": digest, "method": "traditional"}
@@ -69,11 +76,16 @@ def restore_file_traditionally(
             require_unchanged(source, str(image), begun_with, digest)
             write_output(checkpoint, source, options.compression)
             write_list(faults, list_beside(out, options.fix_detectors))
-        except BaseException:  # a strip is no place to go on from: the pipeline looks hundreds of rows back
+        except (
+            BaseException
+        ):  # a strip is no place to go on from: the pipeline looks hundreds of rows back
             checkpoint.remove()
             raise
     time_s = time.perf_counter() - started - check_s
-    how = f"from opening the image to the finished file without the sensor check, {torch.get_num_threads()} threads"
+    how = (
+        "from opening the image to the finished file without the sensor check, "
+        f"{torch.get_num_threads()} threads"
+    )
     figures = {
         "time": measured(time_s, "s", how),
         "throughput": measured(raster.height_px * raster.width_px / time_s / 1e6, "Mpx/s", how),
@@ -81,12 +93,20 @@ def restore_file_traditionally(
         "sensor check": measured(check_s, "s", CHECKED),
         **check.figures,
     }
-    text = {"method": "traditional", "sensor": sensor.name, **scale.text, **check.text, **faults.text_of_row}
+    text = {
+        "method": "traditional",
+        "sensor": sensor.name,
+        **scale.text,
+        **check.text,
+        **faults.text_of_row,
+    }
     return Row("restore", image.name, figures, text)
 
 
 def _fitted(source: Source, chain: Chain, full_scale: float, name: str) -> Chain:
-    """Derive the regularisation of the pipeline from a first pass over the image, which takes little of the time."""
+    """Derive the regularisation of the pipeline from a first pass over the image, which takes
+    little of the time.
+    """
     to_dn = chain.degraded.max_dn / full_scale
     with steps("measuring noise and contrast", source.raster.height_px) as bar:
         return chain.fitted_to(_counted(_read(source, to_dn, full_scale, name), bar))
@@ -99,15 +119,21 @@ def _counted(strips_read: Iterator[Tensor], bar: Steps) -> Iterator[Tensor]:
         bar.advance(strip.shape[0])
 
 
-def _fill(checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: float, name: str) -> None:
+def _fill(
+    checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: float, name: str
+) -> None:
     raster = source.raster
     to_dn = chain.degraded.max_dn / full_scale
     top = 0
     with steps("restoring rows", raster.height_px) as bar:
-        for strip in restore_strips(_read(source, to_dn, full_scale, name), raster.height_px, chain):
+        for strip in restore_strips(
+            _read(source, to_dn, full_scale, name), raster.height_px, chain
+        ):
             stop = top + strip.shape[0]
             missing = torch.isnan(strip).numpy()[None]
-            kept = as_stored(raster, np.nan_to_num(strip.numpy()[None] / np.float32(to_dn)), full_scale)
+            kept = as_stored(
+                raster, np.nan_to_num(strip.numpy()[None] / np.float32(to_dn)), full_scale
+            )
             if missing.any():
                 stored = np.ma.getdata(source.read(top, stop))
                 kept = np.where(missing, stored.astype(raster.out_dtype), kept)

@@ -1,4 +1,5 @@
-"""The whole chain on one image, ending with a report: simulate, export, gate, check, restore, bench.
+"""The whole chain on one image, ending with a report: simulate, export, gate, check, restore,
+bench.
 
 Each step is the verb's own function; here their rows are joined.
 """
@@ -57,21 +58,34 @@ INT8 = f"{VARIANT}, INT8"
 REFERENCE = "reference"
 
 SWATH_CAPTION = (
-    "The traditional pipeline is measured on crops of this image and scaled; the paper's rows are what it printed "
+    "The traditional pipeline is measured on crops of this image and scaled; the paper's rows "
+    "are what it printed "
     "for another network (16 blocks of 64 features) on its own hardware."
 )
 GATE_CAPTION = (
-    "On simulated patches that calibration did not see; the INT8 network obeys the DPU's power-of-two rules."
+    "On simulated patches that calibration did not see; the INT8 network obeys the "
+    "DPU's power-of-two rules."
 )
 NOTES = (
-    "Nothing here has run on a board: the DPU's figures come from a cost model fitted on published networks.",
-    "The power of the DPU run is an assumption anchored at the paper's single figure, with a range.",
+    (
+        "Nothing here has run on a board: the DPU's figures come from a cost model fitted on "
+        "published networks."
+    ),
+    (
+        "The power of the DPU run is an assumption anchored at the paper's single figure, with a "
+        "range."
+    ),
     "INT8 time on this CPU is no proxy for the DPU.",
 )
 
 
 def run_demo(
-    image: Path | None, out: Path, seed: int, say: Log, full_scale: float | None = None, sensor: str = SENSOR
+    image: Path | None,
+    out: Path,
+    seed: int,
+    say: Log,
+    full_scale: float | None = None,
+    sensor: str = SENSOR,
 ) -> Report:
     """Run the chain, write its files into a folder, and return the report.
 
@@ -87,7 +101,9 @@ def run_demo(
     sensors = load_sensors(sensor)
     degraded, pair = read_input(image, seed, sensors, full_scale)
     say("telling the shipped network the sensor, and gating its INT8")
-    floating, int8 = (Network.load(name, sensor=sensors[0]) for name in (VARIANT, f"{VARIANT}-int8"))
+    floating, int8 = (
+        Network.load(name, sensor=sensors[0]) for name in (VARIANT, f"{VARIANT}-int8")
+    )
     for name, network in (("float", floating), ("int8", int8), ("core", int8.core())):
         network.save(out / f"{name}.onnx")
     float_file = out / "float.onnx"
@@ -112,10 +128,15 @@ def run_demo(
         images[REFERENCE] = reference
     say("measuring the traditional pipeline, predicting the board")
     bench = bench_tables(int8_file, degraded, sensors)
-    sections = [*bench, *([Section("Quality on this image, over 4095 DN", quality)] if quality else [])]
+    sections = [
+        *bench,
+        *([Section("Quality on this image, over 4095 DN", quality)] if quality else []),
+    ]
     sections.append(Section("What quantisation changes", verdict.rows, GATE_CAPTION))
     sentence = headline(bench[0].rows, quality, placement)
-    return Report("From training to board, on one image", sentence, sections, pictures_of(images, out), NOTES)
+    return Report(
+        "From training to board, on one image", sentence, sections, pictures_of(images, out), NOTES
+    )
 
 
 def load_sensors(name: str = SENSOR) -> tuple[Sensor, Sensor]:
@@ -131,15 +152,20 @@ def load_sensors(name: str = SENSOR) -> tuple[Sensor, Sensor]:
 def read_input(
     image: Path | None, seed: int, sensors: tuple[Sensor, Sensor], full_scale: float | None = None
 ) -> tuple[np.ndarray, Pair | None]:
-    """The degraded image (H, W) in digital numbers, and the pair that it belongs to where it is simulated.
+    """The degraded image (H, W) in digital numbers, and the pair that it belongs to where it is
+    simulated.
 
     Args:
-        image: a photograph as a scene (8 bits) or a raw acquisition (mono, up to 12 bits); a synthetic scene if None.
+        image: a photograph as a scene (8 bits) or a raw acquisition (mono, up to 12 bits); a
+            synthetic scene if None.
         seed: of every random draw.
         sensors: that acquire a scene.
         full_scale: pixel value that is full scale: with it any image is a raw acquisition.
     """
-    (degraded, reference), ratio = (profile.nominal() for profile in sensors), int(sensors[0].oversampling.low)
+    (degraded, reference), ratio = (
+        (profile.nominal() for profile in sensors),
+        int(sensors[0].oversampling.low),
+    )
     if image is None:
         side = (SIDE_PX + 2 * MARGIN_PX) * ratio
         scene = procedural_scene(side, side, np.random.default_rng(seed))
@@ -152,7 +178,9 @@ def read_input(
 
 
 def bench_tables(model: Path, dn: np.ndarray, sensors: tuple[Sensor, Sensor]) -> list[Section]:
-    """Speed for this image, for the swath of the paper beside its rows, and for that swath on every board."""
+    """Speed for this image, for the swath of the paper beside its rows, and for that swath on every
+    board.
+    """
     dpu = load_dpu(DEFAULT_TARGET)
     halo_px = tiling_of(load_onnx(model)).halo_px
     chain = measure_chain(dn, *sensors)
@@ -169,13 +197,23 @@ def bench_tables(model: Path, dn: np.ndarray, sensors: tuple[Sensor, Sensor]) ->
     title = "A swath of {} x {}, beside the paper's figures".format(*SWATH_PX)
     return [
         Section(f"Time and power for this image, {dn.shape[1]} x {dn.shape[0]}", rows[0]),
-        Section(title, [replace(row, table="swath") for row in (*rows[1], *tables.published_rows())], SWATH_CAPTION),
-        Section("The same swath on each board, predicted", [replace(row, table="boards") for row in boards], words),
+        Section(
+            title,
+            [replace(row, table="swath") for row in (*rows[1], *tables.published_rows())],
+            SWATH_CAPTION,
+        ),
+        Section(
+            "The same swath on each board, predicted",
+            [replace(row, table="boards") for row in boards],
+            words,
+        ),
     ]
 
 
 def pictures_of(images: dict[str, np.ndarray], out: Path) -> list[Picture]:
-    """Crops of several (H, W) images side by side, also written as before-after.png, and the INT8 result whole."""
+    """Crops of several (H, W) images side by side, also written as before-after.png, and the INT8
+    result whole.
+    """
     side = min(CROP_PX, *images[INPUT].shape)
     stretch = stretch_of(images[INPUT])
     windows = busiest_windows(images[INPUT], side)
@@ -197,7 +235,9 @@ def headline(bench: Sequence[Row], quality: Sequence[Row], placement: Placement)
     cpu = bench[0].figures["latency"]
     board = DEFAULT_TARGET.upper()
     fits = "fits" if placement.dpu_subgraphs == 1 and not placement.failed else "does not fit"
-    text = f"{VARIANT} in INT8 {fits} the DPU whole: predicted {latency} s for this image on a {board}"
+    text = (
+        f"{VARIANT} in INT8 {fits} the DPU whole: predicted {latency} s for this image on a {board}"
+    )
     text += f", against {cpu} s {cpu.mode} for the traditional pipeline on this CPU"
     if quality:
         before = quality[0].figures["PSNR"]

@@ -33,7 +33,13 @@ Say = Callable[[str], None]
 
 
 def make_network(
-    recipe: NetworkRecipe, toml: str, images: Sequence[Path], out: Path, resume: bool, device: str, say: Say
+    recipe: NetworkRecipe,
+    toml: str,
+    images: Sequence[Path],
+    out: Path,
+    resume: bool,
+    device: str,
+    say: Say,
 ) -> None:
     """Run a recipe to its end.
 
@@ -74,7 +80,9 @@ def stage_run(
     start: Path | None,
     device: str,
 ) -> Run:
-    """Return the run of a stage; the INT8 file whose roundings it trains with is made where it is not there."""
+    """Return the run of a stage; the INT8 file whose roundings it trains with is made where it is
+    not there.
+    """
     folder = out / f"{number}-{stage.name}"
     rounding = None
     digest = ""
@@ -124,7 +132,9 @@ def model_card(recipe: NetworkRecipe, toml: str, images: Sequence[Path]) -> str:
     """Return the text of a network's card: how it is made, from what, and on what it was made."""
     variant = VARIANTS[recipe.variant]
     files = [file for folder in images for file in list_images(folder)]
-    digests = "".join(f"{file.name} {sha256(file)}\n" for file in sorted(files, key=lambda file: file.name))
+    digests = "".join(
+        f"{file.name} {sha256(file)}\n" for file in sorted(files, key=lambda file: file.name)
+    )
     seen = [file for file in files if site_of(file.name) not in recipe.held_out]
     data = hashlib.sha256(digests.encode()).hexdigest()
     attribution = "".join(f"- {line}\n" for line in recipe.attribution)
@@ -132,15 +142,17 @@ def model_card(recipe: NetworkRecipe, toml: str, images: Sequence[Path]) -> str:
     patches = sum(stage.steps * stage.batch for stage in recipe.stages)
     return f"""# {recipe.variant}
 
-{described(variant)} behind the bank of its sensor: one set of weights and one INT8 file for every sensor in range.
+{described(variant)} behind the bank of its sensor: one set of weights and one INT8 file for \
+every sensor in range.
 
 **Made by**
 
     beers-deploy train --recipe {recipe.variant} --images aerial/ --out runs/{recipe.variant}
 
-on {processor_name()} with PyTorch {torch.__version__}: {patches} patches of {len(seen)} photographs, whose list of \
-names and digests has the SHA-256 `{data[:16]}`, and {recipe.charts} drawn charts. Sites that are held out choose; \
-{len(files) - len(seen)} photographs show them. The recipe:
+on {processor_name()} with PyTorch {torch.__version__}: {patches} patches of {len(seen)} \
+photographs, whose list of names and digests has the SHA-256 `{data[:16]}`, and {recipe.charts} \
+drawn charts. Sites that are held out choose; {len(files) - len(seen)} photographs show them. \
+The recipe:
 
 ```toml
 {toml.strip()}
@@ -156,5 +168,6 @@ def described(variant: Variant) -> str:
     parameters = sum(math.prod(shape) for shape in variant.banked_shapes.values())
     at = f" at 1/{variant.scale} of the resolution" if variant.scale > 1 else ""
     return (
-        f"{variant.blocks} residual blocks of {variant.features} features{at}, {parameters / 1000:.0f} k parameters,"
+        f"{variant.blocks} residual blocks of {variant.features} features{at}, "
+        f"{parameters / 1000:.0f} k parameters,"
     )

@@ -1,4 +1,6 @@
-"""Write docs/reference/api.md: `python docs/make/api.py`. What `beers_deploy` offers, for mkdocstrings to fill.
+"""Write docs/reference/api.md: `python docs/make/api.py`.
+
+What `beers_deploy` offers, for mkdocstrings to fill.
 
 A test keeps it fresh: it names every object that the package's `__all__` has.
 """

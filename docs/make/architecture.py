@@ -1,7 +1,9 @@
-"""Draw the packages in docs/explanation/architecture.md from what their files import, as a Mermaid flowchart.
+"""Draw the packages in docs/explanation/architecture.md from what their files import, as a Mermaid
+flowchart.
 
-An arrow is drawn where a file of one imports a file of the other, late imports included, unless a longer way along
-other arrows says it already. Run it in the checkout's root, with the checkout on PYTHONPATH.
+An arrow is drawn where a file of one imports a file of the other, late imports included, unless a
+longer way along other arrows says it already. Run it in the checkout's root, with the checkout on
+PYTHONPATH.
 """
 
 import ast
@@ -19,7 +21,9 @@ END = "<!-- end of packages -->\n"
 
 
 def box_of(name: str) -> str:
-    """The box that a module is drawn in: its top-level package, or the package or the module one level below."""
+    """The box that a module is drawn in: its top-level package, or the package or the module one
+    level below.
+    """
     parts = name.split(".")
     return parts[0] if parts[0] in WHOLE else ".".join(parts[:2])
 
@@ -39,12 +43,16 @@ def imports_of(path: Path, known: dict[str, Path], *, late: bool = True) -> set[
         if isinstance(node, ast.Import):
             found |= {in_folder(alias.name) for alias in node.names}
         if isinstance(node, ast.ImportFrom) and node.module:
-            found |= {in_folder(f"{node.module}.{alias.name}") for alias in node.names} | {in_folder(node.module)}
+            found |= {in_folder(f"{node.module}.{alias.name}") for alias in node.names} | {
+                in_folder(node.module)
+            }
     return found & known.keys()
 
 
 def in_folder(module: str) -> str:
-    """Where a module of the installed package lies in the checkout: `beers_deploy` itself is deploy/."""
+    """Where a module of the installed package lies in the checkout: `beers_deploy` itself is
+    deploy/.
+    """
     inner = module.removeprefix(f"{INSTALLED}.")
     return inner if inner.partition(".")[0] in PACKAGES[1:] else f"{PACKAGES[0]}.{inner}"
 
@@ -70,7 +78,9 @@ def beyond(box: str, edges: dict[str, set[str]]) -> set[str]:
 
 
 def chart() -> str:
-    """The Mermaid text: a frame a package, a box a part, and the arrows that no longer way replaces."""
+    """The Mermaid text: a frame a package, a box a part, and the arrows that no longer way
+    replaces.
+    """
     edges = arrows()
     boxes = sorted(set(edges).union(*edges.values()))
     lines = ["flowchart TD"]
@@ -79,9 +89,15 @@ def chart() -> str:
         if not inside:
             lines.append(f"  {package}")
             continue
-        lines += [f"  subgraph {package}", *(f"    {box}[{box.split('.')[1]}]" for box in inside), "  end"]
+        lines += [
+            f"  subgraph {package}",
+            *(f"    {box}[{box.split('.')[1]}]" for box in inside),
+            "  end",
+        ]
     for box in boxes:
-        lines += [f"  {box} --> {other}" for other in sorted(edges.get(box, set()) - beyond(box, edges))]
+        lines += [
+            f"  {box} --> {other}" for other in sorted(edges.get(box, set()) - beyond(box, edges))
+        ]
     return "\n".join(["```mermaid", *lines, "```", ""])
 
 

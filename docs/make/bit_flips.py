@@ -1,6 +1,7 @@
 """Write docs/explanation/bit-flips.md and .svg: `python docs/make/bit_flips.py`, some minutes.
 
-It runs what `beers-deploy stress --bit-flips` runs, on three shipped networks. A test keeps its words and rows fresh.
+It runs what `beers-deploy stress --bit-flips` runs, on three shipped networks. A test keeps its
+words and rows fresh.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -55,7 +56,9 @@ FINDINGS = """- Weights: one bit may cost nothing or 20 dB. CRC-32 finds every i
 
 def document(networks: Mapping[str, Sequence[Row]]) -> str:
     """The whole page as Markdown."""
-    return "\n".join([OPENING + FINDINGS + "\n".join(price_lines(networks)), "", *table(networks), ""])
+    return "\n".join(
+        [OPENING + FINDINGS + "\n".join(price_lines(networks)), "", *table(networks), ""]
+    )
 
 
 def price_lines(networks: Mapping[str, Sequence[Row]]) -> Iterator[str]:
@@ -64,16 +67,22 @@ def price_lines(networks: Mapping[str, Sequence[Row]]) -> Iterator[str]:
         row = next(row for row in rows if row.table == "guards" and row.name == "all guards")
         time, share, lost = (f"{figure} {figure.unit}" for figure in row.figures.values())
         yield (
-            f"- All guards of {name} on a {BOARD.upper()} (predicted): {time}, or {share} of a tile if nothing "
+            f"- All guards of {name} on a {BOARD.upper()} (predicted): {time}, or {share} of a "
+            "tile if nothing "
             f"hides; frame rate lost beside the DPU: {lost}."
         )
 
 
 def table(networks: Mapping[str, Sequence[Row]]) -> Iterator[str]:
-    """PSNR by kind of memory and rate, with no guard and with all of them, a column pair a network."""
+    """PSNR by kind of memory and rate, with no guard and with all of them, a
+    column pair a network.
+    """
     shown = SETS[0], SETS[-1]
     yield "PSNR in dB (measured), mean over patches and injections:\n"
-    yield f"| bit flips | {' | '.join(f'{name}, {guards}' for name in networks for guards in shown)} |"
+    yield (
+        "| bit flips | "
+        f"{' | '.join(f'{name}, {guards}' for name in networks for guards in shown)} |"
+    )
     yield "|---" * (1 + len(shown) * len(networks)) + "|"
     columns = [[row for row in rows if row.table == "bit flips"] for rows in networks.values()]
     for rows in zip(*columns, strict=True):
@@ -82,7 +91,9 @@ def table(networks: Mapping[str, Sequence[Row]]) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    studies = {variant: flip_rows(open_subject(Path(variant), None), SOURCE, BOARD) for variant in VARIANTS}
+    studies = {
+        variant: flip_rows(open_subject(Path(variant), None), SOURCE, BOARD) for variant in VARIANTS
+    }
     write_text(PAGE, document(studies))
     write_text(PICTURE, flip_curves_svg(studies))
     print(f"wrote {PAGE} and {PICTURE}")

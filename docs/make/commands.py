@@ -1,7 +1,7 @@
 """Write docs/reference/commands.md: `python docs/make/commands.py`.
 
-The text comes from the commands' own help, what an option takes from docs/make/options.py. A test keeps the page
-fresh.
+The text comes from the commands' own help, what an option takes from docs/make/options.py. A test
+keeps the page fresh.
 """
 
 from collections import Counter
@@ -41,8 +41,14 @@ def reference() -> str:
     counted = Counter(line for each in lines.values() for line in each.values())
     once = {line for line, commands in counted.items() if commands >= SEVERAL}
     shared = sorted(once)
-    parts = [OPENING.format(boards=", ".join(board_names()), npus=", ".join(npu_names())), *shared, ""]
-    return "\n".join([*parts, *(line for name in COMMANDS for line in _section(name, lines[name], once))])
+    parts = [
+        OPENING.format(boards=", ".join(board_names()), npus=", ".join(npu_names())),
+        *shared,
+        "",
+    ]
+    return "\n".join(
+        [*parts, *(line for name in COMMANDS for line in _section(name, lines[name], once))]
+    )
 
 
 def _section(name: str, lines: Mapping[str, str], once: Collection[str]) -> Iterator[str]:
@@ -55,7 +61,10 @@ def _section(name: str, lines: Mapping[str, str], once: Collection[str]) -> Iter
 
 def _lines(name: str) -> dict[str, str]:
     """The line of each argument and option of a command, by its name."""
-    return {_label(each.shown): _line(each.shown, each.kind.removeprefix("flag")) for each in parameters(name)}
+    return {
+        _label(each.shown): _line(each.shown, each.kind.removeprefix("flag"))
+        for each in parameters(name)
+    }
 
 
 def _label(parameter: Any) -> str:
@@ -67,9 +76,16 @@ def _line(parameter: Any, kind: str) -> str:
     default = parameter.default
     shown = "" if default is None or callable(default) or default is False else f"`{default}`"
     said = kind == "input" or parameter.name in ("sensor", "reference", "target")
-    takes = "; ".join(filter(None, ["" if said else kind, "required" if parameter.required else shown]))
+    takes = "; ".join(
+        filter(None, ["" if said else kind, "required" if parameter.required else shown])
+    )
     given = f" ({takes})" if takes else ""
-    text = (parameter.help or "").replace(f": {RULED}", "").replace(f": {BOARDS}", "").replace(f" ({BOARDS})", "")
+    text = (
+        (parameter.help or "")
+        .replace(f": {RULED}", "")
+        .replace(f": {BOARDS}", "")
+        .replace(f" ({BOARDS})", "")
+    )
     return f"- `{_label(parameter)}`{given}: {text}"
 
 

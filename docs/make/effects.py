@@ -1,4 +1,5 @@
-"""Write docs/explanation/effects.md and its picture: each effect alone, all together, and the plans of four scenes.
+"""Write docs/explanation/effects.md and its picture: each effect alone, all together, and the plans
+of four scenes.
 
 Run `python docs/make/effects.py` after a change to the simulator.
 """
@@ -17,7 +18,12 @@ from beers_deploy.model.simulator.plan import ORDER, TOLERANCE_DN, Plan, make_pl
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import TABLES, middle_effect
-from beers_deploy.profiles.scene_call import calling_for, load_scene_call, scene_names, typical_effects
+from beers_deploy.profiles.scene_call import (
+    calling_for,
+    load_scene_call,
+    scene_names,
+    typical_effects,
+)
 from beers_deploy.profiles.sensor import Instrument
 
 DOCS = Path(__file__).parents[1]
@@ -67,7 +73,9 @@ The four shipped scenes under `pleiades-degraded` ask for these effects, with th
 
 def document() -> str:
     """The page as Markdown."""
-    shown = ", ".join(f"{key} {value:g}" for values in SHOWN.values() for key, value in values.items())
+    shown = ", ".join(
+        f"{key} {value:g}" for values in SHOWN.values() for key, value in values.items()
+    )
     scene = procedural_scene(1500, 1500, np.random.default_rng(0)).radiance
     order = ", ".join(ORDER[ORDER.index("sampling") + 1 :])
     count = len(TABLES)
@@ -111,10 +119,15 @@ def bounds(radiance: np.ndarray) -> Iterator[str]:
         plans[name] = make_plan(sensor, scene_stats(radiance * call.radiance_scale.low, RATIO))
     yield f"| effect | {' | '.join(plans)} |"
     yield "|---" * (len(plans) + 1) + "|"
-    for number, effect in enumerate(decision.effect for decision in next(iter(plans.values())).decisions):
+    for number, effect in enumerate(
+        decision.effect for decision in next(iter(plans.values())).decisions
+    ):
         cells = [plan.decisions[number].bound_dn for plan in plans.values()]
         if any(cells):
-            yield f"| {effect} | {' | '.join('-' if cell is None else f'{cell:.3g}' for cell in cells)} |"
+            yield (
+                f"| {effect} | "
+                f"{' | '.join('-' if cell is None else f'{cell:.3g}' for cell in cells)} |"
+            )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""Makes the shipped INT8 files anew, one for all sensors each, calibrated on photographs. Minutes a file.
+"""Makes the shipped INT8 files anew, one for all sensors each, calibrated on photographs.
+
+Minutes a file.
 
 python docs/make/int8.py --images aerial/ [convbeers-s ...]
 """
@@ -16,9 +18,13 @@ WEIGHTS = Path(__file__).parents[2] / "model" / "weights"
 
 def main() -> None:
     """Make them one by one."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("names", nargs="*", default=shipped_names())
-    parser.add_argument("--images", type=Path, required=True, nargs="+", help="folders of photographs")
+    parser.add_argument(
+        "--images", type=Path, required=True, nargs="+", help="folders of photographs"
+    )
     arguments = parser.parse_args()
     for name in arguments.names:
         shipped = WEIGHTS / f"{name}{INT8}.onnx"

@@ -1,8 +1,10 @@
-"""Write docs/explanation/mutations.md: `python docs/make/mutations.py` breaks a copy of this code ten times.
+"""Write docs/explanation/mutations.md: `python docs/make/mutations.py` breaks a copy of this code
+ten times.
 
-It takes some minutes. Each time one or two lines of the product change, as docs/explanation/mutations.toml says, and
-the files of stability tests that it names run on the copy. The tests named there must fail; unbroken, every one must
-pass. Exit code 1 when a broken version survives. A test keeps the list true to the code.
+It takes some minutes. Each time one or two lines of the product change, as
+docs/explanation/mutations.toml says, and the files of stability tests that it names run on the
+copy. The tests named there must fail; unbroken, every one must pass. Exit code 1 when a broken
+version survives. A test keeps the list true to the code.
 """
 
 import os
@@ -50,7 +52,9 @@ class Mutation:
     tests: list[str]
 
 
-MUTATIONS = tuple(Mutation(**entry) for entry in tomllib.loads(LIST.read_text(encoding="utf-8"))["mutation"])
+MUTATIONS = tuple(
+    Mutation(**entry) for entry in tomllib.loads(LIST.read_text(encoding="utf-8"))["mutation"]
+)
 
 OPENING = """# Broken on purpose
 
@@ -68,14 +72,19 @@ def broken(text: str, mutation: Mutation) -> str:
     """
     for old, new in mutation.changes:
         if text.count(old) != 1:
-            raise SystemExit(f"{mutation.name}: in {mutation.file} `{old}` stands {text.count(old)} times, not once")
+            raise SystemExit(
+                f"{mutation.name}: in {mutation.file} `{old}` stands {text.count(old)} times, "
+                "not once"
+            )
         text = text.replace(old, new)
     return text
 
 
 @contextmanager
 def repository_copy() -> Iterator[Path]:
-    """What git knows of or would take, in a temporary folder, with a test that this is what runs."""
+    """What git knows of or would take, in a temporary folder, with a test that
+    this is what runs.
+    """
     command = ["git", "ls-files", "-co", "--exclude-standard", "-z"]
     listed = subprocess.check_output(command, cwd=ROOT, text=True)  # noqa: S603 - the developer's own git
     with tempfile.TemporaryDirectory() as folder:
@@ -115,7 +124,9 @@ def failures(copy: Path, *selection: str) -> Failures:
     named = {name.partition("::")[0] for mutation in MUTATIONS for name in mutation.tests}
     files = [f"{SUITE}/{name}" for name in sorted({PROBE_FILE, *named})]
     command = [sys.executable, "-m", "pytest", *files, *options]
-    done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=False)  # noqa: S603
+    done = subprocess.run(  # noqa: S603
+        command, cwd=copy, env=environment, capture_output=True, text=True, check=False
+    )
     if done.returncode not in (0, 1):
         raise SystemExit(done.stdout + done.stderr)
     found = read_report(report.read_text(encoding="utf-8"))
@@ -127,7 +138,9 @@ def failures(copy: Path, *selection: str) -> Failures:
 def read_report(text: str) -> Failures:
     """Failures in a report of pytest's."""
     cases = [*ET.fromstring(text).iter("testcase")]  # noqa: S314 - pytest wrote it a moment ago
-    failed = [case for case in cases if case.find("failure") is not None or case.find("error") is not None]
+    failed = [
+        case for case in cases if case.find("failure") is not None or case.find("error") is not None
+    ]
     return Counter(
         f"{case.attrib['classname'].rpartition('.')[2]}.py::{case.attrib['name'].partition('[')[0]}"
         for case in failed

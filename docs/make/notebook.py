@@ -1,7 +1,8 @@
 """Shows the tutorials' notebooks as pages of the site: a hook of MkDocs, which mkdocs.yml names.
 
-`tutorials/NAME.ipynb` becomes the page `tutorials/NAME.md` as the site is built; no such file is written. Code
-becomes fenced code, printed text a block, a picture an image inside the page. The notebook itself stays beside it.
+`tutorials/NAME.ipynb` becomes the page `tutorials/NAME.md` as the site is built; no such file is
+written. Code becomes fenced code, printed text a block, a picture an image inside the page. The
+notebook itself stays beside it.
 """
 
 import json
@@ -18,7 +19,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         if file.src_uri.endswith(".ipynb"):
             name = Path(file.src_uri)
             text = page(json.loads(file.content_string), name.name)
-            files.append(File.generated(config, str(name.with_suffix(".md").as_posix()), content=text))
+            files.append(
+                File.generated(config, str(name.with_suffix(".md").as_posix()), content=text)
+            )
     return files
 
 
@@ -40,5 +43,8 @@ def output_part(output: dict[str, Any]) -> str:
     """What a cell gave: a picture where there is one, its text where there is none."""
     data = output.get("data", {})
     if "image/png" in data:
-        return f"![What the cell shows](data:image/png;base64,{''.join(data['image/png']).replace(chr(10), '')})"
+        return (
+            "![What the cell "
+            f"shows](data:image/png;base64,{''.join(data['image/png']).replace(chr(10), '')})"
+        )
     return f"```text\n{''.join(output.get('text') or data.get('text/plain', [])).rstrip()}\n```"

@@ -1,4 +1,5 @@
-"""Write docs/reference/operators.md from the DPUs' rules themselves: `python docs/make/operators.py`.
+"""Write docs/reference/operators.md from the DPUs' rules themselves: `python
+docs/make/operators.py`.
 
 A test keeps it fresh.
 """
@@ -9,7 +10,16 @@ from pathlib import Path
 
 from beers_deploy.dpu.board import Dpu, load_dpu, ruled
 from beers_deploy.dpu.checker.finding import Rule
-from beers_deploy.dpu.checker.operators import NUMBERS, RULES, SHIFTS, SIZES, all_rules, applies, rule_name, rule_text
+from beers_deploy.dpu.checker.operators import (
+    NUMBERS,
+    RULES,
+    SHIFTS,
+    SIZES,
+    all_rules,
+    applies,
+    rule_name,
+    rule_text,
+)
 from beers_deploy.dpu.checker.other_rules import INSTEAD
 from beers_deploy.dpu.checker.remarks import REMARKS
 from beers_deploy.dpu.cost.latency import dpu_power
@@ -44,7 +54,8 @@ def document() -> str:
     parts = [OPENING, *_boards(), *_kinds()]
     parts += _rules("Sizes, for every node", SIZES)
     parts += _rules(
-        "Numbers, in a quantised file", [*NUMBERS, *dict.fromkeys(r for rules in SHIFTS.values() for r in rules)]
+        "Numbers, in a quantised file",
+        [*NUMBERS, *dict.fromkeys(r for rules in SHIFTS.values() for r in rules)],
     )
     parts += _rules("Remarks, which break no rule", REMARKS)
     parts += [line for name in npu_names() for line in _npu(ruled(load_target(name)))]
@@ -100,11 +111,22 @@ def _rules(title: str, rules: Iterable[Callable[..., object]]) -> list[str]:
 
 
 def _npu(npu: Dpu) -> Iterator[str]:
-    """Every rule of a board with an NPU: AMD's table of operators and the numbers of a VINT8 file."""
-    texts = {rule_name(rule): (rule, rule_text(rule, npu)) for rule in all_rules() if applies(rule, npu)}
-    same = [name for name, (rule, text) in texts.items() if _without_sources(text, npu) in _texts(rule).values()]
+    """Every rule of a board with an NPU: AMD's table of operators and the
+    numbers of a VINT8 file.
+    """
+    texts = {
+        rule_name(rule): (rule, rule_text(rule, npu)) for rule in all_rules() if applies(rule, npu)
+    }
+    same = [
+        name
+        for name, (rule, text) in texts.items()
+        if _without_sources(text, npu) in _texts(rule).values()
+    ]
     yield f"## The NPU of {npu.target.name}: a table of operators, and numbers alone\n"
-    yield "AMD publishes no limits; numbers are its quantiser's. [The NPU's flow](npu.md) has what else is known."
+    yield (
+        "AMD publishes no limits; numbers are its quantiser's. [The NPU's flow](npu.md) has "
+        "what else is known."
+    )
     yield f"As for the DPUs: {', '.join(same)}. Otherwise ({npu.target.documents['quantiser']}):\n"
     rest = {name: text for name, (_, text) in texts.items() if name not in same}
     above = f" ({npu.target.documents['quantiser']})"
@@ -114,7 +136,11 @@ def _npu(npu: Dpu) -> Iterator[str]:
 
 def _texts(rule: Callable[..., object]) -> dict[str, str]:
     """What a rule says on each board with a DPU to which it applies."""
-    return {name: _without_sources(rule_text(rule, dpu), dpu) for name, dpu in DPUS.items() if applies(rule, dpu)}
+    return {
+        name: _without_sources(rule_text(rule, dpu), dpu)
+        for name, dpu in DPUS.items()
+        if applies(rule, dpu)
+    }
 
 
 def _lines(rule: Callable[..., object]) -> Iterator[str]:
@@ -141,7 +167,9 @@ def _each(values: Mapping[str, str]) -> str:
 
 def _without_sources(text: str, dpu: Dpu) -> str:
     """A rule's text without its parentheses of sources, in which boards with one limit differ."""
-    stated = {str(getattr(fact, "source", "")) for facts in dpu.tables.values() for fact in facts.values()}
+    stated = {
+        str(getattr(fact, "source", "")) for facts in dpu.tables.values() for fact in facts.values()
+    }
     stated |= {str(getattr(fact, "source", "")) for fact in dpu.target.activations.values()}
     for source in sorted(stated | {*dpu.target.documents.values()}, key=len, reverse=True):
         text = re.sub(rf" \({re.escape(source)}[^()]*\)", "", text) if source else text

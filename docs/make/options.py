@@ -1,7 +1,9 @@
-"""What every option of every command takes, for docs/make/commands.py, and what it is refused with, for tests.
+"""What every option of every command takes, for docs/make/commands.py, and what it is refused with,
+for tests.
 
-Types are read from the commands. The tables below hold what the commands do not say themselves. Tests give
-every command each combination of options that it is said to refuse, and fail for an option that is in no table.
+Types are read from the commands. The tables below hold what the commands do not say themselves.
+Tests give every command each combination of options that it is said to refuse, and fail for an
+option that is in no table.
 """
 
 from dataclasses import dataclass
@@ -38,8 +40,12 @@ PATHS = {
     "profiles": Paths({}, (), ("name",)),
     "characterise": Paths({"out": FILE, "json": FILE}, ("images",)),
     "simulate": Paths({"out": FOLDER}, ("scenes",), ("sensor", "reference", "scene")),
-    "train": Paths({"out": FOLDER}, ("images", "pairs", "lpips", "start", "rounding"), ("sensor", "reference")),
-    "export": Paths({"out": FILE, "board_file": FILE, "delta": FILE}, ("network", "apply"), ("sensor", "target")),
+    "train": Paths(
+        {"out": FOLDER}, ("images", "pairs", "lpips", "start", "rounding"), ("sensor", "reference")
+    ),
+    "export": Paths(
+        {"out": FILE, "board_file": FILE, "delta": FILE}, ("network", "apply"), ("sensor", "target")
+    ),
     "quantize": Paths(
         {"out": FILE, "board_file": FILE, "report": FOLDER, "json": FILE},
         ("model", "images", "samples"),
@@ -54,14 +60,22 @@ PATHS = {
     "golden": Paths({"out": FOLDER, "json": FILE}, ("given", "compare"), ("target",)),
     "bench": Paths({"json": FILE}, ("model", "image", "measured"), ("sensor", "target")),
     "info": Paths({"json": FILE}, ("image", "network"), ("sensor", "target")),
-    "restore": Paths({"out": FILE, "json": FILE, "stac": FILE}, ("image", "network"), ("sensor", "fix_detectors")),
+    "restore": Paths(
+        {"out": FILE, "json": FILE, "stac": FILE}, ("image", "network"), ("sensor", "fix_detectors")
+    ),
     "evaluate": Paths(
-        {"out": FOLDER, "json": FILE}, ("images", "pairs", "lpips"), ("sensor", "reference", "methods")
+        {"out": FOLDER, "json": FILE},
+        ("images", "pairs", "lpips"),
+        ("sensor", "reference", "methods"),
     ),
     "detect": Paths(
-        {"out": FOLDER, "json": FILE}, ("images", "labels", "detector"), ("sensor", "reference", "methods")
+        {"out": FOLDER, "json": FILE},
+        ("images", "labels", "detector"),
+        ("sensor", "reference", "methods"),
     ),
-    "stress": Paths({"out": FILE, "json": FILE}, ("float_model", "int8_model", "images"), ("sensor", "target")),
+    "stress": Paths(
+        {"out": FILE, "json": FILE}, ("float_model", "int8_model", "images"), ("sensor", "target")
+    ),
     "tradeoff": Paths(
         {"out": FOLDER, "json": FILE},
         ("images", "lpips", "calibration", "labelled", "detector"),
@@ -165,7 +179,10 @@ REFUSED = {
         Refused(("workers", "scheduler", "resume"), without="--out"),
     ],
     "train": [
-        Refused(("sensor", "variant", "steps", "seed", "validate_every"), "--recipe convbeers-xs --images aerial/"),
+        Refused(
+            ("sensor", "variant", "steps", "seed", "validate_every"),
+            "--recipe convbeers-xs --images aerial/",
+        ),
         Refused(("images", "drawn", "conditioned"), "--pairs PAIRS"),
         Refused(("validate_every",), without="--images"),
         Refused(("lpips",), "--lpips-weight 0"),
@@ -178,7 +195,10 @@ REFUSED = {
     "quantize": [
         Refused(("tile",), without="--board-file"),
     ],
-    "golden": [Refused(("tile", "target"), "--compare COMPARE"), Refused(("json",), without="--compare")],
+    "golden": [
+        Refused(("tile", "target"), "--compare COMPARE"),
+        Refused(("json",), without="--compare"),
+    ],
     "bench": [
         Refused(
             (
@@ -222,7 +242,8 @@ REFUSED = {
 
 @dataclass(frozen=True)
 class Parameter:
-    """An argument or option of a command: its names in Python and on the command line, its type and range.
+    """An argument or option of a command: its names in Python and on the command line, its type and
+    range.
 
     `shown` is what the command line makes of it: Click's parameter.
     """
@@ -262,8 +283,14 @@ def parameters(command: str) -> list[Parameter]:
         if shown.name in hints:
             hint, info = get_args(hints[shown.name])
             is_option = shown.param_type_name == "option"
-            label = max(shown.opts, key=len) if is_option else (shown.metavar or shown.name.upper()).strip("[]")
-            found.append(Parameter(command, shown.name, label, shown.required, _plain(hint), info, shown))
+            label = (
+                max(shown.opts, key=len)
+                if is_option
+                else (shown.metavar or shown.name.upper()).strip("[]")
+            )
+            found.append(
+                Parameter(command, shown.name, label, shown.required, _plain(hint), info, shown)
+            )
     return found
 
 

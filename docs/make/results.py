@@ -1,12 +1,14 @@
-"""Puts the figures of an evaluation into the pages of docs/results: the tables between their markers.
+"""Puts the figures of an evaluation into the pages of docs/results: the tables between their
+markers.
 
     beers-deploy evaluate --images aerial-test/ --sweep ... --json evaluation.json
     python docs/make/results.py evaluation.json 'without steps'=plain.json
 
-A table lies between `<!-- NAME -->` and `<!-- end -->`, NAME being that of the document's table. The heading of the
-table on the page says which of the document's columns are shown; what the document does not hold stays as it is.
-Tables whose name begins with "mean", such as "mean, radiance x 0.25", and "targets" have a row for each method. A
-document given as WORDS=FILE fills the tables whose name is WORDS, a colon and the document's name of it.
+A table lies between `<!-- NAME -->` and `<!-- end -->`, NAME being that of the document's table.
+The heading of the table on the page says which of the document's columns are shown; what the
+document does not hold stays as it is. Tables whose name begins with "mean", such as "mean, radiance
+x 0.25", and "targets" have a row for each method. A document given as WORDS=FILE fills the tables
+whose name is WORDS, a colon and the document's name of it.
 """
 
 import re
@@ -28,7 +30,9 @@ Row = Mapping[str, Any]
 
 
 def main() -> None:
-    """Fill each table that a document given holds, on whichever page it stands; the last document counts."""
+    """Fill each table that a document given holds, on whichever page it stands; the last document
+    counts.
+    """
     tables: dict[str, list[Row]] = {}
     for argument in sys.argv[1:]:
         words, _, path = argument.rpartition("=")
@@ -61,24 +65,37 @@ def filled(tables: Mapping[str, list[Row]], found: re.Match[str]) -> str:
 
 
 def mean_table(rows: Iterable[Row], wanted: list[str]) -> str:
-    """Return a table with a row for each method and the columns that the page wants, without the paper's rows."""
+    """Return a table with a row for each method and the columns that the page wants, without the
+    paper's rows.
+    """
     ours = [row for row in rows if not row["name"].startswith("paper")]
-    titles = {key: f"{key} {unit(ours, key)}".replace(" ratio", "") for row in ours for key in row["figures"]}
+    titles = {
+        key: f"{key} {unit(ours, key)}".replace(" ratio", "")
+        for row in ours
+        for key in row["figures"]
+    }
     keys = [key for title in wanted for key in titles if titles[key] == title]
     head = ["method", "sensor", *(titles[key] for key in keys)]
     lines = []
     for row in ours:
-        figures = [shown(row["figures"].get(key), digits=DIGITS_OF_BIAS if "bias" in key else None) for key in keys]
+        figures = [
+            shown(row["figures"].get(key), digits=DIGITS_OF_BIAS if "bias" in key else None)
+            for key in keys
+        ]
         lines.append([row["name"], row["text"]["sensor"], *figures])
     return markdown(head, lines)
 
 
 def plain_table(rows: list[Row], wanted: list[str]) -> str:
-    """A row a line, a column for each figure that the page wants; intervals of differences alone."""
+    """A row a line, a column for each figure that the page wants; intervals of
+    differences alone.
+    """
     keys = list(dict.fromkeys(key for row in rows for key in row["figures"] if key in wanted))
     differences = "gain" in rows[0]["table"] or "lost" in rows[0]["table"]
     cells = ([shown(row["figures"].get(key), differences) for key in keys] for row in rows)
-    return markdown(["", *keys], [[row["name"], *line] for row, line in zip(rows, cells, strict=True)])
+    return markdown(
+        ["", *keys], [[row["name"], *line] for row, line in zip(rows, cells, strict=True)]
+    )
 
 
 def unit(rows: Iterable[Row], key: str) -> str:
@@ -91,7 +108,11 @@ def shown(figure: Figure | None, interval: bool = True, digits: int | None = Non
     if figure is None or figure.get("value") is None:
         return str(figure["source"]) if figure and figure.get("unit") == "" else "-"
     if digits is None:
-        digits = 0 if figure["unit"] == "ratio" and figure["value"] > 2 else DIGITS.get(figure["unit"], 2)
+        digits = (
+            0
+            if figure["unit"] == "ratio" and figure["value"] > 2
+            else DIGITS.get(figure["unit"], 2)
+        )
     text = f"{figure['value']:.{digits}f}"
     ends = figure.get("interval")
     return f"{text} [{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]" if ends and interval else text
@@ -101,7 +122,12 @@ def markdown(head: list[str], lines: Iterable[list[str]]) -> str:
     """A table in Markdown."""
     rule = "|".join("---" for _ in head)
     return "".join(
-        f"{line}\n" for line in (f"| {' | '.join(head)} |", f"|{rule}|", *(f"| {' | '.join(x)} |" for x in lines))
+        f"{line}\n"
+        for line in (
+            f"| {' | '.join(head)} |",
+            f"|{rule}|",
+            *(f"| {' | '.join(x)} |" for x in lines),
+        )
     )
 
 

@@ -1,7 +1,8 @@
-"""Write docs/explanation/stability.md: `python docs/make/stability.py` runs the battery on the shipped pair.
+"""Write docs/explanation/stability.md: `python docs/make/stability.py` runs the battery on the
+shipped pair.
 
-It takes two minutes. A test keeps its lists of cases, stages and limitations fresh; its figures are those of the
-machine that made it.
+It takes two minutes. A test keeps its lists of cases, stages and limitations fresh; its figures are
+those of the machine that made it.
 """
 
 from collections.abc import Iterator
@@ -43,21 +44,32 @@ def document(subject: Subject, results: list[StageResult]) -> str:
 
 def finding_lines(subject: Subject, results: list[StageResult]) -> Iterator[str]:
     """The finding in a few sentences, with the figures behind it."""
-    failed, limited = (sum(bool(getattr(r, name)) for r in results) for name in ("failed", "limitations"))
+    failed, limited = (
+        sum(bool(getattr(r, name)) for r in results) for name in ("failed", "limitations")
+    )
     yield f"- {len(results)} looks, {failed} failed, {limited} explained by a known limitation."
     worst = {row.name: row for row in worst_rows(results)}
-    yield "- The same pixels come out, bit for bit, of a second run, on more threads and of every tile plan."
+    yield (
+        "- The same pixels come out, bit for bit, of a second run, on more threads and of "
+        "every tile plan."
+    )
     for network in ("float32", "INT8"):
-        gain, ringing, border = (worst[f"{network}: {check}"] for check in ("gain", "ringing", "border"))
+        gain, ringing, border = (
+            worst[f"{network}: {check}"] for check in ("gain", "ringing", "border")
+        )
         yield (
-            f"- {network}: a change of 1 DN in the image changes a pixel by {gain.figures['worst']} DN at most "
-            f"({gain.text['worst case']}); overshoot is at most {ringing.figures['worst']} % of the contrast around "
-            f"({ringing.text['worst case']}); flat ground is off by at most {border.figures['worst']} DN (measured)."
+            f"- {network}: a change of 1 DN in the image changes a pixel by "
+            f"{gain.figures['worst']} DN at most "
+            f"({gain.text['worst case']}); overshoot is at most {ringing.figures['worst']} % of "
+            "the contrast around "
+            f"({ringing.text['worst case']}); flat ground is off by at most "
+            f"{border.figures['worst']} DN (measured)."
         )
     layers = layer_rows(subject)
     bits = max(row.figures["accumulator"].value or 0 for row in layers)
     yield (
-        f"- No accumulator can overflow: over all images the {len(layers)} integer layers need at most {bits:.1f} of "
+        f"- No accumulator can overflow: over all images the {len(layers)} integer layers need "
+        f"at most {bits:.1f} of "
         "31 bits, by interval arithmetic on the file's own weights (proven)."
     )
 
@@ -73,7 +85,9 @@ def case_lines(results: list[StageResult]) -> Iterator[str]:
     """The cases that came out alike in every stage, a line each."""
     alike: dict[str, list[str]] = {}
     for row in battery_rows(results):
-        alike.setdefault(", ".join(f"{stage}: {word}" for stage, word in row.text.items()), []).append(row.name)
+        alike.setdefault(
+            ", ".join(f"{stage}: {word}" for stage, word in row.text.items()), []
+        ).append(row.name)
     yield from (f"- {words}. {'; '.join(names)}." for words, names in alike.items())
 
 
@@ -81,9 +95,12 @@ def limitation_lines() -> Iterator[str]:
     """Every limitation that is known, met or not."""
     yield "## Known limitations\n"
     for limit in LIMITATIONS:
-        where, checks, cases = (", ".join(names) for names in (limit.stages, limit.checks, limit.cases))
+        where, checks, cases = (
+            ", ".join(names) for names in (limit.stages, limit.checks, limit.cases)
+        )
         yield (
-            f"- **{limit.name}** ({where}; {checks}; {cases or 'all cases'}; fails beyond {limit.ceiling:g}): "
+            f"- **{limit.name}** ({where}; {checks}; {cases or 'all cases'}; fails beyond "
+            f"{limit.ceiling:g}): "
             f"{limit.meaning}"
         )
 

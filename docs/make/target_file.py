@@ -1,7 +1,9 @@
-"""Write docs/reference/target-file.md, every key of a board's file: `python docs/make/target_file.py`.
+"""Write docs/reference/target-file.md, every key of a board's file: `python
+docs/make/target_file.py`.
 
-The keys, and the values among the shipped boards, are read from their files; unit and meaning stand below. A test
-keeps the page fresh, and fails for a key that the tables below lack or that no board has.
+The keys, and the values among the shipped boards, are read from their files; unit and meaning stand
+below. A test keeps the page fresh, and fails for a key that the tables below lack or that no board
+has.
 """
 
 from collections import defaultdict
@@ -14,7 +16,10 @@ from beers_deploy.profiles.target import DOCUMENTS, FUSED, NPU, PLACES, board_na
 
 TARGET = Path(__file__).parents[1] / "reference" / "target-file.md"
 BUILD = "configurations.NAME"
-WINDOW = {"kernel": ("px", "height and width of a kernel"), "stride": ("px", "step along height and width")}
+WINDOW = {
+    "kernel": ("px", "height and width of a kernel"),
+    "stride": ("px", "step along height and width"),
+}
 PADDED = {
     "pad_begin": ("px", "zeros above and to the left"),
     "pad_end": ("px", "zeros below and to the right"),
@@ -25,7 +30,10 @@ SIZES = {
     "feature_map_bytes": ("B", "one group of on-chip banks for maps"),
     "weight_bytes": ("B", "on-chip banks for weights"),
     "weight_banks": ("banks", "banks for weights"),
-    "channels_per_cycle": ("channels", "channels per cycle of pools, depthwise convolutions and adds"),
+    "channels_per_cycle": (
+        "channels",
+        "channels per cycle of pools, depthwise convolutions and adds",
+    ),
     "pixels_per_cycle": ("px", "their pixels per cycle"),
 }
 """Keys that a configuration may also state for itself, with another value than the board's."""
@@ -60,7 +68,11 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
         "window_channels": ("channels", "see `window_max`"),
         "area_max": ("px", "largest kernel height x width"),
     },
-    "depthwise": {**WINDOW, **PADDED, "window_max": ("1", "largest share of a bank that a kernel takes")},
+    "depthwise": {
+        **WINDOW,
+        **PADDED,
+        "window_max": ("1", "largest share of a bank that a kernel takes"),
+    },
     "transposed": {
         "kernel_per_stride": ("1", "kernel / stride, rounded down and up"),
         "output_padding": ("px", "largest output padding"),
@@ -117,7 +129,10 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
         "product_flops_per_cycle": ("1/cycle", "float32 operations of a core in matrix products"),
         "moved_bytes_per_s": ("B/s", "bytes that a core moves"),
         "decoding_mips_per_ghz": ("MIPS/GHz", "7-zip's rating, by which plain code is scaled"),
-        "chain_s_per_mpx": ("s/Mpx", "time of the traditional pipeline for 10^6 pixels on all cores"),
+        "chain_s_per_mpx": (
+            "s/Mpx",
+            "time of the traditional pipeline for 10^6 pixels on all cores",
+        ),
     },
 }
 """Unit and meaning of every key, by its table."""
@@ -144,7 +159,10 @@ def shipped() -> dict[str, dict[str, list[Constant]]]:
     """The constants of every shipped board with a DPU, by table and key."""
     found: dict[str, dict[str, list[Constant]]] = defaultdict(lambda: defaultdict(list))
     for board in map(load_target, board_names()):
-        tables = [*board.tables.items(), *((BUILD, build) for build in board.configurations.values())]
+        tables = [
+            *board.tables.items(),
+            *((BUILD, build) for build in board.configurations.values()),
+        ]
         for table, constants in tables:
             for key, constant in constants.items():
                 found[table][key].append(constant)
@@ -162,8 +180,12 @@ def accepted(limit: target_limits.Limits) -> str:
     return f"{'whole, ' if limit.whole else ''}{low} to {limit.high:g}"
 
 
-def line(key: str, unit: str, meaning: str, limit: target_limits.Limits, constants: list[Constant]) -> str:
-    """A key: what it is, its unit, the values among the shipped boards, and those that it can have."""
+def line(
+    key: str, unit: str, meaning: str, limit: target_limits.Limits, constants: list[Constant]
+) -> str:
+    """A key: what it is, its unit, the values among the shipped boards, and
+    those that it can have.
+    """
     low = min(c.low for c in constants)
     high = max(c.high for c in constants)
     among = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
@@ -177,7 +199,10 @@ def document() -> str:
 
 def _constants() -> Iterator[str]:
     yield "## Constants\n"
-    yield "Parentheses have the values among the shipped boards with the unit, then the numbers that are accepted. A"
+    yield (
+        "Parentheses have the values among the shipped boards with the unit, then the numbers "
+        "that are accepted. A"
+    )
     yield f"configuration may state these keys of other tables for itself: {_names((*SIZES,))}."
     found = shipped()
     for table, keys in KEYS.items():
@@ -185,19 +210,29 @@ def _constants() -> Iterator[str]:
         if table == "cost":
             yield "Fitted, where nothing else is said.\n"
         shown = {key: stated for key, stated in keys.items() if table != BUILD or key not in SIZES}
-        yield from (line(key, *stated, limits(table)[key], found[table][key]) for key, stated in shown.items())
+        yield from (
+            line(key, *stated, limits(table)[key], found[table][key])
+            for key, stated in shown.items()
+        )
 
 
 def _words() -> Iterator[str]:
     yield "\n## Words\n"
-    yield f"`[activations]` has a list for each of {_names(PLACES)}: what is fused behind it, out of {_names(FUSED)}."
+    yield (
+        f"`[activations]` has a list for each of {_names(PLACES)}: what is fused behind it, "
+        f"out of {_names(FUSED)}."
+    )
     yield f"\n`[documents]` names the manuals that findings cite: {_names(DOCUMENTS)}."
     yield "\n## A board with an NPU\n"
     yield (
-        f"A file with `[npu]` has no DPU and predicts nothing. The table lists {_names(NPU)}: the device that AMD's "
-        "compiler is told, and the operators with Y and with N/A in INT8. `[documents]` then has `quantiser` alone, "
-        "`[file]` `opset_max`, `[numbers]` the windows above with `zero_point` and `bias_bits`, the width that a "
-        "shifted bias must fit; `[published_latency_ms]` and `[published_throughput_fps]` name what `bench` quotes."
+        f"A file with `[npu]` has no DPU and predicts nothing. The table lists {_names(NPU)}: "
+        "the device that AMD's "
+        "compiler is told, and the operators with Y and with N/A in INT8. `[documents]` then "
+        "has `quantiser` alone, "
+        "`[file]` `opset_max`, `[numbers]` the windows above with `zero_point` and `bias_bits`, "
+        "the width that a "
+        "shifted bias must fit; `[published_latency_ms]` and `[published_throughput_fps]` name "
+        "what `bench` quotes."
     )
 
 

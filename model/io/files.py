@@ -1,7 +1,8 @@
 """Whole files or none, and never over what a run reads or writes elsewhere.
 
-One rule for every output of every command: it is a regular file or a new name, no input and no other output. Symbolic
-links, pipes and devices are refused: what is renamed over them would stand in their place.
+One rule for every output of every command: it is a regular file or a new name, no input and no
+other output. Symbolic links, pipes and devices are refused: what is renamed over them would stand
+in their place.
 """
 
 import hashlib
@@ -17,12 +18,16 @@ from beers_deploy.profiles.errors import MachineError, OptionError
 TIFF_SUFFIXES = {".tif", ".tiff"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | {".png", ".jpg", ".jpeg"}
 READ_SUFFIXES = IMAGE_SUFFIXES | {".onnx", ".safetensors", ".pth"}
-"""What a command takes from a folder that it reads; an earlier run's figures may lie there and be renewed."""
+"""What a command takes from a folder that it reads; an earlier run's figures may lie there and be
+renewed.
+"""
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; rename it to `path` when the block ends well, else remove it."""
+    """Yield a temporary path beside `path`; rename it to `path` when the block ends well, else
+    remove it.
+    """
     require_regular(path)
     temporary = _part_of(path)
     try:
@@ -42,13 +47,15 @@ def whole_file(path: Path) -> Iterator[Path]:
 def require_writable(
     *paths: Path | None, inputs: Iterable[Path | None] = (), folders: Iterable[Path | None] = ()
 ) -> None:
-    """Find out before long work, not after it, that an output may not or cannot be written; None asks for no output.
+    """Find out before long work, not after it, that an output may not or cannot be written; None
+    asks for no output.
 
     Args:
         paths: files that are to be written.
-        inputs: files that are read, and folders from which files are; what does not exist is passed over. A hard
-            link or a symbolic link to an input is that input.
-        folders: are to be filled with images whose names are not known yet: no image that is read may lie there.
+        inputs: files that are read, and folders from which files are; what does not exist is passed
+            over. A hard link or a symbolic link to an input is that input.
+        folders: are to be filled with images whose names are not known yet: no image that is read
+            may lie there.
     """
     outputs, filled = ([path for path in given if path is not None] for given in (paths, folders))
     _require_apart(outputs, filled, inputs)
@@ -61,11 +68,18 @@ def require_writable(
 
 
 def _require_apart(outputs: list[Path], filled: list[Path], inputs: Iterable[Path | None]) -> None:
-    """Refuse an output that is an input or another output, and a folder to be filled where images are read."""
+    """Refuse an output that is an input or another output, and a folder to be filled where images
+    are read.
+    """
     read = [file for path in inputs if path is not None for file in _files_of(path)]
     known = {_identity(file) for file in read} - {None}
-    homes = {_identity(file.parent) for file in read if file.suffix.lower() in IMAGE_SUFFIXES} - {None}
-    for places, taken, by in ((outputs, known, "an input of this run"), (filled, homes, "the folder of an input")):
+    homes = {_identity(file.parent) for file in read if file.suffix.lower() in IMAGE_SUFFIXES} - {
+        None
+    }
+    for places, taken, by in (
+        (outputs, known, "an input of this run"),
+        (filled, homes, "the folder of an input"),
+    ):
         for path in places:
             if _identity(path) in taken:
                 raise _taken(path, by)
@@ -76,7 +90,9 @@ def _require_apart(outputs: list[Path], filled: list[Path], inputs: Iterable[Pat
 
 
 def require_regular(path: Path) -> None:
-    """Refuse an output at which a folder, a link, a pipe or a device stands; a regular file or nothing may."""
+    """Refuse an output at which a folder, a link, a pipe or a device stands; a regular file or
+    nothing may.
+    """
     if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
         got = "no regular file"
         if path.is_symlink():
@@ -87,7 +103,9 @@ def require_regular(path: Path) -> None:
 
 
 def _probe(path: Path) -> None:
-    """Try to write below the nearest folder that exists: a new one would outlive a command that is refused later."""
+    """Try to write below the nearest folder that exists: a new one would outlive a command that is
+    refused later.
+    """
     path = path.absolute()
     folder = next(parent for parent in path.parents if os.path.lexists(parent))
     try:
@@ -130,7 +148,9 @@ def _unwritable(path: Path, got: str, expected: str = "a place to write to") -> 
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` as UTF-8, whole or not at all, and the same bytes on every system: lines end as they do in it."""
+    """Write `text` as UTF-8, whole or not at all, and the same bytes on every system: lines end as
+    they do in it.
+    """
     with whole_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="")
 

@@ -1,11 +1,15 @@
-"""Recognise files of networks in formats that are not read here, to say in one sentence what to do with them."""
+"""Recognise files of networks in formats that are not read here, to say in one sentence what to do
+with them.
+"""
 
 from typing import NamedTuple
 
 HEAD_BYTES = 4096
 """Of a file, by which its format is recognised."""
 
-FROM_TORCH = "export the network itself with torch.onnx.export, because weights alone lack its layers"
+FROM_TORCH = (
+    "export the network itself with torch.onnx.export, because weights alone lack its layers"
+)
 FROM_TENSORFLOW = "convert it with tf2onnx"
 
 
@@ -24,16 +28,31 @@ class OtherFormat(NamedTuple):
 TORCH = OtherFormat("a file of PyTorch, whose pickles are not opened", FROM_TORCH)
 ARCHIVE = OtherFormat("a ZIP archive", "unpack it first")
 SAFETENSORS = OtherFormat(
-    "safetensors weights", "export it first: beers-deploy export --network FILE.safetensors --out FILE.onnx"
+    "safetensors weights",
+    "export it first: beers-deploy export --network FILE.safetensors --out FILE.onnx",
 )
 
 MAGIC: tuple[tuple[int, bytes, OtherFormat], ...] = (
     (0, b"\x80\x02", TORCH),  # before torch 1.6: a pickle of protocol 2
     (0, b"\x89HDF\r\n", OtherFormat("an HDF5 file, such as Keras writes", FROM_TENSORFLOW)),
     (4, b"TFL3", OtherFormat("a file of TensorFlow Lite", f"{FROM_TENSORFLOW}, by its --tflite")),
-    (4, b"ORTM", OtherFormat("a file in onnxruntime's own format", "give the ONNX file that it was made from")),
-    (0, b"<?xml", OtherFormat("an XML file, such as OpenVINO's", "give the ONNX file that it was made from")),
-    (0, b"\x93NUMPY", OtherFormat("an array of NumPy", "export the network that it belongs to as ONNX")),
+    (
+        4,
+        b"ORTM",
+        OtherFormat(
+            "a file in onnxruntime's own format", "give the ONNX file that it was made from"
+        ),
+    ),
+    (
+        0,
+        b"<?xml",
+        OtherFormat("an XML file, such as OpenVINO's", "give the ONNX file that it was made from"),
+    ),
+    (
+        0,
+        b"\x93NUMPY",
+        OtherFormat("an array of NumPy", "export the network that it belongs to as ONNX"),
+    ),
 )
 """Place of the bytes that a format's files have in common, these bytes, and the format."""
 

@@ -1,4 +1,6 @@
-"""One run at a time on one output: the system holds the lock, so that a killed process blocks nobody."""
+"""One run at a time on one output: the system holds the lock, so that a killed process blocks
+nobody.
+"""
 
 import errno
 import time
@@ -18,7 +20,9 @@ def part_folder(out: Path) -> Path:
 
 NAME = "lock"
 GRACE_S = 0.2
-"""How long to wait for a run that ends just now: it takes the lock's file along, and who waits makes a new one."""
+"""How long to wait for a run that ends just now: it takes the lock's file along, and who waits
+makes a new one.
+"""
 ENOTSUPP = 524
 """Linux's own number beside ENOTSUP, which some network file systems let out."""
 NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, ENOTSUPP)
@@ -26,10 +30,11 @@ NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, ENOTSUP
 
 @contextmanager
 def only_run(out: Path) -> Iterator[None]:
-    """Hold the folder where a run keeps what it needs for `out`; in the end it is gone, unless rows were left in it.
+    """Hold the folder where a run keeps what it needs for `out`; in the end it is gone, unless rows
+    were left in it.
 
-    Folders above it that were made for it are gone then, too, unless something was written there. It locks nothing on
-    a disk that has no locks, as some of networks.
+    Folders above it that were made for it are gone then, too, unless something was written there.
+    It locks nothing on a disk that has no locks, as some of networks.
     """
     folder = part_folder(out)
     new = [parent for parent in folder.parents if not parent.exists()]
@@ -38,7 +43,9 @@ def only_run(out: Path) -> Iterator[None]:
         yield
     finally:
         with suppress(OSError):  # Windows removes no open file: there it goes with the release
-            (folder / NAME).unlink()  # while it is ours: whoever has opened it finds out and begins again
+            (
+                folder / NAME
+            ).unlink()  # while it is ours: whoever has opened it finds out and begins again
         with suppress(OSError):
             lock.release()
         with suppress(OSError):  # rows for --resume lie there
@@ -48,7 +55,8 @@ def only_run(out: Path) -> Iterator[None]:
 
 def _take(out: Path, folder: Path) -> BaseFileLock:
     """The lock, held; where there are no locks it holds nothing."""
-    # A file that only stands for a lock would outlive a killed run: rather none where the system has none.
+    # A file that only stands for a lock would outlive a killed run: rather none where the system
+    # has none.
     if folder.is_symlink():
         got = "a symbolic link"
         remedy = "remove it, or choose another output"
@@ -62,12 +70,16 @@ def _take(out: Path, folder: Path) -> BaseFileLock:
         except Timeout as error:
             got = "another one at work"
             remedy = "wait for its end or choose another output"
-            raise MachineError(str(out), expected="no other run on this output", got=got, remedy=remedy) from error
+            raise MachineError(
+                str(out), expected="no other run on this output", got=got, remedy=remedy
+            ) from error
         except OSError as error:
             if isinstance(error, FileNotFoundError) and time.monotonic() < until_s:
                 continue  # the folder went with a run that ended just now
             if error.errno not in NO_LOCKS:
                 got = error.strerror or str(error)
                 remedy = "choose another path"
-                raise MachineError(str(folder), expected="a folder to write to", got=got, remedy=remedy) from error
+                raise MachineError(
+                    str(folder), expected="a folder to write to", got=got, remedy=remedy
+                ) from error
         return lock

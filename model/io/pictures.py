@@ -25,9 +25,13 @@ class Stretch:
         return np.asarray(np.rint(255 * self._share(dn) ** GAMMA), np.uint8)
 
     def to_srgb(self, dn: np.ndarray) -> np.ndarray:
-        """(H, W) digital numbers to (H, W, 3) float32 in [0, 1], by sRGB's curve, in three equal bands."""
+        """(H, W) digital numbers to (H, W, 3) float32 in [0, 1], by sRGB's curve, in three equal
+        bands.
+        """
         light = self._share(dn)
-        code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
+        code = np.where(
+            light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055
+        )  # IEC 61966-2-1
         return np.repeat(code.astype(np.float32)[..., None], 3, axis=2)
 
     def _share(self, dn: np.ndarray) -> np.ndarray:
@@ -41,7 +45,8 @@ def stretch_of(dn: np.ndarray) -> Stretch:
 
 
 def busiest_windows(dn: np.ndarray, side_px: int) -> list[tuple[int, int]]:
-    """(top, left) of the window with the strongest gradients in the upper and in the lower half of an image.
+    """(top, left) of the window with the strongest gradients in the upper and in the lower half of
+    an image.
 
     Only one where the image is too low for two.
     """
@@ -54,9 +59,13 @@ def busiest_windows(dn: np.ndarray, side_px: int) -> list[tuple[int, int]]:
 
 def _busiest(dn: np.ndarray, side_px: int) -> tuple[int, int]:
     gradient = np.abs(np.diff(dn, axis=0))[:, :-1] + np.abs(np.diff(dn, axis=1))[:-1]
-    rows, columns = (range(0, max(size - side_px, 0) + 1, max(side_px // 2, 1)) for size in dn.shape)
+    rows, columns = (
+        range(0, max(size - side_px, 0) + 1, max(side_px // 2, 1)) for size in dn.shape
+    )
     corners = [(top, left) for top in rows for left in columns]
-    return max(corners, key=lambda c: float(gradient[c[0] : c[0] + side_px, c[1] : c[1] + side_px].mean()))
+    return max(
+        corners, key=lambda c: float(gradient[c[0] : c[0] + side_px, c[1] : c[1] + side_px].mean())
+    )
 
 
 def picture_url(grey: np.ndarray) -> str:
@@ -67,11 +76,19 @@ def picture_url(grey: np.ndarray) -> str:
 
 
 def strip(
-    images: dict[str, np.ndarray], windows: list[tuple[int, int]], side_px: int, zoom: int, stretch: Stretch
+    images: dict[str, np.ndarray],
+    windows: list[tuple[int, int]],
+    side_px: int,
+    zoom: int,
+    stretch: Stretch,
 ) -> Image.Image:
-    """The same crops of several (H, W) images: a column an image under its name, a row a window, no smoothing."""
+    """The same crops of several (H, W) images: a column an image under its name, a row a window, no
+    smoothing.
+    """
     rows = [
-        strip_row((dn[top : top + side_px, left : left + side_px] for dn in images.values()), stretch)
+        strip_row(
+            (dn[top : top + side_px, left : left + side_px] for dn in images.values()), stretch
+        )
         for top, left in windows
     ]
     return grid(list(images), rows, zoom)
@@ -88,7 +105,8 @@ def error_row(errors: Iterable[np.ndarray], white_dn: float) -> list[np.ndarray]
 
 
 def grid(names: list[str], rows: list[list[np.ndarray]], zoom: int) -> Image.Image:
-    """Rows of equally large uint8 cells, each column under its name, every pixel `zoom` pixels wide.
+    """Rows of equally large uint8 cells, each column under its name, every pixel `zoom` pixels
+    wide.
 
     Cells are (h, w), or all of them (h, w, 3).
     """

@@ -1,7 +1,8 @@
-"""Weights as safetensors: named arrays and a JSON header, read and written without torch, and validated as read.
+"""Weights as safetensors: named arrays and a JSON header, read and written without torch, and
+validated as read.
 
-A file of ours states its variant and the recipe that made it; where the network is told its sensor also its kind, and
-the ranges of sensors that it was trained for.
+A file of ours states its variant and the recipe that made it; where the network is told its sensor
+also its kind, and the ranges of sensors that it was trained for.
 """
 
 import json
@@ -22,7 +23,9 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.toml import parse_json, unreadable
 
 BANKED = "behind the bank of its sensor"
-"""The kind, in the header, of weights that need a sensor before they are a network; plain ones state none."""
+"""The kind, in the header, of weights that need a sensor before they are a network; plain ones
+state none.
+"""
 
 TRAINED = "give a file written by 'beers-deploy train'"
 
@@ -35,7 +38,8 @@ Arrays = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Weights:
-    """What a file of weights holds; a conditioned network is told its sensor, and stands behind the bank of it.
+    """What a file of weights holds; a conditioned network is told its sensor, and stands behind the
+    bank of it.
 
     `kernels` says what the kernels of that bank are.
     """
@@ -51,12 +55,16 @@ def write_tensors(path: Path, tensors: Arrays, header: Mapping[str, object]) -> 
     """Write named arrays of any shape and a JSON header as safetensors, whole or not at all."""
     whole = {name: np.asarray(array, order="C") for name, array in tensors.items()}
     with whole_file(path) as temporary:
-        save_file(whole, temporary, metadata={key: json.dumps(value) for key, value in header.items()})
+        save_file(
+            whole, temporary, metadata={key: json.dumps(value) for key, value in header.items()}
+        )
         _sort_metadata(temporary)
 
 
 def _sort_metadata(path: Path) -> None:
-    """Put the keys of a safetensors file's metadata in order: the library writes them in another one each time."""
+    """Put the keys of a safetensors file's metadata in order: the library writes them in another
+    one each time.
+    """
     content = path.read_bytes()
     end = 8 + int.from_bytes(content[:8], "little")
     known = json.loads(content[8:end])
@@ -71,7 +79,8 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
     try:
         with safe_open(path, framework="np") as file:
             header = {key: parse_json(value) for key, value in (file.metadata() or {}).items()}
-            # Copies: the library's own lie in the file, which Windows then does not replace, and others may change.
+            # Copies: the library's own lie in the file, which Windows then does not replace, and
+            # others may change.
             return {key: np.array(file.get_tensor(key)) for key in file.keys()}, header  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
         got = unreadable(path) or " ".join(str(error).split())[:120]
@@ -79,11 +88,15 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
         if other := _other_format(path):
             got = other.name
             remedy = f"{TRAINED}, or an ONNX file of your own network: {other.remedy}"
-        raise ModelError(str(path), expected="safetensors weights", got=got, remedy=remedy) from error
+        raise ModelError(
+            str(path), expected="safetensors weights", got=got, remedy=remedy
+        ) from error
 
 
 def _other_format(path: Path) -> OtherFormat | None:
-    """Return the format of a file whose first bytes are those of another format than safetensors."""
+    """Return the format of a file whose first bytes are those of another format
+    than safetensors.
+    """
     try:
         with path.open("rb") as file:
             found = other_format(file.read(HEAD_BYTES))
@@ -93,7 +106,9 @@ def _other_format(path: Path) -> OtherFormat | None:
 
 
 def write_weights(path: Path, weights: Weights) -> None:
-    """Write a network's weights, its variant and recipe; of one that is told its sensor the ranges it knows, too."""
+    """Write a network's weights, its variant and recipe; of one that is told its sensor the ranges
+    it knows, too.
+    """
     header: dict[str, object] = {"variant": asdict(weights.variant), "recipe": weights.recipe}
     if weights.conditioned:
         header |= {"kind": BANKED, "ranges": dict(RANGES), "kernels": weights.kernels}
@@ -114,7 +129,9 @@ def read_weights(path: Path) -> Weights:
         raise _not_weights(path, "the weights of a ConvBEERS", error) from error
     recipe = header.get("recipe")
     kernels: Kernels = "fitted" if header.get("kernels") == "fitted" else "cut"
-    return Weights(tensors, variant, recipe if isinstance(recipe, dict) else {}, conditioned, kernels)
+    return Weights(
+        tensors, variant, recipe if isinstance(recipe, dict) else {}, conditioned, kernels
+    )
 
 
 def read_plain(path: Path) -> Weights:
@@ -123,7 +140,9 @@ def read_plain(path: Path) -> Weights:
     if found.conditioned:
         remedy = "name the sensor: beers-deploy export --network FILE --sensor NAME"
         got = "one that is conditioned on its sensor"
-        raise ModelError(str(path), expected="the weights of a plain network", got=got, remedy=remedy)
+        raise ModelError(
+            str(path), expected="the weights of a plain network", got=got, remedy=remedy
+        )
     return found
 
 
@@ -131,7 +150,9 @@ def read_conditioned(path: Path) -> Weights:
     """The weights of a network that is told its sensor."""
     found = read_weights(path)
     if not found.conditioned:
-        raise _not_weights(path, "weights that 'train --conditioned' wrote", "a network that is told no sensor")
+        raise _not_weights(
+            path, "weights that 'train --conditioned' wrote", "a network that is told no sensor"
+        )
     return found
 
 
@@ -147,7 +168,9 @@ def all_finite(tensors: Arrays) -> bool:
 
 def _not_weights(path: Path, expected: str, reason: object) -> ModelError:
     got = " ".join(str(reason).split())[:120]
-    return ModelError(str(path), expected=expected, got=got, remedy="give a file written by 'beers-deploy train'")
+    return ModelError(
+        str(path), expected=expected, got=got, remedy="give a file written by 'beers-deploy train'"
+    )
 
 
 def _told(header: Mapping[str, object]) -> bool:
@@ -173,5 +196,7 @@ def _check_like(tensors: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:
     for name, shape in shapes.items():
         if tensors[name].shape != shape:
             raise ValueError(f"{name} of shape {tensors[name].shape}, for {shape}")
-    if not all(tensor.dtype == np.float32 for tensor in tensors.values()) or not all_finite(tensors):
+    if not all(tensor.dtype == np.float32 for tensor in tensors.values()) or not all_finite(
+        tensors
+    ):
         raise ValueError("weights that are not finite float32")

@@ -1,4 +1,5 @@
-"""Open a TIFF of others as plain pages, and refuse one whose pixels would take more memory than they should.
+"""Open a TIFF of others as plain pages, and refuse one whose pixels would take more memory than
+they should.
 
 Formats for microscopes name further files to be opened.
 """
@@ -19,14 +20,32 @@ from beers_deploy.model.io.files import whole_file
 from beers_deploy.profiles.errors import ImageError, MachineError, sizes
 
 LABORATORIES = {
-    "avs", "bif", "eer", "fluoview", "lsm", "mdgel", "mmstack", "ndpi", "ndtiff", "nih", "ome", "philips", "qpi",
-    "scanimage", "scn", "sis", "stk",
-}  # fmt: skip
+    "avs",
+    "bif",
+    "eer",
+    "fluoview",
+    "lsm",
+    "mdgel",
+    "mmstack",
+    "ndpi",
+    "ndtiff",
+    "nih",
+    "ome",
+    "philips",
+    "qpi",
+    "scanimage",
+    "scn",
+    "sis",
+    "stk",
+}
 """Laboratories' own kinds of TIFF are read as plain pages: some name other files to be opened."""
-# Each release of tifffile knows more kinds than the one before, and raises TypeError for one that it does not know.
+# Each release of tifffile knows more kinds than the one before, and raises TypeError for one that
+# it does not know.
 PLAIN: dict[str, Any] = {f"is_{kind}": False for kind in LABORATORIES & tifffile.TIFF.FILE_FLAGS}
 
-logging.getLogger("tifffile").addHandler(logging.NullHandler())  # who asks for its remarks still has them
+logging.getLogger("tifffile").addHandler(
+    logging.NullHandler()
+)  # who asks for its remarks still has them
 
 
 def open_tiff(path: Path) -> tifffile.TiffFile:
@@ -52,25 +71,43 @@ MASK = 4
 """Bits of TIFF's NewSubfileType."""
 MASK_PHOTOMETRIC = 4
 LIGHT = {1, 2, 6}
-"""PhotometricInterpretation of pixels where more is brighter: MinIsBlack, RGB, and JPEG's YCbCr, which is decoded."""
+"""PhotometricInterpretation of pixels where more is brighter: MinIsBlack, RGB, and JPEG's YCbCr,
+which is decoded.
+"""
 GDAL_METADATA = 42112
 OFFSET_DN = 40
 """Of the number that stands for no light: 1 % of 12 bits."""
 
 
-def image_pages(path: Path, file: tifffile.TiffFile) -> tuple[list[tifffile.TiffPage], tifffile.TiffPage | None]:
-    """The pages of the one image of a file, each of which holds bands of it, and the page of its mask, if any."""
-    pages = [page for page in file.pages if isinstance(page, tifffile.TiffPage) and not page.subfiletype & REDUCED]
-    masks = [page for page in pages if page.subfiletype & MASK or page.photometric == MASK_PHOTOMETRIC]
+def image_pages(
+    path: Path, file: tifffile.TiffFile
+) -> tuple[list[tifffile.TiffPage], tifffile.TiffPage | None]:
+    """The pages of the one image of a file, each of which holds bands of it, and the page of its
+    mask, if any.
+    """
+    pages = [
+        page
+        for page in file.pages
+        if isinstance(page, tifffile.TiffPage) and not page.subfiletype & REDUCED
+    ]
+    masks = [
+        page for page in pages if page.subfiletype & MASK or page.photometric == MASK_PHOTOMETRIC
+    ]
     images = [page for page in pages if page not in masks]
     if not images or len(images) != len(file.series[0].pages) or len(masks) > 1:
         got = f"{len(images)} pages and {len(masks)} masks"
-        raise ImageError(str(path), expected="one image", got=got, remedy="save the page that you mean by itself")
+        raise ImageError(
+            str(path), expected="one image", got=got, remedy="save the page that you mean by itself"
+        )
     for page in images:
         if page.photometric not in LIGHT:
             got = getattr(page.photometric, "name", str(page.photometric))
-            remedy = "convert it to MinIsBlack or RGB: 'gdal_translate -expand' does it for palettes"
-            raise ImageError(str(path), expected="pixels where more is brighter", got=got, remedy=remedy)
+            remedy = (
+                "convert it to MinIsBlack or RGB: 'gdal_translate -expand' does it for palettes"
+            )
+            raise ImageError(
+                str(path), expected="pixels where more is brighter", got=got, remedy=remedy
+            )
     _require_no_offset(path, images[0])
     return images, masks[0] if masks else None
 
@@ -78,7 +115,9 @@ def image_pages(path: Path, file: tifffile.TiffFile) -> tuple[list[tifffile.Tiff
 def _require_no_offset(path: Path, page: tifffile.TiffPage) -> None:
     """That 0 stands for no light in every band, by GDAL's metadata."""
     said = str(page.tags[GDAL_METADATA].value) if GDAL_METADATA in page.tags else ""
-    found = [re.findall(rf'<Item [^>]*role="{role}"[^>]*>([^<]*)<', said) for role in ("offset", "scale")]
+    found = [
+        re.findall(rf'<Item [^>]*role="{role}"[^>]*>([^<]*)<', said) for role in ("offset", "scale")
+    ]
     for offset, scale in zip_longest(*found, fillvalue="1"):
         require_small_offset(str(path), number_of(offset, 0), number_of(scale, 1))
 
@@ -94,14 +133,22 @@ def number_of(text: str, otherwise: float) -> float:
 def require_small_offset(path: str, offset: float, scale: float) -> None:
     """Refuse pixels whose 0 is far from no light: value = scale x pixel + offset."""
     if abs(offset) > OFFSET_DN * abs(scale):
-        got = f"{-offset / (scale or 1):g} DN for it, by its offset of {offset:g} and scale of {scale:g}"
-        remedy = "take it off the pixels, or remove the offset with 'gdal_edit.py -offset 0' if it is none of them"
+        got = (
+            f"{-offset / (scale or 1):g} DN for it, by its offset of {offset:g} and scale of "
+            f"{scale:g}"
+        )
+        remedy = (
+            "take it off the pixels, or remove the offset with 'gdal_edit.py -offset 0' if "
+            "it is none of them"
+        )
         raise ImageError(path, expected="pixels whose 0 is no light", got=got, remedy=remedy)
 
 
 KNOWN = {1, 5, 7, 8, 32946, 32773, 50000}
-"""Compressions, by TIFF's numbers: none, LZW, JPEG, deflate (two), PackBits, zstd. The others' decoders take their
-sizes from the packed bytes."""
+"""Compressions, by TIFF's numbers: none, LZW, JPEG, deflate (two), PackBits, zstd.
+
+The others' decoders take their sizes from the packed bytes.
+"""
 
 
 def check_page(path: Path, page: tifffile.TiffPage) -> None:
@@ -109,14 +156,18 @@ def check_page(path: Path, page: tifffile.TiffPage) -> None:
     if page.compression not in KNOWN:
         got = str(tifffile.COMPRESSION(page.compression).name)
         remedy = "write it with deflate, LZW or zstd"
-        raise ImageError(str(path), expected="a TIFF compression known here", got=got, remedy=remedy)
+        raise ImageError(
+            str(path), expected="a TIFF compression known here", got=got, remedy=remedy
+        )
     needed = segment_bytes(page)
     free = psutil.virtual_memory().available
     if needed > free:
         room, size = sizes(free, needed)
         expected = f"strips or tiles that fit in {room}"
         got = f"{size} for one"
-        raise MachineError(str(path), expected=expected, got=got, remedy="rewrite it in smaller tiles")
+        raise MachineError(
+            str(path), expected=expected, got=got, remedy="rewrite it in smaller tiles"
+        )
     _check_whole(path, page)
 
 
@@ -124,7 +175,9 @@ def segment_bytes(page: tifffile.TiffPage) -> int:
     """Bytes of one decoded strip or tile, as the file sizes it."""
     samples = page.samplesperpixel if page.planarconfig == 1 else 1
     place = page.tilelength, page.tilewidth
-    pixels = math.prod(place if page.is_tiled else (min(page.rowsperstrip, page.imagelength), page.imagewidth))
+    pixels = math.prod(
+        place if page.is_tiled else (min(page.rowsperstrip, page.imagelength), page.imagewidth)
+    )
     return pixels * max(page.tiledepth, 1) * samples * max(page.bitspersample // 8, 1)
 
 
@@ -142,4 +195,6 @@ def _check_whole(path: Path, page: tifffile.TiffPage) -> None:
 def write_tiff(path: Path, dn: np.ndarray) -> None:
     """Write (H, W) uint16 as a tiled, losslessly compressed TIFF, whole or not at all."""
     with whole_file(path) as temporary:
-        tifffile.imwrite(temporary, dn, tile=(256, 256), compression="zlib", software="beers-deploy")
+        tifffile.imwrite(
+            temporary, dn, tile=(256, 256), compression="zlib", software="beers-deploy"
+        )

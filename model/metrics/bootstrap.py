@@ -9,13 +9,16 @@ LEVEL = 0.95
 WORDS = "95 % bootstrap interval over sites"
 
 LEAST_SITES = 5
-"""Of fewer sites no interval is shown: drawn with replacement, they vary far less than others of their kind would."""
+"""Of fewer sites no interval is shown: drawn with replacement, they vary far less than others of
+their kind would.
+"""
 
 
 def site_interval(
     values: Sequence[float], sites: Sequence[str], generator: np.random.Generator
 ) -> tuple[tuple[float, float] | None, str]:
-    """Percentile interval (95 %) of the mean of `values`, whole sites drawn with replacement: the one rule of all.
+    """Percentile interval (95 %) of the mean of `values`, whole sites drawn with replacement: the
+    one rule of all.
 
     Images of one site resemble one another: drawn one by one, they would promise too much.
 
@@ -29,7 +32,10 @@ def site_interval(
     """
     count = len(set(sites))
     if count < LEAST_SITES:
-        return None, f"no interval: {count} site{'s' if count > 1 else ''}, fewer than {LEAST_SITES}"
+        return (
+            None,
+            f"no interval: {count} site{'s' if count > 1 else ''}, fewer than {LEAST_SITES}",
+        )
     numbers = np.asarray(values, np.float64)
     names = np.asarray(sites)
     groups = [numbers[names == name] for name in np.unique(names)]
@@ -50,4 +56,7 @@ def too_few(sites: int) -> str:
     """A sentence on why no interval over so many sites is shown; empty where one is."""
     if sites >= LEAST_SITES:
         return ""
-    return f"No interval over sites is shown: of {sites}, fewer than {LEAST_SITES}, none could be trusted."
+    return (
+        f"No interval over sites is shown: of {sites}, fewer than {LEAST_SITES}, none could "
+        "be trusted."
+    )

@@ -1,11 +1,13 @@
-"""Find faults of single detectors in the pixels of one band: lines of another gain, dead lines, wrong single pixels.
+"""Find faults of single detectors in the pixels of one band: lines of another gain, dead lines,
+wrong single pixels.
 
-A detector gives its fault to one column (pushbroom), one row or one pixel, and leaves its neighbours alone. A scene
-cannot do that: the optics spread a line or a point over several pixels. Every test here compares a line or a pixel
-with its neighbours, asks for the share that blurred light would have given them (`SHARED`), and weighs the difference
-with the noise and texture around.
+A detector gives its fault to one column (pushbroom), one row or one pixel, and leaves its
+neighbours alone. A scene cannot do that: the optics spread a line or a point over several pixels.
+Every test here compares a line or a pixel with its neighbours, asks for the share that blurred
+light would have given them (`SHARED`), and weighs the difference with the noise and texture around.
 
-A line is measured in several blocks along it. Detectors repeat themselves in all blocks, and scenes do not.
+A line is measured in several blocks along it. Detectors repeat themselves in all blocks, and scenes
+do not.
 """
 
 from collections.abc import Sequence
@@ -22,7 +24,9 @@ FEW = 8
 LEVEL_LINES = 9
 """Lines over whose median a line's level is taken, so that its own fault does not matter."""
 PARITY_LINES = 63
-"""Lines over which alternate lines are averaged; their pattern is `Phases`, and no gain of single lines."""
+"""Lines over which alternate lines are averaged; their pattern is `Phases`, and no gain of single
+lines.
+"""
 SIGNIFICANT = 6.0
 """Standard errors. Noise of 40 000 lines reaches it once in 10 000 images."""
 CLEAR = 12.0
@@ -30,17 +34,24 @@ CLEAR = 12.0
 SURE = 1.0
 """Standard errors by which a part of a line is alone."""
 REACH = 3
-"""Lines to either side of which a single line is the largest, and what is not judged along a border."""
+"""Lines to either side of which a single line is the largest, and what is not judged along a
+border.
+"""
 ASKEW = 0.3
-"""Of a line's deviation, by how much the lines around may depart from what a single one leaves there."""
+"""Of a line's deviation, by how much the lines around may depart from what a single one leaves
+there.
+"""
 PART = 0.02
 """Least gain of a part of a line."""
 AGREE = 0.75
 """Share of the blocks in which a line must be off to the same side."""
 ISOLATED = 0.75
 LEAST_ISOLATED = 0.55
-"""Least isolation of a line that is measured well, and of any: 1 for a detector. Of a thin bright line it is 0.70,
-0.46, 0.27 and 0.02 where the MTF at Nyquist is 30, 20, 15 and 10 % (a Gaussian centred on a pixel)."""
+"""Least isolation of a line that is measured well, and of any: 1 for a detector.
+
+Of a thin bright line it is 0.70, 0.46, 0.27 and 0.02 where the MTF at Nyquist is 30, 20, 15 and 10
+% (a Gaussian centred on a pixel).
+"""
 SPREAD_SIGNIFICANT = 4.0
 """Standard errors of the covariance from which the spread of all lines is significant."""
 LEVELS = 1.3
@@ -48,24 +59,30 @@ LEVELS = 1.3
 LINES = 16
 """Lines from which their spread can be told."""
 WHITE = -0.35
-"""Correlation of neighbouring second differences: -2/3 for independent detectors; it was above -0.1 for scenes."""
+"""Correlation of neighbouring second differences: -2/3 for independent detectors; it was above -0.1
+for scenes.
+"""
 MAD = 1.4826
 """Standard deviation of Gaussian numbers over their median absolute deviation."""
 MAD_ERROR = 2.33
-"""Relative standard error of a variance by the median absolute deviation of N numbers, times sqrt(N)."""
+"""Relative standard error of a variance by the median absolute deviation of N numbers, times
+sqrt(N).
+"""
 SECOND = 1.5
 """Variance of second differences x - (left + right) / 2 of independent numbers of variance 1."""
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """Lines measured in blocks along them; every array is (blocks, lines), NaN where nothing could be measured.
+    """Lines measured in blocks along them; every array is (blocks, lines), NaN where nothing could
+    be measured.
 
     Attributes:
         second: each line less the mean of its two neighbours, in pixel values.
         error: its standard error by the scatter within the block.
         level: pixel value around the line.
-        constant: True where all pixels of a line in the block have one value, and those around it do not.
+        constant: True where all pixels of a line in the block have one value, and those around it
+            do not.
     """
 
     second: np.ndarray
@@ -99,7 +116,8 @@ class Stripes:
     """What the lines of one direction show.
 
     Attributes:
-        spread: standard deviation of the lines' gains without noise, over the level; None if it cannot be seen.
+        spread: standard deviation of the lines' gains without noise, over the level; None if it
+            cannot be seen.
         spread_error: its standard error.
         seen: whether the spread is significant, and of independent lines.
         off: single lines that are off, the largest deviation first.
@@ -134,7 +152,9 @@ def measure_lines(pixels: np.ndarray, valid: np.ndarray) -> Blocks:
         return Blocks(nothing, nothing, nothing, constant[None])
     second = pixels[:, 1:-1] - (pixels[:, :-2] + pixels[:, 2:]) / 2
     known = valid[:, 1:-1] & valid[:, :-2] & valid[:, 2:]
-    located, error = (np.pad(each, 1, constant_values=np.nan)[None] for each in _location(second, known))
+    located, error = (
+        np.pad(each, 1, constant_values=np.nan)[None] for each in _location(second, known)
+    )
     count = valid.sum(0)
     with np.errstate(invalid="ignore", divide="ignore"):
         level = np.where(4 * count >= rows, pixels.sum(0, dtype=np.float64, where=valid) / count, 0)
@@ -143,9 +163,11 @@ def measure_lines(pixels: np.ndarray, valid: np.ndarray) -> Blocks:
 
 
 def _location(values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the robust location of the columns of (h, w) values by Huber's estimator, and its standard error.
+    """Return the robust location of the columns of (h, w) values by Huber's estimator, and its
+    standard error.
 
-    A median would be one of the few values that integers leave; a mean follows the edges of the scene.
+    A median would be one of the few values that integers leave; a mean follows the edges of the
+    scene.
     """
     count = known.sum(0, dtype=np.float32)
     values = values if known.all() else np.where(known, values, 0)
@@ -154,7 +176,9 @@ def _location(values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.nda
         centre = np.zeros(values.shape[1], np.float32)
         for _ in range(ROUNDS):
             rest = values - centre
-            inside = np.maximum((known & (np.abs(rest) <= reach)).sum(0, dtype=np.float32), count / 3)
+            inside = np.maximum(
+                (known & (np.abs(rest) <= reach)).sum(0, dtype=np.float32), count / 3
+            )
             clipped = np.clip(rest, -reach, reach) * known
             centre = centre + clipped.sum(0) / inside
             reach = 2 * np.abs(clipped).sum(0) / count
@@ -164,7 +188,8 @@ def _location(values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def constant_columns(pixels: np.ndarray) -> np.ndarray:
-    """Return which columns of (h, w) pixels have one value, alone or in pairs, between columns that vary.
+    """Return which columns of (h, w) pixels have one value, alone or in pairs, between columns that
+    vary.
 
     NaN is a missing pixel, which says nothing.
     """
@@ -232,12 +257,16 @@ def _without_parity(gains: np.ndarray) -> np.ndarray:
     sign = 1 - 2.0 * (np.arange(gains.shape[1]) % 2)
     size = min(PARITY_LINES, gains.shape[1])
     bound = 3 * np.nanmedian(np.abs(gains), axis=1, keepdims=True)
-    shared = uniform_filter1d(np.clip(np.nan_to_num(gains) * sign, -bound, bound), size, axis=1, mode="nearest")
+    shared = uniform_filter1d(
+        np.clip(np.nan_to_num(gains) * sign, -bound, bound), size, axis=1, mode="nearest"
+    )
     return np.asarray(gains - shared * sign)
 
 
 def _combined(gains: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean over blocks and its standard error, widened where the blocks contradict each other."""
+    """Return the mean over blocks and its standard error, widened where the blocks contradict each
+    other.
+    """
     weights = np.where(np.isfinite(gains), 1 / np.square(errors), 0)
     total = weights.sum(0)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -248,10 +277,12 @@ def _combined(gains: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _spread(gains: np.ndarray, errors: np.ndarray) -> tuple[float | None, float, bool]:
-    """Return the standard deviation of independent lines' gains, its error, and whether it is significant.
+    """Return the standard deviation of independent lines' gains, its error, and whether it is
+    significant.
 
-    Two halves of the blocks share the detectors, but neither noise nor scene. Their covariance is robust: a quarter
-    of the difference between the variances of sum and difference, by median absolute deviations.
+    Two halves of the blocks share the detectors, but neither noise nor scene. Their covariance is
+    robust: a quarter of the difference between the variances of sum and difference, by median
+    absolute deviations.
     """
     if len(gains) < 2:
         return None, 0.0, False
@@ -274,25 +305,38 @@ def _spread(gains: np.ndarray, errors: np.ndarray) -> tuple[float | None, float,
 
 def _covariance(first: np.ndarray, other: np.ndarray) -> tuple[float, float]:
     """Return a robust covariance (Gnanadesikan and Kettenring 1972) and its standard error."""
-    together, apart = (np.square(MAD * np.median(np.abs(each))) for each in (first + other, first - other))
+    together, apart = (
+        np.square(MAD * np.median(np.abs(each))) for each in (first + other, first - other)
+    )
     # Second differences of neighbouring lines are no independent numbers: half as many count.
     error = MAD_ERROR * np.hypot(together, apart) / 4 / np.sqrt(max(len(first) / 2, 1))
     return float(together - apart) / 4, float(error)
 
 
-def _single(mean: np.ndarray, error: np.ndarray, gains: np.ndarray, errors: np.ndarray, least: float) -> list[Line]:
+def _single(
+    mean: np.ndarray, error: np.ndarray, gains: np.ndarray, errors: np.ndarray, least: float
+) -> list[Line]:
     """Return the lines that are off alone, the largest deviation first."""
     with np.errstate(invalid="ignore"):
         known = np.isfinite(gains).sum(0)
         like = np.abs(gains - mean) < np.maximum(3 * errors, np.abs(mean) / 2)
         agree = (like & (np.sign(gains) == np.sign(mean))).sum(0) >= AGREE * np.maximum(known, 2)
-        off = (np.abs(mean) > np.maximum(least, SIGNIFICANT * error)) & agree & _alone(mean, error, -1.0)
+        off = (
+            (np.abs(mean) > np.maximum(least, SIGNIFICANT * error))
+            & agree
+            & _alone(mean, error, -1.0)
+        )
     farthest = np.argmax(np.abs(np.nan_to_num(gains)), axis=0)
     largest = np.where(off, mean, np.take_along_axis(gains, farthest[None], axis=0)[0])
     taken = set[int]()
     lines = []
-    for index in sorted(np.flatnonzero(off | _partly(gains, errors)), key=lambda index: -abs(largest[index])):
-        if not taken & {index - 1, index + 1}:  # neighbours are off by half of it, to the other side
+    for index in sorted(
+        np.flatnonzero(off | _partly(gains, errors)), key=lambda index: -abs(largest[index])
+    ):
+        if not taken & {
+            index - 1,
+            index + 1,
+        }:  # neighbours are off by half of it, to the other side
             taken.add(int(index))
             lines.append(Line(int(index), float(largest[index]), float(error[index])))
     return lines
@@ -305,21 +349,28 @@ def _partly(gains: np.ndarray, errors: np.ndarray) -> np.ndarray:
     """
     with np.errstate(invalid="ignore"):
         clear = np.abs(gains) > np.maximum(CLEAR * errors, PART)
-    sure = clear & np.array([_alone(each, its, SURE) for each, its in zip(gains, errors, strict=True)])
+    sure = clear & np.array(
+        [_alone(each, its, SURE) for each, its in zip(gains, errors, strict=True)]
+    )
     return np.asarray((sure.sum(0) >= 2) & (4 * sure.sum(0) >= 3 * clear.sum(0)))
 
 
 def _alone(second: np.ndarray, error: np.ndarray, sure: float) -> np.ndarray:
-    """Return which lines are alone with their deviation, by so many standard errors more than `ISOLATED`.
+    """Return which lines are alone with their deviation, by so many standard errors more than
+    `ISOLATED`.
 
-    The second differences around a single line of gain g are (0, -g/2, g, -g/2, 0), and those of a blurred bright
-    line fall off over five lines: with r and q, the sums over the next lines and the ones after them over -g, the
-    isolation r - q is 1 for a detector.
+    The second differences around a single line of gain g are (0, -g/2, g, -g/2, 0), and those of a
+    blurred bright line fall off over five lines: with r and q, the sums over the next lines and the
+    ones after them over -g, the isolation r - q is 1 for a detector.
     """
     padded = np.pad(second, REACH, constant_values=np.nan)
     count = len(second)
-    around = [padded[REACH + step : REACH + step + count] for step in range(-REACH, REACH + 1) if step]
-    expected = np.array([-1 / 2 if abs(step) == 1 else 0.0 for step in range(-REACH, REACH + 1) if step])
+    around = [
+        padded[REACH + step : REACH + step + count] for step in range(-REACH, REACH + 1) if step
+    ]
+    expected = np.array(
+        [-1 / 2 if abs(step) == 1 else 0.0 for step in range(-REACH, REACH + 1) if step]
+    )
     beside = np.array(around)
     near = beside[2] + beside[3]
     far = beside[1] + beside[4]
@@ -334,13 +385,15 @@ def _alone(second: np.ndarray, error: np.ndarray, sure: float) -> np.ndarray:
 
 
 def _grows(gains: np.ndarray, errors: np.ndarray, level: np.ndarray) -> bool | None:
-    """Say whether the pattern of lines grows with the level; None where blocks of other levels do not tell.
+    """Say whether the pattern of lines grows with the level; None where blocks of other levels do
+    not tell.
 
-    The pattern of the other blocks is fitted to each block. Over the level, gains fit all blocks alike, and offsets
-    fall as 1 / level: the slope of the logarithms is 0 or -1.
+    The pattern of the other blocks is fitted to each block. Over the level, gains fit all blocks
+    alike, and offsets fall as 1 / level: the slope of the logarithms is 0 or -1.
     """
     fits, unsure = (
-        np.array(each) for each in zip(*map(partial(_fit, gains, errors), range(len(gains))), strict=True)
+        np.array(each)
+        for each in zip(*map(partial(_fit, gains, errors), range(len(gains))), strict=True)
     )
     levels = np.nanmean(level, axis=1)
     use = (fits > 0) & np.isfinite(unsure)
@@ -358,11 +411,15 @@ def _grows(gains: np.ndarray, errors: np.ndarray, level: np.ndarray) -> bool | N
 
 
 def _fit(gains: np.ndarray, errors: np.ndarray, number: int) -> tuple[float, float]:
-    """Return by what factor the pattern of the other blocks fits one block, and the standard error of that."""
+    """Return by what factor the pattern of the other blocks fits one block, and the standard error
+    of that.
+    """
     others, _ = _combined(np.delete(gains, number, 0), np.delete(errors, number, 0))
     pattern = np.nan_to_num(others)
     power = float(np.square(pattern).sum())
     if power == 0:
         return 0.0, np.inf
     noise = float(np.sqrt(np.square(pattern * np.nan_to_num(errors[number])).sum()))
-    return float((pattern * np.nan_to_num(gains[number])).sum()) / power, noise / power if noise else np.inf
+    return float(
+        (pattern * np.nan_to_num(gains[number])).sum()
+    ) / power, noise / power if noise else np.inf

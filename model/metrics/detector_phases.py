@@ -1,8 +1,8 @@
 """Find a fixed pattern of 2 x 2 pixels: alternate rows, alternate columns, or a checkerboard.
 
-Two or four read-out channels, or pixels that share their electronics, differ in gain or offset. The pattern has the
-period of two pixels, where optics leave little contrast and no scene keeps its phase. It may change slowly over the
-image, and even its sign: so it is measured in sections.
+Two or four read-out channels, or pixels that share their electronics, differ in gain or offset. The
+pattern has the period of two pixels, where optics leave little contrast and no scene keeps its
+phase. It may change slowly over the image, and even its sign: so it is measured in sections.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,8 @@ class Pattern:
 
     Attributes:
         name: one of `PATTERNS`.
-        difference: between its two kinds of pixels over the level, root mean square of the sections without noise.
+        difference: between its two kinds of pixels over the level, root mean square of the sections
+            without noise.
         largest: of the sections, the largest significant one.
         seen: whether enough sections show it significantly.
     """
@@ -53,7 +54,8 @@ def measure_phases(pixels: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, n
         valid: where they are measurements.
 
     Returns:
-        The differences over the level, (3,), in the order of `PATTERNS`, and their standard errors; NaN where the
+        The differences over the level, (3,), in the order of `PATTERNS`, and their standard errors;
+            NaN where the
         section is too small or dark.
     """
     nothing = np.full(3, np.nan), np.full(3, np.nan)
@@ -82,7 +84,9 @@ def measure_phases(pixels: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, n
     return 2 * sums / inside / level, np.full(3, 2 * error / level)
 
 
-def judge_phases(measured: Sequence[tuple[np.ndarray, np.ndarray]], least: float) -> tuple[Pattern, ...]:
+def judge_phases(
+    measured: Sequence[tuple[np.ndarray, np.ndarray]], least: float
+) -> tuple[Pattern, ...]:
     """Say what the sections of an image show of each pattern.
 
     Args:

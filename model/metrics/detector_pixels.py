@@ -1,8 +1,9 @@
 """Find single pixels that no blurred image can have: dead ones, hot ones, hits of particles.
 
-The optics spread a point over its neighbours. Where the MTF at Nyquist is 30 % (a Gaussian), the four pixels beside
-the brightest one of a point source hold 0.22 of its excess in the mean, wherever it lies in that pixel; where it is
-lower, they hold more. A faulty pixel leaves its neighbours alone.
+The optics spread a point over its neighbours. Where the MTF at Nyquist is 30 % (a Gaussian), the
+four pixels beside the brightest one of a point source hold 0.22 of its excess in the mean, wherever
+it lies in that pixel; where it is lower, they hold more. A faulty pixel leaves its neighbours
+alone.
 """
 
 import numpy as np
@@ -13,20 +14,27 @@ LEAST = 9.0
 """Standard deviations of the texture and noise around by which a wrong pixel is off at least."""
 ISOLATED = 0.75
 SURE = 1.5
-"""Least isolation of a wrong pixel, so many standard errors taken off: 1 for a detector. Of a point of light it is
-0.70, 0.46, 0.27 and 0.02 where the MTF at Nyquist is 30, 20, 15 and 10 % (a Gaussian centred on a pixel)."""
+"""Least isolation of a wrong pixel, so many standard errors taken off: 1 for a detector.
+
+Of a point of light it is 0.70, 0.46, 0.27 and 0.02 where the MTF at Nyquist is 30, 20, 15 and 10 %
+(a Gaussian centred on a pixel).
+"""
 DEAD = 0.3
 BRIGHT = 0.6
 DARK = 10.0
-"""A pixel below the first share of its ground, whose neighbours are all above the second: no shadow is that narrow.
-Ground below so many standard deviations is too dark to tell."""
+"""A pixel below the first share of its ground, whose neighbours are all above the second: no shadow
+is that narrow. Ground below so many standard deviations is too dark to tell.
+"""
 CANDIDATE = 2.0
-"""Multiple of the mean step between neighbours by which a candidate lies outside of all its neighbours."""
+"""Multiple of the mean step between neighbours by which a candidate lies outside of all its
+neighbours.
+"""
 CUT = 0.3
 CUT_NOISE = 0.03
 CUT_STEPS = 3.0
-"""Share of equal pixels from which the ground is taken to be cut off, and the noise, over the ground and in steps,
-that is then assumed."""
+"""Share of equal pixels from which the ground is taken to be cut off, and the noise, over the
+ground and in steps, that is then assumed.
+"""
 QUIET = 0.001
 """Noise over the ground that is assumed at least."""
 KNOWN = 60
@@ -55,7 +63,9 @@ def wrong_pixels(pixels: np.ndarray, step: float = 0.0) -> np.ndarray:
 
 
 def _candidates(pixels: np.ndarray) -> np.ndarray:
-    """Return the places (n, 2) of pixels that lie clearly above, or below, all of their eight neighbours."""
+    """Return the places (n, 2) of pixels that lie clearly above, or below, all of their eight
+    neighbours.
+    """
     height, width = pixels.shape
     inner = pixels[PATCH_PX : height - PATCH_PX, PATCH_PX : width - PATCH_PX]
     above = below = None
@@ -73,9 +83,9 @@ def _candidates(pixels: np.ndarray) -> np.ndarray:
 def _wrong(patches: np.ndarray, step: float) -> np.ndarray:
     """Return which patches (n, 9, 9) have a centre that is no light; NaN is unknown.
 
-    The second difference along both axes, x - (its 4 sides) / 2 + (its 4 diagonals) / 4, removes planes and edges. A
-    single pixel of excess e leaves e there, -e/2 beside it and 0 two pixels on; a point of light leaves less beside
-    it and more two pixels on.
+    The second difference along both axes, x - (its 4 sides) / 2 + (its 4 diagonals) / 4, removes
+    planes and edges. A single pixel of excess e leaves e there, -e/2 beside it and 0 two pixels on;
+    a point of light leaves less beside it and more two pixels on.
     """
     along = patches[:, 1:-1] - (patches[:, :-2] + patches[:, 2:]) / 2
     both = along[:, :, 1:-1] - (along[:, :, :-2] + along[:, :, 2:]) / 2
@@ -86,17 +96,25 @@ def _wrong(patches: np.ndarray, step: float) -> np.ndarray:
     ring[2:5, 2:5] = False
     scatter = np.sqrt(np.nanmean(np.square(both[:, ring]), axis=1))
     ground = np.nanmedian(patches[:, 2:7, 2:7].reshape(len(patches), 25), axis=1)
-    # Rounding hides the noise of a quiet image, and an end of the range cuts it off: neither may pass for no noise.
+    # Rounding hides the noise of a quiet image, and an end of the range cuts it off: neither may
+    # pass for no noise.
     cut = (patches == ground[:, None, None]).mean((1, 2)) > CUT
-    floor = np.where(cut, CUT_NOISE * np.abs(ground) + CUT_STEPS * step, np.maximum(step, QUIET * np.abs(ground)))
+    floor = np.where(
+        cut, CUT_NOISE * np.abs(ground) + CUT_STEPS * step, np.maximum(step, QUIET * np.abs(ground))
+    )
     scatter = np.maximum(scatter, floor)
     middle = patches[:, 3:6, 3:6].reshape(len(patches), 9)
     around = np.delete(middle, 4, axis=1)
-    # A star that full scale cuts off is lower than its sides promise, and still above them: that is no fault.
+    # A star that full scale cuts off is lower than its sides promise, and still above them: that is
+    # no fault.
     outward = np.where(middle[:, 4] > np.nanmax(around, axis=1), centre, -centre)
     with np.errstate(invalid="ignore", divide="ignore"):
         isolation = 2 * (far - near) / centre
         unsure = 1.5 * scatter / np.abs(centre)
         alone = (outward > LEAST * scatter) & (isolation - SURE * unsure > ISOLATED)
-    dead = (middle[:, 4] < DEAD * ground) & (around.min(1) > BRIGHT * ground) & (ground > DARK * scatter)
+    dead = (
+        (middle[:, 4] < DEAD * ground)
+        & (around.min(1) > BRIGHT * ground)
+        & (ground > DARK * scatter)
+    )
     return np.asarray(np.isfinite(isolation) & (alone | dead))

@@ -1,12 +1,14 @@
-"""The blur of an instrument from short straight edges, fitted by the curve that a sensor profile states.
+"""The blur of an instrument from short straight edges, fitted by the curve that a sensor profile
+states.
 
-`slanted_edge` measures a whole MTF curve across one long edge. Here a profile's own curve is fitted instead,
-MTF(f) = exp(-gamma f) sinc(f) (`simulator.mtf`): one number an edge, for which 17 x 17 pixels are enough. All edges
-together tell how much steeper the curve falls, by a Gaussian part exp(-shape f^2).
+`slanted_edge` measures a whole MTF curve across one long edge. Here a profile's own curve is fitted
+instead, MTF(f) = exp(-gamma f) sinc(f) (`simulator.mtf`): one number an edge, for which 17 x 17
+pixels are enough. All edges together tell how much steeper the curve falls, by a Gaussian part
+exp(-shape f^2).
 
-What has been sharpened, or was never a step, does not fit and is told apart by that: of 21 000 steep places that six
-sensors saw in ten aerial photographs not one passed. A hedge or a shore is softer than any step, and would be taken
-for blur.
+What has been sharpened, or was never a step, does not fit and is told apart by that: of 21 000
+steep places that six sensors saw in ten aerial photographs not one passed. A hedge or a shore is
+softer than any step, and would be taken for blur.
 """
 
 import math
@@ -15,11 +17,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beers_deploy.model.metrics.edge_fit import ANY, FOUND, HALF_PX, EdgeBlur, Fit, Noise, fit_blurs, fit_shape
+from beers_deploy.model.metrics.edge_fit import (
+    ANY,
+    FOUND,
+    HALF_PX,
+    EdgeBlur,
+    Fit,
+    Noise,
+    fit_blurs,
+    fit_shape,
+)
 from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX
 
 SHAPES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0, 13.0)
-"""Of the Gaussian part: 0 is the profile's curve. Smear, jitter and diffraction fall more steeply than it."""
+"""Of the Gaussian part: 0 is the profile's curve.
+
+Smear, jitter and diffraction fall more steeply than it.
+"""
 
 MIN_STEEPNESS = 6
 """Of a gradient over its noise."""
@@ -35,7 +49,8 @@ class Effort:
 
     Attributes:
         step_px: only every so many rows are searched; edges are longer than that.
-        cell_px: rows, in multiples of `step_px`, and columns of the cells of which only the steepest place is tried.
+        cell_px: rows, in multiples of `step_px`, and columns of the cells of which only the
+            steepest place is tried.
         candidates: steepest places of which squares are compared with plain edges.
         fits: squares that are fitted, the steepest first.
     """
@@ -47,11 +62,16 @@ class Effort:
 
 
 THOROUGH = Effort(step_px=1, cell_px=(4, 2), candidates=6000, fits=400)
-"""With cells twice as large fewer edges are found: of 80 wrong MTFs of drawn towns 41 are seen, not 47 (measured)."""
+"""With cells twice as large fewer edges are found: of 80 wrong MTFs of drawn towns 41 are seen, not
+47 (measured).
+"""
 
 
-def find_blurs(image: np.ndarray, noise: Noise, clipped_at: float, effort: Effort = THOROUGH) -> list[EdgeBlur]:
-    """The blurs across the near-vertical edges of an image (H, W); transpose it for the near-horizontal ones.
+def find_blurs(
+    image: np.ndarray, noise: Noise, clipped_at: float, effort: Effort = THOROUGH
+) -> list[EdgeBlur]:
+    """The blurs across the near-vertical edges of an image (H, W); transpose it for the
+    near-horizontal ones.
 
     Args:
         image: finite values.
@@ -68,9 +88,14 @@ def blurs_of(squares: np.ndarray, noise: Noise) -> list[EdgeBlur]:
 
 
 def plain_squares(
-    image: np.ndarray, noise: Noise, clipped_at: float, effort: Effort, roughness: float = MAX_ROUGHNESS
+    image: np.ndarray,
+    noise: Noise,
+    clipped_at: float,
+    effort: Effort,
+    roughness: float = MAX_ROUGHNESS,
 ) -> np.ndarray:
-    """The squares (N, S, S), S = 2 * HALF_PX + 1, of an image that may hold an edge; see `find_blurs`.
+    """The squares (N, S, S), S = 2 * HALF_PX + 1, of an image that may hold an edge; see
+    `find_blurs`.
 
     Their outer columns scatter by `roughness` of the step at most, beyond noise.
     """
@@ -98,7 +123,9 @@ def _squares(image: np.ndarray, noise: Noise, effort: Effort) -> np.ndarray:
 
 
 def _steepest(steep: np.ndarray, effort: Effort) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows and columns of the steepest place of each cell that is steep, the steepest of all first."""
+    """Return rows and columns of the steepest place of each cell that is steep, the steepest of all
+    first.
+    """
     height, width = steep.shape
     down = effort.cell_px[0] // effort.step_px
     across = effort.cell_px[1]
@@ -118,7 +145,8 @@ def _steepest(steep: np.ndarray, effort: Effort) -> tuple[np.ndarray, np.ndarray
 def _steepness(image: np.ndarray, noise: Noise, step_px: int) -> np.ndarray:
     """Rise along the rows over its noise, of every `step_px`-th row that has room for a square.
 
-    It is the difference over 4 columns of the mean of 5 rows, and 0 where the rise down the columns is larger.
+    It is the difference over 4 columns of the mean of 5 rows, and 0 where the rise down the columns
+    is larger.
     """
     height, width = image.shape
 
@@ -133,7 +161,9 @@ def _steepness(image: np.ndarray, noise: Noise, step_px: int) -> np.ndarray:
     step_down = row(2) - row(-2)
     across = np.abs(column(lengthwise, 2) - column(lengthwise, -2)) / 5
     down = np.abs(sum(column(step_down, k) for k in near)) / 5
-    return np.asarray(np.where(down > across, 0, across / np.sqrt(2 / 5 * noise(column(row(0), 0)))))
+    return np.asarray(
+        np.where(down > across, 0, across / np.sqrt(2 / 5 * noise(column(row(0), 0))))
+    )
 
 
 def _flat(squares: np.ndarray, noise: Noise, roughness: float) -> np.ndarray:
@@ -155,7 +185,9 @@ def _scatter(side: np.ndarray) -> np.ndarray:
 
 MIN_FOUND = 3
 FLOOR = 0.05
-"""Least standard error of gamma: what the fit is off on edges along the grid (measured), 2.5 % of the MTF."""
+"""Least standard error of gamma: what the fit is off on edges along the grid (measured), 2.5 % of
+the MTF.
+"""
 ROBUST = 1.4826
 """Of a median absolute deviation: the standard deviation of normal values."""
 LONE_ERROR = 0.1
@@ -173,10 +205,12 @@ class AxisMtf:
     """The MTF at Nyquist along one axis.
 
     Attributes:
-        mtf_nyquist: contrast kept at 0.5 cycles per pixel, of whichever shapes of the curve explain the edges.
+        mtf_nyquist: contrast kept at 0.5 cycles per pixel, of whichever shapes of the curve explain
+            the edges.
         interval: 95 % interval of it, from the scatter between edges and between such shapes.
         edges: how many.
-        nearest: that of the profile's curve that comes nearest to the edges, whatever their own shape.
+        nearest: that of the profile's curve that comes nearest to the edges, whatever their own
+            shape.
     """
 
     mtf_nyquist: float
@@ -186,7 +220,8 @@ class AxisMtf:
 
 
 def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
-    """The MTF along one axis from the edges across it, at least one, and those across the other axis.
+    """The MTF along one axis from the edges across it, at least one, and those across the other
+    axis.
 
     The shape of the curve is left open: each one counts by what it leaves unexplained of the edges.
     """
@@ -194,11 +229,14 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
 
     other = float(np.median([edge.gamma for edge in others])) if others else None
     known = own[:SHAPED_EDGES]
-    logs, errors, left = (np.array(part) for part in zip(*(_of_shape(own, other, s) for s in SHAPES), strict=True))
+    logs, errors, left = (
+        np.array(part) for part in zip(*(_of_shape(own, other, s) for s in SHAPES), strict=True)
+    )
     scatter = np.maximum(left.min(0) / [edge.count for edge in known], 1.0)
     # The median and not the sum: an edge that another crosses nearby has a shape of its own.
     weights = -len(known) / 2 * np.median((left - left[0]) / scatter, axis=1)
-    # Before any edge is seen, half of the belief is in the profile's curve: of few edges nothing else can be said.
+    # Before any edge is seen, half of the belief is in the profile's curve: of few edges nothing
+    # else can be said.
     belief = np.gradient(SHAPES)
     belief[0] = belief[1:].sum()
     weights = np.exp(weights - weights.max()) * belief
@@ -214,15 +252,20 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
     return AxisMtf(centre, (low, min(high, MTF_NYQUIST_MAX)), len(own), nearest)
 
 
-def _of_shape(own: Sequence[EdgeBlur], other: float | None, shape: float) -> tuple[float, float, np.ndarray]:
-    """Logarithm of the MTF at Nyquist over a perfect lens', its standard error, and what each edge leaves over.
+def _of_shape(
+    own: Sequence[EdgeBlur], other: float | None, shape: float
+) -> tuple[float, float, np.ndarray]:
+    """Logarithm of the MTF at Nyquist over a perfect lens', its standard error, and what each edge
+    leaves over.
 
-    gamma^2 of a leaning edge is (gamma_x cos)^2 + (gamma_y sin)^2: the other axis has a part in it. An edge that the
-    shape cannot be fitted to leaves more than any other.
+    gamma^2 of a leaning edge is (gamma_x cos)^2 + (gamma_y sin)^2: the other axis has a part in it.
+    An edge that the shape cannot be fitted to leaves more than any other.
     """
     fits = _reshaped(own[:SHAPED_EDGES], shape) if shape else list(own)
     known = [fit for fit in fits if isinstance(fit, EdgeBlur)] or list(own)
-    gammas, errors = (np.array([getattr(edge, name) for edge in known]) for name in ("gamma", "error"))
+    gammas, errors = (
+        np.array([getattr(edge, name) for edge in known]) for name in ("gamma", "error")
+    )
     if other is not None and not shape:
         lean = np.array([edge.slope for edge in known]) ** 2
         gammas = np.sqrt(np.maximum(gammas**2 * (1 + lean) - lean * other**2, 1e-4))
@@ -232,14 +275,18 @@ def _of_shape(own: Sequence[EdgeBlur], other: float | None, shape: float) -> tup
 
 
 def _reshaped(edges: Sequence[EdgeBlur], shape: float) -> list[Fit]:
-    """Fit edges again by another shape of the curve; those found by search are of one size, pointed ones are not."""
+    """Fit edges again by another shape of the curve; those found by search are of one size, pointed
+    ones are not.
+    """
     if len({edge.pixels.shape for edge in edges}) == 1:
         return fit_shape(np.stack([edge.pixels for edge in edges]), ANY, shape)
     return [fit_shape(edge.pixels[None], ANY, shape)[0] for edge in edges]
 
 
 def _centre(values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
-    """Weighted mean (N,) without what lies 3 robust deviations off the median, and its standard error."""
+    """Weighted mean (N,) without what lies 3 robust deviations off the median, and its standard
+    error.
+    """
     if values.size == 1:
         return float(values[0]), math.hypot(float(errors[0]), LONE_ERROR)
     off = np.abs(values - np.median(values))

@@ -1,12 +1,15 @@
 """The MTF along one axis, as a table with its interval, from all edges across it together.
 
-1. Fit each edge's line and planes to a first curve (`uneven_edge`), then the curve to all edges, a few times.
-2. Of edges found by search, keep those as sharp as the sharpest, but for chance: in nature an edge is a step or
-   softer. Edges that a person vouches for all count; those that contradict the others are named.
+1. Fit each edge's line and planes to a first curve (`uneven_edge`), then the curve to all edges, a
+  few times.
+2. Of edges found by search, keep those as sharp as the sharpest, but for chance: in nature an edge
+  is a step or softer. Edges that a person vouches for all count; those that contradict the others
+  are named.
 3. Draw edges, and strips along them, with replacement: the spread is the interval.
 
-ISO 12233 averages pixels in bins of a quarter pixel first. Here each pixel keeps its own distance from the edge, its
-noise and its texture: nothing is lost to bins, and short edges along the grid do not leave bins empty.
+ISO 12233 averages pixels in bins of a quarter pixel first. Here each pixel keeps its own distance
+from the edge, its noise and its texture: nothing is lost to bins, and short edges along the grid do
+not leave bins empty.
 """
 
 import math
@@ -16,7 +19,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beers_deploy.model.metrics.edge_blur import THOROUGH, plain_squares
-from beers_deploy.model.metrics.edge_fit import ANY, MAX_SLOPE, EdgeBlur, Limits, Noise, centroids, fit_shape
+from beers_deploy.model.metrics.edge_fit import (
+    ANY,
+    MAX_SLOPE,
+    EdgeBlur,
+    Limits,
+    Noise,
+    centroids,
+    fit_shape,
+)
 from beers_deploy.model.metrics.mtf_basis import (
     BENDS,
     CORNERS,
@@ -41,7 +52,9 @@ from beers_deploy.model.metrics.uneven_edge import (
 from beers_deploy.profiles.response import NYQUIST
 
 FREQUENCIES = np.round(np.arange(0.0, 0.71, 0.05), 2)
-"""Of the table, in cycles per pixel: up to the corner of the spectrum, where restoration still uses the curve."""
+"""Of the table, in cycles per pixel: up to the corner of the spectrum, where restoration still uses
+the curve.
+"""
 START = weights_of(np.exp(-4.0 * CORNERS))
 """The curve to begin with: 8.6 % at Nyquist."""
 FIRST_PASSES = 6
@@ -49,14 +62,17 @@ PASSES = 2
 ROUNDS = 5
 
 TIERS = ((0.012, 3, 0.02), (0.03, 8, 0.08), (0.06, 10, 0.08))
-"""Of edges found by search: largest texture over step, how many such edges are needed, and the least relative
-standard error of their curve. Among 1200 steep places of photographs, those of the first kind were all within 0.5 px
-of a step's softness; of the second, one in three was not (measured)."""
+"""Of edges found by search: largest texture over step, how many such edges are needed, and the
+least relative standard error of their curve. Among 1200 steep places of photographs, those of the
+first kind were all within 0.5 px of a step's softness; of the second, one in three was not
+(measured).
+"""
 MAX_ERROR_PX = 0.6
 """Standard error of softness of an edge found by search."""
 NATURAL_PX = 0.3
-"""How much softer than a step the sharpest edges of a scene may be, and how much sharper thin things beside them make
-them look: it widens the interval."""
+"""How much softer than a step the sharpest edges of a scene may be, and how much sharper thin
+things beside them make them look: it widens the interval.
+"""
 MOST_EDGES = 60
 """The least uneven count; more take time and add little."""
 MOST_FITTED = 600
@@ -64,16 +80,21 @@ MOST_FITTED = 600
 FEW_EDGES = 7
 """Of so many or fewer, strips along the edges are drawn; of more, whole edges."""
 EVEN = 0.012
-"""Texture over step up to which noise alone is drawn along an edge: it has no texture to draw strips of."""
+"""Texture over step up to which noise alone is drawn along an edge: it has no texture to draw
+strips of.
+"""
 UNEVEN_PX = 20.0
-"""By how much texture as large as the step scatters the softness of edges found by search (measured)."""
+"""By how much texture as large as the step scatters the softness of edges found by search
+(measured).
+"""
 
 SCATTER_PX = 0.15
 SOFT_PX = 0.3
 OUTLIERS = 0.05
 OUTLIER_RANGE_PX = 8.0
-"""Of softness: scatter of steps beyond their errors, and mean excess of others, both before any edge is seen; share
-of edges that are neither, and where these lie."""
+"""Of softness: scatter of steps beyond their errors, and mean excess of others, both before any
+edge is seen; share of edges that are neither, and where these lie.
+"""
 KEPT_DEVIATIONS = 2.5
 CONTRADICTION_DEVIATIONS = 3.0
 CONTRADICTION_PX = 0.4
@@ -88,20 +109,25 @@ LOW_PERCENT = 5.0
 HIGH_PERCENT = 95.0
 NORMAL_QUANTILE = 1.645
 FLOOR = 0.02
-"""Least relative standard error of edges that somebody vouches for, of what the model cannot know: far tails, bows,
-aliasing."""
+"""Least relative standard error of edges that somebody vouches for, of what the model cannot know:
+far tails, bows, aliasing.
+"""
 WIDEST = 1.5
 """Factor by which either end of the interval at Nyquist may differ from the figure."""
 MOST_MISSING = 100
 """More edges than that nobody has."""
 LEAST_AT_NYQUIST = 1e-3
-"""A lower end of the interval below it cannot be told from 0: edges that are no steps, such as lawn, end there."""
+"""A lower end of the interval below it cannot be told from 0: edges that are no steps, such as
+lawn, end there.
+"""
 LEAST_CONTRAST = 1e-4
 
 
 SEARCHED = Limits(20, 0.12, 0.8)
 MAX_ROUGHNESS = 0.15
-"""What a square must keep to be fitted: looser than for a target, because its planes and texture are fitted too."""
+"""What a square must keep to be fitted: looser than for a target, because its planes and texture
+are fitted too.
+"""
 POINTED_STEP_SIGMA = 10.0
 POINTED_UNEVENNESS = 0.2
 
@@ -109,7 +135,8 @@ Edge = tuple[EdgePixels, EdgeLine]
 
 
 def find_edges(image: np.ndarray, noise: Noise, clipped_at: float, label: str) -> list[Edge]:
-    """Squares around near-vertical edges of an image (H, W), and where the edges run; transpose it for others.
+    """Squares around near-vertical edges of an image (H, W), and where the edges run; transpose it
+    for others.
 
     Of more than MOST_EDGES, those that fit a blurred step best.
 
@@ -140,7 +167,9 @@ def centre_line(region: np.ndarray) -> EdgeLine:
 
 
 def edge_in(region: np.ndarray, noise: Noise, label: str) -> Edge | Refusal:
-    """The one near-vertical edge that crosses a region (H, W) from top to bottom, or why there is none."""
+    """The one near-vertical edge that crosses a region (H, W) from top to bottom, or why there is
+    none.
+    """
     scale = math.sqrt(float(noise(region).mean()))
     pixels = EdgePixels(region, noise(region), label)
     fit = fit_shape(region[None] / scale, ANY)[0]
@@ -149,10 +178,14 @@ def edge_in(region: np.ndarray, noise: Noise, label: str) -> Edge | Refusal:
     if fitted is None or abs(fitted.line.slope) > MAX_SLOPE:
         return Refusal("no straight edge near to an axis with 8 pixels on both sides")
     if fitted.step < POINTED_STEP_SIGMA * scale:
-        return Refusal(f"a step of {fitted.step / scale:.3g} times the noise, {POINTED_STEP_SIGMA:g} are needed")
+        return Refusal(
+            f"a step of {fitted.step / scale:.3g} times the noise, {POINTED_STEP_SIGMA:g} are "
+            "needed"
+        )
     if fitted.unevenness > POINTED_UNEVENNESS:
         return Refusal(
-            f"sides that are uneven by {fitted.unevenness:.0%} of the step, {POINTED_UNEVENNESS:.0%} at most"
+            f"sides that are uneven by {fitted.unevenness:.0%} of the step, "
+            f"{POINTED_UNEVENNESS:.0%} at most"
         )
     return pixels, fitted.line
 
@@ -167,7 +200,8 @@ class MtfCurve:
         high: (F,) upper end.
         edges: how many it rests on.
         contradicting: labels of edges that differ from the others.
-        lean: mean squared sine of the edges' angle to the axis: how much of the other axis is in it.
+        lean: mean squared sine of the edges' angle to the axis: how much of the other axis is in
+            it.
         missing_edges: how many more such edges would narrow the interval at Nyquist to WIDEST.
     """
 
@@ -255,10 +289,14 @@ def _curve_of_sharpest(
     draws = [softened(*pair) for pair in zip(_drawn(kept, weights, generator), steps, strict=True)]
     curve = _with_interval(softened(weights, step), draws, kept, (), floor)
     unknown = np.exp(NATURAL_PX * FREQUENCIES)
-    return replace(curve, low=curve.low / unknown, high=np.minimum(curve.high * unknown, np.sinc(FREQUENCIES)))
+    return replace(
+        curve, low=curve.low / unknown, high=np.minimum(curve.high * unknown, np.sinc(FREQUENCIES))
+    )
 
 
-def _drawn_steps(values: np.ndarray, errors: np.ndarray, generator: np.random.Generator) -> list[float]:
+def _drawn_steps(
+    values: np.ndarray, errors: np.ndarray, generator: np.random.Generator
+) -> list[float]:
     """Return the softness of the steps in each draw of edges."""
     draws = (generator.integers(values.size, size=values.size) for _ in range(DRAWS))
     return [sharpest(values[chosen], errors[chosen]) for chosen in draws]
@@ -293,8 +331,9 @@ def _softness(edges: Sequence[FittedEdge], weights: np.ndarray) -> tuple[np.ndar
 def sharpest(values: np.ndarray, errors: np.ndarray) -> float:
     """The softness of the steps among edges that are steps or softer, never sharper.
 
-    softness = that of a step + what the edge itself adds, 0 or more + an error: an exponential and a normal
-    distribution added, and few outliers. The most likely value, with weak expectations of both widths.
+    softness = that of a step + what the edge itself adds, 0 or more + an error: an exponential and
+    a normal distribution added, and few outliers. The most likely value, with weak expectations of
+    both widths.
 
     Args:
         values: (N,) softness.
@@ -309,7 +348,12 @@ def sharpest(values: np.ndarray, errors: np.ndarray) -> float:
         soft = SOFT_PX * math.exp(log_soft)
         sigma = np.hypot(errors, scatter)
         off = values - step
-        density = sigma**2 / (2 * soft**2) - off / soft - math.log(soft) + log_ndtr(off / sigma - sigma / soft)
+        density = (
+            sigma**2 / (2 * soft**2)
+            - off / soft
+            - math.log(soft)
+            + log_ndtr(off / sigma - sigma / soft)
+        )
         some = np.logaddexp(math.log(1 - OUTLIERS) + density, math.log(OUTLIERS / OUTLIER_RANGE_PX))
         return float(-some.sum() + (log_scatter**2 + log_soft**2) / 2)
 
@@ -319,7 +363,9 @@ def sharpest(values: np.ndarray, errors: np.ndarray) -> float:
     return float(minimize(unlikeliness, start, method="Nelder-Mead", options=options).x[0])
 
 
-def _drawn(edges: Sequence[FittedEdge], weights: np.ndarray, generator: np.random.Generator) -> list[np.ndarray]:
+def _drawn(
+    edges: Sequence[FittedEdge], weights: np.ndarray, generator: np.random.Generator
+) -> list[np.ndarray]:
     """Return the curve of each draw of edges, strips and expected bends."""
     count = len(edges)
     whole = [normal_equations(edge, weights) for edge in edges]
@@ -331,8 +377,8 @@ def _drawn(edges: Sequence[FittedEdge], weights: np.ndarray, generator: np.rando
             drawn = [whole[number] for number in generator.integers(count, size=count)]
         gram = np.sum([each[0] for each in drawn], axis=0)
         moment = np.sum([each[1] for each in drawn], axis=0)
-        # Where pixels say little, the expected smoothness decides. It is drawn too, and is the loosest one, so that
-        # the interval holds what a smooth curve hides.
+        # Where pixels say little, the expected smoothness decides. It is drawn too, and is the
+        # loosest one, so that the interval holds what a smooth curve hides.
         draws.append(solve(gram, moment, weights, BENDS[-1], generator.standard_normal(PARTS - 3)))
     return draws
 
@@ -340,7 +386,9 @@ def _drawn(edges: Sequence[FittedEdge], weights: np.ndarray, generator: np.rando
 def _drawn_along(
     edge: FittedEdge, weights: np.ndarray, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return an edge's normal equations with its noise drawn again, or its strips drawn with replacement."""
+    """Return an edge's normal equations with its noise drawn again, or its strips drawn with
+    replacement.
+    """
     if edge.unevenness <= EVEN:
         gram, moment = normal_equations(edge, weights)
         sizes, axes = np.linalg.eigh(gram)
@@ -351,7 +399,9 @@ def _drawn_along(
     return normal_equations(edge, weights, counts)
 
 
-def _contradicting(edges: Sequence[FittedEdge], values: np.ndarray, errors: np.ndarray) -> tuple[str, ...]:
+def _contradicting(
+    edges: Sequence[FittedEdge], values: np.ndarray, errors: np.ndarray
+) -> tuple[str, ...]:
     """Return the labels of edges whose softness is not the others'; of two that differ, both."""
     centre = float(np.median(values))
     off = np.abs(values - centre)
@@ -375,21 +425,33 @@ def _with_interval(
     drawn = np.maximum([mtf_at(FREQUENCIES, draw) for draw in draws], LEAST_CONTRAST)
     looks = len(edges)
     if looks <= FEW_EDGES:
-        looks = sum(len(edge.weights) if edge.unevenness <= EVEN else strips_of(edge) for edge in edges)
-    wider = float(stdtrit(looks - 1, HIGH_PERCENT / 100)) / NORMAL_QUANTILE * math.sqrt(looks / (looks - 1))
+        looks = sum(
+            len(edge.weights) if edge.unevenness <= EVEN else strips_of(edge) for edge in edges
+        )
+    wider = (
+        float(stdtrit(looks - 1, HIGH_PERCENT / 100))
+        / NORMAL_QUANTILE
+        * math.sqrt(looks / (looks - 1))
+    )
     lowest, highest = np.percentile(drawn, [LOW_PERCENT, HIGH_PERCENT], axis=0)
     unknown = NORMAL_QUANTILE * floor * contrast
-    low = np.maximum(contrast - np.hypot(wider * np.maximum(contrast - lowest, 0.0), unknown), LEAST_CONTRAST)
+    low = np.maximum(
+        contrast - np.hypot(wider * np.maximum(contrast - lowest, 0.0), unknown), LEAST_CONTRAST
+    )
     high = contrast + np.hypot(wider * np.maximum(highest - contrast, 0.0), unknown)
     contrast[0] = low[0] = high[0] = 1.0
     slope = np.array([edge.line.slope for edge in edges])
     lean = float(np.mean(slope**2 / (1 + slope**2)))
     missing = _missing(contrast, low, high, len(edges))
-    return MtfCurve(contrast, low, np.minimum(high, detector), len(edges), contradicting, lean, missing)
+    return MtfCurve(
+        contrast, low, np.minimum(high, detector), len(edges), contradicting, lean, missing
+    )
 
 
 def _missing(contrast: np.ndarray, low: np.ndarray, high: np.ndarray, edges: int) -> int:
-    """Return how many more edges would narrow the interval at Nyquist to WIDEST; 0 where it is narrow enough."""
+    """Return how many more edges would narrow the interval at Nyquist to WIDEST; 0 where it is
+    narrow enough.
+    """
     place = int(np.argmin(np.abs(FREQUENCIES - NYQUIST)))
     if low[place] < LEAST_AT_NYQUIST:
         return MOST_MISSING
@@ -401,8 +463,8 @@ def _missing(contrast: np.ndarray, low: np.ndarray, high: np.ndarray, edges: int
 def apart(own: MtfCurve, other: MtfCurve) -> MtfCurve:
     """The curve along its axis alone: what leaning edges hold of the other axis is taken out.
 
-    The loss of an edge's normal is sqrt((c loss_own)^2 + (s loss_other)^2), c and s of its angle, as in a profile's
-    formula (`profiles.response.MtfTable`).
+    The loss of an edge's normal is sqrt((c loss_own)^2 + (s loss_other)^2), c and s of its angle,
+    as in a profile's formula (`profiles.response.MtfTable`).
     """
     detector = np.sinc(FREQUENCIES)
     own_loss, other_loss = (np.log(detector / curve.contrast) ** 2 for curve in (own, other))
@@ -410,4 +472,6 @@ def apart(own: MtfCurve, other: MtfCurve) -> MtfCurve:
     loss = np.sqrt(np.maximum(np.linalg.solve(mixed, np.stack([own_loss, other_loss]))[0], 0.0))
     contrast = np.minimum.accumulate(np.maximum(detector * np.exp(-loss), LEAST_CONTRAST))
     ratio = contrast / own.contrast
-    return replace(own, contrast=contrast, low=own.low * ratio, high=np.minimum(own.high * ratio, detector))
+    return replace(
+        own, contrast=contrast, low=own.low * ratio, high=np.minimum(own.high * ratio, detector)
+    )

@@ -1,8 +1,10 @@
-"""The blur across short straight edges, each in a few pixels around it, fitted by the curve that a profile states.
+"""The blur across short straight edges, each in a few pixels around it, fitted by the curve that a
+profile states.
 
-MTF(f) = exp(-gamma f) sinc(f) (`simulator.mtf`) has one number, for which 17 x 17 pixels are enough. Gauss-Newton
-finds it together with the edge's place, its slope and the levels of both sides. Many squares are fitted at once:
-one at a time takes ten times as long (measured), because each step is a few hundred multiplications.
+MTF(f) = exp(-gamma f) sinc(f) (`simulator.mtf`) has one number, for which 17 x 17 pixels are
+enough. Gauss-Newton finds it together with the edge's place, its slope and the levels of both
+sides. Many squares are fitted at once: one at a time takes ten times as long (measured), because
+each step is a few hundred multiplications.
 """
 
 import math
@@ -27,7 +29,9 @@ PER_PX = 16
 REACH_PX = 24
 PERIOD_PX = 250
 HIGHEST_F = 2.5
-"""The tabulated edge repeats after so many pixels, with the other sign; waves beyond so many cycles a pixel are 0."""
+"""The tabulated edge repeats after so many pixels, with the other sign; waves beyond so many cycles
+a pixel are 0.
+"""
 START_GAMMA = 4.0
 LEAST_GAMMA = 0.05
 LARGEST_GAMMA = 9.9
@@ -73,8 +77,8 @@ class Limits:
     """What an edge must keep to count.
 
     Attributes:
-        step_sigma: least difference of the plateaus over the noise of a pixel. A fainter edge may hide in noise that
-            it is none.
+        step_sigma: least difference of the plateaus over the noise of a pixel. A fainter edge may
+            hide in noise that it is none.
         misfit: largest root mean square of what the noise does not explain, of the step.
         error: largest standard error of gamma; 0.6 is a third of the MTF.
     """
@@ -87,15 +91,18 @@ class Limits:
 FOUND = Limits(30, 0.012)
 POINTED_AT = Limits(10, 0.03)
 ANY = Limits(0, math.inf, math.inf)
-"""For edges found by search among much that is none, for those that a person vouches for, and for those known."""
+"""For edges found by search among much that is none, for those that a person vouches for, and for
+those known.
+"""
 
 
 @lru_cache(maxsize=16)
 def _responses(shape: float) -> np.ndarray:
-    """A step of 1 at 0, blurred, for each of GAMMAS and each distance: (101, 2 * REACH_PX * PER_PX + 1).
+    """A step of 1 at 0, blurred, for each of GAMMAS and each distance: (101, 2 * REACH_PX * PER_PX
+    + 1).
 
-    It is the sum over f of MTF(f) sin(2 pi f d) / (pi f), by a Fourier transform over f = (k + 1/2) / PERIOD_PX: as a
-    matrix product it occupies every core for far longer than the sum takes.
+    It is the sum over f of MTF(f) sin(2 pi f d) / (pi f), by a Fourier transform over f = (k + 1/2)
+    / PERIOD_PX: as a matrix product it occupies every core for far longer than the sum takes.
     """
     f = (np.arange(int(HIGHEST_F * PERIOD_PX)) + 0.5) / PERIOD_PX
     waves = np.exp(-np.outer(GAMMAS, f) - shape * f**2) * np.sinc(f) / (math.pi * f * PERIOD_PX)
@@ -125,7 +132,8 @@ def _at_distances(lines: np.ndarray, distance: np.ndarray) -> np.ndarray:
 
 
 def edge_response(distance: np.ndarray, gamma: float, shape: float = 0.0) -> np.ndarray:
-    """What a detector sees of a step of 1 at `distance` pixels (any shape) from it, behind a blur of `gamma`.
+    """What a detector sees of a step of 1 at `distance` pixels (any shape) from it, behind a blur
+    of `gamma`.
 
     `shape` adds a Gaussian part to the blur: MTF(f) = exp(-gamma f - shape f^2) sinc(f).
     """
@@ -147,7 +155,8 @@ def fit_blurs(regions: np.ndarray, noise: Noise, limits: Limits) -> list[Fit]:
         limits: what an edge must keep to.
 
     Returns:
-        The blur by the profile's curve, or, of an edge that no shape of the curve fits, why there is none.
+        The blur by the profile's curve, or, of an edge that no shape of the curve fits, why there
+            is none.
     """
     pixels = regions / np.sqrt(noise(regions).mean((1, 2)))[:, None, None]
     found = fit_shape(pixels, limits)
@@ -164,7 +173,9 @@ def fit_blurs(regions: np.ndarray, noise: Noise, limits: Limits) -> list[Fit]:
 
 
 class _Lines(NamedTuple):
-    """Where edges are thought to run, (N,) each, about the middle of a region, and how soft they are."""
+    """Where edges are thought to run, (N,) each, about the middle of a region, and how soft they
+    are.
+    """
 
     place: np.ndarray
     slope: np.ndarray
@@ -192,7 +203,9 @@ class _Solved(NamedTuple):
 
 
 def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fit]:
-    """As `fit_blurs`, for pixels (N, H, W) whose noise is 1, by the curve with one Gaussian part alone."""
+    """As `fit_blurs`, for pixels (N, H, W) whose noise is 1, by the curve with one Gaussian part
+    alone.
+    """
     count, height, width = pixels.shape
     fits: list[Fit] = [Refusal("no straight edge near to an axis")] * count
     if not count:
@@ -215,11 +228,15 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
         near = near[enough]
         solved = _solve(lines, across, down, seen[left], near, shape)
         moved, lines = _move(lines, solved.change)
-        lost = (np.abs(lines.place - start[left]) > MAX_PLACE_PX) | (np.abs(lines.slope) > MAX_SLOPE)
+        lost = (np.abs(lines.place - start[left]) > MAX_PLACE_PX) | (
+            np.abs(lines.slope) > MAX_SLOPE
+        )
         done = ~lost & (moved < CONVERGED)
         for k in np.flatnonzero(done):
             at = left[k]
-            fits[at] = _judged(lines, solved, int(k), int(near[k].sum()) - 5, pixels[at], limits, bool(shape))
+            fits[at] = _judged(
+                lines, solved, int(k), int(near[k].sum()) - 5, pixels[at], limits, bool(shape)
+            )
         lines = lines.only(~lost & ~done)
         left = left[~lost & ~done]
         if not left.size:
@@ -230,13 +247,17 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
 def centroids(regions: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> _Lines:
     """The lines through the centres of what rises in each row of regions (N, H, W)."""
     rise = np.diff(regions, axis=2)
-    rise = np.maximum(rise * np.sign(rise.sum((1, 2)))[:, None, None], 0) * np.hamming(rise.shape[2])
+    rise = np.maximum(rise * np.sign(rise.sum((1, 2)))[:, None, None], 0) * np.hamming(
+        rise.shape[2]
+    )
     centre = (rise * (columns[1:] - 0.5)).sum(2) / np.maximum(rise.sum(2), 1e-9)
     slope = (centre * rows).sum(1) / max((rows**2).sum(), 1.0)
     return _Lines(np.median(centre, axis=1), slope, np.full(len(regions), START_GAMMA))
 
 
-def _solve(lines: _Lines, x: np.ndarray, y: np.ndarray, seen: np.ndarray, near: np.ndarray, shape: float) -> _Solved:
+def _solve(
+    lines: _Lines, x: np.ndarray, y: np.ndarray, seen: np.ndarray, near: np.ndarray, shape: float
+) -> _Solved:
     """Solve for the levels of both sides, then for small changes of all five numbers, of each edge.
 
     Args:
@@ -262,7 +283,8 @@ def _solve(lines: _Lines, x: np.ndarray, y: np.ndarray, seen: np.ndarray, near: 
     high = np.minimum(lines.gamma + 0.15, float(GAMMAS[-1]))
     softer = (_at_gammas(high, shape) - _at_gammas(low, shape)) / (high - low)[:, None]
     terms = np.stack(
-        [plateaus[:, 0], plateaus[:, 1], -rise, -rise * y, _at_distances(softer, distance) * step], axis=1
+        [plateaus[:, 0], plateaus[:, 1], -rise, -rise * y, _at_distances(softer, distance) * step],
+        axis=1,
     )
     covariance = np.linalg.pinv(terms @ terms.swapaxes(1, 2), hermitian=True)
     rest = seen - fitted
@@ -279,7 +301,13 @@ def _move(lines: _Lines, change: np.ndarray) -> tuple[np.ndarray, _Lines]:
 
 
 def _judged(
-    lines: _Lines, solved: _Solved, k: int, count: int, pixels: np.ndarray, limits: Limits, steeper: bool
+    lines: _Lines,
+    solved: _Solved,
+    k: int,
+    count: int,
+    pixels: np.ndarray,
+    limits: Limits,
+    steeper: bool,
 ) -> Fit:
     """Return edge `k` if it keeps to the limits."""
     gamma = float(lines.gamma[k])

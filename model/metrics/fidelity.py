@@ -15,8 +15,8 @@ MIN_SIDE_PX = 2 * SSIM_RADIUS_PX + 1
 def psnr_db(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
     """Peak signal-to-noise ratio in dB: 10 log10(range^2 / mean squared error).
 
-    Infinite for identical images, NaN where pixels are not finite. scikit-image's agrees to rounding, but divides
-    by zero for identical images.
+    Infinite for identical images, NaN where pixels are not finite. scikit-image's agrees to
+    rounding, but divides by zero for identical images.
 
     Args:
         image: any shape.
@@ -31,17 +31,22 @@ def psnr_db(image: np.ndarray, reference: np.ndarray, data_range: float) -> floa
 
 
 def ssim(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
-    """Mean structural similarity (Wang et al. 2004), by scikit-image: 1 for identical images, without a unit.
+    """Mean structural similarity (Wang et al.
 
-    With the paper's Gaussian window of 11 x 11 pixels, sigma 1.5, and the biased covariance; the mean is over the
-    pixels that the whole window fits around, NaN where one of the images is not finite.
+    2004), by scikit-image: 1 for identical images, without a unit.
+
+    With the paper's Gaussian window of 11 x 11 pixels, sigma 1.5, and the biased covariance; the
+    mean is over the pixels that the whole window fits around, NaN where one of the images is not
+    finite.
 
     Args:
         image: (H, W), at least 11 pixels a side.
         reference: (H, W).
         data_range: the span of legal values.
     """
-    from skimage.metrics import structural_similarity  # here, for PSNR alone needs none of its half second
+    from skimage.metrics import (
+        structural_similarity,
+    )  # here, for PSNR alone needs none of its half second
 
     if min(image.shape) < MIN_SIDE_PX:
         expected = f"at least {MIN_SIDE_PX} pixels a side"
@@ -54,7 +59,15 @@ def ssim(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
         return float(structural_similarity(*pixels, data_range=data_range, **window))
 
 
-def fidelity_db(dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray, max_dn: int = MAX_DN) -> float:
-    """PSNR over full scale without the pixels that clipped in the input or the reference: their truth is unknown."""
+def fidelity_db(
+    dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray, max_dn: int = MAX_DN
+) -> float:
+    """PSNR over full scale without the pixels that clipped in the input or the reference: their
+    truth is unknown.
+    """
     sound = (reference < max_dn) & (degraded < max_dn)
-    return psnr_db(dn[sound], reference[sound], max_dn) if sound.any() else psnr_db(dn, reference, max_dn)
+    return (
+        psnr_db(dn[sound], reference[sound], max_dn)
+        if sound.any()
+        else psnr_db(dn, reference, max_dn)
+    )

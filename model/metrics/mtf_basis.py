@@ -2,9 +2,10 @@
 
     MTF(f) = sinc(f) * sum_k w_k P_k(f),    w_k >= 0,    sum w_k = 1
 
-sinc is the square detector. P_k falls linearly from 1 to 0 within one step of 0.05 cycles per pixel, each at its own
-frequency; the last one never falls. Any curve that falls from 1 is such a sum, and the image of an edge is the same
-sum of the edges' images: that makes finding the curve a linear problem.
+sinc is the square detector. P_k falls linearly from 1 to 0 within one step of 0.05 cycles per
+pixel, each at its own frequency; the last one never falls. Any curve that falls from 1 is such a
+sum, and the image of an edge is the same sum of the edges' images: that makes finding the curve a
+linear problem.
 """
 
 import math
@@ -27,12 +28,16 @@ WAVES = 1250
 """Waves that make the tabulated edge: it repeats after 500 pixels."""
 
 BENDS = (0.2, 0.4, 0.8)
-"""Standard deviations of the second differences of the weights over the weights there, of which edges choose one.
+"""Standard deviations of the second differences of the weights over the weights there, of which
+edges choose one.
 
-exp(-gamma f), a Gaussian and diffraction with 2 to 30 % at Nyquist have 0.05 to 0.3 (computed); where a pupil cuts
-off, 1."""
+exp(-gamma f), a Gaussian and diffraction with 2 to 30 % at Nyquist have 0.05 to 0.3 (computed);
+where a pupil cuts off, 1.
+"""
 FIRST_BEND = 0.1
-"""Standard deviation of the first of them: a curve may begin with a sudden loss (stray light, far tails)."""
+"""Standard deviation of the first of them: a curve may begin with a sudden loss (stray light, far
+tails).
+"""
 LEAST_WEIGHT = 0.002
 """Below it bends are as those of this weight."""
 SMOOTHING = np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / 9
@@ -67,7 +72,8 @@ def softened(weights: np.ndarray, softness_px: float) -> np.ndarray:
 def responses() -> tuple[np.ndarray, np.ndarray]:
     """What a detector sees of a step of 1 at 0, and of a thin line there, behind each part.
 
-    The step behind an MTF is 1/2 + the sum over f of MTF(f) sin(2 pi f d) / (pi f); the line is its derivative.
+    The step behind an MTF is 1/2 + the sum over f of MTF(f) sin(2 pi f d) / (pi f); the line is its
+    derivative.
 
     Returns:
         Edges and lines, (2 * REACH_PX * SAMPLES_PER_PX + 1, PARTS) each.
@@ -81,7 +87,9 @@ def responses() -> tuple[np.ndarray, np.ndarray]:
 
 
 def at_distances(table: np.ndarray, distance_px: np.ndarray) -> np.ndarray:
-    """A tabulated edge or line, (T,) or (T, PARTS), at distances (N,) from it: (N,) or (N, PARTS)."""
+    """A tabulated edge or line, (T,) or (T, PARTS), at distances (N,) from it:
+    (N,) or (N, PARTS).
+    """
     place = np.clip((distance_px + REACH_PX) * SAMPLES_PER_PX, 0, len(table) - 1.001)
     row = place.astype(int)
     share = place - row
@@ -94,7 +102,9 @@ SECOND_DIFFERENCES = np.pad(np.diff(np.eye(PARTS - 1), 2, axis=0), ((0, 0), (0, 
 
 
 def expected_bends(weights: np.ndarray, bend: float) -> np.ndarray:
-    """(PARTS - 3, PARTS): second differences of weights over what is expected of them around `weights` (PARTS,)."""
+    """(PARTS - 3, PARTS): second differences of weights over what is expected of them around
+    `weights` (PARTS,).
+    """
     padded = np.pad(weights[:-1], 2, mode="edge")
     size = np.maximum(np.convolve(padded, SMOOTHING, mode="valid"), LEAST_WEIGHT)[1:-1] * bend
     size[0] = max(size[0], FIRST_BEND)
@@ -102,7 +112,11 @@ def expected_bends(weights: np.ndarray, bend: float) -> np.ndarray:
 
 
 def solve(
-    gram: np.ndarray, moment: np.ndarray, near: np.ndarray, bend: float, bends: np.ndarray | None = None
+    gram: np.ndarray,
+    moment: np.ndarray,
+    near: np.ndarray,
+    bend: float,
+    bends: np.ndarray | None = None,
 ) -> np.ndarray:
     """The weights that fit best, none negative and of sum 1.
 
@@ -111,7 +125,8 @@ def solve(
         moment: (PARTS,) its right side.
         near: (PARTS,) weights near the solution: larger ones may bend more.
         bend: by how much, of them.
-        bends: (PARTS - 3,) what the second differences are expected to be, over their deviations; 0 without.
+        bends: (PARTS - 3,) what the second differences are expected to be, over their deviations; 0
+            without.
     """
     from scipy.optimize import nnls  # here: who tells no sensor need not wait for SciPy
 

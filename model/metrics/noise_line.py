@@ -1,11 +1,13 @@
 """The noise line of an instrument, variance = alpha L + beta, from blurred images of anything.
 
-Natural scenes of a few hundred pixels have no homogeneous areas. The blur helps: it leaves next to no texture in the
-corners of the spectrum, beyond 0.55 cycles per pixel, and noise is white.
+Natural scenes of a few hundred pixels have no homogeneous areas. The blur helps: it leaves next to
+no texture in the corners of the spectrum, beyond 0.55 cycles per pixel, and noise is white.
 
-1. Cut blocks; the energy of a block's waves up to 0.2 cycles per pixel is its structure, that beyond 0.55 its noise.
+1. Cut blocks; the energy of a block's waves up to 0.2 cycles per pixel is its structure, that
+  beyond 0.55 its noise.
 2. Keep the blocks of little structure. Noise does not choose: the two bands share no wave.
-3. Fit noise = alpha L + beta + leak * structure, none of them negative: what texture leaks is taken off.
+3. Fit noise = alpha L + beta + leak * structure, none of them negative: what texture leaks is taken
+  off.
 4. Draw parts of the images with replacement: the spread is the interval.
 """
 
@@ -27,7 +29,9 @@ MIDDLE = 0.5
 FINE = 0.55
 """Cycles per pixel."""
 SPECTRUM = (0.3, 0.4, 0.5, 0.55, 0.6, 0.65, 0.7071)
-"""Ends of the bands in which noise is shown, cycles per pixel; the last is the corner of the spectrum."""
+"""Ends of the bands in which noise is shown, cycles per pixel; the last is the corner of the
+spectrum.
+"""
 
 STRUCTURES = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
 """How much structure a block may have, of its noise: the least that leaves enough blocks."""
@@ -38,9 +42,13 @@ MAX_LEAK = 0.5
 """Of the energy of the corners, what may come from texture."""
 MAX_COLOUR = 0.15
 COLOUR_SCATTER = 3.0
-"""What the noise at middle frequencies may differ from that of the corners by: white noise does not."""
+"""What the noise at middle frequencies may differ from that of the corners by: white noise does
+not.
+"""
 MOSAIC = 0.2
-"""Of the noise at the finest detail, what a mosaic of colour filters leaves at middle frequencies, at most."""
+"""Of the noise at the finest detail, what a mosaic of colour filters leaves at middle frequencies,
+at most.
+"""
 MIN_RANGE = 0.25
 """Least spread of the blocks' means, of the brightest: less gives no line."""
 ROUNDING = 1 / 12
@@ -52,7 +60,9 @@ DRAWS = 200
 PASSES = 6
 FINE_WAVES = 21
 MAX_SCATTER = 3.5
-"""Waves beyond FINE in a block; how many deviations of their mean square, by chance, a block may lie off."""
+"""Waves beyond FINE in a block; how many deviations of their mean square, by chance, a block may
+lie off.
+"""
 EDGE_PERCENT = 2.0
 """Of the blocks lie below, and above, the radiances that are said to be measured."""
 
@@ -62,7 +72,8 @@ class Blocks(NamedTuple):
 
     Attributes:
         mean: (N,) in DN.
-        structure: (N,) mean square of the waves up to 0.2 cycles per pixel, for white noise its variance in DN^2.
+        structure: (N,) mean square of the waves up to 0.2 cycles per pixel, for white noise its
+            variance in DN^2.
         middle: (N,) that of the waves from 0.5 to 0.55.
         fine: (N,) that of the waves beyond.
         spectrum: (N, 6) that of the waves between the frequencies of SPECTRUM.
@@ -81,7 +92,9 @@ class Blocks(NamedTuple):
         return Blocks(*(column[chosen] for column in self))
 
     def noise(self, fit: np.ndarray) -> np.ndarray:
-        """Variance (N,) that a line (alpha, beta, ...) gives each block, that of rounding at least."""
+        """Variance (N,) that a line (alpha, beta, ...) gives each block, that
+        of rounding at least.
+        """
         return np.asarray(np.maximum(fit[0] * self.mean + fit[1], ROUNDING))
 
 
@@ -93,7 +106,9 @@ def join(images: Sequence[Blocks]) -> Blocks:
 
 
 def cut_blocks(image: np.ndarray, clipped_at: float) -> Blocks:
-    """Cut (H, W) digital numbers into blocks side by side, without those with a pixel at 0 or at `clipped_at`."""
+    """Cut (H, W) digital numbers into blocks side by side, without those with a pixel at 0 or at
+    `clipped_at`.
+    """
     pixels, part = _side_by_side(image)
     sound = ((pixels > 0) & (pixels < clipped_at)).all((1, 2))
     pixels = pixels[sound]
@@ -101,7 +116,8 @@ def cut_blocks(image: np.ndarray, clipped_at: float) -> Blocks:
 
 
 def cut_pair(first: np.ndarray, second: np.ndarray, clipped_at: float) -> Blocks:
-    """Blocks of the noise alone, of two images (H, W) of one still scene: their difference over the root of 2.
+    """Blocks of the noise alone, of two images (H, W) of one still scene: their difference over the
+    root of 2.
 
     This is photon transfer: the scene cancels, and so does what every detector does always.
     """
@@ -120,7 +136,9 @@ def _side_by_side(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rows = image.shape[0] // SIDE_PX
     columns = image.shape[1] // SIDE_PX
     pixels = np.asarray(image[: rows * SIDE_PX, : columns * SIDE_PX], np.float64)
-    pixels = pixels.reshape(rows, SIDE_PX, columns, SIDE_PX).swapaxes(1, 2).reshape(-1, SIDE_PX, SIDE_PX)
+    pixels = (
+        pixels.reshape(rows, SIDE_PX, columns, SIDE_PX).swapaxes(1, 2).reshape(-1, SIDE_PX, SIDE_PX)
+    )
     across = columns // PART_BLOCKS + 1
     part = np.arange(rows)[:, None] // PART_BLOCKS * across + np.arange(columns) // PART_BLOCKS
     return pixels, part.ravel()
@@ -128,7 +146,8 @@ def _side_by_side(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _measured(mean: np.ndarray, pixels: np.ndarray, part: np.ndarray) -> Blocks:
     """Return blocks (N, S, S) with these means and parts by the energies of their bands."""
-    # Not by matrix products: the threads of BLAS wait for each other longer than these small sums take.
+    # Not by matrix products: the threads of BLAS wait for each other longer than these small sums
+    # take.
     bands = np.einsum("nk,kb->bn", _energies(pixels).reshape(-1, SIDE_PX**2), _band_means())
     slow, middle, fine, *spectrum = bands
     return Blocks(mean, slow, middle, fine, np.stack(spectrum, axis=1), part)
@@ -148,7 +167,9 @@ def _energies(pixels: np.ndarray) -> np.ndarray:
 
 @cache
 def _band_means() -> np.ndarray:
-    """Return the weights (S * S, 9) that average the energies of slow, middle and fine waves and of SPECTRUM."""
+    """Return the weights (S * S, 9) that average the energies of slow, middle and fine waves and of
+    SPECTRUM.
+    """
     place = np.arange(SIDE_PX)
     frequency = np.hypot(place[:, None], place).ravel() / (2 * SIDE_PX)
     bands = ((1.5 / (2 * SIDE_PX), SLOW), (MIDDLE, FINE), (FINE, 1.0), *pairwise(SPECTRUM))
@@ -176,10 +197,11 @@ class NoiseModel:
         blocks: how many were used.
         measured_dn: means that the blocks reach from and to.
         leak: share of texture in the corners of the spectrum, taken off.
-        colour: noise at middle frequencies over that at the finest; 1 for white noise. The line is that of the
-            stronger of the two.
+        colour: noise at middle frequencies over that at the finest; 1 for white noise. The line is
+            that of the stronger of the two.
         white: whether the two are equal, but for chance.
-        one_level: whether it was seen at one level of light alone, so that how it grows with light is assumed.
+        one_level: whether it was seen at one level of light alone, so that how it grows with light
+            is assumed.
         spectrum: noise in the bands of SPECTRUM over that beyond FINE.
     """
 
@@ -199,7 +221,9 @@ class NoiseModel:
         return np.asarray(self.alpha * np.maximum(dn, 0) + self.beta + ROUNDING)
 
     def at(self, dn: float) -> Variance:
-        """Variance at one value; the further it lies outside what was measured, the wider the interval."""
+        """Variance at one value; the further it lies outside what was measured, the wider the
+        interval.
+        """
         value = self.alpha * dn + self.beta
         low, high = np.percentile(self.draws @ (dn, 1.0), [2.5, 97.5])
         dark, bright = self.measured_dn
@@ -211,19 +235,25 @@ class NoiseModel:
         return Variance(value, (max(low - model * value, 0.0), high + model * value), beyond > 0)
 
 
-def fit_noise_model(blocks: Blocks, generator: np.random.Generator, incomplete: bool = False) -> NoiseModel | Refusal:
+def fit_noise_model(
+    blocks: Blocks, generator: np.random.Generator, incomplete: bool = False
+) -> NoiseModel | Refusal:
     """Fit the line to blocks of any number of images of one instrument; or say why there is none.
 
     Args:
         blocks: of all images.
         generator: for the draws of the interval.
-        incomplete: whether noise that is not white is taken as well, and noise of one level of light alone.
+        incomplete: whether noise that is not white is taken as well, and noise of one level of
+            light alone.
     """
     if blocks.mean.size < LEAST:
         return Refusal(f"{blocks.mean.size} blocks of 16 x 16 unclipped pixels, {LEAST} are needed")
     quietest = float(np.percentile(blocks.fine, QUIET_PERCENT))
     if quietest < ROUNDING + LEAST_NOISE:
-        got = f"a variance of {quietest:.2g} DN^2 at the finest detail, where rounding alone makes {ROUNDING:.2g}"
+        got = (
+            f"a variance of {quietest:.2g} DN^2 at the finest detail, where rounding alone "
+            f"makes {ROUNDING:.2g}"
+        )
         return Refusal(got)
     used, fit = _choose(blocks)
     parts = np.unique(used.part)
@@ -239,7 +269,9 @@ def fit_noise_model(blocks: Blocks, generator: np.random.Generator, incomplete: 
     leak = float(fit[2] * np.maximum(used.structure - used.noise(fit), 0).mean() / used.fine.mean())
     alpha, beta = _unrounded(fit)
     shown = np.array([_unrounded(draw) for draw in draws])
-    model = NoiseModel(alpha, beta, shown, used.mean.size, (dark, bright), leak, one_level=one_level)
+    model = NoiseModel(
+        alpha, beta, shown, used.mean.size, (dark, bright), leak, one_level=one_level
+    )
     return _judged(_with_colour(used, model), incomplete)
 
 
@@ -256,10 +288,11 @@ def _judged(model: NoiseModel, incomplete: bool) -> NoiseModel | Refusal:
 def _of_one_level(
     used: Blocks, fit: np.ndarray, draws: np.ndarray, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return fit and draws of noise whose growth with light is not seen: any part of it may be that of photons.
+    """Return fit and draws of noise whose growth with light is not seen: any part of it may be that
+    of photons.
 
-    The fit takes all: told too much noise in bright light, a restoration smooths, told too little it makes grain. The
-    draws take from none to all.
+    The fit takes all: told too much noise in bright light, a restoration smooths, told too little
+    it makes grain. The draws take from none to all.
     """
     level = float(np.median(used.mean))
 
@@ -267,12 +300,17 @@ def _of_one_level(
         noise = float(numbers[0]) * level + float(numbers[1])
         return [share * noise / max(level, ROUNDING), (1 - share) * noise, float(numbers[2])]
 
-    drawn = [split(draw, share) for draw, share in zip(draws, generator.uniform(size=len(draws)), strict=True)]
+    drawn = [
+        split(draw, share)
+        for draw, share in zip(draws, generator.uniform(size=len(draws)), strict=True)
+    ]
     return np.array(split(fit, 1.0)), np.array(drawn)
 
 
 def _choose(blocks: Blocks) -> tuple[Blocks, np.ndarray]:
-    """The blocks of least structure that are enough, and their fit; what is enough shrinks with the images."""
+    """The blocks of least structure that are enough, and their fit; what is enough shrinks with the
+    images.
+    """
     for limit in STRUCTURES:
         used, fit = _quiet(blocks, limit)
         if used.mean.size >= ENOUGH:
@@ -281,13 +319,16 @@ def _choose(blocks: Blocks) -> tuple[Blocks, np.ndarray]:
 
 
 def _quiet(blocks: Blocks, limit: float) -> tuple[Blocks, np.ndarray]:
-    """The blocks of so little structure whose finest detail is what the others' is, but for chance; and the fit."""
+    """The blocks of so little structure whose finest detail is what the others' is, but for chance;
+    and the fit.
+    """
     noise = expected = np.full(blocks.mean.size, max(np.percentile(blocks.fine, 10), ROUNDING))
     for _ in range(PASSES):
         quiet = blocks.structure <= limit * noise
         if quiet.sum() < LEAST:
             quiet = blocks.structure <= np.partition(blocks.structure, LEAST - 1)[LEAST - 1]
-        # Rows of crops, nets and ripples are as fine as noise: such blocks stand apart from the rest.
+        # Rows of crops, nets and ripples are as fine as noise: such blocks stand apart from the
+        # rest.
         alike = np.abs(blocks.fine - expected) <= MAX_SCATTER * math.sqrt(2 / FINE_WAVES) * expected
         used = blocks.only(quiet & alike if (quiet & alike).sum() >= LEAST else quiet)
         fit = _fitted(used, np.ones(used.mean.size))
@@ -297,7 +338,9 @@ def _quiet(blocks: Blocks, limit: float) -> tuple[Blocks, np.ndarray]:
 
 
 def _fitted(blocks: Blocks, weights: np.ndarray, seen: np.ndarray | None = None) -> np.ndarray:
-    """(alpha, beta, leak), none negative, of a band (N,), the finest if none; a mean square scatters by its size."""
+    """(alpha, beta, leak), none negative, of a band (N,), the finest if none; a mean square
+    scatters by its size.
+    """
     from scipy.optimize import nnls
 
     seen = blocks.fine if seen is None else seen
@@ -305,7 +348,9 @@ def _fitted(blocks: Blocks, weights: np.ndarray, seen: np.ndarray | None = None)
     fit = np.zeros(3)
     for _ in range(4):
         noise = blocks.noise(fit) if fit.any() else size
-        terms = np.stack([blocks.mean, np.ones(seen.size), np.maximum(blocks.structure - noise, 0)], axis=1)
+        terms = np.stack(
+            [blocks.mean, np.ones(seen.size), np.maximum(blocks.structure - noise, 0)], axis=1
+        )
         root = np.sqrt(weights) / size
         fit, _ = nnls(terms * root[:, None], seen * root)
         size = np.maximum(terms @ fit, 0.3 * ROUNDING)
@@ -319,21 +364,26 @@ def _weights(part: np.ndarray, parts: np.ndarray, generator: np.random.Generator
 
 
 def _unrounded(fit: np.ndarray) -> tuple[float, float]:
-    """Alpha and beta of the instrument: the rounding's variance taken off, first of what does not grow."""
+    """Alpha and beta of the instrument: the rounding's variance taken off, first of what does not
+    grow.
+    """
     return float(fit[0]), max(float(fit[1]) - ROUNDING, 0.0)
 
 
 def _with_colour(used: Blocks, model: NoiseModel) -> NoiseModel:
-    """Return the line with the spectrum of the noise; where that is not flat, the line of its stronger part.
+    """Return the line with the spectrum of the noise; where that is not flat, the line of its
+    stronger part.
 
-    What is told to a restoration should rather be too much noise than too little: noise that it takes for detail
-    comes out amplified.
+    What is told to a restoration should rather be too much noise than too little: noise that it
+    takes for detail comes out amplified.
     """
     place = np.array([float(np.median(used.mean)), 1.0])
     ones = np.ones(used.mean.size)
     fine = float((model.alpha, model.beta) @ place)
     bands = np.column_stack([used.middle, used.spectrum])
-    middle, *spectrum = ((_fitted(used, ones, band)[:2] @ place - ROUNDING) / fine for band in bands.T)
+    middle, *spectrum = (
+        (_fitted(used, ones, band)[:2] @ place - ROUNDING) / fine for band in bands.T
+    )
     scatter = float((model.draws @ place).std()) / fine
     white = abs(middle - 1) <= MAX_COLOUR + COLOUR_SCATTER * scatter
     stronger = 1.0 if white else max(middle, 1.0)

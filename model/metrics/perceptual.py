@@ -1,12 +1,12 @@
 """LPIPS and DISTS, differentiable, over a backbone that the user brings: SqueezeNet 1.1 or VGG16.
 
-Both follow the arithmetic of their authors' packages, `lpips` 0.1.4 with the v0.1 weights and `DISTS-pytorch` 0.1,
-whose published channel weights lie in `weights/`. The paper this project reproduces does not say which LPIPS it used,
-so no figure from here compares with its own.
+Both follow the arithmetic of their authors' packages, `lpips` 0.1.4 with the v0.1 weights and
+`DISTS-pytorch` 0.1, whose published channel weights lie in `weights/`. The paper this project
+reproduces does not say which LPIPS it used, so no figure from here compares with its own.
 
-The backbones' feature layers are named as in torchvision, and written here because that does not import beside the
-CPU build of torch. Their weights come from a user's file (`find_backbone`): ImageNet weights are never shipped or
-fetched.
+The backbones' feature layers are named as in torchvision, and written here because that does not
+import beside the CPU build of torch. Their weights come from a user's file (`find_backbone`):
+ImageNet weights are never shipped or fetched.
 """
 
 import os
@@ -59,7 +59,9 @@ class Fire(nn.Module):
 
 
 class L2Pool(nn.Module):
-    """DISTS's pooling: root of the Hanning-weighted mean of squares, stride 2 (Hénaff and Simoncelli 2016)."""
+    """DISTS's pooling: root of the Hanning-weighted mean of squares, stride 2 (Hénaff and
+    Simoncelli 2016).
+    """
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, C, H, W) to (N, C, ceil(H / 2), ceil(W / 2))."""
@@ -85,10 +87,11 @@ class Backbone(nn.Module):
         self.features = nn.Sequential(*layers)
 
     def forward(self, image: Tensor) -> list[Tensor]:
-        """Grey (N, 1, H, W), 0 to 1, as three equal channels, and its compared feature maps, each after a ReLU.
+        """Grey (N, 1, H, W), 0 to 1, as three equal channels, and its compared feature maps, each
+        after a ReLU.
 
-        The image takes the precision of the parameters; the features do so without autocast. The scaling layer of
-        `lpips` is ImageNet's figures after [-1, 1].
+        The image takes the precision of the parameters; the features do so without autocast. The
+        scaling layer of `lpips` is ImageNet's figures after [-1, 1].
         """
         colour = image.to(next(self.parameters()).dtype).expand(-1, 3, -1, -1)
         mean, std = (colour.new_tensor(x)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
@@ -128,17 +131,20 @@ def _vgg16() -> list[nn.Module]:
 WEIGHTS_VARIABLE = "BEERS_LPIPS_WEIGHTS"
 SUFFIXES = (".safetensors", ".npz")
 CONVERT = (
-    "convert it where you trust it: safetensors.torch.save_file(torch.load(FILE, weights_only=True), "
+    "convert it where you trust it: safetensors.torch.save_file(torch.load(FILE, "
+    "weights_only=True), "
     "'NAME.safetensors')"
 )
 NAMED = "give the feature layers named as in torchvision (features.0.weight ...)"
 
 
 def find_backbone(network: str, place: Path | None = None) -> Path | None:
-    """The weights file of "squeeze" or "vgg" (DISTS's), or None: then `not_found(network)` is the reason to show.
+    """The weights file of "squeeze" or "vgg" (DISTS's), or None: then `not_found(network)` is the
+    reason to show.
 
-    A file as `place` is taken at its word. Without a place, a file or a folder, the environment variable
-    BEERS_LPIPS_WEIGHTS is asked; a file that it names counts only for the network its name begins with.
+    A file as `place` is taken at its word. Without a place, a file or a folder, the environment
+    variable BEERS_LPIPS_WEIGHTS is asked; a file that it names counts only for the network its name
+    begins with.
     """
     stem = BACKBONES[network].file_stem
     if place is not None and not place.is_dir():
@@ -147,7 +153,9 @@ def find_backbone(network: str, place: Path | None = None) -> Path | None:
     if not named:
         return None
     files = [Path(named)] if Path(named).is_file() else sorted(Path(named).glob("*"))
-    return next((file for file in files if file.name.startswith(stem) and file.suffix in SUFFIXES), None)
+    return next(
+        (file for file in files if file.name.startswith(stem) and file.suffix in SUFFIXES), None
+    )
 
 
 def not_found(network: str) -> str:
@@ -157,13 +165,20 @@ def not_found(network: str) -> str:
 
 
 def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbone:
-    """A `Backbone` with its parameters from a file, by name; whatever else the file holds is left aside."""
+    """A `Backbone` with its parameters from a file, by name; whatever else the file holds is left
+    aside.
+    """
     backbone = Backbone(network, l2_pool=l2_pool)
     wanted = backbone.state_dict()
     tensors = read_tensors(path, wanted)
     for name, tensor in tensors.items():
         if tensor.shape != wanted[name].shape:
-            raise _error(path, f"{name} of shape {tuple(wanted[name].shape)}", f"{tuple(tensor.shape)}", NAMED)
+            raise _error(
+                path,
+                f"{name} of shape {tuple(wanted[name].shape)}",
+                f"{tuple(tensor.shape)}",
+                NAMED,
+            )
         if not bool(torch.isfinite(tensor).all()):
             raise _error(path, f"finite values in {name}", "NaN or infinity", NAMED)
     backbone.load_state_dict(tensors)
@@ -173,7 +188,9 @@ def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbon
 def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
     """The named tensors, of any shape, of a .safetensors or .npz file, as float32."""
     if path.suffix not in SUFFIXES:
-        raise _error(path, "a .safetensors or .npz file", f"'{path.suffix}', which is not read", CONVERT)
+        raise _error(
+            path, "a .safetensors or .npz file", f"'{path.suffix}', which is not read", CONVERT
+        )
     got = unreadable(path)
     if got is not None:
         raise _error(path, "a weights file", got, "check the path")
@@ -184,7 +201,9 @@ def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
                 raise TypeError(f"an array of {tensor.dtype}")
     except Exception as error:  # whatever the bytes of a damaged archive lead to
         got = " ".join(str(error).split())[:120]
-        raise _error(path, "arrays of floating-point numbers, none pickled", got, CONVERT) from error
+        raise _error(
+            path, "arrays of floating-point numbers, none pickled", got, CONVERT
+        ) from error
     for name in names:
         if name not in found:
             raise _error(path, f"a tensor named {name}", "none of that name", NAMED)
@@ -215,10 +234,12 @@ MIN_NORM = 1e-3
 
 
 class Lpips(nn.Module):
-    """Learned perceptual image patch similarity (Zhang et al. 2018, v0.1): 0 for identical images, no upper bound.
+    """Learned perceptual image patch similarity (Zhang et al.
 
-    Name it with its network, "LPIPS-squeeze" (`label`): the networks' figures do not compare with each other. The
-    heads (C,), one for each compared layer, say how much each channel counts.
+    2018, v0.1): 0 for identical images, no upper bound.
+
+    Name it with its network, "LPIPS-squeeze" (`label`): the networks' figures do not compare with
+    each other. The heads (C,), one for each compared layer, say how much each channel counts.
     """
 
     heads: Tensor
@@ -232,14 +253,18 @@ class Lpips(nn.Module):
 
     @classmethod
     def load(cls, network: str, path: Path) -> Self:
-        """The metric with its published heads, over the backbone in a file (see `find_backbone`)."""
+        """The metric with its published heads, over the backbone in a file (see
+        `find_backbone`).
+        """
         backbone = load_backbone(network, path)
         names = [f"lin{layer}" for layer in range(len(backbone.spec.taps))]
         heads = read_tensors(PUBLISHED / f"lpips-{network}.safetensors", names)
         return cls(backbone, [heads[name] for name in names])
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """The distance (N,) of each pair (N, 1, H, W), 0 to 1 of full scale; its gradient is finite everywhere."""
+        """The distance (N,) of each pair (N, 1, H, W), 0 to 1 of full scale; its gradient is finite
+        everywhere.
+        """
         _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):
             pairs = zip(self.backbone(image)[1:], self.backbone(reference)[1:], strict=True)
@@ -248,10 +273,12 @@ class Lpips(nn.Module):
 
 
 class Dists(nn.Module):
-    """Deep image structure and texture similarity (Ding et al. 2020): 0 for identical images, at most 1.
+    """Deep image structure and texture similarity (Ding et al.
 
-    Over VGG16 with L2 pooling. `alpha` (1475,) says how much the mean (texture) of the image and of each of its
-    channels counts, `beta` (1475,) how much their covariance (structure).
+    2020): 0 for identical images, at most 1.
+
+    Over VGG16 with L2 pooling. `alpha` (1475,) says how much the mean (texture) of the image and of
+    each of its channels counts, `beta` (1475,) how much their covariance (structure).
     """
 
     label = "DISTS"
@@ -268,13 +295,17 @@ class Dists(nn.Module):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """The metric with its published weights, over the VGG16 in a file (`find_backbone("vgg")`)."""
+        """The metric with its published weights, over the VGG16 in a file
+        (`find_backbone("vgg")`).
+        """
         backbone = load_backbone("vgg", path, l2_pool=True)
         weights = read_tensors(PUBLISHED / "dists.safetensors", ["alpha", "beta"])
         return cls(backbone, weights["alpha"], weights["beta"])
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """The distance (N,) of each pair (N, 1, H, W), 0 to 1 of full scale; its gradient is finite everywhere."""
+        """The distance (N,) of each pair (N, 1, H, W), 0 to 1 of full scale; its gradient is finite
+        everywhere.
+        """
         _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):
             stages = zip(self.backbone(image), self.backbone(reference), strict=True)
@@ -286,8 +317,9 @@ class Dists(nn.Module):
 def _unit(features: Tensor) -> Tensor:
     """Each pixel's features at length 1.
 
-    The package divides by sqrt(sum) + 1e-10, whose gradient is NaN where all features are zero and unbounded near it.
-    With a floor under the sum the value is the same and the gradient at most 1 / MIN_NORM.
+    The package divides by sqrt(sum) + 1e-10, whose gradient is NaN where all features are zero and
+    unbounded near it. With a floor under the sum the value is the same and the gradient at most 1 /
+    MIN_NORM.
     """
     return features / features.square().sum(dim=1, keepdim=True).clamp(min=MIN_NORM**2).sqrt()
 
@@ -295,7 +327,8 @@ def _unit(features: Tensor) -> Tensor:
 def _texture_and_structure(a: Tensor, b: Tensor, small: float = 1e-6) -> tuple[Tensor, Tensor]:
     """1 minus the similarity of the means, and of the covariances, of each channel: two (N, C).
 
-    Written as differences, not as 1 - (2 x y + c) / (x^2 + y^2 + c): identical images then give 0 to the last digit.
+    Written as differences, not as 1 - (2 x y + c) / (x^2 + y^2 + c): identical images then give 0
+    to the last digit.
     """
     mean_a = a.mean(dim=(2, 3), keepdim=True)
     mean_b = b.mean(dim=(2, 3), keepdim=True)
@@ -312,4 +345,6 @@ def _check_pair(label: str, backbone: Backbone, image: Tensor, reference: Tensor
     if not grey or min(image.shape[2:]) < smallest:
         expected = f"two images (N, 1, H, W) of at least {smallest} pixels a side"
         got = f"{tuple(image.shape)} and {tuple(reference.shape)}"
-        raise ImageError(label, expected=expected, got=got, remedy="give larger images, grey and of one shape")
+        raise ImageError(
+            label, expected=expected, got=got, remedy="give larger images, grey and of one shape"
+        )

@@ -1,15 +1,18 @@
-"""A slanted edge whose angle is known: how it is drawn as a scene, and the MTF that an image of it has.
+"""A slanted edge whose angle is known: how it is drawn as a scene, and the MTF that an image of it
+has.
 
 ISO 12233:2017 with another DC:
 
-1. The angle and the middle are those that the edge was drawn with; a shift along the rows is measured.
-2. Fit the plateaus: they give the step, which is the MTF's DC, and the far tails of the point-spread function.
-3. Take off an edge with these tails, whose MTF is known. Average what it leaves in bins of a quarter pixel,
-   differentiate, window, transform; add the known MTF.
+1. The angle and the middle are those that the edge was drawn with; a shift along the rows is
+  measured.
+2. Fit the plateaus: they give the step, which is the MTF's DC, and the far tails of the
+  point-spread function.
+3. Take off an edge with these tails, whose MTF is known. Average what it leaves in bins of a
+  quarter pixel, differentiate, window, transform; add the known MTF.
 
-ISO 12233 divides by the windowed derivative's own sum instead. With the tails of optics, MTF = exp(-gamma f), that
-sum lacks 4 to 12 % of the step, and the MTF comes out too high by as much. The window resolves some 0.1 cycles per
-pixel: a narrower peak of the curve comes out flatter.
+ISO 12233 divides by the windowed derivative's own sum instead. With the tails of optics, MTF =
+exp(-gamma f), that sum lacks 4 to 12 % of the step, and the MTF comes out too high by as much. The
+window resolves some 0.1 cycles per pixel: a narrower peak of the curve comes out flatter.
 """
 
 import math
@@ -33,9 +36,11 @@ PASSES = 3
 
 
 def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -> float | Refusal:
-    """Measure the MTF at Nyquist across an edge that runs through the middle of an image, dark on the left.
+    """Measure the MTF at Nyquist across an edge that runs through the middle of an image, dark on
+    the left.
 
-    The figure is that along the edge's normal: a square detector keeps 0.6 % more at 15 degrees than along the axis.
+    The figure is that along the edge's normal: a square detector keeps 0.6 % more at 15 degrees
+    than along the axis.
 
     Args:
         image: (H, W) pixels of any linear unit, 12-bit DN or radiance; about 80 x 80.
@@ -43,7 +48,8 @@ def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -
         saturated: the value at which pixels clip, in the image's unit. They also clip at 0.
 
     Returns:
-        Contrast kept at 0.5 cycles per pixel, below 0 by noise or where contrast is reversed; or why there is none.
+        Contrast kept at 0.5 cycles per pixel, below 0 by noise or where contrast is reversed; or
+            why there is none.
     """
     pixels = np.asarray(image, np.float64)
     distance = _unusable(pixels, saturated) or _distance(pixels, math.radians(angle_deg))
@@ -69,8 +75,9 @@ def _unusable(image: np.ndarray, saturated: float) -> Refusal | None:
 def _distance(image: np.ndarray, angle: float) -> np.ndarray | Refusal:
     """Signed distance (H, W) of every pixel to the edge along its normal, in pixels.
 
-    The centroid of the derivative says by how much the edge lies off the middle: noise does not then add up to a
-    contrast that is not there, nor does a restoration that moves its image lose one.
+    The centroid of the derivative says by how much the edge lies off the middle: noise does not
+    then add up to a contrast that is not there, nor does a restoration that moves its image lose
+    one.
     """
     rows, columns = (np.arange(side) - (side - 1) / 2 for side in image.shape)
     across = columns[None, :] + rows[:, None] * math.tan(angle)
@@ -89,7 +96,9 @@ def _distance(image: np.ndarray, angle: float) -> np.ndarray | Refusal:
 
 
 def _hamming(place: np.ndarray) -> np.ndarray:
-    """Hamming window of half width WINDOW_PX around 0, and 0 beyond; `place` in pixels, of any shape."""
+    """Hamming window of half width WINDOW_PX around 0, and 0 beyond; `place` in pixels, of any
+    shape.
+    """
     window = 0.54 + 0.46 * np.cos(np.pi * place / WINDOW_PX)
     return np.asarray(np.where(np.abs(place) <= WINDOW_PX, window, 0.0))
 
@@ -98,17 +107,21 @@ SOFTNESS_PX = 0.35 * 1.2 ** np.arange(12)
 """What the model may have, 0.35 to 2.6 px: quarter pixels sample the least of it without alias."""
 
 MODEL_FREQUENCIES = np.arange(0.01, 2, 0.02)
-"""Where the model's spectrum is added up, cycles per pixel; it ends before 2, and its tails are cut at 50 px."""
+"""Where the model's spectrum is added up, cycles per pixel; it ends before 2, and its tails are cut
+at 50 px.
+"""
 
 
 @dataclass(frozen=True)
 class Plateaus:
-    """Fit of low + c / |d| on the left and high - c / |d| on the right of the edge, d the distance in pixels.
+    """Fit of low + c / |d| on the left and high - c / |d| on the right of the edge, d the distance
+    in pixels.
 
     Attributes:
         low: far on the left.
         step: difference of the plateaus far from the edge: the DC of the MTF.
-        tail_px: a = pi c / step, the tails of a PSF whose MTF begins as exp(-2 pi a |f|); 0 or more.
+        tail_px: a = pi c / step, the tails of a PSF whose MTF begins as exp(-2 pi a |f|); 0 or
+            more.
         sigma: scatter of a pixel around the fit.
     """
 
@@ -118,7 +131,9 @@ class Plateaus:
     sigma: float
 
     def transfer(self, frequencies: ArrayLike, softness_px: float) -> np.ndarray:
-        """MTF of an edge with these tails and a Gaussian of that standard deviation, of frequencies of any shape."""
+        """MTF of an edge with these tails and a Gaussian of that standard deviation, of frequencies
+        of any shape.
+        """
         frequencies = np.asarray(frequencies)
         gaussian = np.exp(-2 * (math.pi * softness_px * frequencies) ** 2)
         return np.asarray(np.exp(-2 * math.pi * self.tail_px * frequencies) * gaussian)
@@ -127,7 +142,9 @@ class Plateaus:
         """That edge itself: (N,) for distances (N,) of a few pixels."""
         f = MODEL_FREQUENCIES
         waves = np.sin(2 * math.pi * f * distance[:, None]) / (math.pi * f)
-        return np.asarray(self.low + self.step * (0.5 + (f[1] - f[0]) * waves @ self.transfer(f, softness_px)))
+        return np.asarray(
+            self.low + self.step * (0.5 + (f[1] - f[0]) * waves @ self.transfer(f, softness_px))
+        )
 
 
 def _fit_plateaus(image: np.ndarray, distance: np.ndarray) -> Plateaus:
@@ -145,8 +162,8 @@ def _fit_plateaus(image: np.ndarray, distance: np.ndarray) -> Plateaus:
 def _mtf(image: np.ndarray, distance: np.ndarray, plateaus: Plateaus) -> float:
     """The MTF of the model that comes closest to the edge, and that of what it leaves.
 
-    Without the tails what is left is compact, so the window around it costs next to nothing. The model only has to
-    have the right tails: what else it gets wrong stands in the bins.
+    Without the tails what is left is compact, so the window around it costs next to nothing. The
+    model only has to have the right tails: what else it gets wrong stands in the bins.
     """
     near = np.abs(np.rint(distance * BINS_PER_PX)) <= HALF
     place = distance[near] * BINS_PER_PX
@@ -161,7 +178,8 @@ def _mtf(image: np.ndarray, distance: np.ndarray, plateaus: Plateaus) -> float:
 
     edge = mean(values)
     softness_px = min(
-        SOFTNESS_PX, key=lambda s: float(((edge - plateaus.model(centres / BINS_PER_PX, s)) ** 2).sum())
+        SOFTNESS_PX,
+        key=lambda s: float(((edge - plateaus.model(centres / BINS_PER_PX, s)) ** 2).sum()),
     )
     left = mean(values - plateaus.model(place / BINS_PER_PX, softness_px))
     shift = mean(place - bins)
@@ -181,13 +199,15 @@ def _at_centres(averages: np.ndarray, shift: np.ndarray) -> np.ndarray:
 
 
 def _transform(variance_px2: float) -> np.ndarray:
-    """(B,) what each bin adds to the transform at Nyquist: derivative, window and cosine, the losses undone.
+    """(B,) what each bin adds to the transform at Nyquist: derivative, window and cosine, the
+    losses undone.
 
     `variance_px2` is that of the pixels' places within a bin: the blur that averaging adds.
     """
     place = np.arange(-HALF + 1, HALF) / BINS_PER_PX
     wave = np.cos(2 * math.pi * NYQUIST * place) * _hamming(place)
-    # The derivative as a central difference, turned onto the weights so that it costs no pass of its own.
+    # The derivative as a central difference, turned onto the weights so that it costs no pass of
+    # its own.
     weights = (np.pad(wave, (2, 0)) - np.pad(wave, (0, 2))) / 2
     averaging = math.exp(-2 * (math.pi * NYQUIST) ** 2 * variance_px2)
     return np.asarray(weights / (averaging * np.sinc(2 * NYQUIST / BINS_PER_PX)))
@@ -198,8 +218,9 @@ def slanted_edge(
 ) -> np.ndarray:
     """A straight edge through the middle of a square scene, (S, S) with S = side_px * oversampling.
 
-    Simulate a scene much larger than the part you measure: its borders wrap around, which puts a second edge there.
-    240 target pixels for a central part of 80 leave an error of 0.05 MTF points (measured).
+    Simulate a scene much larger than the part you measure: its borders wrap around, which puts a
+    second edge there. 240 target pixels for a central part of 80 leave an error of 0.05 MTF points
+    (measured).
 
     Args:
         side_px: side of the scene in target pixels.
@@ -208,8 +229,10 @@ def slanted_edge(
         radiance: W/m2/sr/um on the left and on the right.
 
     Returns:
-        (side_px * oversampling,) * 2 float32 radiance. Edge pixels hold the share that the edge covers; the blur of
-        that averaging, 1.6 % at Nyquist for an oversampling of 5, is taken off again to fourth order, at the price
+        (side_px * oversampling,) * 2 float32 radiance. Edge pixels hold the share that the edge
+            covers; the blur of
+        that averaging, 1.6 % at Nyquist for an oversampling of 5, is taken off again to fourth
+            order, at the price
         of an overshoot of some 4 % of the step.
     """
     angle = math.radians(angle_deg)
@@ -221,19 +244,25 @@ def slanted_edge(
 
 
 def _covered(distance: np.ndarray, width: float, height: float) -> np.ndarray:
-    """Share of a unit square on the right of an edge at `distance` from its centre, whose projections are given.
+    """Share of a unit square on the right of an edge at `distance` from its centre, whose
+    projections are given.
 
-    The square seen along the edge is a box of `width` smeared by one of `height`: the share is its double integral.
+    The square seen along the edge is a box of `width` smeared by one of `height`: the share is its
+    double integral.
     """
     small, large = sorted((width, height))
     if small < 1e-9:
         return np.asarray(np.clip(distance / large + 0.5, 0, 1))
-    ramps = [(sa * sb, distance + (sa * large + sb * small) / 2) for sa in (1, -1) for sb in (1, -1)]
+    ramps = [
+        (sa * sb, distance + (sa * large + sb * small) / 2) for sa in (1, -1) for sb in (1, -1)
+    ]
     return np.asarray(sum(sign * np.maximum(x, 0) ** 2 for sign, x in ramps) / (2 * small * large))
 
 
 def _sharpened(image: np.ndarray) -> np.ndarray:
-    """The image without 1/24 of its second differences, which undoes a box of one pixel; 2 pixels a side shorter."""
+    """The image without 1/24 of its second differences, which undoes a box of one pixel; 2 pixels a
+    side shorter.
+    """
     rows = image[1:-1] - (image[2:] - 2 * image[1:-1] + image[:-2]) / 24
     both = rows[:, 1:-1] - (rows[:, 2:] - 2 * rows[:, 1:-1] + rows[:, :-2]) / 24
     return np.asarray(both[1:-1, 1:-1])

@@ -1,12 +1,15 @@
-"""One straight edge between uneven sides: where it runs, what lies on either side, and what it says of the MTF.
+"""One straight edge between uneven sides: where it runs, what lies on either side, and what it says
+of the MTF.
 
-Roofs, kerbs and shadows are no calibration targets. Each side is a plane of its own, and what remains of its texture
-counts as noise: it lowers the weight of the edge instead of refusing it.
+Roofs, kerbs and shadows are no calibration targets. Each side is a plane of its own, and what
+remains of its texture counts as noise: it lowers the weight of the edge instead of refusing it.
 
-    pixel = left plane * (1 - E(d)) + right plane * E(d),    d = distance to the edge along its normal
+    pixel = left plane * (1 - E(d)) + right plane * E(d)
+    d     = distance to the edge along its normal
 
-E is the image of a step (`mtf_basis`). Gauss-Newton with Huber's weights finds the line and the planes for a known E;
-what they leave over is linear in the weights of E, and is handed on as normal equations.
+E is the image of a step (`mtf_basis`). Gauss-Newton with Huber's weights finds the line and the
+planes for a known E; what they leave over is linear in the weights of E, and is handed on as normal
+equations.
 """
 
 import math
@@ -20,13 +23,19 @@ from beers_deploy.model.metrics.mtf_basis import PARTS, at_distances, responses,
 HALF_PX = 8.0
 """How far from the edge pixels are fitted."""
 STRIP_PX = 5
-"""Length of the strips along the edge that count as independent looks: longer than blurred texture."""
+"""Length of the strips along the edge that count as independent looks: longer
+than blurred texture.
+"""
 
 GRADIENT = 0.08
-"""Standard deviation of what a plane changes away from the edge over HALF_PX, of the step. Far tails of the blur look
-the same; a wider one lets gradients take their place."""
+"""Standard deviation of what a plane changes away from the edge over HALF_PX, of the step.
+
+Far tails of the blur look the same; a wider one lets gradients take their place.
+"""
 BOW_PX = 0.3
-"""Standard deviation of how far an edge bends off a straight line at its ends: distortion, kerbs."""
+"""Standard deviation of how far an edge bends off a straight line at its ends:
+distortion, kerbs.
+"""
 HUBER = 2.5
 """Robust deviations from which a pixel counts less: cars, branches and drains lie beside edges."""
 MAD = 1.4826
@@ -57,7 +66,9 @@ class EdgePixels:
 
 
 class EdgeLine(NamedTuple):
-    """Where an edge runs: x = place + slope * y + bow * (2 y / H)^2, from the middle of its pixels."""
+    """Where an edge runs: x = place + slope * y + bow * (2 y / H)^2, from the
+    middle of its pixels.
+    """
 
     place_px: float
     slope: float
@@ -65,7 +76,9 @@ class EdgeLine(NamedTuple):
 
 
 class Side(NamedTuple):
-    """Pixels within HALF_PX of an edge, (P,) each: distance and place along it in pixels, values and variance."""
+    """Pixels within HALF_PX of an edge, (P,) each: distance and place along it in pixels, values
+    and variance.
+    """
 
     distance_px: np.ndarray
     along_px: np.ndarray
@@ -80,8 +93,10 @@ class FittedEdge:
     Attributes:
         pixels: of the edge.
         line: where it runs.
-        levels: (6,) left and right plane: in the middle, change over half the length, change over HALF_PX.
-        weights: (P,) one over the standard deviation of each pixel near the edge, texture and Huber's weight in it.
+        levels: (6,) left and right plane: in the middle, change over half the length, change over
+            HALF_PX.
+        weights: (P,) one over the standard deviation of each pixel near the edge, texture and
+            Huber's weight in it.
         step: difference of the planes at the edge.
         unevenness: root mean square of the texture that the planes leave, of the step.
         normal: (P + 9, 9) derivatives by planes and line, weighted, with what is expected of them.
@@ -102,7 +117,9 @@ class FittedEdge:
     strip: np.ndarray
 
 
-def fit_edge(pixels: EdgePixels, line: EdgeLine, weights: np.ndarray, passes: int) -> FittedEdge | None:
+def fit_edge(
+    pixels: EdgePixels, line: EdgeLine, weights: np.ndarray, passes: int
+) -> FittedEdge | None:
     """Fit the line and both planes of an edge to a known curve.
 
     Args:
@@ -128,7 +145,9 @@ def fit_edge(pixels: EdgePixels, line: EdgeLine, weights: np.ndarray, passes: in
         if min(left.sum(), right.sum()) < 4 * HALF_PX:
             return None
         if levels is None:
-            levels = np.array([np.median(near.values[left]), 0, 0, np.median(near.values[right]), 0, 0])
+            levels = np.array(
+                [np.median(near.values[left]), 0, 0, np.median(near.values[right]), 0, 0]
+            )
         step = levels[3] - levels[0]
         if step == 0:
             return None
@@ -145,13 +164,25 @@ def fit_edge(pixels: EdgePixels, line: EdgeLine, weights: np.ndarray, passes: in
         expected, expected_rest = _expectations(levels, line, step)
         normal = np.vstack([np.hstack([by_levels, by_line]) * pixel_weights[:, None], expected])
         curve = np.vstack(
-            [(rise * pixel_weights)[:, None] * at_distances(edges, near.distance_px), np.zeros((NUMBERS, PARTS))]
+            [
+                (rise * pixel_weights)[:, None] * at_distances(edges, near.distance_px),
+                np.zeros((NUMBERS, PARTS)),
+            ]
         )
         weighted_rest = np.concatenate([rest * pixel_weights, expected_rest])
         strip = np.floor((near.along_px + height / 2) / STRIP_PX).astype(int)
         unevenness = math.sqrt(texture) / abs(step)
         fitted = FittedEdge(
-            pixels, line, levels, pixel_weights, abs(step), unevenness, normal, curve, weighted_rest, strip
+            pixels,
+            line,
+            levels,
+            pixel_weights,
+            abs(step),
+            unevenness,
+            normal,
+            curve,
+            weighted_rest,
+            strip,
         )
         change = np.linalg.lstsq(normal, weighted_rest, rcond=None)[0]
         levels = levels + change[:LEVELS]
@@ -173,11 +204,16 @@ def _near(pixels: EdgePixels, line: EdgeLine) -> Side:
 
 def _plane(near: Side, height: int) -> np.ndarray:
     """(P, 3) what each number of a plane adds to each pixel."""
-    return np.stack([np.ones_like(near.along_px), 2 * near.along_px / height, near.distance_px / HALF_PX], axis=1)
+    return np.stack(
+        [np.ones_like(near.along_px), 2 * near.along_px / height, near.distance_px / HALF_PX],
+        axis=1,
+    )
 
 
 def _by_line(near: Side, line: EdgeLine, slope: np.ndarray, height: int) -> np.ndarray:
-    """(P, 3) derivatives of the pixels by place, slope and bow; `slope` (P,) is that by the distance."""
+    """(P, 3) derivatives of the pixels by place, slope and bow; `slope` (P,) is that by the
+    distance.
+    """
     by_place = -slope / math.hypot(1, line.slope)
     along = near.along_px
     return np.stack([by_place, by_place * along, by_place * (2 * along / height) ** 2], axis=1)
@@ -230,9 +266,11 @@ def strips_of(edge: FittedEdge) -> int:
 
 
 def softness(edge: FittedEdge, weights: np.ndarray) -> tuple[float, float]:
-    """By how much an edge is softer than a curve: s of a further factor exp(-s f), in pixels; and its standard error.
+    """By how much an edge is softer than a curve: s of a further factor exp(-s f), in pixels; and
+    its standard error.
 
-    The error is the larger of what noise and texture leave and of what the strips along the edge differ by.
+    The error is the larger of what noise and texture leave and of what the strips along the edge
+    differ by.
     """
     by_softness = edge.curve @ (softened(weights, SOFTER_PX) - weights) / SOFTER_PX
     basis, _ = np.linalg.qr(edge.normal)

@@ -1,4 +1,6 @@
-"""One scene, seen by one sensor or by two: blur, sampling, then what `detector` does in the order of its lists."""
+"""One scene, seen by one sensor or by two: blur, sampling, then what `detector` does in the order
+of its lists.
+"""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
@@ -14,11 +16,15 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument
 
 MARGIN_PX = 32
-"""Target pixels cropped on each side: the FFT wraps around, and the PSF's tail is long (10.8 DN at 32)."""
+"""Target pixels cropped on each side: the FFT wraps around, and the PSF's tail is long (10.8 DN at
+32).
+"""
 LEAST_SIDE_PX = 48
 """Target pixels a side that evaluation and validation want of an image, without its margins."""
 NOISE = ("noise", "digitising")
-"""What an acquisition leaves out to be free of noise: that of the light and the detector, and that of rounding."""
+"""What an acquisition leaves out to be free of noise: that of the light and the detector, and that
+of rounding.
+"""
 
 
 @dataclass(frozen=True)
@@ -31,7 +37,9 @@ class Pair:
 
 @dataclass(frozen=True)
 class PreparedScene:
-    """A scene (H, W) in W/m2/sr/um on its way to several sensors: what they share is computed once."""
+    """A scene (H, W) in W/m2/sr/um on its way to several sensors: what they
+    share is computed once.
+    """
 
     radiance: np.ndarray
     oversampling: int
@@ -43,7 +51,9 @@ class PreparedScene:
 
     @cached_property
     def spectrum(self) -> np.ndarray:
-        """Half spectrum (H, W // 2 + 1) of the scene, computed when the first plan asks for a blur."""
+        """Half spectrum (H, W // 2 + 1) of the scene, computed when the first
+        plan asks for a blur.
+        """
         return scene_spectrum(self.radiance)
 
 
@@ -60,12 +70,16 @@ def simulate_planned(
     role: str = "degraded",
     margin_px: int = MARGIN_PX,
 ) -> np.ndarray:
-    """A scene with only the effects that its plan calls for: digital numbers (H / r - 2 margin, W / r - 2 margin)."""
+    """A scene with only the effects that its plan calls for: digital numbers (H / r - 2 margin, W /
+    r - 2 margin).
+    """
     if "mtf" not in plan.skipped:
         kept = without(sensor, plan.skipped)
         width = scene.radiance.shape[-1]
         ratio = scene.oversampling
-        return acquire(scene.spectrum, width, kept, ratio, draw, role, margin_px=margin_px, skip=plan.skipped)
+        return acquire(
+            scene.spectrum, width, kept, ratio, draw, role, margin_px=margin_px, skip=plan.skipped
+        )
     # Without any blur a target pixel is the mean of its scene pixels, which needs no transform.
     ratio, (height, width) = scene.oversampling, scene.radiance.shape
     pixels = scene.radiance.reshape(height // ratio, ratio, width // ratio, ratio).mean((1, 3))
@@ -85,7 +99,9 @@ def simulate_pair(
     draw: Draw,
     margin_px: int = MARGIN_PX,
 ) -> Pair:
-    """A scene (..., H, W) in W/m2/sr/um twice, each (..., H / r - 2 margin, W / r - 2 margin) with its own noise."""
+    """A scene (..., H, W) in W/m2/sr/um twice, each (..., H / r - 2 margin, W / r - 2 margin) with
+    its own noise.
+    """
     radiance = crop_divisible(radiance, oversampling)
     spectrum = scene_spectrum(radiance)
     pair = (
@@ -106,7 +122,8 @@ def acquire(
     margin_px: int = MARGIN_PX,
     skip: Collection[str] = (),
 ) -> np.ndarray:
-    """Digital numbers (h, w) of one acquisition: blur and sampling, then what `detect` does on the target grid.
+    """Digital numbers (h, w) of one acquisition: blur and sampling, then what `detect` does on the
+    target grid.
 
     Args:
         spectrum: see `sampling.scene_spectrum`.
@@ -127,18 +144,32 @@ def acquire(
 def acquire_three(
     scene: PreparedScene, degraded: Instrument, reference: Instrument, draw: Draw
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A pair of one scene, and the reference once more without noise and rounding: digital numbers (h, w) each."""
+    """A pair of one scene, and the reference once more without noise and rounding: digital numbers
+    (h, w) each.
+    """
 
     def by(sensor: Instrument, role: str, skip: Collection[str] = ()) -> np.ndarray:
-        return acquire(scene.spectrum, scene.radiance.shape[-1], sensor, scene.oversampling, draw, role, skip=skip)
+        return acquire(
+            scene.spectrum,
+            scene.radiance.shape[-1],
+            sensor,
+            scene.oversampling,
+            draw,
+            role,
+            skip=skip,
+        )
 
     return by(degraded, "degraded"), by(reference, "reference"), by(reference, "reference", NOISE)
 
 
-def acquire_padded(radiance: np.ndarray, sensor: Instrument, oversampling: int, draw: Draw, role: str) -> np.ndarray:
-    """Acquire a scene (H, W) whole, (ceil(H / r), ceil(W / r)): a mirror image lies where the margin is cut off.
+def acquire_padded(
+    radiance: np.ndarray, sensor: Instrument, oversampling: int, draw: Draw, role: str
+) -> np.ndarray:
+    """Acquire a scene (H, W) whole, (ceil(H / r), ceil(W / r)): a mirror image lies where the
+    margin is cut off.
 
-    Pixel n covers scene pixels r*n to r*n + r - 1: a place x of the scene, pixel i from i to i + 1, lies at x / r.
+    Pixel n covers scene pixels r*n to r*n + r - 1: a place x of the scene, pixel i from i to i + 1,
+    lies at x / r.
     """
     margin_px = MARGIN_PX * oversampling
     after = [margin_px - size % -oversampling for size in radiance.shape]
@@ -146,10 +177,16 @@ def acquire_padded(radiance: np.ndarray, sensor: Instrument, oversampling: int, 
     return acquire(scene_spectrum(scene), scene.shape[1], sensor, oversampling, draw, role)
 
 
-def fitting_oversampling(radiance: np.ndarray, oversamplings: Iterable[int], side_px: int) -> int | None:
-    """The first oversampling that leaves `side_px` target pixels within the margin of a scene (H, W), or None."""
+def fitting_oversampling(
+    radiance: np.ndarray, oversamplings: Iterable[int], side_px: int
+) -> int | None:
+    """The first oversampling that leaves `side_px` target pixels within the margin of a scene (H,
+    W), or None.
+    """
     target_px = side_px + 2 * MARGIN_PX
-    return next((ratio for ratio in oversamplings if min(radiance.shape) // ratio >= target_px), None)
+    return next(
+        (ratio for ratio in oversamplings if min(radiance.shape) // ratio >= target_px), None
+    )
 
 
 def crop_margin(image: np.ndarray, margin_px: int) -> np.ndarray:

@@ -1,7 +1,9 @@
-"""A drawn chart: squares of flat ground, faint bars, zone plates, soft texture, discs and points, dark and bright.
+"""A drawn chart: squares of flat ground, faint bars, zone plates, soft texture, discs and points,
+dark and bright.
 
-Photographs show faint and fine patterns rarely, and never without a camera's noise. What a network should do with
-them it learns from charts: to keep what the raw image shows, and to add nothing to what is flat.
+Photographs show faint and fine patterns rarely, and never without a camera's noise. What a network
+should do with them it learns from charts: to keep what the raw image shows, and to add nothing to
+what is flat.
 """
 
 import math
@@ -32,7 +34,9 @@ Pattern = NDArray[np.float64]
 def draw_charts(count: int, seed: int) -> list[Scene]:
     """Draw charts, each with its own generator."""
     generators = np.random.default_rng(seed).spawn(count)
-    return [Scene(f"chart {number}", chart(generator)) for number, generator in enumerate(generators)]
+    return [
+        Scene(f"chart {number}", chart(generator)) for number, generator in enumerate(generators)
+    ]
 
 
 def chart(generator: np.random.Generator) -> NDArray[np.float32]:
@@ -41,7 +45,9 @@ def chart(generator: np.random.Generator) -> NDArray[np.float32]:
     radiance = np.empty((SIDE_PX, SIDE_PX))
     for top in range(0, SIDE_PX, SQUARE_PX):
         for left in range(0, SIDE_PX, SQUARE_PX):
-            kind: Callable[[float, np.random.Generator], Pattern] = kinds[int(generator.integers(len(kinds)))]
+            kind: Callable[[float, np.random.Generator], Pattern] = kinds[
+                int(generator.integers(len(kinds)))
+            ]
             level = log_uniform(generator, LEVELS)
             radiance[top : top + SQUARE_PX, left : left + SQUARE_PX] = kind(level, generator)
     return radiance.astype(np.float32)
@@ -56,9 +62,16 @@ def bars(level: float, generator: np.random.Generator) -> Pattern:
     """Bars of any direction, between a sine and a square wave."""
     y, x = _coordinates()
     angle = float(generator.uniform(0, math.pi))
-    if generator.random() < 0.5:  # rows and columns are the commonest direction, and the hardest: they alias
+    if (
+        generator.random() < 0.5
+    ):  # rows and columns are the commonest direction, and the hardest: they alias
         angle = float(generator.choice([0.0, math.pi / 2]))
-    phase = 2 * math.pi / log_uniform(generator, PERIODS_PX) * (x * math.cos(angle) + y * math.sin(angle))
+    phase = (
+        2
+        * math.pi
+        / log_uniform(generator, PERIODS_PX)
+        * (x * math.cos(angle) + y * math.sin(angle))
+    )
     return _wave(level, phase + generator.uniform(0, 2 * math.pi), generator)
 
 
@@ -83,7 +96,9 @@ def discs(level: float, generator: np.random.Generator) -> Pattern:
     for _ in range(12):
         middle_y, middle_x = generator.uniform(-SQUARE_PX / 2, SQUARE_PX / 2, 2)
         inside = np.hypot(y - middle_y, x - middle_x) < generator.uniform(2, 30)
-        found[inside] = level * (1 + float(generator.choice([-1, 1])) * log_uniform(generator, CONTRASTS))
+        found[inside] = level * (
+            1 + float(generator.choice([-1, 1])) * log_uniform(generator, CONTRASTS)
+        )
     return found
 
 

@@ -1,8 +1,9 @@
-"""What the detectors and the electronics do to the sampled signal, on the target grid: the order stands here.
+"""What the detectors and the electronics do to the sampled signal, on the target grid: the order
+stands here.
 
-Haze before the instrument, saturation and what spills over, fixed-pattern noise of a push-broom sensor, noise that
-grows with the light, dead and hot pixels, and the converter. Each random effect has a generator of its own, keyed
-by (seed, patch, effect).
+Haze before the instrument, saturation and what spills over, fixed-pattern noise of a push-broom
+sensor, noise that grows with the light, dead and hot pixels, and the converter. Each random effect
+has a generator of its own, keyed by (seed, patch, effect).
 """
 
 import zlib
@@ -27,15 +28,18 @@ NOISE_LIMIT = 6.0
 
 
 def noise_sigma(radiance: np.ndarray, sensor: Instrument) -> np.ndarray:
-    """sigma(L) = sqrt(alpha L + beta), in W/m2/sr/um, for radiances of any shape (paper, section 3.3).
+    """sigma(L) = sqrt(alpha L + beta), in W/m2/sr/um, for radiances of any shape (paper, section
+    3.3).
 
-    Ringing can push L below zero, where there is no light to be noisy about: L counts as 0 there. A negative
-    variance (possible only for a sensor built by hand) counts as 0 too.
+    Ringing can push L below zero, where there is no light to be noisy about: L counts as 0 there. A
+    negative variance (possible only for a sensor built by hand) counts as 0 too.
     """
     return np.asarray(np.sqrt(np.maximum(sensor.alpha * np.maximum(radiance, 0) + sensor.beta, 0)))
 
 
-def add_noise(radiance: np.ndarray, sensor: Instrument, generator: np.random.Generator) -> np.ndarray:
+def add_noise(
+    radiance: np.ndarray, sensor: Instrument, generator: np.random.Generator
+) -> np.ndarray:
     """L + sigma(L) * n, n standard normal and independent per pixel; any shape."""
     normal = generator.standard_normal(radiance.shape, dtype=np.float32)
     np.clip(normal, -NOISE_LIMIT, NOISE_LIMIT, out=normal)
@@ -45,7 +49,8 @@ def add_noise(radiance: np.ndarray, sensor: Instrument, generator: np.random.Gen
 def digitise(dn: np.ndarray, sensor: Instrument) -> np.ndarray:
     """Round digital numbers, of any shape, to whole ones and clip them to the converter's range.
 
-    Rounding adds 1/12 DN^2 of variance. Clipping comes before any cast, so that nothing wraps around.
+    Rounding adds 1/12 DN^2 of variance. Clipping comes before any cast, so that nothing wraps
+    around.
     """
     return np.asarray(np.rint(dn).clip(0, sensor.max_dn))
 
@@ -56,12 +61,16 @@ def to_radiance(dn: Pixels, sensor: Instrument) -> Pixels:
 
 
 def to_dn(radiance: Pixels, sensor: Instrument) -> Pixels:
-    """Digital numbers of radiances of any shape: `to_radiance` backwards, clipped to the range and not rounded."""
+    """Digital numbers of radiances of any shape: `to_radiance` backwards, clipped to the range and
+    not rounded.
+    """
     return (radiance * sensor.gain_dn_per_radiance + sensor.offset_dn).clip(0, sensor.max_dn)
 
 
 def to_uint16(dn: np.ndarray) -> np.ndarray:
-    """Whole digital numbers of at most 16 bits, of any shape, as the array that a TIFF file takes."""
+    """Whole digital numbers of at most 16 bits, of any shape, as the array that
+    a TIFF file takes.
+    """
     return np.asarray(np.rint(dn).clip(0, 65535), np.uint16)
 
 
@@ -73,20 +82,26 @@ class Draw:
     patch: int = 0
 
     def generator(self, effect: str) -> np.random.Generator:
-        """The generator of one effect of this patch; counter-based (Philox), the same on every machine."""
+        """The generator of one effect of this patch; counter-based (Philox), the same on every
+        machine.
+        """
         entropy = (self.seed, self.patch, zlib.crc32(effect.encode()))
         return np.random.Generator(np.random.Philox(np.random.SeedSequence(entropy)))
 
 
-def detect(signal: np.ndarray, sensor: Instrument, draw: Draw, role: str, skip: Collection[str] = ()) -> np.ndarray:
-    """Digital numbers of a blurred, sampled signal (..., H, W) in W/m2/sr/um: whole ones, unless told otherwise.
+def detect(
+    signal: np.ndarray, sensor: Instrument, draw: Draw, role: str, skip: Collection[str] = ()
+) -> np.ndarray:
+    """Digital numbers of a blurred, sampled signal (..., H, W) in W/m2/sr/um: whole ones, unless
+    told otherwise.
 
     Args:
         signal: radiance on the target grid.
         sensor: the instrument; it has an effect by having its table.
         draw: seed and patch number; each effect takes its own generator from it.
         role: "degraded" or "reference", so that the two draws of a pair differ.
-        skip: effects to leave out, see `plan.Plan.skipped`; without "digitising" they are clipped and not rounded.
+        skip: effects to leave out, see `plan.Plan.skipped`; without "digitising" they are clipped
+            and not rounded.
     """
     effects = {name: effect for name, effect in sensor.effects.items() if name not in skip}
 

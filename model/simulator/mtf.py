@@ -1,4 +1,6 @@
-"""The modulation transfer function: how much contrast an instrument keeps at each spatial frequency."""
+"""The modulation transfer function: how much contrast an instrument keeps at each spatial
+frequency.
+"""
 
 import math
 from functools import lru_cache
@@ -12,16 +14,21 @@ from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX, Instrument, mtf_limit
 
 
 def gamma_from_mtf(mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> float:
-    """Solve MTF(0.5, 0) = mtf_nyquist for gamma: gamma = -2 ln(mtf_nyquist * pi / (2 G)) (paper, section 3.3).
+    """Solve MTF(0.5, 0) = mtf_nyquist for gamma: gamma = -2 ln(mtf_nyquist * pi / (2 G)) (paper,
+    section 3.3).
 
-    G is the anti-alias filter's own gain at Nyquist: the filter is part of the budget, so that the product has the
-    MTF that its profile states. Limits: 2 G / pi gives 0 (the square detector alone); towards 0 it grows without
-    bound.
+    G is the anti-alias filter's own gain at Nyquist: the filter is part of the budget, so that the
+    product has the MTF that its profile states. Limits: 2 G / pi gives 0 (the square detector
+    alone); towards 0 it grows without bound.
     """
     limit = mtf_limit(antialias_sigma_px)
     if not 0 < mtf_nyquist <= limit:
         filter_gain = limit / MTF_NYQUIST_MAX
-        with_filter = f" behind an anti-alias filter that keeps {filter_gain:.3f}" if antialias_sigma_px else ""
+        with_filter = (
+            f" behind an anti-alias filter that keeps {filter_gain:.3f}"
+            if antialias_sigma_px
+            else ""
+        )
         raise OptionError(
             "MTF at Nyquist",
             expected=f"a ratio above 0 and up to {limit:.4f}{with_filter}",
@@ -33,22 +40,28 @@ def gamma_from_mtf(mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> float
 
 
 Blur = float | tuple[float, float] | Response
-"""What settles an MTF: its contrast at Nyquist, one for both axes or (across the track, along it), that is horizontal
-and vertical; or the whole of it, by a table or a point-spread function."""
+"""What settles an MTF: its contrast at Nyquist, one for both axes or (across the track, along it),
+that is horizontal and vertical; or the whole of it, by a table or a point-spread function.
+"""
 
 
-def mtf(fx: ArrayLike, fy: ArrayLike, blur: Blur, antialias_sigma_px: float = 0.0) -> NDArray[np.inexact]:
-    """MTF(fx, fy) = exp(-gamma * sqrt(fx^2 + fy^2)) * sinc(fx) * sinc(fy) * G(fx, fy) (paper, section 3.3).
+def mtf(
+    fx: ArrayLike, fy: ArrayLike, blur: Blur, antialias_sigma_px: float = 0.0
+) -> NDArray[np.inexact]:
+    """MTF(fx, fy) = exp(-gamma * sqrt(fx^2 + fy^2)) * sinc(fx) * sinc(fy) * G(fx, fy) (paper,
+    section 3.3).
 
-    With a second MTF, along the track, gamma * sqrt(fx^2 + fy^2) becomes sqrt((gamma_x fx)^2 + (gamma_y fy)^2): each
-    axis keeps the contrast stated for it, and equal ones give the paper's formula to the last bit. A table or a
-    point-spread function gives its own: see `profiles.response`.
+    With a second MTF, along the track, gamma * sqrt(fx^2 + fy^2) becomes sqrt((gamma_x fx)^2 +
+    (gamma_y fy)^2): each axis keeps the contrast stated for it, and equal ones give the paper's
+    formula to the last bit. A table or a point-spread function gives its own: see
+    `profiles.response`.
 
     Args:
-        fx: horizontal frequencies (1, W) in cycles per TARGET pixel, float64; for the formula any shape that
-            broadcasts against fy.
+        fx: horizontal frequencies (1, W) in cycles per TARGET pixel, float64; for the formula any
+            shape that broadcasts against fy.
         fy: vertical frequencies (H, 1), likewise. Beyond 1 the sinc is negative, and stays so.
-        blur: contrast kept at 0.5 cycles per pixel, the anti-alias filter G included; or the whole response.
+        blur: contrast kept at 0.5 cycles per pixel, the anti-alias filter G included; or the whole
+            response.
         antialias_sigma_px: standard deviation of that filter in target pixels; 0 is none (G = 1).
 
     Returns:
@@ -66,31 +79,48 @@ def mtf(fx: ArrayLike, fy: ArrayLike, blur: Blur, antialias_sigma_px: float = 0.
     across, along = blur if isinstance(blur, tuple) else (blur, blur)
     gamma_x, gamma_y = (gamma_from_mtf(value, antialias_sigma_px) for value in (across, along))
     radius = np.hypot(fx, fy)
-    # gamma * radius where it can be: hypot(gamma fx, gamma fy) rounds otherwise, and one gamma is the usual case
-    optics = np.exp(-gamma_x * radius if gamma_x == gamma_y else -np.hypot(gamma_x * fx, gamma_y * fy))
+    # gamma * radius where it can be: hypot(gamma fx, gamma fy) rounds otherwise, and one gamma is
+    # the usual case
+    optics = np.exp(
+        -gamma_x * radius if gamma_x == gamma_y else -np.hypot(gamma_x * fx, gamma_y * fy)
+    )
     response = np.asarray(optics * np.sinc(fx) * np.sinc(fy))
-    return response * gaussian_response(radius, antialias_sigma_px) if antialias_sigma_px else response
+    return (
+        response * gaussian_response(radius, antialias_sigma_px) if antialias_sigma_px else response
+    )
 
 
 def gaussian_response(frequency: ArrayLike, sigma_px: float) -> NDArray[np.float64]:
-    """exp(-2 pi^2 sigma^2 f^2), the transform of a Gaussian filter, at frequencies of any shape; 1 for sigma 0."""
+    """exp(-2 pi^2 sigma^2 f^2), the transform of a Gaussian filter, at frequencies of any shape; 1
+    for sigma 0.
+    """
     return np.asarray(np.exp(-2 * (math.pi * sigma_px * np.asarray(frequency, np.float64)) ** 2))
 
 
 def smear_response(fy: ArrayLike, length_px: float) -> NDArray[np.float64]:
-    """sinc(length * fy), for fy of any shape: uniform motion along the track during an exposure; 1 for length 0."""
+    """sinc(length * fy), for fy of any shape: uniform motion along the track during an exposure; 1
+    for length 0.
+    """
     return np.asarray(np.sinc(length_px * np.asarray(fy, np.float64)))
 
 
 def sensor_mtf(fx: ArrayLike, fy: ArrayLike, sensor: Instrument) -> NDArray[np.inexact]:
-    """What a sensor's blur and smear leave of each frequency, fx (1, W) and fy (H, 1) as in `mtf`: (H, W)."""
+    """What a sensor's blur and smear leave of each frequency, fx (1, W) and fy (H, 1) as in `mtf`:
+    (H, W).
+    """
     found = mtf(fx, fy, sensor.blur, sensor.antialias_px)
     return found * smear_response(fy, sensor.smear_px) if sensor.smear_px else found
 
 
-def sensor_transfer(height: int, width: int, oversampling: int, sensor: Instrument) -> NDArray[np.inexact]:
-    """All the linear, shift-invariant effects of a sensor as one transfer function (H, W // 2 + 1)."""
-    return transfer_function(height, width, oversampling, sensor.blur, sensor.antialias_px, sensor.smear_px)
+def sensor_transfer(
+    height: int, width: int, oversampling: int, sensor: Instrument
+) -> NDArray[np.inexact]:
+    """All the linear, shift-invariant effects of a sensor as one transfer
+    function (H, W // 2 + 1).
+    """
+    return transfer_function(
+        height, width, oversampling, sensor.blur, sensor.antialias_px, sensor.smear_px
+    )
 
 
 @lru_cache(maxsize=64)
@@ -102,10 +132,11 @@ def transfer_function(
     antialias_sigma_px: float = 0.0,
     smear_px: float = 0.0,
 ) -> NDArray[np.inexact]:
-    """MTF and smear on the half spectrum of a scene: (H, W // 2 + 1) float32, ready to multiply an rfft2.
+    """MTF and smear on the half spectrum of a scene: (H, W // 2 + 1) float32, ready to multiply an
+    rfft2.
 
-    `height` and `width` are in scene pixels, `oversampling` of which make one target pixel. Complex64 for a
-    point-spread function, which may be lopsided or lie aslant.
+    `height` and `width` are in scene pixels, `oversampling` of which make one target pixel.
+    Complex64 for a point-spread function, which may be lopsided or lie aslant.
     """
     aslant = isinstance(blur, PointSpread)
     vertical = np.fft.fftfreq if aslant else np.fft.rfftfreq
@@ -117,4 +148,6 @@ def transfer_function(
     if aslant:
         return found.astype(np.complex64)
     upper = found.astype(np.float32)
-    return np.concatenate([upper, upper[1 : (height + 1) // 2][::-1]])  # even in fy: the rows below are the same
+    return np.concatenate(
+        [upper, upper[1 : (height + 1) // 2][::-1]]
+    )  # even in fy: the rows below are the same

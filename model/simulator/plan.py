@@ -6,7 +6,8 @@ Each effect is applied, or skipped because
 2. neutral: its parameters change nothing;
 3. this scene cannot show it: a bound proves that no pixel changes by more than the tolerance.
 
-What is skipped for the third reason stays within the tolerance all together: bounds are added up, the smallest first.
+What is skipped for the third reason stays within the tolerance all together: bounds are added up,
+the smallest first.
 """
 
 import math
@@ -29,7 +30,9 @@ class SceneStats:
 
     low: float
     high: float
-    step_along: float  # largest difference between neighbours in a column, the periodic border included
+    step_along: (
+        float  # largest difference between neighbours in a column, the periodic border included
+    )
     height: int
     width: int
     oversampling: int
@@ -39,7 +42,10 @@ def scene_stats(radiance: np.ndarray, oversampling: int) -> SceneStats:
     """Statistics of a scene's radiance (H, W), in one pass over it."""
     low = float(radiance.min())
     high = float(radiance.max())
-    step = max(float(np.abs(radiance[1:] - radiance[:-1]).max()), float(np.abs(radiance[0] - radiance[-1]).max()))
+    step = max(
+        float(np.abs(radiance[1:] - radiance[:-1]).max()),
+        float(np.abs(radiance[0] - radiance[-1]).max()),
+    )
     height, width = radiance.shape
     return SceneStats(low, high, step, height, width, oversampling)
 
@@ -47,9 +53,10 @@ def scene_stats(radiance: np.ndarray, oversampling: int) -> SceneStats:
 def ringing_of(sensor: Instrument, stats: SceneStats) -> float:
     """Sum of the absolute values of the blur's kernel on the scene's grid: 1 without ringing.
 
-    A blurrier sensor is a sharper one followed by a positive kernel of sum 1, which cannot enlarge the sum: so the
-    MTF is rounded up to the next whole percent, and sensors share what was computed once. Of two axes rounded each by
-    itself that would not hold, nor of a table or a point-spread function: they are taken as they are.
+    A blurrier sensor is a sharper one followed by a positive kernel of sum 1, which cannot enlarge
+    the sum: so the MTF is rounded up to the next whole percent, and sensors share what was computed
+    once. Of two axes rounded each by itself that would not hold, nor of a table or a point-spread
+    function: they are taken as they are.
     """
     across, along = sensor.mtf_axes
     blur: Blur = sensor.blur
@@ -66,7 +73,9 @@ def _kernel_sum(height: int, width: int, oversampling: int, blur: Blur, sigma_px
 
 @lru_cache(maxsize=256)
 def smear_moments(height: int, oversampling: int, length_px: float) -> tuple[float, float]:
-    """Of the smear's kernel less a unit pulse: half its absolute sum, and its absolute first moment in pixels."""
+    """Of the smear's kernel less a unit pulse: half its absolute sum, and its absolute first moment
+    in pixels.
+    """
     fy = np.fft.fftfreq(height, 1 / oversampling)
     kernel = np.fft.ifft(smear_response(fy, length_px)).real
     kernel[0] -= 1
@@ -118,7 +127,9 @@ COSTS = {
 ORDER = tuple(COSTS)
 """That of the light."""
 
-UNSEEN = {"mtf": "the scene is constant"} | {name: kind.unseen for name, kind in PIXEL_EFFECTS.items()}
+UNSEEN = {"mtf": "the scene is constant"} | {
+    name: kind.unseen for name, kind in PIXEL_EFFECTS.items()
+}
 """Why an effect whose bound is zero cannot show, where that is the scene's doing."""
 
 
@@ -163,15 +174,20 @@ def make_plan(sensor: Instrument, stats: SceneStats, tolerance_dn: float = TOLER
     decisions = []
     for name, cost in COSTS.items():
         choice, why, bound = _decide(name, sensor, bounds, hidden, tolerance_dn)
-        decisions.append(Decision(name, choice, why, bound, cost if choice == "applied" else "none"))
+        decisions.append(
+            Decision(name, choice, why, bound, cost if choice == "applied" else "none")
+        )
     return Plan(tuple(decisions), tolerance_dn)
 
 
 def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
-    """Largest change of any pixel by each effect that can be left out, in DN, through all that comes after it."""
+    """Largest change of any pixel by each effect that can be left out, in DN, through all that
+    comes after it.
+    """
     gain = sensor.gain_dn_per_radiance
     ringing = ringing_of(sensor, stats)
-    # A blur whose kernel sums to 1, in absolute values to `ringing`: |k * (L - m)| <= ringing * span / 2.
+    # A blur whose kernel sums to 1, in absolute values to `ringing`: |k * (L - m)| <= ringing *
+    # span / 2.
     span = stats.high - stats.low
     middle = (stats.low + stats.high) / 2
     reach = ringing * span / 2
@@ -180,17 +196,19 @@ def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
     total = ringing
     bounds = {}
     if "smear" in sensor.effects:
-        # The smear's kernel less a pulse sums to 0: it sees at most half its size times the span, or steps times
-        # moment; the blur behind it enlarges that by its ringing.
+        # The smear's kernel less a pulse sums to 0: it sees at most half its size times the span,
+        # or steps times moment; the blur behind it enlarges that by its ringing.
         size, moment = smear_moments(stats.height, stats.oversampling, sensor.smear_px)
         direct = gain * ringing * min(size * span, moment * stats.step_along)
         bounds["smear"] = behind("smear", direct, sensor)
-        # The smear widens the range that every later effect may meet, whether it is applied or left out.
+        # The smear widens the range that every later effect may meet, whether it is applied or left
+        # out.
         low = low - direct / gain
         high = high + direct / gain
         # Its kernel is a unit pulse and all that differs from it.
         total *= 1 + 2 * size
-    # The blurred pixel and the plain mean of its scene pixels lie in one range: they differ by its width at most.
+    # The blurred pixel and the plain mean of its scene pixels lie in one range: they differ by its
+    # width at most.
     bounds["mtf"] = behind("mtf", gain * (1 + total) / 2 * span, sensor)
     for name, effect in pixel_effects(sensor.effects, "radiance").items():
         direct = effect.bound_dn(sensor, low, high)
@@ -227,5 +245,9 @@ def _decide(
         why = UNSEEN.get(name)
         return "cannot show" if why else "neutral", why or "its parameters change nothing", 0.0
     if name in hidden:
-        return "cannot show", f"no pixel changes by more than the {tolerance_dn:g} DN allowed", bound
+        return (
+            "cannot show",
+            f"no pixel changes by more than the {tolerance_dn:g} DN allowed",
+            bound,
+        )
     return "applied", "it may change a pixel by up to the bound", bound

@@ -1,10 +1,11 @@
-"""A drawn scene: fields, forest, streets, houses, cars and a resolution pattern, as radiance in W/m2/sr/um.
+"""A drawn scene: fields, forest, streets, houses, cars and a resolution pattern, as radiance in
+W/m2/sr/um.
 
-It is the built-in input, so that everything runs without a single image file. Radiances are those of a clear day:
-asphalt 30, grass 45, roofs 60 to 160, concrete 120, white paint 260.
+It is the built-in input, so that everything runs without a single image file. Radiances are those
+of a clear day: asphalt 30, grass 45, roofs 60 to 160, concrete 120, white paint 260.
 
-Pillow draws it. scikit-image has no lines of a width and fills other pixels at the borders of shapes (701 of the
-118 000 of a parcel, measured): every simulated pair would have other bytes.
+Pillow draws it. scikit-image has no lines of a width and fills other pixels at the borders of
+shapes (701 of the 118 000 of a parcel, measured): every simulated pair would have other bytes.
 """
 
 import math
@@ -49,7 +50,9 @@ def procedural_scene(height_px: int, width_px: int, generator: np.random.Generat
     return Scene("procedural", np.array(canvas, dtype=np.float32))
 
 
-def _fields(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator) -> None:
+def _fields(
+    draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator
+) -> None:
     """A patchwork of parcels, each with crop rows of its own direction."""
     width, height = size
     step = 700
@@ -62,7 +65,9 @@ def _fields(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.rand
             _rows(draw, parcel, base, generator)
 
 
-def _rows(draw: ImageDraw.ImageDraw, parcel: list[Point], base: float, generator: np.random.Generator) -> None:
+def _rows(
+    draw: ImageDraw.ImageDraw, parcel: list[Point], base: float, generator: np.random.Generator
+) -> None:
     """Crop rows 6 to 14 pixels apart, between two opposite sides of the parcel."""
     (ax, ay), (bx, by), (cx, cy), (dx, dy) = parcel
     count = int(700 / generator.uniform(6, 14))
@@ -74,8 +79,12 @@ def _rows(draw: ImageDraw.ImageDraw, parcel: list[Point], base: float, generator
         draw.line([start, end], fill=base * contrast, width=3)
 
 
-def _forest(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator) -> None:
-    """Tree crowns: a shadow, a dark disc and a sunlit side, over the left third of the lower half."""
+def _forest(
+    draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator
+) -> None:
+    """Tree crowns: a shadow, a dark disc and a sunlit side, over the left third
+    of the lower half.
+    """
     width, height = size
     for _ in range(int(width * height / 2600)):
         x = generator.uniform(0, width * 0.42)
@@ -85,11 +94,16 @@ def _forest(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.rand
         tree(draw, x, y, generator.uniform(14, 34), generator)
 
 
-def _river(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator) -> None:
+def _river(
+    draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator
+) -> None:
     """A winding river along the left edge, with pale banks."""
     width, height = size
     phase = generator.uniform(0, math.tau)
-    middle = [(width * (0.1 + 0.04 * math.sin(phase + 5 * y / height)), y) for y in range(-50, height + 51, 5)]
+    middle = [
+        (width * (0.1 + 0.04 * math.sin(phase + 5 * y / height)), y)
+        for y in range(-50, height + 51, 5)
+    ]
     for half_width, value in ((width / 36, SOIL * 1.3), (width / 48, WATER)):
         for x, y in middle:
             draw.ellipse(around(x, y, half_width), fill=value)
@@ -131,9 +145,14 @@ def _street(
         side = 22 * float(generator.choice([-1, 1]))
         u = u0 + along[0] * s - along[1] * side
         v = v0 + along[1] * s + along[0] * side
-        car = [(u - along[0] * a - along[1] * b, v - along[1] * a + along[0] * b) for a, b in rectangle(20, 9)]
+        car = [
+            (u - along[0] * a - along[1] * b, v - along[1] * a + along[0] * b)
+            for a, b in rectangle(20, 9)
+        ]
         draw.polygon([shift(place(*p), 5) for p in car], fill=SHADOW)
-        draw.polygon([place(*p) for p in car], fill=float(generator.choice([18, 60, 110, 190, 280])))
+        draw.polygon(
+            [place(*p) for p in car], fill=float(generator.choice([18, 60, 110, 190, 280]))
+        )
 
 
 def _house(
@@ -150,9 +169,12 @@ def _house(
     roof = [(u, v), (u + long, v), (u + long, v + wide), (u, v + wide)]
     draw.polygon([shift(place(*p), 22) for p in roof], fill=SHADOW)
     ridge = v + wide / 2
-    draw.polygon([place(*p) for p in [(u, v), (u + long, v), (u + long, ridge), (u, ridge)]], fill=bright)
     draw.polygon(
-        [place(*p) for p in [(u, ridge), (u + long, ridge), (u + long, v + wide), (u, v + wide)]], fill=bright * 0.55
+        [place(*p) for p in [(u, v), (u + long, v), (u + long, ridge), (u, ridge)]], fill=bright
+    )
+    draw.polygon(
+        [place(*p) for p in [(u, ridge), (u + long, ridge), (u + long, v + wide), (u, v + wide)]],
+        fill=bright * 0.55,
     )
     for k in np.arange(8, long, 11):
         draw.line([place(u + k, v), place(u + k, v + wide)], fill=bright * 0.8, width=2)
@@ -163,7 +185,9 @@ def _house(
 
 
 def _pattern(draw: ImageDraw.ImageDraw, size: tuple[int, int]) -> None:
-    """A calibration site at the top: a slanted edge, a Siemens star and bar groups on a concrete pad."""
+    """A calibration site at the top: a slanted edge, a Siemens star and bar groups on a concrete
+    pad.
+    """
     side = min(size) * 0.22
     left = size[0] * 0.36
     top = size[1] * 0.08
@@ -177,7 +201,8 @@ def _pattern(draw: ImageDraw.ImageDraw, size: tuple[int, int]) -> None:
     for bar in (16.0, 12.0, 8.0, 6.0, 4.0, 3.0):
         for k in range(3):
             draw.rectangle(
-                (x + 2 * k * bar, top + 0.15 * side, x + (2 * k + 1) * bar, top + 0.85 * side), fill=ASPHALT
+                (x + 2 * k * bar, top + 0.15 * side, x + (2 * k + 1) * bar, top + 0.85 * side),
+                fill=ASPHALT,
             )
         x += 7 * bar
 
@@ -200,11 +225,16 @@ def texture(height_px: int, width_px: int, generator: np.random.Generator) -> np
     return np.asarray(np.exp(0.12 * pattern / pattern.std()))
 
 
-def tree(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, generator: np.random.Generator) -> None:
+def tree(
+    draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, generator: np.random.Generator
+) -> None:
     """A shadow, a dark crown around (x, y) with sunlit and darker leaves."""
     draw.ellipse(around(x + 0.6 * radius, y + 0.6 * radius, radius), fill=SHADOW)
     draw.ellipse(around(x, y, radius), fill=float(generator.uniform(24, 34)))
-    draw.ellipse(around(x - 0.25 * radius, y - 0.25 * radius, 0.65 * radius), fill=float(generator.uniform(36, 60)))
+    draw.ellipse(
+        around(x - 0.25 * radius, y - 0.25 * radius, 0.65 * radius),
+        fill=float(generator.uniform(36, 60)),
+    )
     for _ in range(6):
         dx, dy = generator.uniform(-0.6, 0.4, 2) * radius
         draw.ellipse(around(x + dx, y + dy, 0.14 * radius), fill=float(generator.uniform(20, 80)))
@@ -218,7 +248,12 @@ def box(corner: Point, width: float, height: float, angle: float) -> list[Point]
 
 def rectangle(half_long: float, half_wide: float) -> list[Point]:
     """A rectangle around (0, 0)."""
-    return [(-half_long, -half_wide), (half_long, -half_wide), (half_long, half_wide), (-half_long, half_wide)]
+    return [
+        (-half_long, -half_wide),
+        (half_long, -half_wide),
+        (half_long, half_wide),
+        (-half_long, half_wide),
+    ]
 
 
 def turn(x: float, y: float, angle: float) -> Callable[[float, float], Point]:
@@ -238,8 +273,11 @@ def around(x: float, y: float, radius: float) -> tuple[float, float, float, floa
     return (x - radius, y - radius, x + radius, y + radius)
 
 
-def load_scenes(folder: Path | None, sensor: Instrument, seed: int, most: int = SCENES) -> list[Scene]:
-    """The scenes of a folder of images, or drawn ones, other for every seed and no more than are of use.
+def load_scenes(
+    folder: Path | None, sensor: Instrument, seed: int, most: int = SCENES
+) -> list[Scene]:
+    """The scenes of a folder of images, or drawn ones, other for every seed and no more than are of
+    use.
 
     Args:
         folder: of images; None draws scenes.

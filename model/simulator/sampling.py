@@ -1,4 +1,5 @@
-"""From a scene to the sensor's grid: radiance in W/m2/sr/um, read from an image file, blurred and sampled.
+"""From a scene to the sensor's grid: radiance in W/m2/sr/um, read from an image file, blurred and
+sampled.
 
 Every r-th point of the blurred scene is taken, centred, without a shift.
 """
@@ -15,7 +16,9 @@ from beers_deploy.profiles.sensor import Instrument
 
 
 def scene_spectrum(radiance: np.ndarray) -> np.ndarray:
-    """Half spectrum (..., H, W // 2 + 1) of a scene (..., H, W), to be sampled through any number of sensors."""
+    """Half spectrum (..., H, W // 2 + 1) of a scene (..., H, W), to be sampled through any number
+    of sensors.
+    """
     return np.asarray(fft.rfft2(radiance))
 
 
@@ -28,8 +31,9 @@ def sample(
 ) -> np.ndarray:
     """Blur by `transfer` and keep every r-th point in both directions.
 
-    Target pixel n covers scene pixels r*n to r*n + r - 1, so it is sampled at their centre, r*n + (r - 1) / 2. For
-    even r that lies between two scene pixels: a phase ramp goes there, where slicing would shift by half a pixel.
+    Target pixel n covers scene pixels r*n to r*n + r - 1, so it is sampled at their centre, r*n +
+    (r - 1) / 2. For even r that lies between two scene pixels: a phase ramp goes there, where
+    slicing would shift by half a pixel.
 
     Args:
         spectrum: (..., H, W // 2 + 1) complex, of a scene whose H and W are multiples of r.
@@ -45,34 +49,45 @@ def sample(
     centre = (oversampling - 1) / 2
     ramp_y = _ramp(np.fft.fftfreq(height), centre + offset_px[0])
     ramp_x = _ramp(np.fft.rfftfreq(width), centre + offset_px[1])
-    # Keeping every r-th row is adding up the r aliases of each frequency: what follows is r times smaller.
+    # Keeping every r-th row is adding up the r aliases of each frequency: what follows is r times
+    # smaller.
     rows = height // oversampling
     blurred = spectrum * transfer
     blurred *= ramp_y[:, None]
-    folded = blurred.reshape(*blurred.shape[:-2], oversampling, rows, -1).sum(-3) * (ramp_x / oversampling)
-    lines = fft.irfft(fft.ifft(folded, axis=-2, overwrite_x=True), n=width, axis=-1, overwrite_x=True)
+    folded = blurred.reshape(*blurred.shape[:-2], oversampling, rows, -1).sum(-3) * (
+        ramp_x / oversampling
+    )
+    lines = fft.irfft(
+        fft.ifft(folded, axis=-2, overwrite_x=True), n=width, axis=-1, overwrite_x=True
+    )
     return np.ascontiguousarray(lines[..., ::oversampling])
 
 
 def crop_divisible(radiance: np.ndarray, oversampling: int) -> np.ndarray:
-    """Cut the last rows and columns of (..., H, W), so that H and W are multiples of the oversampling."""
+    """Cut the last rows and columns of (..., H, W), so that H and W are multiples of the
+    oversampling.
+    """
     height, width = (size // oversampling * oversampling for size in radiance.shape[-2:])
     return radiance[..., :height, :width]
 
 
 def resample(radiance: np.ndarray, height: int, width: int) -> np.ndarray:
-    """A scene (H, W) on another grid over the same ground, band-limited: for ratios that are no whole number.
+    """A scene (H, W) on another grid over the same ground, band-limited: for ratios that are no
+    whole number.
 
-    Frequencies that the new grid cannot hold are cut, others kept as they are; new ones are zero. Pixel n of the new
-    grid lies at (n + 1/2) H / height - 1/2 of the old: the ground does not shift. The borders wrap.
+    Frequencies that the new grid cannot hold are cut, others kept as they are; new ones are zero.
+    Pixel n of the new grid lies at (n + 1/2) H / height - 1/2 of the old: the ground does not
+    shift. The borders wrap.
 
-    Not scikit-image's `resize`: its splines blur and alias, on a photograph by 26 of 255 and more (measured).
+    Not scikit-image's `resize`: its splines blur and alias, on a photograph by 26 of 255 and more
+    (measured).
     """
     old_height, old_width = radiance.shape[-2:]
     fy = np.fft.fftfreq(old_height)
     fx = np.fft.rfftfreq(old_width)
     ramp_y, ramp_x = (
-        _ramp(f, shift) for f, shift in ((fy, (old_height / height - 1) / 2), (fx, (old_width / width - 1) / 2))
+        _ramp(f, shift)
+        for f, shift in ((fy, (old_height / height - 1) / 2), (fx, (old_width / width - 1) / 2))
     )
     spectrum = scene_spectrum(radiance) * ramp_y[:, None] * ramp_x
     rows = min(old_height, height)
@@ -102,8 +117,8 @@ class Scene:
 def read_scene(path: Path, sensor: Instrument) -> Scene:
     """Read a scene from an image file.
 
-    1. 8-bit RGB or mono: sRGB, linearised, the bands averaged (a panchromatic band weighs the visible evenly:
-       an assumption); white stands for the sensor's full scale.
+    1. 8-bit RGB or mono: sRGB, linearised, the bands averaged (a panchromatic band weighs the
+      visible evenly: an assumption); white stands for the sensor's full scale.
     2. 16-bit mono TIFF or PNG: digital numbers, made radiance by the sensor's gain.
     3. float mono TIFF: radiance in W/m2/sr/um as it stands.
     """
@@ -127,11 +142,14 @@ def scene_of(name: str, pixels: np.ndarray, sensor: Instrument) -> Scene:
 
 
 def _linear(pixels: np.ndarray) -> np.ndarray:
-    """8-bit sRGB, (H, W) or (H, W, bands), to linear light (H, W) in [0, 1], the bands averaged (IEC 61966-2-1).
+    """8-bit sRGB, (H, W) or (H, W, bands), to linear light (H, W) in [0, 1], the bands averaged
+    (IEC 61966-2-1).
 
     scikit-image linearises only on the way to XYZ, which weighs the bands as an eye does.
     """
     code = np.arange(256) / 255
-    table = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    table = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(
+        np.float32
+    )
     light: np.ndarray = table[pixels]
     return np.asarray(light if light.ndim == 2 else light[..., :3].mean(axis=-1))

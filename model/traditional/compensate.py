@@ -1,7 +1,8 @@
-"""MTF compensation: from the contrast that one sensor keeps to the contrast that another would have kept.
+"""MTF compensation: from the contrast that one sensor keeps to the contrast that another would have
+kept.
 
-A finite filter: each pixel depends on those within RADIUS_PX and on no other, so that strips, missing pixels and
-borders reach no further.
+A finite filter: each pixel depends on those within RADIUS_PX and on no other, so that strips,
+missing pixels and borders reach no further.
 """
 
 from collections.abc import Iterable, Iterator
@@ -20,17 +21,22 @@ from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.response import NYQUIST
 
 RADIUS_PX = 64
-"""Half the filter's side. The gain's kink at DC gives it a slow tail: half a per cent of its weight lies beyond."""
+"""Half the filter's side.
+
+The gain's kink at DC gives it a slow tail: half a per cent of its weight lies beyond.
+"""
 
 BLOCK_PX = 384
 """Side of the blocks that are filtered at once: with the radius around it, an FFT of 512."""
 
 
 def filter_strips(strips: Iterable[Tensor], height: int, kernel: Tensor) -> Iterator[Tensor]:
-    """Filter an image (H, W) that comes in strips (any, W), by a kernel (K, K); it goes in strips of BLOCK_PX rows.
+    """Filter an image (H, W) that comes in strips (any, W), by a kernel (K, K); it goes in strips
+    of BLOCK_PX rows.
 
-    Unit and mean are kept, and borders mirrored. Blocks lie on a grid of their own, so the strips that came change no
-    bit. NaN pixels are filled from their neighbours first, and NaN again in the end.
+    Unit and mean are kept, and borders mirrored. Blocks lie on a grid of their own, so the strips
+    that came change no bit. NaN pixels are filled from their neighbours first, and NaN again in the
+    end.
     """
     # The grid of blocks is fixed from row 0: the result may not depend on how the strips were cut.
     rows = Rows(strips)
@@ -43,27 +49,33 @@ def filter_strips(strips: Iterable[Tensor], height: int, kernel: Tensor) -> Iter
 
 
 def _block(rows: Tensor, kernel: Tensor, left: int) -> Tensor:
-    """The filtered pixels of columns left..left + BLOCK_PX - 1, `radius` rows fewer above and below.
+    """The filtered pixels of columns left..left + BLOCK_PX - 1, `radius` rows fewer above and
+    below.
 
-    On one thread: with several inside, a transform adds in another order, and other last bits come out.
+    On one thread: with several inside, a transform adds in another order, and other last bits come
+    out.
     """
     radius = kernel.shape[0] // 2
     width = rows.shape[1]
     right = min(left + BLOCK_PX, width)
     block = rows[:, mirrored(left - radius, right + radius, width)]
     known = torch.isfinite(block)
-    # Filtered without its mean, which has gain 1: in float32 the FFT of large constant values costs digits.
+    # Filtered without its mean, which has gain 1: in float32 the FFT of large constant values costs
+    # digits.
     mean = block[known].mean() if bool(known.any()) else block.new_zeros(())
     size = tuple(next_fast_len(side, real=True) for side in block.shape)
     spectrum = torch.fft.rfft2(fill_with_local_means(block, known) - mean, s=size)
-    filtered: Tensor = torch.fft.irfft2(spectrum * torch.fft.rfft2(kernel, s=size).to(spectrum), s=size)
+    filtered: Tensor = torch.fft.irfft2(
+        spectrum * torch.fft.rfft2(kernel, s=size).to(spectrum), s=size
+    )
     inside = slice(2 * radius, block.shape[0]), slice(2 * radius, block.shape[1])
     core = slice(radius, -radius), slice(radius, -radius)
     return (filtered[inside] + mean).where(known[core], torch.nan)
 
 
 def compensation_kernel(blur_from: Blur, blur_to: Blur, epsilon: float) -> Tensor:
-    """The filter whose gain is `compensation_gain`, cut at RADIUS_PX: (2 R + 1, 2 R + 1) float64, of sum 1.
+    """The filter whose gain is `compensation_gain`, cut at RADIUS_PX: (2 R + 1, 2 R + 1) float64,
+    of sum 1.
 
     The gain is exact at DC, and away from it by more than some cycles per 2 R pixels.
     """
@@ -73,22 +85,27 @@ def compensation_kernel(blur_from: Blur, blur_to: Blur, epsilon: float) -> Tenso
     return torch.from_numpy(cut_filter(np.fft.irfft2(gain, (side, side)), RADIUS_PX, total=1))
 
 
-def compensation_gain(height: int, width: int, blur_from: Blur, blur_to: Blur, epsilon: float) -> NDArray[np.inexact]:
+def compensation_gain(
+    height: int, width: int, blur_from: Blur, blur_to: Blur, epsilon: float
+) -> NDArray[np.inexact]:
     """G = T H* / (|H|^2 + epsilon r^2) on the half spectrum, (height, width // 2 + 1) float64.
 
-    Complex128 where H or T is that of a point-spread function, H* its conjugate. H is the MTF to undo, T the one to
-    reach, r = |f| / f_Nyquist. Limits: epsilon = 0 gives T / H, with up to 20 times the noise at the corner of the
-    spectrum for 3 to 25 %; a large epsilon blurs.
+    Complex128 where H or T is that of a point-spread function, H* its conjugate. H is the MTF to
+    undo, T the one to reach, r = |f| / f_Nyquist. Limits: epsilon = 0 gives T / H, with up to 20
+    times the noise at the corner of the spectrum for 3 to 25 %; a large epsilon blurs.
 
     Args:
         height: rows of the image.
         width: columns of the image.
-        blur_from: MTF at Nyquist of the image, in (0, 2 / pi], one, or across and along the track; or its response.
+        blur_from: MTF at Nyquist of the image, in (0, 2 / pi], one, or across and along the track;
+            or its response.
         blur_to: what to reach, likewise.
         epsilon: regularisation, 0 or more.
     """
     if not 0 <= epsilon < float("inf"):
-        raise OptionError("epsilon", expected="0 or more", got=repr(epsilon), remedy="a few thousandths are usual")
+        raise OptionError(
+            "epsilon", expected="0 or more", got=repr(epsilon), remedy="a few thousandths are usual"
+        )
     fy = np.fft.fftfreq(height)[:, None]
     fx = np.fft.rfftfreq(width)[None, :]
     r_squared = (fx**2 + fy**2) / NYQUIST**2

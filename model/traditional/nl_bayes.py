@@ -1,8 +1,8 @@
 """Non-local Bayes denoising of Gaussian noise (Lebrun, Buades, Morel, IPOL 2013).
 
-Two passes over a regular grid of reference patches. In each, similar patches form a group, the group a Gaussian
-model, and the model an estimate of every patch of the group; overlapping estimates are averaged. The second pass
-searches, and takes its model, in the result of the first.
+Two passes over a regular grid of reference patches. In each, similar patches form a group, the
+group a Gaussian model, and the model an estimate of every patch of the group; overlapping estimates
+are averaged. The second pass searches, and takes its model, in the result of the first.
 
 The settings are the published ones, for grey levels of 0 to 255 (section on the parameters).
 """
@@ -26,15 +26,18 @@ ALIKE_RMS = 4.0
 """Pass 2 takes every patch within this RMS distance, in grey levels (tau = 16 k^2)."""
 
 FLAT_GAMMA = 1.05
-"""A group of pass 1 whose variance stays below gamma sigma^2 holds nothing but noise (homogeneous area criterion)."""
+"""A group of pass 1 whose variance stays below gamma sigma^2 holds nothing but noise (homogeneous
+area criterion).
+"""
 
 
 @dataclass(frozen=True)
 class Quality:
     """How dense the references are, and how large a group of pass 2 may grow.
 
-    `stride_px` lies between neighbouring references; `group_cap` counts in multiples of the usual group. The
-    published method has no cap, and visits every second pixel unless an earlier group held it.
+    `stride_px` lies between neighbouring references; `group_cap` counts in multiples of the usual
+    group. The published method has no cap, and visits every second pixel unless an earlier group
+    held it.
     """
 
     stride_px: int
@@ -64,7 +67,9 @@ class PassSettings:
 
     @property
     def window_px(self) -> int:
-        """Candidates along each axis of the search window: about N / 2, odd so that it has a middle."""
+        """Candidates along each axis of the search window: about N / 2, odd so that it has a
+        middle.
+        """
         return self.similar // 2 | 1
 
     @property
@@ -94,26 +99,32 @@ def _below(sigma: float, table: dict[int, T], otherwise: T) -> T:
 
 
 JITTER = 1e-3
-"""Added to the diagonal of a noisy covariance, in units of sigma^2. Up to 1e-2 costs less than 0.01 dB (measured)."""
+"""Added to the diagonal of a noisy covariance, in units of sigma^2.
+
+Up to 1e-2 costs less than 0.01 dB (measured).
+"""
 
 
 def estimate_groups(
     noisy: Tensor, guide: Tensor, taken: Tensor | None, noise: Noise, settings: PassSettings
 ) -> Tensor:
-    """Posterior mean of every patch: P - beta Sigma S^-1 (P - mean of P), Sigma the covariance of the noise.
+    """Posterior mean of every patch: P - beta Sigma S^-1 (P - mean of P), Sigma the covariance of
+    the noise.
 
     1. Pass 1: S is the covariance of the noisy patches, signal and noise together.
     2. Pass 2: S is the covariance of the guide's patches plus beta Sigma.
-    3. A flat group of pass 1 (variance of all its pixels below gamma sigma^2): every pixel becomes their mean.
+    3. A flat group of pass 1 (variance of all its pixels below gamma sigma^2): every pixel becomes
+      their mean.
     4. No Cholesky factor of S: the noisy patches stay.
 
-    Both S give P_mean + C S^-1 (P - P_mean) with C the signal's covariance, so only S needs an inverse (IPOL 2013,
-    estimates of the first and the second step; there Sigma = sigma^2 I).
+    Both S give P_mean + C S^-1 (P - P_mean) with C the signal's covariance, so only S needs an
+    inverse (IPOL 2013, estimates of the first and the second step; there Sigma = sigma^2 I).
 
     Args:
         noisy: (B, N, k * k) groups of patches.
         guide: the same patches of the guide image; in pass 1 `noisy` itself.
-        taken: (B, N) of 0 and 1: which patches the group counts, None for all; the others' estimates mean nothing.
+        taken: (B, N) of 0 and 1: which patches the group counts, None for all; the others'
+            estimates mean nothing.
         noise: that of `noisy`.
         settings: those of the pass.
     """
@@ -124,7 +135,8 @@ def estimate_groups(
     shrinkage = torch.zeros_like(covariance)
     shrinkage[~flat] = _shrinkage(covariance[~flat], noise, settings)
     estimates = torch.baddbmm(noisy, centred, shrinkage, alpha=-1)
-    # The plain mean knows that the signal is one number; the Gaussian model would have to find that out.
+    # The plain mean knows that the signal is one number; the Gaussian model would have to find that
+    # out.
     estimates[flat] = mean[flat].mean(2, keepdim=True)
     return estimates
 
@@ -147,8 +159,8 @@ def _moments(patches: Tensor, taken: Tensor | None) -> tuple[Tensor, Tensor, Ten
 def _is_flat(mean: Tensor, covariance: Tensor, bound: float) -> Tensor:
     """(B,) whether the variance of all the pixels of a group stays below `bound`.
 
-    It is the variance within the k * k positions, the trace, plus that between them: two small sums, where the sum
-    of the squared pixels would drown sigma^2 in float32.
+    It is the variance within the k * k positions, the trace, plus that between them: two small
+    sums, where the sum of the squared pixels would drown sigma^2 in float32.
     """
     within = covariance.diagonal(dim1=1, dim2=2).mean(1)
     return within + mean[:, 0].var(1, correction=0) < bound
@@ -158,7 +170,8 @@ def _shrinkage(covariance: Tensor, noise: Noise, settings: PassSettings) -> Tens
     """The matrix beta S^-1 Sigma, for patches as rows, or 0 where S has no Cholesky factor."""
     sigma_matrix = noise.covariance(settings.side_px).to(covariance) * settings.excess
     diagonal = covariance.diagonal(dim1=1, dim2=2)
-    # A drawn or saturated area has rank 0 or 1: the covariance is then no better known than its own rounding.
+    # A drawn or saturated area has rank 0 or 1: the covariance is then no better known than its own
+    # rounding.
     diagonal.add_(torch.finfo(covariance.dtype).eps * diagonal.sum(1, keepdim=True))
     if settings.clean_guide:
         covariance = covariance + sigma_matrix
@@ -179,7 +192,9 @@ def patch_matrix(image: Tensor, side_px: int) -> Tensor:
 
 
 def overlap_add(patches: Tensor, shape: torch.Size, side_px: int) -> Tensor:
-    """Add every patch of the matrix onto its place in an image of `shape` (H, W): the adjoint of `patch_matrix`."""
+    """Add every patch of the matrix onto its place in an image of `shape` (H, W): the adjoint of
+    `patch_matrix`.
+    """
     height, width = shape
     stack = patches.reshape(height - side_px + 1, width - side_px + 1, side_px, side_px)
     image = patches.new_zeros(height, width)
@@ -189,10 +204,13 @@ def overlap_add(patches: Tensor, shape: torch.Size, side_px: int) -> Tensor:
     return image
 
 
-def window_distances(guide: Tensor, rows: Tensor, columns: Tensor, side_px: int, window_px: int) -> Tensor:
+def window_distances(
+    guide: Tensor, rows: Tensor, columns: Tensor, side_px: int, window_px: int
+) -> Tensor:
     """Squared L2 distance of each reference patch to the window_px^2 patches around it.
 
-    d(p, q) = sum over k * k pixels of (P - Q)^2, as box sums of shifted differences: exact where the expansion
+    d(p, q) = sum over k * k pixels of (P - Q)^2, as box sums of shifted differences: exact where
+    the expansion
     |P|^2 - 2 P.Q + |Q|^2 would cancel in float32.
 
     Args:
@@ -213,9 +231,12 @@ def window_distances(guide: Tensor, rows: Tensor, columns: Tensor, side_px: int,
     centre = guide[half : half + height, None, half : half + width]
     distances = guide.new_empty(len(rows), len(columns), window_px, window_px)
     for dy in range(window_px):
-        shifted = guide[dy : dy + height].unfold(1, width, 1)[:, :window_px]  # (height, window, width)
+        shifted = guide[dy : dy + height].unfold(1, width, 1)[
+            :, :window_px
+        ]  # (height, window, width)
         squares = (shifted - centre).square_().reshape(height, -1)
-        # Two small matrix products add up the k * k squares at the references alone, not at every pixel.
+        # Two small matrix products add up the k * k squares at the references alone, not at every
+        # pixel.
         sums = (box_rows @ squares).reshape(-1, width) @ box_columns.T
         distances[:, :, dy] = sums.reshape(len(rows), window_px, -1).mT
     # Equal patches are common in drawn areas, and the reference has to be in its own group.
@@ -223,21 +244,29 @@ def window_distances(guide: Tensor, rows: Tensor, columns: Tensor, side_px: int,
     return distances.reshape(len(rows) * len(columns), -1)
 
 
-def window_numbers(rows: Tensor, columns: Tensor, grid_columns: int, window_px: int) -> tuple[Tensor, Tensor]:
-    """Patch number of each window's first candidate (R * C, 1), and what to add for the others (window_px^2,)."""
+def window_numbers(
+    rows: Tensor, columns: Tensor, grid_columns: int, window_px: int
+) -> tuple[Tensor, Tensor]:
+    """Patch number of each window's first candidate (R * C, 1), and what to add for the others
+    (window_px^2,).
+    """
     first = (rows[:, None] * grid_columns + columns).reshape(-1, 1)
     steps = torch.arange(window_px, device=rows.device)
     return first, (steps[:, None] * grid_columns + steps).reshape(-1)
 
 
 def _boxes(starts: Tensor, side_px: int, dtype: torch.dtype) -> Tensor:
-    """(R, E) of ones where pixel e lies in the patch of reference r: a box sum at chosen places is a product."""
+    """(R, E) of ones where pixel e lies in the patch of reference r: a box sum at chosen places is
+    a product.
+    """
     offset = torch.arange(int(starts[-1]) + side_px, device=starts.device) - starts[:, None]
     return ((offset >= 0) & (offset < side_px)).to(dtype)
 
 
 TILE_REFERENCES = 24
-"""References along each side of a tile: bounds the memory whatever the image, and keeps a tile near the cache."""
+"""References along each side of a tile: bounds the memory whatever the image, and keeps a tile near
+the cache.
+"""
 
 Sums = tuple[Tensor, Tensor]
 """Sum and number of the estimates of each pixel, both (h, w)."""
@@ -249,7 +278,9 @@ Places = tuple[Tensor, Tensor]
 def denoise_pass(
     noisy: Rows, guide: Rows, height: int, noise: Noise, settings: PassSettings, stride_px: int
 ) -> Iterator[Tensor]:
-    """Each pixel's mean over all the estimates of it, in strips (any, W); a pixel without any keeps its value."""
+    """Each pixel's mean over all the estimates of it, in strips (any, W); a pixel without any keeps
+    its value.
+    """
     margin = settings.margin_px
     runs = reference_runs(height, stride_px)
     carried: Sums | None = None
@@ -271,13 +302,20 @@ def denoise_pass(
 
 
 def reference_runs(size_px: int, stride_px: int) -> tuple[Tensor, ...]:
-    """Pixels, (n,) a tile, on which references are centred along one axis; the last pixel always has one."""
+    """Pixels, (n,) a tile, on which references are centred along one axis; the last pixel always
+    has one.
+    """
     centres = torch.arange(0, size_px + stride_px - 1, stride_px).clamp(max=size_px - 1)
     return torch.split(centres, TILE_REFERENCES)
 
 
 def _row_of_tiles(
-    noisy: Tensor, guide: Tensor, centres: Tensor, noise: Noise, settings: PassSettings, stride_px: int
+    noisy: Tensor,
+    guide: Tensor,
+    centres: Tensor,
+    noise: Noise,
+    settings: PassSettings,
+    stride_px: int,
 ) -> Sums:
     """The sums of one row of tiles over (h, W); `centres` count from the first reference's own."""
     margin = settings.margin_px
@@ -291,7 +329,9 @@ def _row_of_tiles(
         area = slice(int(run[0]), int(run[-1]) + stride_px + 2 * margin)
         rows = centres
         columns = run - run[0]
-        if not bool(torch.isfinite(noisy_wide[:, area]).all()):  # what is left between missing pixels is narrow
+        if not bool(
+            torch.isfinite(noisy_wide[:, area]).all()
+        ):  # what is left between missing pixels is narrow
             rows, columns = (torch.arange(int(place[-1]) + stride_px) for place in (rows, columns))
         return _tile(noisy_wide[:, area], guide_wide[:, area], (rows, columns), noise, settings)
 
@@ -304,7 +344,9 @@ def _row_of_tiles(
     return total[:, margin : margin + width], count[:, margin : margin + width]
 
 
-def _tile(noisy: Tensor, guide: Tensor, places: Places, noise: Noise, settings: PassSettings) -> Sums:
+def _tile(
+    noisy: Tensor, guide: Tensor, places: Places, noise: Noise, settings: PassSettings
+) -> Sums:
     """The sums over a tile (h, w)."""
     known = torch.isfinite(noisy)
     if not bool(known.any()):
@@ -324,7 +366,9 @@ def _tile(noisy: Tensor, guide: Tensor, places: Places, noise: Noise, settings: 
         # A patch lies in many groups, so its estimates add up here before any pixel is touched.
         total.index_add_(0, numbers.reshape(-1), estimates.reshape(-1, side**2))
         count.index_add_(0, numbers.reshape(-1), weights.reshape(-1, 1))
-    return overlap_add(total, noisy.shape, side), overlap_add(count.expand_as(total), noisy.shape, side)
+    return overlap_add(total, noisy.shape, side), overlap_add(
+        count.expand_as(total), noisy.shape, side
+    )
 
 
 def _rows_of(matrix: Tensor, numbers: Tensor) -> Tensor:
@@ -337,16 +381,20 @@ def similar_groups(
 ) -> Iterator[tuple[Tensor, Tensor | None]]:
     """Groups of like patches: their numbers (B, N), and which of them count (None: all).
 
-    The many groups of no more than the usual number come first, without the room that the others need.
+    The many groups of no more than the usual number come first, without the room that the others
+    need.
     """
     distances = window_distances(guide.nan_to_num(0), *places, settings.side_px, settings.window_px)
-    first, steps = window_numbers(*places, guide.shape[1] - settings.side_px + 1, settings.window_px)
+    first, steps = window_numbers(
+        *places, guide.shape[1] - settings.side_px + 1, settings.window_px
+    )
     if not bool(known.all()):
         _rule_out(distances, first + steps, patch_matrix(known, settings.side_px).all(1))
     usual = settings.similar
     most = min(settings.most_similar, distances.shape[1])
     candidate, nearest = nearest_first(distances, usual, most)
-    # Beyond the usual number a patch of pass 2 still counts if its pixels differ by ALIKE_RMS at most.
+    # Beyond the usual number a patch of pass 2 still counts if its pixels differ by ALIKE_RMS at
+    # most.
     alike = ALIKE_RMS**2 * settings.side_px**2 if settings.clean_guide else 0.0
     enough = nearest[:, :usual].amax(1, keepdim=True).clamp(min=alike)
     taken = (nearest <= enough) & nearest.isfinite()
@@ -359,30 +407,41 @@ def similar_groups(
 
 
 def _rule_out(distances: Tensor, numbers: Tensor, whole: Tensor) -> None:
-    """Put the patches (B, M) that hold a missing pixel, and groups around such a one, out of reach."""
+    """Put the patches (B, M) that hold a missing pixel, and groups around such
+    a one, out of reach.
+    """
     distances[~whole[numbers]] = torch.inf
     distances[~whole[numbers[:, numbers.shape[1] // 2]]] = torch.inf
 
 
 def nearest_first(distances: Tensor, usual: int, most: int) -> tuple[Tensor, Tensor]:
-    """Columns (B, most) of the smallest of each row, the `usual` smallest among them first, and their values.
+    """Columns (B, most) of the smallest of each row, the `usual` smallest among them first, and
+    their values.
 
     numpy's partition is over three times faster than torch's topk (measured).
     """
     ends = [k for k in (usual - 1, most - 1) if k < distances.shape[1] - 1]
-    columns = torch.from_numpy(np.argpartition(distances.numpy(), ends, axis=1)[:, :most]) if ends else None
+    columns = (
+        torch.from_numpy(np.argpartition(distances.numpy(), ends, axis=1)[:, :most])
+        if ends
+        else None
+    )
     if columns is None:
         columns = torch.arange(most).expand(len(distances), most)
     return columns, distances.gather(1, columns)
 
 
-def nl_bayes_strips(strips: Iterable[Tensor], height: int, noise: Noise, quality: Quality) -> Iterator[Tensor]:
-    """Remove Gaussian noise from an image that comes and goes in strips of rows, (any, W) float32 each.
+def nl_bayes_strips(
+    strips: Iterable[Tensor], height: int, noise: Noise, quality: Quality
+) -> Iterator[Tensor]:
+    """Remove Gaussian noise from an image that comes and goes in strips of rows, (any, W) float32
+    each.
 
-    NaN marks missing pixels; they stay so, and no other sees them. The settings were published for 8-bit images:
-    bring the data to a scale where sigma lies within some 5 to 40. Limits: a constant image
-    returns itself, up to rounding; a pixel too near missing ones to lie in any whole patch keeps its value. Any H and
-    W from 1 on; how the strips are cut changes no bit. Holds some 150 rows, and the tallest strip.
+    NaN marks missing pixels; they stay so, and no other sees them. The settings were published for
+    8-bit images: bring the data to a scale where sigma lies within some 5 to 40. Limits: a constant
+    image returns itself, up to rounding; a pixel too near missing ones to lie in any whole patch
+    keeps its value. Any H and W from 1 on; how the strips are cut changes no bit. Holds some 150
+    rows, and the tallest strip.
 
     Args:
         strips: of the image.
@@ -392,9 +451,13 @@ def nl_bayes_strips(strips: Iterable[Tensor], height: int, noise: Noise, quality
     """
     # The second pass reads the noisy rows again, behind the first: tee keeps those between.
     as_guide, for_first, for_second = tee(finite_or_missing(strips), 3)
-    basic = denoise_pass(Rows(for_first), Rows(as_guide), height, noise, first_pass(noise.sigma), quality.stride_px)
+    basic = denoise_pass(
+        Rows(for_first), Rows(as_guide), height, noise, first_pass(noise.sigma), quality.stride_px
+    )
     settings = second_pass(noise.sigma, quality)
-    yield from denoise_pass(Rows(for_second), Rows(basic), height, noise, settings, quality.stride_px)
+    yield from denoise_pass(
+        Rows(for_second), Rows(basic), height, noise, settings, quality.stride_px
+    )
 
 
 def finite_or_missing(strips: Iterable[Tensor]) -> Iterator[Tensor]:
@@ -402,5 +465,7 @@ def finite_or_missing(strips: Iterable[Tensor]) -> Iterator[Tensor]:
     for strip in strips:
         if bool(torch.isinf(strip).any()):
             remedy = "mark missing pixels as NaN"
-            raise ImageError("image to denoise", expected="finite values or NaN", got="infinity", remedy=remedy)
+            raise ImageError(
+                "image to denoise", expected="finite values or NaN", got="infinity", remedy=remedy
+            )
         yield strip

@@ -14,28 +14,36 @@ LAG_PX = 6
 
 @dataclass(frozen=True)
 class Noise:
-    """Stationary Gaussian noise on an image: a pixel's standard deviation, and the correlation of two; None if white.
+    """Stationary Gaussian noise on an image: a pixel's standard deviation, and the correlation of
+    two; None if white.
 
-    The latter by their lag (dy + L, dx + L), (2 L + 1, 2 L + 1), L at least a patch's side less one.
+    The latter by their lag (dy + L, dx + L), (2 L + 1, 2 L + 1), L at least a patch's side less
+    one.
     """
 
     sigma: float
     correlation: Tensor | None = None
 
     def covariance(self, side_px: int) -> Tensor:
-        """Covariance of the pixels of a patch of side k: (k * k, k * k) float64, in the image's unit squared."""
+        """Covariance of the pixels of a patch of side k: (k * k, k * k) float64, in the image's
+        unit squared.
+        """
         if self.correlation is None:
             return torch.eye(side_px**2, dtype=torch.float64) * self.sigma**2
         middle = self.correlation.shape[0] // 2
-        y, x = (grid.reshape(-1) for grid in torch.meshgrid(*2 * [torch.arange(side_px)], indexing="ij"))
+        y, x = (
+            grid.reshape(-1) for grid in torch.meshgrid(*2 * [torch.arange(side_px)], indexing="ij")
+        )
         dy, dx = (axis[:, None] - axis + middle for axis in (y, x))
         return self.correlation.double()[dy, dx] * self.sigma**2
 
 
 def coloured_by(kernel: Tensor, sigma: float) -> Noise:
-    """Noise that filtering by `kernel` (K, K), K odd, makes of white noise of standard deviation `sigma`.
+    """Noise that filtering by `kernel` (K, K), K odd, makes of white noise of standard deviation
+    `sigma`.
 
-    The autocorrelation of the kernel: r(d) = sum over p of k(p) k(p + d), sigma times the root of r(0).
+    The autocorrelation of the kernel: r(d) = sum over p of k(p) k(p + d), sigma times the root of
+    r(0).
     """
     size = kernel.shape[-1] + 2 * LAG_PX  # no lag wraps around
     power = torch.fft.rfft2(kernel.double(), s=(size, size)).abs().square()
@@ -51,12 +59,13 @@ def with_rounding_noise(sensor: Instrument) -> Instrument:
 
 
 def stabilise(radiance: Tensor, sensor: Instrument) -> Tensor:
-    """f(L) = 2 L / (sqrt(alpha L + beta) + sqrt(beta)), which is 2 (sqrt(alpha L + beta) - sqrt(beta)) / alpha.
+    """f(L) = 2 L / (sqrt(alpha L + beta) + sqrt(beta)), which is 2 (sqrt(alpha L + beta) -
+    sqrt(beta)) / alpha.
 
-    Written without the difference, that vanishes in float32 for small alpha. f is monotone, with f' = 1 / sigma(L).
-    Limits: alpha = 0 gives L / sqrt(beta); beta = 0 gives 2 sqrt(L / alpha); below L = 0 the noise is that of the
-    dark, and f goes on as L / sqrt(beta) (as 0 where beta = 0). L has any shape and is in W/m2/sr/um; alpha and beta
-    are at least 0 and not both 0.
+    Written without the difference, that vanishes in float32 for small alpha. f is monotone, with f'
+    = 1 / sigma(L). Limits: alpha = 0 gives L / sqrt(beta); beta = 0 gives 2 sqrt(L / alpha); below
+    L = 0 the noise is that of the dark, and f goes on as L / sqrt(beta) (as 0 where beta = 0). L
+    has any shape and is in W/m2/sr/um; alpha and beta are at least 0 and not both 0.
     """
     dark = math.sqrt(sensor.beta)
     denominator = (sensor.alpha * radiance.clamp(min=0) + sensor.beta).sqrt() + dark
@@ -65,7 +74,8 @@ def stabilise(radiance: Tensor, sensor: Instrument) -> Tensor:
 
 
 def destabilise(stable: Tensor, sensor: Instrument) -> Tensor:
-    """L = t sqrt(beta) + alpha t^2 / 4, any shape: the inverse of `stabilise`; t sqrt(beta) below t = 0.
+    """L = t sqrt(beta) + alpha t^2 / 4, any shape: the inverse of `stabilise`; t sqrt(beta) below t
+    = 0.
 
     The mean of noisy values t lies below f(mean L), f being concave: see `bias_radiance`.
     """
@@ -75,7 +85,8 @@ def destabilise(stable: Tensor, sensor: Instrument) -> Tensor:
 def bias_radiance(sensor: Instrument) -> float:
     """What averaging on the stabilised scale loses: alpha / 4, in W/m2/sr/um.
 
-    To second order E[f(L + n)] = f(L) + f''(L) var / 2 = f(L) - alpha / (4 sigma(L)), and L moves by sigma(L) times
-    that. Exact to higher order only where sigma(L) is small beside L + beta / alpha, as on any lit scene.
+    To second order E[f(L + n)] = f(L) + f''(L) var / 2 = f(L) - alpha / (4 sigma(L)), and L moves
+    by sigma(L) times that. Exact to higher order only where sigma(L) is small beside L + beta /
+    alpha, as on any lit scene.
     """
     return sensor.alpha / 4

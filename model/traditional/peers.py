@@ -1,7 +1,8 @@
-"""Restorations of scikit-image, as peers for tables: each made to aim at the reference's MTF, none tuned further.
+"""Restorations of scikit-image, as peers for tables: each made to aim at the reference's MTF, none
+tuned further.
 
-The three deconvolutions undo the degraded MTF whole; the result is blurred to the reference's. Non-local means stands
-in the place of NL-Bayes in the pipeline.
+The three deconvolutions undo the degraded MTF whole; the result is blurred to the reference's.
+Non-local means stands in the place of NL-Bayes in the pipeline.
 """
 
 from collections.abc import Callable
@@ -16,7 +17,12 @@ from torch import Tensor
 from beers_deploy.model.simulator.detector import to_dn, to_radiance
 from beers_deploy.model.simulator.mtf import transfer_function
 from beers_deploy.model.traditional.compensate import filter_strips
-from beers_deploy.model.traditional.noise import bias_radiance, destabilise, stabilise, with_rounding_noise
+from beers_deploy.model.traditional.noise import (
+    bias_radiance,
+    destabilise,
+    stabilise,
+    with_rounding_noise,
+)
 from beers_deploy.model.traditional.pipeline import Chain
 from beers_deploy.model.traditional.rows import mirrored
 
@@ -46,27 +52,37 @@ def richardson_lucy(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
     """scikit-image's Richardson-Lucy deconvolution, 20 steps."""
     side = 2 * PAD_PX + 1
     spread = np.roll(fft.irfft2(blur, s=image.shape), (PAD_PX, PAD_PX), (0, 1))[:side, :side]
-    # Richardson-Lucy is defined for kernels that are nowhere negative, and this one may ring below 0.
+    # Richardson-Lucy is defined for kernels that are nowhere negative, and this one may ring below
+    # 0.
     spread = np.maximum(spread, 0)
     # It divides by its own blurred estimate, which goes to 0 where the image is 0.
     light = np.maximum(image, 1e-6)
-    return np.asarray(restoration.richardson_lucy(light, spread / spread.sum(), RICHARDSON_LUCY_STEPS, clip=False))
+    return np.asarray(
+        restoration.richardson_lucy(light, spread / spread.sum(), RICHARDSON_LUCY_STEPS, clip=False)
+    )
 
 
 def nl_means(dn: Tensor, chain: Chain) -> Tensor:
-    """The chain with scikit-image's non-local means, 5 x 5 patches within 6 pixels, h = 0.6 sigma: (H, W) DN."""
+    """The chain with scikit-image's non-local means, 5 x 5 patches within 6 pixels, h = 0.6 sigma:
+    (H, W) DN.
+    """
     sensor = with_rounding_noise(chain.degraded)
     stable = stabilise(to_radiance(dn, chain.degraded), sensor)
     clean = restoration.denoise_nl_means(
         stable.numpy(), NLM_PATCH_PX, NLM_DISTANCE_PX, h=NLM_STRENGTH, sigma=1.0, fast_mode=True
     )
     radiance = destabilise(torch.from_numpy(clean).float(), sensor) + bias_radiance(sensor)
-    sharp = torch.cat(list(filter_strips([radiance], len(radiance), chain.fitted_to([dn]).kernel())))
+    sharp = torch.cat(
+        list(filter_strips([radiance], len(radiance), chain.fitted_to([dn]).kernel()))
+    )
     return to_dn(sharp, chain.reference)
 
 
-def _deconvolved(deconvolve: Callable[[np.ndarray, np.ndarray], np.ndarray], dn: Tensor, chain: Chain) -> Tensor:
-    """Undo the degraded MTF on mirrored borders, at a scale of 1 for full scale, and blur to the reference's.
+def _deconvolved(
+    deconvolve: Callable[[np.ndarray, np.ndarray], np.ndarray], dn: Tensor, chain: Chain
+) -> Tensor:
+    """Undo the degraded MTF on mirrored borders, at a scale of 1 for full scale, and blur to the
+    reference's.
 
     `deconvolve` takes an image (H, W) and the half spectrum of its blur, (H, W // 2 + 1).
     """
@@ -74,8 +90,12 @@ def _deconvolved(deconvolve: Callable[[np.ndarray, np.ndarray], np.ndarray], dn:
     rows, columns = (mirrored(-PAD_PX, size + PAD_PX, size) for size in dn.shape)
     height = len(rows)
     width = len(columns)
-    wide = ((dn.double() - chain.degraded.offset_dn) / chain.degraded.max_dn)[rows][:, columns].numpy()
-    blur, target = (transfer_function(height, width, 1, s.blur) for s in (chain.degraded, chain.reference))
+    wide = ((dn.double() - chain.degraded.offset_dn) / chain.degraded.max_dn)[rows][
+        :, columns
+    ].numpy()
+    blur, target = (
+        transfer_function(height, width, 1, s.blur) for s in (chain.degraded, chain.reference)
+    )
     sharp = fft.rfft2(deconvolve(wide, blur)) * target
     inside = fft.irfft2(sharp, s=(height, width))[PAD_PX:-PAD_PX, PAD_PX:-PAD_PX]
     return to_dn(torch.from_numpy((inside * full_scale).astype(np.float32)), chain.reference)

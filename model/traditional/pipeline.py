@@ -1,9 +1,9 @@
 """The two traditional pipelines. Every number comes from the two sensors and from the image.
 
-- denoise first: stabilise, NL-Bayes, inverse, MTF compensation. NL-Bayes meets the white noise that it supposes;
-  what it leaves is amplified afterwards.
-- deconvolve first: MTF compensation, stabilise, NL-Bayes, inverse. The noise that NL-Bayes meets is amplified and
-  coloured by the filter, and it is told how.
+- denoise first: stabilise, NL-Bayes, inverse, MTF compensation. NL-Bayes meets the white noise that
+  it supposes; what it leaves is amplified afterwards.
+- deconvolve first: MTF compensation, stabilise, NL-Bayes, inverse. The noise that NL-Bayes meets is
+  amplified and coloured by the filter, and it is told how.
 """
 
 from collections.abc import Iterable, Iterator
@@ -15,7 +15,12 @@ from torch import Tensor
 
 from beers_deploy.model.simulator.detector import to_dn, to_radiance
 from beers_deploy.model.traditional.compensate import compensation_kernel, filter_strips
-from beers_deploy.model.traditional.nl_bayes import QUALITIES, Quality, finite_or_missing, nl_bayes_strips
+from beers_deploy.model.traditional.nl_bayes import (
+    QUALITIES,
+    Quality,
+    finite_or_missing,
+    nl_bayes_strips,
+)
 from beers_deploy.model.traditional.noise import (
     Noise,
     bias_radiance,
@@ -29,10 +34,12 @@ from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Instrument
 
 WORKING_SIGMA = 12.0
-"""Noise level at which NL-Bayes runs: the stabilised image is scaled to it, where the published settings apply.
+"""Noise level at which NL-Bayes runs: the stabilised image is scaled to it, where the published
+settings apply.
 
-6, 9 and 18 lose 0.05, 0.05 and 0.02 dB, and 25 gains 0.02 dB, all of it in the dark (measured: means of 120 images of
-five training photographs under four sensors at three brightnesses)."""
+6, 9 and 18 lose 0.05, 0.05 and 0.02 dB, and 25 gains 0.02 dB, all of it in the dark (measured:
+means of 120 images of five training photographs under four sensors at three brightnesses).
+"""
 
 Order = Literal["denoise-first", "deconvolve-first"]
 
@@ -41,8 +48,9 @@ Order = Literal["denoise-first", "deconvolve-first"]
 class Chain:
     """How to restore what `degraded` acquired to what `reference` would have, without its noise.
 
-    `quality` is one of `nl_bayes.QUALITIES`. `epsilon` regularises the MTF compensation. With None it is derived from
-    each image: by `restore_traditional` itself, by `fitted_to` for an image that comes in strips.
+    `quality` is one of `nl_bayes.QUALITIES`. `epsilon` regularises the MTF compensation. With None
+    it is derived from each image: by `restore_traditional` itself, by `fitted_to` for an image that
+    comes in strips.
     """
 
     degraded: Instrument
@@ -52,7 +60,8 @@ class Chain:
     epsilon: float | None = None
 
     def fitted_to(self, strips: Iterable[Tensor]) -> "Chain":
-        """Return the pipeline with the epsilon for an image in strips (any, W) of digital numbers, NaN where missing.
+        """Return the pipeline with the epsilon for an image in strips (any, W) of digital numbers,
+        NaN where missing.
 
         A chain that has an epsilon is returned as it is, and no strip is read.
         """
@@ -62,7 +71,9 @@ class Chain:
         return replace(self, epsilon=derived_epsilon(measured, self.degraded))
 
     def kernel(self) -> Tensor:
-        """Return the filter of the MTF compensation, (2 R + 1, 2 R + 1) float64, for the pipeline's epsilon."""
+        """Return the filter of the MTF compensation, (2 R + 1, 2 R + 1) float64, for the pipeline's
+        epsilon.
+        """
         if self.epsilon is None:
             remedy = "call Chain.fitted_to with the strips of the image first"
             raise OptionError("epsilon", expected="a number", got="None", remedy=remedy)
@@ -70,7 +81,8 @@ class Chain:
 
 
 def restore_traditional(dn: Tensor, chain: Chain) -> Tensor:
-    """Digital numbers (H, W) float32 of the degraded sensor to those of the reference, clipped and not rounded.
+    """Digital numbers (H, W) float32 of the degraded sensor to those of the reference, clipped and
+    not rounded.
 
     NaN marks missing pixels, and stays.
     """
@@ -78,10 +90,11 @@ def restore_traditional(dn: Tensor, chain: Chain) -> Tensor:
 
 
 def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Iterator[Tensor]:
-    """Restore as `restore_traditional`, bit for bit, an image that comes and goes in strips of rows, (any, W) each.
+    """Restore as `restore_traditional`, bit for bit, an image that comes and goes in strips of
+    rows, (any, W) each.
 
-    The chain needs an epsilon (see `Chain.fitted_to`), because the strips are read only once. Holds some 700 rows of
-    the image, and the tallest strip.
+    The chain needs an epsilon (see `Chain.fitted_to`), because the strips are read only once. Holds
+    some 700 rows of the image, and the tallest strip.
     """
     radiance = (to_radiance(strip, chain.degraded) for strip in finite_or_missing(strips))
     sensor = with_rounding_noise(chain.degraded)
@@ -92,9 +105,13 @@ def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Itera
         restored = filter_strips(clean, height, kernel)
     else:
         coloured = coloured_by(kernel, 1.0)
-        amplified = replace(sensor, alpha=sensor.alpha * coloured.sigma**2, beta=sensor.beta * coloured.sigma**2)
+        amplified = replace(
+            sensor, alpha=sensor.alpha * coloured.sigma**2, beta=sensor.beta * coloured.sigma**2
+        )
         sharp = filter_strips(radiance, height, kernel)
-        restored = denoise_radiance(sharp, height, amplified, replace(coloured, sigma=WORKING_SIGMA), quality)
+        restored = denoise_radiance(
+            sharp, height, amplified, replace(coloured, sigma=WORKING_SIGMA), quality
+        )
     for strip in restored:
         yield to_dn(strip, chain.reference)
 
@@ -102,7 +119,9 @@ def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Itera
 def denoise_radiance(
     radiance: Iterable[Tensor], height: int, sensor: Instrument, noise: Noise, quality: Quality
 ) -> Iterator[Tensor]:
-    """NL-Bayes on the stabilised scale: strips (any, W) in W/m2/sr/um, of variance alpha L + beta, to the same."""
+    """NL-Bayes on the stabilised scale: strips (any, W) in W/m2/sr/um, of variance alpha L + beta,
+    to the same.
+    """
     scale = noise.sigma
     stable = (stabilise(strip, sensor) * scale for strip in radiance)
     for clean in nl_bayes_strips(stable, height, noise, quality):
@@ -112,5 +131,7 @@ def denoise_radiance(
 def quality_named(name: str) -> Quality:
     """Look a quality up, refusing an unknown name."""
     if name not in QUALITIES:
-        raise OptionError("quality", expected=f"one of {', '.join(QUALITIES)}", got=repr(name), remedy="pick one")
+        raise OptionError(
+            "quality", expected=f"one of {', '.join(QUALITIES)}", got=repr(name), remedy="pick one"
+        )
     return QUALITIES[name]

@@ -1,19 +1,21 @@
-"""The regularisation of the MTF compensation, derived from the image: the Wiener optimum of its noise and its scene.
+"""The regularisation of the MTF compensation, derived from the image: the Wiener optimum of its
+noise and its scene.
 
-The compensation divides by |H|^2 + epsilon r^2, r = |f| / f_Nyquist. It is the Wiener filter if the power of the
-noise over that of the scene is epsilon r^2, which holds for white noise and a scene whose power falls as S / r^2. The
-power of natural scenes falls approximately so.
+The compensation divides by |H|^2 + epsilon r^2, r = |f| / f_Nyquist. It is the Wiener filter if the
+power of the noise over that of the scene is epsilon r^2, which holds for white noise and a scene
+whose power falls as S / r^2. The power of natural scenes falls approximately so.
 
-1. In each block of 4 x 4 pixels, v = alpha L + beta is the variance of the noise at the block's mean radiance L,
-   rounding included, and g the mean squared difference of neighbouring pixels. White noise adds 2 v to g.
-2. u = g / (2 v) - 1, at least 0, is the scene over the noise. A Wiener filter with this ratio leaves v u / (u + 1) of
-   the noise. NL-Bayes acts similarly: it leaves little in flat parts and most of the noise in fine texture. N is the
-   mean of v u / (u + 1) over the image.
-3. S = mean of (g - 2 v) / c. A scene of power S / r^2 adds c S to the squared differences, where c = mean over the
-   frequencies of |H|^2 |D|^2 / r^2, H is the transfer of the sensor, and D that of a difference of neighbours (|D|^2
-   is the mean of both axes).
-4. epsilon = a (N / S)^p, and at most 0.33 sigma / L, the root of the mean of v over the mean radiance. The constants
-   a and p are fitted by `benchmarks/traditional_epsilon.py`.
+1. In each block of 4 x 4 pixels, v = alpha L + beta is the variance of the noise at the block's
+  mean radiance L, rounding included, and g the mean squared difference of neighbouring pixels.
+  White noise adds 2 v to g.
+2. u = g / (2 v) - 1, at least 0, is the scene over the noise. A Wiener filter with this ratio
+  leaves v u / (u + 1) of the noise. NL-Bayes acts similarly: it leaves little in flat parts and
+  most of the noise in fine texture. N is the mean of v u / (u + 1) over the image.
+3. S = mean of (g - 2 v) / c. A scene of power S / r^2 adds c S to the squared differences, where c
+  = mean over the frequencies of |H|^2 |D|^2 / r^2, H is the transfer of the sensor, and D that of a
+  difference of neighbours (|D|^2 is the mean of both axes).
+4. epsilon = a (N / S)^p, and at most 0.33 sigma / L, the root of the mean of v over the mean
+  radiance. The constants a and p are fitted by `benchmarks/traditional_epsilon.py`.
 
 A change of the gain, which scales radiance and noise together, leaves epsilon as it is.
 """
@@ -42,15 +44,19 @@ class Fit(NamedTuple):
 
 
 FIT: Final = Fit(scale=0.55, power=1.12)
-"""Fitted to denoising first. If deconvolution comes first, the mean loss to the best epsilon of each image is 0.07 dB
-on 120 images, and constants fitted to this order lose as much (measured)."""
+"""Fitted to denoising first.
+
+If deconvolution comes first, the mean loss to the best epsilon of each image is 0.07 dB on 120
+images, and constants fitted to this order lose as much (measured).
+"""
 
 LARGEST_PER_NOISE = 0.33
 """The bound of epsilon over sigma / L, the noise as a share of the radiance.
 
-In flat and dark images the formula asks for more, which gains 0.02 dB in the mean of the scan but erases faint
-patterns near Nyquist. It leaves 15 % of the contrast of bars with 10 % contrast and a period of 2 px, relative to the
-reference. With this bound 64 % are left (measured)."""
+In flat and dark images the formula asks for more, which gains 0.02 dB in the mean of the scan but
+erases faint patterns near Nyquist. It leaves 15 % of the contrast of bars with 10 % contrast and a
+period of 2 px, relative to the reference. With this bound 64 % are left (measured).
+"""
 
 LARGEST_EPSILON = 1.0
 """The bound of epsilon in the dark."""
@@ -59,8 +65,9 @@ LEAST_NOISE = 0.005
 LEAST_CONTRAST = 0.02
 """The least N, and the least mean of g - 2 v, over the mean of v.
 
-NL-Bayes leaves 1 % of the noise in flat fields. Differences of 22 500 pixels measure 2 v to within about 0.02 v, so
-that less is no evidence of contrast."""
+NL-Bayes leaves 1 % of the noise in flat fields. Differences of 22 500 pixels measure 2 v to within
+about 0.02 v, so that less is no evidence of contrast.
+"""
 
 BLOCK_PX = 4
 """Side of a block, similar to that of the patches of NL-Bayes.
@@ -91,7 +98,9 @@ class NoiseAndScene:
     contrast: float
 
     def ratio(self, sensor: Instrument) -> float:
-        """Return N / S, the power of the noise over that of the scene at Nyquist, above 0 and finite."""
+        """Return N / S, the power of the noise over that of the scene at Nyquist, above 0 and
+        finite.
+        """
         residual = max(self.residual, LEAST_NOISE * self.noise)
         contrast = max(self.contrast, LEAST_CONTRAST * self.noise)
         return residual * difference_energy(sensor) / contrast
@@ -106,13 +115,15 @@ class NoiseAndScene:
 
 
 def measure(strips: Iterable[Tensor], sensor: Instrument) -> NoiseAndScene:
-    """Measure noise and contrast of an image in strips (any, W) of digital numbers, NaN where they are missing.
+    """Measure noise and contrast of an image in strips (any, W) of digital numbers, NaN where they
+    are missing.
 
-    Missing pixels do not count, and neither do blocks whose known pixels are all saturated. A single saturated pixel
-    counts, because epsilon would otherwise jump where a bright point comes to saturate.
+    Missing pixels do not count, and neither do blocks whose known pixels are all saturated. A
+    single saturated pixel counts, because epsilon would otherwise jump where a bright point comes
+    to saturate.
 
-    The result does not depend, to the last bit, on how the strips are cut: the image is measured in bands of rows on
-    a grid of its own, and the sums of the bands are added in their order.
+    The result does not depend, to the last bit, on how the strips are cut: the image is measured in
+    bands of rows on a grid of its own, and the sums of the bands are added in their order.
     """
     digitised = with_rounding_noise(sensor)
     sums = np.zeros(4)
@@ -136,7 +147,9 @@ def derived_epsilon(measured: NoiseAndScene, sensor: Instrument, fit: Fit = FIT)
 
 
 def bands(strips: Iterable[Tensor]) -> Iterator[Tensor]:
-    """Yield the rows of strips (any, W) in bands of BLOCK_PX rows, the last one with what is left."""
+    """Yield the rows of strips (any, W) in bands of BLOCK_PX rows, the last one
+    with what is left.
+    """
     held: Tensor | None = None
     for strip in strips:
         rows = strip if held is None else torch.cat([held, strip])
@@ -148,10 +161,14 @@ def bands(strips: Iterable[Tensor]) -> Iterator[Tensor]:
         yield held
 
 
-def _sums(radiance: Array, above: Array | None, unsaturated: Mask, sensor: Instrument) -> tuple[Array, int]:
-    """Return the sums of L, v, v u / (u + 1) and g - 2 v over the pixels of a band (rows, W), and their number.
+def _sums(
+    radiance: Array, above: Array | None, unsaturated: Mask, sensor: Instrument
+) -> tuple[Array, int]:
+    """Return the sums of L, v, v u / (u + 1) and g - 2 v over the pixels of a band (rows, W), and
+    their number.
 
-    `above` is the row over the band, (1, W), if there is one. Blocks without a pair of neighbours do not count.
+    `above` is the row over the band, (1, W), if there is one. Blocks without a pair of neighbours
+    do not count.
     """
     first = np.full((1, radiance.shape[1]), np.nan) if above is None else above
     across = np.diff(radiance, axis=1, prepend=np.nan)
@@ -176,12 +193,16 @@ def _sums(radiance: Array, above: Array | None, unsaturated: Mask, sensor: Instr
 
 
 def _blocks(values: Array) -> tuple[Array, Array]:
-    """Return the sum and the number of the known values (rows, W) in each block of BLOCK_PX columns."""
+    """Return the sum and the number of the known values (rows, W) in each block of BLOCK_PX
+    columns.
+    """
     known = np.isfinite(values)
     columns = np.where(known, values, 0.0).sum(0), known.sum(0, dtype=np.float64)
     missing_columns = -values.shape[1] % BLOCK_PX
     # Rows are added first: sums over the few columns of a block are slow.
-    total, number = (np.pad(each, (0, missing_columns)).reshape(-1, BLOCK_PX).sum(1) for each in columns)
+    total, number = (
+        np.pad(each, (0, missing_columns)).reshape(-1, BLOCK_PX).sum(1) for each in columns
+    )
     return total, number
 
 

@@ -11,7 +11,9 @@ from torch.nn.functional import pad
 
 
 class Rows:
-    """Rows of an image as they come, strip by strip; what lies behind the last window is forgotten."""
+    """Rows of an image as they come, strip by strip; what lies behind the last
+    window is forgotten.
+    """
 
     def __init__(self, strips: Iterable[Tensor]) -> None:
         self._strips: Iterator[Tensor] = iter(strips)
@@ -32,7 +34,8 @@ class Rows:
 
 
 def mirrored(start: int, stop: int, size: int) -> Tensor:
-    """Pixel numbers (stop - start,) of an image mirrored at its borders, the edge repeated: c b a | a b c | c b a.
+    """Pixel numbers (stop - start,) of an image mirrored at its borders, the edge repeated: c b a |
+    a b c | c b a.
 
     Folded back into 0..size - 1: the mirror has period 2 * size, whatever the size.
     """
@@ -47,8 +50,9 @@ Result = TypeVar("Result")
 def map_tiles(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
     """`map(work, items)` on as many threads as torch has, the results in the order of the items.
 
-    A tile is thousands of operations on small tensors. Split up inside, each ends with its threads waiting for one
-    another: on a busy machine five times slower with two threads than with one (measured).
+    A tile is thousands of operations on small tensors. Split up inside, each ends with its threads
+    waiting for one another: on a busy machine five times slower with two threads than with one
+    (measured).
     """
     with one_thread_per_operation() as threads, ThreadPoolExecutor(threads) as pool:
         yield from pool.map(work, items)
@@ -66,10 +70,12 @@ def one_thread_per_operation() -> Iterator[int]:
 
 
 def fill_with_local_means(image: Tensor, known: Tensor) -> Tensor:
-    """Fill the pixels of (H, W) that are not `known` with the mean of the nearest known ones around.
+    """Fill the pixels of (H, W) that are not `known` with the mean of the nearest known ones
+    around.
 
-    A pyramid: each level takes its missing pixels from the next, of half the resolution. 0 where nothing is known.
-    scikit-image's biharmonic inpainting gives other values, by up to 117 of 255 in a striped photograph (measured).
+    A pyramid: each level takes its missing pixels from the next, of half the resolution. 0 where
+    nothing is known. scikit-image's biharmonic inpainting gives other values, by up to 117 of 255
+    in a striped photograph (measured).
     """
     filled = image.where(known, 0.0)
     if bool(known.all()) or max(image.shape) == 1:

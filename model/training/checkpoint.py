@@ -31,7 +31,8 @@ class TrainingRecipe:
         batch: patches a step, on every worker.
         learning_rate: the highest, after warm-up.
         warm_up_steps: of a linear rise from 0.
-        gradient_norm: larger gradients are cut to it; the L1 loss of a restoration is small, far above is a burst.
+        gradient_norm: larger gradients are cut to it; the L1 loss of a restoration is small, far
+            above is a burst.
         ema_decay: of the running average of the weights, which is what is shipped.
         loss: weights of the loss's terms.
         seed: of the first weights and of the patches.
@@ -50,7 +51,9 @@ class TrainingRecipe:
 
     def __post_init__(self) -> None:
         numbers = {"learning rate": self.learning_rate}
-        numbers |= {f"weight of {term} in the loss": weight for term, weight in asdict(self.loss).items()}
+        numbers |= {
+            f"weight of {term} in the loss": weight for term, weight in asdict(self.loss).items()
+        }
         for name, value in numbers.items():
             if not (math.isfinite(value) and value >= 0):
                 expected = "a finite number, 0 or above"
@@ -72,12 +75,15 @@ MAX_BAD_STEPS = 10
 WINDOW_STEPS = 200
 TEST_PLACES = 65
 DIVERGED = 5.0
-"""A mean loss this many times the best one so far is no fluctuation: batches vary by a factor of two."""
+"""A mean loss this many times the best one so far is no fluctuation: batches vary by a factor of
+two.
+"""
 
 
 @dataclass
 class Guards:
-    """Counts skipped steps, and compares the loss of each window of steps with the best window so far.
+    """Counts skipped steps, and compares the loss of each window of steps with the best window so
+    far.
 
     Attributes:
         bad_steps: steps whose gradient was not finite: skipped.
@@ -111,8 +117,11 @@ class Guards:
         self.best = mean if self.best is None else min(self.best, mean)
 
 
-def require_finite_output(network: Network, where: str, remedy: str = "lower the learning rate") -> None:
-    """Refuse a network that makes NaN or infinity of an image in [0, 1]: its weights may be finite all the same.
+def require_finite_output(
+    network: Network, where: str, remedy: str = "lower the learning rate"
+) -> None:
+    """Refuse a network that makes NaN or infinity of an image in [0, 1]: its weights may be finite
+    all the same.
 
     It lies on the CPU; a conditioned one is told the middle of every range.
     """
@@ -122,7 +131,9 @@ def require_finite_output(network: Network, where: str, remedy: str = "lower the
     with torch.inference_mode():
         restored = told(network, torch.zeros(len(RANGES)))(images)
     if not bool(torch.isfinite(restored).all()):
-        raise ModelError(where, expected="finite pixels of a test image", got="NaN or infinity", remedy=remedy)
+        raise ModelError(
+            where, expected="finite pixels of a test image", got="NaN or infinity", remedy=remedy
+        )
 
 
 def _error(step: int, expected: str, got: str) -> ModelError:
@@ -146,7 +157,8 @@ def checkpoint_sha256(tensors: Mapping[str, Tensor], header: Mapping[str, object
 def read_checkpoint(
     path: Path, network: Network, recipe: TrainingRecipe, data: str = ""
 ) -> tuple[dict[str, Tensor], int, Guards]:
-    """The parts of a checkpoint by name (see `Trainer.save`), its step and its guards, once all is as it must be.
+    """The parts of a checkpoint by name (see `Trainer.save`), its step and its guards, once all is
+    as it must be.
 
     Args:
         path: the file.
@@ -158,7 +170,9 @@ def read_checkpoint(
     tensors = {name: torch.from_numpy(array) for name, array in found.items()}
     if header.get("recipe") != asdict(recipe):
         remedy = "repeat its options, or choose another folder"
-        raise ModelError(str(path), expected=f"a checkpoint of {recipe}", got="another recipe", remedy=remedy)
+        raise ModelError(
+            str(path), expected=f"a checkpoint of {recipe}", got="another recipe", remedy=remedy
+        )
     if header.get("data") != data:
         remedy = "give the same ones, or choose another folder"
         expected = "a checkpoint of these images, sensors and first weights"
@@ -176,7 +190,9 @@ def read_checkpoint(
     except (AttributeError, LookupError, TypeError, ValueError, OverflowError) as error:
         got = " ".join(str(error).split())[:120]
         remedy = "choose the variant it was begun with, or begin anew where the file is damaged"
-        raise ModelError(str(path), expected="a checkpoint of this network", got=got, remedy=remedy) from error
+        raise ModelError(
+            str(path), expected="a checkpoint of this network", got=got, remedy=remedy
+        ) from error
     return tensors, step, guards
 
 
@@ -191,7 +207,11 @@ def finish(network: Network, path: Path, recipe: dict[str, object]) -> None:
 
 def _check_parts(tensors: dict[str, Tensor], network: Network, steps: int) -> None:
     """Nothing is filled in before all of it fits."""
-    wanted = {f"{part}.{k}": value for k, value in network.state_dict().items() for part in ("network", "average")}
+    wanted = {
+        f"{part}.{k}": value
+        for k, value in network.state_dict().items()
+        for part in ("network", "average")
+    }
     if len(tensors) > len(wanted):  # before the first step Adam keeps nothing
         for name, parameter in network.named_parameters():
             wanted |= {f"moment.{name}.{moment}": parameter for moment in MOMENTS}
@@ -200,9 +220,15 @@ def _check_parts(tensors: dict[str, Tensor], network: Network, steps: int) -> No
         value = tensors[name]
         moment = name.rsplit(".", 1)[1]
         if value.shape != like.shape or value.dtype != like.dtype:
-            raise ValueError(f"a tensor {tuple(value.shape)} of {value.dtype} in place of {tuple(like.shape)}")
-        least, most = {"step": (0, steps), "exp_avg_sq": (0, math.inf)}.get(moment, (-math.inf, math.inf))
+            raise ValueError(
+                f"a tensor {tuple(value.shape)} of {value.dtype} in place of {tuple(like.shape)}"
+            )
+        least, most = {"step": (0, steps), "exp_avg_sq": (0, math.inf)}.get(
+            moment, (-math.inf, math.inf)
+        )
         if not bool(((value >= least) & (value <= most)).all()):
             raise ValueError(f"{name} that Adam cannot have")
     if len(tensors) != len(wanted) or not all_finite(arrays(tensors)):
-        raise ValueError(f"{len(tensors)} tensors in place of {len(wanted)}, or values that are not finite")
+        raise ValueError(
+            f"{len(tensors)} tensors in place of {len(wanted)}, or values that are not finite"
+        )

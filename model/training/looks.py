@@ -1,7 +1,8 @@
 """How the ground of a pass may look: its light, its contrast and its softness.
 
-Aerial photographs are bright, sharp and rich in contrast, more so than most of what a satellite sees. A network that
-learns from nothing else restores dark, hazy and soft ground worse than it could.
+Aerial photographs are bright, sharp and rich in contrast, more so than most of what a satellite
+sees. A network that learns from nothing else restores dark, hazy and soft ground worse than it
+could.
 """
 
 from dataclasses import dataclass
@@ -20,7 +21,8 @@ class Look:
     Attributes:
         light: factor on the scene's radiance.
         contrast: share of the contrast around the scene's mean that is left.
-        softness_px: standard deviation of a further blur of the ground, in target pixels; 0 is none.
+        softness_px: standard deviation of a further blur of the ground, in target pixels; 0 is
+            none.
     """
 
     light: float

@@ -1,14 +1,17 @@
 """The paper's loss: 1.0 L1 + 0.5 LPIPS + 0.1 FFT-L1 (paper, training section), each term reported.
 
-Besides, an L2 term for who wants the highest PSNR, which is a mean of squares: L1 forgives the strongest edges; and a
-PSNR term, its mean over the patches, in which a sharp and quiet sensor's small errors count as much as a blurred and
-noisy one's large ones (as in NAFNet, Chen et al., ECCV 2022).
+Besides, an L2 term for who wants the highest PSNR, which is a mean of squares: L1 forgives the
+strongest edges; and a PSNR term, its mean over the patches, in which a sharp and quiet sensor's
+small errors count as much as a blurred and noisy one's large ones (as in NAFNet, Chen et al., ECCV
+2022).
 
-The consistency step of a restoration removes what an image errs at low spatial frequencies, because the raw image
-shows them as they are. `coarse` below 1 makes an error there count less, so that a network spends itself on the rest:
-G of `model.consistency` is taken of the error, and all but that share of it is left out.
+The consistency step of a restoration removes what an image errs at low spatial frequencies, because
+the raw image shows them as they are. `coarse` below 1 makes an error there count less, so that a
+network spends itself on the rest: G of `model.consistency` is taken of the error, and all but that
+share of it is left out.
 
-LPIPS needs weights that are not shipped; without them the loss is L1 + FFT-L1, and the recipe says so.
+LPIPS needs weights that are not shipped; without them the loss is L1 + FFT-L1, and the recipe says
+so.
 """
 
 from collections.abc import Mapping
@@ -41,14 +44,18 @@ PAPER = LossWeights()
 
 
 class RestorationLoss:
-    """The weighted sum of the terms, in float32 whatever the autocast around it; that of LPIPS where it is given."""
+    """The weighted sum of the terms, in float32 whatever the autocast around it; that of LPIPS
+    where it is given.
+    """
 
     def __init__(self, weights: LossWeights = PAPER, perceptual: Lpips | None = None) -> None:
         self.weights = weights
         self.perceptual = perceptual if weights.lpips else None
 
     def __call__(self, restored: Tensor, reference: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """The loss, and its terms before weighting, of images (N, 1, H, W) in [0, 1] of full scale, not clipped."""
+        """The loss, and its terms before weighting, of images (N, 1, H, W) in [0, 1] of full scale,
+        not clipped.
+        """
         weights = self.weights
         # In bfloat16 the differences of nearly equal images would lose most of their digits.
         with torch.autocast(restored.device.type, enabled=False):
@@ -69,14 +76,17 @@ class RestorationLoss:
 
 
 def coarse(error: Tensor) -> Tensor:
-    """Means over blocks, interpolated bilinearly between their centres: of (N, 1, H, W), whole blocks, the same."""
+    """Means over blocks, interpolated bilinearly between their centres: of (N, 1, H, W), whole
+    blocks, the same.
+    """
     means = avg_pool2d(error, BLOCK_PX)
     found: Tensor = interpolate(means, size=error.shape[-2:], mode="bilinear", align_corners=False)
     return found
 
 
 def log_mse(restored: Tensor, reference: Tensor) -> Tensor:
-    """Mean over the batch of ln(1 + mean squared error in DN^2 of 12 bits): 10 / ln 10 of it is lost PSNR in dB.
+    """Mean over the batch of ln(1 + mean squared error in DN^2 of 12 bits): 10 / ln 10 of it is
+    lost PSNR in dB.
 
     Of (N, 1, H, W) float32. The 1 keeps it above 0, and forgives what rounding does to a patch.
     """
@@ -86,9 +96,11 @@ def log_mse(restored: Tensor, reference: Tensor) -> Tensor:
 
 
 def fft_l1(restored: Tensor, reference: Tensor) -> Tensor:
-    """Mean size of the difference of the spectra, orthonormal: about 1.1 times the L1, whatever the patch size.
+    """Mean size of the difference of the spectra, orthonormal: about 1.1 times the L1, whatever the
+    patch size.
 
-    Of (N, 1, H, W) float32. Without that normalisation it would be 142 times the L1 at 128 pixels, and twice that at
+    Of (N, 1, H, W) float32. Without that normalisation it would be 142 times the L1 at 128 pixels,
+    and twice that at
     256. The size is taken by abs(), whose gradient at 0 is 0; that of sqrt(re^2 + im^2) is NaN.
     """
     size: Tensor = torch.fft.rfft2(restored - reference, norm="ortho").abs().mean()

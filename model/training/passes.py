@@ -1,8 +1,8 @@
 """One simulated pass of two sensors over a scene, in torch, so that a GPU can do it too.
 
-The same physics as `model.simulator`: blur and sampling by FFT, then the detector. A scene's spectrum is computed
-once; each pass blurs, samples and folds it anew. What a pass draws comes from a NumPy generator; noise alone comes
-from torch's, whose numbers differ between a CPU and a GPU.
+The same physics as `model.simulator`: blur and sampling by FFT, then the detector. A scene's
+spectrum is computed once; each pass blurs, samples and folds it anew. What a pass draws comes from
+a NumPy generator; noise alone comes from torch's, whose numbers differ between a CPU and a GPU.
 """
 
 import math
@@ -23,7 +23,9 @@ from beers_deploy.profiles.response import MtfTable, PointSpread
 from beers_deploy.profiles.sensor import Instrument
 
 GAMMAS = 513
-"""Radii at which a table's gamma is known; between them it is interpolated, which is off by 1e-4 at most."""
+"""Radii at which a table's gamma is known; between them it is interpolated, which is off by 1e-4 at
+most.
+"""
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,8 @@ class Pass:
 
     Attributes:
         oversampling: scene pixels per target pixel.
-        phase_px: shift (down, right) of the sampling grid in scene pixels: one for both, because restoring must not
-            shift anything.
+        phase_px: shift (down, right) of the sampling grid in scene pixels: one for both, because
+            restoring must not shift anything.
         look: of the ground.
         margin_px: target pixels cropped on each side.
     """
@@ -69,12 +71,15 @@ def prepare(scene: Scene, multiple: int, device: torch.device | str = "cpu") -> 
 
 
 def folded_signals(scene: Visited, sensors: tuple[Instrument, ...], made: Pass) -> list[Tensor]:
-    """Blurred and sampled radiance (h, w) on the target grid, of each sensor, without the margin."""
+    """Blurred and sampled radiance (h, w) on the target grid, of each sensor,
+    without the margin.
+    """
     height, width = scene.sides
     device = scene.spectrum.device
     down, across = frequencies(height, width, made.oversampling, device)
     ground = looked(scene.spectrum, made.look, down, across)
-    # Target pixel n is sampled at the centre of its scene pixels, as `model.simulator.sampling.sample` does.
+    # Target pixel n is sampled at the centre of its scene pixels, as
+    # `model.simulator.sampling.sample` does.
     centre = (made.oversampling - 1) / 2
     ground *= _ramp(down / made.oversampling, centre + made.phase_px[0])[:, None]
     ramp = _ramp(across / made.oversampling, centre + made.phase_px[1]) / made.oversampling
@@ -82,8 +87,11 @@ def folded_signals(scene: Visited, sensors: tuple[Instrument, ...], made: Pass) 
     for sensor in sensors:
         blurs = sensor.blur, sensor.antialias_px, sensor.smear_px
         transfer = transfer_of(height, width, made.oversampling, *blurs, str(device))
-        # Keeping every r-th row is adding up the r aliases of each frequency: what follows is r times smaller.
-        rows = (ground * transfer).view(made.oversampling, height // made.oversampling, -1).sum(0) * ramp
+        # Keeping every r-th row is adding up the r aliases of each frequency: what follows is r
+        # times smaller.
+        rows = (ground * transfer).view(made.oversampling, height // made.oversampling, -1).sum(
+            0
+        ) * ramp
         lines = torch.fft.irfft(torch.fft.ifft(rows, dim=0), n=width)
         found.append(within_margin(lines[:, :: made.oversampling], made.margin_px))
     return found
@@ -121,15 +129,25 @@ def _ramp(frequency: Tensor, shift_px: float) -> Tensor:
     return torch.polar(torch.ones_like(angle), angle)
 
 
-def frequencies(height: int, width: int, oversampling: int, device: torch.device | str) -> tuple[Tensor, Tensor]:
-    """Vertical (H,) and horizontal (W // 2 + 1,) frequencies of a half spectrum, in cycles per target pixel."""
+def frequencies(
+    height: int, width: int, oversampling: int, device: torch.device | str
+) -> tuple[Tensor, Tensor]:
+    """Vertical (H,) and horizontal (W // 2 + 1,) frequencies of a half spectrum, in cycles per
+    target pixel.
+    """
     down = torch.fft.fftfreq(height, 1 / oversampling, device=device)
     return down, torch.fft.rfftfreq(width, 1 / oversampling, device=device)
 
 
 @lru_cache(maxsize=32)
 def transfer_of(
-    height: int, width: int, oversampling: int, blur: Blur, antialias_px: float, smear_px: float, device: str
+    height: int,
+    width: int,
+    oversampling: int,
+    blur: Blur,
+    antialias_px: float,
+    smear_px: float,
+    device: str,
 ) -> Tensor:
     """As `model.simulator.mtf.transfer_function`, (H, W // 2 + 1) float32 on a device.
 
@@ -152,32 +170,42 @@ def transfer_of(
     # The anti-alias filter's own loss: exp(-2 pi^2 sigma^2 f^2).
     loss = loss + 2 * (math.pi * antialias_px * radius) ** 2
     upper = torch.exp(-loss) * torch.sinc(fx) * (torch.sinc(fy) * torch.sinc(smear_px * fy))
-    return torch.cat([upper, upper[1 : (height + 1) // 2].flip(0)])  # even in fy: the rows below are the same
+    return torch.cat(
+        [upper, upper[1 : (height + 1) // 2].flip(0)]
+    )  # even in fy: the rows below are the same
 
 
 def _table_gammas(table: MtfTable, radius: Tensor) -> list[Tensor]:
     """What `MtfTable.at` interpolates, gamma across and along the track at each radius."""
     frequency = np.array(table.frequency)
     evenly = np.linspace(frequency[1], frequency[-1], GAMMAS)
-    place = (radius.clamp(evenly[0], evenly[-1]) - evenly[0]) * ((GAMMAS - 1) / (evenly[-1] - evenly[0]))
+    place = (radius.clamp(evenly[0], evenly[-1]) - evenly[0]) * (
+        (GAMMAS - 1) / (evenly[-1] - evenly[0])
+    )
     left = place.int().clamp(max=GAMMAS - 2)
     share = place - left
     gammas = []
     for contrast in (table.across, table.along):
         losses = np.maximum(-np.log(np.array(contrast) / np.sinc(frequency)), 0.0)
-        gamma = torch.tensor(np.interp(evenly, frequency, losses) / evenly, dtype=torch.float32).to(radius.device)
+        gamma = torch.tensor(np.interp(evenly, frequency, losses) / evenly, dtype=torch.float32).to(
+            radius.device
+        )
         gammas.append(torch.lerp(gamma[left], gamma[left + 1], share))
     return gammas
 
 
-def detected(signal: Tensor, sensor: Instrument, role: str, generator: np.random.Generator) -> Tensor:
+def detected(
+    signal: Tensor, sensor: Instrument, role: str, generator: np.random.Generator
+) -> Tensor:
     """Digital numbers of a sampled signal (h, w), over full scale."""
     seed = int(generator.integers(2**31))
     if any(pixel_effects(sensor.effects, acts_on) for acts_on in ("radiance", "DN")):
         acquired = detector.detect(signal.cpu().numpy(), sensor, Draw(seed), role)
         return torch.from_numpy(np.asarray(acquired / sensor.max_dn, np.float32)).to(signal.device)
     noise = torch.empty_like(signal)
-    noise.normal_(generator=torch.Generator(signal.device).manual_seed(seed)).clamp_(-NOISE_LIMIT, NOISE_LIMIT)
+    noise.normal_(generator=torch.Generator(signal.device).manual_seed(seed)).clamp_(
+        -NOISE_LIMIT, NOISE_LIMIT
+    )
     sigma = (sensor.alpha * signal.clamp(min=0) + sensor.beta).clamp(min=0).sqrt()
     dn = (signal + sigma * noise) * sensor.gain_dn_per_radiance
     return dn.round().clamp(0, sensor.max_dn) / sensor.max_dn

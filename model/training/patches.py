@@ -1,4 +1,6 @@
-"""How training patches are drawn from scenes and turned, and where stored pairs of them lie; nothing needs torch."""
+"""How training patches are drawn from scenes and turned, and where stored pairs of them lie;
+nothing needs torch.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +25,8 @@ class PatchRecipe:
         oversamplings: ratios to draw from; every ratio shows the same ground at another scale.
         looks: of the ground.
         margin_px: target pixels cropped on each side.
-        family: draws the sensors instead of `degraded`; each patch then comes with what a network is told of its
-            sensor, and dark patches are brightened as a restoration brightens them.
+        family: draws the sensors instead of `degraded`; each patch then comes with what a network
+            is told of its sensor, and dark patches are brightened as a restoration brightens them.
         noisy_reference: whether the wanted image has the reference's noise.
     """
 
@@ -44,15 +46,21 @@ class PatchRecipe:
 def turn(
     patches: np.ndarray, generator: np.random.Generator, quarters: bool = True, mirrors: bool = True
 ) -> np.ndarray:
-    """Patches (..., P, P) in one of the square's eight symmetries, the same for all; see `draw_turn`."""
+    """Patches (..., P, P) in one of the square's eight symmetries, the same for all; see
+    `draw_turn`.
+    """
     return turned(patches, *draw_turn(generator, quarters, mirrors))
 
 
-def draw_turn(generator: np.random.Generator, quarters: bool, mirrors: bool = True) -> tuple[int, bool]:
-    """Quarter turns, and whether to mirror afterwards; an odd number of quarters makes columns of rows.
+def draw_turn(
+    generator: np.random.Generator, quarters: bool, mirrors: bool = True
+) -> tuple[int, bool]:
+    """Quarter turns, and whether to mirror afterwards; an odd number of quarters makes columns of
+    rows.
 
-    A plain network learns one sensor. Where its two axes differ they must not change places, and `quarters` is False:
-    four symmetries are left. Where its blur is lopsided it stays as it is, and `mirrors` is False.
+    A plain network learns one sensor. Where its two axes differ they must not change places, and
+    `quarters` is False: four symmetries are left. Where its blur is lopsided it stays as it is, and
+    `mirrors` is False.
     """
     quarter = int(generator.integers(4))
     mirrored = bool(generator.integers(2))
@@ -73,7 +81,9 @@ Files = tuple[Path, Path]
 
 def pair_files(folder: Path) -> list[Files]:
     """The pairs FOLDER/degraded/NAME and FOLDER/reference/NAME, by name."""
-    degraded, reference = ({p.stem: p for p in list_images(folder / role)} for role in ("degraded", "reference"))
+    degraded, reference = (
+        {p.stem: p for p in list_images(folder / role)} for role in ("degraded", "reference")
+    )
     alone = sorted(degraded.keys() ^ reference.keys())
     if alone:
         expected = "each name in degraded/ and in reference/"

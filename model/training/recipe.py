@@ -1,6 +1,7 @@
 """A recipe: everything that makes a shipped network, as a TOML file.
 
-`model/recipes/NAME.toml` holds the recipe of each shipped network. `beers-deploy train --recipe NAME` runs it.
+`model/recipes/NAME.toml` holds the recipe of each shipped network. `beers-deploy train --recipe
+NAME` runs it.
 """
 
 from collections.abc import Callable, Mapping
@@ -38,9 +39,18 @@ KINDS: Mapping[object, tuple[Callable[[Any], bool], str]] = {
     str: (lambda value: isinstance(value, str), "a text"),
     int: (_whole, "a whole number from 0 on"),
     float: (_number, "a number from 0 on"),
-    tuple[float, float]: (lambda value: _list_of(value, _number) and len(value) == 2, "two numbers from 0 on"),
-    tuple[str, ...]: (lambda value: _list_of(value, lambda each: isinstance(each, str)), "a list of texts"),
-    Precision: (lambda value: value in get_args(Precision), f"one of {', '.join(get_args(Precision))}"),
+    tuple[float, float]: (
+        lambda value: _list_of(value, _number) and len(value) == 2,
+        "two numbers from 0 on",
+    ),
+    tuple[str, ...]: (
+        lambda value: _list_of(value, lambda each: isinstance(each, str)),
+        "a list of texts",
+    ),
+    Precision: (
+        lambda value: value in get_args(Precision),
+        f"one of {', '.join(get_args(Precision))}",
+    ),
 }
 """What a field of each kind takes, and how a message says it."""
 
@@ -54,7 +64,8 @@ class Stage:
         steps: gradient steps.
         batch: patches a step.
         learning_rate: the highest; a cosine leads it down to 0.
-        rounding: whether maps are rounded as in the INT8 file of the weights that the stage begins with.
+        rounding: whether maps are rounded as in the INT8 file of the weights that the stage begins
+            with.
         precision: of the blocks, float32 or bfloat16.
         average: decay a step of the running average of the weights, which is what is kept.
     """
@@ -112,7 +123,9 @@ def recipe_file(name: str) -> Path:
         return Path(name)
     if name not in recipe_names():
         expected = f"one of {', '.join(recipe_names())}, or the path of a .toml file"
-        raise ProfileError(f"recipe {name!r}", expected=expected, got=repr(name), remedy="choose one of them")
+        raise ProfileError(
+            f"recipe {name!r}", expected=expected, got=repr(name), remedy="choose one of them"
+        )
     return RECIPES / f"{name}.toml"
 
 
@@ -123,23 +136,33 @@ def load_recipe(name: str) -> NetworkRecipe:
         name: a shipped recipe's, or the path of a .toml file.
 
     Raises:
-        ProfileError: no such recipe, a key that is unknown or missing, or a value that no training can have.
+        ProfileError: no such recipe, a key that is unknown or missing, or a value that no training
+            can have.
     """
     path = recipe_file(name)
     try:
         raw = read_toml_text(path)
     except OSError as error:
         reason = error.strerror or str(error)
-        raise ProfileError(str(path), expected="a readable file", got=reason, remedy="check the path") from error
+        raise ProfileError(
+            str(path), expected="a readable file", got=reason, remedy="check the path"
+        ) from error
     except ValueError as error:
-        raise ProfileError(str(path), expected="TOML text", got=str(error), remedy="correct that line") from error
+        raise ProfileError(
+            str(path), expected="TOML text", got=str(error), remedy="correct that line"
+        ) from error
     where = f"recipe {path.name}"
     tables = raw.get("stages")
     if not isinstance(tables, list) or not tables:
         raise ProfileError(
-            where, expected="one [[stages]] or more", got="none", remedy="add the stages of the training"
+            where,
+            expected="one [[stages]] or more",
+            got="none",
+            remedy="add the stages of the training",
         )
-    stages = tuple(_made(Stage, f"{where}: stage {number}", each) for number, each in enumerate(tables, 1))
+    stages = tuple(
+        _made(Stage, f"{where}: stage {number}", each) for number, each in enumerate(tables, 1)
+    )
     parts: dict[str, Any] = {"stages": stages}
     for key, kind in (("looks", Looks), ("loss", LossWeights)):
         if key in raw:
@@ -148,7 +171,9 @@ def load_recipe(name: str) -> NetworkRecipe:
     variant_named(recipe.variant)
     if stages[0].rounding and not recipe.start:
         expected = "weights to make an INT8 file of before a stage with rounding"
-        raise ProfileError(where, expected=expected, got="none", remedy="put a stage without rounding in front")
+        raise ProfileError(
+            where, expected=expected, got="none", remedy="put a stage without rounding in front"
+        )
     return recipe
 
 
@@ -157,9 +182,15 @@ def _made(kind: type[T], where: str, raw: object) -> T:
     if not isinstance(raw, Mapping):
         raise ProfileError(where, expected="a table", got=repr(raw), remedy="write it as a table")
     known = {each.name: each for each in fields(kind)}  # type: ignore[arg-type]
-    required = {n for n, each in known.items() if each.default is MISSING and each.default_factory is MISSING}
+    required = {
+        n
+        for n, each in known.items()
+        if each.default is MISSING and each.default_factory is MISSING
+    }
     check_keys(where, raw, required, set(known) - required)
-    return kind(**{key: _value(f"{where}: {key}", known[key].type, value) for key, value in raw.items()})
+    return kind(
+        **{key: _value(f"{where}: {key}", known[key].type, value) for key, value in raw.items()}
+    )
 
 
 def _value(where: str, kind: object, value: object) -> object:

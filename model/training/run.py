@@ -1,6 +1,8 @@
-"""A training run from options to a folder: checkpoint, logs, validation pictures, weights with their recipe.
+"""A training run from options to a folder: checkpoint, logs, validation pictures, weights with
+their recipe.
 
-RUN/checkpoint.safetensors  RUN/log.csv  RUN/validation.csv  RUN/validation.png  RUN/VARIANT.safetensors
+RUN/checkpoint.safetensors  RUN/log.csv  RUN/validation.csv  RUN/validation.png
+RUN/VARIANT.safetensors
 """
 
 import csv
@@ -55,7 +57,9 @@ VALIDATION_CROP_PX = 96
 ZOOM = 2
 
 SENSOR_VIEWS = 4
-"""Sensors that each validation image is seen by where the network is conditioned: they differ by far more."""
+"""Sensors that each validation image is seen by where the network is conditioned: they differ by
+far more.
+"""
 
 
 @dataclass(frozen=True)
@@ -109,7 +113,8 @@ def split_by_site(names: Sequence[str], wanted: Sequence[str] = ()) -> tuple[lis
 
     Args:
         names: of the images.
-        wanted: sites to hold out; without any, those with the fewest images are, and of fewer than three none is.
+        wanted: sites to hold out; without any, those with the fewest images are, and of fewer than
+            three none is.
 
     Raises:
         OptionError: no image shows a wanted site.
@@ -137,7 +142,9 @@ class Validation:
     Scenes too small to leave anything within the margin are left out.
     """
 
-    def __init__(self, scenes: Sequence[Scene], degraded: Sensor | SensorFamily, reference: Sensor) -> None:
+    def __init__(
+        self, scenes: Sequence[Scene], degraded: Sensor | SensorFamily, reference: Sensor
+    ) -> None:
         self.names = list[str]()
         self.pairs = list[tuple[Tensor, Tensor]]()
         self.sensors = list[Instrument]()
@@ -150,7 +157,9 @@ class Validation:
             pair = simulate_pair(scene.radiance, sensors[0], sensors[1], ratio, draw)
             height, width = (min(side, SIDE_PX) for side in pair.degraded.shape)
             both = (pair.degraded / sensors[0].max_dn, pair.reference / sensors[1].max_dn)
-            degraded_image, reference_image = (torch.from_numpy(image[None, None, :height, :width]) for image in both)
+            degraded_image, reference_image = (
+                torch.from_numpy(image[None, None, :height, :width]) for image in both
+            )
             self.names.append(scene.name)
             self.pairs.append((degraded_image, reference_image))
             self.sensors.append(sensors[0])
@@ -158,27 +167,38 @@ class Validation:
     def restore(self, network: Network) -> list[np.ndarray]:
         """Each degraded image through the network in float32, (H, W), clipped to [0, 1].
 
-        A conditioned network is told the sensor that acquired the image. An image whose sides are no
-        multiples of the network's scale is extended by copies of its last row and column, as in a restoration.
+        A conditioned network is told the sensor that acquired the image. An image whose sides are
+        no multiples of the network's scale is extended by copies of its last row and column, as in
+        a restoration.
         """
         restored = []
         for (degraded, _), sensor in zip(self.pairs, self.sensors, strict=True):
             plain = told(network, vector_tensor(sensor), network_bank(sensor))
             height, width = degraded.shape[-2:]
             lack = (-size % plain.variant.scale for size in (width, height))
-            extended = pad(degraded, [each for side in lack for each in (0, side)], mode="replicate")
+            extended = pad(
+                degraded, [each for side in lack for each in (0, side)], mode="replicate"
+            )
             with torch.inference_mode():
                 restored.append(plain(extended)[0, 0, :height, :width].clamp(0, 1).numpy())
         return restored
 
     def judge(self, network: Network) -> dict[str, float]:
-        """Means over the pairs of a network on the CPU, PSNR over full scale: by the names of a log's columns."""
+        """Means over the pairs of a network on the CPU, PSNR over full scale: by the names of a
+        log's columns.
+        """
         restored = self.restore(network)
         references = [reference[0, 0].numpy() for _, reference in self.pairs]
         inputs = [degraded[0, 0].numpy() for degraded, _ in self.pairs]
-        judged = {"psnr_db": (psnr_db, restored), "degraded_psnr_db": (psnr_db, inputs), "ssim": (ssim, restored)}
+        judged = {
+            "psnr_db": (psnr_db, restored),
+            "degraded_psnr_db": (psnr_db, inputs),
+            "ssim": (ssim, restored),
+        }
         return {
-            name: float(np.mean([score(a, b, 1.0) for a, b in zip(images, references, strict=True)]))
+            name: float(
+                np.mean([score(a, b, 1.0) for a, b in zip(images, references, strict=True)])
+            )
             for name, (score, images) in judged.items()
         }
 
@@ -202,7 +222,9 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
         trainer.resume(run.checkpoint)
     elif run.checkpoint.exists():
         remedy = "add `resume` or choose another"
-        raise OptionError("out", expected="a folder without a run", got=str(run.checkpoint), remedy=remedy)
+        raise OptionError(
+            "out", expected="a folder without a run", got=str(run.checkpoint), remedy=remedy
+        )
     batches, validation, names = data(run, trainer)
     _train(run, trainer, batches, validation)
     if worker.first:
@@ -213,18 +235,29 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
 def require_whole_places(run: Run, variant: Variant) -> None:
     """Refuse patches that a network at a lower resolution cannot rearrange."""
     if run.patches.patch_px % variant.scale:
-        expected = f"a multiple of {variant.scale} px, for a network at 1/{variant.scale} resolution"
-        raise OptionError("patch", expected=expected, got=f"{run.patches.patch_px} px", remedy="choose another")
+        expected = (
+            f"a multiple of {variant.scale} px, for a network at 1/{variant.scale} resolution"
+        )
+        raise OptionError(
+            "patch", expected=expected, got=f"{run.patches.patch_px} px", remedy="choose another"
+        )
 
 
 def _given(run: Run, path: Path) -> Network:
-    """A network from its file, of the kind that the run trains; refused where it gives NaN, as every step would."""
+    """A network from its file, of the kind that the run trains; refused where it gives NaN, as
+    every step would.
+    """
     network, _ = load_network(path)
     wanted = ConvBEERS if run.patches.family is None else BankedConvBEERS
     if not isinstance(network, wanted):
-        kinds = {ConvBEERS: "a plain network's", BankedConvBEERS: "those that 'train --conditioned' wrote"}
+        kinds = {
+            ConvBEERS: "a plain network's",
+            BankedConvBEERS: "those that 'train --conditioned' wrote",
+        }
         remedy = "give others, or give `conditioned`" if wanted is ConvBEERS else "give others"
-        raise ModelError(str(path), expected=f"weights: {kinds[wanted]}", got=kinds[type(network)], remedy=remedy)
+        raise ModelError(
+            str(path), expected=f"weights: {kinds[wanted]}", got=kinds[type(network)], remedy=remedy
+        )
     if run.rounding is not None and network.variant != variant_named(run.variant):
         remedy = "train a network of that size first, and make its INT8 file"
         raise OptionError(
@@ -243,13 +276,16 @@ def loss_of(run: Run) -> tuple[RestorationLoss, str]:
         return RestorationLoss(run.recipe.loss), ""
     found = find_backbone("squeeze", run.lpips)
     if found is None:
-        return RestorationLoss(run.recipe.loss), f"trains WITHOUT the LPIPS term: {not_found('squeeze')}"
+        return RestorationLoss(
+            run.recipe.loss
+        ), f"trains WITHOUT the LPIPS term: {not_found('squeeze')}"
     perceptual = Lpips.load("squeeze", found)
     return RestorationLoss(run.recipe.loss, perceptual), f"LPIPS term over {found.name}"
 
 
 def data_sha256(run: Run, loss: RestorationLoss) -> str:
-    """Return one digest of all that a run learns from: a resumed run must learn from the same, or it is none.
+    """Return one digest of all that a run learns from: a resumed run must learn from the same, or
+    it is none.
 
     Args:
         run: what the options say.
@@ -273,7 +309,10 @@ def data_sha256(run: Run, loss: RestorationLoss) -> str:
         loss.perceptual is not None,
         *(
             (file.name, sha256(file))
-            for file in (*files, *(each for each in (run.start, run.lpips) if each and each.is_file()))
+            for file in (
+                *files,
+                *(each for each in (run.start, run.lpips) if each and each.is_file()),
+            )
         ),
     ]
     return hashlib.sha256(repr(stated).encode()).hexdigest()
@@ -289,7 +328,9 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
         given = (run.patches.patch_px, degraded.nominal().max_dn, recipe.batch, recipe.seed)
         mirrors, alike = degraded.nominal().symmetry
         turns = alike and degraded.mtf_nyquist_along is None
-        source = StoredPairs(files, *given, trainer.worker.rank, trainer.worker.count, turns, mirrors)
+        source = StoredPairs(
+            files, *given, trainer.worker.rank, trainer.worker.count, turns, mirrors
+        )
         return source.batches, Validation([], *sensors), [degraded.name for degraded, _ in files]
     scenes = read_scenes(run)
     kept, held = split_by_site([scene.name for scene in scenes], run.held_out)
@@ -299,7 +340,9 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
     train_on = [scenes[k] for k in kept] + drawn
     if not train_on:
         remedy = "give `images`, `pairs` or `drawn`"
-        raise OptionError("training data", expected="images, pairs or drawn scenes", got="none", remedy=remedy)
+        raise OptionError(
+            "training data", expected="images, pairs or drawn scenes", got="none", remedy=remedy
+        )
     worker = trainer.worker
     ranks = worker.rank, worker.count
     patches = PatchSource(train_on, run.patches, recipe.batch, recipe.seed, *ranks, trainer.device)
@@ -328,7 +371,9 @@ def _train(run: Run, trainer: Trainer, batches: Batches, validation: Validation)
         def report(step: int, terms: Mapping[str, float], speed: Speed) -> None:
             log.write(step, {**terms, "patches_per_s": speed.patches_per_s, "waited": speed.waited})
             shown = ", ".join(f"{name} {value:.5f}" for name, value in terms.items())
-            rate = f"{speed.patches_per_s:.0f} patches/s in {run.precision}, waits {speed.waited:.0%}"
+            rate = (
+                f"{speed.patches_per_s:.0f} patches/s in {run.precision}, waits {speed.waited:.0%}"
+            )
             bar.advance(step - bar.done, f"{shown}, {rate}")
 
         def validate(step: int, network: Network) -> None:
@@ -338,18 +383,28 @@ def _train(run: Run, trainer: Trainer, batches: Batches, validation: Validation)
             write_picture(validation, network, run.out / "validation.png")
 
         every = run.validate_steps if validation.pairs else 0
-        trainer.run(batches, run.checkpoint, Schedule(validate_steps=every, report=report, validate=validate))
+        trainer.run(
+            batches,
+            run.checkpoint,
+            Schedule(validate_steps=every, report=report, validate=validate),
+        )
 
 
 class Log:
-    """A CSV file that grows by a line a report; lines beyond the step that a run resumes from are dropped."""
+    """A CSV file that grows by a line a report; lines beyond the step that a run resumes from are
+    dropped.
+    """
 
     def __init__(self, path: Path, step: int) -> None:
         self.path = path
         if path.exists():
             lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-            kept = [line for line in lines if not (number := STEP.match(line)) or int(number[0]) <= step]
-            path.write_text("".join(f"{line}\n" for line in kept if step), encoding="utf-8", newline="")
+            kept = [
+                line for line in lines if not (number := STEP.match(line)) or int(number[0]) <= step
+            ]
+            path.write_text(
+                "".join(f"{line}\n" for line in kept if step), encoding="utf-8", newline=""
+            )
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         """Add a line, and the header where there is none."""
@@ -364,7 +419,9 @@ class Log:
 def write_picture(validation: Validation, network: Network, path: Path) -> None:
     """The busiest crop of each validation image: degraded, restored, reference."""
     rows: list[list[np.ndarray]] = []
-    for (degraded, reference), restored in zip(validation.pairs, validation.restore(network), strict=True):
+    for (degraded, reference), restored in zip(
+        validation.pairs, validation.restore(network), strict=True
+    ):
         images = [degraded[0, 0].numpy(), restored, reference[0, 0].numpy()]
         side = min(VALIDATION_CROP_PX, *images[0].shape)
         top, left = busiest_windows(images[2], side)[0]
@@ -373,10 +430,14 @@ def write_picture(validation: Validation, network: Network, path: Path) -> None:
     smallest = min(row[0].shape for row in rows)
     cells = [[cell[: smallest[0], : smallest[1]] for cell in row] for row in rows]
     with whole_file(path) as temporary:
-        grid(["degraded", "restored", "reference"], cells, ZOOM).save(temporary, "PNG", optimize=True)
+        grid(["degraded", "restored", "reference"], cells, ZOOM).save(
+            temporary, "PNG", optimize=True
+        )
 
 
-def about(run: Run, images: Sequence[str], held_out: Sequence[str], loss: RestorationLoss) -> dict[str, object]:
+def about(
+    run: Run, images: Sequence[str], held_out: Sequence[str], loss: RestorationLoss
+) -> dict[str, object]:
     """The recipe kept in the weights' header: everything but the machine."""
     patches = run.patches
     return {

@@ -1,7 +1,7 @@
 """Training patches, simulated as they are needed from whole scenes.
 
-A scene's spectrum is computed once; each visit blurs, samples and folds it anew with another sensor, scale, phase
-and look. Visiting whole scenes yields many patches for one transform.
+A scene's spectrum is computed once; each visit blurs, samples and folds it anew with another
+sensor, scale, phase and look. Visiting whole scenes yields many patches for one transform.
 """
 
 import os
@@ -20,7 +20,14 @@ from beers_deploy.model.convbeers import Told, vector_tensor
 from beers_deploy.model.exposure import HEADROOM, factors_for
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import Scene
-from beers_deploy.model.training.passes import Pass, Visited, detected, folded_signals, noiseless, prepare
+from beers_deploy.model.training.passes import (
+    Pass,
+    Visited,
+    detected,
+    folded_signals,
+    noiseless,
+    prepare,
+)
 from beers_deploy.model.training.patches import PatchRecipe, draw_turn
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument
@@ -81,12 +88,14 @@ class PatchSource:
     def batches(self, first: int = 0) -> Iterator[Batch]:
         """Batch number `first` and all that follow: a resumed run goes on where it stopped.
 
-        The next shards are made while the present one is used, on half of the cores: a GPU waits for patches.
+        The next shards are made while the present one is used, on half of the cores: a GPU waits
+        for patches.
         """
         number, within = divmod(first, self.SHARD_BATCHES)
         threads = min(max((os.cpu_count() or 1) // 2, 1), self.MOST_THREADS)
-        # One core a thread: each would start as many more as there are cores otherwise. A thread that has not asked
-        # for its number before takes the last one that any thread has set: this one must ask first.
+        # One core a thread: each would start as many more as there are cores otherwise. A thread
+        # that has not asked for its number before takes the last one that any thread has set: this
+        # one must ask first.
         torch.get_num_threads()
         with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as ahead:
             waiting = deque(ahead.submit(self._shard, number + k) for k in range(threads))
@@ -105,18 +114,23 @@ class PatchSource:
         visits = list[Visit]()
         count = 0
         for _ in range(50 * wanted):
-            made = visit(self._scenes[generator.integers(len(self._scenes))], self.recipe, generator)
+            made = visit(
+                self._scenes[generator.integers(len(self._scenes))], self.recipe, generator
+            )
             if made is None:
                 continue
             visits.append(made)
             count += len(made.patches)
             if count >= wanted:
-                # Mixed, because neighbours of one scene would make a batch whose gradient knows one scene.
+                # Mixed, because neighbours of one scene would make a batch whose gradient knows one
+                # scene.
                 order = generator.permutation(count)[:wanted]
                 return _mixed(visits, order)
         expected = f"scenes that hold a patch of {self.recipe.patch_px} target pixels"
         remedy = "give larger images or a smaller patch"
-        raise ImageError("training images", expected=expected, got="none large enough", remedy=remedy)
+        raise ImageError(
+            "training images", expected=expected, got="none large enough", remedy=remedy
+        )
 
 
 def _mixed(visits: Sequence[Visit], order: np.ndarray) -> Batch:
@@ -142,7 +156,8 @@ def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -
         return None
     images, sensor = _acquire_pair(scene, recipe, ratio, generator)
     patches = cut(images, recipe.patch_px, generator)
-    # A conditioned network learns that a sensor's axes changed places, and is told so; a plain one cannot.
+    # A conditioned network learns that a sensor's axes changed places, and is told so; a plain one
+    # cannot.
     mirrors, quarters = sensor.symmetry
     quarter, mirrored = draw_turn(generator, quarters or recipe.family is not None, mirrors)
     if recipe.family is None:
@@ -157,15 +172,21 @@ def _acquire_pair(
     look = recipe.looks.draw(generator)
     phase_y, phase_x = (float(v) for v in generator.uniform(-ratio / 2, ratio / 2, 2))
     sensors = (recipe.family or recipe.degraded).draw(generator), recipe.reference.draw(generator)
-    signals = folded_signals(scene, sensors, Pass(ratio, (phase_y, phase_x), look, recipe.margin_px))
+    signals = folded_signals(
+        scene, sensors, Pass(ratio, (phase_y, phase_x), look, recipe.margin_px)
+    )
     degraded = detected(signals[0], sensors[0], "degraded", generator)
     if recipe.noisy_reference:
-        return torch.stack([degraded, detected(signals[1], sensors[1], "reference", generator)]), sensors[0]
+        return torch.stack(
+            [degraded, detected(signals[1], sensors[1], "reference", generator)]
+        ), sensors[0]
     return torch.stack([degraded, noiseless(signals[1], sensors[1])]), sensors[0]
 
 
 def _told(patches: Tensor, sensor: Instrument, quarter: int, mirrored: bool) -> Visit:
-    """Brighten dark patches (N, 2, P, P) as a restoration does, and add what a network is told of each."""
+    """Brighten dark patches (N, 2, P, P) as a restoration does, and add what a network is told of
+    each.
+    """
     factors = np.ones(len(patches), np.int64)
     brightest = patches[:, 0].amax((1, 2)).cpu().numpy()
     for factor in factors_for(sensor):
@@ -178,7 +199,9 @@ def _told(patches: Tensor, sensor: Instrument, quarter: int, mirrored: bool) -> 
 
 
 def _told_of(sensor: Instrument, factor: int, quarter: int, mirrored: bool) -> tuple[Tensor, Bank]:
-    """The vector (4,) and the bank of a sensor of `factor` times the gain, for patches that were turned."""
+    """The vector (4,) and the bank of a sensor of `factor` times the gain, for patches that were
+    turned.
+    """
     brighter = replace(sensor, gain_dn_per_radiance=sensor.gain_dn_per_radiance * factor)
     vector = vector_tensor(brighter)
     bank = network_bank(brighter)

@@ -1,7 +1,8 @@
 """One gradient step, as a device computes it: nothing in it waits for a result.
 
-So a GPU records the step once as a CUDA graph and replays it: the launch of some hundred kernels, which takes longer
-than they do for a small network, is paid once. A step whose loss or gradient is not finite changes no weight.
+So a GPU records the step once as a CUDA graph and replays it: the launch of some hundred kernels,
+which takes longer than they do for a small network, is paid once. A step whose loss or gradient is
+not finite changes no weight.
 """
 
 from collections.abc import Callable, Mapping
@@ -41,7 +42,14 @@ class Inputs:
     def tensors(self) -> list[Tensor]:
         """All of it, in one order."""
         told = () if self.batch.told is None else self.batch.told.parts
-        return [self.batch.degraded, self.batch.reference, *told, *self.steps, self.rate, self.share]
+        return [
+            self.batch.degraded,
+            self.batch.reference,
+            *told,
+            *self.steps,
+            self.rate,
+            self.share,
+        ]
 
 
 class Step:
@@ -82,7 +90,9 @@ class Step:
         self.average = {k: v.detach().clone() for k, v in network.state_dict().items()}
         rate = torch.zeros((), device=self.device)
         on_gpu = self.device.type == "cuda"
-        self.optimiser = torch.optim.Adam(network.parameters(), lr=rate, fused=True, capturable=on_gpu)
+        self.optimiser = torch.optim.Adam(
+            network.parameters(), lr=rate, fused=True, capturable=on_gpu
+        )
         self._graph: torch.cuda.CUDAGraph | None = None
         self._inputs: Inputs | None = None
         self._outputs: Tensor | None = None
@@ -97,7 +107,8 @@ class Step:
             share: of the new weights in their running average.
 
         Returns:
-            (2 + T,) 1 for a step that changed nothing, the loss, and its terms in the order of `names`.
+            (2 + T,) 1 for a step that changed nothing, the loss, and its terms in the order of
+                `names`.
         """
         inputs = self._on_device(batch, rate, share)
         if self.device.type != "cuda" or self.agree is not None:
@@ -119,7 +130,9 @@ class Step:
                 steps = [each.to(self.device) for each in self.rounding.steps(batch.told.gains)]
         degraded = batch.degraded.to(self.device, memory_format=torch.channels_last)
         placed = Batch(degraded, batch.reference.to(self.device), told)
-        return Inputs(placed, steps, *(torch.tensor(value, device=self.device) for value in (rate, share)))
+        return Inputs(
+            placed, steps, *(torch.tensor(value, device=self.device) for value in (rate, share))
+        )
 
     def _taken(self, inputs: Inputs) -> Tensor:
         total, terms = self._backward(inputs)
@@ -165,6 +178,7 @@ class Step:
             self.optimiser.zero_grad(set_to_none=True)
         torch.cuda.current_stream().wait_stream(stream)
         self._graph = torch.cuda.CUDAGraph()
-        # Other threads simulate patches on the device meanwhile, which a recording forbids unless told otherwise.
+        # Other threads simulate patches on the device meanwhile, which a recording forbids unless
+        # told otherwise.
         with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
             self._outputs = self._taken(inputs)

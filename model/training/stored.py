@@ -18,10 +18,11 @@ RESCALE = "rescale it to the digital numbers of the sensor that made the pairs"
 
 @dataclass(frozen=True)
 class StoredPairs:
-    """Endless batches of (degraded, reference) patches, (N, 1, P, P) in [0, 1]; the same for the same seed.
+    """Endless batches of (degraded, reference) patches, (N, 1, P, P) in [0, 1]; the same for the
+    same seed.
 
-    `max_dn` is the largest digital number of the sensor that made the pairs. Patches may be turned by `quarters`
-    unless its two axes differ, and they have `mirrors` unless its blur is lopsided.
+    `max_dn` is the largest digital number of the sensor that made the pairs. Patches may be turned
+    by `quarters` unless its two axes differ, and they have `mirrors` unless its blur is lopsided.
     """
 
     files: Sequence[Files]
@@ -56,4 +57,6 @@ class StoredPairs:
         top, left = (int(generator.integers(size - self.patch_px + 1)) for size in (height, width))
         window = slice(top, top + self.patch_px), slice(left, left + self.patch_px)
         both = np.stack([np.float32(image[window]) for image in images])
-        return torch.from_numpy(np.ascontiguousarray(turn(both, generator, self.quarters, self.mirrors)))
+        return torch.from_numpy(
+            np.ascontiguousarray(turn(both, generator, self.quarters, self.mirrors))
+        )

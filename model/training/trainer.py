@@ -1,6 +1,8 @@
-"""The steps of a run: Adam, warm-up and cosine, clipped gradients, averaged weights, on several processes.
+"""The steps of a run: Adam, warm-up and cosine, clipped gradients, averaged weights, on several
+processes.
 
-Batches are keyed by (seed, step): a run that was killed and resumed ends with the same weights as one that was not.
+Batches are keyed by (seed, step): a run that was killed and resumed ends with the same weights as
+one that was not.
 """
 
 import os
@@ -16,10 +18,23 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Network, Rounding, arrays, initialise
+from beers_deploy.model.convbeers import (
+    BankedConvBEERS,
+    ConvBEERS,
+    Network,
+    Rounding,
+    arrays,
+    initialise,
+)
 from beers_deploy.model.io.tensors import write_tensors
 from beers_deploy.model.progress import held_back
-from beers_deploy.model.training.checkpoint import MOMENTS, Guards, TrainingRecipe, checkpoint_sha256, read_checkpoint
+from beers_deploy.model.training.checkpoint import (
+    MOMENTS,
+    Guards,
+    TrainingRecipe,
+    checkpoint_sha256,
+    read_checkpoint,
+)
 from beers_deploy.model.training.losses import RestorationLoss
 from beers_deploy.model.training.source import Batch
 from beers_deploy.model.training.step import Step
@@ -45,7 +60,9 @@ class Worker:
         device = torch.device(name)
         if device.type == "cuda" and not torch.cuda.is_available():
             remedy = "choose the device cpu, or install a build of PyTorch for it"
-            raise MachineError("device", expected="a CUDA device", got="none that PyTorch can see", remedy=remedy)
+            raise MachineError(
+                "device", expected="a CUDA device", got="none that PyTorch can see", remedy=remedy
+            )
         if name == "cuda":
             return torch.device("cuda", self.local_rank)
         return device
@@ -80,14 +97,18 @@ UNSEEN_STEPS = 25
 """On a GPU so many steps are taken before anybody looks at what they gave."""
 
 Precision = Literal["float32", "bfloat16"]
-"""The number format of the blocks. Head, tail and what is added stay float32: 8 bits would round a 12-bit image."""
+"""The number format of the blocks.
+
+Head, tail and what is added stay float32: 8 bits would round a 12-bit image.
+"""
 
 
 @dataclass(frozen=True)
 class Schedule:
     """How often a run reports, looks at the validation images, and saves.
 
-    `report` is told the step, the means of the loss's terms since the last report, and how fast it went.
+    `report` is told the step, the means of the loss's terms since the last report, and how fast it
+    went.
     """
 
     report_steps: int = 100
@@ -146,9 +167,11 @@ class Trainer:
         worker: this process among those of the run.
         device: where the steps are computed.
         start: a network of the same kind and size to go on from; None draws new weights.
-        precision: what the body is computed in; it is the machine's, and a resumed run may take another.
+        precision: what the body is computed in; it is the machine's, and a resumed run may take
+            another.
         conditioned: whether the network is given the sensor of each patch.
-        rounding: of a conditioned network's maps, as its INT8 file rounds them; None leaves them as they are.
+        rounding: of a conditioned network's maps, as its INT8 file rounds them; None leaves them as
+            they are.
 
     Attributes:
         data: digest of all that the run learns from; a checkpoint belongs to one.
@@ -202,15 +225,24 @@ class Trainer:
         rows = list[list[float]]()
         with held_back() as interrupt:
             following = batches(self.step)
-            while self.step < self.recipe.steps and not self.worker.any(interrupt.asked, self.device):
+            while self.step < self.recipe.steps and not self.worker.any(
+                interrupt.asked, self.device
+            ):
                 with spent.waiting():
                     batch = next(following)
                 self.train_step(batch)
                 save = time.monotonic() - saved > schedule.save_s
-                if save or self._due(schedule.report_steps) or self._due(schedule.validate_steps) or self._full:
+                if (
+                    save
+                    or self._due(schedule.report_steps)
+                    or self._due(schedule.validate_steps)
+                    or self._full
+                ):
                     rows += self.seen()
                 if self._due(schedule.report_steps):
-                    schedule.report(self.step, self._means(rows), spent.figures(self._patches(len(rows))))
+                    schedule.report(
+                        self.step, self._means(rows), spent.figures(self._patches(len(rows)))
+                    )
                     rows = []
                     spent = Spent()
                 if self._due(schedule.validate_steps):
@@ -229,7 +261,9 @@ class Trainer:
 
     @property
     def _full(self) -> bool:
-        """Whether it is time to look at what the last steps gave: a GPU is not made to wait for it at each."""
+        """Whether it is time to look at what the last steps gave: a GPU is not made to wait for it
+        at each.
+        """
         return len(self._unseen) >= (UNSEEN_STEPS if self.device.type == "cuda" else 1)
 
     def _patches(self, steps: int) -> int:
@@ -273,7 +307,9 @@ class Trainer:
         return network.eval()
 
     def save(self, path: Path) -> None:
-        """Write all that an exact resume needs, as safetensors; of several workers, the first does."""
+        """Write all that an exact resume needs, as safetensors; of several
+        workers, the first does.
+        """
         if not self.worker.first:
             return
         tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
@@ -281,14 +317,20 @@ class Trainer:
         for name, parameter in self.network.named_parameters():
             for moment, value in self.optimiser.state.get(parameter, {}).items():
                 tensors[f"moment.{name}.{moment}"] = value
-        header: dict[str, object] = {"step": self.step, "guards": asdict(self.guards), "recipe": asdict(self.recipe)}
+        header: dict[str, object] = {
+            "step": self.step,
+            "guards": asdict(self.guards),
+            "recipe": asdict(self.recipe),
+        }
         header["data"] = self.data
         header["sha256"] = checkpoint_sha256(tensors, header)
         write_tensors(path, arrays(tensors), header)
 
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint of the same recipe, begun on this processor or another."""
-        tensors, self.step, self.guards = read_checkpoint(path, self.network, self.recipe, self.data)
+        tensors, self.step, self.guards = read_checkpoint(
+            path, self.network, self.recipe, self.data
+        )
         self.network.load_state_dict({name: tensors[f"network.{name}"] for name in self.average})
         for name, value in self.average.items():
             value.copy_(tensors[f"average.{name}"])
@@ -296,7 +338,10 @@ class Trainer:
             return
         for name, parameter in self.network.named_parameters():
             # Adam keeps its step count and its moments with (and laid out as) the parameter.
-            moments = {key: torch.empty_like(parameter).copy_(tensors[f"moment.{name}.{key}"]) for key in MOMENTS}
+            moments = {
+                key: torch.empty_like(parameter).copy_(tensors[f"moment.{name}.{key}"])
+                for key in MOMENTS
+            }
             taken = tensors[f"moment.{name}.step"].to(self.device)
             self.optimiser.state[parameter] = {"step": taken, **moments}
 
@@ -308,4 +353,6 @@ def require_loss(loss: RestorationLoss) -> None:
         return
     left_out = ", and none but LPIPS, which lacks its weights" if weights.lpips else ""
     remedy = "raise one of `l1_weight`, `fft_weight`, `psnr_weight`"
-    raise OptionError("loss", expected="a term of weight above 0", got=f"weights of 0{left_out}", remedy=remedy)
+    raise OptionError(
+        "loss", expected="a term of weight above 0", got=f"weights of 0{left_out}", remedy=remedy
+    )

@@ -1,7 +1,8 @@
-"""A network behind a bank calibrated over the family of sensors, and put into whole numbers once for all of them.
+"""A network behind a bank calibrated over the family of sensors, and put into whole numbers once
+for all of them.
 
-The body reads the bank's results of many sensors' images, rounded as the core will round them; planes of a sensor's
-values stand for what its head's bias will be told.
+The body reads the bank's results of many sensors' images, rounded as the core will round them;
+planes of a sensor's values stand for what its head's bias will be told.
 """
 
 from collections.abc import Sequence
@@ -59,23 +60,28 @@ BODY = "body.correction"
 
 
 def _assembled(body: IntCore, bank: Bank, scale: int, shifts: Shifts, kernels: Kernels) -> IntCore:
-    """The whole core: a body that reads a bank's results as `PLANES`, behind it, beside the analytic restoration."""
+    """The whole core: a body that reads a bank's results as `PLANES`, behind it, beside the
+    analytic restoration.
+    """
     result = body.frac_bits[CORRECTION]
     named = (renamed(op, {PLANES: BANK, CORRECTION: BODY}) for op in body.ops)
     joined = Concat("joined", (BODY, ANALYTIC), CORRECTION)
     frac_bits = dict(body.frac_bits) | {BANK: BITS, BODY: result, ANALYTIC: result}
     unit = float(np.float32(bank.unit))
-    ends = replace(front_ends(scale), gains=2, outputs=scale**2, unit=unit, wide=kernels == "fitted")
+    ends = replace(
+        front_ends(scale), gains=2, outputs=scale**2, unit=unit, wide=kernels == "fitted"
+    )
     analytic = _analytic(scale, result, shifts, kernels)
     ops = (bank_layer(bank, scale, shifts, kernels), *named, analytic, joined)
     return IntCore(ops, frac_bits, ends)
 
 
 def _analytic(scale: int, result: int, shifts: Shifts, kernels: Kernels) -> IntConv:
-    """The mean of the bank's copies of the analytic restoration, rounded at other places of a step each time.
+    """The mean of the bank's copies of the analytic restoration, rounded at other places of a step
+    each time.
 
-    Behind fitted kernels the last result is the coarse copy alone. The results are said to have as many fractional
-    bits as the correction's, `result`, beside which they lie.
+    Behind fitted kernels the last result is the coarse copy alone. The results are said to have as
+    many fractional bits as the correction's, `result`, beside which they lie.
     """
     coarse = int(kernels == "fitted")
     pixels = scale**2
@@ -101,7 +107,9 @@ def _spread(total: int, parts: int) -> list[int]:
 
 
 def body_graph(weights: Weights) -> Graph:
-    """The float body, from a bank's results and four planes of a sensor's values to the correction in units."""
+    """The float body, from a bank's results and four planes of a sensor's values to the correction
+    in units.
+    """
     variant = weights.variant
     tensors = weights.tensors
     graph: list[Op] = [_head(weights)]
@@ -124,14 +132,22 @@ def body_graph(weights: Weights) -> Graph:
 
 
 def _head(weights: Weights) -> Conv:
-    """The head on a bank's results, all copies of each, and on the planes of a sensor's values at its middle tap."""
+    """The head on a bank's results, all copies of each, and on the planes of a sensor's values at
+    its middle tap.
+    """
     variant = weights.variant
-    given = weights.tensors["head.weight"].reshape(variant.features, 1 + FILTERS, variant.pixels, 3, 3)
+    given = weights.tensors["head.weight"].reshape(
+        variant.features, 1 + FILTERS, variant.pixels, 3, 3
+    )
     counts = COPIES
     units = 2.0**BITS / UNIT_STEPS
     copies = [(0, counts[0], 1.0), *((1 + k, counts[1], units) for k in range(FILTERS))]
-    read = [given[:, kernel] * (unit / count) for kernel, count, unit in copies for _ in range(count)]
-    unread = np.zeros((variant.features, counts[2] * variant.pixels, 3, 3))  # the coarse one among them
+    read = [
+        given[:, kernel] * (unit / count) for kernel, count, unit in copies for _ in range(count)
+    ]
+    unread = np.zeros(
+        (variant.features, counts[2] * variant.pixels, 3, 3)
+    )  # the coarse one among them
     told = np.zeros((variant.features, SENSOR_VALUES, 3, 3))
     told[:, :, 1, 1] = 2 * weights.tensors["bias.weight"]  # of planes that hold half of each value
     weight = np.concatenate([*read, unread, told], 1).astype(np.float32)
@@ -142,26 +158,36 @@ def front_ends(scale: int) -> Ends:
     """What the host does around a network of that scale behind a bank."""
     if scale == 1:
         return Ends(1, PLANES_PER_CHANNEL, banked=True)
-    front, back = (Shuffle(name, "", "", scale, up, False) for name, up in (("unshuffle", False), ("shuffle", True)))
+    front, back = (
+        Shuffle(name, "", "", scale, up, False)
+        for name, up in (("unshuffle", False), ("shuffle", True))
+    )
     return Ends(scale**2, PLANES_PER_CHANNEL, front=(front,), back=(back,), banked=True)
 
 
 def bank_results(
     image: np.ndarray, bank: Bank, vector: Sequence[float], scale: int, kernels: Kernels = "fitted"
 ) -> np.ndarray:
-    """What the body of a family is calibrated on, of an image (1, 1, H, W) in [0, 1]: (1, C, H / S, W / S) float32.
+    """What the body of a family is calibrated on, of an image (1, 1, H, W) in [0, 1]: (1, C, H / S,
+    W / S) float32.
 
     The bank's results over 128 at a gain of 1, and planes of the halves of a sensor's values.
     """
     whole = whole_bank(bank, scale, 1, kernels)
     sums = convolve(front_ends(scale).split(image), whole.weight, Window())
-    results = np.floor(sums / 2.0**whole.frac_bits + whole.offsets[:, None, None] + 0.5).clip(-128, 127)
+    results = np.floor(sums / 2.0**whole.frac_bits + whole.offsets[:, None, None] + 0.5).clip(
+        -128, 127
+    )
     told = np.ones((1, SENSOR_VALUES, *results.shape[2:])) * np.asarray(vector)[:, None, None] / 2
     return np.concatenate([results / 2.0**BITS, told], 1).astype(np.float32)
 
 
 def quantise_family(
-    weights: Weights, bank: Bank, images: Remade[np.ndarray], shifts: Shifts = SHIFTS, log: Log = no_log
+    weights: Weights,
+    bank: Bank,
+    images: Remade[np.ndarray],
+    shifts: Shifts = SHIFTS,
+    log: Log = no_log,
 ) -> Family:
     """A network behind a bank in whole numbers, for the middle of the family.
 
@@ -183,7 +209,8 @@ def quantise_family(
 def map_steps(family: Family, weights: Weights) -> list[np.ndarray]:
     """What a 1 of a family's maps is in those of its float network, at a gain of 1.
 
-    Levelling multiplied each channel by a factor: the one that whole weights have to the float ones.
+    Levelling multiplied each channel by a factor: the one that whole weights have to the float
+    ones.
 
     Returns:
         (F,) of the maps between head and tail, then of the one within each block.
@@ -194,17 +221,23 @@ def map_steps(family: Family, weights: Weights) -> list[np.ndarray]:
     def steps(name: str, read: np.ndarray | float, output: str) -> np.ndarray:
         weight = given[name][:, : whole[name].shape[1]] * read
         square = np.square(weight).sum((1, 2, 3))
-        factors = np.where(square > 0, (weight * whole[name]).sum((1, 2, 3)) / np.maximum(square, 1e-30), 1.0)
+        factors = np.where(
+            square > 0, (weight * whole[name]).sum((1, 2, 3)) / np.maximum(square, 1e-30), 1.0
+        )
         return np.asarray(2.0 ** -family.core.frac_bits[output] / factors)
 
     stream = steps("head", 1.0, "head")
     read = 2.0 ** family.core.frac_bits["head"] * stream[:, None, None]
-    inner = (steps(f"body.{k}.first", read, f"body.{k}.relu") for k in range(weights.variant.blocks))
+    inner = (
+        steps(f"body.{k}.first", read, f"body.{k}.relu") for k in range(weights.variant.blocks)
+    )
     return [stream, *inner]
 
 
 def _biases(op: IntConv) -> np.ndarray:
-    """What a convolution adds, (O, 1); where it reads the planes of a sensor's values, which hold half, (O, 5)."""
+    """What a convolution adds, (O, 1); where it reads the planes of a sensor's values, which hold
+    half, (O, 5).
+    """
     if op.input != PLANES:
         return op.float_bias[:, None]
     values = op.weight[:, -SENSOR_VALUES:, 1, 1] * 2.0 ** -(op.weight_frac_bits + 1)
@@ -225,19 +258,23 @@ def _plan(weights: Weights, shifts: Shifts) -> Plan:
     ends = Ends(width, 1, adds_image=False, gains=2, outputs=scale**2, direct=True)
     inner = tuple(lone_tensors(graph))
     chain = Chain(inner, (weights.variant.features,) * len(inner), by_channel=False)
-    # A pair in the last sum costs 10 to 18 % of the time, and bought 0.007 dB at most: what limits lies elsewhere.
+    # A pair in the last sum costs 10 to 18 % of the time, and bought 0.007 dB at most: what limits
+    # lies elsewhere.
     return Plan(graph, ends, streams(graph), chain, shifts, Passes(half_lsb_pair=False))
 
 
 PATCHES = 80
 SNR = (90.0, 165.0)
-"""Of calibration: sensors whose gain lies near 1, so that the body sees what all others will show it at theirs."""
+"""Of calibration: sensors whose gain lies near 1, so that the body sees what all others will show
+it at theirs.
+"""
 
 
 def family_images(
     scenes: list[Scene], scale: int, seed: int, kernels: Kernels, patch_px: int = PATCH_PX
 ) -> Remade[np.ndarray]:
-    """What a family is calibrated on: scenes as many sensors of it see them, behind the bank of each.
+    """What a family is calibrated on: scenes as many sensors of it see them, behind the bank of
+    each.
 
     Args:
         scenes: that are seen.
@@ -248,7 +285,9 @@ def family_images(
     """
     like = load_sensor(LIKE)
     reference = load_sensor(REFERENCE)
-    patches = draw_patches(scenes, like, reference, PATCHES, seed, patch_px, SensorFamily(like.nominal(), SNR))
+    patches = draw_patches(
+        scenes, like, reference, PATCHES, seed, patch_px, SensorFamily(like.nominal(), SNR)
+    )
 
     def results(number: int) -> np.ndarray:
         sensor = patches.views[number].degraded

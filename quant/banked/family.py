@@ -1,12 +1,13 @@
-"""INT8 once for every sensor: a body behind a bank is calibrated over the family of sensors, and told its own later.
+"""INT8 once for every sensor: a body behind a bank is calibrated over the family of sensors, and
+told its own later.
 
     planes -> bank 7 x 7 (the sensor's) -> head, blocks, end, tail -> correction, fine and coarse
                                         -> analytic restoration, in four copies
 
-All weights and scales behind the bank are one for the family. What the body reads and makes of a sensor is finer by
-its gain (`Bank.gain`), so its biases are multiplied with that, and the unit is divided by it: ReLU and sums
-pass a factor on. A sensor's filters, its unit and the biases are written in milliseconds; the host adds both results,
-times the unit, to the image.
+All weights and scales behind the bank are one for the family. What the body reads and makes of a
+sensor is finer by its gain (`Bank.gain`), so its biases are multiplied with that, and the unit is
+divided by it: ReLU and sums pass a factor on. A sensor's filters, its unit and the biases are
+written in milliseconds; the host adds both results, times the unit, to the image.
 """
 
 import json
@@ -39,12 +40,14 @@ BANK = "bank"
 
 @dataclass(frozen=True)
 class Family:
-    """A network behind a bank in whole numbers, for the middle of the family, and what tells it another sensor.
+    """A network behind a bank in whole numbers, for the middle of the family, and what tells it
+    another sensor.
 
     Attributes:
         core: it begins with the bank.
-        biases: of the body's convolutions, by name, at a gain of 1: (O, 1), and of those that read the bank (O, 5),
-            the bias for the middle of the family and what each of a sensor's values adds.
+        biases: of the body's convolutions, by name, at a gain of 1: (O, 1), and of those that read
+            the bank (O, 5), the bias for the middle of the family and what each of a sensor's
+            values adds.
         shifts: the windows of the target.
         kernels: of the banks that it stands behind.
     """
@@ -58,7 +61,11 @@ class Family:
         """The core for one sensor, of its bank and its sensor vector (4,)."""
         gain = bank.gain
         ops = tuple(self._told(op, bank, gain * np.array([1.0, *vector])) for op in self.core.ops)
-        return replace(self.core, ops=ops, ends=replace(self.core.ends, unit=float(np.float32(bank.unit / gain))))
+        return replace(
+            self.core,
+            ops=ops,
+            ends=replace(self.core.ends, unit=float(np.float32(bank.unit / gain))),
+        )
 
     def _told(self, op: IntConv | Op, bank: Bank, values: NDArray[np.float64]) -> IntConv | Op:
         if isinstance(op, IntConv) and op.input == PLANES:
@@ -76,7 +83,9 @@ class Family:
 
 
 def family_of(model: onnx.ModelProto) -> Family | None:
-    """What an INT8 file of a network behind a bank says of other sensors; None of any other file."""
+    """What an INT8 file of a network behind a bank says of other sensors; None
+    of any other file.
+    """
     words = metadata(model).get(FAMILY)
     if words is None:
         return None
@@ -85,7 +94,10 @@ def family_of(model: onnx.ModelProto) -> Family | None:
         said = json.loads(words)
         biases = {str(name): np.array(values, np.float64) for name, values in said.items()}
         body = {op.name: op for op in core.convolutions if op.name in biases}
-        wanted = {name: (len(op.bias), 1 + SENSOR_VALUES * (op.input == BANK)) for name, op in body.items()}
+        wanted = {
+            name: (len(op.bias), 1 + SENSOR_VALUES * (op.input == BANK))
+            for name, op in body.items()
+        }
         if {name: values.shape for name, values in biases.items()} != wanted:
             raise ValueError("biases that are not its convolutions'")
         # Only behind fitted kernels does the analytic restoration have a coarse copy.
@@ -97,7 +109,9 @@ def required_family(model: onnx.ModelProto) -> Family:
     family = family_of(model)
     if family is None:
         remedy = "make one with 'beers-deploy quantize' of weights that 'train --conditioned' wrote"
-        raise ModelError("INT8 model", expected="one that can be told its sensor", got="another", remedy=remedy)
+        raise ModelError(
+            "INT8 model", expected="one that can be told its sensor", got="another", remedy=remedy
+        )
     return family
 
 
@@ -109,20 +123,28 @@ def bank_layer(bank: Bank, scale: int, shifts: Shifts, kernels: Kernels) -> IntC
 
 
 def delta_of_file(model: onnx.ModelProto) -> bytes:
-    """What its sensor has changed in an INT8 file of a network behind a bank: `with_delta` changes it in another's.
+    """What its sensor has changed in an INT8 file of a network behind a bank: `with_delta` changes
+    it in another's.
 
-    A line of JSON and the int8 numbers of each convolution that it names, in their order, all of it compressed.
+    A line of JSON and the int8 numbers of each convolution that it names, in their order, all of it
+    compressed.
     """
     family = required_family(model)
     told = [op for op in family.core.convolutions if op.input == PLANES or op.name in family.biases]
     bits = {op.name: [op.weight_frac_bits, op.bias_frac_bits] for op in told}
-    said = {"sensor": metadata(model).get("sensor", ""), "unit": family.core.ends.unit, "bits": bits}
+    said = {
+        "sensor": metadata(model).get("sensor", ""),
+        "unit": family.core.ends.unit,
+        "bits": bits,
+    }
     numbers = b"".join(values.astype(np.int8).tobytes() for op in told for values in _numbers(op))
     return zlib.compress(json.dumps(said, separators=(",", ":")).encode() + b"\n" + numbers, 9)
 
 
 def _numbers(op: IntConv) -> list[np.ndarray]:
-    """What a sensor changes in a convolution that it changes: of the bank all of it, of others the bias."""
+    """What a sensor changes in a convolution that it changes: of the bank all of it, of others the
+    bias.
+    """
     return [op.weight, op.bias] if op.input == PLANES else [op.bias]
 
 
@@ -150,12 +172,23 @@ def with_delta(core: IntCore, delta: bytes, where: str = "delta") -> tuple[IntCo
             ops.append(op)
         if len(left):
             raise ValueError(f"{len(left)} bytes too many")
-        return replace(core, ops=tuple(ops), ends=replace(core.ends, unit=float(said["unit"]))), str(said["sensor"])
-    except (zlib.error, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+        return replace(
+            core, ops=tuple(ops), ends=replace(core.ends, unit=float(said["unit"]))
+        ), str(said["sensor"])
+    except (
+        zlib.error,
+        AttributeError,
+        LookupError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:
         remedy = "give a file that 'export --delta' wrote for the same network"
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:80]
         got = "damaged bytes" if isinstance(error, zlib.error) else f"another one ({reason})"
-        raise ModelError(where, expected="a delta of this network", got=got, remedy=remedy) from error
+        raise ModelError(
+            where, expected="a delta of this network", got=got, remedy=remedy
+        ) from error
 
 
 LARGEST_DELTA = 1 << 20
@@ -163,11 +196,15 @@ LARGEST_DELTA = 1 << 20
 
 
 def _patched(op: IntConv, bits: tuple[int, ...], left: np.ndarray) -> tuple[IntConv, np.ndarray]:
-    """A convolution with the first of these numbers in the place of its own, and the numbers after them."""
+    """A convolution with the first of these numbers in the place of its own, and the numbers after
+    them.
+    """
     found = list[np.ndarray]()
     for values in _numbers(op):
         found.append(left[: values.size].reshape(values.shape))
         left = left[values.size :]
     weight_bits, bias_bits = bits
     weight = found[0] if len(found) > 1 else op.weight
-    return replace(op, weight=weight, bias=found[-1], weight_frac_bits=weight_bits, bias_frac_bits=bias_bits), left
+    return replace(
+        op, weight=weight, bias=found[-1], weight_frac_bits=weight_bits, bias_frac_bits=bias_bits
+    ), left

@@ -1,15 +1,17 @@
-"""The bank of a sensor in whole numbers: the first convolution of an INT8 network, written from the sensor alone.
+"""The bank of a sensor in whole numbers: the first convolution of an INT8 network, written from the
+sensor alone.
 
-The image enters in four planes: steps of 16 digital numbers about the middle, twice, what they leave, and half of
-that for finer weights. The first two share a filter's weights, which may be twice as large so: half the rounding.
-Weights are rounded so that they sum to exactly 0, for flat ground must leave nothing, and so that their errors lie
-where natural images hold little.
+The image enters in four planes: steps of 16 digital numbers about the middle, twice, what they
+leave, and half of that for finer weights. The first two share a filter's weights, which may be
+twice as large so: half the rounding. Weights are rounded so that they sum to exactly 0, for flat
+ground must leave nothing, and so that their errors lie where natural images hold little.
 
-What the filters give is int8 in steps of 1/24 of a unit of a sensor whose noise is `model.bank.SIGMA`. A sensor's
-own steps are the same share of full scale, within limits (`Bank.gain`): the strongest edges are a share of full
-scale, not of noise, so that noisy sensors can have finer steps in their units. Each result comes several times,
-rounded at other places of a step: together the copies hold what one cannot. The image itself comes in steps of 32 /
-gain, about the middle.
+What the filters give is int8 in steps of 1/24 of a unit of a sensor whose noise is
+`model.bank.SIGMA`. A sensor's own steps are the same share of full scale, within limits
+(`Bank.gain`): the strongest edges are a share of full scale, not of noise, so that noisy sensors
+can have finer steps in their units. Each result comes several times, rounded at other places of a
+step: together the copies hold what one cannot. The image itself comes in steps of 32 / gain, about
+the middle.
 """
 
 from collections.abc import Sequence
@@ -25,40 +27,57 @@ from beers_deploy.profiles.sensor import MAX_DN
 STEP_DN = 16
 MIDDLE_DN = 2048
 PART = 2
-"""Of the planes: the coarse ones' step and their zero, and by what the last divides the remainder."""
+"""Of the planes: the coarse ones' step and their zero, and by what the last
+divides the remainder.
+"""
 
 PLANES_PER_CHANNEL = 4
 PLANE_ENDS = (-128, -128, -8, -4), (127, 127, 15, 8)
-"""The smallest and the largest number of each: at full scale the coarse ones are at their end, and more remains."""
+"""The smallest and the largest number of each: at full scale the coarse ones are at their end, and
+more remains.
+"""
 
 IMAGE_STEP_DN = 32
 
 BITS = 7
-"""Fractional bits that a result is said to have: int8 then stands for -1 to 1, 5.3 units or half of full scale."""
+"""Fractional bits that a result is said to have: int8 then stands for -1 to 1, 5.3 units or half of
+full scale.
+"""
 
 ANALYTIC_COPIES = 4
-"""Of the analytic restoration, in a network's result; behind fitted kernels the last one is coarse by `WIDE`."""
+"""Of the analytic restoration, in a network's result; behind fitted kernels the last one is coarse
+by `WIDE`.
+"""
 
 LARGEST = 2 * 124
-"""Of two coarse weights before they are rounded: what sums and copies make up for still fits int8."""
+"""Of two coarse weights before they are rounded: what sums and copies make up
+for still fits int8.
+"""
 
 COPIES = (1, 2, 7)
-"""Of the image, of each plane, and of the analytic restoration: 16 channels for each pixel of a place. Behind fitted
-kernels the last one of the analytic restoration is coarse by `WIDE`, for what the others clip."""
+"""Of the image, of each plane, and of the analytic restoration: 16 channels for each pixel of a
+place. Behind fitted kernels the last one of the analytic restoration is coarse by `WIDE`, for what
+the others clip.
+"""
 
 COARSE = 2 + FILTERS
 """The kernel of that one: behind the image's, the planes' and the analytic restoration's."""
 
 GRID_BITS = 16
-"""Fractional bits of what weights are fitted with: weights below 2^8, a covariance of at most 1, 49 products."""
+"""Fractional bits of what weights are fitted with: weights below 2^8, a covariance of at most 1, 49
+products.
+"""
 
 REACH_PX = 30.0
-"""Neighbouring pixels of natural images are alike: their correlation falls to 1 / e within so many pixels."""
+"""Neighbouring pixels of natural images are alike: their correlation falls to 1 / e within so many
+pixels.
+"""
 
 
 @dataclass(frozen=True)
 class WholeBank:
-    """The first convolution, (O, 4 S^2, k, k) int8 with so many fractional bits, and what each channel adds.
+    """The first convolution, (O, 4 S^2, k, k) int8 with so many fractional bits, and what each
+    channel adds.
 
     Attributes:
         weight: of the planes of an image, one kind behind the other.
@@ -76,14 +95,22 @@ def split_planes(image: np.ndarray) -> np.ndarray:
     dn = np.clip(np.rint(image * np.float32(MAX_DN)), 0, MAX_DN) - MIDDLE_DN
     coarse = np.minimum(np.rint(dn / STEP_DN), 127)
     remainder = dn - STEP_DN * coarse
-    return np.concatenate([coarse, coarse, remainder, np.rint(remainder / PART)], axis=1).astype(np.int8)
+    return np.concatenate([coarse, coarse, remainder, np.rint(remainder / PART)], axis=1).astype(
+        np.int8
+    )
 
 
 def channels(kernels: Kernels = "fitted") -> list[tuple[int, float]]:
-    """Of each output, before pixels become channels: which of the bank's kernels it is, and its offset in steps."""
+    """Of each output, before pixels become channels: which of the bank's kernels it is, and its
+    offset in steps.
+    """
     coarse = int(kernels == "fitted")
     copies = [COPIES[0], *[COPIES[1]] * FILTERS, COPIES[2] - coarse, coarse]
-    return [(kernel, offset) for kernel, count in enumerate(copies) for offset in spread_over_a_step(count)]
+    return [
+        (kernel, offset)
+        for kernel, count in enumerate(copies)
+        for offset in spread_over_a_step(count)
+    ]
 
 
 def spread_over_a_step(count: int) -> list[float]:
@@ -99,12 +126,18 @@ def whole_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted")
     frac_bits = int(np.floor(np.log2(LARGEST / np.abs(STEP_DN * wanted).max())))
     read, offsets = zip(*channels(kernels), strict=True)
     exact = _copies(wanted * 2.0**frac_bits, read)
-    planes = [in_places(exact[:, plane].astype(np.float64), scale) for plane in range(PLANES_PER_CHANNEL)]
-    return WholeBank(np.concatenate(planes, 1).astype(np.int8), frac_bits, np.repeat(offsets, scale**2))
+    planes = [
+        in_places(exact[:, plane].astype(np.float64), scale) for plane in range(PLANES_PER_CHANNEL)
+    ]
+    return WholeBank(
+        np.concatenate(planes, 1).astype(np.int8), frac_bits, np.repeat(offsets, scale**2)
+    )
 
 
 def _copies(wanted: NDArray[np.float64], kernels: Sequence[int]) -> NDArray[np.int64]:
-    """Weights (O, 4, 7, 7): each further copy of a kernel makes up for what rounding has left of those before it."""
+    """Weights (O, 4, 7, 7): each further copy of a kernel makes up for what rounding has left of
+    those before it.
+    """
     left = np.zeros_like(wanted)
     found = list[NDArray[np.int64]]()
     for kernel in kernels:
@@ -131,7 +164,9 @@ def _shared(whole: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int
 
 
 def _in_four(kernel: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Weights (4, 7, 7) of the four planes for a kernel (7, 7) of sum 0 that multiplies digital numbers."""
+    """Weights (4, 7, 7) of the four planes for a kernel (7, 7) of sum 0 that multiplies digital
+    numbers.
+    """
     coarse = shaped(STEP_DN * kernel.ravel())
     fine = shaped(PART * kernel.ravel())  # in parts of the remainder's weights
     odd = np.flatnonzero(fine % PART)  # an even number of them, for their sum is 0
@@ -144,8 +179,9 @@ def _in_four(kernel: NDArray[np.float64]) -> NDArray[np.int64]:
 def shaped(wanted: NDArray[np.float64]) -> NDArray[np.int64]:
     """Whole numbers (49,) of sum 0 near the wanted ones, whose errors natural images hardly show.
 
-    From the nearest with the largest remainders given up, one is raised and another lowered while that lowers
-    e^T C e, C the covariance of natural images. All sums are exact, so that every processor finds the same numbers.
+    From the nearest with the largest remainders given up, one is raised and another lowered while
+    that lowers e^T C e, C the covariance of natural images. All sums are exact, so that every
+    processor finds the same numbers.
     """
     wanted = _on_grid(wanted)
     whole = np.rint(wanted)
@@ -173,7 +209,9 @@ def _covariance() -> NDArray[np.float64]:
 
 
 def _on_grid(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rounded to so few bits that no sum of products of 49 is rounded again, in whatever order it is taken."""
+    """Rounded to so few bits that no sum of products of 49 is rounded again, in whatever order it
+    is taken.
+    """
     return np.asarray(np.rint(np.ldexp(values, GRID_BITS)) / 2**GRID_BITS)
 
 

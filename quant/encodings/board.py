@@ -1,7 +1,8 @@
-"""The board's files: the integer core by itself as QDQ ONNX, with int8 bias and power-of-two scales; and VINT8.
+"""The board's files: the integer core by itself as QDQ ONNX, with int8 bias and power-of-two
+scales; and VINT8.
 
-HardSigmoid, HardSwish and the mean of a window that is no power of two are ONNX's own in both, and the host's file
-has the DPU's approximations of them: there results may differ by a few steps.
+HardSigmoid, HardSwish and the mean of a window that is no power of two are ONNX's own in both, and
+the host's file has the DPU's approximations of them: there results may differ by a few steps.
 """
 
 import json
@@ -21,16 +22,28 @@ from beers_deploy.quant.encodings.description import BORDER_PX, KEY, PLACE_PX, d
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Add, Conv, Op, Pointwise
 from beers_deploy.quant.graph.writer import onnx_weight, write_float
-from beers_deploy.quant.onnx_file import GraphWriter, constants, fixed_tile_px, image_info, make_model, metadata
+from beers_deploy.quant.onnx_file import (
+    GraphWriter,
+    constants,
+    fixed_tile_px,
+    image_info,
+    make_model,
+    metadata,
+)
 from beers_deploy.quant.untrusted import contradictions
 
 
-def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
-    """`planes` (N, C, H, W) float32, as q * 2^-7, to `correction` (N, C', H', W') float32; `tile_px` is the image's.
+def board_model(
+    core: IntCore, about: dict[str, str], tile_px: int | None = None
+) -> onnx.ModelProto:
+    """`planes` (N, C, H, W) float32, as q * 2^-7, to `correction` (N, C', H', W') float32;
+    `tile_px` is the image's.
 
-    Where the host moves pixels into channels first, the file says of how many pixels a place of the planes is.
+    Where the host moves pixels into channels first, the file says of how many pixels a place of the
+    planes is.
 
-    The correction's channels come several times where it has gains or windows: `quant.ends.Ends.merge` makes one.
+    The correction's channels come several times where it has gains or windows:
+    `quant.ends.Ends.merge` makes one.
     """
     writer = BoardWriter()
     writer.quantised("planes.dequantised", PLANES, core.frac_bits[PLANES])
@@ -42,12 +55,18 @@ def board_model(core: IntCore, about: dict[str, str], tile_px: int | None = None
     return _core_file(writer, core.ends, about, tile_px)
 
 
-def _core_file(writer: GraphWriter, ends: Ends, about: dict[str, str], tile_px: int | None) -> onnx.ModelProto:
+def _core_file(
+    writer: GraphWriter, ends: Ends, about: dict[str, str], tile_px: int | None
+) -> onnx.ModelProto:
     read_px = tile_px and (tile_px + 2 * ends.border_px) // ends.place_px
     size = image_info(PLANES, ends.planes * ends.channels, read_px)
-    result = image_info(CORRECTION, ends.copies * ends.outputs, tile_px and tile_px // ends.correction_px)
+    result = image_info(
+        CORRECTION, ends.copies * ends.outputs, tile_px and tile_px // ends.correction_px
+    )
     if not ends.adds_image:  # of another size than the image, perhaps
-        for side, name in zip(result.type.tensor_type.shape.dim[2:], ("rows", "columns"), strict=True):
+        for side, name in zip(
+            result.type.tensor_type.shape.dim[2:], ("rows", "columns"), strict=True
+        ):
             side.dim_param = name
     places = {PLACE_PX: str(ends.place_px)} if ends.place_px > 1 else {}
     places |= {BORDER_PX: str(ends.border_px)} if ends.border_px else {}
@@ -58,7 +77,8 @@ def _core_file(writer: GraphWriter, ends: Ends, about: dict[str, str], tile_px: 
 def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
     """A host's file whose core is described in it as the board gets it; any other model as it is.
 
-    What the host spells with several operators, such as a transposed convolution, is one of the DPU's own.
+    What the host spells with several operators, such as a transposed convolution, is one of the
+    DPU's own.
     """
     if KEY not in metadata(model):
         return model
@@ -76,16 +96,28 @@ class BoardWriter(GraphWriter):
 
     def quantised(self, output: str, source: str, frac_bits: int) -> None:
         """Quantise and dequantise an activation."""
-        middle = self.node("QuantizeLinear", f"{source}.int8", [source, *self.scale(source, frac_bits)])
-        self.node("DequantizeLinear", output, [middle, *self.scale(source, frac_bits)], f"{middle}.float")
+        middle = self.node(
+            "QuantizeLinear", f"{source}.int8", [source, *self.scale(source, frac_bits)]
+        )
+        self.node(
+            "DequantizeLinear", output, [middle, *self.scale(source, frac_bits)], f"{middle}.float"
+        )
 
     def operation(self, op: IntConv | Op, feeds: list[str], output: str) -> None:
-        """Write an operation on tensors seen as float, a convolution's weights and bias as int8 seen so too."""
+        """Write an operation on tensors seen as float, a convolution's weights and bias as int8
+        seen so too.
+        """
         if isinstance(op, IntConv):
             weight = onnx_weight(op.weight, op.transposed)
             kind = (op.activation, op.window, op.groups, op.transposed)
-            numbers = {"weight": (weight, op.weight_frac_bits), "bias": (op.bias, op.bias_frac_bits)}
-            feeds = [*feeds, *(self._dequantised(f"{op.name}.{role}", *each) for role, each in numbers.items())]
+            numbers = {
+                "weight": (weight, op.weight_frac_bits),
+                "bias": (op.bias, op.bias_frac_bits),
+            }
+            feeds = [
+                *feeds,
+                *(self._dequantised(f"{op.name}.{role}", *each) for role, each in numbers.items()),
+            ]
             op = Conv(op.name, op.input, op.output, op.weight, op.bias, *kind)
         write_float(self, op, feeds, output)
 
@@ -100,19 +132,23 @@ CLAMPS = (Activation.relu, Activation.relu6)
 
 
 def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> onnx.ModelProto:
-    """VINT8, the file that AMD's current NPU flow compiles: the numbers of the board's file in another layout.
+    """VINT8, the file that AMD's current NPU flow compiles: the numbers of the board's file in
+    another layout.
 
-    One image of one tile, every size stated; a pair of Q and DQ for each reader of a tensor; a scale and a zero point
-    of its own for each tensor; and a pair between an operation and a clamp behind it, which AMD's quantiser writes
-    there too. On the result's own grid it does not matter whether a value is clamped before it is rounded or after,
-    so no bit changes. LeakyReLU is no clamp: it stays behind the sums, as the core computes it.
+    One image of one tile, every size stated; a pair of Q and DQ for each reader of a tensor; a
+    scale and a zero point of its own for each tensor; and a pair between an operation and a clamp
+    behind it, which AMD's quantiser writes there too. On the result's own grid it does not matter
+    whether a value is clamped before it is rounded or after, so no bit changes. LeakyReLU is no
+    clamp: it stays behind the sums, as the core computes it.
 
     Raises:
         OptionError: no tile.
     """
     side_px = required_tile(tile_px)
     parts = [(part, core.frac_bits[op.output]) for op in core.ops for part in _apart(op)]
-    writer = _PairWriter({PLANES: core.frac_bits[PLANES], **{op.output: bits for op, bits in parts}})
+    writer = _PairWriter(
+        {PLANES: core.frac_bits[PLANES], **{op.output: bits for op, bits in parts}}
+    )
     for op, _ in parts:
         writer.operation(op, [writer.read(name) for name in op.inputs], writer.source(op.output))
     writer.read(CORRECTION, CORRECTION)
@@ -167,7 +203,9 @@ class _PairWriter(BoardWriter):
 
 
 def save_config(core: Path, device: str) -> Path:
-    """Write what AMD's compiler reads beside the file of a core: the device, and for the rest its own defaults."""
+    """Write what AMD's compiler reads beside the file of a core: the device, and for the rest its
+    own defaults.
+    """
     names = ("init", "vaiml_partition")
     vaiml = {"device": device, "optimize_level": 2}
     first, second = ({"name": name, "plugin": f"vaip-pass_{name}"} for name in names)

@@ -1,7 +1,9 @@
-"""What a host's file says of its core in its metadata: the operations and scales, without weights and biases.
+"""What a host's file says of its core in its metadata: the operations and scales, without weights
+and biases.
 
-An operation such as a transposed convolution is several nodes there. Written again from the description and the
-file's own weights, all nodes must come out the same (`quant.encodings.encoding_faults`).
+An operation such as a transposed convolution is several nodes there. Written again from the
+description and the file's own weights, all nodes must come out the same
+(`quant.encodings.encoding_faults`).
 """
 
 import json
@@ -31,21 +33,27 @@ from beers_deploy.quant.graph.tail import Tail
 
 KEY = "core"
 PLACE_PX = "place_px"
-"""In the metadata of a board's file: the side in pixels of the square of the image that is one place of its planes;
-1 where nothing is said."""
+"""In the metadata of a board's file: the side in pixels of the square of the image that is one
+place of its planes; 1 where nothing is said.
+"""
 BORDER_PX = "border_px"
-"""Likewise: by how many pixels the planes reach beyond the image on each side; 0 where nothing is said."""
+"""Likewise: by how many pixels the planes reach beyond the image on each side; 0 where nothing is
+said.
+"""
 LARGEST = 1 << 16
 """Channels, windows, strides and factors of whatever a DPU runs are smaller still."""
 KINDS: dict[str, type] = {
-    kind.__name__: kind for kind in (IntConv, Add, Mul, Concat, MaxPool, AveragePool, Resize, Shuffle, Pointwise)
+    kind.__name__: kind
+    for kind in (IntConv, Add, Mul, Concat, MaxPool, AveragePool, Resize, Shuffle, Pointwise)
 }
 
 
 def describe(core: IntCore) -> str:
     """The core as JSON, without its arrays."""
     ops = [{"kind": type(op).__name__, **_plain(op)} for op in core.ops]
-    return json.dumps({"ops": ops, "frac_bits": dict(core.frac_bits), "ends": asdict(core.ends)}, sort_keys=True)
+    return json.dumps(
+        {"ops": ops, "frac_bits": dict(core.frac_bits), "ends": asdict(core.ends)}, sort_keys=True
+    )
 
 
 def _plain(op: IntConv | Op) -> dict[str, Any]:
@@ -63,10 +71,19 @@ def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
     """
     try:
         return _described(text, constants)
-    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:
         got = f"damaged ones ({type(error).__name__}: {' '.join(str(error).split())[:80]})"
         expected = f"metadata {KEY!r} that describe its integers"
-        raise ModelError("INT8 core", expected=expected, got=got, remedy="quantise the network again") from error
+        raise ModelError(
+            "INT8 core", expected=expected, got=got, remedy="quantise the network again"
+        ) from error
 
 
 def _described(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
@@ -75,11 +92,15 @@ def _described(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
     frac_bits = {str(name): int(bits) for name, bits in said["frac_bits"].items()}
     ops = tuple(_op(dict(op), frac_bits, constants) for op in said["ops"])
     ends = said["ends"]
-    shuffles = {key: tuple(Shuffle(**each) for each in ends[key]) for key in ("front", "back", "last")}
+    shuffles = {
+        key: tuple(Shuffle(**each) for each in ends[key]) for key in ("front", "back", "last")
+    }
     offsets = tuple(tuple(float(each) for each in window) for window in ends["offsets"])
     counts = {key: int(ends[key]) for key in ("channels", "planes", "gains", "outputs")}
     tail = Tail(**ends["tail"]) if ends["tail"] else None
-    return IntCore(ops, frac_bits, Ends(**{**ends, **counts, **shuffles, "offsets": offsets, "tail": tail}))
+    return IntCore(
+        ops, frac_bits, Ends(**{**ends, **counts, **shuffles, "offsets": offsets, "tail": tail})
+    )
 
 
 def _require_small(said: object) -> None:
@@ -95,7 +116,9 @@ def _require_small(said: object) -> None:
         raise ValueError(f"a size of {said}")
 
 
-def _op(said: dict[str, Any], frac_bits: Mapping[str, int], constants: Mapping[str, np.ndarray]) -> IntConv | Op:
+def _op(
+    said: dict[str, Any], frac_bits: Mapping[str, int], constants: Mapping[str, np.ndarray]
+) -> IntConv | Op:
     kind = KINDS[said.pop("kind")]
     if "window" in said:
         said["window"] = Window(**{key: tuple(value) for key, value in said["window"].items()})
@@ -116,17 +139,20 @@ def _op(said: dict[str, Any], frac_bits: Mapping[str, int], constants: Mapping[s
 
 
 def phases(weight: np.ndarray, stride: int) -> tuple[np.ndarray, int]:
-    """The weights (stride^2 O, I, J, J) of a transposed convolution's phases, and their padding, J - 1.
+    """The weights (stride^2 O, I, J, J) of a transposed convolution's phases, and their padding, J
+    - 1.
 
-    Output row q stride + f takes x[q - j] w[f + stride j]: a convolution over rows q - J + 1 .. q for each f. The
-    phases come first in the channels, as ONNX's own DepthToSpace wants them.
+    Output row q stride + f takes x[q - j] w[f + stride j]: a convolution over rows q - J + 1 .. q
+    for each f. The phases come first in the channels, as ONNX's own DepthToSpace wants them.
     """
     outputs, inputs, *kernel = weight.shape
     reach = max(-(-k // stride) for k in kernel)
     padded = np.zeros((outputs, inputs, reach * stride, reach * stride), weight.dtype)
     padded[:, :, : kernel[0], : kernel[1]] = weight
     taps = padded.reshape(outputs, inputs, reach, stride, reach, stride)[:, :, ::-1, :, ::-1]
-    return np.ascontiguousarray(taps.transpose(3, 5, 0, 1, 2, 4)).reshape(-1, inputs, reach, reach), reach - 1
+    return np.ascontiguousarray(taps.transpose(3, 5, 0, 1, 2, 4)).reshape(
+        -1, inputs, reach, reach
+    ), reach - 1
 
 
 def of_phases(weight: np.ndarray, shape: tuple[int, ...], stride: int) -> np.ndarray:

@@ -1,11 +1,14 @@
-"""The host's file: the integer core on stock onnxruntime by integer kernels, from image to restored image.
+"""The host's file: the integer core on stock onnxruntime by integer kernels, from image to restored
+image.
 
-Every operation rounds once, ties to even, and adds exactly. What onnxruntime has no integer operator for is written
-with those it has: transposed convolution and bilinear enlargement as convolutions and a pixel shuffle, average
-pooling as a depthwise convolution, activations by themselves as tables of 256, LeakyReLU on the convolution's sums.
+Every operation rounds once, ties to even, and adds exactly. What onnxruntime has no integer
+operator for is written with those it has: transposed convolution and bilinear enlargement as
+convolutions and a pixel shuffle, average pooling as a depthwise convolution, activations by
+themselves as tables of 256, LeakyReLU on the convolution's sums.
 
-It describes its operations in its metadata, without weights and scales: those are its nodes' own. What is read back
-is written again, so that any node or constant which differs from what the numbers ask for is a fault.
+It describes its operations in its metadata, without weights and scales: those are its nodes' own.
+What is read back is written again, so that any node or constant which differs from what the numbers
+ask for is a fault.
 """
 
 from collections.abc import Callable
@@ -38,7 +41,12 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.graph.writer import window_attributes, write_float, write_shuffle
-from beers_deploy.quant.integer.arithmetic import activation_table, bilinear_weights, mean_factor, six_in_units
+from beers_deploy.quant.integer.arithmetic import (
+    activation_table,
+    bilinear_weights,
+    mean_factor,
+    six_in_units,
+)
 from beers_deploy.quant.onnx_file import constants, fixed_tile_px, image_info, make_model, metadata
 from beers_deploy.quant.untrusted import contradictions
 
@@ -48,7 +56,9 @@ LEGAL = "int8 legal"
 
 
 def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
-    """The whole INT8 network on stock onnxruntime, (N, C, H, W) float32 in [0, 1] to what its float network gives."""
+    """The whole INT8 network on stock onnxruntime, (N, C, H, W) float32 in [0, 1] to what its float
+    network gives.
+    """
     writer = HostWriter()
     write_front(writer, core.ends)
     for op in core.ops:
@@ -56,7 +66,9 @@ def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None)
     feeds = [CORRECTION, writer.unit(core.frac_bits[CORRECTION]), writer.zero_point()]
     write_back(writer, core.ends, feeds, core.scale(CORRECTION))
     graph = writer.graph(
-        "convbeers-int8", [image_info(IMAGE, core.ends.image_channels, tile_px)], [_result(core, tile_px)]
+        "convbeers-int8",
+        [image_info(IMAGE, core.ends.image_channels, tile_px)],
+        [_result(core, tile_px)],
     )
     return make_model(graph, {**about, KEY: describe(core)}, microsoft=True)
 
@@ -66,7 +78,9 @@ def _result(core: IntCore, tile_px: int | None) -> onnx.ValueInfoProto:
     if ends.tail:
         return ends.tail.result
     if ends.flat:
-        return onnx.helper.make_tensor_value_info("restored", TensorProto.FLOAT, ["N", ends.outputs])
+        return onnx.helper.make_tensor_value_info(
+            "restored", TensorProto.FLOAT, ["N", ends.outputs]
+        )
     if ends.adds_image and not ends.last:
         return image_info("restored", ends.image_channels, tile_px)
     shuffled = int(np.prod([shuffle.block**2 for shuffle in (*ends.back, *ends.last)], initial=1))
@@ -91,14 +105,24 @@ def _bias(core: IntCore, op: IntConv) -> np.ndarray:
 
 def _qlinear(w: HostWriter, core: IntCore, op: IntConv, bias: np.ndarray) -> None:
     feeds = [op.input, w.unit(core.frac_bits[op.input]), w.zero_point()]
-    feeds += [w.constant(f"{op.name}.weight", op.weight), w.unit(op.weight_frac_bits), _weight_zero(w, op.name)]
-    feeds += [w.unit(core.frac_bits[op.output]), w.zero_point(), w.constant(f"{op.name}.bias", bias)]
+    feeds += [
+        w.constant(f"{op.name}.weight", op.weight),
+        w.unit(op.weight_frac_bits),
+        _weight_zero(w, op.name),
+    ]
+    feeds += [
+        w.unit(core.frac_bits[op.output]),
+        w.zero_point(),
+        w.constant(f"{op.name}.bias", bias),
+    ]
     w.node("QLinearConv", _unclamped(op), feeds, name=op.name, **_attributes(op))
     _clamp(w, core, op)
 
 
 def _weight_zero(w: HostWriter, name: str) -> str:
-    """One a weight: where onnxruntime rewrites weights (see quant.session), it trips over a shared one."""
+    """One a weight: where onnxruntime rewrites weights (see quant.session), it trips over a shared
+    one.
+    """
     return w.constant(f"{name}.weight_zero_point", np.array(0, np.int8))
 
 
@@ -118,7 +142,9 @@ def _clamp(w: HostWriter, core: IntCore, op: IntConv | Add) -> None:
     relu = op.output if op.activation is Activation.relu else f"{op.output}.above_0"
     w.node("Max", relu, [_unclamped(op), w.zero_point()], name=f"{op.name}.relu")
     if op.activation is Activation.relu6:
-        six = w.constant(f"{op.name}.six", np.array(ZERO + six_in_units(core.frac_bits[op.output]), np.uint8))
+        six = w.constant(
+            f"{op.name}.six", np.array(ZERO + six_in_units(core.frac_bits[op.output]), np.uint8)
+        )
         w.node("Min", op.output, [relu, six], name=f"{op.name}.relu6")
 
 
@@ -126,7 +152,12 @@ def _leaky(w: HostWriter, core: IntCore, op: IntConv) -> None:
     """max(256 x, 26 x) of the int32 sums, exact in float64, rounded once."""
     name = op.output
     product = op.weight_frac_bits + core.frac_bits[op.input]
-    feeds = [op.input, w.constant(f"{op.name}.weight", op.weight), w.zero_point(), _weight_zero(w, op.name)]
+    feeds = [
+        op.input,
+        w.constant(f"{op.name}.weight", op.weight),
+        w.zero_point(),
+        _weight_zero(w, op.name),
+    ]
     w.node("ConvInteger", f"{name}.products", feeds, name=op.name, **_attributes(op))
     bias = w.constant(f"{op.name}.bias", _bias(core, op)[:, None, None])
     w.node("Add", f"{name}.sums", [f"{name}.products", bias])
@@ -135,36 +166,53 @@ def _leaky(w: HostWriter, core: IntCore, op: IntConv) -> None:
     for kind, factor in {"whole": unit, "leaking": LEAKY_SLOPE * unit}.items():
         by = w.constant(f"{op.name}.{kind}", np.array(factor, np.float64))
         w.node("Mul", f"{name}.{kind}", [f"{name}.wide", by])
-    w.node("Max", f"{name}.linear", [f"{name}.whole", f"{name}.leaking"], name=f"{op.name}.leaky_relu")
+    w.node(
+        "Max", f"{name}.linear", [f"{name}.whole", f"{name}.leaking"], name=f"{op.name}.leaky_relu"
+    )
     w.node("Round", f"{name}.round", [f"{name}.linear"])
     limits = [w.constant(f"int8_{end}", np.array(end, np.float64)) for end in (INT8_MIN, INT8_MAX)]
     w.node("Clip", f"{name}.clip", [f"{name}.round", *limits])
-    w.node("Add", f"{name}.offset", [f"{name}.clip", w.constant("offset_64", np.array(ZERO, np.float64))])
+    w.node(
+        "Add",
+        f"{name}.offset",
+        [f"{name}.clip", w.constant("offset_64", np.array(ZERO, np.float64))],
+    )
     w.node("Cast", name, [f"{name}.offset"], to=TensorProto.UINT8)
 
 
 def _transposed(w: HostWriter, core: IntCore, op: IntConv) -> None:
-    """One convolution for each phase of the enlarged lattice, then a pixel shuffle, then the pads cut."""
+    """One convolution for each phase of the enlarged lattice, then a pixel shuffle, then the pads
+    cut.
+    """
     stride = op.window.strides[0]
     top = op.window.pads[0]
     left = op.window.pads[1]
     weight, reach = phases(op.weight, stride)
-    phased = replace(op, output=f"{op.output}.phases", weight=weight, window=Window(pads=(reach,) * 4))
+    phased = replace(
+        op, output=f"{op.output}.phases", weight=weight, window=Window(pads=(reach,) * 4)
+    )
     both = replace(core, frac_bits={**core.frac_bits, phased.output: core.frac_bits[op.output]})
     _qlinear(w, both, phased, np.tile(_bias(core, op), stride**2))
-    shuffle = Shuffle(f"{op.name}.shuffle", phased.output, f"{op.output}.whole", stride, True, False)
+    shuffle = Shuffle(
+        f"{op.name}.shuffle", phased.output, f"{op.output}.whole", stride, True, False
+    )
     write_shuffle(w, shuffle, shuffle.input, shuffle.output)
-    # Behind the last pixel the phases go on: as many rows and columns as the kernel does not reach are cut as well.
+    # Behind the last pixel the phases go on: as many rows and columns as the kernel does not reach
+    # are cut as well.
     rows, columns = (stride * (reach + 1) - k for k in op.weight.shape[2:])
     ends = [-(op.window.pads[2] + rows), -(op.window.pads[3] + columns)]
     stops = [end if end else np.iinfo(np.int64).max for end in ends]
     feeds = {"from": [top, left], "to": stops, "axes": [2, 3]}
-    places = [w.constant(f"{op.name}.{name}", np.array(value, np.int64)) for name, value in feeds.items()]
+    places = [
+        w.constant(f"{op.name}.{name}", np.array(value, np.int64)) for name, value in feeds.items()
+    ]
     w.node("Slice", op.output, [shuffle.output, *places], name=f"{op.name}.cut")
 
 
 def _add(w: HostWriter, core: IntCore, op: Add | Mul) -> None:
-    feeds = [feed for name in op.inputs for feed in (name, w.unit(core.frac_bits[name]), w.zero_point())]
+    feeds = [
+        feed for name in op.inputs for feed in (name, w.unit(core.frac_bits[name]), w.zero_point())
+    ]
     feeds += [w.unit(core.frac_bits[op.output]), w.zero_point()]
     result = _unclamped(op) if isinstance(op, Add) else op.output
     w.node(f"QLinear{type(op).__name__}", result, feeds, name=op.name, domain=MICROSOFT)
@@ -175,7 +223,9 @@ def _add(w: HostWriter, core: IntCore, op: Add | Mul) -> None:
 def _average_pool(w: HostWriter, core: IntCore, op: AveragePool) -> None:
     assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
     factor, shift = mean_factor(op.kernel)
-    _weighted(w, core, op, (op.input, op.output), np.full((1, 1, *op.kernel), factor), shift, op.window)
+    _weighted(
+        w, core, op, (op.input, op.output), np.full((1, 1, *op.kernel), factor), shift, op.window
+    )
 
 
 def _weighted(
@@ -187,7 +237,9 @@ def _weighted(
     shift: int,
     window: Window,
 ) -> None:
-    """Weights (K, 1, kh, kw) for each channel: a depthwise convolution whose result has its input's scale."""
+    """Weights (K, 1, kh, kw) for each channel: a depthwise convolution whose result has its input's
+    scale.
+    """
     channels = channels_of(core.ops, {PLANES: core.ends.planes * core.ends.channels})[op.input]
     unit = w.unit(core.frac_bits[op.input])
     weight = np.tile(weight.astype(np.int8), (channels, 1, 1, 1))
@@ -204,7 +256,12 @@ def _resize(w: HostWriter, core: IntCore, op: Resize) -> None:
     weight, shift = bilinear_weights(op.factor)
     wide = f"{op.output}.edged"
     phased = f"{op.output}.phases"
-    w.node("Pad", wide, [op.input, w.constant("edge_pads", np.array([0, 0, 1, 1, 0, 0, 1, 1]))], mode="edge")
+    w.node(
+        "Pad",
+        wide,
+        [op.input, w.constant("edge_pads", np.array([0, 0, 1, 1, 0, 0, 1, 1]))],
+        mode="edge",
+    )
     _weighted(w, core, op, (wide, phased), weight[:, None], shift, Window())
     write_shuffle(w, Shuffle(f"{op.name}.shuffle", phased, op.output, op.factor), phased, op.output)
 
@@ -212,14 +269,21 @@ def _resize(w: HostWriter, core: IntCore, op: Resize) -> None:
 def _pointwise(w: HostWriter, core: IntCore, op: Pointwise) -> None:
     table = (activation_table(op, core.frac_bits) + ZERO).astype(np.uint8)
     w.node("Cast", f"{op.output}.place", [op.input], to=TensorProto.INT32)
-    w.node("Gather", op.output, [w.constant(f"{op.name}.table", table), f"{op.output}.place"], name=op.name)
+    w.node(
+        "Gather",
+        op.output,
+        [w.constant(f"{op.name}.table", table), f"{op.output}.place"],
+        name=op.name,
+    )
 
 
 _WRITERS: dict[type, Callable[..., Any]] = {
     IntConv: _conv,
     Add: _add,
     Mul: _add,
-    **dict.fromkeys((Concat, MaxPool, Shuffle), lambda w, _, op: write_float(w, op, op.inputs, op.output)),
+    **dict.fromkeys(
+        (Concat, MaxPool, Shuffle), lambda w, _, op: write_float(w, op, op.inputs, op.output)
+    ),
     AveragePool: _average_pool,
     Resize: _resize,
     Pointwise: _pointwise,
@@ -237,11 +301,14 @@ def read_core(model: onnx.ModelProto) -> IntCore:
         return described_core(said, constants(model))
     expected = "a file that describes its integers"
     remedy = "make it with 'beers-deploy quantize'"
-    raise ModelError("INT8 core", expected=expected, got="a file without a description", remedy=remedy)
+    raise ModelError(
+        "INT8 core", expected=expected, got="a file without a description", remedy=remedy
+    )
 
 
 def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
-    """Where a file of `quantize` is not what its integers ask for: the host's ends, ReLUs, a reader's scale.
+    """Where a file of `quantize` is not what its integers ask for: the host's ends, ReLUs, a
+    reader's scale.
 
     None for a file that does not describe its integers and does not state that `quantize` wrote it.
     """
@@ -260,5 +327,7 @@ def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
         ("node", model.graph.node, meant.node),
     ):
         faults += [f"{kind} {a.name}" for a, b in zip(found, wanted, strict=False) if a != b]
-        faults += [f"{len(found)} {kind}s instead of {len(wanted)}"] if len(found) != len(wanted) else []
+        faults += (
+            [f"{len(found)} {kind}s instead of {len(wanted)}"] if len(found) != len(wanted) else []
+        )
     return faults

@@ -1,9 +1,9 @@
 """A network as the short list of operations that a DPU computes: what quantisation works on.
 
-- `nodes`: the one reading of an ONNX file, for `check` and tiling too, with `moves` of pixels in one spelling and
-  how numbers are `quantised`;
-- `operations`: what there is, convolutions to pixel shuffles, which tensors must share a scale, and how 12 bits enter
-  int8;
+- `nodes`: the one reading of an ONNX file, for `check` and tiling too, with `moves` of pixels in
+  one spelling and how numbers are `quantised`;
+- `operations`: what there is, convolutions to pixel shuffles, which tensors must share a scale, and
+  how 12 bits enter int8;
 - `reader`: from float ONNX to a `network`, cut where the host's part ends;
 - `tail`: what the host computes behind the last map, kept as ONNX nodes;
 - `writer`: back to float ONNX.
@@ -40,13 +40,51 @@ from beers_deploy.quant.graph.operations import (
     tied,
     ties_scales,
 )
-from beers_deploy.quant.graph.reader import correction_graph, image_channels, plain_network, read_network, refusal
+from beers_deploy.quant.graph.reader import (
+    correction_graph,
+    image_channels,
+    plain_network,
+    read_network,
+    refusal,
+)
 from beers_deploy.quant.graph.writer import graph_to_onnx
 
 __all__ = [
-    "COARSE_MAX", "CORRECTION", "COUNT", "IMAGE", "PLANES", "PLANES_FRAC_BITS", "QUARTER", "STEP", "Activation",
-    "Add", "AveragePool", "Concat", "Conv", "Graph", "MaxPool", "Mul", "Network", "Op", "Pointwise", "Resize",
-    "Shuffle", "Window", "channels_of", "check_network", "correction_graph",
-    "graph_to_onnx", "image_channels", "plain_network", "read_network", "read_planes", "refusal",
-    "relu_count", "same", "split", "tensors", "tied", "ties_scales",
-]  # fmt: skip
+    "COARSE_MAX",
+    "CORRECTION",
+    "COUNT",
+    "IMAGE",
+    "PLANES",
+    "PLANES_FRAC_BITS",
+    "QUARTER",
+    "STEP",
+    "Activation",
+    "Add",
+    "AveragePool",
+    "Concat",
+    "Conv",
+    "Graph",
+    "MaxPool",
+    "Mul",
+    "Network",
+    "Op",
+    "Pointwise",
+    "Resize",
+    "Shuffle",
+    "Window",
+    "channels_of",
+    "check_network",
+    "correction_graph",
+    "graph_to_onnx",
+    "image_channels",
+    "plain_network",
+    "read_network",
+    "read_planes",
+    "refusal",
+    "relu_count",
+    "same",
+    "split",
+    "tensors",
+    "tied",
+    "ties_scales",
+]

@@ -1,7 +1,8 @@
-"""Moves of pixels that exporters write in several ways: shuffles as Reshape and Transpose, resizes of all opsets.
+"""Moves of pixels that exporters write in several ways: shuffles as Reshape and Transpose, resizes
+of all opsets.
 
-torch writes PixelUnshuffle as Reshape and Transpose, and PixelShuffle in old opsets. What such nodes do is tried out
-on an image of numbered pixels.
+torch writes PixelUnshuffle as Reshape and Transpose, and PixelShuffle in old opsets. What such
+nodes do is tried out on an image of numbered pixels.
 """
 
 import math
@@ -17,12 +18,17 @@ from beers_deploy.quant.graph.nodes import Node, OnnxGraph
 from beers_deploy.quant.graph.operations import Shuffle
 
 MOVES: dict[str, tuple[str, Callable[[np.ndarray, list[int]], np.ndarray]]] = {
-    "Reshape": ("shape", lambda image, sizes: image.reshape([n or image.shape[k] for k, n in enumerate(sizes)])),
+    "Reshape": (
+        "shape",
+        lambda image, sizes: image.reshape([n or image.shape[k] for k, n in enumerate(sizes)]),
+    ),
     "Squeeze": ("axes", lambda image, axes: image.squeeze(tuple(axes) or None)),
     "Transpose": ("perm", lambda image, axes: image.transpose(axes or None)),
     "Unsqueeze": ("axes", lambda image, axes: np.expand_dims(image, tuple(axes))),
 }
-"""Operators that do nothing but move pixels: what they state, in an input or an attribute, and what they do."""
+"""Operators that do nothing but move pixels: what they state, in an input or an attribute, and what
+they do.
+"""
 ORDERS = {"CRD": True, "DCR": False}
 """The modes of ONNX's DepthToSpace, and whether columns come first."""
 SIDES_PX = 24, 35
@@ -34,16 +40,22 @@ VALUES = 1 << 22
 def with_shuffles(model: onnx.ModelProto) -> OnnxGraph:
     """The nodes of a model, with one DepthToSpace or SpaceToDepth for each that is spelled out.
 
-    Its `mode`, of SpaceToDepth too, says in which order the channels come: one of `ORDERS`, empty for any other.
+    Its `mode`, of SpaceToDepth too, says in which order the channels come: one of `ORDERS`, empty
+    for any other.
     """
     graph = OnnxGraph(model)
     if not any(node.op_type in MOVES for node in graph.nodes):
         return graph
     inferred = onnx.shape_inference.infer_shapes(model).graph
-    known = {value.name: value.type.tensor_type.shape.dim for value in (*inferred.input, *inferred.value_info)}
+    known = {
+        value.name: value.type.tensor_type.shape.dim
+        for value in (*inferred.input, *inferred.value_info)
+    }
     spelled: dict[Node, Node | None] = {}  # of the nodes of a chain the last one stands for all
     for chain in _chains(graph):
-        shuffle = _shuffle(chain, [dim.dim_value for dim in known.get(chain[0].inputs[0], ())], graph)
+        shuffle = _shuffle(
+            chain, [dim.dim_value for dim in known.get(chain[0].inputs[0], ())], graph
+        )
         if shuffle is not None:
             spelled |= {**dict.fromkeys(chain), chain[-1]: shuffle}
     written = (spelled.get(node, node) for node in graph.nodes)
@@ -62,7 +74,9 @@ def _chains(graph: OnnxGraph) -> list[list[Node]]:
 
 
 def _shuffle(chain: list[Node], sizes: list[int], graph: OnnxGraph) -> Node | None:
-    """The pixel shuffle that a chain is, of an image of these sizes, 0 where they are free; None of what is none."""
+    """The pixel shuffle that a chain is, of an image of these sizes, 0 where they are free; None of
+    what is none.
+    """
     for side_px in SIDES_PX if len(sizes) == 4 and sizes[1] else ():
         shape = sizes[0] or 1, sizes[1], sizes[2] or side_px, sizes[3] or 2 * side_px
         if math.prod(shape) > VALUES:
@@ -74,8 +88,12 @@ def _shuffle(chain: list[Node], sizes: list[int], graph: OnnxGraph) -> Node | No
             continue
         up = growth > 1
         block = max(growth.numerator, growth.denominator)
-        trials = ((mode, Shuffle("", "", "", block, up, first)(image)) for mode, first in ORDERS.items())
-        mode = next((mode for mode, moved in trials if block > 1 and np.array_equal(moved, result)), "")
+        trials = (
+            (mode, Shuffle("", "", "", block, up, first)(image)) for mode, first in ORDERS.items()
+        )
+        mode = next(
+            (mode for mode, moved in trials if block > 1 and np.array_equal(moved, result)), ""
+        )
         kind = "DepthToSpace" if up else "SpaceToDepth"
         ends = ([chain[0].inputs[0]], [chain[-1].outputs[0]])
         node = Node.of(helper.make_node(kind, *ends, chain[-1].name, blocksize=block))
@@ -98,7 +116,8 @@ def _moved(chain: list[Node], image: np.ndarray, graph: OnnxGraph) -> np.ndarray
 
 
 def _growth(result: np.ndarray, shape: tuple[int, int, int, int]) -> Fraction | None:
-    """Pixels of a shuffle's result for one of its source, along either side; None of what is no shuffle.
+    """Pixels of a shuffle's result for one of its source, along either side; None of what is no
+    shuffle.
 
     It is one where each pixel comes from its own place: the pixel there, or the block of them.
     """
@@ -117,7 +136,10 @@ PLACES: dict[str, Callable[[int, float], float]] = {
     "pytorch_half_pixel": lambda pixel, factor: (pixel + 0.5) / factor - 0.5,
     "tf_half_pixel_for_nn": lambda pixel, factor: (pixel + 0.5) / factor,
 }
-"""Where a pixel of an enlarged image lies in the image before. ONNX's other coordinates depend on the sizes."""
+"""Where a pixel of an enlarged image lies in the image before.
+
+ONNX's other coordinates depend on the sizes.
+"""
 ROUNDINGS: dict[str, Callable[[float], int]] = {
     "floor": math.floor,
     "ceil": math.ceil,
@@ -144,7 +166,9 @@ class Resizing:
         old = node.op_type == "Upsample" or len(node.inputs) == 2  # before opset 11
         given = node.attributes.get
         scales = graph.numbers(node, 1 if old else 2, "scales") or []
-        factors = dict(zip((axis % 4 for axis in given("axes", range(4))), scales, strict=bool(scales)))
+        factors = dict(
+            zip((axis % 4 for axis in given("axes", range(4))), scales, strict=bool(scales))
+        )
         return cls(
             tuple(factors.get(axis, 1.0) for axis in range(4)) if factors else (),
             given("mode", "nearest"),
@@ -153,7 +177,9 @@ class Resizing:
         )
 
     def makes_blocks(self, factor: int) -> bool:
-        """Whether nearest pixels, enlarged by a factor, are those whose block each pixel of the result lies in."""
+        """Whether nearest pixels, enlarged by a factor, are those whose block each pixel of the
+        result lies in.
+        """
         if self.where not in PLACES or self.rounding not in ROUNDINGS:
             return False
         place = PLACES[self.where]

@@ -27,7 +27,10 @@ from beers_deploy.quant.graph.operations import (
 )
 from beers_deploy.quant.graph.tail import Tail
 
-REMEDY = "see docs/reference/any-network.md for what 'quantize' takes; 'check' names what a DPU does not run"
+REMEDY = (
+    "see docs/reference/any-network.md for what 'quantize' takes; 'check' names what a DPU "
+    "does not run"
+)
 
 
 @dataclass(frozen=True)
@@ -39,8 +42,10 @@ class Network:
         channels: of the image, before `front`.
         front: what the host does to the image first: pixel unshuffle.
         back: what it does to the correction: pixel shuffle.
-        adds_image: whether the image is added to the result (the global add), in the host's float numbers.
-        last: what it does to the sum: pixel shuffle. An image of one channel is added to each of the sum's.
+        adds_image: whether the image is added to the result (the global add), in the host's float
+            numbers.
+        last: what it does to the sum: pixel shuffle. An image of one channel is added to each of
+            the sum's.
         flat: whether the result is (N, K) rather than an image.
         softmax: whether the host makes probabilities of the result, along its channels.
         tail: what else it does to the result, as the nodes that it is.
@@ -68,9 +73,11 @@ def refused_graph(expected: str, got: str, remedy: str = "") -> ModelError:
 
 
 def cut(graph: Graph, channels: int, flat: bool, softmax: bool) -> Network:
-    """The network of operations from `IMAGE` to `CORRECTION`: what the host does at both ends is taken off.
+    """The network of operations from `IMAGE` to `CORRECTION`: what the host does at both ends is
+    taken off.
 
-    Pixel shuffles there move values and cost the host next to nothing; DPUs have been seen to compute them wrongly.
+    Pixel shuffles there move values and cost the host next to nothing; DPUs have been seen to
+    compute them wrongly.
     """
     graph, last = _without_shuffles(graph)
     end = graph[-1] if graph else None
@@ -90,7 +97,8 @@ def cut(graph: Graph, channels: int, flat: bool, softmax: bool) -> Network:
 
 
 def _image_for_convolutions(graph: Graph, channels: int) -> Graph:
-    """The graph in which convolutions alone read the image: whatever else does gets it from one that copies it.
+    """The graph in which convolutions alone read the image: whatever else does gets it from one
+    that copies it.
 
     So the image enters in all its planes, and its copy among the features has a scale of its own.
     """
@@ -98,7 +106,10 @@ def _image_for_convolutions(graph: Graph, channels: int) -> Graph:
         return graph
     weight = np.eye(channels, dtype=np.float32)[:, :, None, None]
     copy = Conv(f"{IMAGE}.copy", IMAGE, f"{IMAGE}.copied", weight, np.zeros(channels, np.float32))
-    others = (op if isinstance(op, Conv) and not op.transposed else renamed(op, {IMAGE: copy.output}) for op in graph)
+    others = (
+        op if isinstance(op, Conv) and not op.transposed else renamed(op, {IMAGE: copy.output})
+        for op in graph
+    )
     return (copy, *others)
 
 
@@ -133,7 +144,9 @@ def renamed(op: Op, names: Mapping[str, str]) -> Op:
 
 
 def named_apart(ops: Sequence[Op], ends: Mapping[str, str]) -> Graph:
-    """The operations with these names for the ends, and with others where ours would mean something else."""
+    """The operations with these names for the ends, and with others where ours would mean something
+    else.
+    """
     names = {op.output: f"net.{op.output}" for op in ops if _is_ours(op.output)} | dict(ends)
     moved = (renamed(op, names) for op in ops)
     return tuple(replace(op, name=f"net.{op.name}") if _is_ours(op.name) else op for op in moved)  # type: ignore[type-var]
@@ -149,16 +162,25 @@ def check_network(network: Network) -> None:
     """Refuse what cannot be quantised, before anything is computed."""
     graph = network.graph
     if not graph or graph[-1].output != CORRECTION:
-        raise refused_graph("a last operation that writes the result", graph[-1].name if graph else "no operation")
+        raise refused_graph(
+            "a last operation that writes the result", graph[-1].name if graph else "no operation"
+        )
     if network.tail and (network.adds_image or network.flat or network.softmax):
         expected = "nothing behind the global add, a Flatten or a Softmax at the end"
         raise refused_graph(expected, str(network.tail.graph.node[0].name))
     widths = channels_of(graph, {IMAGE: network.core_channels})
     for op in graph:
         if isinstance(op, Shuffle) and not op.up and op.columns_first and widths[op.input] > 1:
-            remedy = "put it at the network's start, where the host does it, or take a strided convolution"
-            raise refused_graph("pixel unshuffle of several channels at the image alone", op.name, remedy)
-        if isinstance(op, Conv) and not (np.isfinite(op.weight).all() and np.isfinite(op.bias).all()):
+            remedy = (
+                "put it at the network's start, where the host does it, or take a strided "
+                "convolution"
+            )
+            raise refused_graph(
+                "pixel unshuffle of several channels at the image alone", op.name, remedy
+            )
+        if isinstance(op, Conv) and not (
+            np.isfinite(op.weight).all() and np.isfinite(op.bias).all()
+        ):
             raise refused_graph("finite weights", f"NaN or infinity in {op.name}")
 
 
@@ -169,7 +191,9 @@ def sized(graph: Graph, size: Pair) -> Graph:
     for op in graph:
         read = sizes[op.inputs[0]]
         if any(sizes[name] != read for name in op.inputs):
-            found_sizes = " and ".join(f"{rows} x {columns}" for rows, columns in (sizes[name] for name in op.inputs))
+            found_sizes = " and ".join(
+                f"{rows} x {columns}" for rows, columns in (sizes[name] for name in op.inputs)
+            )
             raise refused_graph(f"tensors of one size for {op.name}", found_sizes)
         if isinstance(op, AveragePool) and op.kernel is None:
             op = replace(op, kernel=read)
@@ -187,7 +211,11 @@ def _size(op: Op, read: Pair) -> Pair:
     if isinstance(op, Resize):
         return read[0] * op.factor, read[1] * op.factor
     if isinstance(op, Shuffle):
-        return (read[0] * op.block, read[1] * op.block) if op.up else (read[0] // op.block, read[1] // op.block)
+        return (
+            (read[0] * op.block, read[1] * op.block)
+            if op.up
+            else (read[0] // op.block, read[1] // op.block)
+        )
     return read
 
 
@@ -210,12 +238,16 @@ def add_channels(widths: dict[str, int], ops: Iterable[Op]) -> None:
 def _width(op: Op, read: list[int]) -> int:
     if isinstance(op, HasWeight):  # in float or in whole numbers
         if read[0] != op.weight.shape[1] * op.groups:
-            raise refused_graph(f"{op.weight.shape[1] * op.groups} channels for {op.name}", f"{read[0]}")
+            raise refused_graph(
+                f"{op.weight.shape[1] * op.groups} channels for {op.name}", f"{read[0]}"
+            )
         return len(op.weight)
     if isinstance(op, Concat):
         return sum(read)
     if isinstance(op, Add | Mul) and len(set(read)) > 1:
-        raise refused_graph(f"two tensors of one width for {op.name}", f"{read[0]} and {read[1]} channels")
+        raise refused_graph(
+            f"two tensors of one width for {op.name}", f"{read[0]} and {read[1]} channels"
+        )
     if isinstance(op, Shuffle):
         if op.up and read[0] % op.block**2:
             raise refused_graph(f"a multiple of {op.block**2} channels for {op.name}", f"{read[0]}")

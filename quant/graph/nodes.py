@@ -1,7 +1,8 @@
-"""An ONNX file read once: its nodes with their attributes, kinds and windows, and its constants as arrays.
+"""An ONNX file read once: its nodes with their attributes, kinds and windows, and its constants as
+arrays.
 
-Nothing is refused here: `quantize` takes a short list of operations of it, tiling what it can prove, `check` all,
-with the sizes of what each node computes of one image.
+Nothing is refused here: `quantize` takes a short list of operations of it, tiling what it can
+prove, `check` all, with the sizes of what each node computes of one image.
 """
 
 from collections import Counter, defaultdict
@@ -24,9 +25,23 @@ from beers_deploy.quant.untrusted import LIST_VALUES
 Pair = tuple[int, int]
 """Of rows and columns."""
 Kind = Literal[
-    "conv", "grouped conv", "depthwise", "transposed", "add", "mul", "pool", "activation", "concat", "pad", "resize",
-    "pixel shuffle", "argmax", "quantise", "dequantise", "other",
-]  # fmt: skip
+    "conv",
+    "grouped conv",
+    "depthwise",
+    "transposed",
+    "add",
+    "mul",
+    "pool",
+    "activation",
+    "concat",
+    "pad",
+    "resize",
+    "pixel shuffle",
+    "argmax",
+    "quantise",
+    "dequantise",
+    "other",
+]
 POOLS = ("AveragePool", "GlobalAveragePool")
 OPERATORS: dict[Kind, tuple[str, ...]] = {
     "conv": ("Conv", "QLinearConv"),
@@ -43,14 +58,18 @@ OPERATORS: dict[Kind, tuple[str, ...]] = {
     "activation": ("Relu", "LeakyRelu", "QLinearLeakyRelu", "PRelu", "HardSigmoid", "HardSwish"),
     "pool": ("MaxPool", *POOLS, *(f"QLinear{pool}" for pool in POOLS), "GlobalMaxPool"),
 }
-KINDS: dict[str, Kind] = {op_type: kind for kind, op_types in OPERATORS.items() for op_type in op_types}
+KINDS: dict[str, Kind] = {
+    op_type: kind for kind, op_types in OPERATORS.items() for op_type in op_types
+}
 WEIGHTS = {"Conv": 1, "ConvInteger": 1, "ConvTranspose": 1, "QLinearConv": 3}
 """Operator, and which input holds its weights."""
 
 
 @dataclass(frozen=True)
 class Window:
-    """What a convolution or a pool reads for one output pixel; pairs are (height, width), axis 0 is the height."""
+    """What a convolution or a pool reads for one output pixel; pairs are (height, width), axis 0 is
+    the height.
+    """
 
     kernel: Pair = (1, 1)
     stride: Pair = (1, 1)
@@ -63,20 +82,32 @@ class Window:
         return (self.kernel[axis] - 1) * self.dilation[axis] + 1
 
     def slid(self, axis: int, size: int, ceil: bool = False) -> int:
-        """How many places it has on so many pixels; with `ceil` the last may reach beyond the padding."""
+        """How many places it has on so many pixels; with `ceil` the last may reach beyond the
+        padding.
+        """
         stride = self.stride[axis]
         before = self.pads[axis]
         room = size + before + self.pads[axis + 2] - self.extent(axis)
-        return min(-(-room // stride), (size + before - 1) // stride) + 1 if ceil else room // stride + 1
+        return (
+            min(-(-room // stride), (size + before - 1) // stride) + 1
+            if ceil
+            else room // stride + 1
+        )
 
     def put_down(self, axis: int, size: int) -> int:
-        """How many pixels it makes of so many where it is put down at each, as a transposed convolution does."""
+        """How many pixels it makes of so many where it is put down at each, as a transposed
+        convolution does.
+        """
         beyond = self.output_padding[axis] - self.pads[axis] - self.pads[axis + 2]
         return self.stride[axis] * (size - 1) + self.extent(axis) + beyond
 
     def padded(self, auto_pad: str, size: Pair) -> "Window":
-        """With the pads that `auto_pad` asks for on such a map: as many places as size / stride, rounded up."""
-        total = [0, 0] if auto_pad == "VALID" else [self._lacking(axis, size[axis]) for axis in (0, 1)]
+        """With the pads that `auto_pad` asks for on such a map: as many places as size / stride,
+        rounded up.
+        """
+        total = (
+            [0, 0] if auto_pad == "VALID" else [self._lacking(axis, size[axis]) for axis in (0, 1)]
+        )
         less = [t // 2 for t in total]
         more = [t - t // 2 for t in total]
         begin, end = (more, less) if auto_pad == "SAME_LOWER" else (less, more)
@@ -102,7 +133,9 @@ class Node:
         """What a file holds of it, which may define functions."""
         name = proto.name or proto.output[0]
         op_type = operator_name(proto, functions)
-        return cls(op_type, name, tuple(proto.input), tuple(proto.output), attributes_of(proto), proto)
+        return cls(
+            op_type, name, tuple(proto.input), tuple(proto.output), attributes_of(proto), proto
+        )
 
     def __str__(self) -> str:
         return f"{self.op_type} {self.name}"
@@ -112,10 +145,15 @@ class Node:
 
         Args:
             kernel: of its weights; what it states where there are none.
-            size: of the map that it reads, or any that is smaller or larger by whole strides: for `auto_pad`.
+            size: of the map that it reads, or any that is smaller or larger by whole strides: for
+                `auto_pad`.
         """
         given = self.attributes.get
-        sides = kernel or given("kernel_shape", ()), given("strides", (1, 1)), given("dilations", (1, 1))
+        sides = (
+            kernel or given("kernel_shape", ()),
+            given("strides", (1, 1)),
+            given("dilations", (1, 1)),
+        )
         pads = given("pads", (0, 0, 0, 0))
         beyond = given("output_padding", (0, 0))
         if [len(each) for each in (*sides, pads, beyond)] != [2, 2, 2, 4, 2]:
@@ -123,7 +161,11 @@ class Node:
         (rows, columns), stride, dilation = sides
         window = Window((rows, columns), tuple(stride), tuple(pads), tuple(dilation), tuple(beyond))
         auto_pad = given("auto_pad", "NOTSET")
-        return window.padded(auto_pad, size) if auto_pad in ("VALID", "SAME_UPPER", "SAME_LOWER") else window
+        return (
+            window.padded(auto_pad, size)
+            if auto_pad in ("VALID", "SAME_UPPER", "SAME_LOWER")
+            else window
+        )
 
 
 class OnnxGraph:
@@ -142,9 +184,15 @@ class OnnxGraph:
         self.constants = constants(model)
         functions = functions_of(model)
         own = (Node.of(node, functions) for node in model.graph.node)
-        self.nodes = tuple(node for node in (own if nodes is None else nodes) if node.op_type != "Constant")
-        inputs = {v.name: v.type.tensor_type for v in model.graph.input if v.name not in self.constants}
-        self.inputs = {name: [dim.dim_value for dim in tensor.shape.dim] for name, tensor in inputs.items()}
+        self.nodes = tuple(
+            node for node in (own if nodes is None else nodes) if node.op_type != "Constant"
+        )
+        inputs = {
+            v.name: v.type.tensor_type for v in model.graph.input if v.name not in self.constants
+        }
+        self.inputs = {
+            name: [dim.dim_value for dim in tensor.shape.dim] for name, tensor in inputs.items()
+        }
         self.types = {name: tensor.elem_type for name, tensor in inputs.items()}
         self.outputs = tuple(value.name for value in model.graph.output)
 
@@ -169,8 +217,12 @@ class OnnxGraph:
         """A constant that a node reads, None where it reads none there."""
         return self.constants.get(node.inputs[place]) if place < len(node.inputs) else None
 
-    def numbers(self, node: Node, place: int, key: str, otherwise: Sequence[float] = ()) -> list[Any] | None:
-        """What a node states in a constant input or, of older opsets, in an attribute; None where it is computed."""
+    def numbers(
+        self, node: Node, place: int, key: str, otherwise: Sequence[float] = ()
+    ) -> list[Any] | None:
+        """What a node states in a constant input or, of older opsets, in an attribute; None where
+        it is computed.
+        """
         if place < len(node.inputs) and node.inputs[place]:
             value = self.value(node, place)
             return None if value is None else list(value.ravel().tolist())
@@ -225,7 +277,11 @@ def out_shape(
         return (sum(shape[0] for shape in known), first[1], first[2])
     if kind in ("add", "mul") or node.op_type == "Where":
         return (max(s[0] for s in known), max(s[1] for s in known), max(s[2] for s in known))
-    return first if kind in ("activation", "quantise", "dequantise") else _inferred(node, known, constants)
+    return (
+        first
+        if kind in ("activation", "quantise", "dequantise")
+        else _inferred(node, known, constants)
+    )
 
 
 def _inferred(node: Node, known: list[Shape], constants: Mapping[str, np.ndarray]) -> Shape | None:
@@ -236,7 +292,9 @@ def _inferred(node: Node, known: list[Shape], constants: Mapping[str, np.ndarray
     for name in filter(None, node.inputs):
         if name in constants:
             value = constants[name]
-            types[name] = helper.make_tensor_type_proto(helper.np_dtype_to_tensor_dtype(value.dtype), value.shape)
+            types[name] = helper.make_tensor_type_proto(
+                helper.np_dtype_to_tensor_dtype(value.dtype), value.shape
+            )
             if value.size <= LIST_VALUES:  # weights are longer, and say nothing of sizes
                 data[name] = numpy_helper.from_array(value)
         elif (shape := next(shapes, None)) is not None:
@@ -246,7 +304,9 @@ def _inferred(node: Node, known: list[Shape], constants: Mapping[str, np.ndarray
     try:
         schema = onnx.defs.get_schema(node.op_type, OPSET)
         opsets = [helper.make_opsetid("", OPSET)]
-        found = shape_inference.infer_node_outputs(schema, node.proto, types, data, opset_imports=opsets)
+        found = shape_inference.infer_node_outputs(
+            schema, node.proto, types, data, opset_imports=opsets
+        )
         sizes = [d.dim_value for d in found[node.outputs[0]].tensor_type.shape.dim]
     except CODE_FAULTS:  # a version of onnx that lacks this call would make every size unknown
         raise

@@ -1,4 +1,5 @@
-"""The short list of operations that a DPU computes, and what quantisation works on: a network as a tuple of them.
+"""The short list of operations that a DPU computes, and what quantisation works on: a network as a
+tuple of them.
 
 Every operation reads and writes tensors (N, C, H, W) by their names, each written once.
 """
@@ -48,7 +49,9 @@ class Activation(StrEnum):
 
     @property
     def homogeneous(self) -> bool:
-        """Whether f(k x) = k f(x) for k above 0: what lets factors pass, as ReLU6 does once its six is scaled."""
+        """Whether f(k x) = k f(x) for k above 0: what lets factors pass, as ReLU6 does once its six
+        is scaled.
+        """
         return self in (Activation.none, Activation.relu, Activation.leaky_relu)
 
 
@@ -60,7 +63,9 @@ _FUNCTIONS: Mapping[Activation, Callable[[np.ndarray], np.ndarray]] = {
     Activation.none: lambda values: values,
     Activation.relu: lambda values: np.maximum(values, 0),
     Activation.relu6: lambda values: np.clip(values, 0, 6),
-    Activation.leaky_relu: lambda values: np.where(values < 0, values * values.dtype.type(LEAKY_SLOPE), values),
+    Activation.leaky_relu: lambda values: np.where(
+        values < 0, values * values.dtype.type(LEAKY_SLOPE), values
+    ),
     Activation.hard_sigmoid: _hard_sigmoid,
     Activation.hard_swish: lambda values: values * _hard_sigmoid(values),
     Activation.saturated_relu: lambda values: values,
@@ -101,7 +106,9 @@ Graph = tuple[Op, ...]
 
 @dataclass(frozen=True)
 class Window:
-    """How a window moves over the image: strides and dilations (rows, columns); pads top, left, bottom, right."""
+    """How a window moves over the image: strides and dilations (rows, columns); pads top, left,
+    bottom, right.
+    """
 
     strides: Pair = (1, 1)
     pads: tuple[int, int, int, int] = (0, 0, 0, 0)
@@ -109,7 +116,9 @@ class Window:
 
 
 def same(weight: np.ndarray) -> Window:
-    """Of stride 1, with the padding that keeps the size: for weights (O, I, kh, kw) of odd sides."""
+    """Of stride 1, with the padding that keeps the size: for weights (O, I, kh,
+    kw) of odd sides.
+    """
     rows = weight.shape[2] // 2
     columns = weight.shape[3] // 2
     return Window(pads=(rows, columns, rows, columns))
@@ -131,10 +140,11 @@ class OneInput:
 
 @dataclass(frozen=True)
 class Conv(OneInput):
-    """A convolution with zero padding and an activation; `groups` is 1, or as many as channels (depthwise).
+    """A convolution with zero padding and an activation; `groups` is 1, or as many as channels
+    (depthwise).
 
-    Transposed, its weights stay (O, I, kh, kw), O the channels that it writes, and `window` is ONNX's: its strides
-    enlarge, its pads cut.
+    Transposed, its weights stay (O, I, kh, kw), O the channels that it writes, and `window` is
+    ONNX's: its strides enlarge, its pads cut.
     """
 
     weight: np.ndarray  # (O, I / groups, kh, kw) float32
@@ -143,7 +153,9 @@ class Conv(OneInput):
     window: Window = field(default_factory=Window)
     groups: int = 1
     transposed: bool = False
-    ceiling: np.ndarray | None = None  # (O,) where ReLU6 clips each channel once they are scaled; None at 6
+    ceiling: np.ndarray | None = (
+        None  # (O,) where ReLU6 clips each channel once they are scaled; None at 6
+    )
     offset: float = 0.0  # taken off the result behind its ReLU: 128 units of int8, or nothing
 
     @property
@@ -191,7 +203,9 @@ class MaxPool(OneInput):
 
 @dataclass(frozen=True)
 class AveragePool(OneInput):
-    """The mean of each window, padding counted as zeros; `kernel` None is the whole image (global pooling)."""
+    """The mean of each window, padding counted as zeros; `kernel` None is the whole image (global
+    pooling).
+    """
 
     kernel: Pair | None
     window: Window = field(default_factory=Window)
@@ -207,9 +221,11 @@ class Resize(OneInput):
 
 @dataclass(frozen=True)
 class Shuffle(OneInput):
-    """Pixel shuffle: blocks of block^2 channels become block x block pixels; or, `up` False, the other way round.
+    """Pixel shuffle: blocks of block^2 channels become block x block pixels; or, `up` False, the
+    other way round.
 
-    `columns_first` is torch's order of the channels (ONNX's CRD), without it ONNX's own (DCR, and SpaceToDepth).
+    `columns_first` is torch's order of the channels (ONNX's CRD), without it ONNX's own (DCR, and
+    SpaceToDepth).
     """
 
     block: int
@@ -238,7 +254,9 @@ class Shuffle(OneInput):
 
 @dataclass(frozen=True)
 class Pointwise(OneInput):
-    """An activation by itself: a function of each value, which the integer core keeps as a table of 256."""
+    """An activation by itself: a function of each value, which the integer core keeps as a table of
+    256.
+    """
 
     activation: Activation
 
@@ -247,7 +265,9 @@ TYING = (Concat, MaxPool, AveragePool, Resize, Shuffle)
 
 
 def ties_scales(op: Op) -> bool:
-    """Whether all that an operation reads and writes has one scale, as the DPU wants of what hands values on."""
+    """Whether all that an operation reads and writes has one scale, as the DPU wants of what hands
+    values on.
+    """
     return isinstance(op, TYING)
 
 
@@ -267,7 +287,9 @@ def united(links: Iterable[Iterable[str]]) -> dict[str, str]:
 
 
 def tied(graph: Graph) -> dict[str, str]:
-    """For every tensor, the first of those that must share its scale: by concat, pooling, resizing, shuffling."""
+    """For every tensor, the first of those that must share its scale: by concat, pooling, resizing,
+    shuffling.
+    """
     alone = [(name,) for op in graph for name in (*op.inputs, op.output)]
     return united([*alone, *((*op.inputs, op.output) for op in graph if ties_scales(op))])
 
@@ -283,8 +305,10 @@ def relu_count(graph: Graph) -> int:
 
 
 PLANES = "planes"
-"""How an image of 12 bits enters a network of int8: each channel a coarse plane, its remainder, and a third for finer
-weights, (N, C, H, W) to (N, 3 C, H, W), all coarse planes first. Convolutions alone read them."""
+"""How an image of 12 bits enters a network of int8: each channel a coarse plane, its remainder, and
+a third for finer weights, (N, C, H, W) to (N, 3 C, H, W), all coarse planes first. Convolutions
+alone read them.
+"""
 STEP = 32
 COARSE_MAX = 127
 QUARTER = 4
@@ -303,12 +327,22 @@ def split(image: np.ndarray, count: int = COUNT) -> np.ndarray:
 
 
 def read_planes(graph: Graph) -> Graph:
-    """The same graph, the convolutions that read the image reading the planes (as q * 2^-7) instead."""
-    return tuple(_reads_planes(op) if isinstance(op, Conv) and op.input == IMAGE else op for op in graph)
+    """The same graph, the convolutions that read the image reading the planes (as q * 2^-7)
+    instead.
+    """
+    return tuple(
+        _reads_planes(op) if isinstance(op, Conv) and op.input == IMAGE else op for op in graph
+    )
 
 
 def _reads_planes(op: Conv) -> Conv:
     unit = np.float32(2.0**PLANES_FRAC_BITS / MAX_DN)
-    weight = op.weight if op.groups == 1 else op.weight * np.eye(op.groups, dtype=np.float32)[:, :, None, None]
+    weight = (
+        op.weight
+        if op.groups == 1
+        else op.weight * np.eye(op.groups, dtype=np.float32)[:, :, None, None]
+    )
     planes = [weight * (STEP * unit), weight * unit, np.zeros_like(weight)]
-    return replace(op, input=PLANES, weight=np.concatenate(planes, axis=1).astype(np.float32), groups=1)
+    return replace(
+        op, input=PLANES, weight=np.concatenate(planes, axis=1).astype(np.float32), groups=1
+    )

@@ -1,8 +1,10 @@
-"""Which nodes of a file compute on integers, with which scales, and which nodes are mere notation for that.
+"""Which nodes of a file compute on integers, with which scales, and which nodes are mere notation
+for that.
 
-A tensor holds one of four things: float numbers that the host computes with; "int8", written by QuantizeLinear, a
-cast or an integer kernel (or the same numbers as uint8 around 128); int8 "seen" as float, behind DequantizeLinear; or
-a "wide" sum of products of such, on its way to a QuantizeLinear.
+A tensor holds one of four things: float numbers that the host computes with; "int8", written by
+QuantizeLinear, a cast or an integer kernel (or the same numbers as uint8 around 128); int8 "seen"
+as float, behind DequantizeLinear; or a "wide" sum of products of such, on its way to a
+QuantizeLinear.
 """
 
 import math
@@ -58,10 +60,21 @@ def stated(node: Node, graph: OnnxGraph) -> Iterator[tuple[str, Scale]]:
         name = node.outputs[0] if place == RESULT else node.inputs[place]
         scales = graph.constants.get(node.inputs[scale], np.zeros(0))
         zeros = graph.value(node, zero_point)
-        if zeros is None:  # around 0, of the constant's own type, the one that is asked for, or ONNX's default
-            asked = helper.tensor_dtype_to_np_dtype(node.attributes.get("output_dtype") or TensorProto.UINT8)
+        if (
+            zeros is None
+        ):  # around 0, of the constant's own type, the one that is asked for, or ONNX's default
+            asked = helper.tensor_dtype_to_np_dtype(
+                node.attributes.get("output_dtype") or TensorProto.UINT8
+            )
             zeros = np.zeros(1, graph.constants[name].dtype if name in graph.constants else asked)
-        yield name, Scale(tuple(scales.astype(float).ravel()), tuple(map(int, zeros.ravel())), str(zeros.dtype))
+        yield (
+            name,
+            Scale(
+                tuple(scales.astype(float).ravel()),
+                tuple(map(int, zeros.ravel())),
+                str(zeros.dtype),
+            ),
+        )
 
 
 BYTES = (TensorProto.INT8, TensorProto.UINT8)
@@ -88,7 +101,9 @@ class Integers:
         self._wide: set[str] = set()
         self._seen: dict[str, str] = {}  # and the int8 tensor that each is
         self._same: dict[str, str] = {}  # notation, and what it stands for
-        self._formats: dict[str, tuple[Scale, ...]] = {}  # the writer's first, then whatever contradicts it
+        self._formats: dict[
+            str, tuple[Scale, ...]
+        ] = {}  # the writer's first, then whatever contradicts it
         self._becomes = self._rounded()
         for node in graph.nodes:
             self._read_formats(node)
@@ -105,7 +120,9 @@ class Integers:
         return self._constants.get(self.resolve(name))
 
     def weight(self, node: Node) -> np.ndarray | None:
-        """The weights of a convolution as stored; None where there are none, or nodes compute them."""
+        """The weights of a convolution as stored; None where there are none, or
+        nodes compute them.
+        """
         place = WEIGHTS.get(node.op_type, len(node.inputs))
         return self.constant(node.inputs[place]) if place < len(node.inputs) else None
 
@@ -140,11 +157,18 @@ class Integers:
         """
         own = dict(stated(node, self._graph))
         numbers = self._numbers(node)
-        found = {role: self._formats.get(self.resolve(name), ()) for role, name in self._tensors(node).items()}
-        return found | {role: (own[n],) if n in own else self._formats.get(n, ()) for role, n in numbers.items()}
+        found = {
+            role: self._formats.get(self.resolve(name), ())
+            for role, name in self._tensors(node).items()
+        }
+        return found | {
+            role: (own[n],) if n in own else self._formats.get(n, ()) for role, n in numbers.items()
+        }
 
     def numbers(self, node: Node) -> dict[str, np.ndarray | None]:
-        """The constants of a node as stored, by role as in `formats`; None for one that other nodes compute."""
+        """The constants of a node as stored, by role as in `formats`; None for one that other nodes
+        compute.
+        """
         return {role: self.constant(name) for role, name in self._numbers(node).items()}
 
     def _operands(self, node: Node) -> tuple[str, ...]:
@@ -165,11 +189,17 @@ class Integers:
         if not self.is_integer(node):
             return names
         if node.op_type in ("Conv", "ConvTranspose", "QLinearConv"):
-            behind = node.inputs[1:] if node.op_type != "QLinearConv" else (node.inputs[3], *node.inputs[8:])
+            behind = (
+                node.inputs[1:]
+                if node.op_type != "QLinearConv"
+                else (node.inputs[3], *node.inputs[8:])
+            )
             names = dict(zip(("weight", "bias"), behind, strict=False))
         elif node.op_type in ELEMENTWISE:
             operands = enumerate(self._operands(node))
-            names = {f"constant {i}": name for i, name in operands if self.constant(name) is not None}
+            names = {
+                f"constant {i}": name for i, name in operands if self.constant(name) is not None
+            }
         return {role: name for role, name in names.items() if name}
 
     def _follow(self, node: Node) -> None:
@@ -178,7 +208,9 @@ class Integers:
         result = node.outputs[0]
         if node.op_type == "DequantizeLinear":
             aliases = self._seen if self.constant(source) is None else self._same
-            aliases[result] = self.resolve(source)  # at once: a chain of aliases would be walked again by each reader
+            aliases[result] = self.resolve(
+                source
+            )  # at once: a chain of aliases would be walked again by each reader
         elif node.op_type == "QuantizeLinear" and source in self._wide:
             self._int8.add(result)
             self._same[result] = self.resolve(source)
@@ -187,7 +219,11 @@ class Integers:
             self._int8.update(node.outputs)
             if result not in self._formats and source in self._formats:
                 self._give(result, self._formats[source][0])
-        elif node.op_type != "Cast" and result in self._becomes and self._reads(node, self._wide, self._seen):
+        elif (
+            node.op_type != "Cast"
+            and result in self._becomes
+            and self._reads(node, self._wide, self._seen)
+        ):
             self._wide.update(node.outputs)
 
     def _writes_int8(self, node: Node) -> bool:
@@ -198,7 +234,11 @@ class Integers:
 
     def _reads(self, node: Node, *tensors: Container[str]) -> bool:
         """Whether all that it reads is among these, constants left out, and there is any."""
-        names = [name for name in map(self.resolve, filter(None, node.inputs)) if name not in self._constants]
+        names = [
+            name
+            for name in map(self.resolve, filter(None, node.inputs))
+            if name not in self._constants
+        ]
         return bool(names) and all(any(name in each for each in tensors) for name in names)
 
     def _rounded(self) -> dict[str, str]:
@@ -216,7 +256,9 @@ class Integers:
         return found
 
     def _read_formats(self, node: Node) -> None:
-        """A constant's format is its reader's own: two nodes may read the same bytes at two scales."""
+        """A constant's format is its reader's own: two nodes may read the same
+        bytes at two scales.
+        """
         for name, scale in stated(node, self._graph):
             if name not in self._constants:
                 self._give(self.resolve(name), scale)

@@ -51,7 +51,9 @@ def read_network(model: onnx.ModelProto) -> Network:
     with contradictions("float model"):
         body, tail = without_tail(model, {*READERS, *ACTIVATIONS})
         reader = _Reader(body)
-        network = replace(cut(reader.graph(), reader.channels(), reader.flat, reader.softmax), tail=tail)
+        network = replace(
+            cut(reader.graph(), reader.channels(), reader.flat, reader.softmax), tail=tail
+        )
         check_network(network)
     return network
 
@@ -59,14 +61,17 @@ def read_network(model: onnx.ModelProto) -> Network:
 def plain_network(model: onnx.ModelProto) -> Network:
     """A network of ConvBEERS' kind: what proofs, the stress battery and bit flips take.
 
-    It adds a correction to an image of one channel, and computes it by same-size convolutions of stride 1, ReLU and
-    adds; at full resolution, or at a lower one, with the image's pixels rearranged into channels and back.
+    It adds a correction to an image of one channel, and computes it by same-size convolutions of
+    stride 1, ReLU and adds; at full resolution, or at a lower one, with the image's pixels
+    rearranged into channels and back.
     """
     network = read_network(model)
     blocks = [[shuffle.block for shuffle in end] for end in (network.front, network.back)]
     same_ends = network == Network(network.graph, front=network.front, back=network.back)
     if not (same_ends and blocks[0] == blocks[1] and len(blocks[0]) <= 1):
-        raise refused_graph("an image of one channel, and a global add of it at the end", "another network")
+        raise refused_graph(
+            "an image of one channel, and a global add of it at the end", "another network"
+        )
     for op in network.graph:
         if not _is_plain(op):
             raise refused_graph("only same-size convolutions of stride 1, ReLU and adds", op.name)
@@ -87,7 +92,9 @@ def correction_graph(model: onnx.ModelProto) -> Graph:
 
 def image_channels(graph: Graph) -> int:
     """Channels of the image as such operations read it: S^2, the pixels of a place."""
-    return next(int(op.weight.shape[1]) for op in graph if isinstance(op, Conv) and op.input == IMAGE)
+    return next(
+        int(op.weight.shape[1]) for op in graph if isinstance(op, Conv) and op.input == IMAGE
+    )
 
 
 def refusal(model: onnx.ModelProto) -> str:
@@ -120,7 +127,9 @@ class _Reader:
         return sizes[1] or 1
 
     def graph(self) -> Graph:
-        """The operations from the network's own input to its own output; global pooling takes one size of image."""
+        """The operations from the network's own input to its own output; global pooling takes one
+        size of image.
+        """
         if len(self.source.outputs) != 1:
             got = f"{len(self.source.outputs)}: {', '.join(self.source.outputs)}"
             raise refused_graph("one output", got, "export it with one of them")
@@ -132,8 +141,13 @@ class _Reader:
         pools = [op for op in graph if isinstance(op, AveragePool) and op.kernel is None]
         rows, columns = self.source.inputs[self.image][2:]
         if pools and not (rows and columns):
-            remedy = "export it with fixed height and width: what pools over the whole image has one size"
-            raise refused_graph("images of one size", f"any size, and global pooling at {pools[0].name}", remedy)
+            remedy = (
+                "export it with fixed height and width: what pools over the whole image "
+                "has one size"
+            )
+            raise refused_graph(
+                "images of one size", f"any size, and global pooling at {pools[0].name}", remedy
+            )
         return sized(graph, (rows, columns)) if pools else graph
 
     def _read(self, node: Node) -> None:
@@ -144,7 +158,8 @@ class _Reader:
             remedy = "replace it by one that the DPU computes, or cut the network in front of it"
             if node.op_type == "Pad":
                 remedy = (
-                    "pad in the convolution; a network behind a bank is quantised from its weights (.safetensors)"
+                    "pad in the convolution; a network behind a bank is quantised from its "
+                    "weights (.safetensors)"
                 )
             raise refused_graph("operations that a DPU computes", str(node), remedy)
         op = READERS[node.op_type](self, node)
@@ -182,7 +197,12 @@ class _Reader:
         bias = self.source.value(node, 2)
         if weight is None:
             raise refused_graph("weights that are constants", f"computed ones at {node}")
-        self._require(weight.ndim == 4, node, "convolutions over rows and columns", f"weights of {weight.ndim} sizes")
+        self._require(
+            weight.ndim == 4,
+            node,
+            "convolutions over rows and columns",
+            f"weights of {weight.ndim} sizes",
+        )
         if node.op_type == "ConvTranspose":
             weight = np.ascontiguousarray(weight.swapaxes(0, 1))
         bias = np.zeros(len(weight)) if bias is None else bias
@@ -192,9 +212,16 @@ class _Reader:
         weight, bias = self._weights(node)
         groups = int(node.attributes.get("group", 1))
         depthwise = groups == len(weight) and weight.shape[1] == 1
-        self._require(groups == 1 or depthwise, node, "one group, or one a channel (depthwise)", f"{groups} groups")
+        self._require(
+            groups == 1 or depthwise,
+            node,
+            "one group, or one a channel (depthwise)",
+            f"{groups} groups",
+        )
         _, window = self._window(node, weight.shape[2:])
-        return Conv(node.name, node.inputs[0], node.outputs[0], weight, bias, window=window, groups=groups)
+        return Conv(
+            node.name, node.inputs[0], node.outputs[0], weight, bias, window=window, groups=groups
+        )
 
     def _convtranspose(self, node: Node) -> Op:
         weight, bias = self._weights(node)
@@ -202,11 +229,22 @@ class _Reader:
         strides = node.attributes.get("strides", [1, 1])
         plain = int(given.get("group", 1)) == 1 and not any(given.get("output_padding", [0]))
         self._require(plain, node, "transposed convolutions of one group, without output padding")
-        even = set(given.get("dilations", [1])) == {1} and len(set(strides)) == 1 and "output_shape" not in given
-        self._require(even, node, "transposed convolutions of one stride, undilated, sized by it", f"{list(strides)}")
+        even = (
+            set(given.get("dilations", [1])) == {1}
+            and len(set(strides)) == 1
+            and "output_shape" not in given
+        )
+        self._require(
+            even,
+            node,
+            "transposed convolutions of one stride, undilated, sized by it",
+            f"{list(strides)}",
+        )
         self._require(given.get("auto_pad", "NOTSET") == "NOTSET", node, "stated pads", "auto_pad")
         _, window = self._window(node, weight.shape[2:])
-        return Conv(node.name, node.inputs[0], node.outputs[0], weight, bias, window=window, transposed=True)
+        return Conv(
+            node.name, node.inputs[0], node.outputs[0], weight, bias, window=window, transposed=True
+        )
 
     def _window(self, node: Node, kernel: Sequence[int] = ()) -> tuple[Pair, Window]:
         window = node.window(kernel)
@@ -219,32 +257,54 @@ class _Reader:
 
     def _flatten(self, node: Node) -> None:
         """At the end, where what is flat is (N, K): inside it stays (N, K, 1, 1)."""
-        ends = node.outputs[0] == self.result and bool(self.ops) and node.attributes.get("axis", 1) == 1
-        self._require(ends and self.ops[-1].output == node.inputs[0], node, "Flatten at the end alone")
+        ends = (
+            node.outputs[0] == self.result
+            and bool(self.ops)
+            and node.attributes.get("axis", 1) == 1
+        )
+        self._require(
+            ends and self.ops[-1].output == node.inputs[0], node, "Flatten at the end alone"
+        )
         self._replace(len(self.ops) - 1, renamed(self.ops[-1], {node.inputs[0]: node.outputs[0]}))
         self.flat = True
 
     def _softmax(self, node: Node) -> None:
         """Along the channels, at the end, where the host does it."""
         rest = [each.op_type for each in self.source.readers.get(node.outputs[0], ())]
-        ends = (node.outputs[0] == self.result or rest == ["Flatten"]) and node.attributes.get("axis", -1) in (1, -3)
-        last = bool(self.ops) and self.ops[-1].output == node.inputs[0] and self.source.reads(node.inputs[0]) == 1
+        ends = (node.outputs[0] == self.result or rest == ["Flatten"]) and node.attributes.get(
+            "axis", -1
+        ) in (1, -3)
+        last = (
+            bool(self.ops)
+            and self.ops[-1].output == node.inputs[0]
+            and self.source.reads(node.inputs[0]) == 1
+        )
         self._require(ends and last, node, "Softmax of channels at the end alone")
         self._replace(len(self.ops) - 1, renamed(self.ops[-1], {node.inputs[0]: node.outputs[0]}))
         self.softmax = True
 
     def _add_or_mul(self, node: Node) -> Op:
         kind = Add if node.op_type == "Add" else Mul
-        return self._by_constant(node) or kind(node.name, (node.inputs[0], node.inputs[1]), node.outputs[0])
+        return self._by_constant(node) or kind(
+            node.name, (node.inputs[0], node.inputs[1]), node.outputs[0]
+        )
 
     def _sub(self, node: Node) -> Op | None:
-        """Of a constant; what a convolution wrote is added since the file was folded (`quant.reading`)."""
+        """Of a constant; what a convolution wrote is added since the file was folded
+        (`quant.reading`).
+        """
         op = self._by_constant(node)
-        self._require(op is not None, node, "a difference whose second tensor a convolution writes, for it alone")
+        self._require(
+            op is not None,
+            node,
+            "a difference whose second tensor a convolution writes, for it alone",
+        )
         return op
 
     def _by_constant(self, node: Node) -> Op | None:
-        """A sum, difference or product with one number a channel: a depthwise convolution of one pixel."""
+        """A sum, difference or product with one number a channel: a depthwise convolution of one
+        pixel.
+        """
         found = {k: value for k in (0, 1) if (value := self.source.value(node, k)) is not None}
         if not found:
             return None
@@ -260,8 +320,12 @@ class _Reader:
         each = np.broadcast_to(flat.astype(np.float32), (channels,))
         one = np.ones(channels, np.float32)
         none = np.zeros(channels, np.float32)
-        factor, offset = {"Add": (one, each), "Sub": (one, -each), "Mul": (each, none)}[node.op_type]
-        return Conv(node.name, source, node.outputs[0], factor[:, None, None, None], offset, groups=channels)
+        factor, offset = {"Add": (one, each), "Sub": (one, -each), "Mul": (each, none)}[
+            node.op_type
+        ]
+        return Conv(
+            node.name, source, node.outputs[0], factor[:, None, None, None], offset, groups=channels
+        )
 
     def _concat(self, node: Node) -> Op:
         axis = node.attributes.get("axis")
@@ -288,10 +352,14 @@ class _Reader:
         self._require(sound, node, "a resize by a constant factor of rows and columns")
         factor = int(found.factors[2])
         where = found.where
-        self._require(found.factors[2] == factor >= 1, node, "a whole factor", f"{found.factors[2]:g}")
+        self._require(
+            found.factors[2] == factor >= 1, node, "a whole factor", f"{found.factors[2]:g}"
+        )
         if found.mode == "linear":
             half = where in ("half_pixel", "pytorch_half_pixel") and factor in (2, 4)
-            self._require(half, node, "bilinear by 2 or 4 with half-pixel centres", f"{where} by {factor}")
+            self._require(
+                half, node, "bilinear by 2 or 4 with half-pixel centres", f"{where} by {factor}"
+            )
         else:
             blocks = found.mode == "nearest" and found.makes_blocks(factor)
             got = f"{found.mode}, {where}, {found.rounding} by {factor}"
@@ -309,13 +377,24 @@ class _Reader:
 
     def _activation(self, node: Node) -> None:
         activation = self._which(node)
-        on_sums = activation not in (Activation.hard_sigmoid, Activation.hard_swish)  # before anything is rounded
+        on_sums = activation not in (
+            Activation.hard_sigmoid,
+            Activation.hard_swish,
+        )  # before anything is rounded
         writer = self._places.get(node.inputs[0])
         before = self.ops[writer] if writer is not None else None
-        fusible = isinstance(before, Conv) or (isinstance(before, Add) and activation is Activation.relu)
-        free = getattr(before, "activation", None) is Activation.none and self.source.reads(node.inputs[0]) == 1
-        # The host computes LeakyReLU on a convolution's own sums, which a transposed one has in phases.
-        phased = isinstance(before, Conv) and before.transposed and activation is Activation.leaky_relu
+        fusible = isinstance(before, Conv) or (
+            isinstance(before, Add) and activation is Activation.relu
+        )
+        free = (
+            getattr(before, "activation", None) is Activation.none
+            and self.source.reads(node.inputs[0]) == 1
+        )
+        # The host computes LeakyReLU on a convolution's own sums, which a transposed one has in
+        # phases.
+        phased = (
+            isinstance(before, Conv) and before.transposed and activation is Activation.leaky_relu
+        )
         if on_sums and fusible and free and not phased and writer is not None:
             assert isinstance(before, Conv | Add)  # noqa: S101
             self._replace(writer, replace(before, output=node.outputs[0], activation=activation))
@@ -326,13 +405,21 @@ class _Reader:
         activation = ACTIVATIONS[node.op_type]
         if node.op_type == "LeakyRelu":
             slope = float(node.attributes.get("alpha", 0.01))
-            self._require(slope == np.float32(LEAKY_SLOPE), node, "a slope of 26/256 (0.1015625)", f"{slope:g}")
+            self._require(
+                slope == np.float32(LEAKY_SLOPE),
+                node,
+                "a slope of 26/256 (0.1015625)",
+                f"{slope:g}",
+            )
         if node.op_type == "Clip":
             low, high = (self.source.value(node, k) for k in (1, 2))
             six = low is not None and high is not None and float(low) == 0 and float(high) == 6
             self._require(six, node, "a clip from 0 to 6 (ReLU6)")
         if node.op_type == "HardSigmoid":
-            alpha, beta = (node.attributes.get(key, default) for key, default in (("alpha", 0.2), ("beta", 0.5)))
+            alpha, beta = (
+                node.attributes.get(key, default)
+                for key, default in (("alpha", 0.2), ("beta", 0.5))
+            )
             plain = bool(np.isclose(alpha, 1 / 6, 1e-4)) and beta == 0.5
             self._require(plain, node, "HardSigmoid with alpha 1/6", f"{alpha:g}")
         return activation
@@ -346,7 +433,9 @@ READERS: dict[str, Callable[[_Reader, Node], Op | None]] = {
     "ConvTranspose": _Reader._convtranspose,
     "DepthToSpace": _Reader._shuffle,
     "Flatten": _Reader._flatten,
-    "GlobalAveragePool": lambda _, node: AveragePool(node.name, node.inputs[0], node.outputs[0], None),
+    "GlobalAveragePool": lambda _, node: AveragePool(
+        node.name, node.inputs[0], node.outputs[0], None
+    ),
     "MaxPool": _Reader._maxpool,
     "Mul": _Reader._add_or_mul,
     "Resize": _Reader._resize,

@@ -1,7 +1,8 @@
-"""What a network does behind its last map that a DPU can compute, such as decoding boxes: the host's, in float.
+"""What a network does behind its last map that a DPU can compute, such as decoding boxes: the
+host's, in float.
 
-A detector's file ends in slices, sums with a grid, exponentials and sigmoids. They are kept as the ONNX nodes that
-they are, from `correction` to the result, and written behind the core again.
+A detector's file ends in slices, sums with a grid, exponentials and sigmoids. They are kept as the
+ONNX nodes that they are, from `correction` to the result, and written behind the core again.
 """
 
 import base64
@@ -21,10 +22,31 @@ from beers_deploy.quant.onnx_file import GraphWriter
 from beers_deploy.quant.reading.folding import IR_VERSION, OPSET
 
 PLAIN = {
-    "Add", "Clip", "Concat", "Div", "Exp", "Flatten", "Mul", "Pow", "Reshape", "Sigmoid", "Slice", "Softmax",
-    "Softplus", "Split", "Sqrt", "Squeeze", "Sub", "Tanh", "Transpose", "Unsqueeze",
-}  # fmt: skip
-"""What a tail may hold: value by value, or moving values, so that it costs next to nothing. No weights."""
+    "Add",
+    "Clip",
+    "Concat",
+    "Div",
+    "Exp",
+    "Flatten",
+    "Mul",
+    "Pow",
+    "Reshape",
+    "Sigmoid",
+    "Slice",
+    "Softmax",
+    "Softplus",
+    "Split",
+    "Sqrt",
+    "Squeeze",
+    "Sub",
+    "Tanh",
+    "Transpose",
+    "Unsqueeze",
+}
+"""What a tail may hold: value by value, or moving values, so that it costs next to nothing.
+
+No weights.
+"""
 
 RESULT = "restored"
 """The name of a host file's result."""
@@ -72,14 +94,17 @@ class Tail:
     @cached_property
     def _evaluator(self) -> ReferenceEvaluator:
         opset = [helper.make_opsetid("", OPSET)]
-        return ReferenceEvaluator(helper.make_model(self.graph, opset_imports=opset, ir_version=IR_VERSION))
+        return ReferenceEvaluator(
+            helper.make_model(self.graph, opset_imports=opset, ir_version=IR_VERSION)
+        )
 
 
 def without_tail(model: ModelProto, known: Collection[str]) -> tuple[ModelProto, Tail | None]:
-    """The network up to the map behind which operators begin that are not `known`, and these as its tail.
+    """The network up to the map behind which operators begin that are not `known`, and these as its
+    tail.
 
-    None, and the network as it is, where all are known, where they read more than one map, or where something lies
-    behind them that is not the host's to compute.
+    None, and the network as it is, where all are known, where they read more than one map, or where
+    something lies behind them that is not the host's to compute.
     """
     nodes = [node for node in model.graph.node if node.op_type != "Constant"]
     first = next((k for k, node in enumerate(nodes) if node.op_type not in known), None)
@@ -89,7 +114,9 @@ def without_tail(model: ModelProto, known: Collection[str]) -> tuple[ModelProto,
         return model, None
     held = {tensor.name for tensor in model.graph.initializer}
     read: set[str] = set()
-    for start in range(len(nodes) - 1, 0, -1):  # the tail grows towards the front, one node at a time
+    for start in range(
+        len(nodes) - 1, 0, -1
+    ):  # the tail grows towards the front, one node at a time
         node = nodes[start]
         if node.op_type not in PLAIN:
             break
@@ -103,13 +130,17 @@ def without_tail(model: ModelProto, known: Collection[str]) -> tuple[ModelProto,
     return model, None
 
 
-def _parted(model: ModelProto, nodes: list[NodeProto], tail: list[NodeProto], source: str) -> tuple[ModelProto, Tail]:
+def _parted(
+    model: ModelProto, nodes: list[NodeProto], tail: list[NodeProto], source: str
+) -> tuple[ModelProto, Tail]:
     body = deepcopy(model)
     output = model.graph.output[0]
     del body.graph.node[:], body.graph.output[:]
     body.graph.node.extend(nodes)
     body.graph.output.append(helper.make_tensor_value_info(source, TensorProto.FLOAT, None))
-    names = {name: f"host_tail.{name}" for node in tail for name in (*node.input, *node.output) if name}
+    names = {
+        name: f"host_tail.{name}" for node in tail for name in (*node.input, *node.output) if name
+    }
     names |= {source: CORRECTION, output.name: RESULT}
     kept = [tensor for tensor in model.graph.initializer if tensor.name in names]
     read = onnx.ValueInfoProto(name=CORRECTION)

@@ -1,4 +1,6 @@
-"""The operations as float ONNX: what calibration looks at, and what a board's file holds between its roundings."""
+"""The operations as float ONNX: what calibration looks at, and what a board's file holds between
+its roundings.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -38,7 +40,9 @@ def graph_to_onnx(graph: Graph, outputs: list[str], channels: int = 3) -> onnx.M
                 writer.constant(f"{op.name}.bias", op.bias),
             ]
         write_float(writer, op, feeds, op.output)
-    results = [helper.make_tensor_value_info(n, TensorProto.FLOAT, ["N", "C", None, None]) for n in outputs]
+    results = [
+        helper.make_tensor_value_info(n, TensorProto.FLOAT, ["N", "C", None, None]) for n in outputs
+    ]
     return make_model(writer.graph("core", [image_info(PLANES, channels, None)], results), {})
 
 
@@ -67,7 +71,11 @@ def write_float(w: GraphWriter, op: Op, feeds: Sequence[str], output: str) -> No
         feeds: the names of what it reads; of a convolution with those of its weights and bias.
         output: the name of its result.
     """
-    activation = Activation.none if isinstance(op, Pointwise) else getattr(op, "activation", Activation.none).written
+    activation = (
+        Activation.none
+        if isinstance(op, Pointwise)
+        else getattr(op, "activation", Activation.none).written
+    )
     offset = getattr(op, "offset", 0.0)
     end = output
     if offset:
@@ -76,13 +84,18 @@ def write_float(w: GraphWriter, op: Op, feeds: Sequence[str], output: str) -> No
     _WRITERS[type(op)](w, op, list(feeds), result)
     if isinstance(op, Conv) and op.ceiling is not None:
         w.node("Relu", f"{output}.above_0", [result])
-        ceiling = w.constant(f"{op.name}.ceiling", np.asarray(op.ceiling, np.float32)[:, None, None])
+        ceiling = w.constant(
+            f"{op.name}.ceiling", np.asarray(op.ceiling, np.float32)[:, None, None]
+        )
         w.node("Min", output, [f"{output}.above_0", ceiling], f"{op.name}.{activation.name}")
     elif activation is not Activation.none:
         _activation(w, activation, result, output, f"{op.name}.{activation.name}")
     if offset:
         w.node(
-            "Sub", end, [output, w.constant(f"{op.name}.offset", np.array(offset, np.float32))], f"{op.name}.lowered"
+            "Sub",
+            end,
+            [output, w.constant(f"{op.name}.offset", np.array(offset, np.float32))],
+            f"{op.name}.lowered",
         )
 
 
@@ -104,7 +117,9 @@ def window_attributes(window: Window, groups: int = 1) -> dict[str, Any]:
     return found
 
 
-def _activation(w: GraphWriter, activation: Activation, source: str, output: str, name: str) -> None:
+def _activation(
+    w: GraphWriter, activation: Activation, source: str, output: str, name: str
+) -> None:
     if activation is Activation.relu6:
         limits = [w.constant(f"limit_{value}", np.array(value, np.float32)) for value in (0, 6)]
         w.node("Clip", output, [source, *limits], name)
@@ -126,9 +141,15 @@ def _pool(w: GraphWriter, op: MaxPool | AveragePool, feeds: list[str], output: s
 
 
 def _resize(w: GraphWriter, op: Resize, feeds: list[str], output: str) -> None:
-    scales = w.constant(f"resize_by_{op.factor}", np.array([1, 1, op.factor, op.factor], np.float32))
+    scales = w.constant(
+        f"resize_by_{op.factor}", np.array([1, 1, op.factor, op.factor], np.float32)
+    )
     how = {"mode": "linear", "coordinate_transformation_mode": "half_pixel"}
-    nearest = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+    nearest = {
+        "mode": "nearest",
+        "coordinate_transformation_mode": "asymmetric",
+        "nearest_mode": "floor",
+    }
     w.node("Resize", output, [feeds[0], "", scales], op.name, **(how if op.bilinear else nearest))
 
 
@@ -141,18 +162,24 @@ def write_shuffle(w: GraphWriter, op: Shuffle, source: str, output: str, channel
         w.node("SpaceToDepth", output, [source], op.name, blocksize=op.block)
     else:  # ONNX has its own order only, blocks before channels
         taps = op.block**2
-        order = w.constant(f"{op.name}.order", np.arange(taps * channels).reshape(taps, channels).T.ravel())
+        order = w.constant(
+            f"{op.name}.order", np.arange(taps * channels).reshape(taps, channels).T.ravel()
+        )
         moved = w.node("SpaceToDepth", f"{output}.blocks", [source], op.name, blocksize=op.block)
         w.node("Gather", output, [moved, order], f"{op.name}.channels", axis=1)
 
 
 _WRITERS: dict[type, Callable[..., None]] = {
     Conv: _conv,
-    **dict.fromkeys((Add, Mul), lambda w, op, feeds, output: w.node(type(op).__name__, output, feeds, op.name)),
+    **dict.fromkeys(
+        (Add, Mul), lambda w, op, feeds, output: w.node(type(op).__name__, output, feeds, op.name)
+    ),
     Concat: lambda w, op, feeds, output: w.node("Concat", output, feeds, op.name, axis=1),
     MaxPool: _pool,
     AveragePool: _pool,
     Resize: _resize,
     Shuffle: lambda w, op, feeds, output: write_shuffle(w, op, feeds[0], output),
-    Pointwise: lambda w, op, feeds, output: _activation(w, op.activation, feeds[0], output, op.name),
+    Pointwise: lambda w, op, feeds, output: _activation(
+        w, op.activation, feeds[0], output, op.name
+    ),
 }

@@ -1,7 +1,8 @@
-"""What may be wrong on a board: a layer's results computed again as a faulty board would compute them.
+"""What may be wrong on a board: a layer's results computed again as a faulty board would compute
+them.
 
-Each explanation is a computation. It is given where it makes the integers that the board wrote, in all cases that
-were run; nothing is guessed from the size of a difference.
+Each explanation is a computation. It is given where it makes the integers that the board wrote, in
+all cases that were run; nothing is guessed from the size of a difference.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,13 +26,17 @@ Explanation = tuple[str, Compute]
 
 @dataclass(frozen=True)
 class Seen:
-    """One layer on a board: every sound tensor of the case, and what the board wrote in place of one."""
+    """One layer on a board: every sound tensor of the case, and what the board wrote in place of
+    one.
+    """
 
     tensors: Tensors
     seen: np.ndarray
 
     def unlike(self, made: np.ndarray, shifted: bool = False) -> int:
-        """How many values are not those; of what is `shifted`, its border of a quarter of the side left out."""
+        """How many values are not those; of what is `shifted`, its border of a quarter of the side
+        left out.
+        """
         seen = self.seen
         if shifted:
             rows, columns = (slice(side // 4, side - side // 4) for side in seen.shape[2:])
@@ -46,19 +51,22 @@ SHIFTED = "the tile is shifted by "
 PADDINGS = {"copies of the border": "edge", "a mirror image": "reflect", "-128": "constant"}
 MOST_CHANNELS = 4
 LIKELY = 12
-"""Channels that are looked through for a wrong bit, which shows in one; and weights of each that are tried."""
+"""Channels that are looked through for a wrong bit, which shows in one; and weights of each that
+are tried.
+"""
 HALO_MAX_PX = 16
 SIDES = {"outer": (1, 1, 1, 1), "upper": (1, 0, 0, 0), "left": (0, 1, 0, 0), "lower": (0, 0, 1, 0)}
 SIDES["right"] = (0, 0, 0, 1)
 
 
 def explain(core: IntCore, ops: Sequence[Layer], cases: Sequence[Seen], half_even: bool) -> str:
-    """The fault that gives exactly what a board wrote of one layer; empty where none that is known does.
+    """The fault that gives exactly what a board wrote of one layer; empty where none that is known
+    does.
 
     Args:
         core: of the network.
-        ops: the layers whose results nobody saw, in their order, and last the one that differs; none for the planes
-            that the core reads.
+        ops: the layers whose results nobody saw, in their order, and last the one that differs;
+            none for the planes that the core reads.
         cases: in which its results differ.
         half_even: how a sound board rounds ties: to even, or else up.
     """
@@ -67,7 +75,11 @@ def explain(core: IntCore, ops: Sequence[Layer], cases: Sequence[Seen], half_eve
     best = (MOST_LEFT, "")
     counts = [case.unlike(case.tensors[output]) for case in cases]
     worst = cases[int(np.argmax(counts))]
-    alone = faults.of_layer(ops[-1], worst) if ops else faults.of_tensor(PLANES, lambda known: known[PLANES], worst)
+    alone = (
+        faults.of_layer(ops[-1], worst)
+        if ops
+        else faults.of_tensor(PLANES, lambda known: known[PLANES], worst)
+    )
     for words, compute in chain(alone, faults.before(ops) if len(ops) > 1 else ()):
         shifted = words.startswith(SHIFTED)
         if worst.unlike(compute(worst.tensors), shifted) > MOST_LEFT * max(counts):
@@ -81,7 +93,9 @@ def explain(core: IntCore, ops: Sequence[Layer], cases: Sequence[Seen], half_eve
 
 @dataclass(frozen=True)
 class Faulty:
-    """A network's integers, and how a sound board rounds ties: what faulty boards make of its layers."""
+    """A network's integers, and how a sound board rounds ties: what faulty boards make of its
+    layers.
+    """
 
     core: IntCore
     half_even: bool
@@ -107,20 +121,39 @@ class Faulty:
             yield from self._bits(op, worst)
 
     def of_rules(self, op: Layer) -> Iterator[Explanation]:
-        """Faults of a board's rules, which may be the same in every layer: rounding, saturation, scales, padding."""
+        """Faults of a board's rules, which may be the same in every layer: rounding, saturation,
+        scales, padding.
+        """
         other = replace(self, half_even=not self.half_even).sound(op)
-        yield f"ties are rounded {'up instead of to even' if self.half_even else 'to even instead of up'}", other
+        yield (
+            (
+                "ties are rounded "
+                f"{'up instead of to even' if self.half_even else 'to even instead of up'}"
+            ),
+            other,
+        )
         cut = self._summed(op, lambda sums, shift: saturated(sums >> max(shift, 0)))
         yield "results are cut off instead of rounded", cut
-        away = self._summed(op, lambda sums, by: saturated(np.sign(sums) * rounded(np.abs(sums), by, False)[0]))
+        away = self._summed(
+            op, lambda sums, by: saturated(np.sign(sums) * rounded(np.abs(sums), by, False)[0])
+        )
         yield "ties are rounded away from zero", away
-        wrap = self._summed(op, lambda sums, by: ((self._whole(sums, by) + 128) % 256 - 128).astype(np.int16))
+        wrap = self._summed(
+            op, lambda sums, by: ((self._whole(sums, by) + 128) % 256 - 128).astype(np.int16)
+        )
         yield "results beyond int8 wrap around instead of saturating", wrap
-        short = self._summed(op, lambda sums, by: np.clip(self._whole(sums, by), -INT8_MAX, INT8_MAX))
+        short = self._summed(
+            op, lambda sums, by: np.clip(self._whole(sums, by), -INT8_MAX, INT8_MAX)
+        )
         yield "results saturate at -127 instead of -128", short
         for by, name in product((1, -1, 2, -2), dict.fromkeys((op.output, *op.inputs))):
-            moved = replace(self.core, frac_bits={**self.core.frac_bits, name: self.core.frac_bits[name] + by})
-            yield f"the scale of {name} is taken as 2^{-by} times what it is", replace(self, core=moved).sound(op)
+            moved = replace(
+                self.core, frac_bits={**self.core.frac_bits, name: self.core.frac_bits[name] + by}
+            )
+            yield (
+                f"the scale of {name} is taken as 2^{-by} times what it is",
+                replace(self, core=moved).sound(op),
+            )
         if isinstance(op, IntConv):
             yield from self._of_convolution(op)
 
@@ -132,29 +165,45 @@ class Faulty:
             )
         yield "its bias is not added", self.sound(op, bias=np.zeros_like(op.bias))
         if op.activation.written is not Activation.none:
-            yield f"its activation {op.activation} is missing", self.sound(op, activation=Activation.none)
-        yield "its kernels are turned by half a turn", self.sound(op, weight=op.weight[:, :, ::-1, ::-1])
+            yield (
+                f"its activation {op.activation} is missing",
+                self.sound(op, activation=Activation.none),
+            )
+        yield (
+            "its kernels are turned by half a turn",
+            self.sound(op, weight=op.weight[:, :, ::-1, ::-1]),
+        )
         if not op.transposed and any(op.window.pads):
             inside = self.sound(op, window=Window(op.window.strides, dilations=op.window.dilations))
             for words, mode in PADDINGS.items():
                 yield f"it is padded with {words} instead of zeros", _padded(op, inside, mode)
 
     def of_tensor(self, name: str, meant: Compute, worst: Seen) -> Iterator[Explanation]:
-        """Values that are right, and stand in other channels or places; of the planes also a halo of zeros."""
+        """Values that are right, and stand in other channels or places; of the planes also a halo
+        of zeros.
+        """
         if name == PLANES:
             yield from _halo(meant)
-        of = [_channel_like(worst.tensors[name], worst.seen[:, k], k) for k in range(worst.seen.shape[1])]
+        of = [
+            _channel_like(worst.tensors[name], worst.seen[:, k], k)
+            for k in range(worst.seen.shape[1])
+        ]
         if None not in of:
             moved = ", ".join(f"{each} at {k}" for k, each in enumerate(of) if each != k)
             sources = np.array(of)
-            yield f"channels stand in another order: {moved}", lambda known: meant(known)[:, sources]
+            yield (
+                f"channels stand in another order: {moved}",
+                lambda known: meant(known)[:, sources],
+            )
         yield "rows and columns changed places", lambda known: meant(known).swapaxes(2, 3)
         yield from _shifted(meant)
 
     def _bits(self, op: IntConv, worst: Seen) -> Iterator[Explanation]:
         """One bit of one bias or one weight that is not what it should be."""
         channels = (worst.seen != worst.tensors[op.output]).any((0, 2, 3)).nonzero()[0]
-        for channel, bit in product(map(int, channels[: len(channels) <= MOST_CHANNELS and MOST_CHANNELS]), range(8)):
+        for channel, bit in product(
+            map(int, channels[: len(channels) <= MOST_CHANNELS and MOST_CHANNELS]), range(8)
+        ):
             words = f"bit {bit} of the bias of channel {channel} is flipped"
             yield words, self.sound(op, bias=_flipped(op.bias, (channel,), bit))
             for place in _likely_weights(op, channel, worst):
@@ -162,7 +211,9 @@ class Faulty:
                 yield words, self.sound(op, weight=_flipped(op.weight, place, bit))
 
     def before(self, ops: Sequence[Layer]) -> Iterator[Explanation]:
-        """Faults of what came before a layer: of a rule in all layers, all of a kind or one; or ahead of all."""
+        """Faults of what came before a layer: of a rule in all layers, all of a kind or one; or
+        ahead of all.
+        """
         faults = {op.output: dict(self.of_rules(op)) for op in ops}
 
         def through(wrong: Mapping[str, Compute]) -> Compute:
@@ -174,10 +225,16 @@ class Faulty:
 
             return compute
 
-        kinds = {f"every {kind}": [op for op in ops if _kind(op) == kind] for kind in map(_kind, ops)}
+        kinds = {
+            f"every {kind}": [op for op in ops if _kind(op) == kind] for kind in map(_kind, ops)
+        }
         for place, chosen in {"every layer": ops, **kinds, **{op.name: [op] for op in ops}}.items():
             for words in dict.fromkeys(words for op in chosen for words in faults[op.output]):
-                wrong = {op.output: faults[op.output][words] for op in chosen if words in faults[op.output]}
+                wrong = {
+                    op.output: faults[op.output][words]
+                    for op in chosen
+                    if words in faults[op.output]
+                }
                 yield f"{words}, in {place}", through(wrong)
         if any(PLANES in op.inputs for op in ops):
             yield from chain(_halo(through({})), _shifted(through({})))
@@ -203,27 +260,49 @@ def _halo(meant: Compute) -> Iterator[Explanation]:
     """What surrounds a tile is zeros where the planes come in."""
     for (side, ends), width in product(SIDES.items(), range(1, HALO_MAX_PX + 1)):
 
-        def compute(known: Tensors, pads: tuple[int, ...] = tuple(width * end for end in ends)) -> np.ndarray:
+        def compute(
+            known: Tensors, pads: tuple[int, ...] = tuple(width * end for end in ends)
+        ) -> np.ndarray:
             bare, (height, across) = np.zeros_like(known[PLANES]), known[PLANES].shape[2:]
             inside = ..., slice(pads[0], height - pads[2]), slice(pads[1], across - pads[3])
             bare[inside] = known[PLANES][inside]
             return meant({**known, PLANES: bare})
 
-        yield f"the {side} {width} px of the planes are zeros instead of the tile's surroundings", compute
+        yield (
+            f"the {side} {width} px of the planes are zeros instead of the tile's surroundings",
+            compute,
+        )
 
 
 def _shifted(meant: Compute) -> Iterator[Explanation]:
     """Pixels that lie beside their places."""
-    for down, across in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (2, 0), (-2, 0), (0, 2), (0, -2)):
+    for down, across in (
+        (1, 0),
+        (-1, 0),
+        (0, 1),
+        (0, -1),
+        (1, 1),
+        (-1, -1),
+        (2, 0),
+        (-2, 0),
+        (0, 2),
+        (0, -2),
+    ):
 
         def compute(known: Tensors, by: tuple[int, int] = (down, across)) -> np.ndarray:
             return np.roll(meant(known), by, (2, 3))
 
-        yield SHIFTED + " and ".join(f"{n} px {way}" for n, way in ((down, "down"), (across, "right")) if n), compute
+        yield (
+            SHIFTED
+            + " and ".join(f"{n} px {way}" for n, way in ((down, "down"), (across, "right")) if n),
+            compute,
+        )
 
 
 def _channel_like(right: np.ndarray, channel: np.ndarray, place: int) -> int | None:
-    """The number of the channel of `right` (N, C, H, W) that is the same as one (N, H, W); `place` where it is."""
+    """The number of the channel of `right` (N, C, H, W) that is the same as one (N, H, W); `place`
+    where it is.
+    """
     same = (right == channel[:, None]).all((0, 2, 3))
     if same[place]:
         return place
@@ -239,21 +318,29 @@ def _flipped(values: np.ndarray, place: tuple[int, ...], bit: int) -> np.ndarray
 def _likely_weights(op: IntConv, channel: int, worst: Seen) -> list[tuple[int, ...]]:
     """The weights of a channel with whose inputs the differences go up and down most."""
     difference = (worst.seen - worst.tensors[op.output])[:, channel].astype(np.float64).ravel()
-    count, row = (len(op.weight), channel) if op.groups > 1 else (1, 0)  # kernels that are computed, and which counts
+    count, row = (
+        (len(op.weight), channel) if op.groups > 1 else (1, 0)
+    )  # kernels that are computed, and which counts
     alike: dict[tuple[int, ...], float] = {}
     for place in np.ndindex(*op.weight.shape[1:]):
         alone = np.zeros((count, *op.weight.shape[1:]), np.int8)
         alone[(row, *place)] = 1
         read = convolve(worst.tensors[op.input], alone, op.window, op.groups, op.transposed)[:, row]
         values = read.astype(np.float64).ravel()
-        alike[(channel, *place)] = abs(float(difference @ values)) / (float(np.linalg.norm(values)) or 1.0)
+        alike[(channel, *place)] = abs(float(difference @ values)) / (
+            float(np.linalg.norm(values)) or 1.0
+        )
     return sorted(alike, key=lambda place: -alike[place])[:LIKELY]
 
 
 def where(seen: np.ndarray, meant: np.ndarray) -> str:
-    """Where in tiles (N, C, H, W) results differ: in a channel, along the border, in some rows, or everywhere."""
+    """Where in tiles (N, C, H, W) results differ: in a channel, along the border, in some rows, or
+    everywhere.
+    """
     differing = seen != meant
-    channels, rows, columns = (differing.any(axes).nonzero()[0] for axes in ((0, 2, 3), (0, 1, 3), (0, 1, 2)))
+    channels, rows, columns = (
+        differing.any(axes).nonzero()[0] for axes in ((0, 2, 3), (0, 1, 3), (0, 1, 2))
+    )
     height, width = seen.shape[2:]
     within = "" if len(channels) > 1 or seen.shape[1] == 1 else f" of channel {channels[0]}"
     at = np.argwhere(differing.any((0, 1)))
@@ -263,4 +350,8 @@ def where(seen: np.ndarray, meant: np.ndarray) -> str:
     for name, found, size in (("row", rows, height), ("column", columns, width)):
         if len(found) <= size // 4:
             return f"in {name}s {found[0]} to {found[-1]}{within}"
-    return f"everywhere{within}" if within else f"everywhere, in {len(channels)} of {seen.shape[1]} channels"
+    return (
+        f"everywhere{within}"
+        if within
+        else f"everywhere, in {len(channels)} of {seen.shape[1]} channels"
+    )

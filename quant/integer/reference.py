@@ -1,10 +1,14 @@
-"""The DPU's arithmetic in whole numbers, as documented, independent of any runtime (facts: UG1414 3.5, vai_q).
+"""The DPU's arithmetic in whole numbers, as documented, independent of any runtime (facts: UG1414
+3.5, vai_q).
 
-    convolution: int8 products added in int32, plus bias << shift_bias, ReLU, >> shift_cut rounded, to [-128, 127]
-    add:         the finer input aligned to the coarser, sum shifted by shift_write rounded, to [-128, 127]
+    convolution: int8 products added in int32, plus bias << shift_bias, ReLU,
+                 >> shift_cut rounded, to [-128, 127]
+    add:         the finer input aligned to the coarser, sum shifted by shift_write rounded,
+                 to [-128, 127]
 
-Activations round half up; a runtime that computes in float rounds half to even. Where a shifted sum ends in exactly
-one half the two differ by one unit: `half_even` takes the runtime's rule, so that both can be proven and counted.
+Activations round half up; a runtime that computes in float rounds half to even. Where a shifted sum
+ends in exactly one half the two differ by one unit: `half_even` takes the runtime's rule, so that
+both can be proven and counted.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -46,7 +50,9 @@ INT32_BITS = 31
 """Of an accumulator, without the sign."""
 
 NARROW_BITS = 23
-"""Of a 24-bit accumulator, without the sign: the documents hint at one (facts on the DPU's rules), int32 has 31."""
+"""Of a 24-bit accumulator, without the sign: the documents hint at one (facts on the DPU's rules),
+int32 has 31.
+"""
 BITS_SOURCE = "128 times the sum of the weights' sizes, plus the bias: no input exceeds it"
 
 
@@ -55,9 +61,10 @@ class Faults:
     """What goes wrong while the core runs, or is held in check.
 
     Attributes:
-        shifts: wrong shifts, by operation and field: `shift_cut`, `shift_bias` of a convolution, `shift_write` of an
-            add.
-        touch: what becomes of a tensor, by name, between the operation that writes it and those that read it.
+        shifts: wrong shifts, by operation and field: `shift_cut`, `shift_bias` of a convolution,
+            `shift_write` of an add.
+        touch: what becomes of a tensor, by name, between the operation that writes it and those
+            that read it.
     """
 
     shifts: Mapping[tuple[str, str], int] = field(default_factory=dict)
@@ -78,7 +85,8 @@ class LayerReport:
     Attributes:
         name: of the operation.
         peak_bits: bits that the largest accumulator needed, without the sign.
-        proven_bits: bits that no input can exceed: 128 times the sum of the weights' sizes, plus the bias.
+        proven_bits: bits that no input can exceed: 128 times the sum of the weights' sizes, plus
+            the bias.
         saturated: share of the results that came to int8's ends.
         ties: share of the results whose rounding was decided by tie rounding.
     """
@@ -101,7 +109,9 @@ def run_core(
         whole, ties = rounded(sums, shift, half_even)
         result = saturated(whole)
         tensors[op.output] = faults.touch(op.output, result)
-        relu = getattr(op, "activation", None) is Activation.saturated_relu  # at whose lower end nothing is lost
+        relu = (
+            getattr(op, "activation", None) is Activation.saturated_relu
+        )  # at whose lower end nothing is lost
         ends = (result == INT8_MAX) | ((result == INT8_MIN) & (not relu))
         peak = max(float(np.log2(max(int(np.abs(sums).max()), 1))) - finer, 0.0)
         reports.append(LayerReport(op.name, peak, bound, float(ends.mean()), ties))
@@ -109,7 +119,9 @@ def run_core(
 
 
 def correction(core: IntCore, planes: np.ndarray, half_even: bool = False) -> np.ndarray:
-    """The correction (N, C, H, W), all its copies, as float32 multiples of its scale, of int8 planes (N, P, H, W)."""
+    """The correction (N, C, H, W), all its copies, as float32 multiples of its scale, of int8
+    planes (N, P, H, W).
+    """
     tensors, _ = run_core(core, planes, half_even)
     return np.asarray(tensors[CORRECTION] * np.float32(core.scale(CORRECTION)), np.float32)
 
@@ -121,14 +133,17 @@ def merged_correction(core: IntCore, tensors: Mapping[str, np.ndarray]) -> np.nd
 
 
 Sums = tuple[np.ndarray, int, float, int]
-"""Sums (N, O, H, W) int64, the shift to int8, the bits that accumulators cannot exceed, and by how many more
-fractional bits an activation has made these sums longer than the accumulators were."""
+"""Sums (N, O, H, W) int64, the shift to int8, the bits that accumulators cannot exceed, and by how
+many more fractional bits an activation has made these sums longer than the accumulators were.
+"""
 
 INT8_BITS = 7.0
 """Of what only moves values, without the sign."""
 
 
-def layer_sums(core: IntCore, op: IntConv | Op, tensors: Mapping[str, np.ndarray], faults: Faults = SOUND) -> Sums:
+def layer_sums(
+    core: IntCore, op: IntConv | Op, tensors: Mapping[str, np.ndarray], faults: Faults = SOUND
+) -> Sums:
     """What an operation adds up, before it is rounded to int8.
 
     Args:
@@ -144,7 +159,12 @@ def layer_sums(core: IntCore, op: IntConv | Op, tensors: Mapping[str, np.ndarray
         return _add(core, op, read, faults)
     if isinstance(op, Mul):
         product = read[0].astype(np.int64) * read[1]
-        return product, sum(core.frac_bits[name] for name in op.inputs) - core.frac_bits[op.output], 14.0, 0
+        return (
+            product,
+            sum(core.frac_bits[name] for name in op.inputs) - core.frac_bits[op.output],
+            14.0,
+            0,
+        )
     if isinstance(op, AveragePool):
         return *means(read[0], op), 0
     if isinstance(op, Resize) and op.bilinear:
@@ -210,7 +230,8 @@ class LayerAgreement:
 
     Attributes:
         report: of the integer reference, which rounds ties up, as the DPU does.
-        unequal: share of onnxruntime's results that are not the reference's when that rounds ties to even.
+        unequal: share of onnxruntime's results that are not the reference's when that rounds ties
+            to even.
         moved: share of the results that the DPU's rule changes, here or in a layer before.
         moved_by: the largest of these changes, in units of 2^-n.
     """
@@ -223,7 +244,9 @@ class LayerAgreement:
 
 @dataclass(frozen=True)
 class Agreement:
-    """All operations in order, and the correction (N, C, H, W) of full scale with half up, and to even."""
+    """All operations in order, and the correction (N, C, H, W) of full scale with half up, and to
+    even.
+    """
 
     layers: list[LayerAgreement]
     up: np.ndarray
@@ -239,7 +262,9 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
         image: (N, C, H, W) in [0, 1].
     """
     names = [op.output for op in core.ops]
-    session = open_session(with_outputs(any_size(host), dict.fromkeys(names, onnx.TensorProto.UINT8)))
+    session = open_session(
+        with_outputs(any_size(host), dict.fromkeys(names, onnx.TensorProto.UINT8))
+    )
     stored = session.run(names, {session.get_inputs()[0].name: image})
     up, reports = run_core(core, core.ends.split(image))
     even, _ = run_core(core, core.ends.split(image), half_even=True)
@@ -247,18 +272,24 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
     for name, report, runtime in zip(names, reports, stored, strict=True):
         difference = np.abs(up[name] - even[name])
         unequal = float((runtime.astype(np.int16) - ZERO != even[name]).mean())
-        layers.append(LayerAgreement(report, unequal, float((difference > 0).mean()), int(difference.max())))
+        layers.append(
+            LayerAgreement(report, unequal, float((difference > 0).mean()), int(difference.max()))
+        )
     return Agreement(layers, merged_correction(core, up), merged_correction(core, even))
 
 
 def integer_rows(
     model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, images: Iterable[np.ndarray]
 ) -> tuple[Row, ...]:
-    """Each integer operation on a crop of a few images (1, C, H, W); last what the DPU's tie rounding changes."""
+    """Each integer operation on a crop of a few images (1, C, H, W); last what the DPU's tie
+    rounding changes.
+    """
     seen = few_crops(images, model)
     found = [agreement(core, host, crop) for crop in seen]
     source = f"the integer reference on {len(found)} calibration patches"
-    layers = [_layer_row(list(same), source) for same in zip(*(one.layers for one in found), strict=True)]
+    layers = [
+        _layer_row(list(same), source) for same in zip(*(one.layers for one in found), strict=True)
+    ]
     session = open_any_size(model)
     both = [
         [core.ends.finished(crop, result) for result in (one.up, one.even)]
@@ -278,10 +309,14 @@ def _layer_row(layers: list[LayerAgreement], source: str) -> Row:
     figures = {
         "accumulator, seen": measured(max(a.report.peak_bits for a in layers), "bits", source),
         "accumulator, proven": predicted(proven, "bits", (proven, proven), BITS_SOURCE),
-        "left of 24 bits": predicted(left, "bits", (left, left), f"23 bits and a sign, less {BITS_SOURCE}"),
+        "left of 24 bits": predicted(
+            left, "bits", (left, left), f"23 bits and a sign, less {BITS_SOURCE}"
+        ),
         "saturated": percent(a.report.saturated for a in layers),
         "ties": percent(a.report.ties for a in layers),
-        "as onnxruntime": percent((1 - a.unequal for a in layers), f"{source}, half to even as there"),
+        "as onnxruntime": percent(
+            (1 - a.unequal for a in layers), f"{source}, half to even as there"
+        ),
         "moved by half up": percent((a.moved for a in layers), f"{source}, half up"),
         "at most by": measured(max(a.moved_by for a in layers), "units", f"{source}, half up"),
     }
@@ -289,7 +324,9 @@ def _layer_row(layers: list[LayerAgreement], source: str) -> Row:
 
 
 def _rounding_row(in_float: list[np.ndarray], both: list[list[np.ndarray]], source: str) -> Row:
-    """How far the DPU's rounding of ties, up, leads away from the runtime's, to even; which is nearer to float."""
+    """How far the DPU's rounding of ties, up, leads away from the runtime's, to even; which is
+    nearer to float.
+    """
     up, even = (np.concatenate([results[k].ravel() for results in both]) for k in (0, 1))
     whole = np.concatenate([result.ravel() for result in in_float])
 

@@ -1,13 +1,14 @@
-"""The integer core in torch, so that its numbers can be trained: whole numbers forwards, slopes backwards.
+"""The integer core in torch, so that its numbers can be trained: whole numbers forwards, slopes
+backwards.
 
-Forwards every tensor holds the very whole numbers of `quant.integer.reference`. Backwards rounding counts as the
-identity, and clipping as what it is (the straight-through estimator, Bengio et al. 2013). A step costs about what one
-of the float network does: weights carry the shift to the result's unit, biases what makes ties round up, and one pass
-over the sums clips them, another rounds them. Sums are of float32, which holds them exactly up to 2^22, behind
-LeakyReLU 2^19.
+Forwards every tensor holds the very whole numbers of `quant.integer.reference`. Backwards rounding
+counts as the identity, and clipping as what it is (the straight-through estimator, Bengio et al.
+2013). A step costs about what one of the float network does: weights carry the shift to the
+result's unit, biases what makes ties round up, and one pass over the sums clips them, another
+rounds them. Sums are of float32, which holds them exactly up to 2^22, behind LeakyReLU 2^19.
 
-A result in windows or two gains is trained as one copy of it, which is not rounded: it differs from what the host
-computes by up to half a unit. `TrainableCore.core` makes the other copies.
+A result in windows or two gains is trained as one copy of it, which is not rounded: it differs from
+what the host computes by up to half a unit. `TrainableCore.core` makes the other copies.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -35,7 +36,12 @@ from beers_deploy.quant.graph import (
     Window,
 )
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
-from beers_deploy.quant.integer.arithmetic import activation_table, bilinear_weights, mean_factor, six_in_units
+from beers_deploy.quant.integer.arithmetic import (
+    activation_table,
+    bilinear_weights,
+    mean_factor,
+    six_in_units,
+)
 
 Tensor = torch.Tensor
 Bits = Mapping[str, int]
@@ -53,13 +59,17 @@ def to_int8(values: Tensor, low: int = INT8_MIN, high: int = INT8_MAX) -> Tensor
 
 
 class TrainableCore(torch.nn.Module):
-    """An integer core whose weights and biases are parameters, in units of their own scale; all scales stay.
+    """An integer core whose weights and biases are parameters, in units of their own scale; all
+    scales stay.
 
-    They may lie between whole numbers while they are trained; forwards the nearest whole numbers count.
+    They may lie between whole numbers while they are trained; forwards the nearest whole numbers
+    count.
     """
 
     def __init__(self, core: IntCore, still: Collection[str] = ()) -> None:
-        """Parameters that begin at the core's whole numbers; convolutions that write what is `still` stay so."""
+        """Parameters that begin at the core's whole numbers; convolutions that write what is
+        `still` stay so.
+        """
         super().__init__()
         self._core = core
         self._convs = [_one_copy(op, core.ends) for op in core.convolutions]
@@ -89,7 +99,9 @@ class TrainableCore(torch.nn.Module):
         return self.tensors(planes)[CORRECTION] * self._core.scale(CORRECTION)
 
     def tensors(self, planes: Tensor) -> dict[str, Tensor]:
-        """Every tensor (N, C, H, W) by its name in whole numbers; of a correction in copies one, unrounded."""
+        """Every tensor (N, C, H, W) by its name in whole numbers; of a correction in copies one,
+        unrounded.
+        """
         found = {PLANES: planes}
         numbers = iter(zip(self._convs, self.weights, self.biases, strict=True))
         for op in self._core.ops:
@@ -107,8 +119,18 @@ class TrainableCore(torch.nn.Module):
         unit = 2.0 ** (frac_bits - op.weight_frac_bits - self._core.frac_bits[op.input])
         bias_unit = 2.0 ** (frac_bits - op.bias_frac_bits)
         if op.output == CORRECTION and ends.copies > 1:
-            return _products(op, image, to_int8(weight) * unit, (bias if ends.offsets else to_int8(bias)) * bias_unit)
-        lifted = _products(op, image, to_int8(weight) * unit, to_int8(bias) * bias_unit + _lift(op.activation) * unit)
+            return _products(
+                op,
+                image,
+                to_int8(weight) * unit,
+                (bias if ends.offsets else to_int8(bias)) * bias_unit,
+            )
+        lifted = _products(
+            op,
+            image,
+            to_int8(weight) * unit,
+            to_int8(bias) * bias_unit + _lift(op.activation) * unit,
+        )
         return _rounded(lifted, op.activation, frac_bits)
 
 
@@ -123,16 +145,21 @@ def _products(op: IntConv, image: Tensor, weight: Tensor, bias: Tensor) -> Tenso
     around = left - within[1], right - within[1], top - within[0], bottom - within[0]
     if not op.transposed:
         image = functional.pad(image, around) if any(around) else image
-        return functional.conv2d(image, weight, bias, window.strides, within, window.dilations, op.groups)
+        return functional.conv2d(
+            image, weight, bias, window.strides, within, window.dilations, op.groups
+        )
     outputs, inner, *kernel = weight.shape
     weight = weight.reshape(op.groups, outputs // op.groups, inner, *kernel).transpose(1, 2)
     weight = weight.reshape(op.groups * inner, outputs // op.groups, *kernel)
-    wide = functional.conv_transpose2d(image, weight, bias, window.strides, within, groups=op.groups)
+    wide = functional.conv_transpose2d(
+        image, weight, bias, window.strides, within, groups=op.groups
+    )
     return wide[:, :, around[2] : wide.shape[2] - around[3], around[0] : wide.shape[3] - around[1]]
 
 
 def _lift(activation: Activation = Activation.none) -> float:
-    """What sums are raised by, in their unit, so that ties to even become ties up and nothing else moves.
+    """What sums are raised by, in their unit, so that ties to even become ties up and nothing else
+    moves.
 
     LeakyReLU divides the unit by 128 and what is added by ten.
     """
@@ -144,14 +171,18 @@ def _rounded(lifted: Tensor, activation: Activation, frac_bits: int) -> Tensor:
     if activation is Activation.leaky_relu:
         lifted = functional.leaky_relu(lifted, LEAKY_SLOPE)
     low = 0 if activation in (Activation.relu, Activation.relu6) else INT8_MIN
-    return to_int8(lifted, low, six_in_units(frac_bits) if activation is Activation.relu6 else INT8_MAX)
+    return to_int8(
+        lifted, low, six_in_units(frac_bits) if activation is Activation.relu6 else INT8_MAX
+    )
 
 
 def _add(op: Add, read: Sequence[Tensor], bits: Bits) -> Tensor:
     """Nothing is rounded, nor lifted, where the result is as fine as what is added."""
     frac_bits = bits[op.output]
     finest = max(bits[name] for name in op.inputs)
-    one, other = (_times(values, frac_bits - bits[name]) for name, values in zip(op.inputs, read, strict=True))
+    one, other = (
+        _times(values, frac_bits - bits[name]) for name, values in zip(op.inputs, read, strict=True)
+    )
     sums = one + other
     if finest > frac_bits or op.activation is Activation.leaky_relu:
         sums = sums + _lift(op.activation) * 2.0 ** (frac_bits - finest)
@@ -175,19 +206,25 @@ def _max_pool(op: MaxPool, read: Sequence[Tensor], _: Bits) -> Tensor:
 def _average_pool(op: AveragePool, read: Sequence[Tensor], _: Bits) -> Tensor:
     assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
     factor, shift = mean_factor(op.kernel)
-    sums = functional.avg_pool2d(_padded(read[0], op.window), op.kernel, op.window.strides, divisor_override=1)
+    sums = functional.avg_pool2d(
+        _padded(read[0], op.window), op.kernel, op.window.strides, divisor_override=1
+    )
     return to_int8((sums * factor + _lift()) * 2.0**-shift)
 
 
 def _padded(image: Tensor, window: Window, fill: float = 0.0) -> Tensor:
     top, left, bottom, right = window.pads
-    return functional.pad(image, (left, right, top, bottom), value=fill) if any(window.pads) else image
+    return (
+        functional.pad(image, (left, right, top, bottom), value=fill) if any(window.pads) else image
+    )
 
 
 def _resize(op: Resize, read: Sequence[Tensor], _: Bits) -> Tensor:
     if not op.bilinear:
         return functional.interpolate(read[0], scale_factor=op.factor, mode="nearest")
-    wide = functional.interpolate(read[0], scale_factor=op.factor, mode="bilinear", align_corners=False)
+    wide = functional.interpolate(
+        read[0], scale_factor=op.factor, mode="bilinear", align_corners=False
+    )
     return to_int8(wide + _lift() * 2.0 ** -bilinear_weights(op.factor)[1])
 
 
@@ -195,7 +232,9 @@ def _shuffle(op: Shuffle, read: Sequence[Tensor], _: Bits) -> Tensor:
     image = read[0]
     squares = op.block**2
     if op.up:
-        return functional.pixel_shuffle(image if op.columns_first else _turned(image, squares), op.block)
+        return functional.pixel_shuffle(
+            image if op.columns_first else _turned(image, squares), op.block
+        )
     moved = functional.pixel_unshuffle(image, op.block)
     return moved if op.columns_first else _turned(moved, moved.shape[1] // squares)
 
@@ -236,24 +275,34 @@ def _one_copy(op: IntConv, ends: Ends) -> IntConv:
     if op.output != CORRECTION or ends.copies == 1:
         return op
     first = ends.outputs if ends.offsets else 0
-    return replace(op, weight=op.weight[first : first + ends.outputs], bias=op.bias[first : first + ends.outputs])
+    return replace(
+        op,
+        weight=op.weight[first : first + ends.outputs],
+        bias=op.bias[first : first + ends.outputs],
+    )
 
 
-def _all_copies(last: IntConv, ends: Ends, weight: np.ndarray, bias: np.ndarray) -> tuple[IntConv, Ends]:
-    """All copies moved as one was trained, the coarse one by an eighth; a window's bias moves the host's offsets.
+def _all_copies(
+    last: IntConv, ends: Ends, weight: np.ndarray, bias: np.ndarray
+) -> tuple[IntConv, Ends]:
+    """All copies moved as one was trained, the coarse one by an eighth; a window's bias moves the
+    host's offsets.
 
     Args:
         last: the convolution that writes the copies, as it was.
         ends: of the core, as they were.
         weight: of the copy that was trained, (O, I, kh, kw) in whole numbers.
-        bias: of that copy, (O,), in whole numbers; of a window in units of its scale with the offset.
+        bias: of that copy, (O,), in whole numbers; of a window in units of its scale with the
+            offset.
     """
     one = _one_copy(last, ends)
     coarse = np.arange(ends.copies) == (0 if ends.offsets else 1)
     shares = np.where(coarse, 1 / GAIN, 1)
     weights = _moved(last.weight, shares, weight.astype(float) - one.weight)
     if not ends.offsets:
-        return replace(last, weight=weights, bias=_moved(last.bias, shares, bias.astype(float) - one.bias)), ends
+        return replace(
+            last, weight=weights, bias=_moved(last.bias, shares, bias.astype(float) - one.bias)
+        ), ends
     moved = bias - _window_bias(one, ends)
     offsets = np.array(ends.offsets) + moved * 2.0**-one.bias_frac_bits
     ends = replace(ends, offsets=tuple(tuple(map(float, window)) for window in offsets))

@@ -1,9 +1,11 @@
-"""Let dead channels carry copies of the others, so that each of these is rounded twice, at no cost on a board.
+"""Let dead channels carry copies of the others, so that each of these is rounded twice, at no cost
+on a board.
 
-A channel behind ReLU that is zero on all calibration patches does nothing. The channel whose rounding costs most may
-be computed there once more: what reads the two takes half of each, and their errors, at scales a little apart, partly
-cancel. Where depthwise convolutions follow one another the copy goes through all of them. A network without a global
-add has its image in such tensors, and training with ReLU leaves a third of their channels dead and more.
+A channel behind ReLU that is zero on all calibration patches does nothing. The channel whose
+rounding costs most may be computed there once more: what reads the two takes half of each, and
+their errors, at scales a little apart, partly cancel. Where depthwise convolutions follow one
+another the copy goes through all of them. A network without a global add has its image in such
+tensors, and training with ReLU leaves a third of their channels dead and more.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -16,7 +18,9 @@ from beers_deploy.quant.graph import Conv, Graph
 from beers_deploy.quant.passes.equalise import largest_sizes
 
 APART = 0.87
-"""The range of a copy is divided by it, so that levelling gives it another scale than its channel has."""
+"""The range of a copy is divided by it, so that levelling gives it another scale than its channel
+has.
+"""
 
 Copies = Mapping[str, np.ndarray]
 """The channels of each tensor that are copies."""
@@ -39,15 +43,25 @@ def with_copies(
     for run, size in zip(last, sizes, strict=True):
         sources, copies = _pairs(graph, run[-1], size)
         if len(copies):
-            graph = tuple(_copied(op, run, sources, copies) if isinstance(op, Conv) else op for op in graph)
+            graph = tuple(
+                _copied(op, run, sources, copies) if isinstance(op, Conv) else op for op in graph
+            )
             found |= dict.fromkeys(run, copies)
     return graph, found
 
 
 def runs(graph: Graph, names: Collection[str]) -> list[list[str]]:
-    """Of these, tensors one behind the other, depthwise convolutions between: from a dense one to dense ones."""
-    readers = {name: [op for op in graph if isinstance(op, Conv) and op.input == name] for name in names}
-    begun = [op.output for op in graph if isinstance(op, Conv) and op.output in readers and op.groups == 1]
+    """Of these, tensors one behind the other, depthwise convolutions between: from a dense one to
+    dense ones.
+    """
+    readers = {
+        name: [op for op in graph if isinstance(op, Conv) and op.input == name] for name in names
+    }
+    begun = [
+        op.output
+        for op in graph
+        if isinstance(op, Conv) and op.output in readers and op.groups == 1
+    ]
     found = []
     for name in begun:
         run = [name]
@@ -59,7 +73,9 @@ def runs(graph: Graph, names: Collection[str]) -> list[list[str]]:
 
 
 def _pairs(graph: Graph, name: str, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The channels that are copied, those first whose rounding weighs most in what reads them, and where to."""
+    """The channels that are copied, those first whose rounding weighs most in what reads them, and
+    where to.
+    """
     weights = sum(
         np.square(op.weight, dtype=np.float64).sum((0, 2, 3))
         for op in graph

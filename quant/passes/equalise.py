@@ -1,10 +1,11 @@
-"""Scale the channels of the residual stream so that one scale suits them all, at no cost in the network.
+"""Scale the channels of the residual stream so that one scale suits them all, at no cost in the
+network.
 
-Whatever writes the stream has its weights multiplied by k per channel, whatever reads it has them divided: the float
-network stays the same, to rounding. A channel that uses a fraction of int8's range is rounded finer for a larger k,
-one that overflows is clipped less for a smaller. The first guess levels the ranges,
-k ~ range^-gamma; then each channel is tried larger and smaller on calibration patches, because what counts is what a
-channel's rounding does to the output.
+Whatever writes the stream has its weights multiplied by k per channel, whatever reads it has them
+divided: the float network stays the same, to rounding. A channel that uses a fraction of int8's
+range is rounded finer for a larger k, one that overflows is clipped less for a smaller. The first
+guess levels the ranges, k ~ range^-gamma; then each channel is tried larger and smaller on
+calibration patches, because what counts is what a channel's rounding does to the output.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -20,11 +21,17 @@ from beers_deploy.quant.passes.stream import STREAM_FRAC_BITS, Stream
 from beers_deploy.quant.session import values_of
 
 QUANTILE = 0.9999
-"""A channel's range: the mean over tiles of this quantile of its sizes. The maximum would be ruled by outliers."""
+"""A channel's range: the mean over tiles of this quantile of its sizes.
+
+The maximum would be ruled by outliers.
+"""
 
 LEVELLING = (0.5, 0.75, 1.0)
 HEADROOM = (0.64, 0.8, 1.0, 1.25)
-"""First guesses tried: gamma, and the largest range as a share of int8's. Above 1 the largest values are clipped."""
+"""First guesses tried: gamma, and the largest range as a share of int8's.
+
+Above 1 the largest values are clipped.
+"""
 
 FULL = INT8_MAX * 2.0**-STREAM_FRAC_BITS
 """Where int8 ends in tensors that are equalised."""
@@ -33,14 +40,19 @@ STEPS = (1.5, 1.2)
 """Factors by which each channel is tried larger and smaller, a sweep each."""
 
 ROOM = 0.8
-"""The share that must fit into int8 of the largest values that calibration sees in the stream's last sum."""
+"""The share that must fit into int8 of the largest values that calibration sees in the stream's
+last sum.
+"""
 
 MOST_CHANNELS = 256
-"""More are not tried one by one: each costs four runs of all crops at most, hours in a wide network."""
+"""More are not tried one by one: each costs four runs of all crops at most, hours in a wide
+network.
+"""
 
 FIRST_CROPS = 2
 MARGIN = 0.003
-"""A trial is given up once the crops that it was tried on cost that share more than with the best factors so far.
+"""A trial is given up once the crops that it was tried on cost that share more than with the best
+factors so far.
 
 Each look doubles the crops. Some 30 % of the runs remain.
 """
@@ -54,7 +66,8 @@ Trial = Callable[[Graph], Costs]
 def equalise(graph: Graph, stream: Stream, factors: np.ndarray) -> Graph:
     """The same network with channel c of a stream scaled by factors[c], (C,) above 0.
 
-    A channel behind ReLU6 is scaled until it can fill int8: the end of int8 is its clip then, and ReLU does.
+    A channel behind ReLU6 is scaled until it can fill int8: the end of int8 is its clip then, and
+    ReLU does.
     """
     factors = np.array(factors, np.float64)
     for op in graph:
@@ -65,7 +78,9 @@ def equalise(graph: Graph, stream: Stream, factors: np.ndarray) -> Graph:
 
 
 def rescaled(graph: Graph, stream: Stream, factors: np.ndarray) -> Graph:
-    """The same network with channel c of a stream scaled by factors[c], and of a ReLU6 there the six."""
+    """The same network with channel c of a stream scaled by factors[c], and of a ReLU6 there the
+    six.
+    """
     return tuple(_scaled(op, factors, stream) if isinstance(op, Conv) else op for op in graph)
 
 
@@ -81,16 +96,23 @@ def _scaled(op: Conv, factors: np.ndarray, stream: Stream) -> Conv:
     if op.input in stream:
         own = factors[stream[op.input]]
         weight = weight / (own[None, :, None, None] if op.groups == 1 else own[:, None, None, None])
-    return replace(op, weight=weight.astype(np.float32), bias=bias.astype(np.float32), ceiling=ceiling)
+    return replace(
+        op, weight=weight.astype(np.float32), bias=bias.astype(np.float32), ceiling=ceiling
+    )
 
 
 def channel_ranges(
     graph: Graph, stream: Stream, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL
 ) -> np.ndarray:
-    """(C,) range of each stream channel over images (1, C', H, W), the widest of all the stream's tensors."""
+    """(C,) range of each stream channel over images (1, C', H, W), the widest of all the stream's
+    tensors.
+    """
     names = sorted(stream)
     tiles = channel_sizes(graph, names, images, ends)
-    means = {name: np.mean(sizes, axis=0) for name, sizes in zip(names, zip(*tiles, strict=True), strict=True)}
+    means = {
+        name: np.mean(sizes, axis=0)
+        for name, sizes in zip(names, zip(*tiles, strict=True), strict=True)
+    }
     ranges = np.zeros(max(stream[name].stop or len(mean) for name, mean in means.items()))
     for name, mean in means.items():
         ranges[stream[name]] = np.maximum(ranges[stream[name]], mean)
@@ -98,9 +120,15 @@ def channel_ranges(
 
 
 def channel_sizes(
-    graph: Graph, names: list[str], images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL, quantile: float = QUANTILE
+    graph: Graph,
+    names: list[str],
+    images: Iterable[np.ndarray],
+    ends: Ends = ONE_CHANNEL,
+    quantile: float = QUANTILE,
 ) -> Iterator[list[np.ndarray]]:
-    """A quantile of each channel's sizes, (C,) of each of the named tensors, for every tile of the images."""
+    """A quantile of each channel's sizes, (C,) of each of the named tensors, for every tile of the
+    images.
+    """
     for results in values_of(graph, names, images, ends):
         sizes = [np.abs(r[0]).reshape(r.shape[1], -1) for r in results]
         yield [np.quantile(each, quantile, axis=1).astype(np.float64) for each in sizes]
@@ -110,14 +138,20 @@ def largest_sizes(
     graph: Graph, names: list[str], images: Iterable[np.ndarray], ends: Ends, quantile: float = 1.0
 ) -> list[np.ndarray]:
     """As `channel_sizes`, of the tile where each channel is largest."""
-    return [np.max(sizes, axis=0) for sizes in zip(*channel_sizes(graph, names, images, ends, quantile), strict=True)]
+    return [
+        np.max(sizes, axis=0)
+        for sizes in zip(*channel_sizes(graph, names, images, ends, quantile), strict=True)
+    ]
 
 
-def with_room(graph: Graph, step: float, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL) -> Graph:
+def with_room(
+    graph: Graph, step: float, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL
+) -> Graph:
     """The same network with room in its last sum, which no block reads, for the brightest roofs.
 
-    The search that equalises clips what is rare on the patches that it looks at. In the stream that is right, for a
-    finer step serves every block; in the last sum of a half-LSB pair it cost a site 0.46 of 0.56 dB.
+    The search that equalises clips what is rare on the patches that it looks at. In the stream that
+    is right, for a finer step serves every block; in the last sum of a half-LSB pair it cost a site
+    0.46 of 0.56 dB.
 
     Args:
         graph: that ends with the sum of a half-LSB pair and a convolution.
@@ -157,7 +191,9 @@ def search(graph: Graph, stream: Stream, ranges: np.ndarray, trial: Trial) -> np
     return stepped(costs_of, channels, best).factors
 
 
-def stepped(costs_of: Callable[[np.ndarray], Costs], channels: Iterable[int], best: "Best") -> "Best":
+def stepped(
+    costs_of: Callable[[np.ndarray], Costs], channels: Iterable[int], best: "Best"
+) -> "Best":
     """The best factors once each of these channels has been tried larger and smaller."""
     for step in STEPS:
         for channel in channels:
@@ -180,7 +216,9 @@ class Best:
 
 
 def race(costs_of: Costs, factors: np.ndarray, best: Best) -> Best:
-    """The better of two, the costliest crops first: six of seven trials fail, and most of them show it on two."""
+    """The better of two, the costliest crops first: six of seven trials fail, and most of them show
+    it on two.
+    """
     order = np.argsort(-best.costs, kind="stable")
     costs = np.zeros(len(order))
     seen = 0

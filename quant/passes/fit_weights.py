@@ -1,13 +1,14 @@
 """Round weights so that the convolution's result errs least, not each weight by itself.
 
-The nearest whole number is the best for one weight, not for a sum: errors of neighbouring weights meet nearly the
-same pixel and add up. The squared error of the result is e^T C e, with e the rounding errors of a channel's weights
-and C the covariance of what they are multiplied with (the criterion of AdaRound, Nagel et al. 2020, and of GPTQ,
-Frantar et al. 2023). From the nearest numbers on, weight after weight takes the whole number that lowers it most,
-until none does. What the mean is off by then goes into the bias.
+The nearest whole number is the best for one weight, not for a sum: errors of neighbouring weights
+meet nearly the same pixel and add up. The squared error of the result is e^T C e, with e the
+rounding errors of a channel's weights and C the covariance of what they are multiplied with (the
+criterion of AdaRound, Nagel et al. 2020, and of GPTQ, Frantar et al. 2023). From the nearest
+numbers on, weight after weight takes the whole number that lowers it most, until none does. What
+the mean is off by then goes into the bias.
 
-Convolutions are rounded one after the other on what they read in INT8, so the bias of each also makes up for what
-those before it are off by in the mean.
+Convolutions are rounded one after the other on what they read in INT8, so the bias of each also
+makes up for what those before it are off by in the mean.
 """
 
 from dataclasses import dataclass, replace
@@ -35,17 +36,24 @@ from beers_deploy.quant.samples import Remade
 from beers_deploy.quant.session import crops, halo_of, open_session, planes_of
 
 FLOOR = 1e-2
-"""Added to every variance, as a share of their mean. Without it the weights of a channel that hardly changes run to
-int8's ends to make up a little of what others err by, and the bias that makes up for its mean is coarse then."""
+"""Added to every variance, as a share of their mean.
+
+Without it the weights of a channel that hardly changes run to int8's ends to make up a little of
+what others err by, and the bias that makes up for its mean is coarse then.
+"""
 EVERY_PX = 4
 """Windows are taken so far apart in both directions: neighbours say nearly the same."""
 SEEN_PX = 16 * 128**2
-"""Pixels of the images that are looked at, all of whose tensors are kept from operation to operation."""
+"""Pixels of the images that are looked at, all of whose tensors are kept from operation to
+operation.
+"""
 
 
 @dataclass
 class Moments:
-    """Sums over windows x, (G, n) each, that the groups of a convolution read in INT8, and over what they lost."""
+    """Sums over windows x, (G, n) each, that the groups of a convolution read in INT8, and over
+    what they lost.
+    """
 
     products: np.ndarray  # (G, n, n) float64, sum of x x^T
     total: np.ndarray  # (G, n), sum of x
@@ -55,7 +63,9 @@ class Moments:
     @classmethod
     def of_none(cls, groups: int, size: int) -> "Moments":
         """Of no windows yet."""
-        return cls(np.zeros((groups, size, size)), np.zeros((groups, size)), np.zeros((groups, size)))
+        return cls(
+            np.zeros((groups, size, size)), np.zeros((groups, size)), np.zeros((groups, size))
+        )
 
     def add(self, windows: np.ndarray, exact: np.ndarray) -> None:
         """Count further windows (K, G, n) float32, and what they are in float."""
@@ -71,7 +81,9 @@ class Moments:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(G, n, n) covariance, a share of its mean variance added to the diagonal so that no direction is free."""
+        """(G, n, n) covariance, a share of its mean variance added to the diagonal so that no
+        direction is free.
+        """
         covariance = self.products / self.count - self.mean[:, :, None] * self.mean[:, None]
         floor = FLOOR * np.trace(covariance, axis1=1, axis2=2).mean() / covariance.shape[-1]
         return np.asarray(covariance + floor * np.eye(covariance.shape[-1]))
@@ -88,11 +100,15 @@ def _windows(values: np.ndarray, op: Conv) -> np.ndarray:
     first = -op.window.pads[0] % rows, -op.window.pads[1] % columns
     windows = sliding_window_view(values[0], kernel, axis=(1, 2))
     windows = windows[:, first[0] :: every[0], first[1] :: every[1], ::tall, ::broad]
-    return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).reshape(-1, op.groups, op.weight[0].size)
+    return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).reshape(
+        -1, op.groups, op.weight[0].size
+    )
 
 
 class Crop(NamedTuple):
-    """What one crop's tensors (1, C, H, W) are in float and in INT8, as far as they are computed and still read."""
+    """What one crop's tensors (1, C, H, W) are in float and in INT8, as far as they are computed
+    and still read.
+    """
 
     exact: dict[str, np.ndarray]
     whole: dict[str, np.ndarray]
@@ -102,7 +118,9 @@ SWEEPS = 20
 """At most; a sweep that changes nothing ends it, after some five."""
 
 
-def fit_weights(graph: Graph, core: IntCore, images: Remade[np.ndarray], shifts: Shifts = SHIFTS) -> IntCore:
+def fit_weights(
+    graph: Graph, core: IntCore, images: Remade[np.ndarray], shifts: Shifts = SHIFTS
+) -> IntCore:
     """The core with weights and biases rounded for what each convolution reads; scales stay.
 
     Args:
@@ -118,8 +136,12 @@ def fit_weights(graph: Graph, core: IntCore, images: Remade[np.ndarray], shifts:
     for op, nearest in zip(graph, core.ops, strict=True):
         whole = nearest
         if isinstance(op, Conv) and isinstance(nearest, IntConv):
-            raised = op.stored_bias - nearest_bias(op, nearest.weight, nearest.weight_frac_bits, graph)
-            whole, shifted = _fit(op, nearest, core.frac_bits[op.input], _moments(op, seen), shifts, raised)
+            raised = op.stored_bias - nearest_bias(
+                op, nearest.weight, nearest.weight_frac_bits, graph
+            )
+            whole, shifted = _fit(
+                op, nearest, core.frac_bits[op.input], _moments(op, seen), shifts, raised
+            )
             if op.output == CORRECTION and ends.offsets:  # the biases left over are others now
                 ends = ends.moved(nearest.float_bias + raised - shifted - whole.float_bias)
         ops.append(whole)
@@ -153,26 +175,37 @@ def _compute(op: Op, whole: IntConv | Op, frac_bits: int, seen: list[Crop]) -> N
     sessions = [open_session(operation_to_onnx(each)) for each in (op, in_int8)]
     for crop in seen:
         for session, known in zip(sessions, crop, strict=True):
-            (known[op.output],) = session.run(None, {name: known[name] for name in dict.fromkeys(op.inputs)})
+            (known[op.output],) = session.run(
+                None, {name: known[name] for name in dict.fromkeys(op.inputs)}
+            )
         crop.whole[op.output] = rounded_to(crop.whole[op.output], frac_bits)
 
 
 def _fit(
-    op: Conv, whole: IntConv, input_frac_bits: int, moments: Moments, shifts: Shifts, raised: np.ndarray
+    op: Conv,
+    whole: IntConv,
+    input_frac_bits: int,
+    moments: Moments,
+    shifts: Shifts,
+    raised: np.ndarray,
 ) -> tuple[IntConv, np.ndarray]:
-    """The fitted convolution, and by how much its weights raise the mean results, (O,): what its bias takes off.
+    """The fitted convolution, and by how much its weights raise the mean results, (O,): what its
+    bias takes off.
 
     Fewer windows than weights say nothing of how errors add up.
     """
     if moments.count <= op.weight[0].size:
         return whole, raised
     weight, shifted = fit(op.weight, 2.0**-whole.weight_frac_bits, moments)
-    bias, bias_frac_bits = quantise_bias(op.stored_bias - shifted, whole.weight_frac_bits + input_frac_bits, shifts)
+    bias, bias_frac_bits = quantise_bias(
+        op.stored_bias - shifted, whole.weight_frac_bits + input_frac_bits, shifts
+    )
     return replace(whole, weight=weight, bias=bias, bias_frac_bits=bias_frac_bits), shifted
 
 
 def fit(weight: np.ndarray, unit: float, moments: Moments) -> tuple[np.ndarray, np.ndarray]:
-    """Whole weights (O, I, kh, kw) int8, and by how much they raise the mean result of each channel (O,).
+    """Whole weights (O, I, kh, kw) int8, and by how much they raise the mean result of each channel
+    (O,).
 
     Args:
         weight: (O, I, kh, kw), what they stand for.
@@ -181,7 +214,9 @@ def fit(weight: np.ndarray, unit: float, moments: Moments) -> tuple[np.ndarray, 
     """
     groups, size = moments.mean.shape
     exact = weight.reshape(groups, -1, size).astype(np.float64)
-    fitted = np.stack([descend(*each) for each in zip(exact / unit, moments.covariance, strict=True)])
+    fitted = np.stack(
+        [descend(*each) for each in zip(exact / unit, moments.covariance, strict=True)]
+    )
     exact_mean = (moments.total + moments.lost) / moments.count
     raised = (fitted * unit) @ moments.mean[:, :, None] - exact @ exact_mean[:, :, None]
     return fitted.astype(np.int8).reshape(weight.shape), np.asarray(raised).ravel()
@@ -190,8 +225,8 @@ def fit(weight: np.ndarray, unit: float, moments: Moments) -> tuple[np.ndarray, 
 def descend(wanted: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Whole numbers (O, n) in [-128, 127] near the wanted ones, of less e^T C e than the nearest.
 
-    Coordinate descent: along one weight the least error lies at q_i - (C e)_i / C_ii, rounded. A weight that meets
-    nothing but one value stays: the bias makes up for it.
+    Coordinate descent: along one weight the least error lies at q_i - (C e)_i / C_ii, rounded. A
+    weight that meets nothing but one value stays: the bias makes up for it.
     """
     whole: np.ndarray = np.clip(np.rint(wanted), INT8_MIN, INT8_MAX)
     gradient = (whole - wanted) @ covariance

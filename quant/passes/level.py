@@ -1,14 +1,16 @@
-"""Level the channels of tensors between two convolutions, one tensor after the other, at no cost in the network.
+"""Level the channels of tensors between two convolutions, one tensor after the other, at no cost in
+the network.
 
-Between two convolutions each channel may be scaled by a factor of its own, as `quant.passes.equalise` does with a
-stream: then one scale suits all channels, and because a factor is any number, the tensor's own scale and that of the
-weights that read it are no longer bound to powers of two. Where there is a stream it is what counts, and levelling
-the rest too made no network of dense convolutions better that is made for one sensor. Those with depthwise ones it
-does, and those behind a bank: one file serves sensors of little noise and of much, and what lies inside a block is
-then small in most channels.
+Between two convolutions each channel may be scaled by a factor of its own, as
+`quant.passes.equalise` does with a stream: then one scale suits all channels, and because a factor
+is any number, the tensor's own scale and that of the weights that read it are no longer bound to
+powers of two. Where there is a stream it is what counts, and levelling the rest too made no network
+of dense convolutions better that is made for one sensor. Those with depthwise ones it does, and
+those behind a bank: one file serves sensors of little noise and of much, and what lies inside a
+block is then small in most channels.
 
-All tensors are levelled together first, for what the worst of them errs hides the others; then one after the other
-from the last, for what is rounded late reaches the result.
+All tensors are levelled together first, for what the worst of them errs hides the others; then one
+after the other from the last, for what is rounded late reaches the result.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -38,8 +40,11 @@ LEVELLING = (0.0, 0.25, 0.5, 1.0)
 HEADROOM = (0.5, 0.75, 1.0, 1.4)
 """First guesses tried, as in `quant.passes.equalise`; at 0.5 twice the range still fits."""
 TILES = 0.85
-"""A channel's range is this quantile over the tiles. The widest tile would set the step of all others: with the
-brightest ground among the patches, a DnCNN lost 1.4 dB by it instead of 0.6 (measured on photographs)."""
+"""A channel's range is this quantile over the tiles.
+
+The widest tile would set the step of all others: with the brightest ground among the patches, a
+DnCNN lost 1.4 dB by it instead of 0.6 (measured on photographs).
+"""
 FEW_TENSORS = 4
 """Of a chain beside a stream, to be tried one by one."""
 
@@ -48,11 +53,14 @@ CLEARLY = 1.1
 """A guess is tried on one of so many crops first, and dropped where it costs so much more there."""
 
 
-def _guess(ranges: np.ndarray, weights: np.ndarray, levelling: float, headroom: float) -> np.ndarray:
-    """Factors (C,) that level the ranges, but let no weak channel's weights outgrow those of the stronger half.
+def _guess(
+    ranges: np.ndarray, weights: np.ndarray, levelling: float, headroom: float
+) -> np.ndarray:
+    """Factors (C,) that level the ranges, but let no weak channel's weights outgrow those of the
+    stronger half.
 
-    A channel that is hardly ever on would else be blown up until its weights, `weights` the largest of those that
-    write each, ruled the scale of all.
+    A channel that is hardly ever on would else be blown up until its weights, `weights` the largest
+    of those that write each, ruled the scale of all.
     """
     factors = first_guess(ranges, levelling, headroom)
     limit = (weights * factors)[ranges >= np.median(ranges)].max()
@@ -63,8 +71,9 @@ def _guess(ranges: np.ndarray, weights: np.ndarray, levelling: float, headroom: 
 class Chain:
     """Tensors that may be levelled, in the graph's order, and how many channels each has.
 
-    Factors and ranges of all of them are one array (sum of the channels,), tensor behind tensor. Beside a stream
-    `by_channel` is off: trying each channel buys nothing there, nor each tensor of a deep network.
+    Factors and ranges of all of them are one array (sum of the channels,), tensor behind tensor.
+    Beside a stream `by_channel` is off: trying each channel buys nothing there, nor each tensor of
+    a deep network.
     """
 
     tensors: tuple[str, ...]
@@ -98,12 +107,18 @@ def chain_ranges(
     return np.concatenate([above_dead(np.quantile(sizes, TILES, axis=0)) for sizes in by_tensor])
 
 
-def largest_values(graph: Graph, chain: Chain, images: Iterable[np.ndarray], ends: Ends) -> np.ndarray:
+def largest_values(
+    graph: Graph, chain: Chain, images: Iterable[np.ndarray], ends: Ends
+) -> np.ndarray:
     """Return the largest size of every channel over images (1, C, H, W)."""
-    return np.concatenate(list(map(above_dead, largest_sizes(graph, list(chain.tensors), images, ends))))
+    return np.concatenate(
+        list(map(above_dead, largest_sizes(graph, list(chain.tensors), images, ends)))
+    )
 
 
-def level(graph: Graph, chain: Chain, ranges: np.ndarray, start: np.ndarray, trial: Trial) -> np.ndarray:
+def level(
+    graph: Graph, chain: Chain, ranges: np.ndarray, start: np.ndarray, trial: Trial
+) -> np.ndarray:
     """The factors of least error that were found, never more than that of `start`."""
     written = {op.output: np.abs(op.weight).max((1, 2, 3)) for op in graph if isinstance(op, Conv)}
     placed = [(part, ranges[part], written[name]) for name, part in chain.parts.items()]

@@ -1,10 +1,11 @@
 """Give a tensor behind ReLU all of int8: stored less 128 units, its ReLU is int8's own lower end.
 
-int8 holds -128 to 127, and a tensor that is never below zero leaves half of that unused. Less 128 units of a scale
-twice as fine it fills all of it: the bias of the convolution that writes it goes down by 128 units, saturation does
-what its ReLU did, and the biases of those that read it give back what was taken off, times the sum of their weights.
-That sum is the same everywhere only where no window reaches into the padding, whose zeros would no longer be zeros.
-So all readers must be convolutions without padding, such as the 1 x 1 ones behind depthwise ones.
+int8 holds -128 to 127, and a tensor that is never below zero leaves half of that unused. Less 128
+units of a scale twice as fine it fills all of it: the bias of the convolution that writes it goes
+down by 128 units, saturation does what its ReLU did, and the biases of those that read it give back
+what was taken off, times the sum of their weights. That sum is the same everywhere only where no
+window reaches into the padding, whose zeros would no longer be zeros. So all readers must be
+convolutions without padding, such as the 1 x 1 ones behind depthwise ones.
 """
 
 from collections.abc import Mapping
@@ -22,15 +23,24 @@ SPAN = 255
 
 
 def lowerable(graph: Graph) -> list[str]:
-    """The tensors behind ReLU or ReLU6 that only convolutions without padding read, in the graph's order."""
+    """The tensors behind ReLU or ReLU6 that only convolutions without padding read, in the graph's
+    order.
+    """
     relus = (Activation.relu, Activation.relu6)
-    written = {op.output for op in graph if isinstance(op, Conv) and op.activation in relus and not op.offset}
-    padded = {op.input for op in graph if isinstance(op, Conv) and (any(op.window.pads) or op.transposed)}
+    written = {
+        op.output
+        for op in graph
+        if isinstance(op, Conv) and op.activation in relus and not op.offset
+    }
+    padded = {
+        op.input for op in graph if isinstance(op, Conv) and (any(op.window.pads) or op.transposed)
+    }
     return [name for name in lone_tensors(graph) if name in written - padded]
 
 
 def lowered(graph: Graph, name: str, frac_bits: int) -> Graph:
-    """The same network with a tensor stored less 128 units of 2^-frac_bits, and given back to those that read it.
+    """The same network with a tensor stored less 128 units of 2^-frac_bits, and given back to those
+    that read it.
 
     Behind ReLU6 its channels are scaled until int8 ends no later than the six.
 
@@ -51,12 +61,16 @@ def _lowered(op: Conv, name: str, offset: float) -> Conv:
     if op.output == name:
         op = replace(op, offset=offset)
     if op.input == name:
-        op = replace(op, bias=(op.bias + offset * op.weight.sum((1, 2, 3), dtype=np.float64)).astype(np.float32))
+        op = replace(
+            op,
+            bias=(op.bias + offset * op.weight.sum((1, 2, 3), dtype=np.float64)).astype(np.float32),
+        )
     return op
 
 
 def lower(graph: Graph, frac_bits: Mapping[str, int], trial: Trial) -> Graph:
-    """The same network with those tensors lowered that cost less so: all of them, or else one after the other.
+    """The same network with those tensors lowered that cost less so: all of them, or else one after
+    the other.
 
     Args:
         graph: plane-reading.

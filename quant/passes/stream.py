@@ -1,9 +1,9 @@
 """What is done to the residual stream and to its last tensor, so that rounding them costs little.
 
-One scale for the whole stream makes its adds exact. Two copies of the last stream tensor, rounded half a step
-apart, together hold nine bits. Two gains for the correction: a fine one for nearly all pixels, a coarse one for the
-strongest edges. Windows for a result that nothing is added to: fine ones side by side over all that it can be, and a
-coarse one for what lies outside.
+One scale for the whole stream makes its adds exact. Two copies of the last stream tensor, rounded
+half a step apart, together hold nine bits. Two gains for the correction: a fine one for nearly all
+pixels, a coarse one for the strongest edges. Windows for a result that nothing is added to: fine
+ones side by side over all that it can be, and a coarse one for what lies outside.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,8 +35,10 @@ STREAM_FRAC_BITS = 8
 
 
 Stream = Mapping[str, slice]
-"""Tensors that have the same factors, channel by channel: each is added to another of them, or is such a sum, or what
-a pool, an enlargement or a concat makes of them. And where in the factors the channels of each stand."""
+"""Tensors that have the same factors, channel by channel: each is added to another of them, or is
+such a sum, or what a pool, an enlargement or a concat makes of them. And where in the factors the
+channels of each stand.
+"""
 PASSING = (Concat, MaxPool, AveragePool, Resize)
 """What hands channels on without mixing them."""
 
@@ -49,23 +51,31 @@ def only(name: str) -> Stream:
 def streams(graph: Graph) -> list[Stream]:
     """The streams that can share a scale and be equalised, in the order of the graph.
 
-    Those that convolutions and adds alone write and read, and what hands channels on, with nothing between that a
-    factor does not pass; so not where a product, a pixel shuffle or the network's end reads them.
+    Those that convolutions and adds alone write and read, and what hands channels on, with nothing
+    between that a factor does not pass; so not where a product, a pixel shuffle or the network's
+    end reads them.
     """
     linking = [op for op in graph if isinstance(op, (Add, *PASSING))]
     leader = united((*op.inputs, op.output) for op in linking)
     sums = {leader[op.output] for op in linking if isinstance(op, Add)}
-    groups = [[name for name in leader if leader[name] == first] for first in dict.fromkeys(leader.values())]
+    groups = [
+        [name for name in leader if leader[name] == first]
+        for first in dict.fromkeys(leader.values())
+    ]
     placed = [_placed(linking, group, graph) for group in groups if leader[group[0]] in sums]
     return [group for group in placed if group and _passes_factors(graph, group)]
 
 
 def _placed(linking: Sequence[Op], names: Sequence[str], graph: Graph) -> Stream:
-    """Where the channels of these tensors stand; nowhere where one would have to stand in two places."""
+    """Where the channels of these tensors stand; nowhere where one would have to stand in two
+    places.
+    """
     own = [op for op in linking if op.output in names]
     if not any(isinstance(op, Concat) for op in own):
         return dict.fromkeys(names, slice(None))
-    widths = channels_of(graph, {PLANES: next(op.weight.shape[1] for op in graph if isinstance(op, Conv))})
+    widths = channels_of(
+        graph, {PLANES: next(op.weight.shape[1] for op in graph if isinstance(op, Conv))}
+    )
     links = [link for op in own for link in _links(op, widths)]
     first = {names[0]: 0}
     while len(first) < len(names):
@@ -77,7 +87,9 @@ def _placed(linking: Sequence[Op], names: Sequence[str], graph: Graph) -> Stream
     if any(first[part] != first[whole] + by for part, whole, by in links):
         return {}
     least = min(first.values())
-    return {name: slice(start - least, start - least + widths[name]) for name, start in first.items()}
+    return {
+        name: slice(start - least, start - least + widths[name]) for name, start in first.items()
+    }
 
 
 def _links(op: Op, widths: Mapping[str, int]) -> list[tuple[str, str, int]]:
@@ -89,12 +101,17 @@ def _links(op: Op, widths: Mapping[str, int]) -> list[tuple[str, str, int]]:
 
 def exceeds_six(graph: Graph, stream: Stream, frac_bits: Mapping[str, int]) -> bool:
     """Whether a ReLU6 writes to it, and int8 ends beyond the six in one of its tensors."""
-    clipped = any(isinstance(op, Conv) and op.activation is Activation.relu6 and op.output in stream for op in graph)
+    clipped = any(
+        isinstance(op, Conv) and op.activation is Activation.relu6 and op.output in stream
+        for op in graph
+    )
     return clipped and any(INT8_MAX * 2.0 ** -frac_bits[name] > SIX for name in stream)
 
 
 def lone_tensors(graph: Graph) -> list[str]:
-    """Tensors of no stream that convolutions alone write and read: each of their channels may have a factor."""
+    """Tensors of no stream that convolutions alone write and read: each of their channels may have
+    a factor.
+    """
     added = {name for op in graph if isinstance(op, Add) for name in (*op.inputs, op.output)}
     written = [op.output for op in graph if isinstance(op, Conv) and op.output not in added]
     passing = {name for op in graph if isinstance(op, PASSING) for name in op.inputs}
@@ -102,7 +119,9 @@ def lone_tensors(graph: Graph) -> list[str]:
 
 
 def _passes_factors(graph: Graph, stream: Stream) -> bool:
-    """Whether factors pass; through ReLU6 where `equalise` may make int8's end its clip, so not behind an add."""
+    """Whether factors pass; through ReLU6 where `equalise` may make int8's end its clip, so not
+    behind an add.
+    """
     touching = [op for op in graph if stream.keys() & {*op.inputs, op.output}]
     known = all(isinstance(op, (Conv, Add, *PASSING)) for op in touching)
     homogeneous = all(
@@ -114,11 +133,14 @@ def _passes_factors(graph: Graph, stream: Stream) -> bool:
 
 
 OFFSETS = np.array([-0.25, 0.25])
-"""What the two copies of a half-LSB pair add before they are rounded, in units of their step; the mean is 0."""
+"""What the two copies of a half-LSB pair add before they are rounded, in units of their step; the
+mean is 0.
+"""
 
 
 def half_lsb_pair(graph: Graph, step: float) -> Graph:
-    """The graph with two copies of what its last convolution reads, where that is the sum of two convolutions.
+    """The graph with two copies of what its last convolution reads, where that is the sum of two
+    convolutions.
 
     `step` is the value of one unit of the tensors that the add reads and writes.
     """
@@ -126,7 +148,11 @@ def half_lsb_pair(graph: Graph, step: float) -> Graph:
     if not (isinstance(add, Add) and isinstance(tail, Conv)):
         return graph
     writers = {op.output: op for op in graph if isinstance(op, Conv) and _plain(op)}
-    two = add.activation is Activation.none and len(set(add.inputs)) == 2 and set(add.inputs) <= set(writers)
+    two = (
+        add.activation is Activation.none
+        and len(set(add.inputs)) == 2
+        and set(add.inputs) <= set(writers)
+    )
     shared = any(add.output in stream for stream in streams(graph))
     if not (shared and two and tail.groups == 1 and tail.input == add.output):
         return graph
@@ -146,24 +172,31 @@ def _twice(op: Conv, step: float) -> Conv:
     """Its output channels down, then up."""
     bias = np.concatenate([op.bias + np.float32(offset * step) for offset in OFFSETS])
     weight = np.concatenate([op.weight] * len(OFFSETS))
-    return replace(op, name=f"{op.name}.twice", output=f"{op.output}.twice", weight=weight, bias=bias)
+    return replace(
+        op, name=f"{op.name}.twice", output=f"{op.output}.twice", weight=weight, bias=bias
+    )
 
 
 def two_gains(graph: Graph) -> Graph:
     """The graph whose last convolution writes its channels twice: fine, and coarse by GAIN.
 
-    Any other last operation stays as it is, and so does one with an activation that factors do not pass.
+    Any other last operation stays as it is, and so does one with an activation that factors do not
+    pass.
     """
     return _in_copies(graph, [(1, 0.0), (GAIN, 0.0)]) if takes_gains(graph) else graph
 
 
 def windowed(graph: Graph, offsets: np.ndarray) -> Graph:
-    """The graph whose last convolution writes its channels coarse by GAIN, then less each of the offsets (W, C)."""
+    """The graph whose last convolution writes its channels coarse by GAIN, then less each of the
+    offsets (W, C).
+    """
     return _in_copies(graph, [(GAIN, 0.0), *((1, offset) for offset in offsets)])
 
 
 def _in_copies(graph: Graph, copies: Sequence[tuple[int, np.ndarray | float]]) -> Graph:
-    """The graph whose last convolution writes its channels once for each gain and offset: coarser, and less that."""
+    """The graph whose last convolution writes its channels once for each gain and offset: coarser,
+    and less that.
+    """
     *before, last = graph
     assert isinstance(last, Conv)  # noqa: S101 - takes_gains has seen to it
     weight = np.concatenate([last.weight / gain for gain, _ in copies])
@@ -177,7 +210,9 @@ MAX_CHANNELS = 4096
 
 
 def window_offsets(low: np.ndarray, high: np.ndarray, unit: float) -> np.ndarray:
-    """The middles (W, C) of as many windows of int8, its step `unit`, as hold values from low to high, (C,) each."""
+    """The middles (W, C) of as many windows of int8, its step `unit`, as hold values from low to
+    high, (C,) each.
+    """
     most = min(MAX_WINDOWS, MAX_CHANNELS // len(low) - 1)
     count = int(np.clip(np.ceil((high - low).max() / (2 * FINE_MAX * unit)), 1, max(most, 1)))
     shares = (np.arange(count)[:, None] + 0.5) / count

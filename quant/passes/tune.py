@@ -1,9 +1,11 @@
-"""Train the whole numbers themselves: weights and biases of the integer core, roundings and clippings in the loop.
+"""Train the whole numbers themselves: weights and biases of the integer core, roundings and
+clippings in the loop.
 
-Rounding each tensor as well as it can be done leaves errors that meet behind many layers, and noise that no rounding
-takes back. Here the core is run as it is, and its numbers follow the slope of what its result errs by (training that
-sees the quantiser, Jacob et al. 2018): from the reference where there is one, and from the float network. Scales and
-shifts stay, so the core stays as legal as it was.
+Rounding each tensor as well as it can be done leaves errors that meet behind many layers, and noise
+that no rounding takes back. Here the core is run as it is, and its numbers follow the slope of what
+its result errs by (training that sees the quantiser, Jacob et al. 2018): from the reference where
+there is one, and from the float network. Scales and shifts stay, so the core stays as legal as it
+was.
 """
 
 import math
@@ -30,8 +32,9 @@ MOST_HELD_OUT = 16
 BATCH_PIXELS = 4 * 128**2
 """Of the planes that one step looks at."""
 BORDER_PX = 8
-"""Not held against a reference in a result of at least four times as many a side: there a patch ends, and its image
-goes on. The float network has the same border."""
+"""Not held against a reference in a result of at least four times as many a side: there a patch
+ends, and its image goes on. The float network has the same border.
+"""
 ROUNDS = (400, 800, 1600)
 """Steps of each round of "auto"."""
 LEAST_GAIN = 0.02
@@ -65,7 +68,8 @@ class Sample:
         planes: of the image, (1, P, H, W) as float32.
         floats: what the float network makes of it.
         reference: the correction that would restore it wholly, or None.
-        weight: of its errors: over the float network's own, so that dark and busy patches count alike.
+        weight: of its errors: over the float network's own, so that dark and busy patches count
+            alike.
     """
 
     image: np.ndarray
@@ -83,7 +87,8 @@ class Sample:
 
 
 class Judge:
-    """Keeps the core whose results, as the host computes them, lose least on samples that it is not trained on.
+    """Keeps the core whose results, as the host computes them, lose least on samples that it is not
+    trained on.
 
     What is lost is the mean error beyond the float network's own.
     """
@@ -96,10 +101,14 @@ class Judge:
 
     def loss(self, core: IntCore) -> float:
         """What a core loses."""
-        ends = replace(core.ends, back=(), adds_image=False, last=(), flat=False, softmax=False, tail=None)
+        ends = replace(
+            core.ends, back=(), adds_image=False, last=(), flat=False, softmax=False, tail=None
+        )
         session = open_session(host_model(replace(core, ends=ends), {}))
         results = (torch.from_numpy(result_of(session, sample.image)) for sample in self._held)
-        errors = [float(sample.error(result)) for sample, result in zip(self._held, results, strict=True)]
+        errors = [
+            float(sample.error(result)) for sample, result in zip(self._held, results, strict=True)
+        ]
         return float(np.mean(errors)) - self._in_float
 
     @property
@@ -118,7 +127,8 @@ class Judge:
 class Descent:
     """The steps by Adam; in each round the rate of learning falls to 0 as a half cosine.
 
-    While the rate is high, numbers turn to and fro at the thresholds of their rounding, and no judgement is of use.
+    While the rate is high, numbers turn to and fro at the thresholds of their rounding, and no
+    judgement is of use.
     """
 
     def __init__(self, trainable: TrainableCore, samples: list[Sample], tuning: Tuning) -> None:
@@ -127,15 +137,21 @@ class Descent:
         self._rate = tuning.rate
         self.done = 0
         self._generator = torch.Generator().manual_seed(tuning.seed)
-        self._optimiser = torch.optim.Adam(trainable.parameters(), eps=1e-15)  # errors are small without references
+        self._optimiser = torch.optim.Adam(
+            trainable.parameters(), eps=1e-15
+        )  # errors are small without references
         self._batch = max(BATCH_PIXELS // math.prod(samples[0].planes.shape[2:]), 1)
 
     def round(self, steps: int) -> Iterator[int]:
         """So many steps; yields how many of them are left."""
         for step in range(steps):
-            self._optimiser.param_groups[0]["lr"] = self._rate * 0.5 * (1 + math.cos(math.pi * step / steps))
+            self._optimiser.param_groups[0]["lr"] = (
+                self._rate * 0.5 * (1 + math.cos(math.pi * step / steps))
+            )
             self._optimiser.zero_grad()
-            for number in torch.randint(len(self._samples), (self._batch,), generator=self._generator).tolist():
+            for number in torch.randint(
+                len(self._samples), (self._batch,), generator=self._generator
+            ).tolist():
                 sample = self._samples[number]
                 (sample.error(self._trainable(sample.planes)) / self._batch).backward()
             self._optimiser.step()
@@ -146,7 +162,8 @@ class Descent:
 def tune(
     core: IntCore, full: Graph, tuning: Tuning, still: Collection[str] = (), log: Log = no_log
 ) -> tuple[IntCore, int]:
-    """The core with the numbers that erred least on pairs that they were not trained on, and the steps taken.
+    """The core with the numbers that erred least on pairs that they were not trained on, and the
+    steps taken.
 
     Args:
         core: to start from; it comes back as it is where training finds nothing better.
@@ -168,7 +185,10 @@ def tune(
         for left in descent.round(steps):
             if left % JUDGED_EVERY == 0:
                 judge.see(trainable.core())
-                log(f"fine-tuning, step {descent.done} of {most}: held-out pairs lose {judge.share:.2f} of the first")
+                log(
+                    f"fine-tuning, step {descent.done} of {most}: held-out pairs lose "
+                    f"{judge.share:.2f} of the first"
+                )
         if before - judge.least < LEAST_GAIN * judge.first:
             break
     return judge.core, descent.done
@@ -178,7 +198,9 @@ def _samples(ends: Ends, full: Graph, pairs: Remade[Pair]) -> Iterator[Sample]:
     session = open_session(graph_to_onnx(full, [CORRECTION], ends.planes * ends.channels))
     for image, reference in pairs:
         ((floats,),) = tensor_values(session, [CORRECTION], image, None, ends)
-        planes = torch.from_numpy(ends.split(image).astype(np.float32)).to(memory_format=torch.channels_last)
+        planes = torch.from_numpy(ends.split(image).astype(np.float32)).to(
+            memory_format=torch.channels_last
+        )
         result = torch.from_numpy(floats)
         if not (reference.size and ends.is_image):
             yield Sample(image, planes, result, None, 1.0)
@@ -189,7 +211,9 @@ def _samples(ends: Ends, full: Graph, pairs: Remade[Pair]) -> Iterator[Sample]:
             remedy = "give references of the size that the network makes"
             raise ImageError("reference", expected=f"one of {made}", got=given, remedy=remedy)
         wanted = torch.from_numpy(ends.correction_of(image, reference))
-        yield Sample(image, planes, result, wanted, 1 / max(float(_inner_error(result, wanted)), LEAST_ERROR))
+        yield Sample(
+            image, planes, result, wanted, 1 / max(float(_inner_error(result, wanted)), LEAST_ERROR)
+        )
 
 
 LEAST_ERROR = 1e-9

@@ -1,7 +1,8 @@
-"""Nodes rewritten as the equal ones that a DPU and a quantiser know, in place: what no runtime's optimisation does.
+"""Nodes rewritten as the equal ones that a DPU and a quantiser know, in place: what no runtime's
+optimisation does.
 
-Every rewriting is exact but for the rounding of float32, borders included. `quant.reading.folding` calls it, and says
-what holds behind it.
+Every rewriting is exact but for the rounding of float32, borders included. `quant.reading.folding`
+calls it, and says what holds behind it.
 """
 
 from copy import deepcopy
@@ -45,7 +46,9 @@ def rewrite(model: onnx.ModelProto) -> None:
         _in_front(graph, shapes)
         for shaped in (_cast, _mean, _depthwise):
             graph.pass_over(partial(shaped, shapes))
-        graph.pass_over(_behind)  # a normalisation that has become a convolution takes in what stands around it
+        graph.pass_over(
+            _behind
+        )  # a normalisation that has become a convolution takes in what stands around it
         _in_front(graph, shapes)
         graph.pass_over(Unflatten(shapes))
         graph.write()
@@ -60,7 +63,9 @@ def _sum(_: Nodes, node: NodeProto) -> list[NodeProto] | None:
     for number, name in enumerate(node.input[1:], 1):
         whole = number == len(node.input) - 1
         output = node.output[0] if whole else f"{node.output[0]}.{number}"
-        adds.append(helper.make_node("Add", [last, name], [output], name=output if not whole else node.name))
+        adds.append(
+            helper.make_node("Add", [last, name], [output], name=output if not whole else node.name)
+        )
         last = output
     return adds
 
@@ -90,7 +95,9 @@ def _behind(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
 
 
 def _affine(graph: Nodes, node: NodeProto) -> tuple[str, Affine] | None:
-    """The tensor that a node works on and what it does to each channel, None where it does something else."""
+    """The tensor that a node works on and what it does to each channel, None where it does
+    something else.
+    """
     if node.op_type == NORMALISATION:
         return _normalisation(graph, node)
     if node.op_type not in ARITHMETIC:
@@ -119,7 +126,11 @@ def _arithmetic(kind: str, value: np.ndarray, place: int) -> Affine | None:
 def _normalisation(graph: Nodes, node: NodeProto) -> tuple[str, Affine] | None:
     values = [graph.value(name) for name in node.input[1:5]]
     given = attributes_of(node)
-    if given.get("training_mode", 0) or len(node.output) > 1 or any(value is None for value in values):
+    if (
+        given.get("training_mode", 0)
+        or len(node.output) > 1
+        or any(value is None for value in values)
+    ):
         return None
     gain, offset, mean, variance = values
     scale = gain / np.sqrt(variance + given.get("epsilon", 1e-5))
@@ -127,7 +138,9 @@ def _normalisation(graph: Nodes, node: NodeProto) -> tuple[str, Affine] | None:
 
 
 def per_channel(value: np.ndarray | None) -> np.ndarray | None:
-    """(C,) or (1,) of a constant that is one number a channel of (N, C, H, W), None of any other."""
+    """(C,) or (1,) of a constant that is one number a channel of (N, C, H, W),
+    None of any other.
+    """
     if value is None or value.ndim > 4:
         return None
     shape = (1,) * (4 - value.ndim) + value.shape
@@ -150,7 +163,11 @@ def _scale_results(graph: Nodes, node: NodeProto, affine: Affine) -> None:
 def _numbers(graph: Nodes, node: NodeProto) -> tuple[np.ndarray, np.ndarray]:
     """Weights and bias (O,) of a convolution."""
     weight = graph.value(node.input[1])
-    bias = graph.value(node.input[2]) if len(node.input) > 2 and node.input[2] else np.zeros(graph.width(node))
+    bias = (
+        graph.value(node.input[2])
+        if len(node.input) > 2 and node.input[2]
+        else np.zeros(graph.width(node))
+    )
     if weight is None or bias is None:  # `is_linear` has seen to it
         raise ValueError(f"{node.name} without weights")
     return weight, bias
@@ -158,7 +175,11 @@ def _numbers(graph: Nodes, node: NodeProto) -> tuple[np.ndarray, np.ndarray]:
 
 def _set_numbers(graph: Nodes, node: NodeProto, weight: np.ndarray, bias: np.ndarray) -> None:
     name = node.name or node.output[0]
-    node.input[:] = [node.input[0], graph.keep(f"{name}.weight", weight), graph.keep(f"{name}.bias", bias)]
+    node.input[:] = [
+        node.input[0],
+        graph.keep(f"{name}.weight", weight),
+        graph.keep(f"{name}.bias", bias),
+    ]
 
 
 def _hard_swish(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
@@ -177,7 +198,11 @@ def _hard_swish(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
 
 def _cast(shapes: Shapes, graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
     """What is float32 already; the runtime leaves such a cast where it writes a result."""
-    before = graph.sole_writer(node.input[0]) if node.op_type == "Cast" and node.input[0] in shapes else None
+    before = (
+        graph.sole_writer(node.input[0])
+        if node.op_type == "Cast" and node.input[0] in shapes
+        else None
+    )
     if before is None or attributes_of(node)["to"] != TensorProto.FLOAT:
         return None
     graph.rename(node.input[0], node.output[0])
@@ -199,7 +224,9 @@ def _mean(shapes: Shapes, _: Nodes, node: NodeProto) -> list[NodeProto] | None:
 
 
 def _in_front(graph: Nodes, shapes: Shapes) -> None:
-    """What works on each channel by itself, folded into all the convolutions that read it, where that is exact."""
+    """What works on each channel by itself, folded into all the convolutions that read it, where
+    that is exact.
+    """
     readers = graph.readers()
     ends = set(graph.ends)
     folded = set[int]()
@@ -220,16 +247,26 @@ def _in_front(graph: Nodes, shapes: Shapes) -> None:
 
 
 def _keeps_channels(source: str, affine: Affine, shapes: Shapes) -> bool:
-    """Whether each constant meets a channel of its own: one channel times many constants would be many."""
-    return affine.channels == 1 or (len(shapes.get(source, ())) == 4 and shapes[source][1] == affine.channels)
+    """Whether each constant meets a channel of its own: one channel times many constants would be
+    many.
+    """
+    return affine.channels == 1 or (
+        len(shapes.get(source, ())) == 4 and shapes[source][1] == affine.channels
+    )
 
 
 def _may_scale_inputs(graph: Nodes, node: NodeProto, name: str, affine: Affine) -> bool:
-    """Zeros that a convolution pads with are not shifted: a shift passes one without padding alone."""
+    """Zeros that a convolution pads with are not shifted: a shift passes one
+    without padding alone.
+    """
     given = attributes_of(node)
     unpadded = node.op_type == "Conv" and given.get("auto_pad", "NOTSET") in ("NOTSET", "VALID")
     unpadded = unpadded and not any(given.get("pads", []))
-    return graph.is_linear(node) and list(node.input).count(name) == 1 and (unpadded or not affine.shift.any())
+    return (
+        graph.is_linear(node)
+        and list(node.input).count(name) == 1
+        and (unpadded or not affine.shift.any())
+    )
 
 
 def _scale_inputs(graph: Nodes, node: NodeProto, affine: Affine) -> None:
@@ -267,9 +304,11 @@ Map = tuple[int, int, int]
 
 
 class Unflatten:
-    """A step of `Nodes.pass_over`, which remembers flat maps: fully connected layers as convolutions of whole maps.
+    """A step of `Nodes.pass_over`, which remembers flat maps: fully connected layers as
+    convolutions of whole maps.
 
-    The flattening is left behind them. A Softmax over what is flat becomes one along the channels of one pixel.
+    The flattening is left behind them. A Softmax over what is flat becomes one along the channels
+    of one pixel.
     """
 
     def __init__(self, shapes: Shapes) -> None:
@@ -288,16 +327,26 @@ class Unflatten:
         source, size = found
         if node.op_type == "Gemm":
             return self._connected(graph, node, source, size)
-        if node.op_type == "Softmax" and size[1:] == (1, 1) and attributes_of(node).get("axis", -1) in (1, -1):
-            return self._flat(helper.make_node("Softmax", [source], node.output, name=node.name, axis=1), size)
+        if (
+            node.op_type == "Softmax"
+            and size[1:] == (1, 1)
+            and attributes_of(node).get("axis", -1) in (1, -1)
+        ):
+            return self._flat(
+                helper.make_node("Softmax", [source], node.output, name=node.name, axis=1), size
+            )
         if node.op_type in POINTWISE:
             image = deepcopy(node)
             image.input[0] = source
             return self._flat(image, size)
-        unseen = graph.reads[node.input[0]] == 1 and graph.reads[source] <= 1 and source in graph.writers
+        unseen = (
+            graph.reads[node.input[0]] == 1 and graph.reads[source] <= 1 and source in graph.writers
+        )
         maps = [1, *size], [0, *size], [-1, *size]
         if unseen and node.op_type == "Reshape" and graph.integers(node.input[1]) in maps:
-            graph.rename(source, node.output[0])  # nothing stands in the place of what makes a map of it again
+            graph.rename(
+                source, node.output[0]
+            )  # nothing stands in the place of what makes a map of it again
             return []
         return None
 
@@ -311,24 +360,35 @@ class Unflatten:
         asked = graph.integers(node.input[1]) if len(node.input) == 2 else None
         if node.op_type == "Squeeze" and asked:
             return {axis % 4 for axis in asked} == {2, 3}
-        if node.op_type != "Reshape" or asked is None or len(asked) != 2 or attributes_of(node).get("allowzero", 0):
+        if (
+            node.op_type != "Reshape"
+            or asked is None
+            or len(asked) != 2
+            or attributes_of(node).get("allowzero", 0)
+        ):
             return False
         return asked[1] == prod(sizes[1:]) or (asked[1] == -1 and asked[0] in (0, sizes[0]))
 
-    def _connected(self, graph: Nodes, node: NodeProto, source: str, size: Map) -> list[NodeProto] | None:
+    def _connected(
+        self, graph: Nodes, node: NodeProto, source: str, size: Map
+    ) -> list[NodeProto] | None:
         given = attributes_of(node)
         weight = graph.array(node.input[1])
         bias = graph.array(node.input[2]) if len(node.input) > 2 and node.input[2] else np.zeros(1)
         if weight is None or bias is None or weight.ndim != 2 or given.get("transA", 0):
             return None
-        weight = (weight if given.get("transB", 0) else weight.T) * np.float32(given.get("alpha", 1.0))
+        weight = (weight if given.get("transB", 0) else weight.T) * np.float32(
+            given.get("alpha", 1.0)
+        )
         if weight.shape[1] != prod(size) or bias.size not in (1, len(weight)):
             return None
         offset = np.broadcast_to(bias.reshape(-1) * given.get("beta", 1.0), len(weight))
         name = node.name or node.output[0]
         values = {"weight": weight.reshape(-1, *size), "bias": offset}
         numbers = [graph.keep(f"{name}.{role}", value) for role, value in values.items()]
-        made = helper.make_node("Conv", [source, *numbers], node.output, name=name, kernel_shape=list(size[1:]))
+        made = helper.make_node(
+            "Conv", [source, *numbers], node.output, name=name, kernel_shape=list(size[1:])
+        )
         return self._flat(made, (len(weight), 1, 1))
 
     def _flat(self, image: NodeProto, size: Map) -> list[NodeProto]:

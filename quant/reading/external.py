@@ -1,7 +1,9 @@
-"""Weights that a model keeps in a file beside it, taken in: from the model's own folder, or not at all.
+"""Weights that a model keeps in a file beside it, taken in: from the model's own folder, or not at
+all.
 
-Exporters write one for large networks, torch's newer one for all. Only initializers are taken in; whatever else says
-that it lies elsewhere is refused by `quant.untrusted.check_content`, which looks at all of it afterwards.
+Exporters write one for large networks, torch's newer one for all. Only initializers are taken in;
+whatever else says that it lies elsewhere is refused by `quant.untrusted.check_content`, which looks
+at all of it afterwards.
 """
 
 import hashlib
@@ -44,21 +46,27 @@ def network_sha256(path: Path) -> str:
         return own
     apart = [tensor for tensor in model.graph.initializer if tensor.external_data]
     beside = sorted({_beside(tensor, _said(tensor).get("location", ""), path) for tensor in apart})
-    return hashlib.sha256("".join([own, *map(sha256, beside)]).encode()).hexdigest() if beside else own
+    return (
+        hashlib.sha256("".join([own, *map(sha256, beside)]).encode()).hexdigest() if beside else own
+    )
 
 
 @contextmanager
 def unchanged(path: Path) -> Iterator[str]:
-    """Give the digest of a network's file, and raise ModelError if the file is another one after it was read.
+    """Give the digest of a network's file, and raise ModelError if the file is another one after it
+    was read.
 
-    So the digest is that of the bytes that were parsed. It is empty where there is no file, which the reader refuses.
+    So the digest is that of the bytes that were parsed. It is empty where there is no file, which
+    the reader refuses.
     """
     before = network_sha256(path) if path.is_file() else ""
     yield before
     if before and network_sha256(path) != before:
         expected = "a network that stays as it is"
         remedy = "wait until it is written, then run this again"
-        raise ModelError(str(path), expected=expected, got="a change while it was read", remedy=remedy)
+        raise ModelError(
+            str(path), expected=expected, got="a change while it was read", remedy=remedy
+        )
 
 
 def _said(tensor: TensorProto) -> dict[str, str]:
@@ -75,7 +83,9 @@ def _content(tensor: TensorProto, path: Path, limit_bytes: int) -> bytes:
     size = math.prod(tensor.dims) * VALUE_BYTES[tensor.data_type]
     if size > limit_bytes:
         raise _refused(tensor, where, f"more than {FILE_BYTES} bytes in all")
-    start, length = (_whole(said.get(key, default)) for key, default in (("offset", "0"), ("length", str(size))))
+    start, length = (
+        _whole(said.get(key, default)) for key, default in (("offset", "0"), ("length", str(size)))
+    )
     beside = _beside(tensor, said.get("location", ""), path)
     if start is None or length != size or start + size > beside.stat().st_size:
         raise _refused(tensor, where, f"not the {size} bytes of its weights in {beside.name!r}")
@@ -90,10 +100,18 @@ def _whole(text: str) -> int | None:
 
 
 def _beside(tensor: TensorProto, location: str, path: Path) -> Path:
-    """The regular file in the model's folder, or one within it, that is meant; no link leads there."""
+    """The regular file in the model's folder, or one within it, that is meant;
+    no link leads there.
+    """
     parts = PurePosixPath(location.replace("\\", "/")).parts
     where = str(path)
-    if not parts or location.startswith(("/", "\\")) or ".." in parts or ":" in location or "\0" in location:
+    if (
+        not parts
+        or location.startswith(("/", "\\"))
+        or ".." in parts
+        or ":" in location
+        or "\0" in location
+    ):
         raise _refused(tensor, where, f"one in {location!r}, outside the model's folder")
     places = [path.parent.joinpath(*parts[: number + 1]) for number in range(len(parts))]
     if any(place.is_symlink() for place in places):

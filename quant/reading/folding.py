@@ -1,25 +1,29 @@
-"""A float ONNX file as exporters leave it, turned into its simplest equal: `simplest(model, where) -> model`.
+"""A float ONNX file as exporters leave it, turned into its simplest equal: `simplest(model, where)
+-> model`.
 
-`quant.onnx_file.load_onnx` calls it for whoever reads a file, once; behind it these hold of a float network:
+`quant.onnx_file.load_onnx` calls it for whoever reads a file, once; behind it these hold of a float
+network:
 
 - constants are initializers, each float32 where it was float16 too, and no initializer is an input;
 - no Identity, Constant, Dropout, needless Cast, no arithmetic on constants;
-- no BatchNormalization, and no Mul, Add, Sub or Div by one constant a channel, behind a convolution that only it
-  reads, nor in front of convolutions where they are exact; a BatchNormalization of images that is left is a depthwise
-  1 x 1 convolution; zeros that Pad adds are the convolution's own;
-- Sub of a convolution's result is Add, Sum is Add, a mean over the image is GlobalAveragePool, HardSwish is itself,
-  ReLU6 is Clip from 0 to 6;
-- operators of opset 17, unless one has no form there; inputs, outputs, metadata and nodes that stay keep their names,
-  each node has one, and no two convolutions share what was folded into one of them.
+- no BatchNormalization, and no Mul, Add, Sub or Div by one constant a channel, behind a convolution
+  that only it reads, nor in front of convolutions where they are exact; a BatchNormalization of
+  images that is left is a depthwise 1 x 1 convolution; zeros that Pad adds are the convolution's
+  own;
+- Sub of a convolution's result is Add, Sum is Add, a mean over the image is GlobalAveragePool,
+  HardSwish is itself, ReLU6 is Clip from 0 to 6;
+- operators of opset 17, unless one has no form there; inputs, outputs, metadata and nodes that stay
+  keep their names, each node has one, and no two convolutions share what was folded into one of
+  them.
 
-A network that needs none of it is returned as it is: its results stay the same to the bit. The same file gives the
-same bytes. INT8 files do not come here.
+A network that needs none of it is returned as it is: its results stay the same to the bit. The same
+file gives the same bytes. INT8 files do not come here.
 
-Constants, normalisation behind convolutions, padding and what does nothing are folded by onnxruntime's basic
-optimisation, which every installation has: it keeps to standard operators, and its own tests run on every release.
-(onnxsim or onnxscript's optimizer would be further packages for the same.) What it leaves is rewritten by
-`quant.reading.equivalents`; onnx's own converter changes the opset. Only what `quant.untrusted` has let through may
-come here: a runtime opens it.
+Constants, normalisation behind convolutions, padding and what does nothing are folded by
+onnxruntime's basic optimisation, which every installation has: it keeps to standard operators, and
+its own tests run on every release. (onnxsim or onnxscript's optimizer would be further packages for
+the same.) What it leaves is rewritten by `quant.reading.equivalents`; onnx's own converter changes
+the opset. Only what `quant.untrusted` has let through may come here: a runtime opens it.
 """
 
 from copy import deepcopy
@@ -40,14 +44,23 @@ OPSET = 17
 IR_VERSION = 8
 
 PLAIN = {
-    "Add", "AveragePool", "Concat", "Conv", "ConvTranspose", "DepthToSpace", "GlobalAveragePool", "LeakyRelu",
-    "MaxPool", "Relu",
-}  # fmt: skip
+    "Add",
+    "AveragePool",
+    "Concat",
+    "Conv",
+    "ConvTranspose",
+    "DepthToSpace",
+    "GlobalAveragePool",
+    "LeakyRelu",
+    "MaxPool",
+    "Relu",
+}
 """Operators behind which nothing is to be folded, where they read no constants but weights."""
 
 ALTERING = ["CommonSubexpressionElimination", "TransposeOptimizer"]
-"""Optimisers of the runtime's that make other networks: layers of equal weights would be one, pixel shuffles that are
-spelled out would not be recognised."""
+"""Optimisers of the runtime's that make other networks: layers of equal weights would be one, pixel
+shuffles that are spelled out would not be recognised.
+"""
 
 HALVES = (TensorProto.FLOAT16, TensorProto.BFLOAT16)
 
@@ -88,7 +101,9 @@ def _is_plain(model: onnx.ModelProto) -> bool:
         and not any(tensor.data_type in HALVES for tensor in model.graph.initializer)
         and not any(value.name in held for value in model.graph.input)
         and all(
-            node.op_type in PLAIN and node.name and (held.isdisjoint(node.input) or "Conv" in node.op_type)
+            node.op_type in PLAIN
+            and node.name
+            and (held.isdisjoint(node.input) or "Conv" in node.op_type)
             for node in model.graph.node
         )
     )
@@ -102,8 +117,14 @@ def _widen(model: onnx.ModelProto) -> None:
             value.type.tensor_type.elem_type = TensorProto.FLOAT
     for tensor in held_tensors(graph):
         if tensor.data_type in HALVES:
-            tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor).astype(np.float32), tensor.name))
-    for attribute in (a for node in graph.node for a in node.attribute if a.name in ("to", "dtype")):
+            tensor.CopyFrom(
+                numpy_helper.from_array(
+                    numpy_helper.to_array(tensor).astype(np.float32), tensor.name
+                )
+            )
+    for attribute in (
+        a for node in graph.node for a in node.attribute if a.name in ("to", "dtype")
+    ):
         attribute.i = TensorProto.FLOAT if attribute.i in HALVES else attribute.i
 
 
@@ -119,7 +140,10 @@ def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
         options.optimized_model_filepath = str(path)
         try:
             ort.InferenceSession(
-                model.SerializeToString(), options, ["CPUExecutionProvider"], disabled_optimizers=ALTERING
+                model.SerializeToString(),
+                options,
+                ["CPUExecutionProvider"],
+                disabled_optimizers=ALTERING,
             )
         except Exception as error:  # onnxruntime raises a class of its own for each status code
             got = " ".join(str(error).split())[:160]
@@ -130,7 +154,9 @@ def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 
 
 def _of_our_opset(model: onnx.ModelProto) -> onnx.ModelProto:
-    """With operators of our opset; as it is where the converter knows no way, or ours has no such operator."""
+    """With operators of our opset; as it is where the converter knows no way, or ours has no such
+    operator.
+    """
     version = opset_of(model)
     _replace(model.opset_import, [onnx.helper.make_opsetid("", version)])
     if version == OPSET:
@@ -148,12 +174,17 @@ RESIZE_HAS_MODES = 11
 
 
 def _place_corners(model: onnx.ModelProto) -> None:
-    """What older operators enlarge starts at the corner; the converter leaves the default, half a pixel off."""
+    """What older operators enlarge starts at the corner; the converter leaves the default, half a
+    pixel off.
+    """
     for node in model.graph.node:
         if node.op_type == "Resize":
             modes = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
             kept = [a for a in node.attribute if a.name not in modes]
-            _replace(node.attribute, [*kept, *(onnx.helper.make_attribute(*mode) for mode in modes.items())])
+            _replace(
+                node.attribute,
+                [*kept, *(onnx.helper.make_attribute(*mode) for mode in modes.items())],
+            )
 
 
 def _tidy(folded: onnx.ModelProto, model: onnx.ModelProto) -> None:
@@ -165,8 +196,12 @@ def _tidy(folded: onnx.ModelProto, model: onnx.ModelProto) -> None:
     graph = folded.graph
     graph.name = model.graph.name
     graph.ClearField("value_info")
-    read = {name for node in graph.node for name in node.input} | {value.name for value in graph.output}
-    kept = sorted((t for t in graph.initializer if t.name in read), key=lambda tensor: str(tensor.name))
+    read = {name for node in graph.node for name in node.input} | {
+        value.name for value in graph.output
+    }
+    kept = sorted(
+        (t for t in graph.initializer if t.name in read), key=lambda tensor: str(tensor.name)
+    )
     _replace(graph.initializer, kept)
     taken = dict.fromkeys((node.name for node in graph.node), 0)
     for node in graph.node:

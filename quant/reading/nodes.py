@@ -1,4 +1,6 @@
-"""The nodes of a network while they are rewritten: who writes and reads what, and the numbers they hold."""
+"""The nodes of a network while they are rewritten: who writes and reads what, and the numbers they
+hold.
+"""
 
 from collections import Counter, defaultdict
 from collections.abc import Callable
@@ -14,13 +16,19 @@ Shapes = dict[str, tuple[int, ...]]
 
 
 def shapes_of(model: onnx.ModelProto) -> Shapes:
-    """The sizes of each float32 tensor whose rank is known, 0 for a size that is not; none where sizes differ."""
+    """The sizes of each float32 tensor whose rank is known, 0 for a size that is not; none where
+    sizes differ.
+    """
     try:
         values = shape_inference.infer_shapes(model).graph
     except shape_inference.InferenceError:
         return {}
-    known = {v.name: v.type.tensor_type for v in (*values.input, *values.value_info, *values.output)}
-    floats = {n: t for n, t in known.items() if t.elem_type == TensorProto.FLOAT and t.HasField("shape")}
+    known = {
+        v.name: v.type.tensor_type for v in (*values.input, *values.value_info, *values.output)
+    }
+    floats = {
+        n: t for n, t in known.items() if t.elem_type == TensorProto.FLOAT and t.HasField("shape")
+    }
     return {name: tuple(d.dim_value for d in t.shape.dim) for name, t in floats.items()}
 
 
@@ -41,7 +49,9 @@ class Nodes:
         self.writers = {name: node for node in self.nodes for name in node.output if name}
 
     def pass_over(self, step: "Step") -> None:
-        """Each node replaced by what `step(graph, node)` gives for it, in order; None leaves it as it is."""
+        """Each node replaced by what `step(graph, node)` gives for it, in order; None leaves it as
+        it is.
+        """
         kept: list[NodeProto] = []
         for node in self.nodes:
             found = step(self, node)
@@ -74,12 +84,18 @@ class Nodes:
     def array(self, name: str) -> np.ndarray | None:
         """A constant of float32 as it is, None where it is none."""
         found = self.constants.get(name)
-        return None if found is None or found.data_type != TensorProto.FLOAT else numpy_helper.to_array(found)
+        return (
+            None
+            if found is None or found.data_type != TensorProto.FLOAT
+            else numpy_helper.to_array(found)
+        )
 
     def integers(self, name: str) -> list[int] | None:
         """A constant list of whole numbers, None where it is none."""
         found = self.constants.get(name)
-        return None if found is None else [int(size) for size in numpy_helper.to_array(found).ravel()]
+        return (
+            None if found is None else [int(size) for size in numpy_helper.to_array(found).ravel()]
+        )
 
     def keep(self, name: str, value: np.ndarray) -> str:
         """Note a constant as float32 under a name that is free, and return it."""
@@ -105,7 +121,9 @@ class Nodes:
         return found
 
     def is_linear(self, node: NodeProto | None) -> bool:
-        """Whether it is a convolution of images, transposed or not, of weights and bias that the file holds."""
+        """Whether it is a convolution of images, transposed or not, of weights and bias that the
+        file holds.
+        """
         if node is None or node.op_type not in LINEAR:
             return False
         numbers = [self.constants.get(name) for name in node.input[1:] if name]
@@ -115,7 +133,9 @@ class Nodes:
     def width(self, node: NodeProto) -> int:
         """The channels that a convolution writes."""
         dims = self.constants[node.input[1]].dims
-        return int(dims[0] if node.op_type == "Conv" else dims[1] * attributes_of(node).get("group", 1))
+        return int(
+            dims[0] if node.op_type == "Conv" else dims[1] * attributes_of(node).get("group", 1)
+        )
 
 
 def fresh(name: str, taken: dict[str, int]) -> str:
@@ -123,8 +143,8 @@ def fresh(name: str, taken: dict[str, int]) -> str:
 
     Args:
         name: that is wanted.
-        taken: of each name how many others were derived from it, so that a thousand nodes of one name do not try each
-            other's.
+        taken: of each name how many others were derived from it, so that a thousand nodes of one
+            name do not try each other's.
     """
     found = name
     while found in taken:

@@ -1,6 +1,8 @@
-"""Networks that were exported while they were trained, and not to be used: Dropout draws, BatchNormalization adapts.
+"""Networks that were exported while they were trained, and not to be used: Dropout draws,
+BatchNormalization adapts.
 
-Such a network gives another result for each run or for each tile. It is refused before these nodes are folded away.
+Such a network gives another result for each run or for each tile. It is refused before these nodes
+are folded away.
 """
 
 import numpy as np
@@ -12,7 +14,9 @@ from beers_deploy.quant.reading.nodes import attributes_of
 from beers_deploy.quant.untrusted import opset_of, refused
 
 IS_TEST_UNTIL = 6
-"""The last opset whose operators state by `is_test` whether they are in use; without it they are in training."""
+"""The last opset whose operators state by `is_test` whether they are in use; without it they are in
+training.
+"""
 DROPOUT_MODE_INPUT = 2
 
 
@@ -24,14 +28,22 @@ def require_inference(model: onnx.ModelProto, where: str) -> None:
         where: names the network in the message.
 
     Raises:
-        ModelError: a Dropout or a BatchNormalization in training mode, or in a mode that the file leaves open.
+        ModelError: a Dropout or a BatchNormalization in training mode, or in a mode that the file
+            leaves open.
     """
     opset = opset_of(model)
     constants = _constants(model.graph)
     for node in model.graph.node:
-        if node.domain in STANDARD and node.op_type in TRAINED and TRAINED[node.op_type](node, opset, constants):
+        if (
+            node.domain in STANDARD
+            and node.op_type in TRAINED
+            and TRAINED[node.op_type](node, opset, constants)
+        ):
             got = f"{node.op_type} {node.name or node.output[0]!r} in training mode"
-            remedy = "call model.eval() before you export it, or give the exporter its mode for inference"
+            remedy = (
+                "call model.eval() before you export it, or give the exporter its mode for "
+                "inference"
+            )
             raise refused(where, "a network that gives one result for one image", got, remedy)
 
 
@@ -46,7 +58,9 @@ def _constants(graph: onnx.GraphProto) -> dict[str, TensorProto]:
 
 
 def _drops(node: NodeProto, opset: int, constants: dict[str, TensorProto]) -> bool:
-    """Return True if a Dropout draws: its mode is a third input, and a mode that is computed may be any."""
+    """Return True if a Dropout draws: its mode is a third input, and a mode that is computed may be
+    any.
+    """
     if opset <= IS_TEST_UNTIL:
         return not attributes_of(node).get("is_test", 0)
     if len(node.input) <= DROPOUT_MODE_INPUT or not node.input[DROPOUT_MODE_INPUT]:
@@ -56,7 +70,8 @@ def _drops(node: NodeProto, opset: int, constants: dict[str, TensorProto]) -> bo
 
 
 def _adapts(node: NodeProto, opset: int, _: dict[str, TensorProto]) -> bool:
-    """Return True if a BatchNormalization takes mean and variance from the image, and gives them as further results.
+    """Return True if a BatchNormalization takes mean and variance from the image, and gives them as
+    further results.
 
     From opset 14 on an attribute states it as well.
     """

@@ -1,8 +1,9 @@
-"""What an operator's pixels read along one side of the image: windows, transposed windows, shuffles, enlargements.
+"""What an operator's pixels read along one side of the image: windows, transposed windows,
+shuffles, enlargements.
 
-`STEPS` says it of each operator that reads other pixels than the one in its own place. Sizes are followed as a share
-of the image's, and what a tensor has beyond that share: so it does not matter where pixels were padded and where
-windows used them up.
+`STEPS` says it of each operator that reads other pixels than the one in its own place. Sizes are
+followed as a share of the image's, and what a tensor has beyond that share: so it does not matter
+where pixels were padded and where windows used them up.
 """
 
 import math
@@ -41,11 +42,14 @@ class Step:
         Args:
             first: of the result's pixels.
             last: of them.
-            size: of the source where the image is one cell of the lattice: it may end on either side of it.
+            size: of the source where the image is one cell of the lattice: it may end on either
+                side of it.
         """
         low = math.ceil(first / self.growth + self.low)
         high = math.floor(last / self.growth + self.high)
-        if self.mirrored:  # beyond an end of the source stands what is mirrored, or copied, from within
+        if (
+            self.mirrored
+        ):  # beyond an end of the source stands what is mirrored, or copied, from within
             return min(low, 2 * (size - 1) - high), max(high, -low)
         return min(low, size - 1), max(high, 0)
 
@@ -71,7 +75,10 @@ class Along:
     def require(self, sound: bool, why: str) -> None:
         """Refuse a node that cannot be tiled."""
         if not sound:
-            raise refused("operators that do the same at every pixel, from near pixels alone", f"{self.node}, {why}")
+            raise refused(
+                "operators that do the same at every pixel, from near pixels alone",
+                f"{self.node}, {why}",
+            )
 
     def given(self, key: str, otherwise: Any) -> Any:
         """An attribute of the node."""
@@ -85,7 +92,9 @@ class Along:
 
     def own(self, numbers: Sequence[Any], axes: Sequence[int], otherwise: Any) -> Any:
         """This side's number, of some for these axes of (N, C, H, W)."""
-        return dict(zip((int(axis) % 4 for axis in axes), numbers, strict=True)).get(2 + self.axis, otherwise)
+        return dict(zip((int(axis) % 4 for axis in axes), numbers, strict=True)).get(
+            2 + self.axis, otherwise
+        )
 
     def slid(self, window: Window, ceil: bool = False) -> Step:
         """A window that slides over its padded source."""
@@ -95,7 +104,9 @@ class Along:
         return Step(Fraction(1, window.stride[self.axis]), extra, Fraction(-before), Fraction(high))
 
     def put_down(self, window: Window) -> Step:
-        """A window that is put down at each pixel of its source; the result is cut by the padding."""
+        """A window that is put down at each pixel of its source; the result is
+        cut by the padding.
+        """
         stride = window.stride[self.axis]
         before = window.pads[self.axis]
         low = Fraction(before - window.extent(self.axis) + 1, stride)
@@ -108,7 +119,8 @@ def _window(at: Along) -> Window:
     kernel = () if weight is None else at.shapes.get(at.node.inputs[weight], ())[2:]
     window = at.node.window(kernel, (at.extra, at.extra))
     at.require(
-        window is not None and not at.given("channels_last", 0), "which has no constant window of rows and columns"
+        window is not None and not at.given("channels_last", 0),
+        "which has no constant window of rows and columns",
     )
     return window or Window()
 
@@ -155,23 +167,38 @@ def _slice(at: Along) -> Step:
     ends = at.numbers(2, "ends")
     axes = at.numbers(3, "axes", range(len(starts)))
     steps = at.numbers(4, "steps", [1] * len(starts))
-    start, end, step = (at.own(*each) for each in ((starts, axes, 0), (ends, axes, FAR), (steps, axes, 1)))
-    at.require(start >= 0 and step > 0 and (end < 0 or end >= FAR), "which cuts at a place that is fixed")
+    start, end, step = (
+        at.own(*each) for each in ((starts, axes, 0), (ends, axes, FAR), (steps, axes, 1))
+    )
+    at.require(
+        start >= 0 and step > 0 and (end < 0 or end >= FAR), "which cuts at a place that is fixed"
+    )
     behind = min(end, 0)
     return at.slid(Window(stride=(step, step), pads=(-start, -start, behind, behind)))
 
 
 def _resize(at: Along) -> Step:
-    """Enlarging by whole factors, or taking every 2nd, 4th, ... pixel; linear where all weights are exact floats."""
+    """Enlarging by whole factors, or taking every 2nd, 4th, ... pixel; linear where all weights are
+    exact floats.
+    """
     found = Resizing.of(at.node, at.graph)
     at.require(bool(found.factors), "to a size that is fixed")
     growth = Fraction(found.factors[2 + at.axis])
-    whole = 0 < growth <= WINDOW_PX and 1 in (growth.numerator, growth.denominator) and found.factors[:2] == (1, 1)
+    whole = (
+        0 < growth <= WINDOW_PX
+        and 1 in (growth.numerator, growth.denominator)
+        and found.factors[:2] == (1, 1)
+    )
     at.require(whole, f"by {times(found.factors)}")
     at.require(found.where in PLACES, f"of coordinates {found.where}, which depend on the size")
-    at.require(growth > 1 or found.where != "pytorch_half_pixel", "of coordinates that depend on the size")
+    at.require(
+        growth > 1 or found.where != "pytorch_half_pixel", "of coordinates that depend on the size"
+    )
     linear = found.mode == "linear"
-    at.require(not at.given("antialias", 0) and (linear or found.mode == "nearest"), f"of mode {found.mode}")
+    at.require(
+        not at.given("antialias", 0) and (linear or found.mode == "nearest"),
+        f"of mode {found.mode}",
+    )
     exact = not linear or growth.numerator & (growth.numerator - 1) == 0
     at.require(exact, f"by {growth}, of weights that depend on the place by rounding")
     ways = (math.floor, math.ceil) if linear else (ROUNDINGS[found.rounding],)

@@ -1,21 +1,23 @@
 """How a network's image may be cut into tiles that give the whole image's result, bit for bit.
 
-The contract, of `tiling_of`: cut tiles at multiples of `lattice_px`; read each with `halo_px` around what is kept of
-it, less only where the image ends; extend the image at the bottom and right to a multiple of `lattice_px` first, and
-to `least_px`.
-Then a kept pixel is computed from the same numbers in the same places as in the whole image, the zeros that layers
-pad with included, and the output is `scale` times the image's size. (A runtime's float sums are the same too where
-it adds in one order: onnxruntime changes that for maps of fewer than some 80 pixels a thread, see
+The contract, of `tiling_of`: cut tiles at multiples of `lattice_px`; read each with `halo_px`
+around what is kept of it, less only where the image ends; extend the image at the bottom and right
+to a multiple of `lattice_px` first, and to `least_px`. Then a kept pixel is computed from the same
+numbers in the same places as in the whole image, the zeros that layers pad with included, and the
+output is `scale` times the image's size. (A runtime's float sums are the same too where it adds in
+one order: onnxruntime changes that for maps of fewer than some 80 pixels a thread, see
 docs/explanation/tiling.md.)
 
-It is found by a walk along the graph and back, once for the rows and once for the columns. On the way there each
-tensor is given how many pixels it has for one of the image, a fraction behind a pool or a stride: the lattice is the
-least common multiple of the denominators. On the way back it is given which of its pixels one cell of the lattice
-reads. The halo reaches to the farthest one's own place: a tile ends there too, and the layers behind pad at its end.
+It is found by a walk along the graph and back, once for the rows and once for the columns. On the
+way there each tensor is given how many pixels it has for one of the image, a fraction behind a pool
+or a stride: the lattice is the least common multiple of the denominators. On the way back it is
+given which of its pixels one cell of the lattice reads. The halo reaches to the farthest one's own
+place: a tile ends there too, and the layers behind pad at its end.
 
-Refused, with the node's name, is what does not do the same at every period of the lattice, from near pixels alone:
-ranges and means over the image, fully connected layers, sizes that are fixed, enlargements whose weights depend on
-the place by rounding (a third has no exact float), and constants that differ from pixel to pixel.
+Refused, with the node's name, is what does not do the same at every period of the lattice, from
+near pixels alone: ranges and means over the image, fully connected layers, sizes that are fixed,
+enlargements whose weights depend on the place by rounding (a third has no exact float), and
+constants that differ from pixel to pixel.
 """
 
 import math
@@ -36,7 +38,8 @@ class Tiling:
     """How a network meets an image (see the module's own words).
 
     Attributes:
-        halo_px: context around what is kept of a tile: the receptive radius, rounded up to the lattice.
+        halo_px: context around what is kept of a tile: the receptive radius, rounded up to the
+            lattice.
         lattice_px: tiles begin and end at multiples of it; 1 without strides.
         scale: pixels of the output for one of the image, along either side.
         channels_in: bands that the network reads together.
@@ -62,7 +65,8 @@ class Tiling:
         """What a message says of it."""
         bands = f"of {self.channels_in} bands in and {self.channels_out} out"
         return (
-            f"{bands}, a result of {self.scale} times the image's size and tiles of multiples of {self.lattice_px} px"
+            f"{bands}, a result of {self.scale} times the image's size and tiles of "
+            f"multiples of {self.lattice_px} px"
         )
 
 
@@ -79,17 +83,26 @@ def tiling_of(model: onnx.ModelProto, where: str = "tiled model") -> Tiling:
         lattice_px = math.lcm(rows.lattice_px, columns.lattice_px)
         radius_px = max(rows.radius_px, columns.radius_px)
         if rows.scale != columns.scale:
-            raise refused("as many pixels of output along both sides", f"{rows.scale} and {columns.scale}")
+            raise refused(
+                "as many pixels of output along both sides", f"{rows.scale} and {columns.scale}"
+            )
         if fixed_px is not None and fixed_px % lattice_px:
-            raise refused(f"tiles of a multiple of {lattice_px} pixels a side", f"a network fixed to {fixed_px}")
+            raise refused(
+                f"tiles of a multiple of {lattice_px} pixels a side",
+                f"a network fixed to {fixed_px}",
+            )
         halo_px = -(-radius_px // lattice_px) * lattice_px
         least_px = max(rows.least_px, columns.least_px)
-        return Tiling(halo_px, lattice_px, rows.scale, channels_in, channels_out, fixed_px, least_px)
+        return Tiling(
+            halo_px, lattice_px, rows.scale, channels_in, channels_out, fixed_px, least_px
+        )
 
 
 def _channels(graph: OnnxGraph, model: onnx.ModelProto) -> tuple[int, int]:
     if len(graph.inputs) != 1 or len(graph.outputs) != 1:
-        raise refused("one image in and one out", f"{len(graph.inputs)} in and {len(graph.outputs)} out")
+        raise refused(
+            "one image in and one out", f"{len(graph.inputs)} in and {len(graph.outputs)} out"
+        )
     (sizes,) = graph.inputs.values()
     if sizes and sizes[0] > 1:
         raise refused("any number of images, or one at a time", f"batches of {sizes[0]}")
@@ -97,7 +110,8 @@ def _channels(graph: OnnxGraph, model: onnx.ModelProto) -> tuple[int, int]:
         raise refused("an image (N, C, H, W) of a stated number of channels", "none stated")
     given = _channel_count(model.graph.output[0])
     given = given or _channel_count(onnx.shape_inference.infer_shapes(model).graph.output[0])
-    # Where neither file nor inference tells, as with a runtime's own operators, what comes out is judged as it comes.
+    # Where neither file nor inference tells, as with a runtime's own operators, what comes out is
+    # judged as it comes.
     return sizes[1], given or sizes[1]
 
 
@@ -113,7 +127,8 @@ PERIOD = 1024
 
 @dataclass(frozen=True)
 class _Grid:
-    """A tensor's pixels along one side: so many for one of the image, and so many beyond, or short of, that share.
+    """A tensor's pixels along one side: so many for one of the image, and so many beyond, or short
+    of, that share.
 
     They are beyond it where something padded, until windows use them up or they are cut off.
     """
@@ -132,7 +147,9 @@ class _Grid:
 
 
 class _Walk:
-    """Follows the image along one side, from node to node, and back what a cell of the lattice reads."""
+    """Follows the image along one side, from node to node, and back what a cell of the lattice
+    reads.
+    """
 
     def __init__(self, graph: OnnxGraph, axis: int) -> None:
         self._graph = graph
@@ -149,9 +166,13 @@ class _Walk:
         self.scale = self._grids[output].per_px
         extra = self._grids[output].extra
         if extra:
-            raise refused("an output of the image's size or a multiple", f"{extra:+d} pixels a side")
+            raise refused(
+                "an output of the image's size or a multiple", f"{extra:+d} pixels a side"
+            )
         self.lattice_px = math.lcm(*(grid.per_px.denominator for grid in self._grids.values()))
-        period = max(self.lattice_px, *(grid.in_cell(self.lattice_px) for grid in self._grids.values()))
+        period = max(
+            self.lattice_px, *(grid.in_cell(self.lattice_px) for grid in self._grids.values())
+        )
         if period > PERIOD:
             raise refused(f"a network that repeats within {PERIOD} pixels", f"a period of {period}")
         self.radius_px = self._radius_px(output)
@@ -163,7 +184,9 @@ class _Walk:
             step = self._step(at, read)
             at.require(step.growth > 0, "of no stride")
             self._steps.append((node, step))
-            self._grids.update(dict.fromkeys(node.outputs, _Grid(read[0].per_px * step.growth, step.extra)))
+            self._grids.update(
+                dict.fromkeys(node.outputs, _Grid(read[0].per_px * step.growth, step.extra))
+            )
             if step.mirrored:
                 self.least_px = max(self.least_px, math.ceil((1 + step.mirrored) / read[0].per_px))
         else:  # such as weights dequantised in a board file
@@ -188,7 +211,9 @@ class _Walk:
                 size = self._grids[name].in_cell(self.lattice_px) + self._grids[name].extra
                 ends = step.reads(*_hull(wanted), size)
                 read[name] = _hull([ends, read.get(name, ends)])
-        return max(self._grids[name].reach_px(*ends, self.lattice_px) for name, ends in read.items())
+        return max(
+            self._grids[name].reach_px(*ends, self.lattice_px) for name, ends in read.items()
+        )
 
 
 def _hull(ranges: list[tuple[int, int]]) -> tuple[int, int]:
@@ -204,7 +229,8 @@ def _require_pointwise(at: Along) -> None:
         at.require(len(table) == 1 and at.given("axis", 0) == 0, "which moves pixels")
     else:
         why = next(
-            (why for why, marks in WHY.items() if any(mark in kind for mark in marks)), "of which it is not known"
+            (why for why, marks in WHY.items() if any(mark in kind for mark in marks)),
+            "of which it is not known",
         )
         at.require(kind in POINTWISE, why)
         flat = all(set(at.shapes.get(name, ())[-2:]) <= {1} for name in at.node.inputs)
@@ -212,17 +238,67 @@ def _require_pointwise(at: Along) -> None:
 
 
 POINTWISE = {
-    "Abs", "Add", "And", "Cast", "Ceil", "Celu", "Clip", "Div", "Dropout", "Elu", "Equal", "Erf", "Exp", "Floor",
-    "Gelu", "Greater", "GreaterOrEqual", "HardSigmoid", "HardSwish", "Identity", "LeakyRelu", "Less", "LessOrEqual",
-    "Log", "Max", "Mean", "Min", "Mish", "Mul", "Neg", "Not", "Or", "PRelu", "Pow", "QLinearAdd", "QLinearLeakyRelu",
-    "QLinearMul", "QLinearSigmoid", "Reciprocal", "Relu", "Round", "Selu", "Sigmoid", "Sign", "Softplus", "Softsign",
-    "Sqrt", "Sub", "Sum", "Tanh", "ThresholdedRelu", "Where", "Xor",
-}  # fmt: skip
+    "Abs",
+    "Add",
+    "And",
+    "Cast",
+    "Ceil",
+    "Celu",
+    "Clip",
+    "Div",
+    "Dropout",
+    "Elu",
+    "Equal",
+    "Erf",
+    "Exp",
+    "Floor",
+    "Gelu",
+    "Greater",
+    "GreaterOrEqual",
+    "HardSigmoid",
+    "HardSwish",
+    "Identity",
+    "LeakyRelu",
+    "Less",
+    "LessOrEqual",
+    "Log",
+    "Max",
+    "Mean",
+    "Min",
+    "Mish",
+    "Mul",
+    "Neg",
+    "Not",
+    "Or",
+    "PRelu",
+    "Pow",
+    "QLinearAdd",
+    "QLinearLeakyRelu",
+    "QLinearMul",
+    "QLinearSigmoid",
+    "Reciprocal",
+    "Relu",
+    "Round",
+    "Selu",
+    "Sigmoid",
+    "Sign",
+    "Softplus",
+    "Softsign",
+    "Sqrt",
+    "Sub",
+    "Sum",
+    "Tanh",
+    "ThresholdedRelu",
+    "Where",
+    "Xor",
+}
 AXES = {
     **dict.fromkeys(("BatchNormalization", "DequantizeLinear", "QuantizeLinear"), 1),
     **dict.fromkeys(("Concat", "QLinearConcat", "Softmax", "Split"), 0),
 }
-"""Point-wise where they work along the channels, or have one number for each, and the axis where none is stated."""
+"""Point-wise where they work along the channels, or have one number for each, and the axis where
+none is stated.
+"""
 KEEPING = {"BatchNormalization", "Cast", "DequantizeLinear", "Identity", "QuantizeLinear"}
 """What leaves the shape of constants as it is."""
 WHY = {

@@ -43,25 +43,38 @@ def test_no_array_does_more_than_its_peak(board: str) -> None:
 
 @pytest.mark.slow
 def test_every_network_is_the_published_one_and_passes_the_rules_of_its_boards() -> None:
-    """AMD compiled them for these boards: a rule that refuses one is wrong, or it is written down wrongly."""
+    """AMD compiled them for these boards: a rule that refuses one is wrong, or it is written down
+    wrongly.
+    """
     for name, entry in NETWORKS.items():
         net = written(name).network
-        assert sum(op.operations for op in net.operations) == pytest.approx(entry.operations, rel=0.05), name
+        assert sum(op.operations for op in net.operations) == pytest.approx(
+            entry.operations, rel=0.05
+        ), name
         if name in WEIGHTS:
-            assert sum(op.weight_bytes for op in net.operations) == pytest.approx(WEIGHTS[name], rel=0.01), name
+            assert sum(op.weight_bytes for op in net.operations) == pytest.approx(
+                WEIGHTS[name], rel=0.01
+            ), name
         read = {tensor for op in net.operations for tensor in op.inputs} | set(net.outputs)
         assert [op.name for op in net.operations if op.output not in read] == [], name
         for board in {rate["board"] for rate in published_rates() if rate["network"] == name}:
-            assert [node.op.name for node in place(net, load_dpu(board)).failed] == [], (name, board)
+            assert [node.op.name for node in place(net, load_dpu(board)).failed] == [], (
+                name,
+                board,
+            )
 
 
-@pytest.mark.parametrize(("board", "name"), [("vck190", "resnet-50"), ("zcu102", "rcan"), ("vek280", "erfnet")])
+@pytest.mark.parametrize(
+    ("board", "name"), [("vck190", "resnet-50"), ("zcu102", "rcan"), ("vek280", "erfnet")]
+)
 def test_the_fit_and_the_prediction_are_one_formula(board: str, name: str) -> None:
     dpu = load_dpu(board)
     case = Cases((network_case(name, dpu, (1.0,)),), Structure.of(dpu))
     times = case.times(Constants.of(dpu))
     found = predict(place(written(name).network, dpu), dpu, NETWORKS[name].host)
-    assert found.dpu.handlers / found.latency_s == pytest.approx(1 / float(times.alone_s[0] + times.host_s[0]))
+    assert found.dpu.handlers / found.latency_s == pytest.approx(
+        1 / float(times.alone_s[0] + times.host_s[0])
+    )
     assert found.fps == pytest.approx(math.exp(float(case.predicted(times)[0])))
 
 
@@ -81,7 +94,9 @@ def test_the_papers_network_is_in_no_fit() -> None:
 def test_the_rank_of_a_tolerance_is_the_least_that_is_sure_enough(count: int) -> None:
     def sure(rank: int) -> float:
         """That fewer than `rank` of the draws fall among SHARE."""
-        return math.fsum(math.comb(count, k) * SHARE**k * (1 - SHARE) ** (count - k) for k in range(rank))
+        return math.fsum(
+            math.comb(count, k) * SHARE**k * (1 - SHARE) ** (count - k) for k in range(rank)
+        )
 
     rank = tolerance_rank(count)
     assert sure(rank) >= 0.75 or rank == count
@@ -118,9 +133,14 @@ def test_the_stored_time_of_the_pipeline_is_what_the_model_says(board: str) -> N
     """Of rates measured on another day: within a fifth at each end."""
     target = load_target(board)
     quality = QUALITIES["standard"]
-    explained = math.fsum(MEASURED.times_s(chain_work(MEASURED_PX, MEASURED_PX, quality)).values()) / MEASURED_S
+    explained = (
+        math.fsum(MEASURED.times_s(chain_work(MEASURED_PX, MEASURED_PX, quality)).values())
+        / MEASURED_S
+    )
     times_s = MEASURED.times_s(chain_work(HEIGHT_PX, WIDTH_PX, quality))
-    shares = {kind: explained * time_s / math.fsum(times_s.values()) for kind, time_s in times_s.items()}
+    shares = {
+        kind: explained * time_s / math.fsum(times_s.values()) for kind, time_s in times_s.items()
+    }
     assert set(shares) == set(UNITS) == set(BOUND_BY)
     ends = s_per_mpx(1e6 * MEASURED_S / MEASURED_PX**2, shares, MEASURED, target)
     stored = target.constant("cpu", "chain_s_per_mpx")

@@ -36,7 +36,9 @@ def test_what_is_counted() -> None:
 
 def test_the_project_keeps_its_limits() -> None:
     script = Path(counts.__file__)
-    done = subprocess.run([sys.executable, str(script), "--check"], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, str(script), "--check"], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert "| tokens a line |" in done.stdout
 

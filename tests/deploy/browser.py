@@ -1,4 +1,6 @@
-"""A page opened in a real browser, where one is installed; the test is skipped where there is none."""
+"""A page opened in a real browser, where one is installed; the test is skipped
+where there is none.
+"""
 
 import json
 import re
@@ -13,7 +15,8 @@ import pytest
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 REPORT = """
 addEventListener("load", () => {
-  const shown = document.querySelector("iframe").contentDocument, told = document.createElement("pre");
+  const shown = document.querySelector("iframe").contentDocument;
+  const told = document.createElement("pre");
   told.id = "told"; told.textContent = JSON.stringify(look(shown)); document.body.append(told);
 });
 """
@@ -29,10 +32,14 @@ def browser() -> str:
 
 
 def seen(page: str, look: str, folder: Path, *, width_px: int = 1280, dark: bool = False) -> Any:
-    """What the body of a script's function `look(document)` returns of a page in a window so wide."""
+    """What the body of a script's function `look(document)` returns of a page
+    in a window so wide.
+    """
     frame = f'<iframe width="{width_px}" height="900" srcdoc="{escape(page)}"></iframe>'
     script = f"<script>const look = (document) => {{ {look} }};{REPORT}</script>"
-    (folder / "page.html").write_text(f"<!doctype html><body>{frame}{script}</body>", encoding="utf-8")
+    (folder / "page.html").write_text(
+        f"<!doctype html><body>{frame}{script}</body>", encoding="utf-8"
+    )
     options = [
         "--headless",
         "--no-sandbox",  # which refuses to run as root, as containers do
@@ -42,7 +49,9 @@ def seen(page: str, look: str, folder: Path, *, width_px: int = 1280, dark: bool
         "--dump-dom",
     ]
     command = [browser(), *options, (folder / "page.html").as_uri()]
-    shown = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=True).stdout
+    shown = subprocess.run(
+        command, capture_output=True, text=True, timeout=TIMEOUT_S, check=True
+    ).stdout
     told = re.search(r'<pre id="told">(.*?)</pre>', shown, re.DOTALL)
     assert told, "the script did not run"
     return json.loads(unescape(told[1]))

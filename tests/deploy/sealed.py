@@ -1,4 +1,5 @@
-"""The command line in a process that the kernel ends at its first internet socket, whoever opens it.
+"""The command line in a process that the kernel ends at its first internet socket, whoever opens
+it.
 
     python -m tests.deploy.sealed restore raw.tif out.tif
 

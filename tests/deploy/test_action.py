@@ -1,4 +1,6 @@
-"""The action and the workflow to copy, run as shell: green on a sound pair, red on a broken or a missing one."""
+"""The action and the workflow to copy, run as shell: green on a sound pair, red on a broken or a
+missing one.
+"""
 
 import json
 import shutil
@@ -25,13 +27,17 @@ OURS = "Train a small network"
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(sys.platform == "win32", reason="the steps run in bash, which Windows has not of itself"),
+    pytest.mark.skipif(
+        sys.platform == "win32", reason="the steps run in bash, which Windows has not of itself"
+    ),
 ]
 
 
 @pytest.fixture(scope="module")
 def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a sound pair, the same with one bias doubled, and in plain/ a network of one sensor alone."""
+    """A folder with a sound pair, the same with one bias doubled, and in plain/ a network of one
+    sensor alone.
+    """
     folder = tmp_path_factory.mktemp("networks")
     done("export", "--network", "convbeers-xs", "--out", folder / "float.onnx")
     shutil.copy(shipped_pair("convbeers-xs")[1], folder / "int8.onnx")
@@ -63,13 +69,17 @@ def suite(path: Path) -> ET.Element:
 
 def test_a_sound_pair_is_green(runner: Runner, networks: Path) -> None:
     take(runner, networks, "float.onnx", "int8.onnx")
-    outputs = runner.run_action({"float": "models/float.onnx", "int8": "models/int8.onnx", "junit": "made/j.xml"})
+    outputs = runner.run_action(
+        {"float": "models/float.onnx", "int8": "models/int8.onnx", "junit": "made/j.xml"}
+    )
     assert not runner.red, runner.stderr
     assert outputs["verdict"] == "passed"
     assert 0 < float(outputs["mae"]) < 0.0007
     assert 0 < float(outputs["drop"]) < 1
     assert (outputs["int8"], outputs["board"]) == ("models/int8.onnx", "")
-    assert runner.summary.read_text().startswith("what a step before wrote\n\n## INT8 gate: passed\n")
+    assert runner.summary.read_text().startswith(
+        "what a step before wrote\n\n## INT8 gate: passed\n"
+    )
     assert "| MAE | 0.000" in runner.summary.read_text()
     assert suite(runner.folder / "made" / "j.xml").get("failures") == "0"
     assert json.loads((runner.folder / "gate.json").read_text())["verdict"] == "passed"
@@ -81,12 +91,18 @@ def test_a_broken_pair_is_red(runner: Runner, networks: Path) -> None:
     pair = {"float": "models/float.onnx", "int8": "models/int8.onnx"}
     sound = runner.run_action({**pair, "json": "models/gate.json"})
     assert sound["verdict"] == "passed"
-    outputs = runner.run_action({**pair, "int8": "models/broken.onnx", "baseline": "models/gate.json"})
+    outputs = runner.run_action(
+        {**pair, "int8": "models/broken.onnx", "baseline": "models/gate.json"}
+    )
     assert runner.red
     assert outputs["verdict"] == "failed"
     assert float(outputs["mae"]) > 0
     assert "**failed**" in runner.summary.read_text()
-    failed = {case.get("name") for case in suite(runner.folder / "gate.xml") if case.find("failure") is not None}
+    failed = {
+        case.get("name")
+        for case in suite(runner.folder / "gate.xml")
+        if case.find("failure") is not None
+    }
     assert "MAE against the baseline" in failed
 
 
@@ -105,11 +121,15 @@ def test_a_missing_float_network_is_red_in_one_sentence(
     assert not (runner.folder / "gate.json").exists()
 
 
-def test_without_an_int8_network_it_quantises_for_the_same_sensor(runner: Runner, networks: Path) -> None:
+def test_without_an_int8_network_it_quantises_for_the_same_sensor(
+    runner: Runner, networks: Path
+) -> None:
     take(runner, networks / "plain", "float.onnx")
     sensor = runner.folder / "mine.toml"
     shutil.copy(ROOT / "profiles" / "sensors" / f"{SENSOR}.toml", sensor)
-    outputs = runner.run_action({"float": "models/float.onnx", "sensor": "mine.toml", "max-mae": "0.001"})
+    outputs = runner.run_action(
+        {"float": "models/float.onnx", "sensor": "mine.toml", "max-mae": "0.001"}
+    )
     assert not runner.red, runner.stderr
     assert outputs["verdict"] == "passed"
     for name in ("int8", "board"):
@@ -122,10 +142,15 @@ def test_without_an_int8_network_it_quantises_for_the_same_sensor(runner: Runner
     assert (arguments["sensor"], arguments["max_mae"]) == ("mine.toml", 0.001)
 
 
-def test_a_network_that_quantize_refuses_is_an_error_whose_reason_is_in_the_summary(runner: Runner) -> None:
+def test_a_network_that_quantize_refuses_is_an_error_whose_reason_is_in_the_summary(
+    runner: Runner,
+) -> None:
     """Also where a good version's document lies at the place of the verdict's."""
     node = onnx.helper.make_node("Sin", ["x"], ["y"], name="odd\n::error::obeyed | `name` <b>")
-    ends = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, 1, "h", "w"]) for name in "xy"]
+    ends = [
+        onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, 1, "h", "w"])
+        for name in "xy"
+    ]
     graph = onnx.helper.make_graph([node], "g", ends[:1], ends[1:])
     (runner.folder / "models").mkdir()
     save_onnx(
@@ -145,7 +170,9 @@ def test_a_network_that_quantize_refuses_is_an_error_whose_reason_is_in_the_summ
 
 
 def obeyed(stdout: str) -> list[str]:
-    """Return the workflow commands that GitHub obeys in an output, without what follows their second colons."""
+    """Return the workflow commands that GitHub obeys in an output, without what follows their
+    second colons.
+    """
     found = list[str]()
     token = ""
     for line in stdout.splitlines():
@@ -159,7 +186,9 @@ def obeyed(stdout: str) -> list[str]:
 
 
 def test_names_are_never_run(runner: Runner) -> None:
-    given = dict.fromkeys(("float", "int8", "sensor", "limits"), "$(touch ran) `touch ran` ; touch ran")
+    given = dict.fromkeys(
+        ("float", "int8", "sensor", "limits"), "$(touch ran) `touch ran` ; touch ran"
+    )
     assert runner.run_action(given)["verdict"] == "error"
     assert not (runner.folder / "ran").exists()
 
@@ -175,8 +204,12 @@ def test_the_action_says_what_it_takes() -> None:
 
 
 def test_installing_puts_the_command_alone_on_the_path(tmp_path: Path) -> None:
-    """With a Python that writes down what it is asked for, for want of a package index in a test."""
-    (step,) = (step for step in read_yaml(ACTION)["runs"]["steps"] if "pip install" in step.get("run", ""))
+    """With a Python that writes down what it is asked for, for want of a
+    package index in a test.
+    """
+    (step,) = (
+        step for step in read_yaml(ACTION)["runs"]["steps"] if "pip install" in step.get("run", "")
+    )
     python = tmp_path / "python"
     python.write_text(
         '#!/usr/bin/env bash\necho "$*" >> "$LOG"\n'
@@ -184,8 +217,17 @@ def test_installing_puts_the_command_alone_on_the_path(tmp_path: Path) -> None:
         'if [ "$3" = install ]; then echo ok > "$(dirname "$0")/beers-deploy"; fi\n'
     )
     python.chmod(0o755)
-    given = {"PYTHON": str(python), "SOURCE": "the action", "RUNNER_TEMP": str(tmp_path), "RUNNER_OS": "Linux"}
-    files = {"LOG": str(tmp_path / "log"), "GITHUB_PATH": str(tmp_path / "path"), "PATH": "/usr/bin:/bin"}
+    given = {
+        "PYTHON": str(python),
+        "SOURCE": "the action",
+        "RUNNER_TEMP": str(tmp_path),
+        "RUNNER_OS": "Linux",
+    }
+    files = {
+        "LOG": str(tmp_path / "log"),
+        "GITHUB_PATH": str(tmp_path / "path"),
+        "PATH": "/usr/bin:/bin",
+    }
     done = subprocess.run([*BASH, step["run"]], cwd=tmp_path, env=given | files, **KEPT)
     assert done.returncode == 0, done.stderr
     venv = tmp_path / "beers-deploy"
@@ -204,7 +246,9 @@ def steps_of_workflow() -> list[dict[str, object]]:
 def test_the_workflow_is_green_with_one(runner: Runner, networks: Path) -> None:
     take(runner, networks / "plain", "float.onnx")
     (runner.folder / "protected" / ".ci").mkdir(parents=True)  # by its second checkout
-    (runner.folder / "protected" / ".ci" / "gate.toml").write_text("mae = 0.001\npsnr_drop_db = 0.4\n")
+    (runner.folder / "protected" / ".ci" / "gate.toml").write_text(
+        "mae = 0.001\npsnr_drop_db = 0.4\n"
+    )
     runner.run_steps([step for step in steps_of_workflow() if step.get("name") != OURS], {})
     assert not runner.red, runner.stderr
     assert runner.outputs["steps.gate.outputs.verdict"] == "passed"

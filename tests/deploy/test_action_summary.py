@@ -17,7 +17,10 @@ from beers_deploy.profiles.figures import Check
 from tests.deploy.workflow_steps import ACTION, ROOT, read_yaml
 
 VERDICT = runpy.run_path(str(ROOT / ".github" / "verdict.py"))
-HOSTILE = "a|b\n::error::c ` ``` <img src=x> **bold** [l](http://x) @someone \u202e\x1b[31m &amp; \\| ~~s~~ #1 %0A::x"
+HOSTILE = (
+    "a|b\n::error::c ` ``` <img src=x> **bold** [l](http://x) @someone \u202e\x1b[31m "
+    "&amp; \\| ~~s~~ #1 %0A::x"
+)
 PINNED = re.compile(r"uses: [\w./-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+")
 FIGURES = {"MAE": {"value": 6e-4}, "PSNR drop": {"value": None}}
 
@@ -53,7 +56,9 @@ def rendered(markdown: str) -> str:
 
 @given(st.text(), st.text())
 @example(HOSTILE, HOSTILE)
-def test_a_check_is_one_row_of_plain_text_and_one_annotation(folder: Path, name: str, detail: str) -> None:
+def test_a_check_is_one_row_of_plain_text_and_one_annotation(
+    folder: Path, name: str, detail: str
+) -> None:
     capture: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.stdout.write", capture.append)
@@ -62,7 +67,9 @@ def test_a_check_is_one_row_of_plain_text_and_one_annotation(folder: Path, name:
     html = rendered(summary)
     cells = re.findall("<td>(.*)</td>", html)
     assert html.count("<tr>") == 2
-    assert [unescape(cells[0]), unescape(cells[-1])] == [VERDICT["plain"](text).strip() for text in (name, detail)]
+    assert [unescape(cells[0]), unescape(cells[-1])] == [
+        VERDICT["plain"](text).strip() for text in (name, detail)
+    ]
     assert not any("<" in cell for cell in (cells[0], cells[-1])), "no markup"
     assert all(letter.isprintable() or letter == "\n" for letter in summary)
     (line,) = capture
@@ -77,7 +84,9 @@ def test_a_refusal_is_a_block_of_code(folder: Path, reason: str) -> None:
     capture: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.stdout.write", capture.append)
-        summary, outputs = reported(folder, 2, {"verdict": "passed"}, f"progress\nbeers-deploy: {reason}\n")
+        summary, outputs = reported(
+            folder, 2, {"verdict": "passed"}, f"progress\nbeers-deploy: {reason}\n"
+        )
     assert outputs == "verdict=error\n"
     html = rendered(summary)
     assert html.startswith("<h2>INT8 gate: not judged</h2>\n<pre><code")
@@ -89,7 +98,8 @@ def test_a_refusal_is_a_block_of_code(folder: Path, reason: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("code", "document"), [(0, {"verdict": "failed"}), (1, {"verdict": "passed"}), (1, []), (0, 3), (137, {})]
+    ("code", "document"),
+    [(0, {"verdict": "failed"}), (1, {"verdict": "passed"}), (1, []), (0, 3), (137, {})],
 )
 def test_a_document_of_another_run_is_no_verdict(
     code: int, document: object, folder: Path, capsys: pytest.CaptureFixture[str]
@@ -106,7 +116,9 @@ def workflows() -> list[Path]:
 
 def used(path: Path) -> list[str]:
     """Return the lines of a workflow or an action that take another's action."""
-    lines = [line.strip().removeprefix("- ") for line in path.read_text(encoding="utf-8").splitlines()]
+    lines = [
+        line.strip().removeprefix("- ") for line in path.read_text(encoding="utf-8").splitlines()
+    ]
     return [line for line in lines if line.startswith("uses: ") and not line.startswith("uses: ./")]
 
 
@@ -118,7 +130,9 @@ def test_actions_of_others_are_pinned_by_commit_with_their_version() -> None:
     versions = {line.partition("@")[0]: set[str]() for line in lines}
     for line in lines:
         versions[line.partition("@")[0]].add(line)
-    assert all(len(found) == 1 for found in versions.values()), "one version of an action in all files"
+    assert all(len(found) == 1 for found in versions.values()), (
+        "one version of an action in all files"
+    )
 
 
 def test_every_workflow_states_the_least_permissions() -> None:

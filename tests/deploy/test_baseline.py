@@ -1,4 +1,6 @@
-"""A baseline is the document of a gate that passed, on the same patches: everything else is refused."""
+"""A baseline is the document of a gate that passed, on the same patches: everything else is
+refused.
+"""
 
 import json
 from collections.abc import Callable
@@ -28,7 +30,10 @@ KEPT = Check("MAE", 5e-4, 1.0, "of full scale")
 
 def document(mae: float = 5e-4, **arguments: object) -> dict[str, Any]:
     """What a gate writes that passed."""
-    figures = {"MAE": measured(mae, "of full scale", "here"), "PSNR float": measured(50.0, "dB", "here")}
+    figures = {
+        "MAE": measured(mae, "of full scale", "here"),
+        "PSNR float": measured(50.0, "dB", "here"),
+    }
     inputs = (Input("float.onnx", "a" * 64), Input("sensor s", "b" * 64))
     row = Row("gate", "INT8 against float", figures)
     check = Check("MAE", mae, 1.0, "of full scale")
@@ -102,7 +107,10 @@ def test_a_document_that_is_no_baseline_is_refused(
 
 
 @settings(max_examples=60, deadline=None)
-@given(path=st.sampled_from(["schema", "command", "inputs", "rows", "checks", "verdict"]), junk=st.none() | st.text())
+@given(
+    path=st.sampled_from(["schema", "command", "inputs", "rows", "checks", "verdict"]),
+    junk=st.none() | st.text(),
+)
 def test_whatever_stands_in_a_place_of_the_document_it_ends_in_one_sentence(
     path: str, junk: object, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -122,8 +130,16 @@ def test_a_key_that_stands_twice_is_refused(key: str, tmp_path: Path) -> None:
 def test_a_name_that_is_not_utf_8_comes_back(tmp_path: Path) -> None:
     inputs = (Input("float.onnx", "a" * 64), Input("samples n\udcff.npy", "b" * 64))
     made = document(samples="n\udcff.npy")
-    table = Table("gate", {**ASKED, "samples": "n\udcff.npy"}, inputs, (Row("gate", "n", {"MAE": MAE}),), (KEPT,))
-    found = read_baseline(table.save(tmp_path / "b.json"), {**ASKED, "samples": Path("n\udcff.npy")})
+    table = Table(
+        "gate",
+        {**ASKED, "samples": "n\udcff.npy"},
+        inputs,
+        (Row("gate", "n", {"MAE": MAE}),),
+        (KEPT,),
+    )
+    found = read_baseline(
+        table.save(tmp_path / "b.json"), {**ASKED, "samples": Path("n\udcff.npy")}
+    )
     found.require_same("a" * 64, 0.0, inputs[1:])
     assert "\udcff" not in made["arguments"]["samples"]
 
@@ -138,7 +154,8 @@ def test_files_that_are_no_document_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "other", [{"seed": 1}, {"patches": 3}, {"sensor": "pleiades-variable"}, {"images": Path("aerial")}]
+    "other",
+    [{"seed": 1}, {"patches": 3}, {"sensor": "pleiades-variable"}, {"images": Path("aerial")}],
 )
 def test_a_baseline_of_other_patches_is_refused_and_a_folder_may_lie_elsewhere(
     other: dict[str, object], tmp_path: Path
@@ -219,7 +236,9 @@ def test_a_baseline_holds_the_mae(scenes: Path, tmp_path: Path) -> None:
 def test_the_baseline_of_another_float_network_is_refused(scenes: Path, tmp_path: Path) -> None:
     command = ["--images", scenes, "--patches", 2]
     done("gate", "convbeers-s", *command, "--json", tmp_path / "s.json")
-    assert "another's" in refused("gate", "convbeers-xs", *command, "--baseline", tmp_path / "s.json")
+    assert "another's" in refused(
+        "gate", "convbeers-xs", *command, "--baseline", tmp_path / "s.json"
+    )
 
 
 def test_the_baseline_of_other_samples_is_refused(model: Path, tmp_path: Path) -> None:
@@ -238,6 +257,8 @@ def test_the_baseline_of_other_samples_is_refused(model: Path, tmp_path: Path) -
     limits = {"mae": 0.1}
     bd.gate(int8, model, values, limits=limits).save(before)
     assert bd.gate(int8, model, values, limits=limits, baseline=before)
-    assert "same patches (samples None), got samples in memory" in refused(*command, "--baseline", before)
+    assert "same patches (samples None), got samples in memory" in refused(
+        *command, "--baseline", before
+    )
     with pytest.raises(OptionError, match="same samples in memory"):
         bd.gate(int8, model, values[::-1], limits=limits, baseline=before)

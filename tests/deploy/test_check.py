@@ -1,4 +1,6 @@
-"""The command check: its document, its picture, the traditional pipeline, and the page made from the rules."""
+"""The command check: its document, its picture, the traditional pipeline, and the page made from
+the rules.
+"""
 
 import subprocess
 import sys
@@ -41,7 +43,9 @@ def test_a_network_of_one_tile_is_checked_at_that(tmp_path: Path) -> None:
 
 def test_the_document_holds_subgraphs_cuts_and_remarks(tmp_path: Path) -> None:
     sketch = Sketch(8)
-    path = sketch.save(tmp_path / "bad.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
+    path = sketch.save(
+        tmp_path / "bad.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image")))
+    )
     output = done("check", path, "--tile", 96, "--json", tmp_path / "o.json", code=1)
     found = tables(tmp_path / "o.json")
     assert [row["text"]["device"] for row in found["subgraphs"]] == ["DPU", "CPU", "DPU"]
@@ -53,7 +57,9 @@ def test_the_document_holds_subgraphs_cuts_and_remarks(tmp_path: Path) -> None:
 
 def test_the_document_holds_the_verdict(tmp_path: Path) -> None:
     sketch = Sketch(8)
-    path = sketch.save(tmp_path / "bad.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
+    path = sketch.save(
+        tmp_path / "bad.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image")))
+    )
     bad = verdict(tmp_path / "bad.json", path, code=1)
     sound = verdict(tmp_path / "sound.json", float_convbeers(tmp_path / "n.onnx", 2, 8))
     assert [found[0] for found in (bad, sound)] == ["failed", "passed"]
@@ -99,7 +105,10 @@ def test_of_a_float_file_check_says_what_quantize_would(tmp_path: Path) -> None:
     with pytest.raises(ModelError) as error:
         read_network(model)
     said = " ".join(done("check", other).split())
-    assert f"'quantize' does not take it: expected {error.value.expected}, got {error.value.got}" in said
+    assert (
+        f"'quantize' does not take it: expected {error.value.expected}, got {error.value.got}"
+        in said
+    )
 
 
 def test_of_an_int8_file_nothing_is_said_of_quantising(tmp_path: Path) -> None:
@@ -108,6 +117,9 @@ def test_of_an_int8_file_nothing_is_said_of_quantising(tmp_path: Path) -> None:
 
 def test_a_check_and_its_picture_need_no_torch(tmp_path: Path) -> None:
     call = f"app(['check', '--picture', {str(tmp_path / 'graph.png')!r}], standalone_mode=False)"
-    code = f"import sys; from beers_deploy.cli import app; {call}; print({{'torch', 'skimage'}} & set(sys.modules))"
+    code = (
+        f"import sys; from beers_deploy.cli import app; {call}; print({{'torch', 'skimage'}} "
+        "& set(sys.modules))"
+    )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout.splitlines()[-1] == "set()"

@@ -1,4 +1,6 @@
-"""The command line as a user meets it: help, exit codes, one sentence for each fault, nothing half-written."""
+"""The command line as a user meets it: help, exit codes, one sentence for each fault, nothing
+half-written.
+"""
 
 import os
 import subprocess
@@ -51,10 +53,17 @@ def test_every_command_has_help_with_an_example(name: str) -> None:
 
 
 def test_what_is_told_no_sensor_takes_the_same_one() -> None:
-    """A network calibrated on one and judged on another is no fair trial; `detect` takes the paper's two of DIOR."""
+    """A network calibrated on one and judged on another is no fair trial; `detect` takes the
+    paper's two of DIOR.
+    """
     group = get_command(app)
     assert isinstance(group, TyperGroup)
-    defaults = {name: p.default for name, c in group.commands.items() for p in c.params if p.name == "sensor"}
+    defaults = {
+        name: p.default
+        for name, c in group.commands.items()
+        for p in c.params
+        if p.name == "sensor"
+    }
     assert {"quantize", "gate", "evaluate"} <= set(defaults)
     assert defaults.pop("detect") == "dior-medium,dior-high"
     assert set(defaults.values()) == {SENSOR, None}
@@ -74,7 +83,14 @@ def test_version() -> None:
 def test_the_version_in_full_says_what_the_kernels_were_asked() -> None:
     for order in (["--version", "--verbose"], ["--verbose", "--version"]):
         lines = dict(line.split(": ", 1) for line in done(*order).splitlines()[1:])
-        assert {"system", "machine", "int8 on onnxruntime", "onnxruntime", "torch", "openvino"} <= set(lines)
+        assert {
+            "system",
+            "machine",
+            "int8 on onnxruntime",
+            "onnxruntime",
+            "torch",
+            "openvino",
+        } <= set(lines)
 
 
 def test_restore_writes_a_whole_twelve_bit_image(tmp_path: Path) -> None:
@@ -100,7 +116,11 @@ def test_a_name_that_the_terminal_cannot_show_ends_no_run(tmp_path: Path) -> Non
     ]
     environment = {**os.environ, "PYTHONIOENCODING": "cp1252"}  # as pipes have it on Windows
     ran = subprocess.run(
-        list(map(str, command)), env=environment, capture_output=True, encoding="cp1252", check=False
+        list(map(str, command)),
+        env=environment,
+        capture_output=True,
+        encoding="cp1252",
+        check=False,
     )
     assert ran.returncode == 0, ran.stderr
     assert "\\u6771\\u4eac" in ran.stdout
@@ -139,16 +159,20 @@ def test_an_acquisition_of_another_scale_is_read_as_digital_numbers(tmp_path: Pa
     np.testing.assert_allclose(read_acquisition(tmp_path / "share.tif", 1), dn, atol=1e-3)
     np.testing.assert_allclose(read_acquisition(tmp_path / "eight.tif", 255), dn, atol=17)
     for name in ("share.tif", "eight.tif"):
-        with pytest.raises(ImageError, match="rescale it"):  # where no option settles it, as for pairs
+        with pytest.raises(
+            ImageError, match="rescale it"
+        ):  # where no option settles it, as for pairs
             read_acquisition(tmp_path / name)
         with pytest.raises(ImageError, match="full_scale"):
-            read_input(tmp_path / name, 0, load_sensors()) if name == "share.tif" else read_acquisition(
-                tmp_path / name, None, None
-            )
+            read_input(
+                tmp_path / name, 0, load_sensors()
+            ) if name == "share.tif" else read_acquisition(tmp_path / name, None, None)
         with pytest.raises(ImageError, match="values from 0"):
             read_acquisition(tmp_path / name, 0.5 if name == "share.tif" else 100)
     assert read_input(tmp_path / "share.tif", 0, load_sensors(), 1)[0].max() == 4095
-    assert read_input(tmp_path / "eight.tif", 0, load_sensors(), 255)[1] is None  # a raw image, no scene
+    assert (
+        read_input(tmp_path / "eight.tif", 0, load_sensors(), 255)[1] is None
+    )  # a raw image, no scene
 
 
 def test_a_full_scale_without_an_image_is_refused() -> None:
@@ -187,7 +211,11 @@ def test_garbage_models_are_refused(tmp_path: Path) -> None:
 def test_rules_need_a_board_that_has_them(tmp_path: Path) -> None:
     paths = [str(tmp_path / name) for name in ("float.onnx", "int8.onnx")]
     done("export", "--network", "convbeers-xs", "--out", paths[0])
-    fails(["quantize", paths[0], "--target", "host-cpu", "--out", paths[1]], "--target", "choose another")
+    fails(
+        ["quantize", paths[0], "--target", "host-cpu", "--out", paths[1]],
+        "--target",
+        "choose another",
+    )
     assert not Path(paths[1]).exists()
 
 
@@ -202,7 +230,9 @@ def test_profiles_show_scenes_targets_and_sensors_with_every_source() -> None:
 
 def test_a_description_is_shown_and_not_obeyed(tmp_path: Path) -> None:
     first = next(line for line in SHIPPED.splitlines() if line.startswith("description"))
-    text = edited((first, 'description = "a \\u001b]0;title\\u0007 \\u001b[31mred"')) + "# \x9b31m\n"
+    text = (
+        edited((first, 'description = "a \\u001b]0;title\\u0007 \\u001b[31mred"')) + "# \x9b31m\n"
+    )
     own = own_sensor(tmp_path, text=text)
     for more in ([], ["--toml"]):
         output = done("profiles", own, *more)
@@ -244,21 +274,32 @@ def run_with(closing: str, *words: object) -> tuple[int, str]:
     ],
 )
 def test_no_stream_loses_an_image(closing: str, code: int, tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "in.tif", np.random.default_rng(0).integers(900, 1200, (40, 50)).astype(np.uint16))
+    tifffile.imwrite(
+        tmp_path / "in.tif",
+        np.random.default_rng(0).integers(900, 1200, (40, 50)).astype(np.uint16),
+    )
     network = ("--network", "convbeers-xs-int8")
     found, said = run_with(closing, "restore", tmp_path / "in.tif", tmp_path / "out.tif", *network)
     assert tifffile.imread(tmp_path / "out.tif").shape == (40, 50)
     assert "Traceback" not in said
-    assert found == code or (found == 0 and "true" in closing)  # the pipe may live until the last word
+    assert found == code or (
+        found == 0 and "true" in closing
+    )  # the pipe may live until the last word
 
 
 @pytest.mark.parametrize("module", ["typing_extensions", "psutil", "numpy"])
 def test_an_installation_that_does_not_work_is_no_failed_gate(module: str, tmp_path: Path) -> None:
-    """Python ends a program whose libraries do not load with 1, which is the code of a failed gate."""
+    """Python ends a program whose libraries do not load with 1, which is the
+    code of a failed gate.
+    """
     (tmp_path / f"{module}.py").write_text("raise RuntimeError('broken')\n", encoding="utf-8")
     command = [sys.executable, "-m", "beers_deploy", "--version", "-v"]
     found = subprocess.run(
-        command, env={**os.environ, "PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=False
+        command,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert found.returncode == CRASHED
     assert found.stderr.splitlines()[-1].startswith("beers-deploy: this installation does not work")

@@ -13,12 +13,24 @@ import tifffile
 from PIL import Image
 
 from beers_deploy.cluster import open_cluster
-from beers_deploy.model.dataset import CHUNK, DatasetRecipe, make_patches, plan_windows, write_dataset
+from beers_deploy.model.dataset import (
+    CHUNK,
+    DatasetRecipe,
+    make_patches,
+    plan_windows,
+    write_dataset,
+)
 from beers_deploy.model.manifest import DIGESTS, Line, line_text
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import TABLES
 from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.profiles.scene_call import calling_for, load_scene_call, origins, scene_names, typical_effects
+from beers_deploy.profiles.scene_call import (
+    calling_for,
+    load_scene_call,
+    origins,
+    scene_names,
+    typical_effects,
+)
 from tests.deploy.command_line import done, refused
 from tests.deploy.two_workers import local_cluster
 
@@ -52,7 +64,9 @@ def silent(_: int) -> None:
 
 
 def bytes_of(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+    return {
+        str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
+    }
 
 
 @pytest.mark.slow
@@ -71,7 +85,9 @@ def test_any_patch_can_be_made_again_alone(scene: Path, made: Path) -> None:
 
 def test_the_manifest_tells_where_each_patch_comes_from(scene: Path, tmp_path: Path) -> None:
     summary = write_dataset(small(scene), tmp_path / "d", 1, resume=False, tick=silent)
-    lines = [json.loads(line) for line in (tmp_path / "d" / "manifest.jsonl").read_text().splitlines()]
+    lines = [
+        json.loads(line) for line in (tmp_path / "d" / "manifest.jsonl").read_text().splitlines()
+    ]
     assert len(lines) == summary["patches"] == len(plan_windows(small(scene)))
     assert [line["number"] for line in lines] == list(range(len(lines)))
     assert len({line["degraded"]["sensor"]["mtf_nyquist"] for line in lines}) == len(lines)
@@ -88,9 +104,18 @@ def test_the_manifest_tells_where_each_patch_comes_from(scene: Path, tmp_path: P
 def test_a_killed_dataset_is_resumed_to_the_same_bytes(scene: Path, tmp_path: Path) -> None:
     options = [str(scene), "--oversampling", "2", "--patch", "8", "--workers", "1"]
     whole, killed = (tmp_path / name for name in ("whole", "killed"))
-    command = [sys.executable, "-c", "from beers_deploy.cli import app; app()", "simulate", *options, "--out"]
+    command = [
+        sys.executable,
+        "-c",
+        "from beers_deploy.cli import app; app()",
+        "simulate",
+        *options,
+        "--out",
+    ]
     subprocess.run([*command, str(whole)], check=True, capture_output=True)
-    with subprocess.Popen([*command, str(killed)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as run:
+    with subprocess.Popen(
+        [*command, str(killed)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as run:
         while not list(killed.glob("parts/*.jsonl")) and run.poll() is None:
             time.sleep(0.01)
         run.kill()
@@ -153,7 +178,9 @@ def test_damaged_pairs_of_a_finished_dataset_are_made_again(
     said: list[str] = []
     write_dataset(small(scene), folder, 1, resume=True, tick=silent, log=said.append)
     assert bytes_of(folder) == bytes_of(made)
-    assert [sentence.split(" ")[0] for sentence in said] == [str(count)] if count else len(said) <= 1
+    assert (
+        [sentence.split(" ")[0] for sentence in said] == [str(count)] if count else len(said) <= 1
+    )
     assert all("they are made again" in sentence for sentence in said)
 
 
@@ -171,7 +198,9 @@ FORGED: dict[str, Callable[[Line], object]] = {
 
 
 @pytest.mark.parametrize("kind", FORGED)
-def test_a_forged_line_with_its_digest_is_made_again(kind: str, scene: Path, made: Path, tmp_path: Path) -> None:
+def test_a_forged_line_with_its_digest_is_made_again(
+    kind: str, scene: Path, made: Path, tmp_path: Path
+) -> None:
     folder = Path(shutil.copytree(made, tmp_path / "forged"))
     lines = (folder / "manifest.jsonl").read_text().splitlines(keepends=True)
     line = json.loads(lines[0])
@@ -184,7 +213,9 @@ def test_a_forged_line_with_its_digest_is_made_again(kind: str, scene: Path, mad
     assert said[0].startswith("1 of ")
 
 
-def test_a_recipe_whose_lines_end_otherwise_is_the_same(scene: Path, made: Path, tmp_path: Path) -> None:
+def test_a_recipe_whose_lines_end_otherwise_is_the_same(
+    scene: Path, made: Path, tmp_path: Path
+) -> None:
     folder = Path(shutil.copytree(made, tmp_path / "other"))
     recipe = folder / "recipe.json"
     recipe.write_bytes(recipe.read_bytes().replace(b"\n", b"\r\n"))
@@ -192,7 +223,9 @@ def test_a_recipe_whose_lines_end_otherwise_is_the_same(scene: Path, made: Path,
     assert bytes_of(folder) == bytes_of(made)
 
 
-def test_left_overs_of_a_run_are_deleted_and_nothing_else(scene: Path, made: Path, tmp_path: Path) -> None:
+def test_left_overs_of_a_run_are_deleted_and_nothing_else(
+    scene: Path, made: Path, tmp_path: Path
+) -> None:
     folder = Path(shutil.copytree(made, tmp_path / "left"))
     ours = [folder / "degraded" / ".a.tif.123.part", folder / ".manifest.jsonl.9.part"]
     foreign = [folder / "mine" / ".b.tif.123.part", folder / ".mine.part"]
@@ -255,10 +288,15 @@ def test_each_effect_says_who_asks_for_it() -> None:
     base = {"mtf": "sensor pleiades-degraded", "noise": "sensor pleiades-degraded"}
     assert origins(profile, None) == base
     assert origins(profile, haze, ["prnu", "striping"], ["veil"]) == base | {
-        "veil": "left out by --without", "striping": "scene haze-over-sea", "prnu": "--with",
-    }  # fmt: skip
+        "veil": "left out by --without",
+        "striping": "scene haze-over-sea",
+        "prnu": "--with",
+    }
     striped = replace(profile, effects=typical_effects())
-    assert origins(striped, replace(haze, without=("dsnu",)))["dsnu"] == "left out by scene haze-over-sea"
+    assert (
+        origins(striped, replace(haze, without=("dsnu",)))["dsnu"]
+        == "left out by scene haze-over-sea"
+    )
     for scene, add in ((None, []), (haze, ["prnu"])):
         kept = {name for name in origins(profile, scene, add) if name not in base}
         assert kept == set(calling_for(profile, scene, add).effects)
@@ -273,7 +311,9 @@ def scheduler() -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_a_scheduler_s_workers_give_the_same_bytes(scene: Path, scheduler: str, tmp_path: Path) -> None:
+def test_a_scheduler_s_workers_give_the_same_bytes(
+    scene: Path, scheduler: str, tmp_path: Path
+) -> None:
     recipe = DatasetRecipe((scene, scene), VARIABLE, REFERENCE, oversampling=2, patch_px=12)
     assert len(plan_windows(recipe)) > 2 * CHUNK
     write_dataset(recipe, tmp_path / "here", 1, resume=False, tick=silent)
@@ -294,7 +334,9 @@ def test_a_dataset_begun_here_is_finished_by_a_scheduler_s_workers(
             raise KeyboardInterrupt
 
     options = [str(scene), "--oversampling", "2", "--patch", "8"]
-    recipe = DatasetRecipe((scene,), load_sensor("pleiades-degraded"), REFERENCE, oversampling=2, patch_px=8)
+    recipe = DatasetRecipe(
+        (scene,), load_sensor("pleiades-degraded"), REFERENCE, oversampling=2, patch_px=8
+    )
     with pytest.raises(KeyboardInterrupt):
         write_dataset(recipe, tmp_path / "d", 1, resume=False, tick=stop)
     done("simulate", *options, "--out", tmp_path / "d", "--resume", "--scheduler", scheduler)
@@ -308,6 +350,15 @@ def test_a_scene_that_cannot_be_read_there_is_one_sentence(scene: Path, tmp_path
 
 
 def test_workers_and_a_scheduler_do_not_go_together(scene: Path, tmp_path: Path) -> None:
-    options = ["simulate", str(scene), "--out", str(tmp_path / "d"), "--workers", "2", "--scheduler", "host:8786"]
+    options = [
+        "simulate",
+        str(scene),
+        "--out",
+        str(tmp_path / "d"),
+        "--workers",
+        "2",
+        "--scheduler",
+        "host:8786",
+    ]
     assert "--workers: expected none beside --scheduler" in refused(*options)
     assert not (tmp_path / "d").exists()

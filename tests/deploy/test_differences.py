@@ -10,8 +10,13 @@ from beers_deploy.results import Table
 from tests.deploy.command_line import done, refused
 
 
-def document(path: Path, psnr: float = 46.5, mae: float = 0.0006, more: tuple[Row, ...] = ()) -> Path:
-    figures = {"PSNR": measured(psnr, "dB", "22 pairs"), "MAE": measured(mae, "of full scale", "patches")}
+def document(
+    path: Path, psnr: float = 46.5, mae: float = 0.0006, more: tuple[Row, ...] = ()
+) -> Path:
+    figures = {
+        "PSNR": measured(psnr, "dB", "22 pairs"),
+        "MAE": measured(mae, "of full scale", "patches"),
+    }
     rows = (
         Row("gate", "network", figures),
         Row("bench", "network", {"latency": predicted(42, "s", (30, 60), "model")}),
@@ -25,7 +30,10 @@ def test_the_same_document_has_not_changed(tmp_path: Path) -> None:
     one = document(tmp_path / "a.json")
     output = done("diff", one, one, "--fail-on", "PSNR<0", "--fail-on", "MAE>0%")
     assert "3 figures in both, 0 changed, 0 gone, 0 new" in output
-    for table, words in (("gate", "note: another command: gate, bench"), ("other", "got none in both")):
+    for table, words in (
+        ("gate", "note: another command: gate, bench"),
+        ("other", "got none in both"),
+    ):
         row = Row(table, "network", {"PSNR": measured(46.5, "dB", "22 pairs")})
         Table("bench", {"model": "b.onnx"}, (one,), (row,)).save(tmp_path / "b.json")
         assert words in done("diff", one, tmp_path / "b.json", code=2 * (table == "other"))
@@ -51,8 +59,14 @@ def test_a_limit_knows_its_direction_and_its_unit(limit: str, code: int, tmp_pat
     assert ("FAILED gate / network" in output) == bool(code)
 
 
-def test_figures_that_come_and_go_are_counted_and_a_watched_one_that_goes_fails(tmp_path: Path) -> None:
-    extra = Row("gate", "other", {"SSIM": measured(0.99, "ratio", "pairs"), "LPIPS": unavailable("distance", "none")})
+def test_figures_that_come_and_go_are_counted_and_a_watched_one_that_goes_fails(
+    tmp_path: Path,
+) -> None:
+    extra = Row(
+        "gate",
+        "other",
+        {"SSIM": measured(0.99, "ratio", "pairs"), "LPIPS": unavailable("distance", "none")},
+    )
     with_more = document(tmp_path / "a.json", more=(extra,))
     without = document(tmp_path / "b.json")
     assert "2 gone, 0 new" in done("diff", with_more, without)
@@ -64,7 +78,10 @@ def test_from_nothing_any_rise_is_endless() -> None:
     limit = parse_limit("saturated>5%")
     none = measured(0.0, "%", "seen")
     for value, broken in ((0.0, False), (1e-9, True)):
-        assert limit.broken_by(Change(("t", "n", "saturated"), none, measured(value, "%", "seen"))) is broken
+        assert (
+            limit.broken_by(Change(("t", "n", "saturated"), none, measured(value, "%", "seen")))
+            is broken
+        )
 
 
 def test_a_written_comparison_is_a_document_again(tmp_path: Path) -> None:
@@ -78,7 +95,9 @@ def test_a_written_comparison_is_a_document_again(tmp_path: Path) -> None:
     ("content", "words"),
     [(None, "no such file"), ("", "an empty file"), ("[]", "another document"), ("{}", "required")],
 )
-def test_what_is_no_document_gets_one_sentence(content: str | None, words: str, tmp_path: Path) -> None:
+def test_what_is_no_document_gets_one_sentence(
+    content: str | None, words: str, tmp_path: Path
+) -> None:
     if content is not None:
         (tmp_path / "x.json").write_text(content)
     assert words in refused("diff", document(tmp_path / "a.json"), tmp_path / "x.json")

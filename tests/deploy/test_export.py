@@ -10,7 +10,15 @@ from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.export import banked_to_onnx, float_for, to_onnx
 from beers_deploy.model.bank import network_bank
-from beers_deploy.model.convbeers import ConvBEERS, arrays, grow, load_network, save_network, told, vector_tensor
+from beers_deploy.model.convbeers import (
+    ConvBEERS,
+    arrays,
+    grow,
+    load_network,
+    save_network,
+    told,
+    vector_tensor,
+)
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.shipped import shipped_names, shipped_weights
 from beers_deploy.model.variants import VARIANTS, Variant
@@ -41,7 +49,9 @@ def test_torch_and_onnxruntime_agree(scale: int, tile_px: int | None, tmp_path: 
     assert fixed_tile_px(onnx.load(path)) == tile_px
     assert metadata(onnx.load(path))["variant"] == "test"
     if scale > 1:
-        with pytest.raises(OptionError, match=f"tile: expected a multiple of {scale} px, got 41 px"):
+        with pytest.raises(
+            OptionError, match=f"tile: expected a multiple of {scale} px, got 41 px"
+        ):
             to_onnx(network, {}, 41)
 
 
@@ -53,14 +63,20 @@ def test_torch_and_onnxruntime_agree_on_shipped_weights(name: str) -> None:
 
 
 @pytest.mark.parametrize(("scale", "rows", "columns"), [(1, 37, 29), (2, 38, 46)])
-def test_a_network_behind_a_bank_is_exported_for_one_sensor(scale: int, rows: int, columns: int) -> None:
-    """Its filters, unit and head's bias are constants then; tiled, with mirrored borders, it gives the same."""
+def test_a_network_behind_a_bank_is_exported_for_one_sensor(
+    scale: int, rows: int, columns: int
+) -> None:
+    """Its filters, unit and head's bias are constants then; tiled, with mirrored borders, it gives
+    the same.
+    """
     banked = behind_a_bank(Variant(1, 8, scale), 0.1)
     sensor = load_sensor("pleiades-degraded").nominal()
     model = banked_to_onnx(Weights(arrays(banked.state_dict()), banked.variant, {}), sensor, {})
     image = np.random.default_rng(1).random((2, 1, rows, columns), dtype=np.float32) * 0.02 + 0.4
     with torch.inference_mode():
-        expected = told(banked, vector_tensor(sensor), network_bank(sensor))(torch.from_numpy(image)).numpy()
+        expected = told(banked, vector_tensor(sensor), network_bank(sensor))(
+            torch.from_numpy(image)
+        ).numpy()
     np.testing.assert_allclose(run(open_session(model), image), expected, atol=2e-6)
     placed = place(network_of(model, 64), load_dpu("vck190", "C32B6"))
     assert [node.op.name for node in placed.nodes if node.broken] == []
@@ -74,9 +90,13 @@ def test_the_shipped_network_at_half_resolution_restores_the_same_image() -> Non
     small = load_network(shipped_weights("convbeers-xs"))[0]
     sensor = load_sensor("pleiades-degraded").nominal()
     coarse = grow(small, VARIANTS["convbeers-half"], torch.Generator().manual_seed(0))
-    both = [Weights(arrays(network.state_dict()), network.variant, {}) for network in (small, coarse)]
+    both = [
+        Weights(arrays(network.state_dict()), network.variant, {}) for network in (small, coarse)
+    ]
     image = np.random.default_rng(1).random((1, 1, 34, 50), dtype=np.float32)
-    expected, found = (run(open_session(banked_to_onnx(weights, sensor, {})), image) for weights in both)
+    expected, found = (
+        run(open_session(banked_to_onnx(weights, sensor, {})), image) for weights in both
+    )
     np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
@@ -105,12 +125,16 @@ def test_an_export_that_computes_something_else_is_refused(network: ConvBEERS) -
 
 
 @pytest.mark.parametrize("sensor", ["pleiades-degraded", "pleiades-variable"])
-def test_conditioned_weights_become_the_sensors(conditioned: Path, sensor: str, tmp_path: Path) -> None:
+def test_conditioned_weights_become_the_sensors(
+    conditioned: Path, sensor: str, tmp_path: Path
+) -> None:
     """And the same sensor makes the same bytes."""
     path = tmp_path / "x.onnx"
     again = tmp_path / "again.onnx"
     for file in (path, again):
-        assert "warning" not in done("export", "--network", conditioned, "--sensor", sensor, "--out", file)
+        assert "warning" not in done(
+            "export", "--network", conditioned, "--sensor", sensor, "--out", file
+        )
     assert path.read_bytes() == again.read_bytes()
     unfolded = load_network(conditioned)[0]
     nominal = load_sensor(sensor).nominal()
@@ -122,7 +146,9 @@ def test_conditioned_weights_become_the_sensors(conditioned: Path, sensor: str, 
     assert metadata(onnx.load(path))["sensor"] == sensor
 
 
-def test_a_users_own_sensor_and_what_lies_outside_the_ranges_is_said(conditioned: Path, tmp_path: Path) -> None:
+def test_a_users_own_sensor_and_what_lies_outside_the_ranges_is_said(
+    conditioned: Path, tmp_path: Path
+) -> None:
     mine = own_sensor(tmp_path, ("[noise]", "mtf_nyquist_along = 0.004\n[noise]"))
     said = done("export", "--network", conditioned, "--sensor", mine, "--out", tmp_path / "x.onnx")
     warning = "warning: mtf_along 0.004 is outside 0.015 to 0.15, the network is told 0.015"
@@ -135,9 +161,13 @@ def test_plain_weights_take_no_sensor_and_conditioned_ones_the_default(
     plain_weights = tmp_path / "plain.safetensors"
     out = tmp_path / "x.onnx"
     save_network(plain_weights, network, {})
-    useless = refused("export", "--network", plain_weights, "--sensor", "pleiades-degraded", "--out", out)
+    useless = refused(
+        "export", "--network", plain_weights, "--sensor", "pleiades-degraded", "--out", out
+    )
     assert "train --conditioned" in useless
-    assert "hubble" in refused("export", "--network", conditioned, "--sensor", "hubble", "--out", out)
+    assert "hubble" in refused(
+        "export", "--network", conditioned, "--sensor", "hubble", "--out", out
+    )
     assert not out.exists()
     done("export", "--network", conditioned, "--out", out)
     assert metadata(onnx.load(out))["sensor"] == "pleiades-degraded"
@@ -146,7 +176,9 @@ def test_plain_weights_take_no_sensor_and_conditioned_ones_the_default(
 SMALL = "convbeers-xs-int8"
 
 
-@pytest.mark.parametrize(("sensor", "factors"), [("pleiades-degraded", [4, 8]), ("dior-medium", [2, 4])])
+@pytest.mark.parametrize(
+    ("sensor", "factors"), [("pleiades-degraded", [4, 8]), ("dior-medium", [2, 4])]
+)
 def test_the_deltas_of_exposures_make_the_networks_that_restore_runs(
     sensor: str, factors: list[int], tmp_path: Path
 ) -> None:
@@ -169,19 +201,37 @@ def test_the_deltas_of_exposures_make_the_networks_that_restore_runs(
 
 def test_where_no_higher_exposure_is_allowed_there_is_one_delta(tmp_path: Path) -> None:
     done(
-        "export", "--network", SMALL, "--sensor", "dior-high", "--out", tmp_path / "x.onnx", "--delta", tmp_path / "d"
+        "export",
+        "--network",
+        SMALL,
+        "--sensor",
+        "dior-high",
+        "--out",
+        tmp_path / "x.onnx",
+        "--delta",
+        tmp_path / "d",
     )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["d", "x.onnx"]
 
 
 def test_a_damaged_delta_is_named(tmp_path: Path) -> None:
     (tmp_path / "bad.delta").write_bytes(b"none")
-    said = refused("export", "--network", SMALL, "--out", tmp_path / "x.onnx", "--apply", tmp_path / "bad.delta")
+    said = refused(
+        "export",
+        "--network",
+        SMALL,
+        "--out",
+        tmp_path / "x.onnx",
+        "--apply",
+        tmp_path / "bad.delta",
+    )
     assert "bad.delta: expected a delta of this network, got damaged bytes" in said
 
 
 def test_the_files_of_exposures_are_refused_before_any_work(tmp_path: Path) -> None:
-    """Where one is an input, another output or cannot be written; and where the sensor does not exist."""
+    """Where one is an input, another output or cannot be written; and where the sensor does not
+    exist.
+    """
     sensor = own_sensor(tmp_path).rename(tmp_path / "my-x4.toml")
     before = sensor.read_bytes()
     out = tmp_path / "my-x8.onnx"

@@ -1,4 +1,6 @@
-"""The names of `import beers_deploy`: what they take and return, and what they refuse in one sentence."""
+"""The names of `import beers_deploy`: what they take and return, and what they refuse in one
+sentence.
+"""
 
 import copy
 import json
@@ -117,7 +119,9 @@ def test_the_gate_says_which_samples_calibration_saw(int8: bd.Network, samples: 
     verdict.raise_if_failed()
     assert "6 of the 8 samples were its calibration" in verdict.notes[0]
     assert verdict.comparison.result.patches == 8
-    with pytest.raises(AssertionError, match=r"gate FAILED, 1 of \d checks: MAE .* allowed at most 1e-09"):
+    with pytest.raises(
+        AssertionError, match=r"gate FAILED, 1 of \d checks: MAE .* allowed at most 1e-09"
+    ):
         bd.gate(int8, samples=samples, limits={"mae": 1e-9}).raise_if_failed()
 
 
@@ -176,7 +180,11 @@ def test_a_pair_is_read_as_evaluate_reads_it(pair: bd.Pair, tmp_path: Path) -> N
     degraded, reference = pair
     assert degraded.shape == reference.shape == pair.clean.shape == (70, 70)
     saved = bd.evaluate(["convbeers-half-xs"], pair.save(tmp_path / "pairs"), progress=False)
-    ways: dict[str, Any] = {"network": "convbeers-half-xs", "half": lambda dn: dn / 2, "mine": Tiny()}
+    ways: dict[str, Any] = {
+        "network": "convbeers-half-xs",
+        "half": lambda dn: dn / 2,
+        "mine": Tiny(),
+    }
     held = bd.evaluate(ways, [pair], progress=False)
     names = {row.name: row.figures for row in held.rows if row.table == "mean"}
     assert set(names) >= {"degraded", "network", "half", "mine"}
@@ -209,11 +217,15 @@ def test_bands_are_told_by_name(raw: np.ndarray) -> None:
     xarray = pytest.importorskip("xarray", reason="no xarray")
     bands = np.stack([raw, raw[::-1], raw // 2])
     expected = bd.restore(bands, SMALL)
-    last = xarray.DataArray(np.moveaxis(bands, 0, -1), dims=("y", "x", "band"), coords={"band": [1, 2, 3]})
+    last = xarray.DataArray(
+        np.moveaxis(bands, 0, -1), dims=("y", "x", "band"), coords={"band": [1, 2, 3]}
+    )
     restored = bd.restore(last, SMALL)
     assert restored.dims == last.dims
     np.testing.assert_array_equal(restored.transpose("band", "y", "x").values, expected)
-    scaled = xarray.DataArray((raw // 16).astype(np.uint8), dims=("y", "x"), attrs={"full_scale": 255})
+    scaled = xarray.DataArray(
+        (raw // 16).astype(np.uint8), dims=("y", "x"), attrs={"full_scale": 255}
+    )
     assert bd.restore(scaled, SMALL).dtype == np.uint8
 
 
@@ -237,19 +249,40 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
     "bands last": (lambda raw: bd.restore(np.stack([raw] * 3, -1)), "moveaxis"),
     "no array": (lambda _: bd.restore(3), "got int"),
     "a path alone": (lambda _: bd.restore("raw.tif"), "out: expected a path"),
-    "an array with out": (lambda raw: bd.restore(raw, out="a.tif"), "expected none beside an array"),
-    "a file's nodata": (lambda _: bd.restore("raw.tif", out="a.tif", nodata=0), "nodata: expected none"),
+    "an array with out": (
+        lambda raw: bd.restore(raw, out="a.tif"),
+        "expected none beside an array",
+    ),
+    "a file's nodata": (
+        lambda _: bd.restore("raw.tif", out="a.tif", nodata=0),
+        "nodata: expected none",
+    ),
     "no such sensor": (lambda raw: bd.restore(raw, sensor="none"), "expected one of"),
     "no such network": (lambda raw: bd.restore(raw, "none"), "a shipped network"),
     "no network": (lambda _: bd.Network.load(3), r"torch.nn.Module"),  # type: ignore[arg-type]
-    "a network of no use": (lambda raw: bd.restore(raw, SMALL, method="traditional"), "network: expected none"),
-    "a tile of no use": (lambda raw: bd.restore(raw, tile=64, method="traditional"), "tile: expected none"),
-    "a COG of an array": (lambda raw: bd.restore(raw, cog=True), "cog: expected none beside an array"),
-    "a COG of no use": (lambda _: bd.restore("raw.tif", out="a.tif", method="traditional", cog=True), "cog: exp"),
+    "a network of no use": (
+        lambda raw: bd.restore(raw, SMALL, method="traditional"),
+        "network: expected none",
+    ),
+    "a tile of no use": (
+        lambda raw: bd.restore(raw, tile=64, method="traditional"),
+        "tile: expected none",
+    ),
+    "a COG of an array": (
+        lambda raw: bd.restore(raw, cog=True),
+        "cog: expected none beside an array",
+    ),
+    "a COG of no use": (
+        lambda _: bd.restore("raw.tif", out="a.tif", method="traditional", cog=True),
+        "cog: exp",
+    ),
     "no method": (lambda _: bd.restore("raw.tif", out="a.tif", method="x"), "method: exp"),  # type: ignore[arg-type]
     "8 bits": (lambda raw: bd.restore(raw.astype(np.uint8)), "full_scale"),
     "shares": (lambda raw: bd.restore(raw / 4095), "full_scale"),
-    "other channels": (lambda raw: bd.quantize(Tiny(), raw[None, None, :32, :32].repeat(3, 1)), "1 channel"),
+    "other channels": (
+        lambda raw: bd.quantize(Tiny(), raw[None, None, :32, :32].repeat(3, 1)),
+        "1 channel",
+    ),
     "not 0..1": (lambda raw: bd.quantize(Tiny(), raw[None, None]), "values in"),
     "INT8 again": (lambda _: bd.quantize(f"{SMALL}-int8"), "got an INT8 one"),
     "no float network": (lambda _: bd.gate(f"{SMALL}-int8"), "against: expected the float network"),
@@ -264,7 +297,10 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
     "no batch": (lambda raw: bd.quantize(Tiny(), [raw]), "a batch of"),
     "empty": (lambda _: bd.quantize(Tiny(), []), "at least one sample"),
     "no raw image": (lambda _: bd.characterize([]), "one or several"),
-    "no module's size": (lambda _: bd.Network.load(Tiny(), example=(1, 9, 8, 8)), "that torch exports"),
+    "no module's size": (
+        lambda _: bd.Network.load(Tiny(), example=(1, 9, 8, 8)),
+        "that torch exports",
+    ),
     "no samples": (lambda raw: bd.quantize(Tiny(), {"image": raw}), "or a path"),
     "no swath": (lambda _: bd.predict(SMALL, size=(0, 0)), "size: expected"),
     "no size": (lambda _: bd.simulate(size=0), "size: expected"),
@@ -275,7 +311,9 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_bad_input_is_one_sentence_and_the_class_that_one_expects(case: str, raw: np.ndarray) -> None:
+def test_bad_input_is_one_sentence_and_the_class_that_one_expects(
+    case: str, raw: np.ndarray
+) -> None:
     call, words = REFUSED[case]
     with pytest.raises(ValueError, match=words) as caught:
         call(raw)
@@ -294,12 +332,18 @@ def test_from_raw_images_to_a_kit(tmp_path: Path) -> None:
     low, high = found.evidence.rows[0].figures["MTF across at Nyquist"].interval or (0, 0)
     assert low < 7 < high
     with small_studies():
-        study = bd.tradeoff([SMALL], sensor=found, board="zcu104", budget="latency<=60s", progress=False)
+        study = bd.tradeoff(
+            [SMALL], sensor=found, board="zcu104", budget="latency<=60s", progress=False
+        )
     assert study.best is not None
     assert study.plot().get_xlabel().startswith("board latency")
     assert "recommended" in str(study)
-    assert study.report(tmp_path / "study").read_text(encoding="utf-8").startswith("<!doctype html>")
-    assert (bd.Board.load("zcu104").kit(study.best.network, tmp_path / "kit") / "core.onnx").is_file()
+    assert (
+        study.report(tmp_path / "study").read_text(encoding="utf-8").startswith("<!doctype html>")
+    )
+    assert (
+        bd.Board.load("zcu104").kit(study.best.network, tmp_path / "kit") / "core.onnx"
+    ).is_file()
 
 
 WITHOUT_EXTRAS = """

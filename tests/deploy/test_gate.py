@@ -25,7 +25,14 @@ from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.gate import compare, judge, judge_saturation
 from beers_deploy.quant.limits import Limits, limits_of
-from beers_deploy.quant.onnx_file import GraphWriter, image_info, load_onnx, make_model, metadata, save_onnx
+from beers_deploy.quant.onnx_file import (
+    GraphWriter,
+    image_info,
+    load_onnx,
+    make_model,
+    metadata,
+    save_onnx,
+)
 from beers_deploy.quant.samples import CALIBRATED_ON, Patches, digest_of
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
@@ -46,14 +53,18 @@ def unseen() -> Patches:
     return drawn(2, seed=7, scene=77)
 
 
-def failed(reference_model: onnx.ModelProto, unseen: Patches, folder: Path, spoil: Spoil) -> set[str]:
+def failed(
+    reference_model: onnx.ModelProto, unseen: Patches, folder: Path, spoil: Spoil
+) -> set[str]:
     """The names of the checks that a spoilt copy of the shipped file fails."""
     model = onnx.load(shipped_pair("convbeers-xs")[1])
     spoil(model)
     save_onnx(model, folder / "spoilt.onnx")
     result = compare(open_session(reference_model), open_session(model), unseen.pairs)
     limits = Limits(std_over_mae=2.5, saturated=0.001)
-    checks = judge(result, limits) + judge_saturation(saturated_shares(model, unseen.degraded), limits)
+    checks = judge(result, limits) + judge_saturation(
+        saturated_shares(model, unseen.degraded), limits
+    )
     checks += file_checks(reference_model, Network(model, "spoilt"), load_target("vck190"))
     return {check.name for check in checks if not check.passed}
 
@@ -78,7 +89,9 @@ def drop_a_relu(model: onnx.ModelProto) -> None:
 
 
 def give_a_float_scale(model: onnx.ModelProto) -> None:
-    node(model, "body.2.first").input[6] = own_constant(model, "odd_scale", np.array(0.0043, np.float32))
+    node(model, "body.2.first").input[6] = own_constant(
+        model, "odd_scale", np.array(0.0043, np.float32)
+    )
     node(model, "body.2.second").input[1] = "odd_scale"
 
 
@@ -86,7 +99,9 @@ def clip_an_activation(model: onnx.ModelProto) -> None:
     """A block's inner tensor at a scale four too fine: it saturates."""
     conv = node(model, "body.1.first")
     reader = node(model, "body.1.second")
-    scale = next(numpy_helper.to_array(t) for t in model.graph.initializer if t.name == conv.input[6])
+    scale = next(
+        numpy_helper.to_array(t) for t in model.graph.initializer if t.name == conv.input[6]
+    )
     conv.input[6] = own_constant(model, "scale_too_fine", scale / np.float32(16))
     reader.input[1] = "scale_too_fine"
 
@@ -100,7 +115,9 @@ def swap_the_planes(model: onnx.ModelProto) -> None:
 
 
 def raise_a_floor(model: onnx.ModelProto) -> None:
-    node(model, "body.1.first.relu").input[1] = own_constant(model, "floor", np.array(130, np.uint8))
+    node(model, "body.1.first.relu").input[1] = own_constant(
+        model, "floor", np.array(130, np.uint8)
+    )
 
 
 def change_the_host(name: str, value: float) -> Spoil:
@@ -112,7 +129,9 @@ def read_at_another_scale(model: onnx.ModelProto) -> None:
     reader.input[1] = own_constant(model, "other_scale", np.array(2.0**-6, np.float32))
 
 
-def test_the_shipped_file_passes(reference_model: onnx.ModelProto, unseen: Patches, tmp_path: Path) -> None:
+def test_the_shipped_file_passes(
+    reference_model: onnx.ModelProto, unseen: Patches, tmp_path: Path
+) -> None:
     assert failed(reference_model, unseen, tmp_path, lambda _: None) == set()
 
 
@@ -133,7 +152,11 @@ def test_the_shipped_file_passes(reference_model: onnx.ModelProto, unseen: Patch
     ],
 )
 def test_a_spoilt_file_is_stopped(
-    spoil: Spoil, checks: set[str], reference_model: onnx.ModelProto, unseen: Patches, tmp_path: Path
+    spoil: Spoil,
+    checks: set[str],
+    reference_model: onnx.ModelProto,
+    unseen: Patches,
+    tmp_path: Path,
 ) -> None:
     assert checks <= failed(reference_model, unseen, tmp_path, spoil)
 
@@ -150,7 +173,14 @@ def test_limits_come_from_a_file(tmp_path: Path) -> None:
     assert limits_of(path) == Limits(mae_growth=1.2)  # what is left out has its default
 
 
-UNBREAKABLE = ["mae = inf", "mae = 0.5", "p999 = 1.1", "saturated = 2", "mae_growth = inf", "std_over_mae = 1e300"]
+UNBREAKABLE = [
+    "mae = inf",
+    "mae = 0.5",
+    "p999 = 1.1",
+    "saturated = 2",
+    "mae_growth = inf",
+    "std_over_mae = 1e300",
+]
 UNBREAKABLE += ["psnr_drop_db = inf", "min_psnr_float_int8_db = 1e-9"]
 
 
@@ -158,17 +188,33 @@ UNBREAKABLE += ["psnr_drop_db = inf", "min_psnr_float_int8_db = 1e-9"]
 def test_a_limit_that_no_network_breaks_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "gate.toml").write_text(text)
     name, value = text.split(" = ")
-    for given in (tmp_path / "gate.toml", {name: float(value)}, replace(Limits(), **{name: float(value)})):
+    for given in (
+        tmp_path / "gate.toml",
+        {name: float(value)},
+        replace(Limits(), **{name: float(value)}),
+    ):
         with pytest.raises(OptionError, match="broken network"):
             limits_of(given)
     with pytest.raises(OptionError, match="max_mae"):
         limits_of(None, float("inf"))
 
 
-NO_LIMITS = ["mae = 'small'", "mae = true", "mea = 0.1", "mae = -1", "mae = nan", "= 3", "[mae]", "", "# none"]
+NO_LIMITS = [
+    "mae = 'small'",
+    "mae = true",
+    "mea = 0.1",
+    "mae = -1",
+    "mae = nan",
+    "= 3",
+    "[mae]",
+    "",
+    "# none",
+]
 
 
-@pytest.mark.parametrize("text", [*NO_LIMITS, "mae = [1]", "mae = 0x" + "f" * 400, "mae = " + "9" * 5000])
+@pytest.mark.parametrize(
+    "text", [*NO_LIMITS, "mae = [1]", "mae = 0x" + "f" * 400, "mae = " + "9" * 5000]
+)
 def test_limits_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "gate.toml").write_text(text)
     with pytest.raises(OptionError, match=r"gate\.toml: (?!.*sys\.set)"):
@@ -204,9 +250,15 @@ def test_the_action_s_summary_is_a_table_whatever_a_stranger_s_name_holds(
     for name in ("GITHUB_OUTPUT", "GITHUB_STEP_SUMMARY"):
         monkeypatch.setenv(name, str(tmp_path / name))
     figures = {"MAE": {"value": 6e-4}, "PSNR drop": {"value": None}}
-    document = {"verdict": "failed", "rows": [{"figures": figures}], "checks": [each.to_json() for each in CHECKS]}
+    document = {
+        "verdict": "failed",
+        "rows": [{"figures": figures}],
+        "checks": [each.to_json() for each in CHECKS],
+    }
     (tmp_path / "gate.json").write_text(json.dumps(document))
-    runpy.run_path(str(ROOT / ".github" / "verdict.py"))["main"](1, tmp_path / "gate.json", tmp_path / "none")
+    runpy.run_path(str(ROOT / ".github" / "verdict.py"))["main"](
+        1, tmp_path / "gate.json", tmp_path / "none"
+    )
     assert (tmp_path / "GITHUB_OUTPUT").read_text() == "verdict=failed\nmae=0.0006\n"
     _, title, _, *lines = (tmp_path / "GITHUB_STEP_SUMMARY").read_text().splitlines()
     assert title == "## INT8 gate: failed"
@@ -219,7 +271,9 @@ def test_the_last_line_names_what_failed_and_nothing_else() -> None:
     assert sentence(CHECKS[:1], "MAE 0.0006") == "passed, all 1 checks: MAE 0.0006"
     text = sentence(CHECKS, "MAE 0.0006")
     assert text.isprintable()  # a node's name may hold what a terminal or a CI's log would obey
-    assert text.startswith("FAILED, 2 of 4 checks: PSNR drop 0.31 dB, allowed at most 0.25; nodes <all> 1 (tail")
+    assert text.startswith(
+        "FAILED, 2 of 4 checks: PSNR drop 0.31 dB, allowed at most 0.25; nodes <all> 1 (tail"
+    )
     assert "MAE" not in text
     assert "float-INT8" not in text
 
@@ -258,8 +312,12 @@ def test_the_judged_file_does_not_choose_its_judges(model: Path) -> None:
     mixed = np.concatenate([samples[10:], samples[2:7]])
     found = bd.compare(int8, samples=mixed)
     assert found.result.patches == 7
-    assert "4 of the 7 samples" in found.notes[0]  # of the eight, two were held out, and one of them is here
-    claimed = replace(int8, model=claiming(int8.model, CALIBRATED_ON, " ".join(map(digest_of, mixed[:, None]))))
+    assert (
+        "4 of the 7 samples" in found.notes[0]
+    )  # of the eight, two were held out, and one of them is here
+    claimed = replace(
+        int8, model=claiming(int8.model, CALIBRATED_ON, " ".join(map(digest_of, mixed[:, None])))
+    )
     again = bd.compare(claimed, samples=mixed)
     assert (again.result.mae, again.result.patches) == (found.result.mae, 7)
     assert "7 of the 7 samples" in again.notes[0]
@@ -300,7 +358,8 @@ SMALL = "convbeers-xs"
 
 @pytest.mark.parametrize("factor", [2, 0])
 def test_a_baseline_shows_a_wrong_bias_in_nearly_any_layer(factor: int, unseen: Patches) -> None:
-    """A bias off by one scale, or lost, may hide below a limit on the MAE, seldom in a twentieth of what it was.
+    """A bias off by one scale, or lost, may hide below a limit on the MAE, seldom in a twentieth of
+    what it was.
 
     The two that are left out add nothing but where a copy is rounded.
     """
@@ -322,7 +381,8 @@ def test_a_baseline_shows_a_wrong_bias_in_nearly_any_layer(factor: int, unseen: 
 def as_nodes(model: onnx.ModelProto) -> onnx.ModelProto:
     """The same network, its constants held by nodes."""
     held = [
-        onnx.helper.make_node("Constant", [], [t.name], name=f"of.{t.name}", value=t) for t in model.graph.initializer
+        onnx.helper.make_node("Constant", [], [t.name], name=f"of.{t.name}", value=t)
+        for t in model.graph.initializer
     ]
     nodes = [*held, *model.graph.node]
     del model.graph.initializer[:], model.graph.node[:]
@@ -348,12 +408,16 @@ def test_a_relu_is_the_larger_of_zero_whatever_comes_first(explicit: list[str]) 
 
 
 def test_results_that_are_never_below_zero_need_no_relu() -> None:
-    """An 8-bit range from zero may be a ReLU folded in, or none: both are told apart by what was there in float."""
+    """An 8-bit range from zero may be a ReLU folded in, or none: both are told apart by what was
+    there in float.
+    """
     found = Relus(explicit=1, folded=2)
     assert [found.off_by(wanted) for wanted in range(6)] == [1, 0, 0, 0, 1, 2]
 
 
-def test_a_file_of_another_quantiser_is_judged_without_the_rules_of_a_dpu(model: Path, tmp_path: Path) -> None:
+def test_a_file_of_another_quantiser_is_judged_without_the_rules_of_a_dpu(
+    model: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "free.onnx"
     reference_model = load_onnx(model)
     noise = list(np.random.default_rng(0).random((2, 1, 1, 32, 32), np.float32))
@@ -365,18 +429,27 @@ def test_a_file_of_another_quantiser_is_judged_without_the_rules_of_a_dpu(model:
         ("layers computed in float", True),
         ("optimised against unoptimised", True),
     ]
-    (rules,) = {c.name for c in file_checks(reference_model, free, load_target("vck190")) if not c.passed}
+    (rules,) = {
+        c.name for c in file_checks(reference_model, free, load_target("vck190")) if not c.passed
+    }
     assert rules == "nodes the DPU refuses"
 
 
-def test_two_networks_of_one_kind_are_refused(reference_model: onnx.ModelProto, tmp_path: Path) -> None:
+def test_two_networks_of_one_kind_are_refused(
+    reference_model: onnx.ModelProto, tmp_path: Path
+) -> None:
     path = tmp_path / "float.onnx"
     save_onnx(reference_model, path)
-    for pair, expected in (([path, path], "an INT8"), ([shipped_pair("convbeers-xs")[1]] * 2, "a float")):
+    for pair, expected in (
+        ([path, path], "an INT8"),
+        ([shipped_pair("convbeers-xs")[1]] * 2, "a float"),
+    ):
         assert f"expected {expected} network" in refused("gate", *pair)
 
 
-def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(tmp_path: Path) -> None:
+def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(
+    tmp_path: Path,
+) -> None:
     samples = tmp_path / "samples.npy"
     limits = tmp_path / "limits.toml"
     np.save(samples, np.random.default_rng(0).uniform(0.1, 0.9, (2, 1, 40, 40)).astype(np.float32))
@@ -397,11 +470,14 @@ def test_references_that_do_not_fit_are_refused_and_the_sample_is_named(tmp_path
     np.savez(path, image=image, reference=image * 4095)
     assert "s.npz[0]: expected a reference with values in [0, 1]" in refused(*command)
     np.savez(path, image=image, reference=image[..., :20])
-    assert "s.npz[0]: expected a reference of the results' size for psnr_drop_db, got 1 x 40 x 20" in refused(
-        *command
+    assert (
+        "s.npz[0]: expected a reference of the results' size for psnr_drop_db, got 1 x 40 x 20"
+        in refused(*command)
     )
     assert "gate passed" in done(*command[:-2], "--max-mae", 0.1)  # no check needs them
     assert "--metric: expected one of psnr" in refused(*command, "--metric", "PSNR")
     mixed = [(image[:1], image[:1]), (image[1:], image[1:, ..., :20])]
-    with pytest.raises(ImageError, match=r"samples\[1\]: expected a reference of the results' size"):
+    with pytest.raises(
+        ImageError, match=r"samples\[1\]: expected a reference of the results' size"
+    ):
         bd.compare("convbeers-xs-int8", SMALL, mixed)

@@ -1,4 +1,6 @@
-"""What a gate leaves behind: nothing of an older verdict, an error for the CI, and the digest of what was judged."""
+"""What a gate leaves behind: nothing of an older verdict, an error for the CI, and the digest of
+what was judged.
+"""
 
 import hashlib
 import json
@@ -44,10 +46,23 @@ def test_a_refused_gate_leaves_no_older_verdict_and_tells_the_ci(tmp_path: Path)
     record = tmp_path / "record"
     done("gate", *SMALL, "--json", document, "--junit", junit, "--record", record)
     assert json.loads(document.read_text())["verdict"] == "passed"
-    assert sorted(path.name for path in record.iterdir()) == ["record.cdx.json", "record.html", "record.json"]
+    assert sorted(path.name for path in record.iterdir()) == [
+        "record.cdx.json",
+        "record.html",
+        "record.json",
+    ]
     (tmp_path / "none.onnx").write_bytes(b"no network\n<&>\x1b[31m")
-    said = refused("gate", tmp_path / "none.onnx", tmp_path / "none.onnx", "--json", document, "--junit", junit,
-                   "--record", record)  # fmt: skip
+    said = refused(
+        "gate",
+        tmp_path / "none.onnx",
+        tmp_path / "none.onnx",
+        "--json",
+        document,
+        "--junit",
+        junit,
+        "--record",
+        record,
+    )
     assert not document.exists()
     assert list(record.iterdir()) == []
     suite = ET.fromstring(junit.read_text())  # noqa: S314 - our own text
@@ -57,7 +72,9 @@ def test_a_refused_gate_leaves_no_older_verdict_and_tells_the_ci(tmp_path: Path)
     assert " ".join((error.text or "").split()) in said
 
 
-def test_an_output_that_is_an_input_is_refused_and_stays(pair: tuple[Path, Path], tmp_path: Path) -> None:
+def test_an_output_that_is_an_input_is_refused_and_stays(
+    pair: tuple[Path, Path], tmp_path: Path
+) -> None:
     baseline = tmp_path / "gate.json"
     baseline.write_text("{}")
     refused("gate", *pair, "--baseline", baseline, "--json", baseline)
@@ -107,7 +124,9 @@ def test_a_file_that_changes_while_it_is_read_is_refused(
 def test_too_little_contrast_judges_nothing() -> None:
     """Samples of 2 DN of contrast: a network that returned their mean would keep the limit."""
     generator = np.random.default_rng(0)
-    samples = (2000 + generator.integers(0, 3, (3, 1, 48, 40))).astype(np.float32) / np.float32(4095)
+    samples = (2000 + generator.integers(0, 3, (3, 1, 48, 40))).astype(np.float32) / np.float32(
+        4095
+    )
     with pytest.raises(OptionError, match="contrast"):
         bd.gate("convbeers-xs-int8", "convbeers-xs", samples)
 
@@ -122,8 +141,12 @@ def test_a_note_says_if_the_default_limit_does_not_suit(model: Path) -> None:
 
 
 @pytest.mark.parametrize("claim", ["weights", "none"])
-def test_claims_of_weights_are_verified(claim: str, pair: tuple[Path, Path], tmp_path: Path) -> None:
-    """Licence and training are those of shipped weights: a file that only claims them has neither."""
+def test_claims_of_weights_are_verified(
+    claim: str, pair: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """Licence and training are those of shipped weights: a file that only
+    claims them has neither.
+    """
     sensor = Sensor.load("pleiades-degraded")
     int8 = Network.load(pair[1])
     digest = metadata(int8.model)[WEIGHTS]
@@ -132,17 +155,25 @@ def test_claims_of_weights_are_verified(claim: str, pair: tuple[Path, Path], tmp
     assert record_of(verdict, int8, sensor, Network.load(pair[0]))["training"] is not None
     other = onnx.ModelProto.FromString(int8.model.SerializeToString())
     if claim == "weights":
-        node = next(tensor for tensor in other.graph.initializer if tensor.name == "body.1.first.bias")
+        node = next(
+            tensor for tensor in other.graph.initializer if tensor.name == "body.1.first.bias"
+        )
         node.raw_data = bytes(len(node.raw_data))
     else:
-        onnx.helper.set_model_props(other, {k: v for k, v in metadata(other).items() if k != WEIGHTS})
+        onnx.helper.set_model_props(
+            other, {k: v for k, v in metadata(other).items() if k != WEIGHTS}
+        )
     save_onnx(other, tmp_path / "other.onnx")
     said = record_of(verdict, replace(int8, model=load_onnx(tmp_path / "other.onnx")), sensor)
     assert (said["weights_sha256"], said["training"], said["licence"]) == (None, None, None)
 
 
-def test_a_file_without_its_description_loses_no_check_silently(pair: tuple[Path, Path], tmp_path: Path) -> None:
-    """A changed constant of the host part is a fault of the encoding, which only the description shows."""
+def test_a_file_without_its_description_loses_no_check_silently(
+    pair: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """A changed constant of the host part is a fault of the encoding, which only the description
+    shows.
+    """
     int8 = pair[1]
     baseline = tmp_path / "before.json"
     done("gate", *pair, "--patches", 1, "--json", baseline)
@@ -153,7 +184,9 @@ def test_a_file_without_its_description_loses_no_check_silently(pair: tuple[Path
     assert "faults of the encoding" in done("gate", *pair, "--patches", 1, code=1)
     onnx.helper.set_model_props(model, about)
     save_onnx(model, int8)
-    assert "note: not checked: faults of the encoding" in " ".join(done("gate", *pair, "--patches", 1).split())
+    assert "note: not checked: faults of the encoding" in " ".join(
+        done("gate", *pair, "--patches", 1).split()
+    )
     said = done("gate", *pair, "--patches", 1, "--baseline", baseline, code=1)
     assert "does not describe its integers" in said
     onnx.helper.set_model_props(model, about | {"core": "{}"})
@@ -208,12 +241,16 @@ def test_claims_of_the_file_are_shown_as_claims(pair: tuple[Path, Path], tmp_pat
     save_onnx(model, tmp_path / "int8.onnx")
     int8 = Network.load(tmp_path / "int8.onnx")
     verdict = bd.gate(int8, Network.load(pair[0]), patches=1)
-    write_record(verdict, int8, Sensor.load("pleiades-degraded"), tmp_path / "r", verdict.comparison.floating)
+    write_record(
+        verdict, int8, Sensor.load("pleiades-degraded"), tmp_path / "r", verdict.comparison.floating
+    )
     said = json.loads((tmp_path / "r" / "record.json").read_text())
     assert said["sensors_in_range"] is None
     assert said["says"][CALIBRATED_ON] == "deadbeef cafe"
     assert "calibration_samples" not in said
-    known, claimed = (tmp_path / "r" / "record.html").read_text().split("What the file says of itself")
+    known, claimed = (
+        (tmp_path / "r" / "record.html").read_text().split("What the file says of itself")
+    )
     assert int8.sha256 in known
     assert "0" * 64 not in known
     assert "convbeers-gold" in claimed

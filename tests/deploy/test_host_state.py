@@ -44,7 +44,9 @@ def test_memory_that_was_given_back_is_still_in_the_peak(taken_mb: int) -> None:
 
 def test_the_peak_is_this_process_s_own_not_its_parent_s() -> None:
     block = b"x" * (400 * MEGABYTE)
-    done = subprocess.run([sys.executable, "-c", TAKE, "0"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", TAKE, "0"], capture_output=True, text=True, check=True
+    )
     assert gigabytes(peak_memory()) > len(block) / 1e9
     assert float(done.stdout.split()[1]) < 0.3
 
@@ -53,7 +55,9 @@ def test_the_peak_is_this_process_s_own_not_its_parent_s() -> None:
 def test_every_posix_system_s_way_agrees_with_linux_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
     own = gigabytes(peak_memory())
     monkeypatch.setattr("beers_deploy.host_state.STATUS", NOWHERE)
-    assert own * 0.95 < gigabytes(peak_memory()) < psutil.virtual_memory().total / 1e9  # a parent may have held more
+    assert (
+        own * 0.95 < gigabytes(peak_memory()) < psutil.virtual_memory().total / 1e9
+    )  # a parent may have held more
 
 
 @pytest.mark.parametrize(("system", "unit_bytes"), [("darwin", 1), ("freebsd14", 1024)])
@@ -67,7 +71,9 @@ def test_macos_counts_bytes_and_the_others_kibibytes(
     assert gigabytes(peak_memory()) == pytest.approx(2e6 * unit_bytes / 1e9)
 
 
-def test_where_nothing_counts_it_there_is_a_reason_and_no_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_nothing_counts_it_there_is_a_reason_and_no_zero(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("beers_deploy.host_state.STATUS", NOWHERE)
     monkeypatch.setattr(sys, "platform", "unheard-of")
     monkeypatch.setitem(sys.modules, "resource", None)

@@ -1,6 +1,8 @@
-"""Text of others' files in every kind of output: it is shown, on its line, and neither obeyed nor taken for markup.
+"""Text of others' files in every kind of output: it is shown, on its line, and neither obeyed nor
+taken for markup.
 
-The files are networks (metadata, names of nodes and tensors), images and samples (names), sensors and boards.
+The files are networks (metadata, names of nodes and tensors), images and samples (names), sensors
+and boards.
 """
 
 import io
@@ -28,12 +30,28 @@ from beers_deploy.results import PIPE_WIDTH, Input, Table, markdown_text, print_
 from beers_deploy.studies.stress.battery import table_lines
 
 HOSTILE = (
-    "a|b\n::error::c\r\x1b[31m\x9b31m\x00 \u202egnp.exe\u2066 ``` <img src=x onerror=y> [l](http://x) "
+    "a|b\n::error::c\r\x1b[31m\x9b31m\x00 \u202egnp.exe\u2066 ``` <img src=x onerror=y> "
+    "[l](http://x) "
     "[red]r[/red] [/b] &lt;"
 )
 TEXT = st.text(alphabet=st.characters(exclude_categories=["Cs"]))
 HEAD = {"html", "head", "meta", "title", "style", "body", "script"}
-TABLES = {"h1", "h2", "p", "div", "table", "thead", "tbody", "tr", "th", "td", "small", "ul", "li", "b"}
+TABLES = {
+    "h1",
+    "h2",
+    "p",
+    "div",
+    "table",
+    "thead",
+    "tbody",
+    "tr",
+    "th",
+    "td",
+    "small",
+    "ul",
+    "li",
+    "b",
+}
 TAGS = HEAD | TABLES
 """That a page of ours has without a picture."""
 
@@ -41,7 +59,9 @@ TAGS = HEAD | TABLES
 def rows_with(text: str) -> list[Row]:
     """Rows that have a text wherever a row may have one."""
     figure = measured(1.5, text, text)
-    return [Row("t", text, {"size": figure, text: unavailable("px", text)}, {text: text, "word": text})]
+    return [
+        Row("t", text, {"size": figure, text: unavailable("px", text)}, {text: text, "word": text})
+    ]
 
 
 def shown_alike(text: str, allowed: str = "\n\t\N{NO-BREAK SPACE}") -> bool:
@@ -71,7 +91,9 @@ class Tags(HTMLParser):
 @example(HOSTILE)
 def test_a_page_has_the_text_and_no_tag_of_it(text: str) -> None:
     picture = Picture(text, "data:,", text)
-    html = render(Report(text, text, [Section(text, rows_with(text), text)], [picture], [text], sorts=True))
+    html = render(
+        Report(text, text, [Section(text, rows_with(text), text)], [picture], [text], sorts=True)
+    )
     assert shown_alike(html)
     found = Tags(html)
     assert found.tags <= TAGS | {"figure", "img", "figcaption"}
@@ -199,13 +221,18 @@ def test_a_drawing_has_the_text_as_words(text: str) -> None:
 
 
 def test_no_output_is_written_past_the_functions_that_escape() -> None:
-    """Words of a file reach a terminal by `say`, `print_rows` and progress alone; each place is looked at once."""
+    """Words of a file reach a terminal by `say`, `print_rows` and progress alone; each place is
+    looked at once.
+    """
     folder = Path(__file__).parents[2]
     found = {
         path.relative_to(folder).as_posix()
         for part in ("deploy", "model", "quant", "profiles")
         for path in (folder / part).rglob("*.py")
-        if re.search(r"typer\.echo\(|\bconsole\.print\(|std(out|err)\.write\(|(?<![.\w>])print\(", _code(path))
+        if re.search(
+            r"typer\.echo\(|\bconsole\.print\(|std(out|err)\.write\(|(?<![.\w>])print\(",
+            _code(path),
+        )
     }
     known = {
         "deploy/__main__.py",

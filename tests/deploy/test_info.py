@@ -38,12 +38,17 @@ def test_it_says_what_the_header_says(model: Path, tmp_path: Path) -> None:
     assert [row.figures[key].value for key in ("width", "height", "bands")] == [70, 90, 1]
     assert row.text["pixels"] == "uint16"
     assert (row.text["full scale"], row.text["full scale from"]) == ("4095", "assumed: 12 bits")
-    assert row.text["georeference"] == "EPSG:32631, first corner (300000, 4800000), pixels of 0.5 x 0.25"
+    assert (
+        row.text["georeference"]
+        == "EPSG:32631, first corner (300000, 4800000), pixels of 0.5 x 0.25"
+    )
     assert (row.text["nodata"], row.text["rational polynomials"]) == ("7", "yes")
     assert row.figures["time here"].mode == "unavailable"
 
 
-def test_of_a_large_image_few_pixels_are_read(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_a_large_image_few_pixels_are_read(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.ones((900, 700), np.uint16))
     read = TiffSource.read
     rows = list[int]()
@@ -75,12 +80,17 @@ def test_a_full_scale_that_is_open_is_said_to_be(kind: str, model: Path, tmp_pat
     text = about(tmp_path / "in.tif", Options(model)).text
     assert text["full scale"] == "open"
     assert "full scale" in text["full scale from"]
-    assert about(tmp_path / "in.tif", Options(model, full_scale=200)).text["full scale from"] == "asked for"
+    assert (
+        about(tmp_path / "in.tif", Options(model, full_scale=200)).text["full scale from"]
+        == "asked for"
+    )
 
 
 def test_time_here_is_predicted_from_what_was_timed(model: Path, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.ones((90, 70), np.uint16))
-    figure = about(tmp_path / "in.tif", Options(model, tile_px=23), measure=True).figures["time here"]
+    figure = about(tmp_path / "in.tif", Options(model, tile_px=23), measure=True).figures[
+        "time here"
+    ]
     assert figure.mode == "predicted"
     assert figure.value is not None
     assert figure.interval is not None
@@ -93,7 +103,9 @@ def test_time_on_the_board_is_the_cost_model_s(tmp_path: Path) -> None:
     for height in (6000, 12000):
         image = tifffile.memmap(tmp_path / f"{height}.tif", shape=(height, 6000), dtype="uint16")
         del image
-        times.append(about(tmp_path / f"{height}.tif", Options(shipped_pair()[1])).figures["time on vck190"])
+        times.append(
+            about(tmp_path / f"{height}.tif", Options(shipped_pair()[1])).figures["time on vck190"]
+        )
     assert all(each.mode == "predicted" for each in times)
     first, second = (each.value or math.nan for each in times)
     assert second / first == pytest.approx(2, abs=0.1)
@@ -101,7 +113,9 @@ def test_time_on_the_board_is_the_cost_model_s(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems write its zeros")
 def test_it_reads_none_of_a_file_of_ten_gigabytes(model: Path, tmp_path: Path) -> None:
-    image = tifffile.memmap(tmp_path / "big.tif", shape=(73_000, 73_000), dtype="uint16", bigtiff=True)
+    image = tifffile.memmap(
+        tmp_path / "big.tif", shape=(73_000, 73_000), dtype="uint16", bigtiff=True
+    )
     del image
     out = tmp_path / "a.json"
     done("info", tmp_path / "big.tif", "--network", model, "--json", out)

@@ -1,4 +1,6 @@
-"""The cells of docs/tutorials/jp2-to-cog.ipynb, as a reader would run them, and the words it keeps of such a run."""
+"""The cells of docs/tutorials/jp2-to-cog.ipynb, as a reader would run them, and the words it keeps
+of such a run.
+"""
 
 import contextlib
 import io
@@ -21,7 +23,9 @@ MOST_BYTES = 100_000
 
 
 def run_cell(source: str, names: dict[str, Any]) -> str:
-    """What a cell prints: of Python, or of the program where its line begins with an exclamation mark."""
+    """What a cell prints: of Python, or of the program where its line begins with an exclamation
+    mark.
+    """
     printed = io.StringIO()
     if source.startswith("!beers-deploy "):
         done = CliRunner().invoke(app, source.split()[1:])
@@ -32,7 +36,9 @@ def run_cell(source: str, names: dict[str, Any]) -> str:
     return printed.getvalue()
 
 
-def test_its_cells_run_and_print_what_it_keeps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_its_cells_run_and_print_what_it_keeps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("rasterio")
     pytest.importorskip("pystac")
     import matplotlib.pyplot as plt
@@ -43,12 +49,20 @@ def test_its_cells_run_and_print_what_it_keeps(tmp_path: Path, monkeypatch: pyte
         for cell in CELLS:
             if cell["cell_type"] == "code":
                 printed = run_cell("".join(cell["source"]), names)
-                kept = "".join(line for output in cell["outputs"] for line in output.get("text", []))
+                kept = "".join(
+                    line for output in cell["outputs"] for line in output.get("text", [])
+                )
                 assert not kept or printed == kept
         plt.close("all")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["raw.jp2", "restored.json", "restored.tif"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "raw.jp2",
+        "restored.json",
+        "restored.tif",
+    ]
     truth = names["pair"].reference
-    errors = {name: np.abs(gain_of(names[name], truth) - truth).mean() for name in ("before", "restored")}
+    errors = {
+        name: np.abs(gain_of(names[name], truth) - truth).mean() for name in ("before", "restored")
+    }
     assert errors["restored"] < 0.7 * errors["before"]
 
 
@@ -61,13 +75,20 @@ def gain_of(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def test_it_is_small_and_shows_a_picture() -> None:
     assert NOTEBOOK.stat().st_size < MOST_BYTES
-    kinds = [kind for cell in CELLS for output in cell.get("outputs", []) for kind in output.get("data", {})]
+    kinds = [
+        kind
+        for cell in CELLS
+        for output in cell.get("outputs", [])
+        for kind in output.get("data", {})
+    ]
     assert kinds.count("image/png") == 1
 
 
 def test_the_pages_beside_it_are_there() -> None:
     import re
 
-    words = "".join(line for cell in CELLS if cell["cell_type"] == "markdown" for line in cell["source"])
+    words = "".join(
+        line for cell in CELLS if cell["cell_type"] == "markdown" for line in cell["source"]
+    )
     for target in re.findall(r"\]\(([^)]+)\)", words):
         assert (NOTEBOOK.parent / target).is_file(), target

@@ -30,12 +30,18 @@ def da() -> Any:
     return pytest.importorskip("dask.array", reason="the extra 'dask' is not installed")
 
 
-def of_file(folder: Path, pixels: np.ndarray, options: Options, nodata: float | None = None) -> np.ndarray:
+def of_file(
+    folder: Path, pixels: np.ndarray, options: Options, nodata: float | None = None
+) -> np.ndarray:
     """What the command makes of the same pixels."""
     tags = [] if nodata is None else [(42113, "s", 0, f"{nodata:g}", True)]
-    planes: dict[str, Any] = {"photometric": "rgb", "planarconfig": "separate"} if pixels.shape[0] == 3 else {}
+    planes: dict[str, Any] = (
+        {"photometric": "rgb", "planarconfig": "separate"} if pixels.shape[0] == 3 else {}
+    )
     stored = pixels if pixels.ndim == 2 or planes else pixels[0]
-    tifffile.imwrite(folder / "in.tif", stored, extratags=tags, **(planes if pixels.ndim == 3 else {}))
+    tifffile.imwrite(
+        folder / "in.tif", stored, extratags=tags, **(planes if pixels.ndim == 3 else {})
+    )
     restore_file(folder / "in.tif", folder / "out.tif", options)
     return tifffile.imread(folder / "out.tif").reshape(pixels.shape)
 
@@ -73,7 +79,9 @@ def test_missing_pixels_stay_as_in_a_file(kind: str, da: Any, model: Path, tmp_p
 
 
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.integers(1, 50), st.integers(1, 50), st.integers(2, 50), st.integers(2, 50), st.booleans())
+@given(
+    st.integers(1, 50), st.integers(1, 50), st.integers(2, 50), st.integers(2, 50), st.booleans()
+)
 def test_a_dask_array_of_any_chunks_gives_the_same(
     da: Any, model: Path, height: int, width: int, down: int, across: int, planes: bool
 ) -> None:
@@ -93,7 +101,9 @@ def test_nothing_is_read_before_it_is_asked_for_and_no_more_than_that(da: Any, m
         return block
 
     pixels = noise(200, 200)
-    chunks = da.from_array(pixels, chunks=50).map_blocks(counted, dtype=np.uint16, meta=np.empty((0, 0), np.uint16))
+    chunks = da.from_array(pixels, chunks=50).map_blocks(
+        counted, dtype=np.uint16, meta=np.empty((0, 0), np.uint16)
+    )
     lazy = restore(chunks, model, tile=40)
     assert read == []
     corner = lazy[:30, :30].compute(scheduler="synchronous")
@@ -127,7 +137,9 @@ def test_a_data_array_keeps_what_it_says(lazy: bool, da: Any, model: Path) -> No
     held = da.from_array(pixels, chunks=(1, 32, 32)) if lazy else pixels
     places = {"y": np.arange(60.0), "x": np.arange(50.0), "band": [1], "spatial_ref": 0}
     attributes = {"_FillValue": 9, "units": "DN"}
-    image = xarray.DataArray(held, dims=("band", "y", "x"), coords=places, attrs=attributes, name="scene")
+    image = xarray.DataArray(
+        held, dims=("band", "y", "x"), coords=places, attrs=attributes, name="scene"
+    )
     restored = restore(image, model, tile=23)
     assert hasattr(restored.data, "__dask_graph__") == lazy
     np.testing.assert_array_equal(restored.values, restore(pixels, model, tile=23, nodata=9))
@@ -152,7 +164,9 @@ def test_a_data_array_of_more_pixels_has_their_places(tmp_path: Path) -> None:
     assert (restored.name, list(restored.band)) == ("scene", [1])
 
 
-def test_values_beyond_full_scale_are_refused_at_once_or_when_computed(da: Any, model: Path) -> None:
+def test_values_beyond_full_scale_are_refused_at_once_or_when_computed(
+    da: Any, model: Path
+) -> None:
     pixels = noise(60, 50)
     pixels[40, 30] = 60000
     with pytest.raises(ImageError, match=r"60000.*full_scale"):
@@ -202,8 +216,14 @@ def test_a_dask_array_of_unknown_size_is_refused(da: Any, model: Path) -> None:
         restore(da.ma.masked_equal(da.zeros((9, 9)), 0), model)
 
 
-def test_options_and_models_are_refused_before_anything_is_computed(da: Any, model: Path, tmp_path: Path) -> None:
-    wrong: dict[str, Any] = {"runtime: expected onnxruntime or openvino": "tensorrt", "tile": 10, "halo": -1}
+def test_options_and_models_are_refused_before_anything_is_computed(
+    da: Any, model: Path, tmp_path: Path
+) -> None:
+    wrong: dict[str, Any] = {
+        "runtime: expected onnxruntime or openvino": "tensorrt",
+        "tile": 10,
+        "halo": -1,
+    }
     for image in (noise(40, 40), da.from_array(noise(40, 40), chunks=20)):
         for said, value in wrong.items():
             with pytest.raises(OptionError, match=said):
@@ -214,6 +234,9 @@ def test_options_and_models_are_refused_before_anything_is_computed(da: Any, mod
 
 def test_importing_it_brings_nothing_that_only_other_work_needs() -> None:
     names = ("torch", "dask", "distributed", "xarray", "matplotlib", "skimage")
-    code = f"import sys; from beers_deploy.library import restore; print([m for m in {names} if m in sys.modules])"
+    code = (
+        f"import sys; from beers_deploy.library import restore; print([m for m in {names} if "
+        "m in sys.modules])"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -1,4 +1,6 @@
-"""A fault of an installed library ends with 70 and the library's name; it is not taken for a damaged file."""
+"""A fault of an installed library ends with 70 and the library's name; it is not taken for a
+damaged file.
+"""
 
 from collections.abc import Callable
 from importlib.metadata import version
@@ -14,7 +16,13 @@ from beers_deploy.cli import ending
 from beers_deploy.commands.restore import restore
 from beers_deploy.model.io import tiff
 from beers_deploy.model.processor import int8_adds_exactly
-from beers_deploy.profiles.errors import CODE_FAULTS, CRASHED, MissingExtraError, ModelError, printable
+from beers_deploy.profiles.errors import (
+    CODE_FAULTS,
+    CRASHED,
+    MissingExtraError,
+    ModelError,
+    printable,
+)
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.untrusted import contradictions
@@ -25,7 +33,9 @@ from tests.deploy.command_line import done
 PIXELS = np.full((20, 30), 900, np.uint16)
 
 
-def test_an_argument_that_tifffile_does_not_know(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_argument_that_tifffile_does_not_know(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     tifffile.imwrite(tmp_path / "raw.tif", PIXELS)
     monkeypatch.setitem(tiff.PLAIN, "is_of_the_future", False)
     said = done("info", tmp_path / "raw.tif", code=CRASHED)
@@ -70,7 +80,9 @@ def test_a_fault_of_this_program_names_no_library() -> None:
     assert (code, said.partition(",")[0]) == (CRASHED, "a fault of this program")
 
 
-def test_a_run_of_onnxruntime_that_fails_is_no_fault_of_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_of_onnxruntime_that_fails_is_no_fault_of_the_file(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Also where the processor is asked how it adds, with a network of this program."""
 
     def moved(*_: object, **__: object) -> None:

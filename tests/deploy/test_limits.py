@@ -1,4 +1,6 @@
-"""What is asked of a machine has an end: said before any work, not after minutes of silence or at the last byte."""
+"""What is asked of a machine has an end: said before any work, not after minutes of silence or at
+the last byte.
+"""
 
 import os
 from pathlib import Path
@@ -15,7 +17,9 @@ HUGE = str(10**23)
 
 
 @pytest.mark.parametrize("cores", [1, 2, 16])
-def test_threads_and_processes_are_at_most_the_cores(cores: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_and_processes_are_at_most_the_cores(
+    cores: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: cores)
     for asked in (0, 1, cores):
         require_cores("--threads", asked)
@@ -26,12 +30,20 @@ def test_threads_and_processes_are_at_most_the_cores(cores: int, monkeypatch: py
 
 @pytest.mark.parametrize(
     "command",
-    ["bench --target host --threads", "restore raw.tif out.tif --threads", "simulate --out pairs --workers"],
+    [
+        "bench --target host --threads",
+        "restore raw.tif out.tif --threads",
+        "simulate --out pairs --workers",
+    ],
 )
-def test_a_command_says_how_many(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_command_says_how_many(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "raw.tif").write_bytes(b"not read yet")
-    assert f"expected 0 to {os.cpu_count()}, the cores of this machine, got 9999" in refused(*command.split(), "9999")
+    assert f"expected 0 to {os.cpu_count()}, the cores of this machine, got 9999" in refused(
+        *command.split(), "9999"
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["raw.tif"]
 
 

@@ -1,4 +1,6 @@
-"""Shipped networks by name, wherever one is taken, and by sensor: told each, in float32 and in INT8."""
+"""Shipped networks by name, wherever one is taken, and by sensor: told each, in float32 and in
+INT8.
+"""
 
 import re
 import subprocess
@@ -13,7 +15,14 @@ import tifffile
 
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.progress import once
-from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_names, shipped_weights
+from beers_deploy.model.shipped import (
+    INT8,
+    SENSOR,
+    SHIPPED,
+    VARIANT,
+    shipped_names,
+    shipped_weights,
+)
 from beers_deploy.network_files import (
     float_file,
     int8_file,
@@ -43,10 +52,18 @@ def test_a_network_is_written_once_for_a_sensor(conditioned: Path) -> None:
     assert metadata(onnx.load(first))["sensor"] == SENSOR
 
 
-def test_the_same_numbers_are_the_same_sensor_and_others_are_not(conditioned: Path, tmp_path: Path) -> None:
-    """Sources and descriptions make no other network; a number does, under the same name of a file."""
+def test_the_same_numbers_are_the_same_sensor_and_others_are_not(
+    conditioned: Path, tmp_path: Path
+) -> None:
+    """Sources and descriptions make no other network; a number does, under the
+    same name of a file.
+    """
     files = []
-    for folder, old, new in (("a", "", ""), ("b", "Raw", "My raw"), ("c", "value = 0.07", "value = 0.08")):
+    for folder, old, new in (
+        ("a", "", ""),
+        ("b", "Raw", "My raw"),
+        ("c", "value = 0.07", "value = 0.08"),
+    ):
         (tmp_path / folder).mkdir()
         sensor = load_sensor(str(own_sensor(tmp_path / folder, (old, new))))
         files.append(float_file(conditioned, sensor))
@@ -71,13 +88,18 @@ def test_int8_is_calibrated_once_and_then_told_any_sensor(
     assert Path("applied.onnx").read_bytes() == Path("mine.onnx").read_bytes()
     assert Path("mine.delta").stat().st_size < 3000
     other = load_onnx(Path("mine.onnx"))
-    assert (metadata(base)["sensor"], metadata(other)["sensor"]) == (SENSOR, load_sensor(str(sensor)).name)
+    assert (metadata(base)["sensor"], metadata(other)["sensor"]) == (
+        SENSOR,
+        load_sensor(str(sensor)).name,
+    )
     again = told_int8(other, KNOWN)
     assert again.SerializeToString(deterministic=True) == base.SerializeToString(deterministic=True)
 
 
 def test_weights_of_ones_own_are_calibrated_by_quantize_alone(conditioned: Path) -> None:
-    with pytest.raises(ModelError, match=r"expected an INT8 network, got float weights; .*beers-deploy quantize"):
+    with pytest.raises(
+        ModelError, match=r"expected an INT8 network, got float weights; .*beers-deploy quantize"
+    ):
         int8_file(conditioned, KNOWN)
 
 
@@ -92,7 +114,9 @@ def test_the_shipped_int8_files_are_of_these_weights(name: str) -> None:
 
 def test_a_name_that_is_none_is_told_the_names_that_there_are() -> None:
     for name in ("convbeers-z", "convbeers-z-int8"):
-        with pytest.raises(ModelError, match=r"shipped network \(convbeers, convbeers-half, .*convbeers-xs"):
+        with pytest.raises(
+            ModelError, match=r"shipped network \(convbeers, convbeers-half, .*convbeers-xs"
+        ):
             network_file(Path(name), KNOWN)
     with pytest.raises(ModelError, match="no such file"):
         network_file(Path("none.safetensors"), KNOWN)
@@ -101,7 +125,10 @@ def test_a_name_that_is_none_is_told_the_names_that_there_are() -> None:
 def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
     blind = load_sensor(BLIND)
     assert (blind.name, numbers_of(blind)) == (BLIND, numbers_of(load_sensor(BLIND_PROFILE)))
-    floating = [load_onnx(float_file(Path("convbeers-xs"), load_sensor(name))) for name in (BLIND, BLIND_PROFILE)]
+    floating = [
+        load_onnx(float_file(Path("convbeers-xs"), load_sensor(name)))
+        for name in (BLIND, BLIND_PROFILE)
+    ]
     weights = [[tensor.raw_data for tensor in model.graph.initializer] for model in floating]
     assert weights[0] == weights[1]
 
@@ -112,19 +139,37 @@ def test_what_lies_outside_is_said_each_time(conditioned: Path, tmp_path: Path) 
     for _ in range(2):
         float_file(conditioned, sensor, said.append)
     assert len(said) == 4
-    assert all(re.match("warning: mtf_(across|along) 0.004 is outside 0.015 to 0.15", sentence) for sentence in said)
+    assert all(
+        re.match("warning: mtf_(across|along) 0.004 is outside 0.015 to 0.15", sentence)
+        for sentence in said
+    )
 
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-xs-int8"])
-def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_it(name: str, tmp_path: Path) -> None:
+def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_it(
+    name: str, tmp_path: Path
+) -> None:
     """At once: filters are written without what training needs."""
     dn = np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16)
     tifffile.imwrite(tmp_path / "in.tif", dn)
     sensor = own_sensor(tmp_path, ("value = 0.07", "value = 0.05"))
-    words = ["restore", str(tmp_path / "in.tif"), "out.tif", "--network", name, "--sensor", str(sensor)]
+    words = [
+        "restore",
+        str(tmp_path / "in.tif"),
+        "out.tif",
+        "--network",
+        name,
+        "--sensor",
+        str(sensor),
+    ]
     call = f"app({words!r}, standalone_mode=False)"
-    code = f"import sys; from beers_deploy.cli import app; {call}; print({{'torch', 'skimage'}} & set(sys.modules))"
-    ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    code = (
+        f"import sys; from beers_deploy.cli import app; {call}; print({{'torch', 'skimage'}} "
+        "& set(sys.modules))"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
     assert ran.stdout.splitlines()[-1] == "set()"
     other = [*words[:2], str(tmp_path / "other.tif"), *words[3:5], "--sensor", SENSOR]
     done(*other)
@@ -132,10 +177,14 @@ def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_i
     assert np.abs(restored[0] - restored[1]).max() > 5
 
 
-def test_a_network_that_is_made_for_one_sensor_takes_no_sensor_for_each_band(tmp_path: Path) -> None:
+def test_a_network_that_is_made_for_one_sensor_takes_no_sensor_for_each_band(
+    tmp_path: Path,
+) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.full((2, 20, 30), 900, np.uint16))
     words = ["--network", shipped_pair("convbeers-xs")[0], "--sensor", f"B0={SENSOR},B1={SENSOR}"]
-    assert "one sensor for all bands" in refused("restore", tmp_path / "in.tif", tmp_path / "out.tif", *words)
+    assert "one sensor for all bands" in refused(
+        "restore", tmp_path / "in.tif", tmp_path / "out.tif", *words
+    )
     assert not (tmp_path / "out.tif").exists()
 
 
@@ -153,7 +202,9 @@ def test_what_several_networks_have_to_say_is_said_once() -> None:
 
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s"])
-def test_a_name_is_the_shipped_network(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_name_is_the_shipped_network(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     floating, int8 = shipped_pair(name)
     assert int8_file(Path(name), KNOWN) == int8_file(Path(f"{name}-int8"), KNOWN) == int8
     assert network_file(Path(name), KNOWN) == float_file(Path(f"{name}-int8"), KNOWN) == floating
@@ -161,7 +212,12 @@ def test_a_name_is_the_shipped_network(name: str, tmp_path: Path, monkeypatch: p
     assert weights_file(Path(name)) == shipped_weights(name)
     monkeypatch.chdir(tmp_path)
     Path(name).write_bytes(b"mine")  # a file of that name is what was meant
-    assert int8_file(Path(name), KNOWN) == float_file(Path(name), KNOWN) == weights_file(Path(name)) == Path(name)
+    assert (
+        int8_file(Path(name), KNOWN)
+        == float_file(Path(name), KNOWN)
+        == weights_file(Path(name))
+        == Path(name)
+    )
 
 
 def test_anything_else_stays_a_path_and_nothing_is_the_default() -> None:
@@ -171,12 +227,19 @@ def test_anything_else_stays_a_path_and_nothing_is_the_default() -> None:
 
 
 def test_commands_take_the_name(tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "in.tif", np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16))
+    tifffile.imwrite(
+        tmp_path / "in.tif",
+        np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16),
+    )
     for model in ("convbeers-xs-int8", str(shipped_pair("convbeers-xs", "blind")[1])):
         out = tmp_path / f"{len(model)}.tif"
         said = done("restore", tmp_path / "in.tif", out, "--network", model)
-        assert ("network: convbeers-xs-int8, told no sensor" in said) == (model == "convbeers-xs-int8")
-    first, second = (tifffile.imread(path) for path in tmp_path.glob("*.tif") if path.name != "in.tif")
+        assert ("network: convbeers-xs-int8, told no sensor" in said) == (
+            model == "convbeers-xs-int8"
+        )
+    first, second = (
+        tifffile.imread(path) for path in tmp_path.glob("*.tif") if path.name != "in.tif"
+    )
     np.testing.assert_array_equal(first, second)
     said = refused("restore", tmp_path / "in.tif", tmp_path / "x.tif", "--network", "huge")
     assert "a shipped network (convbeers, convbeers-half" in said
@@ -199,12 +262,24 @@ def test_the_gate_takes_the_names() -> None:
         assert tuple(map(str, names)) == ("convbeers-xs", "convbeers-xs-int8")
 
 
-def test_export_writes_a_shipped_networks_integers_for_the_host_and_the_board(tmp_path: Path) -> None:
+def test_export_writes_a_shipped_networks_integers_for_the_host_and_the_board(
+    tmp_path: Path,
+) -> None:
     done("export", "--network", "convbeers-xs", "--out", tmp_path / "net.onnx")
     assert metadata(load_onnx(tmp_path / "net.onnx"))["variant"] == "convbeers-xs"
     host = str(tmp_path / "int8.onnx")
     board = str(tmp_path / "core.onnx")
-    words = ["export", "--network", "convbeers-half-xs-int8", "--sensor", "blind", "--tile", "64", "--out", host]
+    words = [
+        "export",
+        "--network",
+        "convbeers-half-xs-int8",
+        "--sensor",
+        "blind",
+        "--tile",
+        "64",
+        "--out",
+        host,
+    ]
     done(*words, "--board-file", board)
     assert metadata(load_onnx(Path(host)))["sensor"] == "blind"
     for path in (host, board):
@@ -212,6 +287,14 @@ def test_export_writes_a_shipped_networks_integers_for_the_host_and_the_board(tm
 
 
 def test_a_tile_that_a_network_cannot_rearrange_is_refused(tmp_path: Path) -> None:
-    words = ["export", "--network", "convbeers-half-xs-int8", "--tile", "65", "--out", str(tmp_path / "x.onnx")]
+    words = [
+        "export",
+        "--network",
+        "convbeers-half-xs-int8",
+        "--tile",
+        "65",
+        "--out",
+        str(tmp_path / "x.onnx"),
+    ]
     assert "--tile: expected a multiple of 2 px, got 65 px" in refused(*words)
     assert not (tmp_path / "x.onnx").exists()

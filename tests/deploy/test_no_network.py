@@ -1,7 +1,7 @@
 """The main commands where no socket can be opened: nothing is fetched, asked or told at run time.
 
-Most run in this process, where Python's sockets are watched; some in a process of their own, where the kernel watches
-native libraries' too (tests/deploy/sealed.py).
+Most run in this process, where Python's sockets are watched; some in a process of their own, where
+the kernel watches native libraries' too (tests/deploy/sealed.py).
 """
 
 import json
@@ -85,7 +85,9 @@ def test_the_chain_opens_no_socket(tmp_path: Path, no_sockets: list[tuple[object
 
 
 def alone(home: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
-    """Python where a user would start it: no variable is set that makes libraries hold their tongues in CI."""
+    """Python where a user would start it: no variable is set that makes libraries hold their
+    tongues in CI.
+    """
     inherited = {name: os.environ[name] for name in ("PATH", "SYSTEMROOT") if name in os.environ}
     environment = {**inherited, "HOME": str(home), "TMPDIR": str(home)}
     command = [sys.executable, *map(str, arguments)]
@@ -119,4 +121,7 @@ def test_a_native_attempt_would_end_the_process(tmp_path: Path) -> None:
     begin = "from tests.deploy.sealed import seal; seal(); import socket; "
     assert alone(tmp_path, "-c", begin + "socket.socketpair()").returncode == 0
     for family in ("AF_INET", "AF_INET6"):
-        assert alone(tmp_path, "-c", begin + f"socket.socket(socket.{family})").returncode == -signal.SIGSYS
+        assert (
+            alone(tmp_path, "-c", begin + f"socket.socket(socket.{family})").returncode
+            == -signal.SIGSYS
+        )

@@ -1,4 +1,6 @@
-"""A network with weights that are not finite, or that makes NaN of an image, gives one sentence and no figure."""
+"""A network with weights that are not finite, or that makes NaN of an image, gives one sentence and
+no figure.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -33,7 +35,9 @@ READERS = [
     "bench {0} --target host --json {1}/b.json",
     "restore {1}/raw.tif {1}/out.tif --network {0}",
 ]
-TRAINING = f"--variant {VARIANT} --drawn 1 --steps 2 --batch 1 --patch 24 --validate-every 0 --out {{1}}"
+TRAINING = (
+    f"--variant {VARIANT} --drawn 1 --steps 2 --batch 1 --patch 24 --validate-every 0 --out {{1}}"
+)
 OF_WEIGHTS = [
     "export --network {0} --out {1}/float.onnx",
     f"train --start {{0}} {TRAINING}",
@@ -84,7 +88,9 @@ def spoken(command: str, path: Path, exit_code: int = 2) -> str:
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_file_with_such_a_weight_is_not_read(tmp_path: Path, value: float) -> None:
-    with pytest.raises(ModelError, match=r"finite weights, got 1 NaN or infinite in body\.1\.first\.weight"):
+    with pytest.raises(
+        ModelError, match=r"finite weights, got 1 NaN or infinite in body\.1\.first\.weight"
+    ):
         load_onnx(written(tmp_path, one(value), ".onnx"), to_run=False)
 
 
@@ -108,7 +114,9 @@ def test_no_command_takes_such_weights(tmp_path: Path, command: str) -> None:
         "restore {1}/raw.tif {1}/out.tif --network {0}",
     ],
 )
-def test_a_network_whose_sums_overflow_is_refused_where_it_runs(tmp_path: Path, command: str, scenes: Path) -> None:
+def test_a_network_whose_sums_overflow_is_refused_where_it_runs(
+    tmp_path: Path, command: str, scenes: Path
+) -> None:
     said = spoken(command.replace("{2}", str(scenes)), written(tmp_path, overflowing, ".onnx"))
     assert "NaN" in said
     assert "finite" in said
@@ -116,7 +124,9 @@ def test_a_network_whose_sums_overflow_is_refused_where_it_runs(tmp_path: Path, 
 
 def test_the_gate_fails_a_network_whose_sums_overflow(tmp_path: Path, scenes: Path) -> None:
     said = spoken(
-        f"gate {{0}} {INT8} --images {scenes} --patches 1", written(tmp_path, overflowing, ".onnx"), exit_code=1
+        f"gate {{0}} {INT8} --images {scenes} --patches 1",
+        written(tmp_path, overflowing, ".onnx"),
+        exit_code=1,
     )
     assert "gate FAILED" in said
     assert "MAE nan" in said
@@ -124,10 +134,17 @@ def test_the_gate_fails_a_network_whose_sums_overflow(tmp_path: Path, scenes: Pa
 
 def test_an_infinite_pixel_is_no_full_scale_to_the_gate() -> None:
     """Clipped to 1, infinity on both sides would agree."""
-    ends = [helper.make_tensor_value_info(name, 1, ["N", 1, "H", "W"]) for name in ("image", "restored")]
+    ends = [
+        helper.make_tensor_value_info(name, 1, ["N", 1, "H", "W"]) for name in ("image", "restored")
+    ]
     scale = numpy_helper.from_array(np.full((1, 1, 1, 1), 3e38, np.float32), "s")
-    nodes = [helper.make_node("Mul", ["image", "s"], ["a"]), helper.make_node("Mul", ["a", "s"], ["restored"])]
+    nodes = [
+        helper.make_node("Mul", ["image", "s"], ["a"]),
+        helper.make_node("Mul", ["a", "s"], ["restored"]),
+    ]
     graph = helper.make_graph(nodes, "g", ends[:1], ends[1:], [scale])
-    session = open_session(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8))
+    session = open_session(
+        helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    )
     image = np.full((1, 1, 8, 8), 0.5, np.float32)
     assert np.isnan(compare(session, session, [(image, image)]).mae)

@@ -23,7 +23,8 @@ class Net(torch.nn.Module):
     def __init__(self):
         super().__init__()
         generator = torch.Generator().manual_seed(0)
-        self.head, self.tail = torch.nn.Conv2d(1, 8, 3, padding=1), torch.nn.Conv2d(8, 1, 3, padding=1)
+        self.head = torch.nn.Conv2d(1, 8, 3, padding=1)
+        self.tail = torch.nn.Conv2d(8, 1, 3, padding=1)
         for weight in self.parameters():
             weight.data = 0.1 * torch.randn(weight.shape, generator=generator)
 
@@ -34,13 +35,19 @@ PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "notebook.md"
 
 
 @pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")  # between rioxarray and affine
-def test_the_page_gives_what_the_command_gives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_gives_what_the_command_gives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rasterio = pytest.importorskip("rasterio", reason="no rasterio and no rioxarray")
     pytest.importorskip("rioxarray", reason="no rioxarray")
     monkeypatch.chdir(tmp_path)
     pixels = np.random.default_rng(0).integers(1, 4096, (1, 300, 260)).astype(np.uint16)
     pixels[:, 40:90, 50:120] = 0
-    about = {"crs": "EPSG:32631", "transform": rasterio.Affine(0.5, 0, 3e5, 0, -0.5, 4.8e6), "nodata": 0}
+    about = {
+        "crs": "EPSG:32631",
+        "transform": rasterio.Affine(0.5, 0, 3e5, 0, -0.5, 4.8e6),
+        "nodata": 0,
+    }
     with rasterio.open("raw.tif", "w", "GTiff", 260, 300, 1, dtype="uint16", **about) as file:
         file.write(pixels)
     shutil.copy(profile_path("sensors", "pleiades-degraded"), "my-sensor.toml")
@@ -55,7 +62,11 @@ def test_the_page_gives_what_the_command_gives(tmp_path: Path, monkeypatch: pyte
     expected = tifffile.imread("expected.tif")
     with rasterio.open("restored.tif") as ours, rasterio.open("expected.tif") as theirs:
         np.testing.assert_array_equal(ours.read(1), expected)
-        assert (ours.crs, ours.transform, ours.nodata) == (theirs.crs, theirs.transform, theirs.nodata)
+        assert (ours.crs, ours.transform, ours.nodata) == (
+            theirs.crs,
+            theirs.transform,
+            theirs.nodata,
+        )
     names["test_int8_stays_close_to_float"]()
     assert names["int8"] == bd.Network.load("int8.onnx")
     psnrs_db = [names["pair"].psnr(names["images"][name]) for name in ("raw", "chain", "network")]

@@ -1,4 +1,6 @@
-"""Every option of every command, as docs/make/options.py lists them: what it takes, and what it must not meet."""
+"""Every option of every command, as docs/make/options.py lists them: what it takes, and what it
+must not meet.
+"""
 
 from enum import StrEnum
 from pathlib import Path
@@ -9,7 +11,12 @@ from typer.testing import CliRunner
 from beers_deploy.cli import COMMANDS, app
 from docs.make.options import PATHS, REFUSED, UNITS, WORDS, Parameter, Refused, parameters
 
-CASES = [(name, option, case) for name, cases in REFUSED.items() for case in cases for option in case.options]
+CASES = [
+    (name, option, case)
+    for name, cases in REFUSED.items()
+    for case in cases
+    for option in case.options
+]
 GIVEN = {
     "add": "haze",
     "dpu": "C32B3",
@@ -56,7 +63,9 @@ def test_a_combination_is_refused(
     done = CliRunner().invoke(app, command)
     assert done.exit_code == 2, (command, done.output)
     sentence = done.stderr.removeprefix("beers-deploy: ")
-    assert sentence.startswith((known[option].label, *case.without.split(), *(b for b in beside if b[0] == "-")))
+    assert sentence.startswith(
+        (known[option].label, *case.without.split(), *(b for b in beside if b[0] == "-"))
+    )
     assert done.stderr.count("\n") == 1, done.stderr
     assert sorted(tmp_path.rglob("*")) == before
 

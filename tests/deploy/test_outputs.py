@@ -1,4 +1,5 @@
-"""One rule for every output of every command: no input, no other output, nothing but a regular file or a new name.
+"""One rule for every output of every command: no input, no other output, nothing but a regular file
+or a new name.
 
 docs/make/options.py says of every path that a command takes whether it is read or written.
 """
@@ -50,7 +51,9 @@ FOLDERS = [pair for pair in WRITERS if pair not in FILES]
 
 
 def in_turn(cases: Iterable[tuple[str, ...]], ways: Iterable[object]) -> list[tuple[object, ...]]:
-    """Each case one way, each way in its turn: one function looks at the outputs of all commands."""
+    """Each case one way, each way in its turn: one function looks at the
+    outputs of all commands.
+    """
     return [(*case, way) for case, way in zip(cases, cycle(ways), strict=False)]
 
 
@@ -87,7 +90,9 @@ def arguments(name: str, values: dict[str, Path]) -> list[str]:
 
 
 def given(name: str, folder: Path, **values: Path) -> list[str]:
-    """As `arguments`: an input for each argument, an output for each that must be given, unless told otherwise."""
+    """As `arguments`: an input for each argument, an output for each that must be given, unless
+    told otherwise.
+    """
     paths = PATHS[name]
     whole = dict(values)
     for key, parameter in parameters(name).items():
@@ -174,7 +179,9 @@ STANDS: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize(("name", "option", "what"), in_turn(WRITERS, STANDS))
-def test_only_a_regular_file_is_written_over(name: str, option: str, what: str, tmp_path: Path) -> None:
+def test_only_a_regular_file_is_written_over(
+    name: str, option: str, what: str, tmp_path: Path
+) -> None:
     value, file = output_at(name, option, tmp_path)
     file.parent.mkdir(parents=True, exist_ok=True)
     make, word = STANDS[what]
@@ -182,14 +189,22 @@ def test_only_a_regular_file_is_written_over(name: str, option: str, what: str, 
     refused(given(name, tmp_path, **{option: value}), tmp_path, str(file), word)
 
 
-@pytest.mark.parametrize(("name", "option", "make"), in_turn(FOLDERS, [kept, pipe, device, dangling]))
-def test_an_output_folder_is_a_folder(name: str, option: str, make: Callable[[Path], object], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "option", "make"), in_turn(FOLDERS, [kept, pipe, device, dangling])
+)
+def test_an_output_folder_is_a_folder(
+    name: str, option: str, make: Callable[[Path], object], tmp_path: Path
+) -> None:
     make(tmp_path / "place")
     refused(given(name, tmp_path, **{option: tmp_path / "place"}), tmp_path, "place")
 
 
-@pytest.mark.parametrize(("name", "option"), [pair for pair in WRITERS if pair != TELLS_CI], ids=str)
-def test_what_is_refused_for_its_input_leaves_no_new_folder(name: str, option: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "option"), [pair for pair in WRITERS if pair != TELLS_CI], ids=str
+)
+def test_what_is_refused_for_its_input_leaves_no_new_folder(
+    name: str, option: str, tmp_path: Path
+) -> None:
     source = kept(tmp_path / f"source{suffix_of(name)}")
     value, _ = output_at(name, option, tmp_path / "new" / "below")
     command = given(name, tmp_path, **{option: value, PATHS[name].read[0]: source})
@@ -205,9 +220,12 @@ def inputs_met() -> Iterator[tuple[str, str, str]]:
 
 
 @pytest.mark.parametrize(
-    ("name", "option", "source", "how"), in_turn(inputs_met(), ["itself", "symbolic link", "hard link"])
+    ("name", "option", "source", "how"),
+    in_turn(inputs_met(), ["itself", "symbolic link", "hard link"]),
 )
-def test_no_output_is_an_input(name: str, option: str, source: str, how: str, tmp_path: Path) -> None:
+def test_no_output_is_an_input(
+    name: str, option: str, source: str, how: str, tmp_path: Path
+) -> None:
     value, file = output_at(name, option, tmp_path)
     file.parent.mkdir(parents=True, exist_ok=True)
     source_path = kept(file if how == "itself" else tmp_path / f"source{suffix_of(name)}")
@@ -227,7 +245,9 @@ FOLDERS_READ = [
 
 
 @pytest.mark.parametrize(("name", "option", "source"), FOLDERS_READ)
-def test_no_output_is_a_file_of_an_input_folder(name: str, option: str, source: str, tmp_path: Path) -> None:
+def test_no_output_is_a_file_of_an_input_folder(
+    name: str, option: str, source: str, tmp_path: Path
+) -> None:
     scene = kept(tmp_path / "scenes" / ("scene.tif" if suffix_of(name) == ".json" else "scene.png"))
     if source == "pairs":
         scene = kept(tmp_path / "scenes" / "reference" / "scene.tif")
@@ -239,7 +259,9 @@ def test_figures_of_an_earlier_run_beside_the_images_are_renewed(tmp_path: Path)
     """The rule does not stop a job that is run twice: it gets as far as reading the images."""
     kept(tmp_path / "scenes" / "scene.png")
     figures = kept(tmp_path / "scenes" / "figures.json")
-    done = CliRunner().invoke(app, ["evaluate", "--images", str(figures.parent), "--json", str(figures)])
+    done = CliRunner().invoke(
+        app, ["evaluate", "--images", str(figures.parent), "--json", str(figures)]
+    )
     assert done.exit_code == 2
     assert "scene.png" in done.stderr
 
@@ -254,7 +276,11 @@ def test_pictures_do_not_go_where_images_are_read(command: str, tmp_path: Path) 
     refused([command, *wanted[command]], tmp_path, "the folder of an input")
 
 
-PAIRS = [(name, one, other) for name, paths in PATHS.items() for one, other in combinations(paths.written, 2)]
+PAIRS = [
+    (name, one, other)
+    for name, paths in PATHS.items()
+    for one, other in combinations(paths.written, 2)
+]
 
 
 @pytest.mark.parametrize(("name", "one", "other"), PAIRS)

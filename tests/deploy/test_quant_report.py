@@ -59,8 +59,22 @@ def test_quantize_reports_layers(tmp_path: Path) -> None:
     float_file(tmp_path / "f.onnx")
     dn = procedural_scene(640, 700, np.random.default_rng(0)).radiance * 4095 / 400
     write_tiff(tmp_path / "scenes" / "drawn.tif", np.rint(dn).astype(np.uint16))
-    options = ["--out", str(tmp_path / "i.onnx"), "--patches", "4", "--json", str(tmp_path / "q.json")]
-    options += ["--patch", "96", "--report", str(tmp_path / "r"), "--images", str(tmp_path / "scenes")]
+    options = [
+        "--out",
+        str(tmp_path / "i.onnx"),
+        "--patches",
+        "4",
+        "--json",
+        str(tmp_path / "q.json"),
+    ]
+    options += [
+        "--patch",
+        "96",
+        "--report",
+        str(tmp_path / "r"),
+        "--images",
+        str(tmp_path / "scenes"),
+    ]
     done("quantize", tmp_path / "f.onnx", *options)
     document = valid(tmp_path / "q.json")
     tables = [row["table"] for row in document["rows"]]
@@ -68,7 +82,11 @@ def test_quantize_reports_layers(tmp_path: Path) -> None:
     for row in document["rows"]:
         if row["table"] == "integer layers":
             figures = row["figures"]
-            assert figures["accumulator, seen"]["value"] <= figures["accumulator, proven"]["value"] < 31
+            assert (
+                figures["accumulator, seen"]["value"]
+                <= figures["accumulator, proven"]["value"]
+                < 31
+            )
     layers = [row for row in document["rows"] if row["table"] == "layers"]
     assert [row["name"] for row in layers][-1] == "all layers"
     shares = [row["figures"]["share of squared error"]["value"] for row in layers[:-1]]
@@ -109,7 +127,9 @@ def test_the_histogram_is_a_picture_for_light_and_dark() -> None:
 
 @pytest.mark.parametrize("farthest", [1, 40, 137, 4095])
 def test_labels_of_the_histogram_can_be_read_on_the_narrowest_page(farthest: int) -> None:
-    """At the size at which they are written: nothing is scaled down to fit, none is cut, none hides another."""
+    """At the size at which they are written: nothing is scaled down to fit, none is cut, none hides
+    another.
+    """
     dn = np.array([0] * 3_000_000 + [-farthest, farthest])
     url = histogram_url(spread(dn))
     root = ET.fromstring(base64.b64decode(url.removeprefix("data:image/svg+xml;base64,")))  # noqa: S314
@@ -153,14 +173,32 @@ def test_the_ratio_is_put_into_words() -> None:
 def test_a_report_on_samples_shows_the_worst_of_them(tmp_path: Path) -> None:
     save_onnx(to_onnx(plain(Variant(1, 4)), {}), tmp_path / "f.onnx")
     np.save(tmp_path / "s.npy", np.random.default_rng(0).random((8, 1, 40, 48), np.float32))
-    options = ["--samples", tmp_path / "s.npy", "--out", tmp_path / "i.onnx", "--report", tmp_path / "r"]
-    assert "none together with --samples" in refused("quantize", tmp_path / "f.onnx", *options, "--patches", 3)
+    options = [
+        "--samples",
+        tmp_path / "s.npy",
+        "--out",
+        tmp_path / "i.onnx",
+        "--report",
+        tmp_path / "r",
+    ]
+    assert "none together with --samples" in refused(
+        "quantize", tmp_path / "f.onnx", *options, "--patches", 3
+    )
     assert "dB" not in done("quantize", tmp_path / "f.onnx", *options).splitlines()[-1]
     document = json.loads((tmp_path / "r" / "report.json").read_text())
     rows = document["rows"]
     assert [each["name"] for each in document["inputs"]] == ["f.onnx", "i.onnx", "samples s.npy"]
-    assert {row["name"] for row in rows if row["table"] == "worst samples"} == {"sample 0", "sample 1"}
+    assert {row["name"] for row in rows if row["table"] == "worst samples"} == {
+        "sample 0",
+        "sample 1",
+    }
     judged = done(
-        "gate", tmp_path / "f.onnx", tmp_path / "i.onnx", "--samples", tmp_path / "s.npy", "--max-mae", "0.1"
+        "gate",
+        tmp_path / "f.onnx",
+        tmp_path / "i.onnx",
+        "--samples",
+        tmp_path / "s.npy",
+        "--max-mae",
+        "0.1",
     )
     assert "6 of the 8 samples were its calibration" in judged

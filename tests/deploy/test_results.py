@@ -6,7 +6,16 @@ from typing import Any
 import jsonschema
 import pytest
 
-from beers_deploy.profiles.figures import Check, Figure, Row, measured, number, predicted, published, unavailable
+from beers_deploy.profiles.figures import (
+    Check,
+    Figure,
+    Row,
+    measured,
+    number,
+    predicted,
+    published,
+    unavailable,
+)
 from beers_deploy.quant.gate import GateResult, gate_row, judge
 from beers_deploy.quant.limits import Limits
 from beers_deploy.results import SCHEMA_PATH, Table
@@ -15,7 +24,9 @@ SCHEMA = json.loads(SCHEMA_PATH.read_text())
 
 
 def document(**figures: Figure) -> dict[str, object]:
-    return Table("test", {"tile": 640, "image": Path("a.tif")}, (), (Row("t", "row", figures),)).to_dict()
+    return Table(
+        "test", {"tile": 640, "image": Path("a.tif")}, (), (Row("t", "row", figures),)
+    ).to_dict()
 
 
 def test_every_mode_validates() -> None:
@@ -54,7 +65,13 @@ def test_inputs_are_named_by_their_digest(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("value", "digits", "text"),
-    [(98965, 12, "98,965"), (571991.3, 3, "572,000"), (0.07258, 3, "0.0726"), (36.161, 4, "36.16"), (0, 4, "0")],
+    [
+        (98965, 12, "98,965"),
+        (571991.3, 3, "572,000"),
+        (0.07258, 3, "0.0726"),
+        (36.161, 4, "36.16"),
+        (0, 4, "0"),
+    ],
 )
 def test_numbers_read_well(value: float, digits: int, text: str) -> None:
     assert number(value, digits) == text
@@ -85,7 +102,9 @@ def test_a_document_without_rows_is_invalid() -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 0.0])
 def test_a_gate_on_a_network_gone_wrong_still_writes_json(value: float, tmp_path: Path) -> None:
-    """A network that gives NaN has no MAE: unavailable with a reason, in JSON that every reader takes."""
+    """A network that gives NaN has no MAE: unavailable with a reason, in JSON that every reader
+    takes.
+    """
     result = GateResult(value, value, value, value, value, value, value, value, patches=1)
     checks = tuple(judge(result, Limits(mae=1.0)))
     Table("gate", {}, (), (gate_row(result),), checks).save(tmp_path / "gate.json")
@@ -110,7 +129,10 @@ def test_no_figure_is_other_than_finite(value: float) -> None:
     assert measured(1, "s", "here", (0, 2)).interval == (0, 2)
 
 
-CHECKS = Check("MAE", 6e-4, 7e-4, "of full scale"), Check("PSNR drop", math.nan, 0.25, "dB", detail="of a layer")
+CHECKS = (
+    Check("MAE", 6e-4, 7e-4, "of full scale"),
+    Check("PSNR drop", math.nan, 0.25, "dB", detail="of a layer"),
+)
 
 
 def judged(*checks: Check, command: str = "gate") -> dict[str, Any]:
@@ -124,7 +146,13 @@ def test_a_verdict_stands_beside_its_checks(checks: tuple[Check, ...], verdict: 
     jsonschema.validate(strictly(json.dumps(whole, allow_nan=False)), SCHEMA)
     assert whole["verdict"] == verdict
     assert [check["passed"] for check in whole["checks"]] == [True, False][: len(checks)]
-    first = {"name": "MAE", "value": 6e-4, "limit": 7e-4, "unit": "of full scale", "bound": "at most"}
+    first = {
+        "name": "MAE",
+        "value": 6e-4,
+        "limit": 7e-4,
+        "unit": "of full scale",
+        "bound": "at most",
+    }
     assert whole["checks"][0] == {**first, "passed": True, "detail": ""}
     assert whole["checks"][-1]["value"] == (6e-4 if verdict == "passed" else None)
 

@@ -8,16 +8,41 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from beers_deploy.profiles.errors import visible
-from beers_deploy.profiles.figures import DIGITS, Figure, Row, measured, number, predicted, published, unavailable
+from beers_deploy.profiles.figures import (
+    DIGITS,
+    Figure,
+    Row,
+    measured,
+    number,
+    predicted,
+    published,
+    unavailable,
+)
 from beers_deploy.results import LEGEND, PIPE_WIDTH, default_console, print_rows
 
 TALL = [
-    Row("t", "one", {"latency": predicted(2, "s", (1, 3), "m"), "power": unavailable("W", "no [counter]")}),
+    Row(
+        "t",
+        "one",
+        {"latency": predicted(2, "s", (1, 3), "m"), "power": unavailable("W", "no [counter]")},
+    ),
     Row("t", "two", {"latency": published(42, "s", "paper")}, {"remedy": "none"}),
     Row("t", "three", {}),
 ]
-WIDE = [Row("t", "one", {f"figure {k}": measured(k + 0.5, "px", "here") for k in range(12)}, {"remedy": "pad " * 30})]
-TABLES = {"tall": TALL, "wide": WIDE, "words alone": [Row("t", "one", {}, {"finding": "a [b] c"})], "empty": []}
+WIDE = [
+    Row(
+        "t",
+        "one",
+        {f"figure {k}": measured(k + 0.5, "px", "here") for k in range(12)},
+        {"remedy": "pad " * 30},
+    )
+]
+TABLES = {
+    "tall": TALL,
+    "wide": WIDE,
+    "words alone": [Row("t", "one", {}, {"finding": "a [b] c"})],
+    "empty": [],
+}
 
 
 def shown(rows: list[Row], width: int) -> str:
@@ -43,14 +68,20 @@ def test_every_figure_of_a_wide_row_is_read_at_80_columns() -> None:
     """More figures than rows: one line a figure, so that no column is squeezed."""
     lines = shown(WIDE, 80).splitlines()
     for k in range(12):
-        assert any(f"figure {k} " in line and "measured" in line and f" {k + 0.5:g} " in line for line in lines)
+        assert any(
+            f"figure {k} " in line and "measured" in line and f" {k + 0.5:g} " in line
+            for line in lines
+        )
 
 
 @pytest.mark.parametrize("width", [70, 80, 120, 200])
 @pytest.mark.parametrize("count", [3, 9])
 def test_no_number_of_many_rows_is_cut_or_broken(width: int, count: int) -> None:
     figures = {f"figure {k}": predicted(913_456, "px", (503_456, 1_660_123), "m") for k in range(8)}
-    rows = [Row("t", f"vck190 C32B{k}, tiles of 640", figures, {"range": "outside"}) for k in range(count)]
+    rows = [
+        Row("t", f"vck190 C32B{k}, tiles of 640", figures, {"range": "outside"})
+        for k in range(count)
+    ]
     text = shown(rows, width)
     assert "\u2026" not in text
     assert text.count("913,000 ") == text.count("1,660,000]") == 8 * count
@@ -64,14 +95,20 @@ def test_a_missing_figure_is_a_dash_with_its_reason_once() -> None:
     assert "0" not in text.replace(LEGEND, "")
 
 
-@pytest.mark.parametrize("word", ["\x1b[31mred", "\x9b31m", "\u202egnp.exe", "[red]red[/red]", "a[/b]", "\r"])
+@pytest.mark.parametrize(
+    "word", ["\x1b[31mred", "\x9b31m", "\u202egnp.exe", "[red]red[/red]", "a[/b]", "\r"]
+)
 def test_what_a_file_says_is_shown_and_not_obeyed(word: str) -> None:
     """By a terminal of colours, which prints escapes of its own."""
     figure = measured(1.5, "px", "here")
     stream = io.StringIO()
     rows = [Row("t", word, {"size": figure, word: unavailable(word, word)}, {word: word})] * 2
     for shape in (rows, rows[:1]):
-        print_rows(word, shape, Console(file=stream, width=PIPE_WIDTH, force_terminal=True, color_system="standard"))
+        print_rows(
+            word,
+            shape,
+            Console(file=stream, width=PIPE_WIDTH, force_terminal=True, color_system="standard"),
+        )
     text = re.sub(r"\x1b\[(0|1|2|3|3[0-9]|1;3[0-9]|2;3[0-9])?m", "", stream.getvalue())
     assert set("\x1b\x9b\u202e\r").isdisjoint(text)
     assert text.count(visible(word)) >= 10
@@ -115,7 +152,13 @@ FIGURES = st.one_of(
 
 
 @settings(max_examples=25)
-@given(st.lists(st.dictionaries(st.text(min_size=1, max_size=9), FIGURES, max_size=4), min_size=1, max_size=4))
+@given(
+    st.lists(
+        st.dictionaries(st.text(min_size=1, max_size=9), FIGURES, max_size=4),
+        min_size=1,
+        max_size=4,
+    )
+)
 def test_any_rows_print_at_80_columns(figures: list[dict[str, Figure]]) -> None:
     shown([Row("t", f"row [{k}]", row) for k, row in enumerate(figures)], 80)
 
@@ -124,5 +167,7 @@ def test_any_rows_print_at_80_columns(figures: list[dict[str, Figure]]) -> None:
 @example(1234.5, 12)
 def test_a_shown_number_is_the_number_to_its_digits(value: float, digits: int) -> None:
     text = number(value, digits)
-    assert float(text.replace(",", "")) == pytest.approx(value, rel=5.01 * 10.0**-digits, abs=1e-300)
+    assert float(text.replace(",", "")) == pytest.approx(
+        value, rel=5.01 * 10.0**-digits, abs=1e-300
+    )
     assert "e" not in text or abs(value) < 1e-4

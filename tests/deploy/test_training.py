@@ -51,7 +51,13 @@ def test_a_run_leaves_logs_pictures_and_weights_that_tell_how_they_were_made(
     output = run(images, tmp_path / "r", "--validate-every", "2")
     assert "WITHOUT the LPIPS term" in output
     assert [row["step"] for row in rows(tmp_path / "r" / "validation.csv")] == ["2", "4"]
-    assert set(rows(tmp_path / "r" / "log.csv")[0]) == {"step", "l1", "fft", "patches_per_s", "waited"}
+    assert set(rows(tmp_path / "r" / "log.csv")[0]) == {
+        "step",
+        "l1",
+        "fft",
+        "patches_per_s",
+        "waited",
+    }
     with Image.open(tmp_path / "r" / "validation.png") as picture:
         assert picture.width > 200
     _, recipe = load_network(tmp_path / "r" / "convbeers-xs.safetensors")
@@ -69,16 +75,33 @@ def test_a_finished_run_resumes_to_the_same_weights(images: Path, tmp_path: Path
 
 
 def test_a_run_is_not_resumed_with_other_data(images: Path, tmp_path: Path) -> None:
-    """Another image, another sensor, another patch: each would end in weights that no single run gives."""
+    """Another image, another sensor, another patch: each would end in weights that no single run
+    gives.
+    """
     run(images, tmp_path / "a")
     other = Path(shutil.copytree(images, tmp_path / "other"))
     image = sorted(other.glob("*.png"))[0]
     pixels = np.array(Image.open(image))
     pixels.flat[pixels.size // 2] ^= 1
     Image.fromarray(pixels).save(image)
-    begun = ["train", "--out", tmp_path / "a", "--variant", "convbeers-xs", "--steps", 4, "--batch", 2, "--resume"]
+    begun = [
+        "train",
+        "--out",
+        tmp_path / "a",
+        "--variant",
+        "convbeers-xs",
+        "--steps",
+        4,
+        "--batch",
+        2,
+        "--resume",
+    ]
     same = ["--images", images, "--patch", 32]
-    for words in (["--images", other, "--patch", 32], [*same, "--sensor", "dior-high"], [*same, "--drawn", 1]):
+    for words in (
+        ["--images", other, "--patch", 32],
+        [*same, "--sensor", "dior-high"],
+        [*same, "--drawn", 1],
+    ):
         said = refused(*begun, *words)
         assert "a checkpoint of these images, sensors and first weights" in said
 
@@ -97,7 +120,9 @@ def test_a_checkpoint_with_a_flipped_bit_is_refused(images: Path, tmp_path: Path
             run(images, tmp_path / "a", "--resume")
 
 
-def test_a_conditioned_run_goes_on_from_others_and_resumes_to_the_same(images: Path, tmp_path: Path) -> None:
+def test_a_conditioned_run_goes_on_from_others_and_resumes_to_the_same(
+    images: Path, tmp_path: Path
+) -> None:
     options = ["--conditioned", "--start", str(banked_weights(tmp_path)), "--validate-every", "2"]
     run(images, tmp_path / "a", *options)
     path = tmp_path / "a" / "convbeers-xs.safetensors"
@@ -123,9 +148,12 @@ def test_a_run_with_the_roundings_of_int8_differs_from_one_without_and_resumes_t
     assert not torch.equal(first["tail.weight"], plain["tail.weight"])
     run(images, tmp_path / "a", *options, "--rounding", f"{name}-int8", "--resume")
     assert all(
-        torch.equal(value, first[k]) for k, value in weights_of(tmp_path / "a" / f"{name}.safetensors").items()
+        torch.equal(value, first[k])
+        for k, value in weights_of(tmp_path / "a" / f"{name}.safetensors").items()
     )
-    said = refused("train", "--images", images, "--out", tmp_path / "a", *options, "--steps", 4, "--resume")
+    said = refused(
+        "train", "--images", images, "--out", tmp_path / "a", *options, "--steps", 4, "--resume"
+    )
     assert "another recipe" in said
 
 
@@ -136,14 +164,30 @@ def test_a_run_with_the_roundings_of_int8_differs_from_one_without_and_resumes_t
         (["--conditioned"], "--conditioned and --start"),
         (["--conditioned", "--start", "convbeers-s"], "the INT8 file of"),
         (["--conditioned", "--start", "none.safetensors"], "none.safetensors: expected"),
-        (["--conditioned", "--start", "convbeers-xs", "--rounding", "none.onnx"], "none.onnx: expected"),
-        (["--conditioned", "--start", "convbeers-xs", "--variant", "convbeers-s"], "weights of convbeers-s"),
+        (
+            ["--conditioned", "--start", "convbeers-xs", "--rounding", "none.onnx"],
+            "none.onnx: expected",
+        ),
+        (
+            ["--conditioned", "--start", "convbeers-xs", "--variant", "convbeers-s"],
+            "weights of convbeers-s",
+        ),
     ],
 )
 def test_roundings_of_anything_but_the_start_are_refused(
     options: list[str], said: str, images: Path, tmp_path: Path
 ) -> None:
-    command = ["train", "--images", images, "--out", tmp_path / "r", "--steps", 1, "--rounding", "convbeers-xs-int8"]
+    command = [
+        "train",
+        "--images",
+        images,
+        "--out",
+        tmp_path / "r",
+        "--steps",
+        1,
+        "--rounding",
+        "convbeers-xs-int8",
+    ]
     assert said in refused(*command, *options)
     assert not (tmp_path / "r").exists()
 
@@ -160,19 +204,34 @@ def restored(path: Path, image: torch.Tensor, vector: torch.Tensor) -> torch.Ten
     return found
 
 
-def test_a_run_at_half_resolution_starts_from_a_network_at_full_resolution(images: Path, tmp_path: Path) -> None:
+def test_a_run_at_half_resolution_starts_from_a_network_at_full_resolution(
+    images: Path, tmp_path: Path
+) -> None:
     start = banked_weights(tmp_path)
-    options = ["--variant", "convbeers-half", "--conditioned", "--validate-every", "2", "--start", str(start)]
+    options = [
+        "--variant",
+        "convbeers-half",
+        "--conditioned",
+        "--validate-every",
+        "2",
+        "--start",
+        str(start),
+    ]
     run(images, tmp_path / "still", *options, "--learning-rate", "0", steps=1)
     weights = tmp_path / "still" / "convbeers-half.safetensors"
     image = torch.rand(1, 1, 26, 34, generator=torch.Generator().manual_seed(0))
     vector = torch.tensor([0.3, 0, -1, 1])
-    torch.testing.assert_close(restored(weights, image, vector), restored(start, image, vector), rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        restored(weights, image, vector), restored(start, image, vector), rtol=0, atol=1e-5
+    )
     run(images, tmp_path / "a", *options)
     assert [row["step"] for row in rows(tmp_path / "a" / "validation.csv")] == ["2", "4"]
     first = weights_of(tmp_path / "a" / weights.name)
     run(images, tmp_path / "a", *options, "--resume")
-    assert all(torch.equal(value, first[name]) for name, value in weights_of(tmp_path / "a" / weights.name).items())
+    assert all(
+        torch.equal(value, first[name])
+        for name, value in weights_of(tmp_path / "a" / weights.name).items()
+    )
 
 
 def test_a_plain_run_takes_no_conditioned_weights(images: Path, tmp_path: Path) -> None:
@@ -202,14 +261,20 @@ def weights_of(path: Path) -> dict[str, torch.Tensor]:
         (["--resume", "--drawn", "1"], "no such file"),
         (["--conditioned", "--pairs", "here"], "do not say what sensor"),
         (["--drawn", "1", "--learning-rate", "inf"], "learning rate: expected a finite number"),
-        (["--drawn", "1", "--fft-weight", "inf"], "weight of fft in the loss: expected a finite number"),
+        (
+            ["--drawn", "1", "--fft-weight", "inf"],
+            "weight of fft in the loss: expected a finite number",
+        ),
         (
             ["--drawn", "1", "--l1-weight", "0", "--lpips-weight", "0", "--fft-weight", "0"],
             "a term of weight above 0",
         ),
         (["--pairs", "here", "--validate-every", "5"], "nothing to validate on"),
         (["--drawn", "1", "--validate-every", "5"], "--validate-every: expected --images"),
-        (["--drawn", "1", "--variant", "convbeers-half", "--patch", "33"], "--patch: expected a multiple of 2 px"),
+        (
+            ["--drawn", "1", "--variant", "convbeers-half", "--patch", "33"],
+            "--patch: expected a multiple of 2 px",
+        ),
     ],
 )
 def test_wrong_options_get_one_sentence(options: list[str], words: str, tmp_path: Path) -> None:
@@ -223,10 +288,21 @@ def test_pairs_bring_their_sensor_and_its_full_scale(
 ) -> None:
     """Of 14 bits, and of another MTF along the track than across it."""
     along = 'mtf_nyquist_along = { value = 0.05, status = "measured", source = "a test" }'
-    own = own_sensor(tmp_path, ("bits = { value = 12", "bits = { value = 14"), ("[mtf]", f"[mtf]\n{along}"))
+    own = own_sensor(
+        tmp_path, ("bits = { value = 12", "bits = { value = 14"), ("[mtf]", f"[mtf]\n{along}")
+    )
     scene = next(images.glob("*.png"))
     done("simulate", scene, "--sensor", own, "--out", tmp_path / "pairs", "--workers", "1")
-    options = ["--pairs", str(tmp_path / "pairs"), "--variant", "convbeers-xs", "--steps", "1", "--batch", "1"]
+    options = [
+        "--pairs",
+        str(tmp_path / "pairs"),
+        "--variant",
+        "convbeers-xs",
+        "--steps",
+        "1",
+        "--batch",
+        "1",
+    ]
     options += ["--patch", "17", "--out", str(tmp_path / "r")]
     for contradiction in (["--sensor", "pleiades-degraded"], ["--reference", "dior-medium"]):
         said = refused("train", *options, *contradiction)
@@ -244,7 +320,9 @@ def test_pairs_bring_their_sensor_and_its_full_scale(
     assert (made[0].max_dn, made[0].quarters) == (16383, False)
 
 
-def test_a_loss_of_nothing_but_lpips_needs_its_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loss_of_nothing_but_lpips_needs_its_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv("BEERS_LPIPS_WEIGHTS", raising=False)
     options = ["--drawn", "1", "--l1-weight", "0", "--fft-weight", "0", "--steps", "1"]
     assert "lacks its weights" in refused("train", "--out", tmp_path / "r", *options)
@@ -255,7 +333,13 @@ def test_a_loss_of_nothing_but_lpips_needs_its_weights(tmp_path: Path, monkeypat
 def test_a_run_that_ends_in_nan_leaves_no_weights(
     conditioned: bool, validate_every: str, images: Path, tmp_path: Path
 ) -> None:
-    more = ["--learning-rate", "1e30", "--validate-every", validate_every, *["--conditioned"] * conditioned]
+    more = [
+        "--learning-rate",
+        "1e30",
+        "--validate-every",
+        validate_every,
+        *["--conditioned"] * conditioned,
+    ]
     options = ["--variant", "convbeers-xs", "--steps", "2", "--batch", "2", "--patch", "32", *more]
     said = refused("train", "--images", images, "--out", tmp_path / "r", *options)
     assert "lower the learning rate" in said
@@ -274,11 +358,29 @@ def test_a_larger_network_starts_where_a_smaller_one_stopped(images: Path, tmp_p
     narrow = tmp_path / "narrow" / "convbeers-xs.safetensors"
     large = ["--start", str(narrow), "--variant", "convbeers-s", "--validate-every", "0"]
     run(images, tmp_path / "large", *large, steps=1)
-    small = ["--start", str(tmp_path / "large" / "convbeers-s.safetensors"), "--variant", "convbeers-xs"]
-    assert "8 blocks of 32 features" in refused("train", "--images", images, "--out", tmp_path / "small", *small)
-    again = run(images, tmp_path / "again", "--start", str(narrow), "--learning-rate", "0", "--validate-every", "0")
+    small = [
+        "--start",
+        str(tmp_path / "large" / "convbeers-s.safetensors"),
+        "--variant",
+        "convbeers-xs",
+    ]
+    assert "8 blocks of 32 features" in refused(
+        "train", "--images", images, "--out", tmp_path / "small", *small
+    )
+    again = run(
+        images,
+        tmp_path / "again",
+        "--start",
+        str(narrow),
+        "--learning-rate",
+        "0",
+        "--validate-every",
+        "0",
+    )
     assert "wrote" in again
-    weights = (load_network(path)[0].state_dict() for path in (narrow, tmp_path / "again" / narrow.name))
+    weights = (
+        load_network(path)[0].state_dict() for path in (narrow, tmp_path / "again" / narrow.name)
+    )
     assert all(torch.allclose(a, b) for a, b in zip(*(w.values() for w in weights), strict=True))
 
 

@@ -1,4 +1,6 @@
-"""A digital number means the same in a degraded image and in its reference, whatever the sensor's digitiser."""
+"""A digital number means the same in a degraded image and in its reference, whatever the sensor's
+digitiser.
+"""
 
 from dataclasses import replace
 from functools import cache
@@ -34,10 +36,13 @@ def with_units(profile: Sensor, gain: float, bits: int, offset_dn: float = 0.0) 
 
 
 def rescaled(profile: Sensor, bits: int, dimmer: float, offset_dn: float) -> Sensor:
-    """Full scale, gain and offset grow alike with the bits; scenes are so many times dimmer, and the gain higher."""
+    """Full scale, gain and offset grow alike with the bits; scenes are so many times dimmer, and
+    the gain higher.
+    """
     times = (2**bits - 1) / 4095
     darker, brighter = (
-        Constant(point.low / dimmer, "stated", "a test") for point in (profile.radiance_0, profile.radiance_1)
+        Constant(point.low / dimmer, "stated", "a test")
+        for point in (profile.radiance_0, profile.radiance_1)
     )
     gain = profile.gain_dn_per_radiance.low * times * dimmer
     dimmed = replace(profile, radiance_0=darker, radiance_1=brighter)
@@ -48,7 +53,8 @@ def rescaled(profile: Sensor, bits: int, dimmer: float, offset_dn: float) -> Sen
 def evaluated(bits: int, dimmer: float, offset_dn: float) -> tuple[np.ndarray, int]:
     """PSNR in dB over full scale of each method, (3,), and the pixels it is a mean of."""
     degraded, reference = (
-        rescaled(profile, bits, dimmer, offset_dn) for profile in (DEGRADED, load_sensor("pleiades-reference"))
+        rescaled(profile, bits, dimmer, offset_dn)
+        for profile in (DEGRADED, load_sensor("pleiades-reference"))
     )
     scene = replace(SCENE, radiance=SCENE.radiance / dimmer)
     (pair,), _ = simulate_pairs([scene], degraded, reference, 0, (2,))
@@ -61,10 +67,11 @@ def evaluated(bits: int, dimmer: float, offset_dn: float) -> tuple[np.ndarray, i
 def rounding_db(psnr_db: np.ndarray, bits: int, pixels: int) -> np.ndarray:
     """How far rounding to whole DN, of 12 bits here and of `bits` there, may move these PSNRs.
 
-    A step q leaves an error of q / sqrt(12): in the reference, in what is restored, and in the input, where the
-    restoration amplifies it as white noise, by the ratio of the MTFs over all frequencies (rms). The noise dithers
-    it, so it is independent of the error that a method leaves: the squares add, and the mean product of the two
-    stays within four standard deviations; errors are alike within a patch of 5 x 5 pixels.
+    A step q leaves an error of q / sqrt(12): in the reference, in what is restored, and in the
+    input, where the restoration amplifies it as white noise, by the ratio of the MTFs over all
+    frequencies (rms). The noise dithers it, so it is independent of the error that a method leaves:
+    the squares add, and the mean product of the two stays within four standard deviations; errors
+    are alike within a patch of 5 x 5 pixels.
     """
     steps = np.hypot(1 / 4095, 1 / (2**bits - 1)) / np.sqrt(12)
     fx = np.fft.fftfreq(64)[None]

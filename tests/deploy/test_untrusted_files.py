@@ -1,4 +1,6 @@
-"""Documents, weights and folders that others wrote, each once the end of a run: now a sentence, or no matter."""
+"""Documents, weights and folders that others wrote, each once the end of a run: now a sentence, or
+no matter.
+"""
 
 import hashlib
 import io
@@ -51,7 +53,9 @@ def document(path: Path, value: object, name: str = "int8") -> Path:
     return path
 
 
-@pytest.mark.parametrize("value", ["NaN", "Infinity", "1e999", "1" + "0" * 400, "9" * 5000, "[" * 100_000])
+@pytest.mark.parametrize(
+    "value", ["NaN", "Infinity", "1e999", "1" + "0" * 400, "9" * 5000, "[" * 100_000]
+)
 def test_figures_that_are_no_numbers_are_refused(value: str, tmp_path: Path) -> None:
     path = document(tmp_path / "a.json", value)
     with pytest.raises(OptionError, match=r"a\.json"):
@@ -88,7 +92,9 @@ def test_a_name_too_long_for_the_disk_is_a_sentence(tmp_path: Path) -> None:
         ("\nweight_banks = {", "\nmine = 0\nweight_banks = {"),
     ],
 )
-def test_a_target_with_constants_that_no_board_has_is_refused(line: str, changed: str, tmp_path: Path) -> None:
+def test_a_target_with_constants_that_no_board_has_is_refused(
+    line: str, changed: str, tmp_path: Path
+) -> None:
     shipped = (HERE / "targets" / "vck190.toml").read_text(encoding="utf-8")
     assert line in shipped
     path = tmp_path / "mine.toml"
@@ -150,7 +156,9 @@ def test_an_array_larger_than_its_archive_is_refused(tmp_path: Path) -> None:
 def stored_rows(rows_px: int = 4, **counts: int) -> tuple[bytes, FinishedRow]:
     """Return rows of pixels as a checkpoint stores them, and their line in its journal."""
     pixels = np.arange(rows_px * SHAPE[2], dtype=np.uint16).tobytes()
-    return pixels, FinishedRow(rows_px, len(pixels), hashlib.sha256(pixels).hexdigest(), Tally(**counts))
+    return pixels, FinishedRow(
+        rows_px, len(pixels), hashlib.sha256(pixels).hexdigest(), Tally(**counts)
+    )
 
 
 ENDS = (4, SHAPE[1])
@@ -176,7 +184,9 @@ ENDS = (4, SHAPE[1])
         journal_text(JOB, [stored_rows()[1]]).replace('"known": 0', '"known": 1'),
     ],
 )
-def test_a_journal_that_counts_rows_that_are_not_there_is_refused(journal: str, tmp_path: Path) -> None:
+def test_a_journal_that_counts_rows_that_are_not_there_is_refused(
+    journal: str, tmp_path: Path
+) -> None:
     out = tmp_path / "out.tif"
     part_folder(out).mkdir()
     pixels, row = stored_rows()
@@ -189,14 +199,18 @@ def test_a_journal_that_counts_rows_that_are_not_there_is_refused(journal: str, 
     assert Checkpoint(out, SHAPE, np.dtype(np.uint16), JOB, resume=True, row_ends=ENDS).rows == 4
 
 
-@pytest.mark.parametrize("line", ["", "{}", "[]", "3", "[" * 5000, '{"degraded": {"rejected_snr_pairs": "x"}}'])
+@pytest.mark.parametrize(
+    "line", ["", "{}", "[]", "3", "[" * 5000, '{"degraded": {"rejected_snr_pairs": "x"}}']
+)
 def test_a_manifest_that_is_none_is_refused(line: str, tmp_path: Path) -> None:
     (tmp_path / "manifest.jsonl").write_text(line + "\n")
     with pytest.raises(OptionError, match="manifest"):
         _read_summary(tmp_path / "manifest.jsonl")
 
 
-@pytest.mark.parametrize("text", ["", "[]", "3", "{}", "[" * 100_000, '{"measurements": 3}', '{"measurements": NaN}'])
+@pytest.mark.parametrize(
+    "text", ["", "[]", "3", "{}", "[" * 100_000, '{"measurements": 3}', '{"measurements": NaN}']
+)
 def test_measurements_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
     path = tmp_path / "measurements.json"
     path.write_text(text)
@@ -206,7 +220,9 @@ def test_measurements_that_are_none_are_refused(text: str, tmp_path: Path) -> No
 
 def test_a_log_with_strange_lines_is_gone_on_with(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
-    path.write_bytes("step,loss\n1,0.5\n²,1\n12abc\n30,2\n".encode() + b"\xff\xfe\n" + b"9" * 5000 + b",1\n")
+    path.write_bytes(
+        "step,loss\n1,0.5\n²,1\n12abc\n30,2\n".encode() + b"\xff\xfe\n" + b"9" * 5000 + b",1\n"
+    )
     Log(path, 20).write(21, {"loss": 0.25})
     lines = path.read_text().splitlines()
     assert lines[:2] == ["step,loss", "1,0.5"]

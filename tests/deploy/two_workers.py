@@ -11,6 +11,13 @@ from typing import Any
 def local_cluster(workers: int = 2) -> Iterator[Any]:
     """A distributed.LocalCluster of so many processes with a thread each."""
     no_page = {"dashboard_address": "127.0.0.1:0", "scheduler_kwargs": {"dashboard": False}}
-    options = {"processes": True, "threads_per_worker": 1, "memory_limit": 0, "silence_logs": logging.CRITICAL}
-    with import_module("distributed").LocalCluster(n_workers=workers, **options, **no_page) as local:
+    options = {
+        "processes": True,
+        "threads_per_worker": 1,
+        "memory_limit": 0,
+        "silence_logs": logging.CRITICAL,
+    }
+    with import_module("distributed").LocalCluster(
+        n_workers=workers, **options, **no_page
+    ) as local:
         yield local

@@ -1,8 +1,9 @@
-"""Runs what a GitHub workflow or a composite action would: its steps as shell, one after the other, in a folder.
+"""Runs what a GitHub workflow or a composite action would: its steps as shell, one after the other,
+in a folder.
 
-Of the expressions and the conditions only those are understood that our own files use; any other is an error, and so
-is a name that nothing defines. Steps of other actions (checkout, setup-python, uploads) are left out, as are those
-that install.
+Of the expressions and the conditions only those are understood that our own files use; any other is
+an error, and so is a name that nothing defines. Steps of other actions (checkout, setup-python,
+uploads) are left out, as are those that install.
 """
 
 import os
@@ -53,11 +54,17 @@ class Runner:
     outputs: dict[str, str] = field(default_factory=dict)
 
     def prepare(self) -> None:
-        """What is there before the first step: the commands, and a summary that another job's step began."""
+        """What is there before the first step: the commands, and a summary that another job's step
+        began.
+        """
         (self.temporary / "command").mkdir(parents=True)
         self.summary.write_text("what a step before wrote\n")
         lines = [f'{name}) set -- "$@" {more};;' for name, more in SHORT.items()]
-        self.command("beers-deploy", f'echo "$*" >> "{self.calls}"; case "$1" in {" ".join(lines)} esac', '"$@"')
+        self.command(
+            "beers-deploy",
+            f'echo "$*" >> "{self.calls}"; case "$1" in {" ".join(lines)} esac',
+            '"$@"',
+        )
         self.command("pipx", "shift 3", '"${@:2}"')  # pipx run --spec . beers-deploy ...
 
     @property
@@ -88,7 +95,9 @@ class Runner:
         inputs = {name: str(about.get("default", "")) for name, about in action["inputs"].items()}
         assert given.keys() <= inputs.keys()
         inputs.update(given)
-        context = {f"inputs.{name}": text for name, text in inputs.items()} | {"github.action_path": str(ROOT)}
+        context = {f"inputs.{name}": text for name, text in inputs.items()} | {
+            "github.action_path": str(ROOT)
+        }
         context["steps.python.outputs.python-path"] = sys.executable  # of a step that is left out
         own = Runner(self.folder)  # its steps have ids of their own
         own.run_steps(action["runs"]["steps"], context)
@@ -105,9 +114,14 @@ class Runner:
             if condition != "always()" and (self.red or not holds(condition, context)):
                 continue
             if step.get("uses") == "./":
-                given = {name: value_of(str(text), context | self.outputs) for name, text in step["with"].items()}
+                given = {
+                    name: value_of(str(text), context | self.outputs)
+                    for name, text in step["with"].items()
+                }
                 outputs = self.run_action(given)
-                self.outputs |= {f"steps.{step['id']}.outputs.{name}": text for name, text in outputs.items()}
+                self.outputs |= {
+                    f"steps.{step['id']}.outputs.{name}": text for name, text in outputs.items()
+                }
             elif "run" in step and "pip install" not in step["run"]:
                 self.run_shell(step, context)
 
@@ -118,7 +132,9 @@ class Runner:
         known = context | self.outputs
         given = {name: value_of(str(text), known) for name, text in step.get("env", {}).items()}
         assert "${{" not in step["run"], "values reach the shell by its environment"
-        done = subprocess.run([*BASH, step["run"]], cwd=self.folder, env=self.environment | given, **KEPT)
+        done = subprocess.run(
+            [*BASH, step["run"]], cwd=self.folder, env=self.environment | given, **KEPT
+        )
         lines = [line.partition("=") for line in written.read_text(encoding="utf-8").splitlines()]
         self.outputs |= {f"steps.{step['id']}.outputs.{name}": text for name, _, text in lines}
         self.stdout += done.stdout
@@ -155,10 +171,14 @@ def value_of(text: str, known: dict[str, str]) -> str:
 
 
 def lookup(name: str, known: dict[str, str]) -> str:
-    """A name's value, or a text in quotes; of an output that no step wrote, nothing, as GitHub has it."""
+    """A name's value, or a text in quotes; of an output that no step wrote, nothing, as GitHub has
+    it.
+    """
     if name.startswith("'"):
         return name.strip("'")
-    return known.get(name, "") if re.fullmatch(r"steps\.\w+\.outputs\.[\w-]+", name) else known[name]
+    return (
+        known.get(name, "") if re.fullmatch(r"steps\.\w+\.outputs\.[\w-]+", name) else known[name]
+    )
 
 
 def holds(condition: str, known: dict[str, str]) -> bool:

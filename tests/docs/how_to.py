@@ -1,8 +1,10 @@
-"""The commands of the how-to pages: where they stand, what makes them short, what they need and what they write.
+"""The commands of the how-to pages: where they stand, what makes them short, what they need and
+what they write.
 
-A command stands in a fence of a shell, in an indented block, in a cell of a table, or as code within a sentence. The
-commands of one block are one sitting: each uses what those before it wrote. Within a sentence `beers-deploy check` is
-the name of a command, and no command; in a table, where a reader copies it, it is one.
+A command stands in a fence of a shell, in an indented block, in a cell of a table, or as code
+within a sentence. The commands of one block are one sitting: each uses what those before it wrote.
+Within a sentence `beers-deploy check` is the name of a command, and no command; in a table, where a
+reader copies it, it is one.
 """
 
 import json
@@ -34,7 +36,10 @@ LEFT_OUT = {
     "xdputil benchmark core.xmodel 3": "is a program of the board",
     "beers-deploy gate FLOAT INT8": "is a form: the page's own commands fill it in",
     **{
-        f"beers-deploy train --recipe {name} --images aerial-train/ --images aerial-train2/ {more}": "takes hours"
+        (
+            f"beers-deploy train --recipe {name} --images aerial-train/ --images aerial-train2/ "
+            f"{more}"
+        ): "takes hours"
         for name, more in (
             ("convbeers-xs", "--out runs/convbeers-xs"),
             ("convbeers-s", "--device cuda --out runs/convbeers-s"),
@@ -69,15 +74,21 @@ NEEDED = {
 
 
 def sittings(text: str) -> Iterator[Sitting]:
-    """The commands of a page, block by block; one within a sentence or a table is a sitting of its own."""
+    """The commands of a page, block by block; one within a sentence or a table is a sitting of its
+    own.
+    """
     text = re.sub(r"\\\n\s*", "", text)
     blocks = [body for language, body in FENCE.findall(text) if language in SHELLS]
     prose = FENCE.sub("", text)
     blocks += [block for block in INDENTED.findall(prose) if not _is_json(block)]
-    yield from (tuple(line.strip().removeprefix("$ ") for line in block.splitlines()) for block in blocks)
+    yield from (
+        tuple(line.strip().removeprefix("$ ") for line in block.splitlines()) for block in blocks
+    )
     for line in prose.splitlines():
         if not line.startswith("    "):
-            yield from ((code,) for code in re.findall(r"`([^`]+)`", line) if _is_command(code, line))
+            yield from (
+                (code,) for code in re.findall(r"`([^`]+)`", line) if _is_command(code, line)
+            )
 
 
 def _is_command(code: str, line: str) -> bool:
@@ -102,7 +113,9 @@ def shortened(command: str) -> str:
 
 def packages(sitting: Sitting) -> set[str]:
     """Packages of extras that a sitting needs."""
-    return {package for pattern, package in NEEDED.items() if re.search(pattern, "\n".join(sitting))}
+    return {
+        package for pattern, package in NEEDED.items() if re.search(pattern, "\n".join(sitting))
+    }
 
 
 def outputs(command: str) -> list[Path]:

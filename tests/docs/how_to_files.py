@@ -1,4 +1,6 @@
-"""The files that the how-to pages name, small: made by the program itself where it can make them."""
+"""The files that the how-to pages name, small: made by the program itself where
+it can make them.
+"""
 
 import re
 import shutil
@@ -52,22 +54,30 @@ def prepare(folder: Path) -> None:
 
 def copied_files(folder: Path) -> None:
     """Those of this project, and those that the pages show."""
-    shutil.copytree(ROOT / "benchmarks", folder / "benchmarks", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        ROOT / "benchmarks", folder / "benchmarks", ignore=shutil.ignore_patterns("__pycache__")
+    )
     shutil.copy(MEASURE, folder / "measure.py")
     shutil.copy(PROFILES / "sensors" / "pleiades-degraded.toml", folder / "my-sensor.toml")
     shutil.copy(SHIPPED / "convbeers-s.safetensors", folder)
-    (folder / "gate.toml").write_text(shown("gate.md", r"```toml\n(# gate\.toml\n.*?)```"), encoding="utf-8")
+    (folder / "gate.toml").write_text(
+        shown("gate.md", r"```toml\n(# gate\.toml\n.*?)```"), encoding="utf-8"
+    )
     (folder / "board.json").write_text(shown("board.md", r"^    (\[\{.*\}\])$"), encoding="utf-8")
 
 
 def shown(page: str, pattern: str) -> str:
     """The one part of a page that a pattern finds."""
-    (part,) = re.findall(pattern, (HOW_TO / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    (part,) = re.findall(
+        pattern, (HOW_TO / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
+    )
     return str(part)
 
 
 def scenes(folder: Path) -> None:
-    """Photographs of roofs and yards, drawn; and two raw images of a sensor, a checkerboard in the first."""
+    """Photographs of roofs and yards, drawn; and two raw images of a sensor, a checkerboard in the
+    first.
+    """
     for name in ("aerial", "aerial-train"):
         (folder / name).mkdir()
     for site in range(SITES):
@@ -95,7 +105,9 @@ def faulty_frames(folder: Path) -> None:
 
 def networks(folder: Path) -> None:
     """Weights of a narrow network, and a detector that always sees the same."""
-    save_network(folder / "narrow.safetensors", plain(Variant(1, 4)), {"degraded": "pleiades-degraded"})
+    save_network(
+        folder / "narrow.safetensors", plain(Variant(1, 4)), {"degraded": "pleiades-degraded"}
+    )
     detector(folder / "yolo11n.onnx", raw((30, 20, 20, 10, 0.1, 0.9)))
 
 

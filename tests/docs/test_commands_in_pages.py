@@ -1,4 +1,7 @@
-"""Every command that a page shows is read by the command line itself: a changed option fails here. None is run."""
+"""Every command that a page shows is read by the command line itself: a changed option fails here.
+
+None is run.
+"""
 
 import re
 import shlex
@@ -22,7 +25,9 @@ UsageError: type[Exception] = typer.BadParameter.__bases__[0]
 
 
 def commands(text: str) -> Iterator[str]:
-    """Of blocks, fenced and indented, and of code within a sentence; lines that end in a backslash are joined."""
+    """Of blocks, fenced and indented, and of code within a sentence; lines that end in a backslash
+    are joined.
+    """
     for line in re.sub(r"\\\n\s*", "", text).splitlines():
         if re.match(rf"(    |\$ )?(\S+/)?{NAME} ", line):
             yield line.strip()
@@ -39,7 +44,9 @@ def words_of(line: str) -> list[str]:
 
 
 def context_of(line: str) -> Any:
-    """What the command line makes of a whole command: Click's context, with the value of each parameter."""
+    """What the command line makes of a whole command: Click's context, with the value of each
+    parameter.
+    """
     group = get_command(app)
     assert isinstance(group, TyperGroup)
     name, *words = words_of(line)

@@ -1,4 +1,6 @@
-"""Every name of the library has an example in its docstring that gives what it shows; the README's cell runs."""
+"""Every name of the library has an example in its docstring that gives what it shows; the README's
+cell runs.
+"""
 
 import doctest
 import re
@@ -15,7 +17,9 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("name", vars(bd)["__all__"])
-def test_the_example_gives_what_it_shows(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_example_gives_what_it_shows(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     parser = doctest.DocTestParser()
     text = getattr(bd, name).__doc__
@@ -26,5 +30,7 @@ def test_the_example_gives_what_it_shows(name: str, tmp_path: Path, monkeypatch:
 
 
 def test_the_cell_of_the_readme_runs() -> None:
-    (cell,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    (cell,) = re.findall(
+        r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL
+    )
     exec(cell, {})  # noqa: S102 - our own page

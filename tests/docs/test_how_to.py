@@ -1,4 +1,6 @@
-"""Every command of the how-to pages, run on small files: it ends as the page says, and what it names is written."""
+"""Every command of the how-to pages, run on small files: it ends as the page says, and what it
+names is written.
+"""
 
 import shutil
 import tempfile
@@ -50,6 +52,8 @@ def run(walk: Walk, command: str) -> None:
         path.unlink(missing_ok=True)
     done = walk.run(short)
     assert done.returncode == 0, f"{command}\nrun as {short}\n{done.stdout}"
-    assert [path for path in written if not path.is_file()] == [], f"{command}\nrun as {short}\n{done.stdout}"
+    assert [path for path in written if not path.is_file()] == [], (
+        f"{command}\nrun as {short}\n{done.stdout}"
+    )
     if command.startswith("rio cogeo validate"):
         assert "is a valid cloud optimized GeoTIFF" in done.stdout

@@ -1,4 +1,6 @@
-"""What files say of the documentation is there: paths of pages, links, keys of generated pages, words, exit codes."""
+"""What files say of the documentation is there: paths of pages, links, keys of generated pages,
+words, exit codes.
+"""
 
 import inspect
 import re
@@ -21,7 +23,18 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PATH = re.compile(r"(?<![\w/.-])docs/[\w./-]*\w\.(?:md|py|toml|svg|png|ipynb)\b")
 LINK = re.compile(r"\]\((?!https?:|data:|#)([^)#\s]+)")
-TERMS = ("halo", "told sensor", "DPU", "MTF", "residual stream", "encoding", "gate", "swath", "haze", "front")
+TERMS = (
+    "halo",
+    "told sensor",
+    "DPU",
+    "MTF",
+    "residual stream",
+    "encoding",
+    "gate",
+    "swath",
+    "haze",
+    "front",
+)
 
 
 def tracked() -> list[Path]:
@@ -42,7 +55,9 @@ def test_paths_of_the_documentation_are_there() -> None:
     assert [(str(path), word) for path, word in sorted(named) if not (ROOT / word).exists()] == []
 
 
-@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "model/weights/convbeers-s.md"])
+@pytest.mark.parametrize(
+    "name", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "model/weights/convbeers-s.md"]
+)
 def test_links_outside_of_the_site_lead_somewhere(name: str) -> None:
     page = ROOT / name
     targets = LINK.findall(page.read_text(encoding="utf-8"))
@@ -73,7 +88,9 @@ def test_the_scenes_page_is_true_and_its_example_a_scene(tmp_path: Path) -> None
     page = (DOCS / "reference" / "scene-file.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     assert {*tomllib.loads(example)} <= {"description", "radiance_scale", "without", *TABLES}
-    assert re.findall(r"Shipped: (.*)\.", page) == [", ".join(f"`{name}`" for name in scene_names())]
+    assert re.findall(r"Shipped: (.*)\.", page) == [
+        ", ".join(f"`{name}`" for name in scene_names())
+    ]
     (tmp_path / "mine.toml").write_text(example, encoding="utf-8")
     assert load_scene_call(str(tmp_path / "mine.toml")).without == ("striping",)
 
@@ -105,15 +122,23 @@ def test_every_number_of_the_readme_stands_where_it_says_how_it_is_known() -> No
 
 def test_the_citation_and_the_changelog_are_of_this_version() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    cited = dict(re.findall(r"^([\w-]+): (.+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE))
+    cited = dict(
+        re.findall(
+            r"^([\w-]+): (.+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE
+        )
+    )
     assert (cited["cff-version"], cited["version"]) == ("1.2.0", __version__)
-    changes = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    changes = re.findall(
+        r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
     assert changes[0] == f"{__version__} - {cited['date-released']}"
     assert cited["license"] == project["license"]
 
 
 def test_the_site_is_built_from_what_the_extra_asks_for() -> None:
-    extra = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    extra = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "optional-dependencies"
+    ]
     workflow = (ROOT / ".github" / "workflows" / "docs.yml").read_text(encoding="utf-8")
     installed = re.findall(r"pip install (.*?')(?: #.*)?$", workflow, re.MULTILINE)
     assert installed

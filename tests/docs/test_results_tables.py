@@ -1,4 +1,6 @@
-"""Tables of docs/results, filled from a document: those with a row for each method, and the others."""
+"""Tables of docs/results, filled from a document: those with a row for each
+method, and the others.
+"""
 
 from typing import Any
 
@@ -8,7 +10,13 @@ from docs.make.results import MARKED, filled
 
 
 def figure(value: float | None, unit: str, interval: list[float] | None = None) -> dict[str, Any]:
-    return {"value": value, "unit": unit, "mode": "measured", "interval": interval, "source": "a test"}
+    return {
+        "value": value,
+        "unit": unit,
+        "mode": "measured",
+        "interval": interval,
+        "source": "a test",
+    }
 
 
 def row(table: str, name: str, **figures: Any) -> dict[str, Any]:
@@ -39,10 +47,17 @@ def test_tables_of_means_have_a_row_for_each_method_without_the_papers(table: st
 
 
 def test_targets_are_filled_likewise() -> None:
-    figures = {"zone plate of 8%": figure(0.5499, "of the reference", [0.5288, 0.5711]), "flux": figure(98, "%")}
+    figures = {
+        "zone plate of 8%": figure(0.5499, "of the reference", [0.5288, 0.5711]),
+        "flux": figure(98, "%"),
+    }
     heading = "| method | sensor | zone plate of 8% of the reference |"
     page = fill("targets", heading, {**row("targets", "net"), "figures": figures})
-    assert page.splitlines()[2:5] == [heading, "|---|---|---|", "| net | known | 0.55 [0.53, 0.57] |"]
+    assert page.splitlines()[2:5] == [
+        heading,
+        "|---|---|---|",
+        "| net | known | 0.55 [0.53, 0.57] |",
+    ]
 
 
 def test_what_the_document_lacks_stays() -> None:

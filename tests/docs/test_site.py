@@ -1,7 +1,8 @@
-"""The documentation's site, built strictly and looked at in a real browser; skipped where either is missing.
+"""The documentation's site, built strictly and looked at in a real browser; skipped where either is
+missing.
 
-`pip install -e '.[dev,docs]' --config-settings editable_mode=strict` brings MkDocs. Every page is opened at the width
-of a desk and of a telephone.
+`pip install -e '.[dev,docs]' --config-settings editable_mode=strict` brings MkDocs. Every page is
+opened at the width of a desk and of a telephone.
 """
 
 import json
@@ -45,18 +46,22 @@ drive().then(tell, (error) => tell({ failed: String(error) + error.stack }));
 LOOK = """
 const report = [];
 for (const address of %s) {
-  const shown = await frame(address, 1280), page = shown.contentDocument, root = page.documentElement;
+  const shown = await frame(address, 1280);
+  const page = shown.contentDocument;
+  const root = page.documentElement;
   for (const width of %s) {
     shown.width = width;
     await sleep(50);
     report.push({
       address, width,
       over: root.scrollWidth - root.clientWidth,
-      broken: [...page.images].filter((each) => !each.naturalWidth).map((each) => each.getAttribute("src")),
+      broken: [...page.images]
+        .filter((each) => !each.naturalWidth).map((each) => each.getAttribute("src")),
       scheme: page.body.getAttribute("data-md-color-scheme"),
       back: getComputedStyle(page.body).backgroundColor,
       words: getComputedStyle(page.body).color,
-      elsewhere: shown.contentWindow.performance.getEntriesByType("resource").map((each) => each.name)
+      elsewhere: shown.contentWindow.performance.getEntriesByType("resource")
+        .map((each) => each.name)
         .filter((each) => !each.startsWith(location.origin) && !each.startsWith("data:")),
     });
   }
@@ -69,12 +74,14 @@ const shown = await frame("index.html", 1280), page = shown.contentDocument;
 const box = page.querySelector("[data-md-component=search-query]"), report = {};
 page.querySelector("#__search").checked = true;
 box.focus();
-const found = () => [...page.querySelectorAll(".md-search-result__link")].map((each) => each.getAttribute("href"));
+const links = () => [...page.querySelectorAll(".md-search-result__link")];
+const found = () => links().map((each) => each.getAttribute("href"));
 for (const words of %s) {
   box.value = words;
   box.dispatchEvent(new Event("keyup", { bubbles: true }));
   box.dispatchEvent(new Event("input", { bubbles: true }));
-  for (let tries = 0; tries < 50 && !(found().length && found()[0].includes(encodeURI(words.split(" ")[0]))); tries++)
+  const first = encodeURI(words.split(" ")[0]);
+  for (let tries = 0; tries < 50 && !(found().length && found()[0].includes(first)); tries++)
     await sleep(200);
   report[words] = found();
 }
@@ -85,9 +92,20 @@ return report;
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if find_spec("mkdocs") is None:
-        pytest.skip("no MkDocs here: pip install -e '.[docs]' --config-settings editable_mode=strict")
+        pytest.skip(
+            "no MkDocs here: pip install -e '.[docs]' --config-settings editable_mode=strict"
+        )
     folder = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    command = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "--strict",
+        "--quiet",
+        "--site-dir",
+        str(folder),
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return folder
@@ -106,7 +124,9 @@ class Server(SimpleHTTPRequestHandler):
 
     def do_GET(self) -> None:
         if self.path.endswith("search_index.json") and self.script.startswith(LOOK[:20]):
-            return self.answer(404, b"")  # a megabyte that every page would read, and look for nothing in it
+            return self.answer(
+                404, b""
+            )  # a megabyte that every page would read, and look for nothing in it
         if self.path != "/harness":
             return super().do_GET()
         return self.answer(200, (HARNESS % self.script).encode())
@@ -150,26 +170,49 @@ def run(site: Path, tmp_path: Path) -> Run:
 
 
 def command(profile: Path, *, dark: bool) -> list[str]:
-    options = ["--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0", "--window-size=1400,1000"]
-    options += [f"--user-data-dir={profile}", f"--blink-settings=preferredColorScheme={0 if dark else 1}"]
+    options = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--remote-debugging-port=0",
+        "--window-size=1400,1000",
+    ]
+    options += [
+        f"--user-data-dir={profile}",
+        f"--blink-settings=preferredColorScheme={0 if dark else 1}",
+    ]
     return [browser(), *options]
 
 
 def pages(site: Path) -> list[str]:
-    return sorted(str(path.relative_to(site)) for path in site.rglob("*.html") if path.name == "index.html")
+    return sorted(
+        str(path.relative_to(site)) for path in site.rglob("*.html") if path.name == "index.html"
+    )
 
 
-def test_no_page_is_wider_than_its_window_and_every_picture_loads_from_here(site: Path, run: Run) -> None:
+def test_no_page_is_wider_than_its_window_and_every_picture_loads_from_here(
+    site: Path, run: Run
+) -> None:
     looks = run(LOOK % (json.dumps(pages(site)), json.dumps(WIDTHS_PX)))
     assert len(looks) == len(pages(site)) * len(WIDTHS_PX) > 80
-    assert [(each["address"], each["width"], each["over"]) for each in looks if each["over"] > 0] == []
+    assert [
+        (each["address"], each["width"], each["over"]) for each in looks if each["over"] > 0
+    ] == []
     assert [(each["address"], each["broken"]) for each in looks if each["broken"]] == []
-    elsewhere = [each["elsewhere"] for each in looks if each["elsewhere"] and "architecture" not in each["address"]]
-    assert elsewhere == [], "pages ask other places for Mermaid alone, which the published site has: see mkdocs.yml"
+    elsewhere = [
+        each["elsewhere"]
+        for each in looks
+        if each["elsewhere"] and "architecture" not in each["address"]
+    ]
+    assert elsewhere == [], (
+        "pages ask other places for Mermaid alone, which the published site has: see mkdocs.yml"
+    )
 
 
 @pytest.mark.parametrize(("dark", "scheme"), [(False, "default"), (True, "slate")])
-def test_the_colours_are_those_that_the_reader_prefers(site: Path, run: Run, dark: bool, scheme: str) -> None:
+def test_the_colours_are_those_that_the_reader_prefers(
+    site: Path, run: Run, dark: bool, scheme: str
+) -> None:
     some = [page for page in pages(site) if page.count("/") < 2]
     for look in run(LOOK % (json.dumps(some), json.dumps(WIDTHS_PX)), dark=dark):
         assert look["scheme"] == scheme

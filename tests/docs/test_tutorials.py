@@ -1,4 +1,6 @@
-"""Every command of docs/tutorials, as a reader would type it, and what it shows; each tutorial in an empty folder."""
+"""Every command of docs/tutorials, as a reader would type it, and what it shows; each tutorial in
+an empty folder.
+"""
 
 import re
 import shutil
@@ -25,12 +27,21 @@ def walked(name: str, folder: Path) -> Walk:
 
 @pytest.mark.parametrize("name", PAGES)
 def test_it_is_set_up_as_the_readme_says(name: str) -> None:
-    """That command is run by .ci/run, in an empty environment; it is the one fence of a tutorial that is not run."""
+    """That command is run by .ci/run, in an empty environment; it is the one fence of a tutorial
+    that is not run.
+    """
     page = (FOLDER / f"{name}.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     assert block.splitlines()[0] == INSTALLED
     assert INSTALLED in (ROOT / "README.md").read_text(encoding="utf-8")
-    assert set(re.findall(r"^```(\w+)", page, re.MULTILINE)) <= {"sh", "bash", "text", "python", "toml", "yaml"}
+    assert set(re.findall(r"^```(\w+)", page, re.MULTILINE)) <= {
+        "sh",
+        "bash",
+        "text",
+        "python",
+        "toml",
+        "yaml",
+    }
 
 
 def test_restore_an_image(tmp_path: Path) -> None:
@@ -54,18 +65,26 @@ def test_real_camera(tmp_path: Path, shared_data: Path) -> None:
     for path in sorted((shared_data / "mono16").glob("*.tif")):
         shutil.copy(path, tmp_path / "frames" / path.name.replace("garfield", "IMG"))
     walked("real-camera", tmp_path)
-    assert tifffile.imread(tmp_path / "restored/network/IMG_161122_164605_0126_GRE.tif").dtype == "uint16"
+    assert (
+        tifffile.imread(tmp_path / "restored/network/IMG_161122_164605_0126_GRE.tif").dtype
+        == "uint16"
+    )
 
 
 def test_your_network(tmp_path: Path) -> None:
     walked("your-network", tmp_path)
-    raw, restored = (tifffile.imread(tmp_path / name) for name in ("pairs/degraded/0000-drawn.tif", "restored.tif"))
+    raw, restored = (
+        tifffile.imread(tmp_path / name)
+        for name in ("pairs/degraded/0000-drawn.tif", "restored.tif")
+    )
     assert (restored.shape, restored.dtype) == (raw.shape, raw.dtype)
     assert (restored != raw).any()
 
 
 def test_gate_in_ci(tmp_path: Path) -> None:
-    """Beside the commands: the workflow gives the action inputs that it has, and files that the page made."""
+    """Beside the commands: the workflow gives the action inputs that it has, and files that the
+    page made.
+    """
     import yaml  # type: ignore[import-untyped]
 
     walked("gate-in-ci", tmp_path)
@@ -73,7 +92,9 @@ def test_gate_in_ci(tmp_path: Path) -> None:
         yaml.safe_load(path.read_text(encoding="utf-8"))
         for path in (ROOT / "action.yml", tmp_path / ".github" / "workflows" / "gate.yml")
     )
-    (given,) = (step["with"] for step in workflow["jobs"]["gate"]["steps"] if step.get("id") == "gate")
+    (given,) = (
+        step["with"] for step in workflow["jobs"]["gate"]["steps"] if step.get("id") == "gate"
+    )
     assert set(given) <= set(action["inputs"])
     assert all((tmp_path / path.removeprefix("protected/")).is_file() for path in given.values())
     assert 'failures="5"' in (tmp_path / "gate.xml").read_text(encoding="utf-8")

@@ -1,17 +1,22 @@
-"""Walks a page as a reader would: writes its files, runs its commands in order, and holds them to what it shows.
+"""Walks a page as a reader would: writes its files, runs its commands in order, and holds them to
+what it shows.
 
 Of a page's fences these count, in order:
 
 - any with a title, as ```toml title="my-sensor.toml": a file, written as it stands;
-- ```bash: commands, a line each, of the programs known here (`PROGRAMS`), run without a shell (so also on Windows),
-  ours within this process, where all is imported already, but for the first time that each command comes up;
-- ```text: what the commands before it print. Each of its lines must come, in this order; `...` stands for anything,
-  blanks and rules of tables have any length, and a number must be within 2 %, for processors differ.
+- ```bash: commands, a line each, of the programs known here (`PROGRAMS`), run without a shell (so
+  also on Windows), ours within this process, where all is imported already, but for the first time
+  that each command comes up;
+- ```text: what the commands before it print. Each of its lines must come, in this order; `...`
+  stands for anything, blanks and rules of tables have any length, and a number must be within 2 %,
+  for processors differ.
 
 Comments of the page say where a test differs from a reader:
 
-- `<!-- test: A -> B -->`: from here on commands have B in the place of A, once each at most in a line;
-- `<!-- test: figures vary -->`: of the next output the numbers are another machine's: only their place is compared;
+- `<!-- test: A -> B -->`: from here on commands have B in the place of A, once each at most in a
+  line;
+- `<!-- test: figures vary -->`: of the next output the numbers are another machine's: only their
+  place is compared;
 - `<!-- test: exits 1 -->`: the next commands end with this code, not with 0.
 """
 
@@ -38,13 +43,17 @@ PROGRAMS = {
     "python3": PYTHON,
     "rio": [*PYTHON, "-c", "from rasterio.rio.main import main_group; main_group()"],
 }
-PART = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$|^<!-- test: (.+?) -->$', re.MULTILINE | re.DOTALL)
+PART = re.compile(
+    r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$|^<!-- test: (.+?) -->$', re.MULTILINE | re.DOTALL
+)
 NUMBER = re.compile(r"(?<![\w.])-?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 RELATIVE = 0.02
 Done = subprocess.CompletedProcess[str]
 """A command that ended: its code, and both streams as a terminal shows them."""
 STARTED = {"tradeoff"}
-"""Commands that have been started as a shell starts them; a study is small in this process alone."""
+"""Commands that have been started as a shell starts them; a study is small in
+this process alone.
+"""
 
 
 class PageError(AssertionError):
@@ -72,7 +81,8 @@ class Walk:
         """Walk through a whole page.
 
         Raises:
-            PageError: a command ends with another code, prints something else, or a comment is of no use.
+            PageError: a command ends with another code, prints something else, or a comment is of
+                no use.
         """
         for language, title, body, comment in PART.findall(text):
             if comment:
@@ -85,7 +95,9 @@ class Walk:
                 self._compare(body)
         unused = [f"{long} -> {short}" for (long, short), used in self.shorter.items() if not used]
         if unused or self._code or self._vary:
-            raise PageError(f"comments that no command or output follows: {unused or 'exits, or figures vary'}")
+            raise PageError(
+                f"comments that no command or output follows: {unused or 'exits, or figures vary'}"
+            )
 
     def _note(self, comment: str) -> None:
         if " -> " in comment:
@@ -110,7 +122,9 @@ class Walk:
         for command in block.replace("\\\n", " ").splitlines():
             done = self.run(command)
             if done.returncode != expected:
-                raise PageError(f"{command}\nended with {done.returncode}, not {expected}:\n{done.stdout}")
+                raise PageError(
+                    f"{command}\nended with {done.returncode}, not {expected}:\n{done.stdout}"
+                )
             self.printed[command] = done.stdout
             self._last += done.stdout
 
@@ -141,7 +155,12 @@ class Walk:
 
     def _started(self, words: list[str]) -> Done:
         kept = {name: os.environ[name] for name in ("SYSTEMROOT", "TEMP") if name in os.environ}
-        ours = {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "PYTHONUTF8": "1", "OMP_NUM_THREADS": "1"}
+        ours = {
+            "PYTHONPATH": str(ROOT),
+            "PYTHONUNBUFFERED": "1",
+            "PYTHONUTF8": "1",
+            "OMP_NUM_THREADS": "1",
+        }
         return subprocess.run(
             [*PROGRAMS[words[0]], *words[1:]],
             cwd=self.folder,
@@ -158,7 +177,9 @@ class Walk:
         self._vary = False
         for line in plain(shown):
             if line != "..." and not any(agrees(line, found, vary) for found in lines):
-                raise PageError(f"not printed, or not in this place:\n{line}\nwhat was printed:\n{self._last}")
+                raise PageError(
+                    f"not printed, or not in this place:\n{line}\nwhat was printed:\n{self._last}"
+                )
 
 
 def environment(folder: Path) -> dict[str, str]:
@@ -168,11 +189,14 @@ def environment(folder: Path) -> dict[str, str]:
 
 def plain(text: str) -> list[str]:
     """The lines that are not empty; blanks and rules of tables have one length."""
-    return [line for raw in text.splitlines() if (line := re.sub(r"([\s━─])\1*", r"\1", raw.strip()))]
+    return [
+        line for raw in text.splitlines() if (line := re.sub(r"([\s━─])\1*", r"\1", raw.strip()))
+    ]
 
 
 def agrees(shown: str, found: str, vary: bool) -> bool:
-    """Whether a line of the page is what a command printed: the same words, and numbers that are close.
+    """Whether a line of the page is what a command printed: the same words, and numbers that are
+    close.
 
     Args:
         shown: the page's, where `...` stands for anything.
@@ -180,7 +204,9 @@ def agrees(shown: str, found: str, vary: bool) -> bool:
         vary: numbers may be any.
     """
     parts = shown.split("...")
-    texts = (re.escape(NUMBER.sub("\0", part)).replace("\0", f"({NUMBER.pattern})") for part in parts)
+    texts = (
+        re.escape(NUMBER.sub("\0", part)).replace("\0", f"({NUMBER.pattern})") for part in parts
+    )
     match = re.fullmatch(".*?".join(texts), found)
     if match is None or vary:
         return match is not None

@@ -1,4 +1,6 @@
-"""Networks as users bring them: what torch exports of them computes the same, at every size that is legal."""
+"""Networks as users bring them: what torch exports of them computes the same, at every size that is
+legal.
+"""
 
 from collections import Counter
 
@@ -30,7 +32,9 @@ def shapes(name: str) -> list[tuple[int, int, int, int]]:
     return [(1, example.inputs, 9 * step, 10 * step), (2, example.inputs, 12 * step, 7 * step)]
 
 
-def differences(network: nn.Module, model: onnx.ModelProto, sizes: list[tuple[int, int, int, int]]) -> list[float]:
+def differences(
+    network: nn.Module, model: onnx.ModelProto, sizes: list[tuple[int, int, int, int]]
+) -> list[float]:
     session = open_session(model)
     found = []
     for size in sizes:
@@ -62,7 +66,9 @@ def test_sizes_and_channels_are_those_that_the_example_states(name: str) -> None
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_the_same_seed_gives_the_same_bytes_and_another_gives_others(name: str) -> None:
-    first, again, other = (to_onnx(name, made(name, seed)).SerializeToString() for seed in (0, 0, 1))
+    first, again, other = (
+        to_onnx(name, made(name, seed)).SerializeToString() for seed in (0, 0, 1)
+    )
     assert first == again
     assert first != other
 

@@ -1,4 +1,6 @@
-"""What the example networks learn from: what each is for, the same for the same seed, as `--samples` reads it."""
+"""What the example networks learn from: what each is for, the same for the same seed, as
+`--samples` reads it.
+"""
 
 from pathlib import Path
 
@@ -17,8 +19,12 @@ from examples.train_network import criterion
 
 # One network for each kind of batch: the others take what the first one takes.
 @pytest.mark.parametrize("name", ["dncnn", "espcn", "edsr4", "segment", "classifier"])
-def test_batches_fit_the_network_and_come_again_with_the_seed(name: str, scenes: list[Scene]) -> None:
-    (image, wanted), (again, _), (other, _) = (next(batches(name, scenes, seed)) for seed in (0, 0, 1))
+def test_batches_fit_the_network_and_come_again_with_the_seed(
+    name: str, scenes: list[Scene]
+) -> None:
+    (image, wanted), (again, _), (other, _) = (
+        next(batches(name, scenes, seed)) for seed in (0, 0, 1)
+    )
     with torch.inference_mode():
         loss = criterion(name)(build(name, torch.Generator().manual_seed(0))(image), wanted)
     assert loss.isfinite()
@@ -35,7 +41,9 @@ def test_bands_show_one_ground_with_a_gain_and_a_noise_of_their_own(scenes: list
     noise = (image / torch.tensor(GAINS).view(1, -1, 1, 1)).transpose(0, 1).flatten(1)
     between = noise - noise.mean(0)  # the ground is in each band, and cancels
     assert float(between.std(1).min()) > 0
-    assert float(torch.corrcoef(between[2:])[0, 1]) < 0.5  # one noise in every band would leave nothing but rounding
+    assert (
+        float(torch.corrcoef(between[2:])[0, 1]) < 0.5
+    )  # one noise in every band would leave nothing but rounding
 
 
 def test_images_too_small_for_four_bands_are_refused() -> None:
@@ -54,7 +62,9 @@ def test_bright_is_what_is_bright_around_a_pixel_and_not_the_pixel_alone() -> No
 
 
 @pytest.mark.parametrize("name", ["espcn", "classifier"])
-def test_a_file_of_samples_is_read_as_data(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_of_samples_is_read_as_data(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "samples.npz"
     assert main([name, "--count", "5", "--out", str(out)]) == 0
     assert "wrote" in capsys.readouterr().out
@@ -63,7 +73,9 @@ def test_a_file_of_samples_is_read_as_data(name: str, tmp_path: Path, capsys: py
     assert (pairs[0][1].size > 0) == NETWORKS[name].restores
 
 
-def test_other_names_and_counts_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_names_and_counts_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["classifier", "--out", str(tmp_path / "samples.npy")]) == 2
     assert "ends in .npz" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):

@@ -23,7 +23,9 @@ def test_a_few_steps_help_on_other_patches(name: str, scenes: list[Scene]) -> No
     assert trained[1:] == untrained[1:]
 
 
-def test_both_files_hold_the_trained_network(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_both_files_hold_the_trained_network(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "classifier.onnx"
     assert main(["classifier", "--steps", "3", "--out", str(out)]) == 0
     assert "(measured)" in capsys.readouterr().out
@@ -34,7 +36,9 @@ def test_both_files_hold_the_trained_network(tmp_path: Path, capsys: pytest.Capt
     assert to_onnx("classifier", network) == onnx.load(out)
 
 
-def test_another_suffix_is_refused_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_suffix_is_refused_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["classifier", "--steps", "3", "--out", str(tmp_path / "classifier.pt")]) == 2
     assert "ends in .onnx" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

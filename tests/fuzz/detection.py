@@ -18,7 +18,9 @@ GREY = np.full((*SIZE_PX, 3), 90, np.uint8)
 
 def label_seeds(folder: Path, make: Callable[[Path], Path], suffix: str) -> list[bytes]:
     """The files of labels in a folder of some layout."""
-    found = sorted(path for path in make(folder / "made").rglob(f"*{suffix}") if path.stem != "data")
+    found = sorted(
+        path for path in make(folder / "made").rglob(f"*{suffix}") if path.stem != "data"
+    )
     return [path.read_bytes() for path in found]
 
 
@@ -32,7 +34,9 @@ def read_beside(path: Path) -> None:
     with TemporaryDirectory() as made:
         for stem in OBJECTS:
             Image.fromarray(GREY).save(Path(made) / f"{stem}.png")
-            shutil.copy(path, Path(made) / f"{'labels' if path.suffix == '.json' else stem}{path.suffix}")
+            shutil.copy(
+                path, Path(made) / f"{'labels' if path.suffix == '.json' else stem}{path.suffix}"
+            )
         (Path(made) / "classes.txt").write_text("Expressway-Service-area\nship\n", encoding="utf-8")
         read_labelled(Path(made))
 
@@ -45,7 +49,10 @@ def read_names(path: Path) -> None:
 def detector_seeds(folder: Path) -> list[bytes]:
     """Both layouts, of a fixed size and of any, one with a suppression inside."""
     row = (20.0, 30.0, 40.0, 50.0, 0.5, 0.0)
-    kinds = [detector(folder / "a.onnx", raw(row)), detector(folder / "b.onnx", raw(row), size_px="side")]
+    kinds = [
+        detector(folder / "a.onnx", raw(row)),
+        detector(folder / "b.onnx", raw(row), size_px="side"),
+    ]
     kinds.append(detector(folder / "c.onnx", final(row), cut=0.25))
     return [path.read_bytes() for path in kinds]
 

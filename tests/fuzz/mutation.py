@@ -1,4 +1,6 @@
-"""Damage to the bytes of a file, and to what its format means by them; all of it drawn from one generator."""
+"""Damage to the bytes of a file, and to what its format means by them; all of it drawn from one
+generator.
+"""
 
 import json
 import struct
@@ -17,17 +19,81 @@ Mutate = Callable[[bytes, Rng], bytes]
 T = TypeVar("T")
 
 NUMBERS = (
-    0, 1, -1, 2, 7, 8, 127, 128, 255, 256, 1000, 32767, 65535, 65536, 10**6, 2**31 - 1, 2**31, 2**32 - 1, 2**62,
-)  # fmt: skip
+    0,
+    1,
+    -1,
+    2,
+    7,
+    8,
+    127,
+    128,
+    255,
+    256,
+    1000,
+    32767,
+    65535,
+    65536,
+    10**6,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**62,
+)
 TEXTS = (
-    "", "a", "\0", "\n", "../../x", "/etc/passwd", "1e999", "NaN", "\ud800", "é", "a" * 5000, "9" * 5000, "%s%n",
-    "com.microsoft", "If", "Loop", "Conv", "image",
-)  # fmt: skip
-PATHS = ("/vsicurl/http://a/b.tif", "http://a/b.tif", "/vsimem/a", "a.vrt", ".", "R0C0.jp2", "IMG_R2C1.TIF")
+    "",
+    "a",
+    "\0",
+    "\n",
+    "../../x",
+    "/etc/passwd",
+    "1e999",
+    "NaN",
+    "\ud800",
+    "é",
+    "a" * 5000,
+    "9" * 5000,
+    "%s%n",
+    "com.microsoft",
+    "If",
+    "Loop",
+    "Conv",
+    "image",
+)
+PATHS = (
+    "/vsicurl/http://a/b.tif",
+    "http://a/b.tif",
+    "/vsimem/a",
+    "a.vrt",
+    ".",
+    "R0C0.jp2",
+    "IMG_R2C1.TIF",
+)
 TOKENS = (
-    b"\0", b"\n", b'"', b"[", b"]", b"{", b"}", b"=", b".", b",", b"-", b"inf", b"nan", b"1e999", b"0x" + b"f" * 600,
-    b"9" * 5000, b"[" * 400, b"{\"a\":" * 400, b"a." * 90, b"\xff\xff\xff\xff", b"\\ud800", b"true", b"null", b"'''",
-)  # fmt: skip
+    b"\0",
+    b"\n",
+    b'"',
+    b"[",
+    b"]",
+    b"{",
+    b"}",
+    b"=",
+    b".",
+    b",",
+    b"-",
+    b"inf",
+    b"nan",
+    b"1e999",
+    b"0x" + b"f" * 600,
+    b"9" * 5000,
+    b"[" * 400,
+    b'{"a":' * 400,
+    b"a." * 90,
+    b"\xff\xff\xff\xff",
+    b"\\ud800",
+    b"true",
+    b"null",
+    b"'''",
+)
 
 
 def pick(options: Sequence[T], rng: Rng) -> T:
@@ -35,7 +101,9 @@ def pick(options: Sequence[T], rng: Rng) -> T:
 
 
 def damaged(content: bytes, others: Sequence[bytes], meaning: Mutate | None, rng: Rng) -> bytes:
-    """A few faults, one after another: of the bytes, or (where the format is known) of what they mean."""
+    """A few faults, one after another: of the bytes, or (where the format is known) of what they
+    mean.
+    """
     for _ in range(int(rng.geometric(0.6))):
         if meaning is not None and rng.random() < 0.6:
             content = meaning(content, rng)
@@ -79,7 +147,9 @@ def of_json(content: bytes, rng: Rng) -> bytes:
 
 
 def of_xml(content: bytes, rng: Rng) -> bytes:
-    """Change an element's text, name, place or one of its attributes; as it was where it is no XML any more."""
+    """Change an element's text, name, place or one of its attributes; as it was where it is no XML
+    any more.
+    """
     try:
         root = ET.fromstring(content)  # noqa: S314 - our own seeds, damaged
     except (ET.ParseError, ValueError, LookupError):
@@ -139,7 +209,9 @@ def of_png(content: bytes, rng: Rng) -> bytes:
 
 
 def of_tiff(content: bytes, rng: Rng) -> bytes:
-    """Change tag, type, count or value of an entry of the first directory (classic and little-endian)."""
+    """Change tag, type, count or value of an entry of the first directory (classic and
+    little-endian).
+    """
     if content[:4] != b"II*\0" or len(content) < 8:
         return content
     start = int.from_bytes(content[4:8], "little")
@@ -205,7 +277,11 @@ def _like(value: object, rng: Rng) -> object:
     if isinstance(value, float):
         return float(rng.choice((0.0, -1.0, 1e38, np.inf, np.nan, 1e-40)))
     text = pick(TEXTS, rng)
-    return of_bytes(value, [value], rng) if isinstance(value, bytes) else text.encode("utf-8", "ignore").decode()
+    return (
+        of_bytes(value, [value], rng)
+        if isinstance(value, bytes)
+        else text.encode("utf-8", "ignore").decode()
+    )
 
 
 def _tree(value: object, rng: Rng) -> object:
@@ -217,7 +293,10 @@ def _tree(value: object, rng: Rng) -> object:
         kind = rng.random()
         if kind < 0.1:
             return {name: inner for name, inner in value.items() if name != key}
-        return {**value, **({pick(TEXTS, rng): value[key]} if kind < 0.2 else {key: _tree(value[key], rng)})}
+        return {
+            **value,
+            **({pick(TEXTS, rng): value[key]} if kind < 0.2 else {key: _tree(value[key], rng)}),
+        }
     place = int(rng.integers(len(value)))
     kind = rng.random()
     if kind < 0.2:

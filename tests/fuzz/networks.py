@@ -35,20 +35,32 @@ SMALL = Variant(1, 2)
 def onnx_seeds(folder: Path) -> list[bytes]:
     """The three encodings of a small network, one of them fixed to a tile."""
     encodings = (float_convbeers, integer_convbeers, board_convbeers)
-    made = [written(partial(encoding, blocks=1, features=2), folder / "a.onnx") for encoding in encodings]
+    made = [
+        written(partial(encoding, blocks=1, features=2), folder / "a.onnx")
+        for encoding in encodings
+    ]
     fixed = onnx.load_model(float_convbeers(folder / "a.onnx", 1, 2))
     for value in (*fixed.graph.input, *fixed.graph.output):
-        for dim, size in zip(value.type.tensor_type.shape.dim, (1, 1, SIDE_PX, SIDE_PX), strict=True):
+        for dim, size in zip(
+            value.type.tensor_type.shape.dim, (1, 1, SIDE_PX, SIDE_PX), strict=True
+        ):
             dim.dim_value = size
     return [*made, fixed.SerializeToString()]
 
 
 def exported_seeds(_: Path) -> list[bytes]:
-    """What exporters leave: constants computed, normalisation, padding, other opsets, 16-bit floats."""
+    """What exporters leave: constants computed, normalisation, padding, other opsets, 16-bit
+    floats.
+    """
     sizes = CASES["sizes of constants"][0]
     scaled = CASES["normalised and scaled again"][0]
     idle = CASES["what does nothing"][0]
-    networks = [made(sizes), made(scaled, 9), made(sizes, 20), made(idle, kind=onnx.TensorProto.FLOAT16)]
+    networks = [
+        made(sizes),
+        made(scaled, 9),
+        made(sizes, 20),
+        made(idle, kind=onnx.TensorProto.FLOAT16),
+    ]
     return [network.SerializeToString() for network in networks]
 
 
@@ -60,7 +72,14 @@ def look_at_onnx(path: Path) -> None:
 def understand_onnx(path: Path) -> None:
     """What `quantize`, `restore` and `gate` ask of a network before they run it."""
     model = load_onnx(path)
-    questions = fixed_tile_px, tiling_of, correction_graph, count_relus, encoding_faults, rounded_tensors
+    questions = (
+        fixed_tile_px,
+        tiling_of,
+        correction_graph,
+        count_relus,
+        encoding_faults,
+        rounded_tensors,
+    )
     for question in questions:
         _asked(question, model)
 
@@ -83,7 +102,9 @@ def run_onnx(path: Path) -> None:
 
 
 def checkpoint_seeds(folder: Path) -> list[bytes]:
-    return [written(partial(_checkpoint, steps=steps), folder / "c.safetensors") for steps in (0, 1)]
+    return [
+        written(partial(_checkpoint, steps=steps), folder / "c.safetensors") for steps in (0, 1)
+    ]
 
 
 def _checkpoint(path: Path, steps: int) -> None:

@@ -38,7 +38,14 @@ from beers_deploy.results import Table, by_row, cell
 from beers_deploy.studies.tradeoff.measure import Measurements
 from tests.deploy.dpu.graphs import integer_convbeers
 from tests.deploy.studies.detection.folders import coco, voc, yolo
-from tests.fuzz.detection import detect, detector_seeds, label_seeds, names_seeds, read_beside, read_names
+from tests.fuzz.detection import (
+    detect,
+    detector_seeds,
+    label_seeds,
+    names_seeds,
+    read_beside,
+    read_names,
+)
 from tests.fuzz.mutation import Mutate, of_json, of_onnx, of_png, of_safetensors, of_tiff, of_xml
 from tests.fuzz.networks import (
     SIDE_PX,
@@ -51,11 +58,24 @@ from tests.fuzz.networks import (
     understand_onnx,
     weights_seeds,
 )
-from tests.fuzz.pictures import gdal_seeds, image_of, read_rows, read_with_tiles, tiff_seeds, written
+from tests.fuzz.pictures import (
+    gdal_seeds,
+    image_of,
+    read_rows,
+    read_with_tiles,
+    tiff_seeds,
+    written,
+)
 from tests.profiles.own_sensor import SHIPPED
 
 ROOT = Path(__file__).parents[2]
-JOB: dict[str, object] = {"image": [1, "a", 2], "model": "b", "tile_px": 64, "halo_px": 4, "full_scale": 4095.0}
+JOB: dict[str, object] = {
+    "image": [1, "a", 2],
+    "model": "b",
+    "tile_px": 64,
+    "halo_px": 4,
+    "full_scale": 4095.0,
+}
 SHAPE = (1, 8, 8)
 
 
@@ -88,7 +108,9 @@ def described_seeds(_: Path) -> list[bytes]:
     head, rest = SHIPPED.split("[mtf]")
     mtf = "frequency = [0, 0.25, 0.5]\nacross = [1, 0.5, 0.12]\nalong = [1, 0.4, 0.1]"
     noise = "alpha = 0.01\nbeta = [0.1, 0.2]"
-    return [f"{head}[mtf]\n{mtf}\n\n[noise]\n{noise}\n\n[digitiser]{rest.split('[digitiser]')[1]}".encode()]
+    return [
+        f"{head}[mtf]\n{mtf}\n\n[noise]\n{noise}\n\n[digitiser]{rest.split('[digitiser]')[1]}".encode()
+    ]
 
 
 def point_seeds(folder: Path) -> list[bytes]:
@@ -111,7 +133,11 @@ def recipe_seeds(folder: Path) -> list[bytes]:
     point, *_ = read_response("a test", {"psf": "point.npy", "psf_samples_per_px": 4}, folder)
     across, along = (replace(profile.mtf_nyquist, value=value) for value in point.at_nyquist)
     other = replace(profile, response=point, mtf_nyquist=across, mtf_nyquist_along=along)
-    recipe = {"scenes": [{"name": "a", "sha256": "b"}], "degraded": asdict(profile), "reference": asdict(other)}
+    recipe = {
+        "scenes": [{"name": "a", "sha256": "b"}],
+        "degraded": asdict(profile),
+        "reference": asdict(other),
+    }
     return [json.dumps(recipe).encode()]
 
 
@@ -128,7 +154,10 @@ GATED = dict.fromkeys(PATCHES, 1)
 
 
 def document_seeds(_: Path) -> list[bytes]:
-    figures = {"MAE": measured(7e-4, "of full scale", "here"), "none": unavailable("W", "no counter")}
+    figures = {
+        "MAE": measured(7e-4, "of full scale", "here"),
+        "none": unavailable("W", "no counter"),
+    }
     figures["time"] = predicted(3.0, "s", (2.0, 4.0), "cost model")
     rows = (Row("gate", "int8", figures, {"word": "text"}), Row("other", "other", figures))
     check = Check("MAE", 7e-4, 2.0, "of full scale", detail="text")
@@ -171,7 +200,9 @@ def log_lines(path: Path) -> None:
 
 def backbone_seeds(_: Path, packed: bool) -> list[bytes]:
     stream = io.BytesIO()
-    (np.savez_compressed if packed else np.savez)(stream, a=np.ones((2, 3), np.float32), b=np.zeros(4, np.float16))
+    (np.savez_compressed if packed else np.savez)(
+        stream, a=np.ones((2, 3), np.float32), b=np.zeros(4, np.float16)
+    )
     return [stream.getvalue()]
 
 
@@ -199,7 +230,10 @@ def _network() -> Network:
         return read_network(integer_convbeers(Path(name) / "a.onnx", 1, 2), SIDE_PX)
 
 
-LIMITS = [b"mae = 0.0007\np999 = 0.01\n", b"psnr_drop_db = 0.05\nmae_growth = 1.1\nmin_psnr_float_int8_db = 60\n"]
+LIMITS = [
+    b"mae = 0.0007\np999 = 0.01\n",
+    b"psnr_drop_db = 0.05\nmae_growth = 1.1\nmin_psnr_float_int8_db = 60\n",
+]
 
 GDAL = {"VRT": "a.vrt", "DIMAP": "DIM.XML", "JPEG 2000": "a.jp2", "NITF": "a.ntf", "HFA": "a.img"}
 XML = ("VRT", "DIMAP")
@@ -222,28 +256,58 @@ PARSERS: tuple[Parser, ...] = (
     Parser("PNG", ".png", lambda _: [image_of({"format": "PNG"})], read_pixels, of_png),
     Parser("JPEG", ".jpg", lambda _: [image_of({"format": "JPEG"})], read_pixels),
     *(of_gdal(kind, name) for kind, name in GDAL.items()),
-    Parser("sensor TOML", ".toml", lambda _: _files("sensors"), lambda p: load_sensor(str(p)).nominal()),
-    Parser("sensor TOML, MTF table", ".toml", described_seeds, lambda p: load_sensor(str(p)).nominal()),
+    Parser(
+        "sensor TOML", ".toml", lambda _: _files("sensors"), lambda p: load_sensor(str(p)).nominal()
+    ),
+    Parser(
+        "sensor TOML, MTF table", ".toml", described_seeds, lambda p: load_sensor(str(p)).nominal()
+    ),
     Parser("point spread, npy", ".npy", point_seeds, read_point),
     Parser("recipe of pairs", ".json", recipe_seeds, read_recipe, of_json),
     Parser("scene TOML", ".toml", lambda _: _files("scenes"), lambda p: load_scene_call(str(p))),
     Parser("target TOML", ".toml", lambda _: _files("targets"), board_of, share=0.3),
     Parser("gate limits TOML", ".toml", lambda _: LIMITS, limits_of),
     Parser("results JSON", ".json", document_seeds, read_results, of_json),
-    Parser("gate baseline JSON", ".json", document_seeds, lambda p: read_baseline(p, GATED), of_json),
-    Parser("board's runs JSON", ".json", runs_seeds, lambda p: read_own_runs(p, load_dpu("vck190")), of_json, 0.3),
+    Parser(
+        "gate baseline JSON", ".json", document_seeds, lambda p: read_baseline(p, GATED), of_json
+    ),
+    Parser(
+        "board's runs JSON",
+        ".json",
+        runs_seeds,
+        lambda p: read_own_runs(p, load_dpu("vck190")),
+        of_json,
+        0.3,
+    ),
     Parser("kept measurements", ".json", measurement_seeds, Measurements.open, of_json),
     Parser("journal of a run", ".json", journal_seeds, resume, of_json, 0.5),
     Parser("dataset manifest", ".jsonl", manifest_seeds, _read_summary, of_json),
-    Parser("training log", ".csv", lambda _: [b"step,loss\n10,0.5\n20,0.25\n"], log_lines, share=0.5),
+    Parser(
+        "training log", ".csv", lambda _: [b"step,loss\n10,0.5\n20,0.25\n"], log_lines, share=0.5
+    ),
     Parser("weights", ".safetensors", weights_seeds, load_network, of_safetensors),
     Parser(
-        "told weights", ".safetensors", partial(weights_seeds, kind=BankedConvBEERS), load_network, of_safetensors
+        "told weights",
+        ".safetensors",
+        partial(weights_seeds, kind=BankedConvBEERS),
+        load_network,
+        of_safetensors,
     ),
     Parser("checkpoint", ".safetensors", checkpoint_seeds, go_on, of_safetensors),
-    Parser("backbone npz", ".npz", partial(backbone_seeds, packed=True), lambda p: read_tensors(p, ["a", "b"])),
+    Parser(
+        "backbone npz",
+        ".npz",
+        partial(backbone_seeds, packed=True),
+        lambda p: read_tensors(p, ["a", "b"]),
+    ),
     Parser("labels of VOC", ".xml", partial(label_seeds, make=voc, suffix=".xml"), read_beside),
-    Parser("labels of COCO", ".json", partial(label_seeds, make=coco, suffix=".json"), read_beside, of_json),
+    Parser(
+        "labels of COCO",
+        ".json",
+        partial(label_seeds, make=coco, suffix=".json"),
+        read_beside,
+        of_json,
+    ),
     Parser("labels of YOLO", ".txt", partial(label_seeds, make=yolo, suffix=".txt"), read_beside),
     Parser("names of classes", ".yaml", names_seeds, read_names),
     Parser("detector", ".onnx", detector_seeds, detect, of_onnx, 0.5),

@@ -21,7 +21,9 @@ def written(make: Callable[[Path], object], path: Path) -> bytes:
 
 
 def tiff_seeds(folder: Path) -> list[bytes]:
-    """Strips and tiles, packed or not, bands in planes or mixed, pages, tags of geography, every byte order."""
+    """Strips and tiles, packed or not, bands in planes or mixed, pages, tags of geography, every
+    byte order.
+    """
     rng = np.random.default_rng(0)
     grey = rng.integers(0, 4096, (17, 19)).astype(np.uint16)
     colour = rng.integers(0, 256, (17, 19, 3)).astype(np.uint8)
@@ -39,8 +41,17 @@ def tiff_seeds(folder: Path) -> list[bytes]:
         (grey, {"imagej": True}),
         (grey, {"ome": True}),
     ]
-    made = [written(partial(tifffile.imwrite, data=pixels, **given), path) for pixels, given in kinds]  # type: ignore[arg-type]
-    return [*made, *(image_of(kind) for kind in ({"format": "TIFF", "compression": c} for c in ("jpeg", "tiff_lzw")))]
+    made = [
+        written(partial(tifffile.imwrite, data=pixels, **given), path)  # type: ignore[arg-type]
+        for pixels, given in kinds
+    ]
+    return [
+        *made,
+        *(
+            image_of(kind)
+            for kind in ({"format": "TIFF", "compression": c} for c in ("jpeg", "tiff_lzw"))
+        ),
+    ]
 
 
 def image_of(given: dict[str, str]) -> bytes:
@@ -66,7 +77,9 @@ def gdal_seeds(_: Path, name: str) -> list[bytes]:
 
 @cache
 def _with_tiles(name: str) -> dict[str, bytes]:
-    """An image, or an index and what it names, by their names; a test is skipped where rasterio is not installed."""
+    """An image, or an index and what it names, by their names; a test is skipped where rasterio is
+    not installed.
+    """
     from tests.deploy.restoration import images
 
     with TemporaryDirectory() as folder:

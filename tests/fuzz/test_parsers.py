@@ -1,7 +1,8 @@
-"""Each parser on files damaged by a fixed seed, and on arbitrary bytes: read, or refused by a sentence.
+"""Each parser on files damaged by a fixed seed, and on arbitrary bytes: read, or refused by a
+sentence.
 
-`BEERS_FUZZ=1000 pytest tests/fuzz` damages a thousand times as many files, with BEERS_FUZZ_SEED=1 others. What a test
-fails on is left in its temporary folder.
+`BEERS_FUZZ=1000 pytest tests/fuzz` damages a thousand times as many files, with BEERS_FUZZ_SEED=1
+others. What a test fails on is left in its temporary folder.
 """
 
 import os
@@ -39,7 +40,9 @@ class TooLongError(BaseException):
 
 @contextmanager
 def limited_time() -> Iterator[None]:
-    """By the process's own time, so that a busy machine makes no finding; Windows has no such timer."""
+    """By the process's own time, so that a busy machine makes no finding; Windows has no such
+    timer.
+    """
 
     def ring(*_: object) -> None:
         raise TooLongError
@@ -58,7 +61,9 @@ def limited_time() -> Iterator[None]:
 
 
 def is_read(parser: Parser, content: bytes, folder: Path) -> bool:
-    """Whether a file is read; refused by anything but a sentence, or with another file beside it, the test fails."""
+    """Whether a file is read; refused by anything but a sentence, or with another file beside it,
+    the test fails.
+    """
     path = folder / "in" / f"file{parser.suffix}"
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(content)
@@ -86,7 +91,9 @@ def seeds(parser: Parser, tmp_path_factory: pytest.TempPathFactory) -> list[byte
 
 
 @BY_NAME
-def test_damaged_files_are_read_or_refused_by_a_sentence(parser: Parser, seeds: list[bytes], tmp_path: Path) -> None:
+def test_damaged_files_are_read_or_refused_by_a_sentence(
+    parser: Parser, seeds: list[bytes], tmp_path: Path
+) -> None:
     assert True in {is_read(parser, content, tmp_path) for content in seeds}
     for number in range(max(round(EXECUTIONS * parser.share), 10)):
         rng = np.random.default_rng([SEED, crc32(parser.name.encode()), number])
@@ -95,9 +102,16 @@ def test_damaged_files_are_read_or_refused_by_a_sentence(parser: Parser, seeds: 
 
 
 @BY_NAME
-def test_arbitrary_bytes_are_refused_by_a_sentence(parser: Parser, seeds: list[bytes], tmp_path: Path) -> None:
+def test_arbitrary_bytes_are_refused_by_a_sentence(
+    parser: Parser, seeds: list[bytes], tmp_path: Path
+) -> None:
     @settings(max_examples=ARBITRARY, derandomize=True, database=None)
-    @given(st.one_of(st.binary(max_size=64), st.text(max_size=64).map(lambda text: text.encode("utf-8", "ignore"))))
+    @given(
+        st.one_of(
+            st.binary(max_size=64),
+            st.text(max_size=64).map(lambda text: text.encode("utf-8", "ignore")),
+        )
+    )
     def holds(content: bytes) -> None:
         for head in (b"", seeds[0][:12]):
             is_read(parser, head + content, tmp_path)

@@ -1,8 +1,10 @@
-"""What the verbs give for three networks and two small images, in a form that is small to keep and to compare.
+"""What the verbs give for three networks and two small images, in a form that is small to keep and
+to compare.
 
     PYTHONPATH=. python tests/golden/outputs.py
 
-writes `outputs.npz` and `outputs.json` anew: to be done only where a change of them is meant, and said in its commit.
+writes `outputs.npz` and `outputs.json` anew: to be done only where a change of them is meant, and
+said in its commit.
 """
 
 import json
@@ -34,7 +36,9 @@ PATCHES = ("--patches", "4", "--patch", "48")
 
 
 def outputs(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Restored pixels and the integers of INT8 files by name; predicted and counted figures by verb and network."""
+    """Restored pixels and the integers of INT8 files by name; predicted and counted figures by verb
+    and network.
+    """
     images = _images(folder)
     networks = _networks(folder)
     arrays: dict[str, np.ndarray] = {}
@@ -43,11 +47,17 @@ def outputs(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         for precision, file in (("float32", float_model), ("int8", int8_model)):
             for image, path in images.items():
                 arrays[f"{name}, {precision}, {image}"] = _restored(file, path, folder)
-            figures |= _figures(f"check, {name}, {precision}", folder, "check", file, "--tile", "64")
+            figures |= _figures(
+                f"check, {name}, {precision}", folder, "check", file, "--tile", "64"
+            )
         arrays |= {f"{name}, {key}": value for key, value in _integers(Path(int8_model)).items()}
         pair = (float_model, int8_model) if name != SHIPPED else (name,)
-        figures |= _figures(f"gate, {name}", folder, "gate", *pair, "--patches", "2", "--max-mae", "0.1")
-    figures |= _figures(f"bench, {SHIPPED}", folder, "bench", f"{SHIPPED}-int8", "--size", "3000x2000")
+        figures |= _figures(
+            f"gate, {name}", folder, "gate", *pair, "--patches", "2", "--max-mae", "0.1"
+        )
+    figures |= _figures(
+        f"bench, {SHIPPED}", folder, "bench", f"{SHIPPED}-int8", "--size", "3000x2000"
+    )
     return arrays, figures
 
 
@@ -65,11 +75,16 @@ def _images(folder: Path) -> dict[str, Path]:
 
 
 def _networks(folder: Path) -> dict[str, tuple[str, str]]:
-    """The float and the INT8 file of each network: a shipped pair, and two of random weights quantised here."""
+    """The float and the INT8 file of each network: a shipped pair, and two of random weights
+    quantised here.
+    """
     network = ConvBEERS(Variant(blocks=2, features=8))
     initialise(network, torch.Generator().manual_seed(0))
     save_onnx(to_onnx(network, {}), folder / f"{PLAIN}.onnx")
-    save_onnx(example_to_onnx(OTHER, build(OTHER, torch.Generator().manual_seed(0))), folder / f"{OTHER}.onnx")
+    save_onnx(
+        example_to_onnx(OTHER, build(OTHER, torch.Generator().manual_seed(0))),
+        folder / f"{OTHER}.onnx",
+    )
     found = {SHIPPED: (str(folder / "xs.onnx"), str(folder / "xs-int8.onnx"))}
     for name, path in ((SHIPPED, "xs.onnx"), (f"{SHIPPED}-int8", "xs-int8.onnx")):
         _run("export", "--network", name, "--out", folder / path)

@@ -28,5 +28,7 @@ def told_of(vectors: torch.Tensor) -> Told:
 
 
 def radius_px(variant: Variant) -> int:
-    """How far an output pixel sees around its place: one per convolution (head, two a block, body end, tail)."""
+    """How far an output pixel sees around its place: one per convolution (head, two a block, body
+    end, tail).
+    """
     return variant.scale * (2 * variant.blocks + 3)

@@ -1,4 +1,6 @@
-"""The bank of a sensor: what its kernels keep and what its planes mean, for sensors of any blur and noise."""
+"""The bank of a sensor: what its kernels keep and what its planes mean, for sensors of any blur and
+noise.
+"""
 
 from dataclasses import replace
 
@@ -36,15 +38,21 @@ CONTRAST = st.floats(0.015, 0.15)
 
 def sensor(across: float, along: float, snr: float = 110.0) -> Instrument:
     """Of noise that does not grow with the light, with that SNR at a quarter of full scale."""
-    return replace(NOMINAL, mtf_nyquist=across, mtf_nyquist_along=along, alpha=0.0, beta=(100 / snr) ** 2)
+    return replace(
+        NOMINAL, mtf_nyquist=across, mtf_nyquist_along=along, alpha=0.0, beta=(100 / snr) ** 2
+    )
 
 
 @settings(max_examples=40)
 @given(CONTRAST, CONTRAST, st.floats(35, 220))
-def test_details_have_sum_0_and_noise_makes_planes_of_one_size(across: float, along: float, snr: float) -> None:
+def test_details_have_sum_0_and_noise_makes_planes_of_one_size(
+    across: float, along: float, snr: float
+) -> None:
     bank = network_bank(sensor(across, along, snr))
     assert bank.details.shape == (FILTERS, SIDE_PX, SIDE_PX)
-    assert np.abs(bank.details.sum((1, 2))).max() < 1e-12  # so every restoration, and the image beside it, is 1 at DC
+    assert (
+        np.abs(bank.details.sum((1, 2))).max() < 1e-12
+    )  # so every restoration, and the image beside it, is 1 at DC
     noise = bank.sigma * np.sqrt(np.square(bank.planes).sum((1, 2)))
     np.testing.assert_allclose(noise, 1 / UNIT, rtol=1e-12)
     assert bank.unit == pytest.approx(UNIT * bank.sigma * np.linalg.norm(bank.analytic))
@@ -55,7 +63,9 @@ def test_details_have_sum_0_and_noise_makes_planes_of_one_size(across: float, al
 def test_a_sensor_whose_axes_change_places_has_its_kernels_transposed(
     across: float, along: float, snr: float
 ) -> None:
-    upright, turned = (network_bank(sensor(*axes, snr)) for axes in ((across, along), (along, across)))
+    upright, turned = (
+        network_bank(sensor(*axes, snr)) for axes in ((across, along), (along, across))
+    )
     np.testing.assert_allclose(turned.details.transpose(0, 2, 1), upright.details, atol=1e-12)
     assert turned.unit == pytest.approx(upright.unit)
 
@@ -69,8 +79,12 @@ def test_a_lopsided_point_spread_transposed_has_its_kernels_transposed() -> None
 
 
 def test_smear_is_undone_along_the_track_alone() -> None:
-    plain, smeared = (network_bank(each) for each in (NOMINAL, replace(NOMINAL, effects={"smear": Smear(0.9)})))
-    down, across = (np.abs(smeared.analytic.sum(axis) - plain.analytic.sum(axis)).max() for axis in (1, 0))
+    plain, smeared = (
+        network_bank(each) for each in (NOMINAL, replace(NOMINAL, effects={"smear": Smear(0.9)}))
+    )
+    down, across = (
+        np.abs(smeared.analytic.sum(axis) - plain.analytic.sum(axis)).max() for axis in (1, 0)
+    )
     assert down > 10 * across
 
 
@@ -92,13 +106,17 @@ def error(kernel: np.ndarray, made: Instrument, epsilon: float) -> float:
     blur, target = (sensor_mtf(fx[:1], fy[:, :1], each) for each in (made, REFERENCE))
     gain = response(kernel)
     seen = r > 0
-    errors = np.abs(gain * blur - target)[seen] ** 2 / r[seen] ** 2 + epsilon * np.abs(gain[seen]) ** 2
+    errors = (
+        np.abs(gain * blur - target)[seen] ** 2 / r[seen] ** 2 + epsilon * np.abs(gain[seen]) ** 2
+    )
     return float(errors.mean())
 
 
 @settings(max_examples=15, deadline=None)
 @given(CONTRAST, CONTRAST, st.floats(36, 219), st.integers(0, 2**20))
-def test_no_other_kernel_of_its_size_restores_better(across: float, along: float, snr: float, seed: int) -> None:
+def test_no_other_kernel_of_its_size_restores_better(
+    across: float, along: float, snr: float, seed: int
+) -> None:
     """Any change of a kernel that keeps its sum makes the error larger."""
     made = sensor(across, along, snr)
     generator = np.random.default_rng(seed)
@@ -125,17 +143,27 @@ def test_the_fitted_kernel_errs_less_than_the_pipelines_filter_cut_small(contras
     near = whole[middle - radius : middle + radius + 1, middle - radius : middle + radius + 1]
     itself = np.zeros((SIDE_PX, SIDE_PX))
     itself[radius, radius] = 1
-    assert error(itself + network_bank(made).analytic, made, epsilon) < 0.9 * error(near / near.sum(), made, epsilon)
+    assert error(itself + network_bank(made).analytic, made, epsilon) < 0.9 * error(
+        near / near.sum(), made, epsilon
+    )
 
 
 @pytest.mark.parametrize(("alpha", "end"), [(0.0, 0), (1.0, 1)])
-def test_noise_beyond_what_was_trained_counts_as_the_nearest_end_of_it(alpha: float, end: int) -> None:
-    assert network_bank(replace(NOMINAL, alpha=alpha, beta=0.0)).sigma == RANGES["sigma_bright"][end]
+def test_noise_beyond_what_was_trained_counts_as_the_nearest_end_of_it(
+    alpha: float, end: int
+) -> None:
+    assert (
+        network_bank(replace(NOMINAL, alpha=alpha, beta=0.0)).sigma == RANGES["sigma_bright"][end]
+    )
 
 
 def test_more_noise_asks_for_less_sharpening() -> None:
-    row = np.tile([-1.0, 1.0], 4)[:SIDE_PX][None].repeat(SIDE_PX, 0)  # Nyquist across, -1 in the middle
-    gains = [abs((network_bank(sensor(0.07, 0.07, snr)).analytic * row).sum()) for snr in (220, 110, 35)]
+    row = np.tile([-1.0, 1.0], 4)[:SIDE_PX][None].repeat(
+        SIDE_PX, 0
+    )  # Nyquist across, -1 in the middle
+    gains = [
+        abs((network_bank(sensor(0.07, 0.07, snr)).analytic * row).sum()) for snr in (220, 110, 35)
+    ]
     assert gains == sorted(gains, reverse=True)
     assert gains[0] > 1.8 * gains[2]
 
@@ -143,7 +171,14 @@ def test_more_noise_asks_for_less_sharpening() -> None:
 @pytest.mark.parametrize("scale", [1, 2, 3])
 def test_in_places_of_pixels_the_filters_give_the_same(scale: int) -> None:
     kernels = network_bank(sensor(0.08, 0.05)).kernels
-    image = torch.rand(1, 1, 10 * scale, 12 * scale, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    image = torch.rand(
+        1,
+        1,
+        10 * scale,
+        12 * scale,
+        dtype=torch.float64,
+        generator=torch.Generator().manual_seed(0),
+    )
     places = torch.from_numpy(in_places(kernels, scale))
     around = places.shape[-1] // 2
     planes = conv2d(image, torch.from_numpy(kernels)[:, None], padding=SIDE_PX // 2)
@@ -154,7 +189,9 @@ def test_in_places_of_pixels_the_filters_give_the_same(scale: int) -> None:
 
 @settings(max_examples=20)
 @given(CONTRAST, CONTRAST, st.floats(36, 219))
-def test_a_sensor_vector_tells_the_bank_of_its_sensor(across: float, along: float, snr: float) -> None:
+def test_a_sensor_vector_tells_the_bank_of_its_sensor(
+    across: float, along: float, snr: float
+) -> None:
     made = sensor(across, along, snr)
     told = bank_of_vector(sensor_vector(made).values)
     own = network_bank(made)

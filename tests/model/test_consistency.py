@@ -1,6 +1,8 @@
-"""The consistency step: what it leaves alone, what it removes, and that tiles give the whole image's correction.
+"""The consistency step: what it leaves alone, what it removes, and that tiles give the whole
+image's correction.
 
-`blurred` computes H x apart from the code under test: by a Fourier transform of the mirrored image in float64.
+`blurred` computes H x apart from the code under test: by a Fourier transform of the mirrored image
+in float64.
 """
 
 from dataclasses import replace
@@ -19,7 +21,13 @@ from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import AntiAlias, Offset, Smear
 from beers_deploy.profiles.response import PointSpread, packed, unpacked
 from beers_deploy.profiles.sensor import Instrument
-from tests.model.simulator.stages import formula_table, gaussian_pixel, lopsided_point, plain_sensor, with_response
+from tests.model.simulator.stages import (
+    formula_table,
+    gaussian_pixel,
+    lopsided_point,
+    plain_sensor,
+    with_response,
+)
 
 Pixels = NDArray[np.float64] | NDArray[np.float32]
 Cut = tuple[int, int, int, int]
@@ -47,12 +55,16 @@ OTHERS: dict[str, tuple[Instrument, float]] = {
     "antialias": (plain_sensor(), 2),
     "table": (with_response(plain_sensor(), formula_table(0.05, 0.1)), 4),
     "lopsided point": (
-        with_response(plain_sensor(), PointSpread(37, 48, 4, packed(unpacked(POINT)[::-1, ::-1].copy()))),
+        with_response(
+            plain_sensor(), PointSpread(37, 48, 4, packed(unpacked(POINT)[::-1, ::-1].copy()))
+        ),
         4,
     ),
 }
-"""A sensor that is nearly the same, and how many times larger its correction is. Smear of 1.5 px hardly changes the
-means of blocks."""
+"""A sensor that is nearly the same, and how many times larger its correction is.
+
+Smear of 1.5 px hardly changes the means of blocks.
+"""
 
 INSIDE = np.s_[40:-40, 40:-40]
 ROWS = 333
@@ -66,14 +78,21 @@ def step_for(name: str) -> Consistency:
 
 @cache
 def scene() -> NDArray[np.float32]:
-    """Texture whose spectrum falls as that of photographs does, with sharp stripes: 50 to 4000 DN, 480 DN rms."""
+    """Texture whose spectrum falls as that of photographs does, with sharp stripes: 50 to 4000 DN,
+    480 DN rms.
+    """
     generator = np.random.default_rng(0)
     frequency = np.hypot(np.fft.fftfreq(ROWS)[:, None], np.fft.rfftfreq(COLUMNS)[None])
-    spectrum = np.fft.rfft2(generator.normal(size=(ROWS, COLUMNS))) / np.maximum(frequency, 1 / ROWS) ** 1.2
+    spectrum = (
+        np.fft.rfft2(generator.normal(size=(ROWS, COLUMNS)))
+        / np.maximum(frequency, 1 / ROWS) ** 1.2
+    )
     texture = np.fft.irfft2(spectrum, (ROWS, COLUMNS))
     row, column = np.mgrid[:ROWS, :COLUMNS]
     stripes = (column * 0.8 + row * 0.6) % 90 < 30
-    return np.asarray(np.clip(texture / texture.std() * 400 + 1500 + 600 * stripes, 50, 4000), np.float32)
+    return np.asarray(
+        np.clip(texture / texture.std() * 400 + 1500 + 600 * stripes, 50, 4000), np.float32
+    )
 
 
 def blurred(restored: Pixels, sensor: Instrument) -> NDArray[np.float64]:
@@ -104,11 +123,17 @@ def corrected(step: Consistency, raw: Pixels, restored: Pixels) -> NDArray[np.fl
     height, width = restored.shape
     down = Placed(height, 0, 0, height)
     across = Placed(width, 0, 0, width)
-    return step.correction(raw.astype(np.float32), restored.astype(np.float32), down, across, (0, 0))
+    return step.correction(
+        raw.astype(np.float32), restored.astype(np.float32), down, across, (0, 0)
+    )
 
 
-def corrected_in_part(step: Consistency, raw: Pixels, restored: Pixels, cut: Cut) -> NDArray[np.float32]:
-    """Compute the correction of rows and columns of an image, from as many pixels around them as it must have."""
+def corrected_in_part(
+    step: Consistency, raw: Pixels, restored: Pixels, cut: Cut
+) -> NDArray[np.float32]:
+    """Compute the correction of rows and columns of an image, from as many pixels around them as it
+    must have.
+    """
     (height, width), (top, bottom, left, right) = restored.shape, cut
     first = max(top - REACH_PX, 0), max(left - REACH_PX, 0)
     first_raw = max(top - RAW_REACH_PX, 0), max(left - RAW_REACH_PX, 0)
@@ -116,7 +141,9 @@ def corrected_in_part(step: Consistency, raw: Pixels, restored: Pixels, cut: Cut
     part_raw = raw[first_raw[0] : bottom + RAW_REACH_PX, first_raw[1] : right + RAW_REACH_PX]
     down = Placed(height, first[0], top, bottom)
     across = Placed(width, first[1], left, right)
-    return step.correction(part_raw.astype(np.float32), part.astype(np.float32), down, across, first_raw)
+    return step.correction(
+        part_raw.astype(np.float32), part.astype(np.float32), down, across, first_raw
+    )
 
 
 def rms(pixels: Pixels) -> float:
@@ -159,7 +186,9 @@ def test_any_part_is_corrected_as_the_whole_image_is_bit_for_bit(
     assert np.isfinite(whole).all()
 
 
-@pytest.mark.parametrize(("reach_px", "changes", "value"), [(REACH_PX, 1, 1e6), (RAW_REACH_PX, 0, FULL_SCALE)])
+@pytest.mark.parametrize(
+    ("reach_px", "changes", "value"), [(REACH_PX, 1, 1e6), (RAW_REACH_PX, 0, FULL_SCALE)]
+)
 def test_no_pixel_farther_than_the_reach_matters_and_the_farthest_does(
     reach_px: int, changes: int, value: float
 ) -> None:
@@ -169,7 +198,10 @@ def test_no_pixel_farther_than_the_reach_matters_and_the_farthest_does(
     images = generator.random((2, 333, 301)) * 2000 + 1000
     before = corrected(step, *images)
     seen = []
-    for at in (*range(8), *range(150, 158)):  # how far a pixel reaches depends on where in its block it lies
+    for at in (
+        *range(8),
+        *range(150, 158),
+    ):  # how far a pixel reaches depends on where in its block it lies
         for further_px in (0, 1):
             changed = images.copy()
             changed[changes, at + reach_px + further_px, 150] = value
@@ -186,7 +218,8 @@ def test_no_pixel_farther_than_the_reach_matters_and_the_farthest_does(
     share=st.floats(0, 1),
 )
 def test_a_constant_image_stays(name: str, height: int, width: int, share: float) -> None:
-    """Of any size, from where noise is no longer clipped at zero up to full scale, but for rounding.
+    """Of any size, from where noise is no longer clipped at zero up to full scale, but for
+    rounding.
 
     Measured: 0.002 DN at most, 8 units in the last place of float32.
     """
@@ -220,13 +253,17 @@ ERRORS = {
     "slope": np.broadcast_to(np.linspace(-6, 6, COLUMNS), (ROWS, COLUMNS)),
     "gain": 0.01 * gaussian_filter(scene().astype(np.float64), 24),
 }
-"""Smooth errors of a restored image in DN: an offset, a slope, and a gain of the large structures."""
+"""Smooth errors of a restored image in DN: an offset, a slope, and a gain of
+the large structures.
+"""
 
 
 @pytest.mark.parametrize("name", ["formula", "two axes", "lopsided point"])
 @pytest.mark.parametrize("error", ERRORS)
 def test_smooth_errors_are_removed_in_noise_and_once_is_enough(name: str, error: str) -> None:
-    """The noise is the same with the error and without it, so the difference is the error's correction alone."""
+    """The noise is the same with the error and without it, so the difference is the error's
+    correction alone.
+    """
     sensor = SENSORS[name]
     step = step_for(name)
     wrong = ERRORS[error]
@@ -241,7 +278,9 @@ def test_smooth_errors_are_removed_in_noise_and_once_is_enough(name: str, error:
 
 
 def test_a_gain_error_of_all_detail_is_removed_from_the_mean() -> None:
-    """Detail smaller than two blocks keeps its error: 11 % of the error's rms on this scene (measured)."""
+    """Detail smaller than two blocks keeps its error: 11 % of the error's rms on this scene
+    (measured).
+    """
     sensor = SENSORS["formula"]
     step = step_for("formula")
     raw = noisy(blurred(scene(), sensor), sensor)
@@ -253,9 +292,11 @@ def test_a_gain_error_of_all_detail_is_removed_from_the_mean() -> None:
 
 @pytest.mark.parametrize("name", ["formula", "two axes", "lopsided point", "narrow point"])
 def test_little_noise_comes_back_on_even_ground(name: str) -> None:
-    """Measured: 0.083 sigma at first; a second application changes 0.028 to 0.037 sigma, a third 0.013 to 0.021.
+    """Measured: 0.083 sigma at first; a second application changes 0.028 to 0.037 sigma, a third
+    0.013 to 0.021.
 
-    Interpolation between means of blocks is no projection: it keeps half of what alternates from block to block.
+    Interpolation between means of blocks is no projection: it keeps half of what alternates from
+    block to block.
     """
     sensor = SENSORS[name]
     step = step_for(name)
@@ -271,7 +312,9 @@ def test_little_noise_comes_back_on_even_ground(name: str) -> None:
 
 
 def test_means_of_blocks_are_those_of_the_raw_image_within_the_noise() -> None:
-    """After the step the residual's block means lie within the noise of a block's mean, an eighth of a pixel's."""
+    """After the step the residual's block means lie within the noise of a block's mean, an eighth
+    of a pixel's.
+    """
     sensor = SENSORS["formula"]
     step = step_for("formula")
     raw = noisy(blurred(scene(), sensor), sensor)
@@ -309,7 +352,9 @@ def around_hole(px: int) -> NDArray[np.bool_]:
 
 
 def holed(name: str) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """The raw image, a restored one with smooth errors and a hole, and the correction without the hole."""
+    """The raw image, a restored one with smooth errors and a hole, and the correction without the
+    hole.
+    """
     sensor = SENSORS[name]
     raw = noisy(blurred(scene(), sensor), sensor)
     restored = scene() + np.float32(5)
@@ -331,7 +376,8 @@ def test_missing_pixels_change_nothing_farther_than_the_reach(name: str) -> None
 
 @pytest.mark.parametrize("name", ["formula", "lopsided point"])
 def test_around_a_hole_the_correction_is_nearly_the_one_without_it(name: str) -> None:
-    """Measured: 0.16 to 0.24 sigma rms off from 8 to 16 px, 0.06 to 0.08 from 24 to 40 px, 0.02 farther away.
+    """Measured: 0.16 to 0.24 sigma rms off from 8 to 16 px, 0.06 to 0.08 from 24 to 40 px, 0.02
+    farther away.
 
     Nearer than 8 px most pixels have no block whose residual is known, and their correction is 0.
     """
@@ -339,7 +385,12 @@ def test_around_a_hole_the_correction_is_nearly_the_one_without_it(name: str) ->
     change = corrected(step_for(name), raw, restored)
     sigma = sigma_dn(SENSORS[name], 1500)
     assert np.isfinite(change).all()
-    for nearer_px, farther_px, most in ((8, 16, 0.3), (16, 24, 0.2), (24, 40, 0.1), (40, REACH_PX, 0.03)):
+    for nearer_px, farther_px, most in (
+        (8, 16, 0.3),
+        (16, 24, 0.2),
+        (24, 40, 0.1),
+        (40, REACH_PX, 0.03),
+    ):
         ring = around_hole(farther_px) & ~around_hole(nearer_px)
         assert rms((change - whole)[ring]) < most * sigma
     assert np.abs(change).max() < np.abs(whole).max() + sigma
@@ -358,7 +409,10 @@ def test_raw_values_of_missing_pixels_do_not_matter(value: float) -> None:
 
 @pytest.mark.parametrize("name", ["formula", "lopsided point"])
 def test_around_a_clipped_area_nothing_is_brightened(name: str) -> None:
-    """A roof of 5200 DN, clipped: its residual is no noise. The control counts clipped pixels like others."""
+    """A roof of 5200 DN, clipped: its residual is no noise.
+
+    The control counts clipped pixels like others.
+    """
     sensor = SENSORS[name]
     step = step_for(name)
     bright = scene().copy()
@@ -380,7 +434,10 @@ def test_around_a_clipped_area_nothing_is_brightened(name: str) -> None:
 @pytest.mark.parametrize("offset_dn", [0.0, 2.0, 100.0])
 @pytest.mark.parametrize("sigmas", [0.3, 1.0, 3.0])
 def test_noise_clipped_at_zero_keeps_the_mean_of_the_dark(offset_dn: float, sigmas: float) -> None:
-    """The raw mean is up to 0.65 DN of 0.74 too bright. The step removes all but 0.04 DN (measured)."""
+    """The raw mean is up to 0.65 DN of 0.74 too bright.
+
+    The step removes all but 0.04 DN (measured).
+    """
     sensor = plain_sensor(**({"offset": Offset(offset_dn)} if offset_dn else {}))
     dark_dn = float(np.hypot(sensor.noise_sigma(0) * sensor.gain_dn_per_radiance, np.sqrt(1 / 12)))
     signal_dn = sigmas * dark_dn + offset_dn

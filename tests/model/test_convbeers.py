@@ -8,7 +8,9 @@ from beers_deploy.model.variants import VARIANTS, Variant
 from tests.model.networks import behind_a_bank, plain, radius_px, told_of
 
 
-@pytest.mark.parametrize(("name", "parameters"), [("convbeers", 1_219_841), ("convbeers-s", 157_825)])
+@pytest.mark.parametrize(
+    ("name", "parameters"), [("convbeers", 1_219_841), ("convbeers-s", 157_825)]
+)
 def test_the_parameters_are_those_of_the_paper(name: str, parameters: int) -> None:
     assert sum(p.numel() for p in ConvBEERS(VARIANTS[name]).parameters()) == parameters
 
@@ -19,7 +21,9 @@ def test_the_radius_is_how_far_a_gradient_reaches(blocks: int, scale: int) -> No
     variant = Variant(blocks=blocks, features=4, scale=scale)
     side = 4 * scale * radius_px(variant) + scale
     middle = 2 * scale * radius_px(variant)
-    image = torch.rand(1, 1, side, side, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    image = torch.rand(
+        1, 1, side, side, generator=torch.Generator().manual_seed(1)
+    ).requires_grad_()
     network = plain(variant)
     for module in network.modules():
         if isinstance(module, torch.nn.Conv2d) and module.bias is not None:
@@ -65,14 +69,21 @@ def test_any_size_keeps_its_shape(scale: int) -> None:
 
 
 def test_at_half_resolution_a_shift_by_a_place_shifts_the_result_and_a_pixel_does_not() -> None:
-    """The four pixels of a place are channels of their own: the lattice, by which tiles are cut, is 2."""
+    """The four pixels of a place are channels of their own: the lattice, by which tiles are cut, is
+    2.
+    """
     network = plain(Variant(1, 4, 2))
     side = 32
     image = torch.rand(1, 1, side, side, generator=torch.Generator().manual_seed(1))
     inner = slice(12, -12)
     whole = network(image)
     apart = [
-        float((network(image.roll(step, -1)).roll(-step, -1) - whole)[..., inner, inner].detach().abs().max())
+        float(
+            (network(image.roll(step, -1)).roll(-step, -1) - whole)[..., inner, inner]
+            .detach()
+            .abs()
+            .max()
+        )
         for step in (2, 1)
     ]
     assert apart[0] < 1e-6
@@ -88,7 +99,10 @@ def test_each_image_of_a_batch_meets_its_own_sensor() -> None:
     with torch.inference_mode():
         together = network(images, told_of(VECTORS))
         for number in range(3):
-            alone, other = (told(network, VECTORS[k])(images[number : number + 1])[0] for k in (number, number - 1))
+            alone, other = (
+                told(network, VECTORS[k])(images[number : number + 1])[0]
+                for k in (number, number - 1)
+            )
             assert float((together[number] - alone).abs().max()) <= 1e-6
             assert float((together[number] - other).abs().max()) > 1e-3
 
@@ -98,7 +112,9 @@ def test_a_body_that_adds_nothing_leaves_the_analytic_restoration(scale: int) ->
     network = behind_a_bank(Variant(2, 5, scale), 0.3)
     image = 0.4 + 0.002 * torch.rand(1, 1, 26, 22, generator=torch.Generator().manual_seed(0))
     torch.nn.init.zeros_(network.tail.weight)
-    kernel = torch.from_numpy(bank_of_vector(tuple(VECTORS[1].tolist())).analytic).float()[None, None]
+    kernel = torch.from_numpy(bank_of_vector(tuple(VECTORS[1].tolist())).analytic).float()[
+        None, None
+    ]
     wanted = image + conv2d(pad(image, [3] * 4, mode="reflect"), kernel)
     with torch.inference_mode():
         torch.testing.assert_close(network(image, told_of(VECTORS[1:2])), wanted, rtol=0, atol=1e-6)

@@ -1,4 +1,6 @@
-"""Curves of the MTF that training draws: such as an instrument may have, of the contrast at Nyquist asked for."""
+"""Curves of the MTF that training draws: such as an instrument may have, of the contrast at Nyquist
+asked for.
+"""
 
 from dataclasses import replace
 
@@ -33,7 +35,9 @@ def test_a_drawn_curve_has_the_contrast_asked_for_and_is_one_that_optics_can_hav
 
 @pytest.mark.parametrize("obscuration", OBSCURATIONS)
 def test_a_pupil_has_its_closed_form(obscuration: float) -> None:
-    """Of a clear pupil: 2 / pi (arccos s - s sqrt(1 - s^2)); an obscuration lowers the middle frequencies."""
+    """Of a clear pupil: 2 / pi (arccos s - s sqrt(1 - s^2)); an obscuration lowers the middle
+    frequencies.
+    """
     found = pupil_contrast(0.2, obscuration)
     assert found[-1] == pytest.approx(0.2, abs=1e-3)
     assert (np.diff(found) <= 1e-9).all()
@@ -44,7 +48,9 @@ def test_a_pupil_has_its_closed_form(obscuration: float) -> None:
     shares = np.linspace(0, 1, 4001)
     closed = 2 / np.pi * (np.arccos(shares) - shares * np.sqrt(1 - shares**2))
     cutoff = float(np.interp(0.2, closed[::-1], shares[::-1]))
-    np.testing.assert_allclose(found, np.interp(FREQUENCIES / 0.5 * cutoff, shares, closed), atol=0.005)
+    np.testing.assert_allclose(
+        found, np.interp(FREQUENCIES / 0.5 * cutoff, shares, closed), atol=0.005
+    )
 
 
 def of_curve(contrast: np.ndarray) -> Instrument:
@@ -55,7 +61,9 @@ def of_curve(contrast: np.ndarray) -> Instrument:
 
 
 @given(CONTRAST, st.floats(0.4, 1), st.integers(0, 2**20))
-def test_no_sensor_that_is_drawn_departs_from_what_was_trained(contrast: float, ratio: float, seed: int) -> None:
+def test_no_sensor_that_is_drawn_departs_from_what_was_trained(
+    contrast: float, ratio: float, seed: int
+) -> None:
     table = draw_table(contrast, ratio * contrast, np.random.default_rng(seed))
     across, along = table.at_nyquist
     sensor = replace(NOMINAL, response=table, mtf_nyquist=across, mtf_nyquist_along=along)
@@ -67,7 +75,12 @@ def test_no_sensor_that_is_drawn_departs_from_what_was_trained(contrast: float, 
 def test_curves_that_no_training_drew_are_said() -> None:
     formula = (0.07 / np.sinc(0.5)) ** (FREQUENCIES / 0.5) * np.sinc(FREQUENCIES)
     hill = np.exp(-(((FREQUENCIES - 0.25) / 0.1) ** 2))
-    for bend, cut, fitted in ((-0.1, True, False), (0.1, True, False), (-0.45, True, True), (0.02, False, False)):
+    for bend, cut, fitted in (
+        (-0.1, True, False),
+        (0.1, True, False),
+        (-0.45, True, True),
+        (0.02, False, False),
+    ):
         sensor = of_curve(formula * (1 + bend * hill))
         assert [departure(sensor, "cut") != "", departure(sensor, "fitted") != ""] == [cut, fitted]
     said = departure(of_curve(formula * (1 - 0.45 * hill)), "fitted")
@@ -79,5 +92,7 @@ def test_a_family_draws_other_curves_in_their_share_and_none_is_outside_the_rang
     family = SensorFamily(load_sensor("pleiades-degraded").nominal(), other_curves=0.5)
     generator = np.random.default_rng(0)
     drawn = [family.draw(generator) for _ in range(400)]
-    assert np.mean([sensor.response is not None for sensor in drawn]) == pytest.approx(0.5, abs=0.08)
+    assert np.mean([sensor.response is not None for sensor in drawn]) == pytest.approx(
+        0.5, abs=0.08
+    )
     assert all(sensor_vector(sensor).outside == () for sensor in drawn)

@@ -31,8 +31,12 @@ def noisier(times: float) -> Instrument:
 
 
 def excess_of(sensor: Instrument, factor: int) -> float:
-    """How far the noise lies above what training saw, at so many times the gain: 1 is at the end of the range."""
-    values = sensor_values(replace(sensor, gain_dn_per_radiance=sensor.gain_dn_per_radiance * factor))
+    """How far the noise lies above what training saw, at so many times the gain: 1 is at the end of
+    the range.
+    """
+    values = sensor_values(
+        replace(sensor, gain_dn_per_radiance=sensor.gain_dn_per_radiance * factor)
+    )
     return max(values[key] / RANGES[key][1] for key in ("sigma_dark", "sigma_bright"))
 
 
@@ -55,7 +59,8 @@ def test_a_noisier_sensor_has_no_higher_factor(times: float, more: float) -> Non
 
 
 @pytest.mark.parametrize(
-    ("name", "factors"), [("pleiades-degraded", (1, 4, 8)), ("dior-medium", (1, 2, 4)), ("dior-high", (1,))]
+    ("name", "factors"),
+    [("pleiades-degraded", (1, 4, 8)), ("dior-medium", (1, 2, 4)), ("dior-high", (1,))],
 )
 def test_the_factors_of_shipped_sensors(name: str, factors: tuple[int, ...]) -> None:
     assert factors_for(load_sensor(name).nominal()) == factors
@@ -65,7 +70,11 @@ def test_the_factors_of_shipped_sensors(name: str, factors: tuple[int, ...]) -> 
 def test_a_brightened_sensor_has_more_gain_and_is_otherwise_the_same(factor: int) -> None:
     sensor = load_sensor("pleiades-variable")
     other = brightened(sensor, factor)
-    changed = {each.name for each in fields(sensor) if getattr(sensor, each.name) != getattr(other, each.name)}
+    changed = {
+        each.name
+        for each in fields(sensor)
+        if getattr(sensor, each.name) != getattr(other, each.name)
+    }
     assert changed == {"gain_dn_per_radiance"}
     assert other.gain_dn_per_radiance.low == factor * sensor.gain_dn_per_radiance.low
     assert other.nominal().mtf_axes == sensor.nominal().mtf_axes
@@ -96,7 +105,11 @@ def test_a_pixel_takes_the_highest_factor_that_leaves_headroom(
     for row, column in np.random.default_rng(seed).integers(0, (height, width), (20, 2)):
         around = image[max(row - radius_px, 0) : row + radius_px + 1, max(column - radius_px, 0) :]
         brightest = float(around[:, : min(column, radius_px) + radius_px + 1].max())
-        fitting = [each for each in factors if (brightest - offset) * each + offset <= HEADROOM * FULL_SCALE]
+        fitting = [
+            each
+            for each in factors
+            if (brightest - offset) * each + offset <= HEADROOM * FULL_SCALE
+        ]
         assert chosen[row, column] == max(fitting, default=1)
 
 
@@ -134,12 +147,16 @@ def test_a_brighter_image_takes_no_higher_factor(
 ) -> None:
     image = image_of(seed, height, width)
     brighter = image + np.float32(more) * (np.arange(width) % 3 == 0).astype(np.float32)
-    before, after = (choose_factors(each, (1, 4, 8), radius_px, FULL_SCALE, offset) for each in (image, brighter))
+    before, after = (
+        choose_factors(each, (1, 4, 8), radius_px, FULL_SCALE, offset) for each in (image, brighter)
+    )
     assert (after <= before).all()
 
 
 def test_the_offset_is_no_light() -> None:
-    """A factor multiplies what lies above the offset: an image and its offset copy take the same factors."""
+    """A factor multiplies what lies above the offset: an image and its offset copy take the same
+    factors.
+    """
     image = np.arange(0, 1200, dtype=np.float32)[None]
     plain = choose_factors(image, (1, 4, 8), 0, FULL_SCALE, 0.0)
     assert np.unique(plain).tolist() == [1, 4, 8]

@@ -23,19 +23,25 @@ def drawn(seed: int) -> Instrument:
 
 
 def test_the_values_of_a_sensor_known_by_hand() -> None:
-    values = sensor_values(NOMINAL)  # SNR 50 at 25 and 110 at 100 W/m2/sr/um, 400 of them full scale
+    values = sensor_values(
+        NOMINAL
+    )  # SNR 50 at 25 and 110 at 100 W/m2/sr/um, 400 of them full scale
     assert values["mtf_across"] == values["mtf_along"] == 0.07
     assert values["sigma_dark"] == pytest.approx(25 / 50 / 400, rel=2e-3)
     assert values["sigma_bright"] == pytest.approx(100 / 110 / 400, rel=1e-3)
     alpha, beta = noise_from_snr(25, 50, 100, 110)
-    assert values == sensor_values(Instrument(0.07, alpha, beta, NOMINAL.gain_dn_per_radiance, 12, {}, 0.07))
+    assert values == sensor_values(
+        Instrument(0.07, alpha, beta, NOMINAL.gain_dn_per_radiance, 12, {}, 0.07)
+    )
 
 
 def test_the_ends_of_the_ranges_are_minus_one_and_one() -> None:
     ends = [vector_tensor(replace(NOMINAL, mtf_nyquist=mtf)) for mtf in RANGES["mtf_across"]]
     assert [vector[:2].tolist() for vector in ends] == [[-1.0, -1.0], [1.0, 1.0]]
     middle = (RANGES["mtf_across"][0] * RANGES["mtf_across"][1]) ** 0.5
-    assert float(vector_tensor(replace(NOMINAL, mtf_nyquist=middle))[0]) == pytest.approx(0, abs=1e-6)
+    assert float(vector_tensor(replace(NOMINAL, mtf_nyquist=middle))[0]) == pytest.approx(
+        0, abs=1e-6
+    )
 
 
 @pytest.mark.parametrize(
@@ -55,7 +61,9 @@ def test_what_lies_outside_is_moved_to_the_end_and_said(sensor: Instrument, name
     assert "outside" in said[0]
 
 
-@pytest.mark.parametrize(("along", "said"), [(0.027, True), (0.029, False), (0.15, False), (0.07, False)])
+@pytest.mark.parametrize(
+    ("along", "said"), [(0.027, True), (0.029, False), (0.15, False), (0.07, False)]
+)
 def test_axes_further_apart_than_any_in_training_are_said(along: float, said: bool) -> None:
     for sensor in (
         replace(NOMINAL, mtf_nyquist_along=along),
@@ -77,7 +85,9 @@ def test_no_sensor_that_is_trained_on_is_clamped_or_impossible(seed: int) -> Non
 
 
 def test_no_corner_of_the_ranges_is_starved() -> None:
-    """Blurred and noisy together, and each mixture: more than one sensor in a hundred for each of eight corners."""
+    """Blurred and noisy together, and each mixture: more than one sensor in a hundred for each of
+    eight corners.
+    """
     generator = np.random.default_rng(0)
     vectors = torch.stack([vector_tensor(FAMILY.draw(generator)) for _ in range(3000)])
     low = vectors[:, [0, 1, 3]] < -1 / 3
@@ -106,7 +116,9 @@ def test_the_vector_speaks_of_full_scale_whatever_the_gain(gain: float) -> None:
 
 
 def test_few_bits_are_noise() -> None:
-    coarse = replace(NOMINAL, bits=7, gain_dn_per_radiance=NOMINAL.gain_dn_per_radiance * 127 / 4095)
+    coarse = replace(
+        NOMINAL, bits=7, gain_dn_per_radiance=NOMINAL.gain_dn_per_radiance * 127 / 4095
+    )
     assert sensor_values(coarse)["sigma_dark"] > 1.5 * sensor_values(NOMINAL)["sigma_dark"]
 
 

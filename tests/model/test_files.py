@@ -26,7 +26,9 @@ def test_text_is_the_same_bytes_on_every_system(text: str, tmp_path: Path) -> No
     ],
 )
 @pytest.mark.skipif(os.name != "posix", reason="the words are those of POSIX")
-def test_where_no_folder_can_be_made_is_said_before_any_is(below: str, reason: str, tmp_path: Path) -> None:
+def test_where_no_folder_can_be_made_is_said_before_any_is(
+    below: str, reason: str, tmp_path: Path
+) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "link").symlink_to("nothing")
     path = tmp_path / below
@@ -37,7 +39,9 @@ def test_where_no_folder_can_be_made_is_said_before_any_is(below: str, reason: s
 
 
 @pytest.mark.parametrize("below", ["out", "new/out", "new/below/out"])
-def test_what_is_found_writable_can_be_written_and_the_asking_leaves_nothing(below: str, tmp_path: Path) -> None:
+def test_what_is_found_writable_can_be_written_and_the_asking_leaves_nothing(
+    below: str, tmp_path: Path
+) -> None:
     require_writable(tmp_path / below)
     assert list(tmp_path.iterdir()) == []
     write_text(tmp_path / below, "text")
@@ -55,7 +59,9 @@ def test_a_folder_is_no_file_to_write_and_a_relative_path_lies_where_the_run_is(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="an administrator may write anywhere")
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() == 0, reason="an administrator may write anywhere"
+)
 def test_a_folder_that_is_not_ours_to_write_to_is_refused(tmp_path: Path) -> None:
     (tmp_path / "theirs").mkdir(mode=0o500)
     with pytest.raises(MachineError, match="Permission denied"):

@@ -1,4 +1,6 @@
-"""Files of networks in other formats are named with what to do; no ONNX file is taken for one of them."""
+"""Files of networks in other formats are named with what to do; no ONNX file is taken for one of
+them.
+"""
 
 import io
 from collections.abc import Callable
@@ -40,7 +42,10 @@ OTHERS: dict[str, tuple[Write, str]] = {
     "an array of NumPy": (lambda path: path.write_bytes(stored(np.save)), "as ONNX"),
     "Keras": (lambda path: path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(64)), "tf2onnx"),
     "TensorFlow Lite": (lambda path: path.write_bytes(b"\x1c\0\0\0TFL3" + bytes(64)), "--tflite"),
-    "onnxruntime's own format": (lambda path: path.write_bytes(b"\x1c\0\0\0ORTM" + bytes(64)), "made from"),
+    "onnxruntime's own format": (
+        lambda path: path.write_bytes(b"\x1c\0\0\0ORTM" + bytes(64)),
+        "made from",
+    ),
     "OpenVINO": (lambda path: path.write_text('<?xml version="1.0"?><net name="a"/>'), "made from"),
 }
 
@@ -57,8 +62,12 @@ def test_another_format_is_named_with_its_remedy(name: str, suffix: str, tmp_pat
     assert "parsing" not in str(caught.value)
 
 
-@pytest.mark.parametrize("words", [("check",), ("quantize", "--out", "out.onnx"), ("export", "--out", "o.onnx")])
-def test_commands_say_what_to_do_with_a_file_of_pytorch(words: tuple[str, ...], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "words", [("check",), ("quantize", "--out", "out.onnx"), ("export", "--out", "o.onnx")]
+)
+def test_commands_say_what_to_do_with_a_file_of_pytorch(
+    words: tuple[str, ...], tmp_path: Path
+) -> None:
     path = tmp_path / "network.pth"
     torch.save(STATE, path)
     command, *options = words

@@ -23,11 +23,21 @@ def test_every_kind_of_file_reads_as_stored(tmp_path: Path) -> None:
     colour = rng.integers(0, 256, (13, 21, 3)).astype(np.uint8)
     tifffile.imwrite(tmp_path / "grey.tif", grey)
     tifffile.imwrite(tmp_path / "tiled.tif", grey, tile=(16, 16), compression="zlib")
-    tifffile.imwrite(tmp_path / "planar.tif", np.moveaxis(colour, 2, 0), photometric="rgb", planarconfig="separate")
+    tifffile.imwrite(
+        tmp_path / "planar.tif",
+        np.moveaxis(colour, 2, 0),
+        photometric="rgb",
+        planarconfig="separate",
+    )
     tifffile.imwrite(tmp_path / "float.tif", grey.astype(np.float32))
     Image.fromarray(colour).save(tmp_path / "colour.png")
     Image.fromarray(grey).save(tmp_path / "grey16.png")
-    for name, expected in (("grey.tif", grey), ("tiled.tif", grey), ("grey16.png", grey), ("float.tif", grey)):
+    for name, expected in (
+        ("grey.tif", grey),
+        ("tiled.tif", grey),
+        ("grey16.png", grey),
+        ("float.tif", grey),
+    ):
         np.testing.assert_array_equal(read_pixels(tmp_path / name), expected)
     for name in ("planar.tif", "colour.png"):
         np.testing.assert_array_equal(read_pixels(tmp_path / name), colour)
@@ -48,17 +58,25 @@ def test_scenes_become_radiance(tmp_path: Path) -> None:
     ends = np.array([[[0, 0, 0], [255, 255, 255], [188, 188, 188]]], np.uint8).repeat(4, axis=0)
     Image.fromarray(ends).save(tmp_path / "ends.png")
     radiance = read_scene(tmp_path / "ends.png", SENSOR).radiance[0]
-    np.testing.assert_allclose(radiance[:2], np.array([0, 400], np.float32), rtol=1.3e-6, atol=1e-5, strict=True)
+    np.testing.assert_allclose(
+        radiance[:2], np.array([0, 400], np.float32), rtol=1.3e-6, atol=1e-5, strict=True
+    )
     assert float(radiance[2]) == pytest.approx(200, rel=0.02)  # 188 is half the light in sRGB
     tifffile.imwrite(tmp_path / "dn.tif", np.full((5, 7), 2048, np.uint16))
-    assert float(read_scene(tmp_path / "dn.tif", SENSOR).radiance[0, 0]) == pytest.approx(2048 / 10.2375)
+    assert float(read_scene(tmp_path / "dn.tif", SENSOR).radiance[0, 0]) == pytest.approx(
+        2048 / 10.2375
+    )
     tifffile.imwrite(tmp_path / "radiance.tif", np.full((5, 7), 33.5, np.float32))
     assert float(read_scene(tmp_path / "radiance.tif", SENSOR).radiance[0, 0]) == 33.5
 
 
 def test_photographs_of_one_or_three_bands_are_linearised(tmp_path: Path) -> None:
     grey = np.full((16, 24), 188, np.uint8)
-    for name, pixels in (("grey.png", grey), ("grey.jpg", grey), ("colour.jpg", np.dstack([grey] * 3))):
+    for name, pixels in (
+        ("grey.png", grey),
+        ("grey.jpg", grey),
+        ("colour.jpg", np.dstack([grey] * 3)),
+    ):
         Image.fromarray(pixels).save(tmp_path / name)
         radiance = read_scene(tmp_path / name, SENSOR).radiance
         assert radiance.shape == (16, 24)
@@ -67,7 +85,9 @@ def test_photographs_of_one_or_three_bands_are_linearised(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("pixels", [np.zeros((5, 7, 3), np.uint16), np.zeros((5, 7), np.int16)])
 def test_pixels_of_an_unclear_meaning_are_refused(pixels: np.ndarray, tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "odd.tif", pixels, photometric="rgb" if pixels.ndim == 3 else "minisblack")
+    tifffile.imwrite(
+        tmp_path / "odd.tif", pixels, photometric="rgb" if pixels.ndim == 3 else "minisblack"
+    )
     with pytest.raises(ImageError, match=rf"odd\.tif.*{pixels.dtype}"):
         read_scene(tmp_path / "odd.tif", SENSOR)
 
@@ -77,11 +97,15 @@ def test_bands_weigh_evenly(tmp_path: Path) -> None:
         pixels = np.zeros((4, 4, 3), np.uint8)
         pixels[..., band] = 255
         Image.fromarray(pixels).save(tmp_path / "one.png")
-        assert float(read_scene(tmp_path / "one.png", SENSOR).radiance[0, 0]) == pytest.approx(400 / 3, rel=1e-6)
+        assert float(read_scene(tmp_path / "one.png", SENSOR).radiance[0, 0]) == pytest.approx(
+            400 / 3, rel=1e-6
+        )
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".png", ".jpg"])
-@pytest.mark.parametrize("content", [b"", b"text", b"II*\x00\xff\xff\xff\xff", b"\x89PNG\r\n\x1a\n\x00\x00"])
+@pytest.mark.parametrize(
+    "content", [b"", b"text", b"II*\x00\xff\xff\xff\xff", b"\x89PNG\r\n\x1a\n\x00\x00"]
+)
 def test_damaged_files_are_one_sentence(suffix: str, content: bytes, tmp_path: Path) -> None:
     path = tmp_path / f"bad{suffix}"
     path.write_bytes(content)

@@ -1,4 +1,6 @@
-"""The processor is asked by computing, and its answers hold for larger computations; its system tells its name."""
+"""The processor is asked by computing, and its answers hold for larger computations; its system
+tells its name.
+"""
 
 import platform
 import shutil
@@ -16,7 +18,9 @@ from beers_deploy.model.processor import decided, int8_adds_exactly, processor_n
 
 
 def convolved(image: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray:
-    """A quantised 3 x 3 convolution (1, C, H, W) uint8 by (O, C, 3, 3) int8, as onnxruntime's kernels compute it."""
+    """A quantised 3 x 3 convolution (1, C, H, W) uint8 by (O, C, 3, 3) int8, as onnxruntime's
+    kernels compute it.
+    """
     constants = {
         "one": np.float32(1),
         "zero": np.uint8(0),
@@ -25,7 +29,9 @@ def convolved(image: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray
         "scale": np.float32(scale),
     }
     feeds = ["image", "one", "zero", "weight", "one", "no_offset", "scale", "zero"]
-    ends = [helper.make_tensor_value_info(name, TensorProto.UINT8, None) for name in ("image", "result")]
+    ends = [
+        helper.make_tensor_value_info(name, TensorProto.UINT8, None) for name in ("image", "result")
+    ]
     held = [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()]
     node = helper.make_node("QLinearConv", feeds, ["result"], pads=[1, 1, 1, 1])
     graph = helper.make_graph([node], "one", ends[:1], ends[1:], held)
@@ -35,7 +41,9 @@ def convolved(image: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray
 
 
 def test_the_answer_holds_for_convolutions() -> None:
-    """The largest products: their sum at the middle of an image, in units of a two hundredth of it."""
+    """The largest products: their sum at the middle of an image, in units of a
+    two hundredth of it.
+    """
     image = np.full((1, 32, 9, 11), 255, np.uint8)
     weight = np.full((32, 32, 3, 3), 127, np.int8)
     middle = convolved(image, weight, 32 * 9 * 255 * 127 / 200)[0, :, 1:-1, 1:-1]
@@ -50,7 +58,9 @@ def test_what_was_asked_is_told_in_words() -> None:
 NOWHERE = Path("no such file")
 
 
-def named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, cpuinfo: str, comm: str = "python3\n") -> str | None:
+def named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, cpuinfo: str, comm: str = "python3\n"
+) -> str | None:
     (tmp_path / "comm").write_text(comm, encoding="utf-8")
     (tmp_path / "cpuinfo").write_text(cpuinfo, encoding="utf-8")
     monkeypatch.setattr(processor, "COMM", tmp_path / "comm")
@@ -59,7 +69,10 @@ def named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, cpuinfo: str, comm: s
     return processor_name.__wrapped__()
 
 
-X86 = "".join(f"processor\t: {core}\nmodel name\t: Some  CPU @ 2.0GHz\nflags\t\t: a b\n\n" for core in range(3))
+X86 = "".join(
+    f"processor\t: {core}\nmodel name\t: Some  CPU @ 2.0GHz\nflags\t\t: a b\n\n"
+    for core in range(3)
+)
 CORE = "processor\t: {}\nCPU implementer\t: 0x41\nCPU architecture: 8\nCPU part\t: {}\n\n"
 ARM = "".join(CORE.format(core, part) for core, part in enumerate(["0xd03", "0xd03", "0xd09"]))
 

@@ -3,7 +3,9 @@ import pytest
 from beers_deploy.model.progress import Step, progress, reporting, steps
 
 
-def test_progress_is_a_call_or_a_bar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_is_a_call_or_a_bar(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     heard = list[Step]()
     with reporting(heard.append), progress("making") as log:
         log("a part")

@@ -21,14 +21,18 @@ SEVERE = load_sensor("dior-high")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two frames of one site and one of another, two patches each, of a sensor that is not the default one."""
+    """Two frames of one site and one of another, two patches each, of a sensor that is not the
+    default one.
+    """
     here = tmp_path_factory.mktemp("pairs")
     scenes = list[Path]()
     for name in ("forest_1.png", "forest_2.png", "port_1.png"):
         pixels = np.random.default_rng(len(scenes)).integers(0, 255, (170, 192), np.uint8)
         Image.fromarray(pixels).save(here / name)
         scenes.append(here / name)
-    recipe = DatasetRecipe(tuple(scenes), SEVERE, reference_for(SEVERE), oversampling=2, patch_px=15)
+    recipe = DatasetRecipe(
+        tuple(scenes), SEVERE, reference_for(SEVERE), oversampling=2, patch_px=15
+    )
     write_dataset(recipe, here / "out", 1, False, lambda _: None)
     return here / "out"
 
@@ -41,8 +45,12 @@ def test_the_sensor_that_made_the_pairs_is_known(folder: Path) -> None:
 
 def test_a_sensor_that_contradicts_the_recipe_is_refused(folder: Path) -> None:
     recipe = read_pairs_recipe(folder)
-    assert profiles_for("dior-high", "pleiades-reference", recipe, pytest.fail)[0].name == "dior-high"
-    with pytest.raises(OptionError, match=r"sensor: expected the sensor that made the pairs, dior-high"):
+    assert (
+        profiles_for("dior-high", "pleiades-reference", recipe, pytest.fail)[0].name == "dior-high"
+    )
+    with pytest.raises(
+        OptionError, match=r"sensor: expected the sensor that made the pairs, dior-high"
+    ):
         profiles_for("pleiades-degraded", None, recipe, pytest.fail)
     with pytest.raises(OptionError, match="reference"):
         profiles_for(None, "dior-medium", recipe, pytest.fail)
@@ -60,7 +68,9 @@ def test_without_a_recipe_the_sensor_is_the_one_named(tmp_path: Path) -> None:
     assert profiles_for(None, None, None, pytest.fail)[0].name == "pleiades-degraded"
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"scenes": 3}', '{"scenes": [{}], "degraded": 1}'])
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"scenes": 3}', '{"scenes": [{}], "degraded": 1}']
+)
 def test_a_recipe_of_another_kind_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "recipe.json").write_text(text)
     with pytest.raises((OptionError, ProfileError), match=r"recipe\.json"):

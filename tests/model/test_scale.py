@@ -11,7 +11,9 @@ from beers_deploy.profiles.sensor import MAX_DN
 
 
 def settled(kind: str, *largest: float, asked: float | None = None) -> float:
-    return settled_scale("x.tif", np.dtype(kind), (Extent(each, whole=True) for each in largest), asked)
+    return settled_scale(
+        "x.tif", np.dtype(kind), (Extent(each, whole=True) for each in largest), asked
+    )
 
 
 @pytest.mark.parametrize("kind", ["uint16", "int16", "uint32", "int32"])
@@ -25,7 +27,9 @@ def test_floats_beyond_any_share_are_digital_numbers(kind: str) -> None:
     assert settled(kind, 0.0, 1.0, 2.5) == MAX_DN
     assert settled(kind, 4095) == MAX_DN
     for brightest in (1e-6, 0.5, 1.0, UNIT_MAX):
-        with pytest.raises(ImageError, match=r"x\.tif: .*more than 8 bits, got floats of at most .*full_scale"):
+        with pytest.raises(
+            ImageError, match=r"x\.tif: .*more than 8 bits, got floats of at most .*full_scale"
+        ):
             settled(kind, 0.0, brightest)
 
 
@@ -39,7 +43,9 @@ def test_black_says_nothing() -> None:
     assert settled("float32") == settled("float32", 0.0, 0.0) == MAX_DN
 
 
-@pytest.mark.parametrize(("kind", "asked"), [("uint8", 255), ("float32", 0.5), ("float32", 4095), ("uint16", 1023)])
+@pytest.mark.parametrize(
+    ("kind", "asked"), [("uint8", 255), ("float32", 0.5), ("float32", 4095), ("uint16", 1023)]
+)
 def test_what_was_asked_for_settles_it(kind: str, asked: float) -> None:
     assert settled(kind, 0.7, asked=asked) == asked
 
@@ -48,7 +54,8 @@ IMPOSSIBLE = (0, -1, float("nan"), float("inf"))
 
 
 @pytest.mark.parametrize(
-    ("kind", "words", "asked"), [("uint16", "whole number", (*IMPOSSIBLE, 0.5)), ("float32", "above 0", IMPOSSIBLE)]
+    ("kind", "words", "asked"),
+    [("uint16", "whole number", (*IMPOSSIBLE, 0.5)), ("float32", "above 0", IMPOSSIBLE)],
 )
 def test_no_image_has_such_a_full_scale(kind: str, words: str, asked: tuple[float, ...]) -> None:
     for full_scale in asked:
@@ -72,7 +79,12 @@ def test_no_more_is_looked_at_than_decides() -> None:
 
 def test_floats_that_may_be_radiances_leave_it_open() -> None:
     digital = np.random.default_rng(0).integers(0, 1700, (40, 40)).astype(np.float32)
-    for pixels, open_ in ((digital, False), (digital / 10.2375, True), (digital * 2.1, False), (digital / 4.0, True)):
+    for pixels, open_ in (
+        (digital, False),
+        (digital / 10.2375, True),
+        (digital * 2.1, False),
+        (digital / 4.0, True),
+    ):
         if open_:
             with pytest.raises(ImageError, match=r"radiances.*full_scale"):
                 settled_scale("x", pixels.dtype, [extent_of(pixels)])

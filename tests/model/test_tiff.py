@@ -22,7 +22,15 @@ GREY = np.random.default_rng(0).integers(0, 250, (16, 16)).astype(np.uint8)
 
 def tiff(path: Path, data: bytes, **changed: int) -> Path:
     """A TIFF of one strip of 16 x 16 bytes, with entries of the names changed or added."""
-    names = {"bits": 258, "compression": 259, "rows": 278, "size": 279, "samples": 277, "height": 257, "width": 256}
+    names = {
+        "bits": 258,
+        "compression": 259,
+        "rows": 278,
+        "size": 279,
+        "samples": 277,
+        "height": 257,
+        "width": 256,
+    }
     names |= {"tile_width": 322, "tile_height": 323}
     entries = {256: 16, 257: 16, 258: 8, 259: 1, 262: 1, 273: 0, 277: 1, 278: 16, 279: len(data)}
     entries |= {names[name]: value for name, value in changed.items()}
@@ -32,7 +40,9 @@ def tiff(path: Path, data: bytes, **changed: int) -> Path:
         del entries[273], entries[278]
         entries[place] = 0
     entries[place] = 8 + 2 + 12 * len(entries) + 4
-    listed = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in sorted(entries.items()))
+    listed = b"".join(
+        struct.pack("<HHII", tag, 4, 1, value) for tag, value in sorted(entries.items())
+    )
     path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(entries)) + listed + bytes(4) + data)
     return path
 
@@ -62,7 +72,11 @@ def rows(path: Path) -> np.ndarray:
 
 @pytest.mark.parametrize("compression", [34712, 50002, 34925, 34887, 50001])
 def test_compressions_that_size_themselves_are_refused(compression: int, tmp_path: Path) -> None:
-    refused(tiff(tmp_path / "a.tif", GREY.tobytes(), compression=compression), ImageError, "compression known")
+    refused(
+        tiff(tmp_path / "a.tif", GREY.tobytes(), compression=compression),
+        ImageError,
+        "compression known",
+    )
 
 
 def test_a_tile_that_no_memory_holds_is_refused(tmp_path: Path) -> None:
@@ -107,9 +121,12 @@ def test_other_files_that_a_microscopes_tiff_names_are_not_opened(tmp_path: Path
     with tifffile.TiffFile(tmp_path / "secret.tif") as file:
         identity = file.ome_metadata.split('UUID="')[1].split('"')[0]  # type: ignore[union-attr]
     xml = (
-        '<?xml version="1.0"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06" UUID="urn:uuid:1">'
-        '<Image><Pixels DimensionOrder="XYZCT" Type="uint8" SizeX="16" SizeY="16" SizeZ="1" SizeC="1" SizeT="1">'
-        f'<TiffData IFD="0" PlaneCount="1"><UUID FileName="../secret.tif">{identity}</UUID></TiffData>'
+        '<?xml version="1.0"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06" '
+        'UUID="urn:uuid:1">'
+        '<Image><Pixels DimensionOrder="XYZCT" Type="uint8" SizeX="16" SizeY="16" SizeZ="1" '
+        'SizeC="1" SizeT="1">'
+        '<TiffData IFD="0" PlaneCount="1"><UUID '
+        f'FileName="../secret.tif">{identity}</UUID></TiffData>'
         "</Pixels></Image></OME>"
     )
     tifffile.imwrite(folder / "a.tif", GREY, description=xml, metadata=None)
@@ -117,7 +134,9 @@ def test_other_files_that_a_microscopes_tiff_names_are_not_opened(tmp_path: Path
     np.testing.assert_array_equal(rows(folder / "a.tif")[0], GREY)
 
 
-def test_what_is_no_png_or_jpeg_starts_no_other_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_no_png_or_jpeg_starts_no_other_program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Pillow hands EPS to Ghostscript, whatever the file is called."""
 
     def started(*_: object, **__: object) -> None:
@@ -126,7 +145,9 @@ def test_what_is_no_png_or_jpeg_starts_no_other_program(tmp_path: Path, monkeypa
     for name in ("Popen", "check_call", "run"):
         monkeypatch.setattr(subprocess, name, started)
     path = tmp_path / "a.png"
-    path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n%%EOF\n")
+    path.write_bytes(
+        b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n%%EOF\n"
+    )
     with pytest.raises(ImageError, match=r"a\.png"):
         read_pixels(path)
 

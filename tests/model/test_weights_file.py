@@ -7,7 +7,13 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from beers_deploy.model.convbeers import BankedConvBEERS, Network, arrays, load_network, save_network
+from beers_deploy.model.convbeers import (
+    BankedConvBEERS,
+    Network,
+    arrays,
+    load_network,
+    save_network,
+)
 from beers_deploy.model.io.tensors import (
     is_conditioned,
     read_conditioned,
@@ -26,7 +32,9 @@ def conditioned() -> BankedConvBEERS:
     return behind_a_bank(Variant(1, 4), 0.1)
 
 
-@pytest.mark.parametrize("written", [*(plain(Variant(*size)) for size in ((0, 1), (1, 4, 2), (3, 5))), conditioned()])
+@pytest.mark.parametrize(
+    "written", [*(plain(Variant(*size)) for size in ((0, 1), (1, 4, 2), (3, 5))), conditioned()]
+)
 def test_a_network_comes_back_as_it_was(written: Network, tmp_path: Path) -> None:
     path = tmp_path / "made" / "w.safetensors"
     save_network(path, written, {"loss": "L1", "steps": 7})
@@ -35,13 +43,17 @@ def test_a_network_comes_back_as_it_was(written: Network, tmp_path: Path) -> Non
     assert read.variant == written.variant
     assert recipe == {"loss": "L1", "steps": 7}
     assert not read.training
-    assert all(torch.equal(value, read.state_dict()[name]) for name, value in written.state_dict().items())
+    assert all(
+        torch.equal(value, read.state_dict()[name]) for name, value in written.state_dict().items()
+    )
     assert [p.name for p in path.parent.iterdir()] == ["w.safetensors"]
 
 
 def test_full_resolution_is_meant_where_no_scale_is_said(tmp_path: Path) -> None:
     path = tmp_path / "w.safetensors"
-    write_tensors(path, arrays(plain(Variant(1, 4)).state_dict()), {"variant": {"blocks": 1, "features": 4}})
+    write_tensors(
+        path, arrays(plain(Variant(1, 4)).state_dict()), {"variant": {"blocks": 1, "features": 4}}
+    )
     assert load_network(path)[0].variant.scale == 1
 
 
@@ -60,7 +72,9 @@ def test_tensors_of_any_layout_and_kind_come_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content", [b"", b"garbage", b"\x08\x00\x00\x00\x00\x00\x00\x00{}      ", b"\xff" * 64, None]
 )
-def test_what_is_no_weights_file_or_a_truncated_one_is_refused(content: bytes | None, tmp_path: Path) -> None:
+def test_what_is_no_weights_file_or_a_truncated_one_is_refused(
+    content: bytes | None, tmp_path: Path
+) -> None:
     path = tmp_path / "w.safetensors"
     save_network(path, plain(Variant(1, 4)), {})
     path.write_bytes(path.read_bytes()[:-5] if content is None else content)
@@ -89,14 +103,20 @@ def test_what_is_no_weights_file_or_a_truncated_one_is_refused(content: bytes | 
     ],
 )
 def test_a_header_that_does_not_fit_the_tensors_is_refused(variant: object, tmp_path: Path) -> None:
-    write_tensors(tmp_path / "w.safetensors", arrays(plain(Variant(1, 4)).state_dict()), {"variant": variant})
+    write_tensors(
+        tmp_path / "w.safetensors", arrays(plain(Variant(1, 4)).state_dict()), {"variant": variant}
+    )
     with pytest.raises(ModelError, match=r"weights of a ConvBEERS|number") as caught:
         load_network(tmp_path / "w.safetensors")
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("metadata", [None, {"format": "pt"}, {"variant": json.dumps({"blocks": 1})}])
-def test_another_programs_weights_are_refused(metadata: dict[str, str] | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "metadata", [None, {"format": "pt"}, {"variant": json.dumps({"blocks": 1})}]
+)
+def test_another_programs_weights_are_refused(
+    metadata: dict[str, str] | None, tmp_path: Path
+) -> None:
     save_file({"weight": torch.zeros(3)}, tmp_path / "w.safetensors", metadata=metadata)
     with pytest.raises(ModelError, match=r"w\.safetensors"):
         load_network(tmp_path / "w.safetensors")
@@ -135,10 +155,17 @@ def test_the_shipped_weights_load_and_say_how_they_were_made(name: str) -> None:
 @pytest.mark.parametrize(
     "read", [lambda path: read_tensors(path)[0], lambda path: perceptual.read_tensors(path, "ab")]
 )
-def test_what_was_read_is_a_copy(read: Callable[[Path], Mapping[str, np.ndarray]], tmp_path: Path) -> None:
-    """Windows replaces no file that is held, such as a checkpoint, and who writes into it changes nothing."""
+def test_what_was_read_is_a_copy(
+    read: Callable[[Path], Mapping[str, np.ndarray]], tmp_path: Path
+) -> None:
+    """Windows replaces no file that is held, such as a checkpoint, and who writes into it changes
+    nothing.
+    """
     path = tmp_path / "w.safetensors"
-    tensors = {"a": np.arange(3, dtype=np.float32), "b": np.arange(20_000, dtype=np.float32).reshape(100, 200)}
+    tensors = {
+        "a": np.arange(3, dtype=np.float32),
+        "b": np.arange(20_000, dtype=np.float32).reshape(100, 200),
+    }
     write_tensors(path, tensors, {})
     found = read(path)
     with path.open("r+b") as file:
@@ -175,7 +202,9 @@ def test_conditioned_and_plain_weights_are_not_taken_for_one_another(tmp_path: P
         ({"kind": "conditioned on its sensor"}, "another version"),
     ],
 )
-def test_conditioned_weights_need_their_header(change: dict[str, object], words: str, tmp_path: Path) -> None:
+def test_conditioned_weights_need_their_header(
+    change: dict[str, object], words: str, tmp_path: Path
+) -> None:
     path = tmp_path / "w.safetensors"
     save_network(path, conditioned(), {})
     tensors, header = read_tensors(path)
@@ -196,7 +225,9 @@ def test_conditioned_weights_that_lack_a_tensor_are_refused(missing: str, tmp_pa
 
 
 def test_the_same_weights_are_the_same_bytes(tmp_path: Path) -> None:
-    """Also the header, whose keys the library shuffles; 8 keys come in order by chance once in 40 000 times."""
+    """Also the header, whose keys the library shuffles; 8 keys come in order by chance once in 40
+    000 times.
+    """
     header = {f"key {k}": {"ä": k} for k in range(8)}
     tensors = {"one": np.arange(3, dtype=np.float32), "two": np.ones((2, 5), np.float32)}
     contents = set()

@@ -1,6 +1,8 @@
-"""What every processor must compute alike: run natively by the whole suite, and emulated by `.ci/emulate`.
+"""What every processor must compute alike: run natively by the whole suite, and emulated by
+`.ci/emulate`.
 
-Nothing here starts another process, which would not be emulated, or needs more than the command `gate` does.
+Nothing here starts another process, which would not be emulated, or needs more than the command
+`gate` does.
 """
 
 from dataclasses import dataclass, replace
@@ -17,7 +19,9 @@ from beers_deploy.quant.onnx_file import load_onnx
 
 @dataclass(frozen=True)
 class Encodings:
-    """One shipped network in whole numbers: its core, the host's file, and the same core in the board's encoding."""
+    """One shipped network in whole numbers: its core, the host's file, and the same core in the
+    board's encoding.
+    """
 
     core: IntCore
     host: onnx.ModelProto
@@ -32,8 +36,12 @@ def shipped(request: pytest.FixtureRequest) -> Encodings:
 
 
 def with_int8_bias(core: IntCore) -> IntCore:
-    """The core of a host file, which aligns every bias to its accumulator, with the board's int8 bias."""
-    return replace(core, ops=tuple(_unaligned(op) if isinstance(op, IntConv) else op for op in core.ops))
+    """The core of a host file, which aligns every bias to its accumulator, with the board's int8
+    bias.
+    """
+    return replace(
+        core, ops=tuple(_unaligned(op) if isinstance(op, IntConv) else op for op in core.ops)
+    )
 
 
 def _unaligned(op: IntConv) -> IntConv:

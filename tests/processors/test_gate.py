@@ -11,7 +11,9 @@ from tests.deploy.command_line import done
 
 
 def gate(scenes: Path, *pair: object, code: int = 0) -> str:
-    """The command's words on one patch of 128 x 128: emulated float networks take seconds for each."""
+    """The command's words on one patch of 128 x 128: emulated float networks
+    take seconds for each.
+    """
     return done("gate", *pair, "--images", scenes, "--patches", 1, code=code)
 
 

@@ -1,4 +1,6 @@
-"""The shipped networks, and such as are made to saturate, in both encodings: the integer reference bit for bit."""
+"""The shipped networks, and such as are made to saturate, in both encodings: the integer reference
+bit for bit.
+"""
 
 from collections.abc import Callable
 
@@ -41,7 +43,9 @@ def test_both_encodings_are_the_integer_reference(
     planes = shipped.core.ends.split(seen)
     tensors, _ = run_core(shipped.core, planes, half_even=True)
     restored = np.clip(seen + merged_correction(shipped.core, tensors), 0, 1)
-    np.testing.assert_array_equal(run(open_session(shipped.host, optimise=optimise), seen), restored)
+    np.testing.assert_array_equal(
+        run(open_session(shipped.host, optimise=optimise), seen), restored
+    )
     feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
     by_board = open_session(shipped.board, optimise=optimise).run(None, feed)[0]
     np.testing.assert_array_equal(by_board, correction(shipped.core, planes, half_even=True))
@@ -53,15 +57,23 @@ def test_every_layer_is_that_of_the_integer_reference(shipped: Encodings) -> Non
 
 
 def test_the_board_s_core_is_the_host_file_s(shipped: Encodings) -> None:
-    """The tests above compare two files of one network: its bias, made int8, aligns to what the file holds."""
-    assert list(host_model(shipped.core, {}).graph.initializer) == list(shipped.host.graph.initializer)
+    """The tests above compare two files of one network: its bias, made int8, aligns to what the
+    file holds.
+    """
+    assert list(host_model(shipped.core, {}).graph.initializer) == list(
+        shipped.host.graph.initializer
+    )
 
 
 def harsh_core(seed: int, channels: int) -> IntCore:
-    """Two convolutions of weights at the ends of int8, cut so that their results fill int8 but for few of them."""
+    """Two convolutions of weights at the ends of int8, cut so that their results fill int8 but for
+    few of them.
+    """
     generator = np.random.default_rng(seed)
 
-    def conv(name: str, source: str, result: str, shape: tuple[int, int, int, int], relu: bool) -> IntConv:
+    def conv(
+        name: str, source: str, result: str, shape: tuple[int, int, int, int], relu: bool
+    ) -> IntConv:
         weight = generator.choice(np.array([INT8_MIN, -100, 100, INT8_MAX], np.int8), shape)
         bias = generator.integers(INT8_MIN, INT8_MAX, shape[0]).astype(np.int8)
         activation = Activation.relu if relu else Activation.none
@@ -70,7 +82,9 @@ def harsh_core(seed: int, channels: int) -> IntCore:
     first = conv("first", PLANES, "inner", (channels, 3, 3, 3), relu=bool(seed % 2))
     last = conv("last", "inner", CORRECTION, (1, channels, 3, 3), relu=False)
     inner = PLANES_FRAC_BITS + 10 - 9  # product - cut
-    return IntCore((first, last), {PLANES: PLANES_FRAC_BITS, "inner": inner, CORRECTION: inner + 10 - 10})
+    return IntCore(
+        (first, last), {PLANES: PLANES_FRAC_BITS, "inner": inner, CORRECTION: inner + 10 - 10}
+    )
 
 
 @pytest.mark.parametrize("channels", [5, 16, 32])
@@ -83,25 +97,33 @@ def test_the_largest_products_are_added_exactly(seed: int, channels: int) -> Non
     restored = np.clip(seen + whole, 0, 1)
     feed = {PLANES: split(seen).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
     for optimise in (True, False):
-        np.testing.assert_array_equal(run(open_session(host_model(core, {}), optimise=optimise), seen), restored)
+        np.testing.assert_array_equal(
+            run(open_session(host_model(core, {}), optimise=optimise), seen), restored
+        )
         by_board = open_session(board_model(core, {}), optimise=optimise).run(None, feed)[0]
         np.testing.assert_array_equal(by_board, whole)
 
 
 def saturating_sums(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """What kernels without VNNI make of sums over the last axis: products of neighbours added in saturating int16."""
+    """What kernels without VNNI make of sums over the last axis: products of neighbours added in
+    saturating int16.
+    """
     pairs = (values.astype(np.int64) * weights).reshape(*values.shape[:-1], -1, 2).sum(-1)
     return np.asarray(np.clip(pairs, -(2**15), 2**15 - 1).sum(-1))
 
 
 def test_saturated_sums_would_show() -> None:
-    """The control: what these networks add leaves int16, so a kernel that saturates would give other numbers."""
+    """The control: what these networks add leaves int16, so a kernel that saturates would give
+    other numbers.
+    """
     for seed in range(4):
         core = harsh_core(seed, 16)
         last = core.ops[-1]
         assert isinstance(last, IntConv)
         tensors, _ = run_core(core, split(image(edges, (13, 21), seed)), half_even=True)
         weights = last.weight[0, :, 1, 1].astype(np.int64)  # the middle tap, over its channels
-        stored = np.moveaxis(tensors["inner"], 1, -1).astype(np.int64) + 128  # as the host's file holds them
+        stored = (
+            np.moveaxis(tensors["inner"], 1, -1).astype(np.int64) + 128
+        )  # as the host's file holds them
         exact = (stored * weights).sum(-1)
         assert (saturating_sums(stored, weights) != exact).mean() > 0.3

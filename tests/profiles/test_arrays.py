@@ -26,12 +26,16 @@ def stored(folder: Path, kind: str) -> Path:
 def test_the_content_tells_an_archive_from_an_array(tmp_path: Path) -> None:
     np.testing.assert_array_equal(load_arrays(stored(tmp_path, "npy"))[ALONE], HELD["image"])
     found = load_arrays(stored(tmp_path, "npz"))
-    assert {name: values.shape for name, values in found.items()} == {"image": (4, 10), "reference": (7,)}
+    assert {name: values.shape for name, values in found.items()} == {
+        "image": (4, 10),
+        "reference": (7,),
+    }
 
 
 @settings(max_examples=100, deadline=None)
 @given(
-    kind=st.sampled_from(["npy", "npz"]), places=st.dictionaries(st.floats(0, 0.999), st.integers(0, 255), max_size=4)
+    kind=st.sampled_from(["npy", "npz"]),
+    places=st.dictionaries(st.floats(0, 0.999), st.integers(0, 255), max_size=4),
 )
 def test_whatever_bytes_are_damaged_it_is_a_value_error(
     kind: str, places: dict[float, int], tmp_path_factory: pytest.TempPathFactory
@@ -48,7 +52,9 @@ def test_whatever_bytes_are_damaged_it_is_a_value_error(
 
 
 HEADERS = ["(((((", "{'descr': '<f4', 'fortran_order': False, 'shape': (-1, 3)}"]
-HEADERS += [f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({size},)}}" for size in (10**12, 10**20)]
+HEADERS += [
+    f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({size},)}}" for size in (10**12, 10**20)
+]
 
 
 @pytest.mark.parametrize("header", HEADERS)

@@ -1,4 +1,6 @@
-"""Errors come back whole from worker processes, which hand them over pickled; what they say can be read."""
+"""Errors come back whole from worker processes, which hand them over pickled; what they say can be
+read.
+"""
 
 import sys
 from importlib import import_module
@@ -24,13 +26,20 @@ from beers_deploy.profiles.errors import (
 )
 
 
-@pytest.mark.parametrize("kind", [BeersError, ImageError, MachineError, ModelError, OptionError, ProfileError])
+@pytest.mark.parametrize(
+    "kind", [BeersError, ImageError, MachineError, ModelError, OptionError, ProfileError]
+)
 def test_an_error_survives_the_way_between_processes(kind: type[BeersError]) -> None:
     sent = kind("a.tif", expected="rows", got="none", remedy="give some")
     come = ForkingPickler.loads(ForkingPickler.dumps(sent))
     assert type(come) is kind
     assert str(come) == str(sent) == "a.tif: expected rows, got none; give some."
-    assert (come.where, come.expected, come.got, come.remedy) == ("a.tif", "rows", "none", "give some")
+    assert (come.where, come.expected, come.got, come.remedy) == (
+        "a.tif",
+        "rows",
+        "none",
+        "give some",
+    )
 
 
 @given(st.lists(st.integers(0, 10**13), min_size=1, max_size=3))
@@ -55,18 +64,24 @@ def test_visible_text_keeps_its_lines_and_nothing_that_is_obeyed(text: str) -> N
     assert visible(found) == found
 
 
-@pytest.mark.parametrize("lacks", ["import affine_of_nobody", "raise ImportError('libexpat.so.1: no such file')"])
+@pytest.mark.parametrize(
+    "lacks", ["import affine_of_nobody", "raise ImportError('libexpat.so.1: no such file')"]
+)
 def test_a_package_that_cannot_load_is_one_sentence(
     lacks: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "rasterio.py").write_text(lacks, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "rasterio", raising=False)
-    with pytest.raises(MissingExtraError, match=r"^cog: .*one that does not load.*beers-deploy\[gdal\]"):
+    with pytest.raises(
+        MissingExtraError, match=r"^cog: .*one that does not load.*beers-deploy\[gdal\]"
+    ):
         optional("rasterio", "cog")
 
 
-@pytest.mark.parametrize("lacks", ["import affine_of_nobody", "raise ImportError('libtorch.so: no such file')"])
+@pytest.mark.parametrize(
+    "lacks", ["import affine_of_nobody", "raise ImportError('libtorch.so: no such file')"]
+)
 def test_a_package_that_cannot_load_is_no_fault_of_the_program(
     lacks: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

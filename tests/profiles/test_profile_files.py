@@ -20,7 +20,9 @@ def refusal(path: Path) -> ProfileError:
     with pytest.raises(ProfileError) as caught:
         load_sensor(str(path))
     error = caught.value
-    assert str(error) == f"{error.where}: expected {error.expected}, got {error.got}; {error.remedy}."
+    assert (
+        str(error) == f"{error.where}: expected {error.expected}, got {error.got}; {error.remedy}."
+    )
     assert all(part.strip() for part in (error.where, error.expected, error.got, error.remedy))
     assert "mine" in error.where
     assert "\n" not in str(error)
@@ -43,10 +45,13 @@ def test_a_missing_table_is_named(table: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "value", ["-1", "-0.07", "1e-200", "nan", "inf", "true", "[]", "[0.01, 0.02, 0.03]", '"7 %"', "1" * 400]
+    "value",
+    ["-1", "-0.07", "1e-200", "nan", "inf", "true", "[]", "[0.01, 0.02, 0.03]", '"7 %"', "1" * 400],
 )
 def test_an_mtf_that_is_no_contrast_is_refused(value: str, tmp_path: Path) -> None:
-    assert "mtf_nyquist" in refusal(own_sensor(tmp_path, ("value = 0.07", f"value = {value}"))).where
+    assert (
+        "mtf_nyquist" in refusal(own_sensor(tmp_path, ("value = 0.07", f"value = {value}"))).where
+    )
 
 
 def test_text_that_is_not_unicode_is_refused(tmp_path: Path) -> None:
@@ -76,10 +81,14 @@ def test_a_range_is_drawn_from_or_refused(old: str, new: str, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("snr_0", "snr_1"), [(55.0, 110.0), (27.5, 110.0), (34.3, 68.6), (13.7, 27.4), (83.2, 166.4)]
 )
-def test_what_loads_can_be_drawn_at_the_very_bounds(snr_0: float, snr_1: float, tmp_path: Path) -> None:
+def test_what_loads_can_be_drawn_at_the_very_bounds(
+    snr_0: float, snr_1: float, tmp_path: Path
+) -> None:
     """There alpha or beta is 0, and rounding may leave it a hair below."""
     assert snr_0 in snr_0_bounds(25, 100, snr_1)
-    path = own_sensor(tmp_path, ("value = 50,", f"value = {snr_0},"), ("value = 110,", f"value = {snr_1},"))
+    path = own_sensor(
+        tmp_path, ("value = 50,", f"value = {snr_0},"), ("value = 110,", f"value = {snr_1},")
+    )
     sensor = load_sensor(str(path)).draw(np.random.default_rng(0))
     assert sensor.alpha >= 0
     assert sensor.beta >= 0
@@ -87,13 +96,17 @@ def test_what_loads_can_be_drawn_at_the_very_bounds(snr_0: float, snr_1: float, 
 
 
 @given(st.floats(1, 90), st.floats(1.1, 9), st.floats(5, 300), st.floats(5, 300))
-def test_noise_reproduces_any_two_points(radiance_0: float, factor: float, snr_0: float, snr_1: float) -> None:
+def test_noise_reproduces_any_two_points(
+    radiance_0: float, factor: float, snr_0: float, snr_1: float
+) -> None:
     """Whatever the signs of alpha and beta: the line passes through both variances."""
     radiance_1 = factor * radiance_0
     alpha, beta = noise_from_snr(radiance_0, snr_0, radiance_1, snr_1)
     scale = max((radiance_0 / snr_0) ** 2, (radiance_1 / snr_1) ** 2)
     for radiance, snr in ((radiance_0, snr_0), (radiance_1, snr_1)):
-        assert alpha * radiance + beta == pytest.approx((radiance / snr) ** 2, rel=1e-9, abs=1e-12 * scale)
+        assert alpha * radiance + beta == pytest.approx(
+            (radiance / snr) ** 2, rel=1e-9, abs=1e-12 * scale
+        )
 
 
 @pytest.mark.parametrize(
@@ -103,11 +116,16 @@ def test_noise_reproduces_any_two_points(radiance_0: float, factor: float, snr_0
         ("description = 'x'\nclock = 3", ("[clock]", "table of constants")),
         ("description = 'x'\n[dpu]\nclock_mhz = 'fast'", ("clock_mhz", "finite number")),
         ("description = 'x'\n[dpu]\nclock_mhz = { value = 333 }", ("clock_mhz", "'source'")),
-        ("description = 'x'\ndefault_configuration = 'Z'\n[configurations.A]\nn = 3", ("configuration out of A",)),
+        (
+            "description = 'x'\ndefault_configuration = 'Z'\n[configurations.A]\nn = 3",
+            ("configuration out of A",),
+        ),
         ("description = 'x'\nconfigurations = 3", ("table of constants",)),
     ],
 )
-def test_a_wrong_target_gets_one_sentence(text: str, words: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_wrong_target_gets_one_sentence(
+    text: str, words: tuple[str, ...], tmp_path: Path
+) -> None:
     with pytest.raises(ProfileError) as caught:
         load_target(str(own_sensor(tmp_path, text=text)))
     for word in ("mine", "expected", "got", *words):

@@ -1,4 +1,6 @@
-"""A tabulated MTF and a point-spread function: read, compared, kept, and refused in one sentence."""
+"""A tabulated MTF and a point-spread function: read, compared, kept, and
+refused in one sentence.
+"""
 
 import json
 import math
@@ -26,7 +28,9 @@ PSF = 'psf = "psf.npy"\npsf_samples_per_px = 4'
 
 
 def lopsided(rows: int = 33, columns: int = 44) -> np.ndarray:
-    """A point's image of other widths down and right, leaning, with a one-sided tail: (rows, columns)."""
+    """A point's image of other widths down and right, leaning, with a one-sided tail: (rows,
+    columns).
+    """
     y, x = np.mgrid[:rows, :columns] - np.array([rows - 1, columns - 1])[:, None, None] / 2
     samples: np.ndarray = np.exp(-(y**2) / 18 - (x + 0.4 * y) ** 2 / 10)
     samples += 0.1 * np.exp(-(y**2) / 30 - (x - 3) ** 2 / 30)
@@ -37,7 +41,9 @@ def sensor_file(folder: Path, mtf: str, noise: str | None = None) -> Path:
     """The nominal sensor with another [mtf], and another [noise] where one is given."""
     text = re.sub(r"\[mtf\].*?(?=\n\[)", lambda _: f"[mtf]\n{mtf}\n", SHIPPED, flags=re.DOTALL)
     if noise is not None:
-        text = re.sub(r"\[noise\].*?(?=\n\[)", lambda _: f"[noise]\n{noise}\n", text, flags=re.DOTALL)
+        text = re.sub(
+            r"\[noise\].*?(?=\n\[)", lambda _: f"[noise]\n{noise}\n", text, flags=re.DOTALL
+        )
     return own_sensor(folder, text=text)
 
 
@@ -66,23 +72,32 @@ def test_a_table_says_what_stands_in_it(tmp_path: Path) -> None:
 
 @settings(max_examples=30)
 @given(st.floats(0.005, 0.6), st.floats(0.005, 0.6), st.lists(st.floats(0.01, 0.99), max_size=6))
-def test_a_table_never_rises_beyond_its_end(across: float, along: float, inner: list[float]) -> None:
+def test_a_table_never_rises_beyond_its_end(
+    across: float, along: float, inner: list[float]
+) -> None:
     frequency = (0.0, *sorted({f / 2 for f in inner}), 0.5)
     contrast = [tuple(formula(np.array(frequency), c)) for c in (across, along)]
     table = MtfTable(frequency, *contrast)
     beyond = np.linspace(0.5, 4, 50)[None]
-    for response in (table.at(beyond, np.zeros((1, 1)))[0], table.at(np.zeros((1, 1)), beyond.T)[:, 0]):
+    for response in (
+        table.at(beyond, np.zeros((1, 1)))[0],
+        table.at(np.zeros((1, 1)), beyond.T)[:, 0],
+    ):
         optics = response / np.where(np.abs(np.sinc(beyond[0])) < 1e-9, np.nan, np.sinc(beyond[0]))
         assert (np.diff(optics[np.isfinite(optics)]) <= 0).all()
 
 
 def test_a_point_spread_is_its_transform_about_its_centroid(tmp_path: Path) -> None:
-    """Against a padded FFT, whose frequencies are multiples of 4 / 96 cycles per pixel, shifted by hand."""
+    """Against a padded FFT, whose frequencies are multiples of 4 / 96 cycles per pixel, shifted by
+    hand.
+    """
     samples = lopsided(24, 32)
     sensor = with_psf(tmp_path, samples).nominal()
     row, column = centroid(samples)
     f = np.fft.fftfreq(96, 1 / 4)
-    shift = np.exp(2j * np.pi * f[:, None] * (row + 11.5) / 4) * np.exp(2j * np.pi * f * (column + 15.5) / 4)
+    shift = np.exp(2j * np.pi * f[:, None] * (row + 11.5) / 4) * np.exp(
+        2j * np.pi * f * (column + 15.5) / 4
+    )
     wanted = np.fft.fft2(samples, (96, 96)) * shift / samples.sum()
     assert sensor.response is not None
     assert np.abs(sensor.response.at(f[None], f[:, None]) - wanted).max() < 3e-6
@@ -108,7 +123,10 @@ def test_packed_samples_come_back(height: int, width: int, seed: int) -> None:
 
 @pytest.mark.parametrize("scale", [1e-300, 1e300])
 def test_the_unit_of_the_samples_does_not_matter(scale: float, tmp_path: Path) -> None:
-    one, other = (with_psf(tmp_path, samples).nominal().mtf_axes for samples in (lopsided(), lopsided() * scale))
+    one, other = (
+        with_psf(tmp_path, samples).nominal().mtf_axes
+        for samples in (lopsided(), lopsided() * scale)
+    )
     assert one == pytest.approx(other, rel=1e-6)
 
 
@@ -128,12 +146,16 @@ def test_the_empty_rim_of_a_point_spread_is_cut_and_changes_nothing(tmp_path: Pa
 @pytest.mark.parametrize("dtype", [">f8", "<u2"])
 def test_any_type_of_number_is_the_same_instrument(dtype: str, tmp_path: Path) -> None:
     samples = np.rint(lopsided() * 4000)
-    assert same_instrument(with_psf(tmp_path, samples.astype("<f4")), with_psf(tmp_path, samples.astype(dtype)))
+    assert same_instrument(
+        with_psf(tmp_path, samples.astype("<f4")), with_psf(tmp_path, samples.astype(dtype))
+    )
 
 
 @pytest.mark.parametrize("mtf", [TABLE, PSF])
 @pytest.mark.parametrize("noise", [None, "alpha = 0.0077\nbeta = [0.05, 0.07]"])
-def test_a_profile_comes_back_from_json_without_its_file(mtf: str, noise: str | None, tmp_path: Path) -> None:
+def test_a_profile_comes_back_from_json_without_its_file(
+    mtf: str, noise: str | None, tmp_path: Path
+) -> None:
     np.save(tmp_path / "psf.npy", lopsided())
     profile = load_sensor(str(sensor_file(tmp_path, mtf, noise)))
     (tmp_path / "psf.npy").unlink()
@@ -151,13 +173,19 @@ def test_another_contrast_beside_a_response_is_refused(tmp_path: Path) -> None:
     sensor = load_sensor(str(sensor_file(tmp_path, TABLE))).nominal()
     with pytest.raises(ValueError, match="beside a response"):
         replace(sensor, mtf_nyquist=0.2)
-    assert replace(sensor, mtf_nyquist=0.2, mtf_nyquist_along=None, response=None).mtf_axes == (0.2, 0.2)
+    assert replace(sensor, mtf_nyquist=0.2, mtf_nyquist_along=None, response=None).mtf_axes == (
+        0.2,
+        0.2,
+    )
 
 
 @pytest.mark.parametrize(
     ("mtf", "words"),
     [
-        (TABLE + "\nmtf_nyquist = 0.07", ("one of mtf_nyquist, or frequency and across, or psf", "keep one")),
+        (
+            TABLE + "\nmtf_nyquist = 0.07",
+            ("one of mtf_nyquist, or frequency and across, or psf", "keep one"),
+        ),
         (TABLE + "\n" + PSF, ("keep one",)),
         (PSF + "\nmtf_nyquist_along = 0.07", ("keep one",)),
         ("across = [1, 0.1]", ("'frequency'",)),
@@ -228,7 +256,9 @@ def test_samples_that_are_no_point_spread_get_one_sentence(
     assert all(word in str(error) for word in words)
 
 
-@pytest.mark.parametrize("content", [b"", b"\x93NUMPY", b"version https://git-lfs.github.com", b"x" * 999])
+@pytest.mark.parametrize(
+    "content", [b"", b"\x93NUMPY", b"version https://git-lfs.github.com", b"x" * 999]
+)
 def test_a_damaged_file_gets_one_sentence(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "psf.npy").write_bytes(content)
     refusal(sensor_file(tmp_path, PSF))
@@ -238,14 +268,25 @@ def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:
     plain = load_sensor("pleiades-degraded")
     alpha = plain.nominal().alpha
     beta = plain.nominal().beta
-    profile = load_sensor(str(sensor_file(tmp_path, "mtf_nyquist = 0.07", f"alpha = {alpha}\nbeta = {beta}")))
+    profile = load_sensor(
+        str(sensor_file(tmp_path, "mtf_nyquist = 0.07", f"alpha = {alpha}\nbeta = {beta}"))
+    )
     assert profile.nominal() == plain.nominal()
-    assert (profile.radiance_0.low, profile.radiance_1.low) == (25, 100)  # of the shipped full scale, 400
+    assert (profile.radiance_0.low, profile.radiance_1.low) == (
+        25,
+        100,
+    )  # of the shipped full scale, 400
     ranged = load_sensor(
-        str(sensor_file(tmp_path, "mtf_nyquist = 0.07", "alpha = [0.1, 0.2]\nbeta = 0\nradiance_1 = 60"))
+        str(
+            sensor_file(
+                tmp_path, "mtf_nyquist = 0.07", "alpha = [0.1, 0.2]\nbeta = 0\nradiance_1 = 60"
+            )
+        )
     )
     drawn = [ranged.draw_counted(np.random.default_rng(seed)) for seed in range(20)]
-    assert all(0.1 <= sensor.alpha <= 0.2 and sensor.beta == rejected == 0 for sensor, rejected in drawn)
+    assert all(
+        0.1 <= sensor.alpha <= 0.2 and sensor.beta == rejected == 0 for sensor, rejected in drawn
+    )
     assert len({sensor.alpha for sensor, _ in drawn}) == 20
     assert ranged.nominal().noise_sigma(60) == pytest.approx(math.sqrt(0.15 * 60))
     assert (ranged.radiance_0.low, ranged.nominal().radiance_1) == (15, 60)
@@ -264,21 +305,26 @@ def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:
         ("radiance_0 = 25\nradiance_1 = 100", ("'snr_0'",)),
     ],
 )
-def test_a_wrong_noise_gets_one_sentence(noise: str, words: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_wrong_noise_gets_one_sentence(
+    noise: str, words: tuple[str, ...], tmp_path: Path
+) -> None:
     error = refusal(sensor_file(tmp_path, "mtf_nyquist = 0.07", noise))
     assert all(word in str(error) for word in words)
 
 
 def test_profiles_print_the_response_and_its_source(tmp_path: Path) -> None:
     def shown(mtf: str, *more: str) -> str:
-        run = CliRunner(env={"COLUMNS": "400"}).invoke(app, ["profiles", str(sensor_file(tmp_path, mtf)), *more])
+        run = CliRunner(env={"COLUMNS": "400"}).invoke(
+            app, ["profiles", str(sensor_file(tmp_path, mtf)), *more]
+        )
         assert run.exit_code == 0
         return run.output
 
     np.save(tmp_path / "psf.npy", lopsided())
     table = shown(
         TABLE.replace(
-            "across = [1, 0.5, 0.12]", 'across = {value = [1, 0.5, 0.12], status = "measured", source = "a lab"}'
+            "across = [1, 0.5, 0.12]",
+            'across = {value = [1, 0.5, 0.12], status = "measured", source = "a lab"}',
         )
     )
     assert re.search(r"mtf\.across .*1, 0\.5, 0\.12 .*measured .*a lab", table)

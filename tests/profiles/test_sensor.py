@@ -14,7 +14,13 @@ from beers_deploy.profiles.toml import HERE
 from tests.profiles.own_sensor import own_sensor
 from tests.profiles.test_profile_files import refusal
 
-SHIPPED = ["dior-high", "dior-medium", "pleiades-degraded", "pleiades-reference", "pleiades-variable"]
+SHIPPED = [
+    "dior-high",
+    "dior-medium",
+    "pleiades-degraded",
+    "pleiades-reference",
+    "pleiades-variable",
+]
 
 
 def test_the_promised_profiles_are_shipped() -> None:
@@ -52,7 +58,11 @@ def test_every_target_constant_has_a_source(name: str) -> None:
         ("value = 5,", "value = 2.5,", ("oversampling", "whole numbers")),
         ("[mtf]", "[mtf", ("TOML",)),
         ("[noise]", "mtf_nyquist_along = 0.7\n[noise]", ("mtf_nyquist_along", "0.6366", "0.7")),
-        ("[noise]", "mtf_nyquist_vertical = 0.05\n[noise]", ("mtf_nyquist_vertical", "mtf_nyquist_along")),
+        (
+            "[noise]",
+            "mtf_nyquist_vertical = 0.05\n[noise]",
+            ("mtf_nyquist_vertical", "mtf_nyquist_along"),
+        ),
         (
             "[noise]",
             "mtf_nyquist_along = 0.5\n[antialias]\nsigma_px = 0.4\n[noise]",
@@ -63,13 +73,17 @@ def test_every_target_constant_has_a_source(name: str) -> None:
         ("value = 25,", 'value = "bright",', ("finite number",)),
     ],
 )
-def test_a_wrong_file_gets_one_sentence(old: str, new: str, words: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_wrong_file_gets_one_sentence(
+    old: str, new: str, words: tuple[str, ...], tmp_path: Path
+) -> None:
     message = str(refusal(own_sensor(tmp_path, (old, new))))
     assert all(word in message for word in words)
 
 
 def test_the_track_may_have_a_contrast_of_its_own(tmp_path: Path) -> None:
-    both = load_sensor(str(own_sensor(tmp_path, ("[noise]", "mtf_nyquist_along = [0.03, 0.05]\n[noise]"))))
+    both = load_sensor(
+        str(own_sensor(tmp_path, ("[noise]", "mtf_nyquist_along = [0.03, 0.05]\n[noise]")))
+    )
     one = load_sensor("pleiades-degraded")
     assert both.nominal().mtf_axes == pytest.approx((0.07, 0.04))
     assert one.nominal().mtf_axes == (0.07, 0.07)
@@ -102,7 +116,9 @@ def test_every_draw_is_physical_and_within_its_ranges(name: str, seed: int) -> N
     assert sensor.alpha >= 0
     assert sensor.beta >= 0
     assert profile.mtf_nyquist.low <= sensor.mtf_nyquist <= profile.mtf_nyquist.high
-    for radiance, snr in zip((profile.radiance_0, profile.radiance_1), profile.snr_pair, strict=True):
+    for radiance, snr in zip(
+        (profile.radiance_0, profile.radiance_1), profile.snr_pair, strict=True
+    ):
         drawn = radiance.low / sensor.noise_sigma(radiance.low)
         assert snr.low * (1 - 1e-9) <= drawn <= snr.high * (1 + 1e-9)
     assert sensor == profile.draw(np.random.default_rng(seed))
@@ -149,7 +165,9 @@ def test_a_table_calls_for_its_effect(tmp_path: Path) -> None:
         ("smear = 3\n", ("smear",)),
     ],
 )
-def test_a_wrong_effect_gets_one_sentence(table: str, words: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_wrong_effect_gets_one_sentence(
+    table: str, words: tuple[str, ...], tmp_path: Path
+) -> None:
     message = str(refusal(with_table(tmp_path, table)))
     assert all(word in message for word in words)
 
@@ -157,7 +175,15 @@ def test_a_wrong_effect_gets_one_sentence(table: str, words: tuple[str, ...], tm
 def test_the_units_of_another_sensor_bring_its_offset_and_no_other_effect(tmp_path: Path) -> None:
     own = load_sensor(str(with_table(tmp_path, "[smear]\nlength_px = 0.5\n")))
     other = load_sensor(
-        str(with_table(tmp_path, "[smear]\nlength_px = 2\n[prnu]\nrms = 0.1\n[offset]\noffset_dn = 64"))
+        str(
+            with_table(
+                tmp_path, "[smear]\nlength_px = 2\n[prnu]\nrms = 0.1\n[offset]\noffset_dn = 64"
+            )
+        )
     )
     for found in (own.in_units_of(other).nominal(), own.nominal().in_units_of(other.nominal())):
-        assert (found.smear_px, found.offset_dn, set(found.effects)) == (0.5, 64, {"smear", "offset"})
+        assert (found.smear_px, found.offset_dn, set(found.effects)) == (
+            0.5,
+            64,
+            {"smear", "offset"},
+        )

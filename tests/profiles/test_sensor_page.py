@@ -18,7 +18,9 @@ from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX, TABLES, same_instrumen
 from beers_deploy.profiles.sensor_file import SINGLE, load_sensor, read_sensor, sensor_names
 from tests.deploy.command_line import done
 
-PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "sensor-profile.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "sensor-profile.md").read_text(
+    encoding="utf-8"
+)
 ROWS = dict(re.findall(r"^- `(\[\w+\] \w+)` \(.+?; (.+?)\): .+$", PAGE, re.MULTILINE))
 """The range of each key."""
 
@@ -37,14 +39,19 @@ def test_the_page_gives_the_ranges_of_effects(name: str) -> None:
 
 def test_the_page_says_where_a_range_is_refused_and_what_bounds_the_mtf() -> None:
     single = {f"[{table}] {key}" for table in TABLES for key in table_keys(table) if key in SINGLE}
-    assert {key for key, allowed in ROWS.items() if "no range" in allowed} == {*single, "[offset] offset_dn"}
+    assert {key for key, allowed in ROWS.items() if "no range" in allowed} == {
+        *single,
+        "[offset] offset_dn",
+    }
     assert f"{MTF_NYQUIST_MAX:.4f}" in ROWS["[mtf] mtf_nyquist"]
 
 
 @pytest.mark.parametrize("status", get_args(Status))
 def test_the_page_names_every_status_and_each_is_read(status: str) -> None:
     assert f"`{status}`" in PAGE
-    assert read_constant("a test", {"value": 1, "status": status, "source": "a test"}).status == status
+    assert (
+        read_constant("a test", {"value": 1, "status": status, "source": "a test"}).status == status
+    )
 
 
 WHOLE, *PARTS = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
@@ -56,7 +63,9 @@ def test_the_example_of_the_page_is_a_profile(tmp_path: Path) -> None:
     assert read_sensor("a test", tomllib.loads(WHOLE)).mtf_nyquist.low == 0.05
 
 
-@pytest.mark.parametrize(("part", "axes"), [*zip(PARTS, [(0.11, 0.08), (0.2, 0.1), (0.05, 0.05)], strict=True)])
+@pytest.mark.parametrize(
+    ("part", "axes"), [*zip(PARTS, [(0.11, 0.08), (0.2, 0.1), (0.05, 0.05)], strict=True)]
+)
 def test_each_other_way_of_the_page_fits_into_the_example(
     part: str, axes: tuple[float, float], tmp_path: Path
 ) -> None:
@@ -67,7 +76,9 @@ def test_each_other_way_of_the_page_fits_into_the_example(
     (name,) = tomllib.loads(part)
     text = re.sub(rf"\[{name}\].*?(?=\n\[)", lambda _: part, WHOLE, flags=re.DOTALL)
     (tmp_path / "my-sensor.toml").write_text(text, encoding="utf-8")
-    assert load_sensor(str(tmp_path / "my-sensor.toml")).nominal().mtf_axes == pytest.approx(axes, abs=1e-3)
+    assert load_sensor(str(tmp_path / "my-sensor.toml")).nominal().mtf_axes == pytest.approx(
+        axes, abs=1e-3
+    )
 
 
 def test_profiles_print_the_file_to_start_from(tmp_path: Path) -> None:
@@ -80,7 +91,9 @@ def test_profiles_print_the_file_to_start_from(tmp_path: Path) -> None:
 
 
 def test_the_pages_commands_are_understood_and_use_what_was_written_before() -> None:
-    """Read by the command line itself, not run; each input is the page's own, the user's, or an earlier output."""
+    """Read by the command line itself, not run; each input is the page's own, the user's, or an
+    earlier output.
+    """
     (block,) = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
     group = get_command(app)
     known = {"scene.png", "raw.tif", "my-sensor.toml"}
@@ -88,8 +101,15 @@ def test_the_pages_commands_are_understood_and_use_what_was_written_before() -> 
     lines = [line.split()[1:] for line in block.splitlines()]
     for name, *words in lines:
         context = group.commands[name].make_context(name, [*words])
-        paths = {word for part in words for word in part.split(",") if re.search(r"\.(png|tif|toml|onnx)$", word)}
-        outputs = {str(context.params.get(key)) for key in ("out", "output", "board_file")} & {*words}
+        paths = {
+            word
+            for part in words
+            for word in part.split(",")
+            if re.search(r"\.(png|tif|toml|onnx)$", word)
+        }
+        outputs = {str(context.params.get(key)) for key in ("out", "output", "board_file")} & {
+            *words
+        }
         assert paths - outputs <= known, (name, paths - outputs - known)
         known |= outputs
     assert [name for name, *_ in lines].count("restore") == 2

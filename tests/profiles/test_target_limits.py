@@ -19,21 +19,41 @@ LIMITS: dict[tuple[str, str], Limits] = {
     **{(BUILD, key): limits for key, limits in CONFIGURATION.items()},
 }
 ANY_KEY = st.sampled_from(sorted(LIMITS))
-NOT_NUMBERS = ("nan", "-nan", "inf", "-inf", '"16"', '""', "true", "[]", "[1]", "[1, 2, 3]", "{}", "1979-05-27")
+NOT_NUMBERS = (
+    "nan",
+    "-nan",
+    "inf",
+    "-inf",
+    '"16"',
+    '""',
+    "true",
+    "[]",
+    "[1]",
+    "[1, 2, 3]",
+    "{}",
+    "1979-05-27",
+)
 
 
 def board(folder: Path, table: str, key: str, value: str) -> str:
     """A board like the VCK190 but for one key."""
     path = folder / "my-board.toml"
     name = "configurations.C32B3" if table == BUILD else table
-    path.write_text(f'base = "vck190"\ndescription = "a test"\n\n[{name}]\n{key} = {value}\n', encoding="utf-8")
+    path.write_text(
+        f'base = "vck190"\ndescription = "a test"\n\n[{name}]\n{key} = {value}\n', encoding="utf-8"
+    )
     return str(path)
 
 
 @st.composite
 def outside(draw: st.DrawFn, limits: Limits) -> float:
-    """A number that the key cannot have: too small, too large, or broken where it counts something."""
-    kinds = [st.floats(-1e300, limits.low, exclude_max=True), st.floats(limits.high, 1e300, exclude_min=True)]
+    """A number that the key cannot have: too small, too large, or broken where
+    it counts something.
+    """
+    kinds = [
+        st.floats(-1e300, limits.low, exclude_max=True),
+        st.floats(limits.high, 1e300, exclude_min=True),
+    ]
     if limits.whole:
         kinds.append(st.integers(int(limits.low), 1000).map(lambda whole: whole + 0.5))
     return draw(st.one_of(kinds))
@@ -84,9 +104,16 @@ def test_every_number_within_the_limits_is_taken(
 @pytest.mark.parametrize("value", ["0", "-1", "2.5"])
 def test_commands_name_file_key_and_value(key: str, value: str, tmp_path: Path) -> None:
     path = board(tmp_path, BUILD, key, value)
-    for words in (("check", "--tile", "64", "--target", path), ("bench", "--target", path), ("profiles", path)):
+    for words in (
+        ("check", "--tile", "64", "--target", path),
+        ("bench", "--target", path),
+        ("profiles", path),
+    ):
         said = refused(*words)
-        assert f"my-board.toml [configurations.C32B3] {key}: expected a whole number of at least 1" in said
+        assert (
+            f"my-board.toml [configurations.C32B3] {key}: expected a whole number of at least 1"
+            in said
+        )
         assert f"got {value}" in said
 
 
@@ -98,13 +125,20 @@ def test_every_key_of_the_reference_has_limits() -> None:
 @pytest.mark.parametrize("name", target_names())
 def test_shipped_targets_state_no_key_without_limits(name: str) -> None:
     target = load_target(name)
-    stated = {(table, key) for table, keys in target.tables.items() for key in keys if "published" not in table}
+    stated = {
+        (table, key)
+        for table, keys in target.tables.items()
+        for key in keys
+        if "published" not in table
+    }
     stated |= {(BUILD, key) for keys in target.configurations.values() for key in keys}
     assert stated <= set(LIMITS)
 
 
 def test_a_published_figure_is_above_0(tmp_path: Path) -> None:
-    assert "published_latency_ms" in refusal(board(tmp_path, "published_latency_ms", '"a network"', "-3"))
+    assert "published_latency_ms" in refusal(
+        board(tmp_path, "published_latency_ms", '"a network"', "-3")
+    )
     assert done("profiles", board(tmp_path, "published_latency_ms", '"a network"', "3"))
 
 

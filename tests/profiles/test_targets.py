@@ -64,7 +64,9 @@ def test_the_zcu104_is_the_zcu102_but_for_cores_clock_and_memory() -> None:
         ("power", "dpu_range_w"),
     }
     for size, constants in other.configurations.items():
-        changed = {key for key, constant in one.configurations[size].items() if constants[key] != constant}
+        changed = {
+            key for key, constant in one.configurations[size].items() if constants[key] != constant
+        }
         assert changed == {"cores", "peak_tops"}
 
 
@@ -76,13 +78,19 @@ def test_the_zcu104_is_the_zcu102_but_for_cores_clock_and_memory() -> None:
         ('"zcu102"', "3", ("base", "got 3")),
         ('"zcu102"', '["zcu102"]', ("base", "shipped")),
         ("value = 250e6", 'value = "fast"', ("pl_clock_hz", "finite number")),
-        ("[tile]", '[activations]\nconv = ["relu"]\n[tile]', ("[activations] conv", "ReLU6", "['relu']")),
+        (
+            "[tile]",
+            '[activations]\nconv = ["relu"]\n[tile]',
+            ("[activations] conv", "ReLU6", "['relu']"),
+        ),
         ("[tile]", '[activations]\nconf = ["ReLU"]\n[tile]', ("'conf'", "conv")),
         ("[tile]", '[documents]\nmanual = "mine"\n[tile]', ("'manual'", "operators")),
         ("cores = { value = 2,", "cores = { value = 0,", ("cores", "at least 1", "got 0")),
     ],
 )
-def test_a_wrong_board_gets_one_sentence(old: str, new: str, words: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_wrong_board_gets_one_sentence(
+    old: str, new: str, words: tuple[str, ...], tmp_path: Path
+) -> None:
     assert old in EXAMPLE
     with pytest.raises(ProfileError) as caught:
         load_dpu(written(tmp_path, EXAMPLE.replace(old, new)))
@@ -92,7 +100,11 @@ def test_a_wrong_board_gets_one_sentence(old: str, new: str, words: tuple[str, .
 
 
 def test_a_misspelt_constant_does_not_silence_its_rule(tmp_path: Path) -> None:
-    text = (HERE / "targets" / "vek280.toml").read_text(encoding="utf-8").replace("\narea_max =", "\narea_mox =")
+    text = (
+        (HERE / "targets" / "vek280.toml")
+        .read_text(encoding="utf-8")
+        .replace("\narea_max =", "\narea_mox =")
+    )
     said = done("check", "--tile", "64", "--target", written(tmp_path, text), code=2)
     assert "[conv]" in said
     assert "'area_mox'" in said
@@ -110,7 +122,9 @@ def test_without_cost_constants_what_predicts_refuses_and_the_rest_works(tmp_pat
     text = (HERE / "targets" / "vck190.toml").read_text(encoding="utf-8")
     path = written(tmp_path, re.sub(r"\n\[cost].*?\n\n", "\n", text, flags=re.DOTALL))
     done("check", "--tile", "64", "--target", path)
-    assert "no cost constants yet" in refused("stress", "--bit-flips", "--target", path, "--side", "32")
+    assert "no cost constants yet" in refused(
+        "stress", "--bit-flips", "--target", path, "--side", "32"
+    )
 
 
 def test_a_target_without_a_dpu_is_told_the_boards() -> None:

@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.errors import BeersError, OptionError, ProfileError
 from beers_deploy.profiles.scene_call import load_scene_call
-from beers_deploy.profiles.toml import JSON_BYTES, QUOTED, TOML_BYTES, parse_json, read_json, read_toml_text
+from beers_deploy.profiles.toml import (
+    JSON_BYTES,
+    QUOTED,
+    TOML_BYTES,
+    parse_json,
+    read_json,
+    read_toml_text,
+)
 from beers_deploy.quant.limits import limits_of
 
 BAD_TOML = {
@@ -80,14 +87,22 @@ def test_hostile_json_is_a_value_error(name: str) -> None:
         parse_json(BAD_JSON[name])
 
 
-@given(st.recursive(st.none() | st.booleans() | st.integers(-(10**9), 10**9) | st.text(), st.lists, max_leaves=20))
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers(-(10**9), 10**9) | st.text(),
+        st.lists,
+        max_leaves=20,
+    )
+)
 def test_what_is_plain_comes_through(value: object) -> None:
     import json
 
     assert parse_json(json.dumps(value)) == value
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pipes and devices among its files")
+@pytest.mark.skipif(
+    sys.platform == "win32", reason="Windows has no pipes and devices among its files"
+)
 def test_pipes_and_devices_are_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.json")
     for path in (tmp_path / "pipe.json", Path("/dev/zero")):

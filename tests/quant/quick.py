@@ -1,4 +1,6 @@
-"""What tests of quantising begin with: an image, patches of images, a copy to be spoilt, a search in a moment."""
+"""What tests of quantising begin with: an image, patches of images, a copy to be spoilt, a search
+in a moment.
+"""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,7 +16,16 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles import load_sensor
 from beers_deploy.quant.calibration import draw_patches
 from beers_deploy.quant.ends import ONE_CHANNEL, Ends
-from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Conv, Graph, Op, graph_to_onnx, same
+from beers_deploy.quant.graph import (
+    CORRECTION,
+    PLANES,
+    Activation,
+    Conv,
+    Graph,
+    Op,
+    graph_to_onnx,
+    same,
+)
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.quantise import Quantised, quantise_model
 from beers_deploy.quant.samples import Patches, Remade
@@ -29,7 +40,9 @@ def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:
 
 def patches_of(seen: list[np.ndarray]) -> Patches:
     """These images, each its own reference."""
-    return Patches([], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen)))
+    return Patches(
+        [], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen))
+    )
 
 
 def drawn(count: int, seed: int, scene: int = 1, patch_px: int = 128) -> Patches:
@@ -40,7 +53,9 @@ def drawn(count: int, seed: int, scene: int = 1, patch_px: int = 128) -> Patches
 
 
 def with_relu6(size: float) -> Graph:
-    """A depthwise convolution between others, behind each a ReLU6; the larger `size`, the more is clipped."""
+    """A depthwise convolution between others, behind each a ReLU6; the larger `size`, the more is
+    clipped.
+    """
     generator = np.random.default_rng(0)
     shapes = {"a": (5, 3, 3, 3), "b": (5, 1, 3, 3), "c": (4, 5, 1, 1), CORRECTION: (1, 4, 3, 3)}
     graph = list[Op]()
@@ -55,7 +70,9 @@ def with_relu6(size: float) -> Graph:
     return tuple(graph)
 
 
-def in_float(graph: Graph, seen: np.ndarray, ends: Ends = ONE_CHANNEL, name: str = CORRECTION) -> np.ndarray:
+def in_float(
+    graph: Graph, seen: np.ndarray, ends: Ends = ONE_CHANNEL, name: str = CORRECTION
+) -> np.ndarray:
     """What a plane-reading float graph makes of an image, or another of its tensors."""
     session = open_session(graph_to_onnx(graph, [name], ends.planes * ends.channels))
     return np.asarray(session.run(None, {PLANES: planes_of(seen, ends)})[0])
@@ -64,7 +81,9 @@ def in_float(graph: Graph, seen: np.ndarray, ends: Ends = ONE_CHANNEL, name: str
 def behind_conv(write: Callable[[GraphWriter], object]) -> onnx.ModelProto:
     """A convolution of one pixel, and behind it what `write` writes from `x` to `restored`."""
     writer = GraphWriter()
-    writer.node("Conv", "x", ["image", writer.constant("w", np.ones((2, 1, 1, 1), np.float32))], "first")
+    writer.node(
+        "Conv", "x", ["image", writer.constant("w", np.ones((2, 1, 1, 1), np.float32))], "first"
+    )
     write(writer)
     result = onnx.helper.make_tensor_value_info("restored", onnx.TensorProto.FLOAT, None)
     return make_model(writer.graph("g", [image_info("image", 1, None)], [result]), {})
@@ -83,7 +102,9 @@ def change(model: onnx.ModelProto, name: str, by: Callable[[np.ndarray], np.ndar
     tensor.CopyFrom(numpy_helper.from_array(np.asarray(by(value.copy()), value.dtype), name))
 
 
-def changed(model: onnx.ModelProto, name: str, by: Callable[[np.ndarray], np.ndarray]) -> onnx.ModelProto:
+def changed(
+    model: onnx.ModelProto, name: str, by: Callable[[np.ndarray], np.ndarray]
+) -> onnx.ModelProto:
     """A copy with one weight or bias changed."""
     copy = copied(model)
     change(copy, name, by)

@@ -1,4 +1,6 @@
-"""Networks that cannot be quantised are refused in a sentence; odd ones that can be lose no more than others."""
+"""Networks that cannot be quantised are refused in a sentence; odd ones that can be lose no more
+than others.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +13,15 @@ import pytest
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.core import build_core, shift_faults
 from beers_deploy.quant.gate import compare
-from beers_deploy.quant.graph import PLANES, Conv, Graph, Network, check_network, correction_graph, read_planes
+from beers_deploy.quant.graph import (
+    PLANES,
+    Conv,
+    Graph,
+    Network,
+    check_network,
+    correction_graph,
+    read_planes,
+)
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session
@@ -39,14 +49,25 @@ def twice(values: np.ndarray) -> np.ndarray:
     ("spoil", "said"),
     [
         (lambda _: (), "no operation"),
-        (lambda g: with_conv(g, "head", weight=lambda w: np.repeat(w, 3, axis=1)), "3 channels for head"),
+        (
+            lambda g: with_conv(g, "head", weight=lambda w: np.repeat(w, 3, axis=1)),
+            "3 channels for head",
+        ),
         (lambda g: g[:-1], "a last operation that writes the result"),
         (lambda g: with_conv(g, "head", bias=lambda b: b * np.nan), "NaN or infinity in head"),
-        (lambda g: with_conv(g, "body.0.second", weight=twice, bias=twice), "two tensors of one width"),
-        (lambda g: with_conv(g, "body.0.second", input=lambda _: "before the relu"), "before the relu"),
+        (
+            lambda g: with_conv(g, "body.0.second", weight=twice, bias=twice),
+            "two tensors of one width",
+        ),
+        (
+            lambda g: with_conv(g, "body.0.second", input=lambda _: "before the relu"),
+            "before the relu",
+        ),
     ],
 )
-def test_what_cannot_be_quantised_is_refused(spoil: Callable[[Graph], Graph], said: str, graph: Graph) -> None:
+def test_what_cannot_be_quantised_is_refused(
+    spoil: Callable[[Graph], Graph], said: str, graph: Graph
+) -> None:
     check_network(Network(graph))
     with pytest.raises(ModelError, match=said):
         check_network(Network(spoil(graph)))
@@ -68,15 +89,21 @@ def test_a_layer_that_never_fires_costs_nothing(
 
 
 @pytest.mark.parametrize("share", [1e-5, 1e-9, 0.0])
-def test_a_branch_of_tiny_values_stays_legal(share: float, float_onnx: onnx.ModelProto, patches: Patches) -> None:
-    """An add moves the branch to the stream's scale long after its weights were given one of their own."""
+def test_a_branch_of_tiny_values_stays_legal(
+    share: float, float_onnx: onnx.ModelProto, patches: Patches
+) -> None:
+    """An add moves the branch to the stream's scale long after its weights were given one of their
+    own.
+    """
     tiny = changed(float_onnx, "body.0.second.weight", lambda weight: weight * share)
     tiny = changed(tiny, "body.0.second.bias", lambda bias: bias * share)
     assert shift_faults(quickly(tiny, patches).core) == []
 
 
 def test_sizes_beyond_all_shifts_are_refused(graph: Graph) -> None:
-    huge = with_conv(read_planes(graph), "body.0.second", weight=lambda weight: weight * np.float32(1e30))
+    huge = with_conv(
+        read_planes(graph), "body.0.second", weight=lambda weight: weight * np.float32(1e30)
+    )
     frac_bits = {PLANES: 7, **{op.output: 8 for op in huge}}
     with pytest.raises(ModelError, match="shifts reach"):
         build_core(huge, frac_bits)

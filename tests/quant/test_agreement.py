@@ -1,4 +1,6 @@
-"""Layer by layer the integer reference and onnxruntime say the same, and what the DPU's rule changes is counted."""
+"""Layer by layer the integer reference and onnxruntime say the same, and what the DPU's rule
+changes is counted.
+"""
 
 from pathlib import Path
 

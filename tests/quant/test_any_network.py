@@ -1,4 +1,6 @@
-"""Networks of users: quantised, held to the integer reference bit for bit, bounded, read back, and tiled."""
+"""Networks of users: quantised, held to the integer reference bit for bit, bounded, read back, and
+tiled.
+"""
 
 import json
 from collections.abc import Callable
@@ -35,13 +37,19 @@ SIDE_PX = 48
 
 
 def images(name: str, count: int = 3, side_px: int = SIDE_PX) -> list[np.ndarray]:
-    """Smooth patches with an edge, of the network's channels and size: (1, C, h, w) float32 in [0, 1]."""
+    """Smooth patches with an edge, of the network's channels and size: (1, C, h, w) float32 in [0,
+    1].
+    """
     side = NETWORKS[name].side_px or side_px
     generator = np.random.default_rng(7)
     rows, columns = np.mgrid[:side, :side] / side
     found = []
     for k in range(count):
-        waves = 0.3 + 0.2 * np.sin(9 * rows + k) * np.cos(7 * columns) + 0.3 * (rows + columns > 0.8 + 0.2 * k)
+        waves = (
+            0.3
+            + 0.2 * np.sin(9 * rows + k) * np.cos(7 * columns)
+            + 0.3 * (rows + columns > 0.8 + 0.2 * k)
+        )
         bands = [waves * share for share in np.linspace(1, 0.5, NETWORKS[name].inputs)]
         noisy = np.stack(bands) + 0.01 * generator.standard_normal((len(bands), side, side))
         found.append(np.clip(noisy, 0, 1).astype(np.float32)[None])
@@ -100,7 +108,11 @@ def test_a_file_is_read_back_as_the_core_it_was_written_from(name: str) -> None:
     assert encoding_faults(made.host) == []
     for one, other in zip(again.convolutions, made.core.convolutions, strict=True):
         np.testing.assert_array_equal(one.weight, other.weight)
-        assert (one.window, one.groups, one.activation) == (other.window, other.groups, other.activation)
+        assert (one.window, one.groups, one.activation) == (
+            other.window,
+            other.groups,
+            other.activation,
+        )
     planes = made.core.ends.split(images(name)[0])
     np.testing.assert_array_equal(
         run_core(again, planes)[0]["correction"], run_core(made.core, planes)[0]["correction"]
@@ -126,7 +138,9 @@ def test_a_weight_that_is_not_what_the_file_says_is_a_fault() -> None:
         lambda said: said["ops"].clear(),
     ],
 )
-def test_a_description_of_something_else_is_one_sentence(change: Callable[[dict[str, Any]], object]) -> None:
+def test_a_description_of_something_else_is_one_sentence(
+    change: Callable[[dict[str, Any]], object],
+) -> None:
     spoilt = copied(quantised("unet").host)
     entry = next(each for each in spoilt.metadata_props if each.key == KEY)
     said = json.loads(entry.value)
@@ -159,12 +173,21 @@ def one_convolution(weight: float, bias: float) -> onnx.ModelProto:
     """image * weight + bias, without a global add."""
     writer = GraphWriter()
     weights = writer.constant("w", np.full((1, 1, 1, 1), weight, np.float32))
-    writer.node("Conv", "restored", ["image", weights, writer.constant("b", np.full(1, bias, np.float32))], "c")
-    return make_model(writer.graph("one", [image_info("image", 1, None)], [image_info("restored", 1, None)]), {})
+    writer.node(
+        "Conv",
+        "restored",
+        ["image", weights, writer.constant("b", np.full(1, bias, np.float32))],
+        "c",
+    )
+    return make_model(
+        writer.graph("one", [image_info("image", 1, None)], [image_info("restored", 1, None)]), {}
+    )
 
 
 @pytest.mark.parametrize(("weight", "bias"), [(1.0, 0.0), (-0.7, 0.93), (0.4, -0.31)])
-def test_windows_make_a_result_finer_than_8_bits(weight: float, bias: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_windows_make_a_result_finer_than_8_bits(
+    weight: float, bias: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     seen = images("ffdnet")
     patches = patches_of(seen)
     model = one_convolution(weight, bias)

@@ -1,4 +1,6 @@
-"""Calibration patches: spread over light, blur and noise; made anew each time; statistics the same in pieces."""
+"""Calibration patches: spread over light, blur and noise; made anew each time; statistics the same
+in pieces.
+"""
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -17,7 +19,14 @@ from beers_deploy.quant.calibration import draw_patches, stratified
 from beers_deploy.quant.graph import PLANES, Graph, graph_to_onnx, tensors
 from beers_deploy.quant.quantise import choose_frac_bits
 from beers_deploy.quant.samples import Patches
-from beers_deploy.quant.session import TILE_PX, crops, halo_of, open_session, planes_of, tensor_values
+from beers_deploy.quant.session import (
+    TILE_PX,
+    crops,
+    halo_of,
+    open_session,
+    planes_of,
+    tensor_values,
+)
 from tests.quant.quick import image
 
 VARIABLE = load_sensor("pleiades-variable")
@@ -61,7 +70,9 @@ def test_the_pair_shows_the_same_ground(drawn: Patches) -> None:
 
 
 def test_the_ranges_are_covered_without_gaps(scenes: list[Scene]) -> None:
-    """With 40 strata, each 1/40 of the candidates: no gap in the MTF exceeds a few strata, and both ends are seen."""
+    """With 40 strata, each 1/40 of the candidates: no gap in the MTF exceeds a few strata, and both
+    ends are seen.
+    """
     views = draw_patches(scenes, VARIABLE, REFERENCE, count=40, seed=0, patch_px=40).views
     low = VARIABLE.mtf_nyquist.low
     high = VARIABLE.mtf_nyquist.high
@@ -105,7 +116,9 @@ def test_scenes_too_small_for_a_patch_are_refused(scenes: list[Scene]) -> None:
         draw_patches(scenes, VARIABLE, REFERENCE, count=1, seed=0, patch_px=300)
 
 
-@pytest.mark.parametrize("shape", [(TILE_PX, 31), (TILE_PX + 1, 37), (2 * TILE_PX + 3, TILE_PX + 70)])
+@pytest.mark.parametrize(
+    "shape", [(TILE_PX, 31), (TILE_PX + 1, 37), (2 * TILE_PX + 3, TILE_PX + 70)]
+)
 def test_pieces_hold_what_the_whole_image_gives(graph: Graph, shape: tuple[int, int]) -> None:
     """And no run returns more than a piece with its halo, which bounds memory."""
     names = tensors(graph)
@@ -117,11 +130,15 @@ def test_pieces_hold_what_the_whole_image_gives(graph: Graph, shape: tuple[int, 
     pieces, without_halo = (list(tensor_values(session, names, whole, px)) for px in (halo_px, 0))
     for k, tensor in enumerate(wanted):
         assert sum(piece[k].size for piece in pieces) == tensor.size
-        assert max(np.abs(piece[k]).max() for piece in pieces) == pytest.approx(np.abs(tensor).max(), rel=1e-5)
+        assert max(np.abs(piece[k]).max() for piece in pieces) == pytest.approx(
+            np.abs(tensor).max(), rel=1e-5
+        )
         assert energy(piece[k] for piece in pieces) == pytest.approx(energy([tensor]), rel=1e-5)
     assert max(each.base.shape[2] for piece in pieces for each in piece) <= TILE_PX + 2 * halo_px  # type: ignore[union-attr]
     if len(pieces) > 1:
-        assert energy(piece[-1] for piece in without_halo) != pytest.approx(energy(wanted[-1:]), rel=1e-5)
+        assert energy(piece[-1] for piece in without_halo) != pytest.approx(
+            energy(wanted[-1:]), rel=1e-5
+        )
 
 
 def energy(parts: Iterable[np.ndarray]) -> float:
@@ -135,10 +152,14 @@ def test_crops_tile_the_image() -> None:
     np.testing.assert_array_equal(np.concatenate(found, axis=2), whole)
 
 
-def test_positions_of_a_large_image_are_those_of_its_whole(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_positions_of_a_large_image_are_those_of_its_whole(
+    graph: Graph, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """In pieces or at once: found here by hand from whole tensors."""
     whole = image(TILE_PX + 21, 50)
-    monkeypatch.setattr("beers_deploy.quant.quantise._errors", lambda *_: np.zeros(1))  # the scale that clips nothing
+    monkeypatch.setattr(
+        "beers_deploy.quant.quantise._errors", lambda *_: np.zeros(1)
+    )  # the scale that clips nothing
     frac_bits = choose_frac_bits(graph, [whole])
     names = tensors(graph)
     values = open_session(graph_to_onnx(graph, names)).run(names, {PLANES: planes_of(whole)})

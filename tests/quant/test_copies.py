@@ -15,16 +15,25 @@ SEEN = [image(24, 31, seed) for seed in range(3)]
 
 
 def network(dead: int, seed: int = 0) -> Graph:
-    """A depthwise convolution between dense ones; so many of its seven channels are never above zero."""
+    """A depthwise convolution between dense ones; so many of its seven channels are never above
+    zero.
+    """
     generator = np.random.default_rng(seed)
     graph = list[Conv]()
     source = PLANES
-    for name, shape in {"a": (7, 3, 3, 3), "b": (7, 1, 3, 3), "c": (4, 7, 1, 1), CORRECTION: (2, 4, 3, 3)}.items():
+    for name, shape in {
+        "a": (7, 3, 3, 3),
+        "b": (7, 1, 3, 3),
+        "c": (4, 7, 1, 1),
+        CORRECTION: (2, 4, 3, 3),
+    }.items():
         weight = generator.normal(0.1, 0.4, shape).astype(np.float32)
         bias = np.full(shape[0], 0.1, np.float32)
         activation = Activation.none if name == CORRECTION else Activation.relu
         groups = 7 if name == "b" else 1
-        graph.append(Conv(f"{name}.conv", source, name, weight, bias, activation, same(weight), groups))
+        graph.append(
+            Conv(f"{name}.conv", source, name, weight, bias, activation, same(weight), groups)
+        )
         source = name
     bias = graph[1].bias.copy()
     bias[1 : 1 + dead] = -100
@@ -47,7 +56,9 @@ def test_the_network_stays_and_dead_channels_are_those_that_cost_most(dead: int)
     }
     for name in "ab":
         values = results(found, name)
-        assert all((values[:, [c]] == np.delete(values, c, 1)).all((0, 2, 3)).any() for c in copies[name])
+        assert all(
+            (values[:, [c]] == np.delete(values, c, 1)).all((0, 2, 3)).any() for c in copies[name]
+        )
     size = results(graph, "b").max((0, 2, 3))
     weights = np.square(graph[2].weight).sum((0, 2, 3))  # type: ignore[attr-defined]
     most = int(np.argmax(np.square(size) * weights))

@@ -1,4 +1,6 @@
-"""Weights fitted to what a convolution reads: its result errs less, in the spirit of the exact quadratic."""
+"""Weights fitted to what a convolution reads: its result errs less, in the spirit of the exact
+quadratic.
+"""
 
 import numpy as np
 import onnx
@@ -56,10 +58,14 @@ def test_of_weights_that_meet_unrelated_values_the_nearest_stay() -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(-4, -1), st.integers(1, 5))
-def test_weights_of_a_channel_that_hardly_changes_stay_near(seed: int, exponent: float, still: int) -> None:
+def test_weights_of_a_channel_that_hardly_changes_stay_near(
+    seed: int, exponent: float, still: int
+) -> None:
     generator = np.random.default_rng(seed)
     spread = np.where(np.arange(12) < still, 10.0**exponent, 1.0)
-    seen, other = (generator.normal(0, 1, (400, 12)) + generator.normal(0, 2, (400, 1)) for _ in range(2))
+    seen, other = (
+        generator.normal(0, 1, (400, 12)) + generator.normal(0, 2, (400, 1)) for _ in range(2)
+    )
     moments = moments_of((3 + spread * seen).astype(np.float32)[:, None])
     wanted = generator.uniform(-100, 100, (24, 12))
     found = descend(wanted, moments.covariance[0])
@@ -93,12 +99,16 @@ def test_each_group_is_fitted_to_what_it_reads_in_int8_and_to_its_float_mean(
     wanted, found = (values.reshape(groups, outputs, 6) for values in (weight, unit * fitted))
     lost = np.einsum("kgn,gon->kgo", read, found) - np.einsum("kgn,gon->kgo", exact, wanted)
     assert_allclose(raised, lost.mean(axis=0).ravel(), atol=1e-3)
-    for each, meant, covariance in zip(found / unit, wanted / unit, moments.covariance, strict=True):
+    for each, meant, covariance in zip(
+        found / unit, wanted / unit, moments.covariance, strict=True
+    ):
         assert (each == descend(meant, covariance)).all()
 
 
 @pytest.mark.parametrize("depthwise", [False, True])
-def test_every_layer_errs_less(depthwise: bool, graph: Graph, patches: Patches, unseen: Patches) -> None:
+def test_every_layer_errs_less(
+    depthwise: bool, graph: Graph, patches: Patches, unseen: Patches
+) -> None:
     graph = with_relu6(0.5) if depthwise else graph
     nearest = build_core(graph, choose_frac_bits(graph, patches.degraded))
     fitted = fit_weights(graph, nearest, patches.degraded)
@@ -110,7 +120,9 @@ def test_every_layer_errs_less(depthwise: bool, graph: Graph, patches: Patches, 
             found, _ = run_core(core, core.ends.split(image))
             scaled = (found[op.output] * core.scale(op.output) for op in core.ops)
             errors[k] += [np.square(a - b).mean() for a, b in zip(scaled, wanted, strict=True)]
-    behind = 1 if depthwise else 0  # the first of so few channels errs by chance, and reads nothing that is rounded
+    behind = (
+        1 if depthwise else 0
+    )  # the first of so few channels errs by chance, and reads nothing that is rounded
     assert (errors[1] < errors[0])[behind:].all()
 
 
@@ -118,7 +130,9 @@ def test_it_lowers_the_network_s_error_on_unseen_patches(
     float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def mae() -> float:
-        return compare(open_session(float_onnx), open_session(quickly(float_onnx, patches).host), unseen.pairs).mae
+        return compare(
+            open_session(float_onnx), open_session(quickly(float_onnx, patches).host), unseen.pairs
+        ).mae
 
     fitted = mae()
     monkeypatch.setattr("beers_deploy.quant.quantise.fit_weights", lambda _graph, core, *_: core)

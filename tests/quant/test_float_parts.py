@@ -57,7 +57,10 @@ def written(path: Path) -> Path:
     w.node("Conv", "a", ["image", first], pads=[1, 1, 1, 1])
     w.node("Relu", "b", ["a"])
     w.node("Conv", "y", ["b", second], pads=[1, 1, 1, 1])
-    save_onnx(make_model(w.graph("g", [image_info("image", 1, None)], [image_info("y", 1, None)]), {}), path)
+    save_onnx(
+        make_model(w.graph("g", [image_info("image", 1, None)], [image_info("y", 1, None)]), {}),
+        path,
+    )
     return path
 
 

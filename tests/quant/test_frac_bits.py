@@ -5,7 +5,13 @@ from hypothesis import strategies as st
 
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.errors import ProfileError
-from beers_deploy.quant.core import SHIFTS, best_frac_bits, quantise, target_shifts, unclipped_frac_bits
+from beers_deploy.quant.core import (
+    SHIFTS,
+    best_frac_bits,
+    quantise,
+    target_shifts,
+    unclipped_frac_bits,
+)
 
 
 @given(st.floats(1e-6, 1e6))
@@ -33,14 +39,17 @@ def test_an_outlier_is_clipped_rather_than_coarsening_the_rest_and_zeros_have_a_
 
 
 @pytest.mark.parametrize(
-    ("value", "expected"), [(0.5, 1), (-0.5, -1), (1.5, 2), (126.5, 127), (300.0, 127), (-300.0, -128)]
+    ("value", "expected"),
+    [(0.5, 1), (-0.5, -1), (1.5, 2), (126.5, 127), (300.0, 127), (-300.0, -128)],
 )
 def test_constants_round_half_away_from_zero_and_saturate(value: float, expected: int) -> None:
     assert quantise(np.array([value]), 0)[0] == expected
 
 
 def test_the_windows_are_those_of_the_target() -> None:
-    """What is built in, for tests and callers without a board, is what the shipped profile states."""
+    """What is built in, for tests and callers without a board, is what the
+    shipped profile states.
+    """
     assert target_shifts(load_target("vck190")) == SHIFTS
     with pytest.raises(ProfileError, match="shift_"):
         target_shifts(load_target("host-cpu"))

@@ -35,7 +35,9 @@ def test_no_digital_number_is_lost_in_planes_nor_wrapped() -> None:
     assert STEP * high[0] + high[1] == MAX_DN
 
 
-def test_a_plain_network_keeps_its_weights_and_relus_and_leaves_the_global_add(float_onnx: onnx.ModelProto) -> None:
+def test_a_plain_network_keeps_its_weights_and_relus_and_leaves_the_global_add(
+    float_onnx: onnx.ModelProto,
+) -> None:
     graph = correction_graph(float_onnx)
     assert graph[0].inputs == (IMAGE,)
     assert graph[-1].output == CORRECTION
@@ -49,8 +51,13 @@ def test_a_plain_network_keeps_its_weights_and_relus_and_leaves_the_global_add(f
 
 @pytest.mark.parametrize("kind", ["Sigmoid", "Tanh"])
 def test_other_operators_are_refused_by_name(kind: str) -> None:
-    nodes = [helper.make_node(kind, ["image"], ["x"]), helper.make_node("Add", ["image", "x"], ["restored"])]
-    graph = helper.make_graph(nodes, "g", [image_info("image", 1, None)], [image_info("restored", 1, None)])
+    nodes = [
+        helper.make_node(kind, ["image"], ["x"]),
+        helper.make_node("Add", ["image", "x"], ["restored"]),
+    ]
+    graph = helper.make_graph(
+        nodes, "g", [image_info("image", 1, None)], [image_info("restored", 1, None)]
+    )
     with pytest.raises(ModelError, match=kind):
         correction_graph(make_model(graph, {}))
 
@@ -72,11 +79,17 @@ def test_a_strided_convolution_is_refused(float_onnx: onnx.ModelProto) -> None:
 
 @pytest.mark.parametrize("kind", ["Add", "Sub", "Mul"])
 @pytest.mark.parametrize("shape", [(1, 2, 1, 1), (2, 1, 1), ()])
-def test_one_number_a_channel_behind_an_activation_is_a_convolution(kind: str, shape: tuple[int, ...]) -> None:
+def test_one_number_a_channel_behind_an_activation_is_a_convolution(
+    kind: str, shape: tuple[int, ...]
+) -> None:
     value = np.random.default_rng(0).normal(size=shape).astype(np.float32)
 
     def write(w: GraphWriter) -> None:
-        w.node(kind, "restored", [w.node("LeakyRelu", "y", ["x"], alpha=26 / 256), w.constant("own", value)])
+        w.node(
+            kind,
+            "restored",
+            [w.node("LeakyRelu", "y", ["x"], alpha=26 / 256), w.constant("own", value)],
+        )
 
     last = read_network(behind_conv(write)).graph[-1]
     assert isinstance(last, Conv)
@@ -88,19 +101,30 @@ def test_one_number_a_channel_behind_an_activation_is_a_convolution(kind: str, s
 
 @pytest.mark.parametrize("factor", [2, 3, 4])
 @pytest.mark.parametrize("rounding", ["floor", "ceil", "round_prefer_floor", "round_prefer_ceil"])
-@pytest.mark.parametrize("where", ["asymmetric", "half_pixel", "pytorch_half_pixel", "align_corners"])
-def test_a_nearest_resize_is_taken_where_it_makes_blocks(where: str, rounding: str, factor: int) -> None:
+@pytest.mark.parametrize(
+    "where", ["asymmetric", "half_pixel", "pytorch_half_pixel", "align_corners"]
+)
+def test_a_nearest_resize_is_taken_where_it_makes_blocks(
+    where: str, rounding: str, factor: int
+) -> None:
     def write(w: GraphWriter) -> None:
         how = {"mode": "nearest", "coordinate_transformation_mode": where, "nearest_mode": rounding}
         w.node(
-            "Resize", "restored", ["x", "", w.constant("s", np.array([1, 1, factor, factor], np.float32))], "r", **how
+            "Resize",
+            "restored",
+            ["x", "", w.constant("s", np.array([1, 1, factor, factor], np.float32))],
+            "r",
+            **how,
         )
 
     model = behind_conv(write)
     pixels = np.random.default_rng(0).random((1, 1, 5, 7), np.float32)
     found = result_of(open_session(model), pixels)[:, :1]
-    # With aligned corners the places depend on the image's size: right for this one is not right for all.
-    if where != "align_corners" and np.array_equal(found, pixels.repeat(factor, 2).repeat(factor, 3)):
+    # With aligned corners the places depend on the image's size: right for this one is not right
+    # for all.
+    if where != "align_corners" and np.array_equal(
+        found, pixels.repeat(factor, 2).repeat(factor, 3)
+    ):
         last = read_network(model).graph[-1]
         assert isinstance(last, Resize)
         assert last.factor == factor
@@ -118,9 +142,17 @@ def test_a_nearest_resize_is_taken_where_it_makes_blocks(where: str, rounding: s
         ({"strides": [2, 2], "auto_pad": "SAME_UPPER"}, "stated pads"),
     ],
 )
-def test_transposed_convolutions_that_the_dpu_lacks_are_refused(given: dict[str, Any], said: str) -> None:
+def test_transposed_convolutions_that_the_dpu_lacks_are_refused(
+    given: dict[str, Any], said: str
+) -> None:
     def write(w: GraphWriter) -> None:
-        w.node("ConvTranspose", "restored", ["x", w.constant("t", np.ones((2, 2, 2, 2), np.float32))], "up", **given)
+        w.node(
+            "ConvTranspose",
+            "restored",
+            ["x", w.constant("t", np.ones((2, 2, 2, 2), np.float32))],
+            "up",
+            **given,
+        )
 
     with pytest.raises(ModelError, match=f"{said}.* at ConvTranspose up"):
         read_network(behind_conv(write))
@@ -128,6 +160,8 @@ def test_transposed_convolutions_that_the_dpu_lacks_are_refused(given: dict[str,
 
 def test_two_outputs_are_refused_by_name() -> None:
     model = behind_conv(lambda w: w.node("Relu", "restored", ["x"]))
-    model.graph.output.append(helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, ["N", 2, "H", "W"]))
+    model.graph.output.append(
+        helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, ["N", 2, "H", "W"])
+    )
     with pytest.raises(ModelError, match="one output, got 2: restored, x"):
         read_network(model)

@@ -1,4 +1,6 @@
-"""The integer reference: the documented arithmetic, equal to the runtime bit for bit but for tie rounding."""
+"""The integer reference: the documented arithmetic, equal to the runtime bit for bit but for tie
+rounding.
+"""
 
 from dataclasses import replace
 
@@ -44,7 +46,14 @@ def test_under_the_dpu_s_rounding_it_differs_by_halves_alone(quantised: Quantise
 
 def one_conv(weight: int, bias: int, cut: int, activation: Activation = Activation.none) -> IntCore:
     op = IntConv(
-        "c", PLANES, CORRECTION, np.full((1, 1, 1, 1), weight, np.int8), 0, np.array([bias], np.int8), 0, activation
+        "c",
+        PLANES,
+        CORRECTION,
+        np.full((1, 1, 1, 1), weight, np.int8),
+        0,
+        np.array([bias], np.int8),
+        0,
+        activation,
     )
     return IntCore((op,), {PLANES: 0, CORRECTION: -cut})
 
@@ -57,7 +66,21 @@ def values(core: IntCore, inputs: list[int], half_even: bool = False) -> list[in
 def test_halves_go_up_and_in_the_runtime_to_even() -> None:
     inputs = [-6, -5, -4, -3, -2, -1, 0, 1, 2, 3, 4, 5, 6]
     assert values(one_conv(1, 0, 2), inputs) == [-1, -1, -1, -1, 0, 0, 0, 0, 1, 1, 1, 1, 2]
-    assert values(one_conv(1, 0, 2), inputs, half_even=True) == [-2, -1, -1, -1, 0, 0, 0, 0, 0, 1, 1, 1, 2]
+    assert values(one_conv(1, 0, 2), inputs, half_even=True) == [
+        -2,
+        -1,
+        -1,
+        -1,
+        0,
+        0,
+        0,
+        0,
+        0,
+        1,
+        1,
+        1,
+        2,
+    ]
 
 
 def test_products_saturate_at_int8_s_ends() -> None:

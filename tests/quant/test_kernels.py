@@ -1,8 +1,9 @@
-"""Integer operators are added exactly, in the ways that a processor takes whose fast kernels saturate.
+"""Integer operators are added exactly, in the ways that a processor takes whose fast kernels
+saturate.
 
-The ways are forced, so that they are proven on every processor; where the kernels do saturate, leaving them out
-fails (`test_left_alone_they_saturate_where_the_processor_does`). Filled with channels of zeros, a network gives the
-same numbers.
+The ways are forced, so that they are proven on every processor; where the kernels do saturate,
+leaving them out fails (`test_left_alone_they_saturate_where_the_processor_does`). Filled with
+channels of zeros, a network gives the same numbers.
 """
 
 from pathlib import Path
@@ -21,7 +22,15 @@ from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.integer.reference import merged_correction, run_core
-from beers_deploy.quant.kernels import FEWEST_OUTPUTS, INT16_MAX, INT16_MIN, Way, cannot_saturate, filled, made_exact
+from beers_deploy.quant.kernels import (
+    FEWEST_OUTPUTS,
+    INT16_MAX,
+    INT16_MIN,
+    Way,
+    cannot_saturate,
+    filled,
+    made_exact,
+)
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session, run
 from tests.quant.quick import Calibration
@@ -33,9 +42,15 @@ GROUPED = [(12, 3, 3, 2), (12, 1, 3, 6)]
 
 
 def convolution(
-    weight: np.ndarray, kind: type[np.uint8 | np.int8], groups: int = 1, per_channel: bool = False, middle: int = 3
+    weight: np.ndarray,
+    kind: type[np.uint8 | np.int8],
+    groups: int = 1,
+    per_channel: bool = False,
+    middle: int = 3,
 ) -> onnx.ModelProto:
-    """QLinearConv of images (N, C, H, W) of 8 bits by int8 weights (O, C / groups, k, k), asymmetric, with a bias."""
+    """QLinearConv of images (N, C, H, W) of 8 bits by int8 weights (O, C / groups, k, k),
+    asymmetric, with a bias.
+    """
     outputs = len(weight)
     terms = weight[0].size
     unit = 2.0 ** -np.ceil(np.log2(terms * 127))
@@ -43,14 +58,29 @@ def convolution(
         "unit": np.float32(1),
         "middle": np.asarray(100 if kind is np.uint8 else -7, kind),
         "weight": weight,
-        "weight_unit": 2.0 ** (np.arange(outputs) % 3).astype(np.float32) if per_channel else np.float32(1),
+        "weight_unit": 2.0 ** (np.arange(outputs) % 3).astype(np.float32)
+        if per_channel
+        else np.float32(1),
         "weight_middle": np.zeros(outputs, np.int8) if per_channel else np.int8(middle),
         "result_unit": np.float32(1 / unit / 4),
         "bias": np.arange(outputs, dtype=np.int32) * 1001 - 7,
     }
-    feeds = ["image", "unit", "middle", "weight", "weight_unit", "weight_middle", "result_unit", "middle", "bias"]
+    feeds = [
+        "image",
+        "unit",
+        "middle",
+        "weight",
+        "weight_unit",
+        "weight_middle",
+        "result_unit",
+        "middle",
+        "bias",
+    ]
     element = helper.np_dtype_to_tensor_dtype(np.dtype(kind))
-    ends = [helper.make_tensor_value_info(name, element, ["N", None, "H", "W"]) for name in ("image", "result")]
+    ends = [
+        helper.make_tensor_value_info(name, element, ["N", None, "H", "W"])
+        for name in ("image", "result")
+    ]
     held = [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()]
     node = helper.make_node("QLinearConv", feeds, ["result"], name="convolution", group=groups)
     graph = helper.make_graph([node], "one", ends[:1], ends[1:], held)
@@ -62,7 +92,10 @@ def by_definition(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
     held = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
     groups = model.graph.node[0].attribute[0].i
     shifted = image.astype(np.int64) - int(held["middle"])
-    weight = held["weight"].astype(np.int64) - held["weight_middle"].astype(np.int64).reshape(-1, *([1] * 3))[:1]
+    weight = (
+        held["weight"].astype(np.int64)
+        - held["weight_middle"].astype(np.int64).reshape(-1, *([1] * 3))[:1]
+    )
     per_group = weight.shape[1]
     kernel = weight.shape[2]
     height, width = (side - kernel + 1 for side in image.shape[2:])
@@ -87,7 +120,11 @@ def by_definition(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
 )
 @settings(max_examples=60, deadline=None)
 def test_any_convolution_is_added_exactly(
-    shape: tuple[int, int, int, int], kind: type[np.uint8 | np.int8], per_channel: bool, large: bool, seed: int
+    shape: tuple[int, int, int, int],
+    kind: type[np.uint8 | np.int8],
+    per_channel: bool,
+    large: bool,
+    seed: int,
 ) -> None:
     generator = np.random.default_rng(seed)
     outputs, inputs, kernel, groups = shape
@@ -103,7 +140,9 @@ def test_any_convolution_is_added_exactly(
 
 
 def test_left_alone_they_saturate_where_the_processor_does() -> None:
-    """The control: without the ways the numbers are wrong on such a processor, and right on any other."""
+    """The control: without the ways the numbers are wrong on such a processor, and right on any
+    other.
+    """
     image = np.full((1, 32, 5, 5), 255, np.uint8)
     weight = np.full((16, 32, 3, 3), 127, np.int8)
     model = convolution(weight, np.uint8)
@@ -122,9 +161,13 @@ def test_left_alone_they_saturate_where_the_processor_does() -> None:
 def test_what_is_proven_holds_for_the_worst_activations(
     inputs: int, kernel: int, largest: int, seed: int, size: int
 ) -> None:
-    """Of the pairs that a kernel forms from channel to channel of a tap, and across taps where they are odd."""
+    """Of the pairs that a kernel forms from channel to channel of a tap, and across taps where they
+    are odd.
+    """
     generator = np.random.default_rng(seed)
-    weight = np.clip(generator.integers(-size, size + 1, (3, inputs, kernel, kernel)), -128, 127).astype(np.int8)
+    weight = np.clip(
+        generator.integers(-size, size + 1, (3, inputs, kernel, kernel)), -128, 127
+    ).astype(np.int8)
     line = np.moveaxis(weight.reshape(3, inputs, -1), 1, 2).reshape(3, -1).astype(np.int64)
     line = np.pad(line, ((0, 0), (0, line.shape[1] % 2)))
     pairs = line.reshape(3, -1, 2)
@@ -170,7 +213,9 @@ def test_shipped_networks_are_those_of_the_integer_reference(path: Path, optimis
 
 @pytest.mark.parametrize("path", SMALL, ids=lambda path: path.stem)
 def test_behind_a_relu_no_weights_saturate(path: Path) -> None:
-    """What keeps INT8 faster than float32: a third of the convolutions, the largest, keep the fast kernels."""
+    """What keeps INT8 faster than float32: a third of the convolutions, the largest, keep the fast
+    kernels.
+    """
     ways = made_exact(load_onnx(path))[1]
     behind = {way for name, way in ways.items() if name.endswith(".second")}
     assert behind == {Way.signed}
@@ -209,7 +254,9 @@ def test_weights_that_are_computed_are_refused_in_a_sentence() -> None:
     model = convolution(np.full((4, 4, 1, 1), 3, np.int8), np.uint8)
     stored = next(tensor for tensor in model.graph.initializer if tensor.name == "weight")
     model.graph.initializer.remove(stored)
-    model.graph.input.append(helper.make_tensor_value_info("weight", TensorProto.INT8, [4, 4, 1, 1]))
+    model.graph.input.append(
+        helper.make_tensor_value_info("weight", TensorProto.INT8, [4, 4, 1, 1])
+    )
     with pytest.raises(ModelError, match="QLinearConv 'convolution' with computed weights"):
         open_session(model, exact=True)
 
@@ -218,9 +265,15 @@ def test_weights_that_are_computed_are_refused_in_a_sentence() -> None:
 @pytest.mark.parametrize("per_channel", [False, True])
 @pytest.mark.parametrize("form", [QuantFormat.QOperator, QuantFormat.QDQ])
 def test_files_of_other_makers_give_the_same_numbers_in_these_ways(
-    form: QuantFormat, per_channel: bool, activations: QuantType, float_onnx: onnx.ModelProto, tmp_path: Path
+    form: QuantFormat,
+    per_channel: bool,
+    activations: QuantType,
+    float_onnx: onnx.ModelProto,
+    tmp_path: Path,
 ) -> None:
-    """Asymmetric activations, float scales; QDQ as the integer operators that the runtime makes of it."""
+    """Asymmetric activations, float scales; QDQ as the integer operators that the runtime makes of
+    it.
+    """
     options = {
         "quant_format": form,
         "per_channel": per_channel,
@@ -229,7 +282,9 @@ def test_files_of_other_makers_give_the_same_numbers_in_these_ways(
     }
     noise = list(np.random.default_rng(4).random((4, 1, 1, 24, 24), dtype=np.float32))
     onnx.save_model(float_onnx, tmp_path / "float.onnx")
-    quantize_static(tmp_path / "float.onnx", tmp_path / "theirs.onnx", Calibration(noise), **options)
+    quantize_static(
+        tmp_path / "float.onnx", tmp_path / "theirs.onnx", Calibration(noise), **options
+    )
     theirs = load_onnx(tmp_path / "theirs.onnx")
     assert set(made_exact(theirs)[1].values()) & {Way.unsigned, Way.converted}
     image = np.random.default_rng(1).integers(0, 2, (1, 1, 31, 45)).astype(np.float32)
@@ -267,12 +322,15 @@ def test_no_convolution_stays_narrow_and_the_numbers_are_the_same(path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("middle", "opset", "shape"), [(0, 17, (FEWEST_OUTPUTS, 4, 1, 1)), (3, 17, (1, 2, 1, 1)), (0, 10, (1, 2, 1, 1))]
+    ("middle", "opset", "shape"),
+    [(0, 17, (FEWEST_OUTPUTS, 4, 1, 1)), (3, 17, (1, 2, 1, 1)), (0, 10, (1, 2, 1, 1))],
 )
 def test_one_output_is_filled_where_a_stored_zero_is_a_weight_of_zero(
     middle: int, opset: int, shape: tuple[int, ...]
 ) -> None:
-    """Its bias has one number, as a scale for the whole tensor might; older opsets cannot be filled."""
+    """Its bias has one number, as a scale for the whole tensor might; older opsets cannot be
+    filled.
+    """
     model = convolution(np.array([[[[1]], [[-2]]]], np.int8), np.uint8, middle=middle)
     model.opset_import[0].version = opset
     image = np.random.default_rng(0).integers(0, 256, (1, 2, 3, 5)).astype(np.uint8)

@@ -1,4 +1,6 @@
-"""Levelling a network without a stream: the float network stays, the search only gains, most on unequal channels."""
+"""Levelling a network without a stream: the float network stays, the search only gains, most on
+unequal channels.
+"""
 
 import numpy as np
 import onnx
@@ -67,7 +69,9 @@ def test_levelling_leaves_the_float_network_as_it_was(name: str) -> None:
 
 def test_what_others_read_or_factors_do_not_pass_is_left_alone() -> None:
     _, graph, _, chain = read("unet")
-    pooled = {tensor for op in graph if not isinstance(op, Conv) for tensor in (*op.inputs, op.output)}
+    pooled = {
+        tensor for op in graph if not isinstance(op, Conv) for tensor in (*op.inputs, op.output)
+    }
     assert pooled
     assert not pooled & set(chain.tensors)
     _, graph, _, chain = read("segment")
@@ -85,17 +89,23 @@ def test_relu6_is_the_end_of_int8_whatever_the_factors(seed: int, size: float) -
     scaled = chain.scaled(graph, np.random.default_rng(seed).lognormal(-2, 1, 14))
     wanted = correction(graph, ends)
     np.testing.assert_allclose(correction(scaled, ends), wanted, atol=2e-5 * np.abs(wanted).max())
-    core = build_core(scaled, {PLANES: PLANES_FRAC_BITS, CORRECTION: 4} | dict.fromkeys("abc", STREAM_FRAC_BITS))
+    core = build_core(
+        scaled, {PLANES: PLANES_FRAC_BITS, CORRECTION: 4} | dict.fromkeys("abc", STREAM_FRAC_BITS)
+    )
     kinds = [op.activation for op in core.convolutions]
     assert kinds == [Activation.relu] * 3 + [Activation.none]
     tensors, _ = run_core(core, split(images()[0]))
     for op in scaled[:-1]:
         assert isinstance(op, Conv)
-        assert (tensors[op.output].max((0, 2, 3)) * core.scale(op.output) <= op.ceilings * (1 + 1e-6)).all()
+        assert (
+            tensors[op.output].max((0, 2, 3)) * core.scale(op.output) <= op.ceilings * (1 + 1e-6)
+        ).all()
 
 
 class Bowl:
-    """A cost that is known: how far the channels of the first tensor are from factors of their own, on two crops."""
+    """A cost that is known: how far the channels of the first tensor are from factors of their own,
+    on two crops.
+    """
 
     def __init__(self, graph: Graph) -> None:
         self.sizes = self._sizes(graph)
@@ -116,7 +126,10 @@ def test_the_search_never_ends_above_its_start(most: int, monkeypatch: pytest.Mo
     _, graph, ends, chain = read("espcn")
     ranges = chain_ranges(graph, chain, images(), ends)
     trial = Bowl(graph)
-    for start in (np.ones(sum(chain.widths)), np.concatenate([trial.lowest, np.ones(chain.widths[1])])):
+    for start in (
+        np.ones(sum(chain.widths)),
+        np.concatenate([trial.lowest, np.ones(chain.widths[1])]),
+    ):
         found = level.level(graph, chain, ranges, start, trial)
         before, after = (trial(chain.scaled(graph, each))(None).sum() for each in (start, found))
         assert after <= before
@@ -132,18 +145,32 @@ def test_the_start_leaves_each_tensor_the_scale_it_has() -> None:
 def test_what_calibration_sees_is_not_clipped_where_the_image_itself_passes(
     loud: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("beers_deploy.quant.quantise.level", lambda _g, _c, ranges, *_: loud * FULL / ranges)
+    monkeypatch.setattr(
+        "beers_deploy.quant.quantise.level", lambda _g, _c, ranges, *_: loud * FULL / ranges
+    )
     model, _, _, chain = read("espcn")
     made = quickly(model, patches_of(images()))
     assert made.core.ends.offsets
-    assert chain_ranges(made.graph, chain, images(), made.core.ends, quantile=1.0).max() <= FULL * (1 + 1e-5)
+    assert chain_ranges(made.graph, chain, images(), made.core.ends, quantile=1.0).max() <= FULL * (
+        1 + 1e-5
+    )
 
 
-def test_unequal_channels_err_half_as_much_once_they_are_levelled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A network whose channels differ thirtyfold, as training with batch normalisation leaves them."""
-    monkeypatch.setattr(level, "MOST_CHANNELS", 0)  # the first guesses alone: channel by channel takes half a minute
+def test_unequal_channels_err_half_as_much_once_they_are_levelled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A network whose channels differ thirtyfold, as training with batch
+    normalisation leaves them.
+    """
+    monkeypatch.setattr(
+        level, "MOST_CHANNELS", 0
+    )  # the first guesses alone: channel by channel takes half a minute
     network = build("dncnn", torch.Generator().manual_seed(0))
-    layers = [layer for layer in network.modules() if isinstance(layer, torch.nn.Conv2d | torch.nn.BatchNorm2d)]
+    layers = [
+        layer
+        for layer in network.modules()
+        if isinstance(layer, torch.nn.Conv2d | torch.nn.BatchNorm2d)
+    ]
     with torch.no_grad():
         for norm, conv in zip(layers[2::2], layers[3::2], strict=True):
             factors = torch.logspace(0, -1.5, norm.weight.numel())
@@ -156,8 +183,12 @@ def test_unequal_channels_err_half_as_much_once_they_are_levelled(monkeypatch: p
 
     def mae() -> float:
         made = quickly(model, patches)
-        return compare(open_session(model), open_session(made.host), patches.pairs, simulated=False).mae
+        return compare(
+            open_session(model), open_session(made.host), patches.pairs, simulated=False
+        ).mae
 
     levelled = mae()
-    monkeypatch.setattr("beers_deploy.quant.quantise.level", lambda _graph, _chain, _ranges, start, _trial: start)
+    monkeypatch.setattr(
+        "beers_deploy.quant.quantise.level", lambda _graph, _chain, _ranges, start, _trial: start
+    )
     assert levelled < 0.5 * mae()

@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles import load_sensor
 from beers_deploy.quant.calibration import Calibration, draw_patches, unseen_patches
-from beers_deploy.quant.lighting import CALIBRATION, JUDGING, Lighting, assign_lightings, full_scale_radiance
+from beers_deploy.quant.lighting import (
+    CALIBRATION,
+    JUDGING,
+    Lighting,
+    assign_lightings,
+    full_scale_radiance,
+)
 from beers_deploy.quant.sample_range import range_of
 
 SENSOR = load_sensor("pleiades-degraded")
@@ -23,7 +29,11 @@ def test_the_shares_add_up(lightings: tuple[Lighting, ...]) -> None:
     assert sum(lighting.share for lighting in lightings) == 1
 
 
-@given(count=st.integers(1, 400), seed=st.integers(0, 2**31), lightings=st.sampled_from([CALIBRATION, JUDGING]))
+@given(
+    count=st.integers(1, 400),
+    seed=st.integers(0, 2**31),
+    lightings=st.sampled_from([CALIBRATION, JUDGING]),
+)
 def test_any_number_of_patches_is_lit_in_the_stated_shares(
     count: int, seed: int, lightings: tuple[Lighting, ...]
 ) -> None:
@@ -73,7 +83,9 @@ def test_default_patches_cover_the_range_and_those_of_the_gate_as_well() -> None
 
 def test_light_changes_nothing_but_the_light() -> None:
     scenes = [procedural_scene(500, 520, np.random.default_rng(1))]
-    lit, plain = (draw_patches(scenes, SENSOR, REFERENCE, 16, 3, 40, lightings=each) for each in (JUDGING, ()))
+    lit, plain = (
+        draw_patches(scenes, SENSOR, REFERENCE, 16, 3, 40, lightings=each) for each in (JUDGING, ())
+    )
     ratios = set()
     for one, other in zip(lit.views, plain.views, strict=True):
         assert (one.degraded, one.ground.top, one.ground.left) == (

@@ -1,4 +1,6 @@
-"""Tensors stored from -128 on: the float network stays, the integers are those of every file, and half is lost."""
+"""Tensors stored from -128 on: the float network stays, the integers are those of every file, and
+half is lost.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -10,7 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beers_deploy.quant.core import IntCore, build_core, shift_faults
-from beers_deploy.quant.encodings import board_model, encoding_faults, host_model, read_core, vint8_model
+from beers_deploy.quant.encodings import (
+    board_model,
+    encoding_faults,
+    host_model,
+    read_core,
+    vint8_model,
+)
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import (
     CORRECTION,
@@ -38,20 +46,32 @@ VALID = Window()
 BITS = {PLANES: PLANES_FRAC_BITS, "a": 5, "b": 5, "c": 5, "d": 5, CORRECTION: 5}
 
 
-def conv(source: str, output: str, shape: tuple[int, int, int, int], seed: int, **more: Any) -> Conv:
+def conv(
+    source: str, output: str, shape: tuple[int, int, int, int], seed: int, **more: Any
+) -> Conv:
     generator = np.random.default_rng(seed)
     weight = (0.3 * generator.standard_normal(shape)).astype(np.float32)
     bias = (0.2 * generator.standard_normal(shape[0])).astype(np.float32)
-    return replace(Conv(f"{output}.conv", source, output, weight, bias, Activation.relu, same(weight)), **more)
+    return replace(
+        Conv(f"{output}.conv", source, output, weight, bias, Activation.relu, same(weight)), **more
+    )
 
 
 def network(seed: int = 0) -> Graph:
-    """Two tensors that only convolutions without padding read, one of them 2 x 3, and two that are padded."""
+    """Two tensors that only convolutions without padding read, one of them 2 x 3, and two that are
+    padded.
+    """
     first = conv(PLANES, "a", (5, 3, 3, 3), seed)
     depthwise = conv("a", "b", (5, 1, 3, 3), seed + 1, groups=5)
     point = conv("b", "c", (4, 5, 1, 1), seed + 2)
     large = conv("c", "d", (3, 4, 2, 3), seed + 3, window=VALID)
-    return first, depthwise, point, large, conv("d", CORRECTION, (1, 3, 3, 3), seed + 4, activation=Activation.none)
+    return (
+        first,
+        depthwise,
+        point,
+        large,
+        conv("d", CORRECTION, (1, 3, 3, 3), seed + 4, activation=Activation.none),
+    )
 
 
 def both_lowered(graph: Graph) -> Graph:
@@ -69,7 +89,10 @@ def result(graph: Graph) -> np.ndarray:
 def test_behind_relu_and_read_without_padding() -> None:
     graph = network()
     assert lowerable(graph) == ["b", "c"]
-    leaky = tuple(replace(op, activation=Activation.leaky_relu) if op.output == "b" else op for op in graph)  # type: ignore[type-var]
+    leaky = tuple(
+        replace(op, activation=Activation.leaky_relu) if op.output == "b" else op  # type: ignore[type-var]
+        for op in graph
+    )
     assert lowerable(leaky) == ["c"]
     up = replace(graph[2], transposed=True)  # type: ignore[type-var]
     assert lowerable((*graph[:2], up, *graph[3:])) == ["c"]
@@ -82,7 +105,9 @@ def test_the_float_network_stays(seed: int, frac_bits: int, size: float) -> None
     for graph, name in ((network(seed), "c"), (with_relu6(size), "b")):
         wanted = result(graph)
         found = result(lowered(graph, name, frac_bits))
-        np.testing.assert_allclose(found, wanted, atol=1e-4 * max(np.abs(wanted).max(), 2.0**-frac_bits))
+        np.testing.assert_allclose(
+            found, wanted, atol=1e-4 * max(np.abs(wanted).max(), 2.0**-frac_bits)
+        )
 
 
 @settings(max_examples=8, deadline=None)
@@ -105,10 +130,13 @@ def test_every_file_holds_the_references_integers(seed: int) -> None:
 
 def test_a_file_counts_its_relus_and_not_their_zeros_as_saturated() -> None:
     model, plain = (
-        host_model(core_of(graph), {"precision": "int8 legal"}) for graph in (both_lowered(network()), network())
+        host_model(core_of(graph), {"precision": "int8 legal"})
+        for graph in (both_lowered(network()), network())
     )
     assert encoding_faults(model) == []
-    assert [op.activation for op in read_core(model).convolutions][1:3] == [Activation.saturated_relu] * 2
+    assert [op.activation for op in read_core(model).convolutions][1:3] == [
+        Activation.saturated_relu
+    ] * 2
     wanted = count_relus(plain).explicit
     assert count_relus(model).off_by(wanted) == 0
     assert count_relus(model).off_by(wanted + 1) == 1
@@ -153,7 +181,9 @@ def test_fitted_biases_give_back_what_was_taken() -> None:
     assert abs(found - wanted) < core.scale(CORRECTION)
 
 
-@pytest.mark.parametrize(("costs", "kept"), [((3, 4, 4, 2), "bc"), ((3, 2, 4, 5), "b"), ((3, 4, 4, 3), "")])
+@pytest.mark.parametrize(
+    ("costs", "kept"), [((3, 4, 4, 2), "bc"), ((3, 2, 4, 5), "b"), ((3, 4, 4, 3), "")]
+)
 def test_only_where_it_costs_less(costs: tuple[int, ...], kept: str) -> None:
     """The costs of none of the two tensors lowered, of either, and of both."""
 
@@ -161,4 +191,7 @@ def test_only_where_it_costs_less(costs: tuple[int, ...], kept: str) -> None:
         return "".join(op.output for op in graph if isinstance(op, Conv) and op.offset)
 
     known = dict(zip(("", "b", "c", "bc"), costs, strict=True))
-    assert names(lower(network(), BITS, lambda graph: lambda _: np.array([known[names(graph)]]))) == kept
+    assert (
+        names(lower(network(), BITS, lambda graph: lambda _: np.array([known[names(graph)]])))
+        == kept
+    )

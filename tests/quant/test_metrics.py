@@ -20,13 +20,18 @@ def measured(name: str, results: list[np.ndarray], references: list[np.ndarray])
 
 
 @given(
-    arrays(np.int64, (2, 5, 7), elements=st.integers(0, 3)), arrays(np.int64, (2, 5, 7), elements=st.integers(0, 3))
+    arrays(np.int64, (2, 5, 7), elements=st.integers(0, 3)),
+    arrays(np.int64, (2, 5, 7), elements=st.integers(0, 3)),
 )
 def test_classes_of_pixels_are_counted_as_by_hand(said: np.ndarray, meant: np.ndarray) -> None:
     results = [np.eye(4, dtype=np.float32)[each].transpose(2, 0, 1)[None] for each in said]
     references = [each[None].astype(np.float32) for each in meant]
-    both = [(((said == k) & (meant == k)).sum(), ((said == k) | (meant == k)).sum()) for k in range(4)]
-    assert measured("iou", results, references) == pytest.approx(np.mean([a / b for a, b in both if b]))
+    both = [
+        (((said == k) & (meant == k)).sum(), ((said == k) | (meant == k)).sum()) for k in range(4)
+    ]
+    assert measured("iou", results, references) == pytest.approx(
+        np.mean([a / b for a, b in both if b])
+    )
     assert measured("top1", results, references) == pytest.approx((said == meant).mean())
 
 
@@ -34,32 +39,52 @@ def test_images_are_measured_as_everywhere_else() -> None:
     generator = np.random.default_rng(0)
     results, references = ([generator.random((1, 2, 23, 31)) for _ in range(3)] for _ in range(2))
     pairs = list(zip(results, references, strict=True))
-    assert measured("psnr", results, references) == pytest.approx(np.mean([psnr_db(*pair, 1.0) for pair in pairs]))
-    assert measured("mae", results, references) == pytest.approx(np.mean([np.abs(a - b).mean() for a, b in pairs]))
+    assert measured("psnr", results, references) == pytest.approx(
+        np.mean([psnr_db(*pair, 1.0) for pair in pairs])
+    )
+    assert measured("mae", results, references) == pytest.approx(
+        np.mean([np.abs(a - b).mean() for a, b in pairs])
+    )
     each = [ssim(a[0, k], b[0, k], 1.0) for a, b in pairs for k in range(2)]
     assert measured("ssim", results, references) == pytest.approx(np.mean(each))
 
 
-@pytest.mark.parametrize(("name", "shape"), [("psnr", (1, 2, 23, 30)), ("top1", (1, 2, 23, 31)), ("iou", (1,))])
+@pytest.mark.parametrize(
+    ("name", "shape"), [("psnr", (1, 2, 23, 30)), ("top1", (1, 2, 23, 31)), ("iou", (1,))]
+)
 def test_references_of_another_kind_are_refused(name: str, shape: tuple[int, ...]) -> None:
-    with pytest.raises(OptionError, match=r"metric: expected (references|numbers of classes) of 1 x "):
+    with pytest.raises(
+        OptionError, match=r"metric: expected (references|numbers of classes) of 1 x "
+    ):
         parts_of(name, np.zeros((1, 2, 23, 31)), np.zeros(shape))
 
 
 def test_a_gate_speaks_of_classes() -> None:
-    """Of a segmentation network on samples whose classes are known: what INT8 loses is limited, and can be broken."""
-    network = bd.Network.load(to_onnx("segment", build("segment", torch.Generator().manual_seed(0))))
+    """Of a segmentation network on samples whose classes are known: what INT8 loses is limited, and
+    can be broken.
+    """
+    network = bd.Network.load(
+        to_onnx("segment", build("segment", torch.Generator().manual_seed(0)))
+    )
     images = np.random.default_rng(0).random((12, 1, 32, 32), dtype=np.float32)
     classes = network(images).argmax(1)
     with one_guess():
         int8 = bd.quantize(network, images[:8], progress=False)
     samples = images[8:], classes[8:]
-    verdict = bd.gate(int8, samples=samples, metric="iou", limits={"metric_loss": 0.5, "mae": 0.1}, progress=False)
+    verdict = bd.gate(
+        int8, samples=samples, metric="iou", limits={"metric_loss": 0.5, "mae": 0.1}, progress=False
+    )
     figures = verdict.rows[0].figures
     assert verdict
     assert figures["iou float"].value == 1
     assert figures["iou lost"].value == pytest.approx(1 - float(figures["iou INT8"].value or 0))
-    broken = bd.gate(int8, samples=(samples[0], 1 - samples[1]), metric="top1", limits={"mae": 0.1}, progress=False)
+    broken = bd.gate(
+        int8,
+        samples=(samples[0], 1 - samples[1]),
+        metric="top1",
+        limits={"mae": 0.1},
+        progress=False,
+    )
     assert broken.rows[0].figures["top1 float"].value == 0
     with pytest.raises(OptionError, match="one beside the limit metric_loss"):
         bd.gate(int8, samples=samples, limits={"metric_loss": 0.1}, progress=False)

@@ -27,9 +27,15 @@ def windowed(draw: st.DrawFn) -> Row:
         moves |= {"pads": [min(pad, k - 1) for pad, k in zip(pads, kernel * 2, strict=True)]}
         return Row().add(kind, kernel_shape=kernel, ceil_mode=int(draw(st.booleans())), **moves)
     if kind == "Conv":
-        moves = {"strides": strides, "auto_pad": draw(st.sampled_from(["VALID", "SAME_UPPER", "SAME_LOWER"]))}
+        moves = {
+            "strides": strides,
+            "auto_pad": draw(st.sampled_from(["VALID", "SAME_UPPER", "SAME_LOWER"])),
+        }
     else:
-        moves |= {"pads": pads, "output_padding": [draw(st.integers(0, stride - 1)) for stride in strides]}
+        moves |= {
+            "pads": pads,
+            "output_padding": [draw(st.integers(0, stride - 1)) for stride in strides],
+        }
     return Row().add(kind, taps("w", 1, 1, *kernel), **moves)
 
 
@@ -39,7 +45,10 @@ def test_sizes_are_the_runtimes_own(row: Row, side: int) -> None:
     model = row.model()
     shape = network_of(model, side).operations[0].out_shape
     if shape is not None:
-        assert result_of(open_session(model), np.zeros((1, 1, side, side), np.float32)).shape[1:] == shape
+        assert (
+            result_of(open_session(model), np.zeros((1, 1, side, side), np.float32)).shape[1:]
+            == shape
+        )
 
 
 RESHAPED = [[0, 6, -1], [-1, 3, 0, 10], [1, 3, 2, 20]]
@@ -48,7 +57,12 @@ RESHAPED = [[0, 6, -1], [-1, 3, 0, 10], [1, 3, 2, 20]]
 @given(st.permutations(range(4)), st.sampled_from(RESHAPED), st.sampled_from([0, 2]))
 def test_moves_are_those_of_onnx(perm: list[int], sizes: list[int], axis: int) -> None:
     image = np.arange(120).reshape(1, 6, 4, 5)
-    for kind, stated in {"Transpose": perm, "Reshape": sizes, "Unsqueeze": [axis], "Squeeze": [0]}.items():
+    for kind, stated in {
+        "Transpose": perm,
+        "Reshape": sizes,
+        "Unsqueeze": [axis],
+        "Squeeze": [0],
+    }.items():
         if kind == "Transpose":
             node = helper.make_node(kind, ["x"], ["y"], perm=stated)
             feeds = {"x": image}

@@ -1,4 +1,6 @@
-"""Networks of odd shapes, a few operations each: right in INT8 and without faults, or refused by the node's name."""
+"""Networks of odd shapes, a few operations each: right in INT8 and without faults, or refused by
+the node's name.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -25,7 +27,13 @@ class Sketch(GraphWriter):
     """Writes networks in few words; results have the names of their nodes."""
 
     def conv(
-        self, name: str, source: str, shape: Sequence[int], size: float = 0.3, kind: str = "Conv", **given: Any
+        self,
+        name: str,
+        source: str,
+        shape: Sequence[int],
+        size: float = 0.3,
+        kind: str = "Conv",
+        **given: Any,
     ) -> str:
         generator = np.random.default_rng(len(self.nodes))
         weight = (size * generator.standard_normal(tuple(shape))).astype(np.float32)
@@ -52,7 +60,9 @@ def features_beside_the_image(w: Sketch) -> onnx.ModelProto:
 
 def pooled_image(w: Sketch) -> onnx.ModelProto:
     pooled = w.node("MaxPool", "p", ["in"], kernel_shape=[3, 3], pads=[1] * 4)
-    mean = w.node("AveragePool", "mean", ["in"], kernel_shape=[3, 3], pads=[1] * 4, count_include_pad=1)
+    mean = w.node(
+        "AveragePool", "mean", ["in"], kernel_shape=[3, 3], pads=[1] * 4, count_include_pad=1
+    )
     w.conv("out", w.node("Add", "s", [pooled, mean]), (2, 1, 3, 3), pads=[1] * 4)
     return w.model(2)
 
@@ -100,14 +110,18 @@ def names_of_ours(w: Sketch) -> onnx.ModelProto:
 
 def thirds(w: Sketch) -> onnx.ModelProto:
     down = w.conv("down", "in", (4, 1, 3, 3), strides=[3, 3])
-    w.node("Add", "out", ["in", w.conv("up", down, (4, 1, 3, 3), 0.1, "ConvTranspose", strides=[3, 3])])
+    w.node(
+        "Add", "out", ["in", w.conv("up", down, (4, 1, 3, 3), 0.1, "ConvTranspose", strides=[3, 3])]
+    )
     return w.model(1)
 
 
 def products(w: Sketch) -> onnx.ModelProto:
     first, second = (w.conv(name, "in", (3, 1, 3, 3), pads=[1] * 4) for name in ("a", "b"))
     gate = w.node("HardSigmoid", "gate", [second], alpha=1 / 6, beta=0.5)
-    w.conv("out", w.node("Relu", "r", [w.node("Mul", "m", [first, gate])]), (2, 3, 3, 3), pads=[1] * 4)
+    w.conv(
+        "out", w.node("Relu", "r", [w.node("Mul", "m", [first, gate])]), (2, 3, 3, 3), pads=[1] * 4
+    )
     return w.model(2)
 
 
@@ -116,12 +130,22 @@ def skip_past_a_pool(w: Sketch) -> onnx.ModelProto:
     limits = [w.constant(f"limit_{end}", np.array(end, np.float32)) for end in (0, 6)]
     head = w.node("Clip", "head", [first, *limits])
     inner = w.conv("inner", head, (3, 1, 3, 3), 0.2, pads=[1] * 4, group=3)
-    fine = w.node("Add", "fine", [head, w.conv("point", w.node("Relu", "r", [inner]), (3, 3, 1, 1))])
-    deep = w.conv("deep", w.node("MaxPool", "down", [fine], kernel_shape=[2, 2], strides=[2, 2]), (2, 3, 1, 1))
+    fine = w.node(
+        "Add", "fine", [head, w.conv("point", w.node("Relu", "r", [inner]), (3, 3, 1, 1))]
+    )
+    deep = w.conv(
+        "deep", w.node("MaxPool", "down", [fine], kernel_shape=[2, 2], strides=[2, 2]), (2, 3, 1, 1)
+    )
     sizes = w.constant("twice", np.array([1, 1, 2, 2], np.float32))
-    how = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+    how = {
+        "mode": "nearest",
+        "coordinate_transformation_mode": "asymmetric",
+        "nearest_mode": "floor",
+    }
     up = w.node("Resize", "up", [deep, "", sizes], **how)
-    last = w.conv("last", w.node("Concat", "both", [up, fine], axis=1), (1, 5, 3, 3), 0.1, pads=[1] * 4)
+    last = w.conv(
+        "last", w.node("Concat", "both", [up, fine], axis=1), (1, 5, 3, 3), 0.1, pads=[1] * 4
+    )
     w.node("Add", "out", ["in", last])
     return w.model(1)
 
@@ -130,7 +154,12 @@ def dead_channels(w: Sketch) -> onnx.ModelProto:
     first = w.node("Relu", "r", [w.conv("first", "in", (5, 1, 3, 3), 0.6, pads=[1] * 4)])
     w.constant("inner.b", np.array([0.1, -9, 0.2, -9, 0.1], np.float32))
     inner = w.node("Relu", "s", [w.conv("inner", first, (5, 1, 3, 3), 0.6, pads=[1] * 4, group=5)])
-    w.conv("out", w.node("Relu", "t", [w.conv("point", inner, (4, 5, 1, 1))]), (1, 4, 3, 3), pads=[1] * 4)
+    w.conv(
+        "out",
+        w.node("Relu", "t", [w.conv("point", inner, (4, 5, 1, 1))]),
+        (1, 4, 3, 3),
+        pads=[1] * 4,
+    )
     return w.model(1)
 
 
@@ -145,9 +174,21 @@ def shares_of_classes(w: Sketch) -> onnx.ModelProto:
 
 
 SOUND = [
-    features_beside_the_image, pooled_image, preactivation, leaking_upwards, one_tensor_twice, sum_of_two, separable,
-    names_of_ours, thirds, products, skip_past_a_pool, dead_channels, many_classes, shares_of_classes,
-]  # fmt: skip
+    features_beside_the_image,
+    pooled_image,
+    preactivation,
+    leaking_upwards,
+    one_tensor_twice,
+    sum_of_two,
+    separable,
+    names_of_ours,
+    thirds,
+    products,
+    skip_past_a_pool,
+    dead_channels,
+    many_classes,
+    shares_of_classes,
+]
 
 
 @pytest.mark.parametrize("make", SOUND)
@@ -156,7 +197,10 @@ def test_near_float_equal_to_the_reference_and_without_faults(
 ) -> None:
     model = make(Sketch())
     rows, columns = np.mgrid[:48, :36] / 40
-    seen = [(0.4 + 0.3 * np.sin(7 * rows + k) * np.cos(5 * columns)).astype(np.float32)[None, None] for k in range(3)]
+    seen = [
+        (0.4 + 0.3 * np.sin(7 * rows + k) * np.cos(5 * columns)).astype(np.float32)[None, None]
+        for k in range(3)
+    ]
     patches = patches_of(seen)
     made = quantise_model(model, patches, {})
     wanted = made.core.ends.clipped(result_of(open_session(model), seen[1]))
@@ -172,12 +216,20 @@ def unshuffled_inside(w: Sketch) -> onnx.ModelProto:
     inner = w.conv("c", "in", (4, 1, 1, 1))
     five = w.node("Reshape", "five", [inner, w.constant("s5", np.array([0, 4, 18, 2, 18, 2]))])
     w.node("Transpose", "moved", [five], perm=[0, 1, 3, 5, 2, 4])
-    w.conv("out", w.node("Reshape", "four", ["moved", w.constant("s4", np.array([0, 16, 18, 18]))]), (1, 16, 1, 1))
+    w.conv(
+        "out",
+        w.node("Reshape", "four", ["moved", w.constant("s4", np.array([0, 16, 18, 18]))]),
+        (1, 16, 1, 1),
+    )
     return w.model(1, 36)
 
 
 def column_by_column(w: Sketch) -> onnx.ModelProto:
-    w.node("Mul", "out", [w.conv("c", "in", (36, 1, 1, 1)), w.constant("each", np.ones(36, np.float32))])
+    w.node(
+        "Mul",
+        "out",
+        [w.conv("c", "in", (36, 1, 1, 1)), w.constant("each", np.ones(36, np.float32))],
+    )
     return w.model(36, 36)
 
 
@@ -209,6 +261,8 @@ def flattened_elsewhere(w: Sketch) -> onnx.ModelProto:
         (flattened_elsewhere, "Flatten at the end"),
     ],
 )
-def test_what_would_be_computed_wrongly_is_refused(make: Callable[[Sketch], onnx.ModelProto], said: str) -> None:
+def test_what_would_be_computed_wrongly_is_refused(
+    make: Callable[[Sketch], onnx.ModelProto], said: str
+) -> None:
     with pytest.raises(ModelError, match=said):
         read_network(make(Sketch()))

@@ -27,15 +27,23 @@ def test_scales_are_powers_of_two_and_numbers_are_int8(quantised: Quantised) -> 
             assert op.weight.dtype == op.bias.dtype == np.int8
 
 
-def test_every_shift_is_within_its_window_and_one_that_is_not_is_named(quantised: Quantised) -> None:
+def test_every_shift_is_within_its_window_and_one_that_is_not_is_named(
+    quantised: Quantised,
+) -> None:
     assert shift_faults(quantised.core) == []
-    faults = shift_faults(replace(quantised.core, frac_bits={**quantised.core.frac_bits, "head": 40}))
+    faults = shift_faults(
+        replace(quantised.core, frac_bits={**quantised.core.frac_bits, "head": 40})
+    )
     assert any(fault.startswith("head: shift_cut") for fault in faults)
 
 
-def test_unreachable_positions_are_moved_to_legal_ones(float_onnx: onnx.ModelProto, quantised: Quantised) -> None:
+def test_unreachable_positions_are_moved_to_legal_ones(
+    float_onnx: onnx.ModelProto, quantised: Quantised
+) -> None:
     graph = read_planes(correction_graph(float_onnx))
-    wild = {name: (p if name == "planes" else p + 20) for name, p in quantised.core.frac_bits.items()}
+    wild = {
+        name: (p if name == "planes" else p + 20) for name, p in quantised.core.frac_bits.items()
+    }
     assert shift_faults(build_core(graph, wild)) == []
 
 
@@ -47,8 +55,12 @@ def test_every_convolution_is_an_integer_kernel(quantised: Quantised) -> None:
     assert "Conv" not in kinds
 
 
-def test_int8_stays_close_to_float(float_onnx: onnx.ModelProto, quantised: Quantised, patches: Patches) -> None:
-    assert compare(open_session(float_onnx), open_session(quantised.host), patches.pairs).mae < 0.002
+def test_int8_stays_close_to_float(
+    float_onnx: onnx.ModelProto, quantised: Quantised, patches: Patches
+) -> None:
+    assert (
+        compare(open_session(float_onnx), open_session(quantised.host), patches.pairs).mae < 0.002
+    )
 
 
 def test_the_same_patches_give_the_same_bytes(
@@ -65,6 +77,10 @@ def test_the_file_says_what_it_was_calibrated_on(quantised: Quantised, patches: 
 
 
 @pytest.mark.parametrize("encoding", ["float", "host", "board"])
-def test_the_radius_is_read_from_the_graph(encoding: str, float_onnx: onnx.ModelProto, quantised: Quantised) -> None:
-    model = {"float": float_onnx, "host": quantised.host, "board": board_model(quantised.core, {})}[encoding]
+def test_the_radius_is_read_from_the_graph(
+    encoding: str, float_onnx: onnx.ModelProto, quantised: Quantised
+) -> None:
+    model = {"float": float_onnx, "host": quantised.host, "board": board_model(quantised.core, {})}[
+        encoding
+    ]
     assert tiling_of(model).halo_px == 7

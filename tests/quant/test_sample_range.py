@@ -1,4 +1,6 @@
-"""The range of samples: right percentiles, recorded and read back, and no claim of a file is believed."""
+"""The range of samples: right percentiles, recorded and read back, and no claim of a file is
+believed.
+"""
 
 import numpy as np
 import pytest
@@ -12,11 +14,15 @@ FULL = SampleRange(0.0, 0.2, 0.95, 1.0, 0.01)
 
 
 @given(st.lists(st.integers(0, 4095), min_size=1, max_size=300), st.integers(1, 5))
-def test_percentiles_are_those_of_all_pixels_however_they_are_divided(pixels: list[int], parts: int) -> None:
+def test_percentiles_are_those_of_all_pixels_however_they_are_divided(
+    pixels: list[int], parts: int
+) -> None:
     values = np.array(pixels, np.float32) / np.float32(4095)
     found = range_of(np.array_split(values, parts))
     expected = np.quantile(values, [0.01, 0.5, 0.99, 0.999], method="inverted_cdf")
-    np.testing.assert_allclose([found.p1, found.p50, found.p99, found.p99_9], expected, atol=2 / 4096)
+    np.testing.assert_allclose(
+        [found.p1, found.p50, found.p99, found.p99_9], expected, atol=2 / 4096
+    )
     assert found.saturated == pytest.approx(np.mean(np.array(pixels) == 4095))
 
 

@@ -28,13 +28,17 @@ def test_large_samples_are_cut_to_patches_on_the_lattice(tmp_path: Path) -> None
 
 def test_references_stay_with_their_images(tmp_path: Path) -> None:
     np.savez(tmp_path / "both.npz", image=RAMP[:, :1, :20, :24], reference=RAMP[:, :1, :40, :48])
-    for (image, reference), whole in zip(read_samples(tmp_path / "both.npz", 1, None).pairs, RAMP, strict=True):
+    for (image, reference), whole in zip(
+        read_samples(tmp_path / "both.npz", 1, None).pairs, RAMP, strict=True
+    ):
         np.testing.assert_array_equal(image[0], whole[:1, :20, :24])
         np.testing.assert_array_equal(reference[0], whole[:1, :40, :48])
 
 
 @pytest.mark.parametrize(("kind", "full_scale"), [(np.uint8, 255), (np.uint16, 4095)])
-def test_a_folder_holds_images_and_arrays(kind: type[np.generic], full_scale: int, tmp_path: Path) -> None:
+def test_a_folder_holds_images_and_arrays(
+    kind: type[np.generic], full_scale: int, tmp_path: Path
+) -> None:
     pixels = (np.arange(40 * 30).reshape(40, 30) % full_scale).astype(kind)
     tifffile.imwrite(tmp_path / "a.tif", pixels)
     np.save(tmp_path / "b.npy", RAMP[0, :1, :40, :30])
@@ -45,7 +49,10 @@ def test_a_folder_holds_images_and_arrays(kind: type[np.generic], full_scale: in
 
 
 def test_every_fourth_sample_is_kept_from_calibration(tmp_path: Path) -> None:
-    np.save(tmp_path / "nine.npy", np.arange(9, dtype=np.float32).reshape(9, 1, 1, 1).repeat(8, 2).repeat(8, 3) / 9)
+    np.save(
+        tmp_path / "nine.npy",
+        np.arange(9, dtype=np.float32).reshape(9, 1, 1, 1).repeat(8, 2).repeat(8, 3) / 9,
+    )
     seen, unseen = split_samples(read_samples(tmp_path / "nine.npy", 1, None))
     assert [round(9 * float(image[0, 0, 0, 0])) for image in unseen.degraded] == [3, 7]
     assert len(seen.pairs) == 7
@@ -79,7 +86,9 @@ def cut_off(folder: Path) -> Path:
     return folder / "x.npz"
 
 
-def with_reference(reference: np.ndarray, image: np.ndarray = RAMP[:, :1, :8, :8]) -> Callable[[Path], Path]:
+def with_reference(
+    reference: np.ndarray, image: np.ndarray = RAMP[:, :1, :8, :8]
+) -> Callable[[Path], Path]:
     def write(folder: Path) -> Path:
         np.savez(folder / "x.npz", image=image, reference=reference)
         return folder / "x.npz"
@@ -102,18 +111,29 @@ def with_reference(reference: np.ndarray, image: np.ndarray = RAMP[:, :1, :8, :8
         (cut_off, "a .npy or .npz file of numbers"),
         (with_reference(np.array(0.5)), "as many references as images"),
         (with_reference(np.zeros((2, 1))), "as many references as images"),
-        (with_reference(np.full((3, 2), "text")), r"x.npz\[0\]: expected a reference of real numbers"),
+        (
+            with_reference(np.full((3, 2), "text")),
+            r"x.npz\[0\]: expected a reference of real numbers",
+        ),
         (with_reference(np.zeros((3, 2), np.complex64)), "got complex64"),
         (with_reference(np.zeros((3, 2), "datetime64[s]")), "got datetime64"),
         (with_reference(np.zeros((3, 2), [("a", "f4")])), "a reference of real numbers"),
-        (with_reference(np.array([0.5, np.nan, 0.5])), r"x.npz\[1\]: expected a reference of finite numbers"),
-        (with_reference(np.array([0.5, 0.5, np.inf])), r"x.npz\[2\]: expected a reference of finite numbers"),
+        (
+            with_reference(np.array([0.5, np.nan, 0.5])),
+            r"x.npz\[1\]: expected a reference of finite numbers",
+        ),
+        (
+            with_reference(np.array([0.5, 0.5, np.inf])),
+            r"x.npz\[2\]: expected a reference of finite numbers",
+        ),
         (with_reference(np.zeros((3, 2)), RAMP[:, :1, :0]), "an image with pixels"),
         (lambda folder: folder / "missing.npy", "no such file"),
         (lambda folder: folder, "at least one sample"),
     ],
 )
-def test_what_are_no_samples_is_refused(write: Callable[[Path], Path], said: str, tmp_path: Path) -> None:
+def test_what_are_no_samples_is_refused(
+    write: Callable[[Path], Path], said: str, tmp_path: Path
+) -> None:
     with pytest.raises(ImageError, match=said):
         read_samples(write(tmp_path), 1, None, 4)
 
@@ -135,6 +155,8 @@ def test_networks_that_simulated_patches_do_not_suit_ask_for_samples(tmp_path: P
     pooled = network(1)
     pooled.graph.node[0].op_type = "GlobalAveragePool"
     for value in (*pooled.graph.input, *pooled.graph.output):
-        value.CopyFrom(helper.make_tensor_value_info(value.name, TensorProto.FLOAT, ["N", 1, 32, 32]))
+        value.CopyFrom(
+            helper.make_tensor_value_info(value.name, TensorProto.FLOAT, ["N", 1, 32, 32])
+        )
     with pytest.raises(OptionError, match="32 x 32 pixels alone"):
         samples_of(pooled, None)

@@ -28,8 +28,14 @@ def qdq(scale: float, zero_point: np.ndarray | None, relu: bool = False) -> onnx
         names.append("zero")
     nodes = [helper.make_node("QuantizeLinear", ["image", *names], ["whole"])]
     nodes += [helper.make_node("Max", ["whole", "zero"], ["positive"])] if relu else []
-    nodes += [helper.make_node("DequantizeLinear", ["positive" if relu else "whole", *names], ["restored"])]
-    return make_model(helper.make_graph(nodes, "qdq", [image_info("image", 1, None)], [RESTORED], stored), {})
+    nodes += [
+        helper.make_node(
+            "DequantizeLinear", ["positive" if relu else "whole", *names], ["restored"]
+        )
+    ]
+    return make_model(
+        helper.make_graph(nodes, "qdq", [image_info("image", 1, None)], [RESTORED], stored), {}
+    )
 
 
 @pytest.mark.parametrize(
@@ -43,7 +49,9 @@ def qdq(scale: float, zero_point: np.ndarray | None, relu: bool = False) -> onnx
     ],
     ids=["int8", "uint8 around 128", "uint8 from 0", "no zero point", "a ReLU reads it"],
 )
-def test_shares_are_those_of_the_values(zero_point: np.ndarray | None, relu: bool, lost: Lost) -> None:
+def test_shares_are_those_of_the_values(
+    zero_point: np.ndarray | None, relu: bool, lost: Lost
+) -> None:
     scale = 1 / 400
     signed = (IMAGE - 0.5) * 2
     shares = saturated_shares(qdq(scale, zero_point, relu), [signed[:1], signed[1:]])
@@ -53,7 +61,9 @@ def test_shares_are_those_of_the_values(zero_point: np.ndarray | None, relu: boo
 
 
 def test_a_relu_between_two_roundings_reads_the_first() -> None:
-    """QuantizeLinear, DequantizeLinear, Relu, QuantizeLinear: what is below zero was to be cut off."""
+    """QuantizeLinear, DequantizeLinear, Relu, QuantizeLinear: what is below
+    zero was to be cut off.
+    """
     model = qdq(1 / 400, np.array(0, np.int8))
     model.graph.node[1].output[0] = "float"
     model.graph.node.extend(
@@ -66,7 +76,10 @@ def test_a_relu_between_two_roundings_reads_the_first() -> None:
     signed = (IMAGE - 0.5) * 2
     shares = saturated_shares(model, [signed])
     lost = float((signed * 400 >= 126.5).mean())
-    assert shares == {"whole": pytest.approx(lost, abs=1e-3), "again": pytest.approx(lost, abs=1e-3)}
+    assert shares == {
+        "whole": pytest.approx(lost, abs=1e-3),
+        "again": pytest.approx(lost, abs=1e-3),
+    }
 
 
 def test_the_shipped_file_saturates_as_the_integer_reference_says() -> None:
@@ -86,6 +99,8 @@ def test_the_shipped_file_saturates_as_the_integer_reference_says() -> None:
 def test_a_scale_that_fits_saturates_nothing_and_a_float_network_has_nothing_to_saturate() -> None:
     assert saturated_shares(qdq(1 / 120, np.array(0, np.int8)), [IMAGE]) == {"whole": 0.0}
     node = helper.make_node("Relu", ["image"], ["restored"])
-    model = make_model(helper.make_graph([node], "float", [image_info("image", 1, None)], [RESTORED]), {})
+    model = make_model(
+        helper.make_graph([node], "float", [image_info("image", 1, None)], [RESTORED]), {}
+    )
     assert rounded_tensors(model) == []
     assert saturated_shares(model, [IMAGE]) == {}

@@ -28,7 +28,9 @@ def waves(phase: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def results(float_onnx: onnx.ModelProto) -> Results:
-    """What two networks restore once quantised: one adds to the image, through the other it passes itself."""
+    """What two networks restore once quantised: one adds to the image, through the other it passes
+    itself.
+    """
     patches = patches_of([waves(phase) for phase in range(3)])
 
     def of_passes(passes: Passes) -> list[np.ndarray]:

@@ -55,10 +55,15 @@ def test_what_is_lost_is_told_and_of_much_also_where(
     gate = compare(open_session(float_onnx), open_session(spoilt.host), patches.pairs)
     assert gate.worst_drop_db > gate.drop_db
     little, much = (
-        losses(spoilt, replace(gate, psnr_float_db=40.0, psnr_int8_db=db, worst_drop_db=2.0), patches)
+        losses(
+            spoilt, replace(gate, psnr_float_db=40.0, psnr_int8_db=db, worst_drop_db=2.0), patches
+        )
         for db in (39.9, 39.6)
     )
-    assert little == "INT8 loses 0.10 dB of 40.00, and 2.00 dB where most (6 simulated patches of 128 x 128)"
+    assert (
+        little
+        == "INT8 loses 0.10 dB of 40.00, and 2.00 dB where most (6 simulated patches of 128 x 128)"
+    )
     layers, _ = layer_errors(spoilt.graph, spoilt.core, few_crops(patches.degraded, spoilt.host))
     worst = max(layers, key=lambda layer: layer.network.squared)
     assert f": most of it in {worst.name} (" in much
@@ -75,7 +80,10 @@ def test_a_spoilt_layer_is_found(spoilt: Quantised, crops: list[np.ndarray]) -> 
 
 
 def test_one_gain_is_attributed_as_two_are(
-    float_onnx: onnx.ModelProto, patches: Patches, crops: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+    float_onnx: onnx.ModelProto,
+    patches: Patches,
+    crops: list[np.ndarray],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("beers_deploy.quant.quantise.takes_gains", lambda _: False)
     made = quickly(float_onnx, patches)
@@ -103,13 +111,18 @@ def test_spread_counts_every_pixel_by_its_difference(
     sessions = open_session(float_onnx), open_session(quantised.host)
     spread = spread_of(*sessions, crops)
     difference = np.concatenate(
-        [np.subtract(*(np.clip(run(s, crop), 0, 1) for s in reversed(sessions))).ravel() for crop in crops]
+        [
+            np.subtract(*(np.clip(run(s, crop), 0, 1) for s in reversed(sessions))).ravel()
+            for crop in crops
+        ]
     )
     assert spread.counts.sum() == difference.size
     dn = np.rint(difference * MAX_DN)
     assert spread.std_dn == pytest.approx(float(dn.std()), rel=1e-6)
     for beyond in (0, 1, 5):
-        assert spread.share_beyond(beyond) == pytest.approx(float((np.abs(dn) > beyond).mean()), abs=1e-9)
+        assert spread.share_beyond(beyond) == pytest.approx(
+            float((np.abs(dn) > beyond).mean()), abs=1e-9
+        )
     order = spread.worst(3)
     assert sorted(order) == [0, 1, 2]
     assert spread.mae[order[0]] == spread.mae.max()

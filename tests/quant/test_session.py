@@ -19,7 +19,9 @@ def idle_cpu_s(wait_s: float) -> float:
 
 
 def test_a_session_that_has_run_leaves_the_processor_alone() -> None:
-    """Its threads would wait busily for the next run, and take that from a session timed after it."""
+    """Its threads would wait busily for the next run, and take that from a
+    session timed after it.
+    """
     session = open_session(shipped_pair()[1], threads=2)
     run(session, IMAGE)
     idle = []
@@ -33,5 +35,6 @@ def test_a_session_that_has_run_leaves_the_processor_alone() -> None:
 def test_the_number_of_threads_changes_no_bit(threads: int) -> None:
     image = np.random.default_rng(0).random((1, 1, 53, 71), dtype=np.float32)
     assert np.array_equal(
-        run(open_session(shipped_pair()[1], threads), image), run(open_session(shipped_pair()[1]), image)
+        run(open_session(shipped_pair()[1], threads), image),
+        run(open_session(shipped_pair()[1]), image),
     )

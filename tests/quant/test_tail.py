@@ -31,13 +31,17 @@ SIDE_PX = 160
 
 
 def detector() -> onnx.ModelProto:
-    """Untrained, with statistics of its own, and a last layer whose boxes and scores differ from place to place."""
+    """Untrained, with statistics of its own, and a last layer whose boxes and scores differ from
+    place to place.
+    """
     network = DetectorNetwork(2)
     generator = torch.Generator().manual_seed(0)
     initialise(network, generator)
     with torch.no_grad():
         network.tail.weight.mul_(3)
-    return simplest(detector_to_onnx(network.eval(), ("a", "b"), SIDE_PX, {"kept": "said"}), "detector")
+    return simplest(
+        detector_to_onnx(network.eval(), ("a", "b"), SIDE_PX, {"kept": "said"}), "detector"
+    )
 
 
 def images(count: int = 3) -> list[np.ndarray]:
@@ -55,10 +59,15 @@ def test_the_tail_begins_behind_the_last_convolution() -> None:
     model = detector()
     network = read_network(model)
     assert network.tail is not None
-    assert network.graph[-1].name == [node for node in model.graph.node if node.op_type == "Conv"][-1].name
+    assert (
+        network.graph[-1].name
+        == [node for node in model.graph.node if node.op_type == "Conv"][-1].name
+    )
     behind = {"Slice", "Exp", "Sigmoid", "Add", "Mul", "Concat", "Reshape"}
     assert {node.op_type for node in network.tail.graph.node} == behind
-    assert len(network.tail.graph.node) + 10 + len(network.graph) == len(model.graph.node)  # 10 ReLUs are fused
+    assert len(network.tail.graph.node) + 10 + len(network.graph) == len(
+        model.graph.node
+    )  # 10 ReLUs are fused
 
 
 def test_the_tail_by_itself_is_what_the_runtime_computes() -> None:
@@ -75,7 +84,9 @@ def test_the_tail_by_itself_is_what_the_runtime_computes() -> None:
 
 def test_int8_gives_boxes_and_scores_as_float_does() -> None:
     seen = images()[1]
-    wanted, found = (result_of(open_session(model), seen) for model in (detector(), quantised().host))
+    wanted, found = (
+        result_of(open_session(model), seen) for model in (detector(), quantised().host)
+    )
     assert found.shape == wanted.shape == (1, 6, (SIDE_PX // 4) ** 2)
     for row, spread in zip(np.abs(found - wanted)[0], wanted[0].std(axis=1), strict=True):
         assert row.mean() < 0.15 * max(float(spread), 1e-6)
@@ -115,12 +126,18 @@ def test_a_tail_that_was_changed_is_a_fault() -> None:
 
 
 def graph_text(kind: str) -> str:
-    read, result = (helper.make_tensor_value_info(n, TensorProto.FLOAT, None) for n in (CORRECTION, "restored"))
+    read, result = (
+        helper.make_tensor_value_info(n, TensorProto.FLOAT, None) for n in (CORRECTION, "restored")
+    )
     node = helper.make_node(kind, [CORRECTION], ["restored"])
-    return base64.b64encode(helper.make_graph([node], "t", [read], [result]).SerializeToString()).decode()
+    return base64.b64encode(
+        helper.make_graph([node], "t", [read], [result]).SerializeToString()
+    ).decode()
 
 
-@pytest.mark.parametrize("text", [graph_text("Loop"), graph_text("Conv"), "bm8gZ3JhcGg=", "not base64"])
+@pytest.mark.parametrize(
+    "text", [graph_text("Loop"), graph_text("Conv"), "bm8gZ3JhcGg=", "not base64"]
+)
 def test_a_description_with_another_tail_is_one_sentence(text: str) -> None:
     spoilt = copied(quantised().host)
     ends = quantised().core.ends
@@ -138,7 +155,10 @@ def sigmoid_then_conv(w: GraphWriter) -> None:
 
 def of_two_maps(w: GraphWriter) -> None:
     other = w.node("MaxPool", "y", ["x"], kernel_shape=[2, 2], strides=[2, 2])
-    flat = [w.node("Flatten", f"{name}.flat", [w.node("Sigmoid", f"{name}.s", [name])]) for name in ("x", other)]
+    flat = [
+        w.node("Flatten", f"{name}.flat", [w.node("Sigmoid", f"{name}.s", [name])])
+        for name in ("x", other)
+    ]
     w.node("Concat", "restored", flat, axis=1)
 
 

@@ -1,4 +1,6 @@
-"""Whole numbers trained with their roundings: nearer to what is wanted, never worse, as legal as before."""
+"""Whole numbers trained with their roundings: nearer to what is wanted, never worse, as legal as
+before.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -72,7 +74,10 @@ def trained(core: IntCore, model: onnx.ModelProto, tuning: Tuning) -> IntCore:
 def difference(core: IntCore, other: IntCore, patches: Patches) -> float:
     """Mean squared difference between two cores' corrections."""
     results = [
-        [merged_correction(each, run_core(each, each.ends.split(seen))[0]) for seen in patches.degraded]
+        [
+            merged_correction(each, run_core(each, each.ends.split(seen))[0])
+            for seen in patches.degraded
+        ]
         for each in (core, other)
     ]
     return float(np.mean([np.square(a - b).mean() for a, b in zip(*results, strict=True)]))
@@ -86,9 +91,13 @@ def test_it_begins_with_the_core_s_own_numbers(quantised: Quantised) -> None:
 
 
 def odd_operations(generator: np.random.Generator) -> Graph:
-    """Pads that differ from side to side, groups, dilation, shuffles, poolings, adds and products of other scales."""
+    """Pads that differ from side to side, groups, dilation, shuffles, poolings, adds and products
+    of other scales.
+    """
 
-    def conv(name: str, source: str, shape: tuple[int, ...], window: Window, groups: int = 1, **more: Any) -> Conv:
+    def conv(
+        name: str, source: str, shape: tuple[int, ...], window: Window, groups: int = 1, **more: Any
+    ) -> Conv:
         weight = generator.normal(0, 0.3, shape).astype(np.float32)
         return Conv(
             name,
@@ -102,8 +111,21 @@ def odd_operations(generator: np.random.Generator) -> Graph:
         )
 
     return (
-        conv("a", PLANES, (8, 3, 3, 2), Window((2, 1), (1, 0, 2, 1)), activation=Activation.leaky_relu),
-        conv("b", "a", (8, 4, 3, 3), Window((1, 1), (2, 2, 2, 2), (2, 2)), 2, activation=Activation.relu6),
+        conv(
+            "a",
+            PLANES,
+            (8, 3, 3, 2),
+            Window((2, 1), (1, 0, 2, 1)),
+            activation=Activation.leaky_relu,
+        ),
+        conv(
+            "b",
+            "a",
+            (8, 4, 3, 3),
+            Window((1, 1), (2, 2, 2, 2), (2, 2)),
+            2,
+            activation=Activation.relu6,
+        ),
         Add("c", ("a", "b"), "c", Activation.leaky_relu),
         Shuffle("d", "c", "d", 2, True, False),
         MaxPool("e", "d", "e", (3, 2), Window((1, 2), (2, 0, 1, 1))),
@@ -164,25 +186,33 @@ def test_a_reference_of_another_size_is_one_sentence(
 ) -> None:
     seen, meant = patches.pairs[0]
     short = Remade(lambda _: (seen, meant[..., :-2]), 2)
-    with pytest.raises(ImageError, match=r"reference: expected one of 1 x 1 x 128 x 128, got 1 x 1 x 128 x 126"):
+    with pytest.raises(
+        ImageError, match=r"reference: expected one of 1 x 1 x 128 x 128, got 1 x 1 x 128 x 126"
+    ):
         trained(quantised.core, float_onnx, Tuning(short, 1))
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_numbers(float_onnx: onnx.ModelProto, patches: Patches) -> None:
+def test_the_same_seed_gives_the_same_numbers(
+    float_onnx: onnx.ModelProto, patches: Patches
+) -> None:
     def made(seed: int) -> bytes:
         told: list[str] = []
         tuning = Tuning(patches.pairs, 3, rate=0.3, seed=seed)
         model = quantise_model(float_onnx, patches, {}, tuning=tuning, log=told.append)
         assert told[-1].startswith("fine-tuning, step 3 of 3: ")
-        assert {each.key: each.value for each in model.host.metadata_props}["finetune"].startswith("3 steps")
+        assert {each.key: each.value for each in model.host.metadata_props}["finetune"].startswith(
+            "3 steps"
+        )
         return bytes(model.host.SerializeToString())
 
     assert made(1) == made(1)
 
 
 @pytest.mark.slow
-def test_the_last_sum_keeps_the_room_it_was_given(float_onnx: onnx.ModelProto, patches: Patches) -> None:
+def test_the_last_sum_keeps_the_room_it_was_given(
+    float_onnx: onnx.ModelProto, patches: Patches
+) -> None:
     plain = quantise_model(float_onnx, patches, {})
     tuned = quantise_model(float_onnx, patches, {}, tuning=Tuning(patches.pairs, 3, rate=0.3))
     both = list(zip(plain.core.convolutions, tuned.core.convolutions, strict=True))
@@ -191,7 +221,9 @@ def test_the_last_sum_keeps_the_room_it_was_given(float_onnx: onnx.ModelProto, p
 
 
 @pytest.mark.parametrize(("side", "looked_at"), [(4 * BORDER_PX, False), (4 * BORDER_PX - 1, True)])
-def test_the_border_is_the_float_network_s_where_the_reference_cannot_know(side: int, looked_at: bool) -> None:
+def test_the_border_is_the_float_network_s_where_the_reference_cannot_know(
+    side: int, looked_at: bool
+) -> None:
     inner = torch.rand((1, 1, side, side + 9), generator=torch.Generator().manual_seed(1))
     edge = inner.clone()
     edge[..., 0, :] += 1
@@ -200,7 +232,9 @@ def test_the_border_is_the_float_network_s_where_the_reference_cannot_know(side:
     assert float(Sample(image, inner, edge, inner, 1.0).error(inner)) > 0
 
 
-def test_slopes_pass_roundings_and_stop_where_int8_ends(quantised: Quantised, patches: Patches) -> None:
+def test_slopes_pass_roundings_and_stop_where_int8_ends(
+    quantised: Quantised, patches: Patches
+) -> None:
     trainable = TrainableCore(quantised.core)
     planes = torch.from_numpy(quantised.core.ends.split(patches.degraded[0]).astype(np.float32))
     trainable(planes).square().mean().backward()
@@ -217,9 +251,13 @@ def test_slopes_pass_roundings_and_stop_where_int8_ends(quantised: Quantised, pa
     adds=st.booleans(),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_the_correction_of_a_result_makes_it(backs: list[tuple[int, bool]], adds: bool, seed: int) -> None:
+def test_the_correction_of_a_result_makes_it(
+    backs: list[tuple[int, bool]], adds: bool, seed: int
+) -> None:
     generator = np.random.default_rng(seed)
-    back = tuple(Shuffle(f"s{k}", "a", "b", block, True, order) for k, (block, order) in enumerate(backs))
+    back = tuple(
+        Shuffle(f"s{k}", "a", "b", block, True, order) for k, (block, order) in enumerate(backs)
+    )
     ends = Ends(back=back, adds_image=adds)
     image, result = (generator.random((1, 1, 36, 72)).astype(np.float32) for _ in range(2))
     found = ends.finished(image, ends.correction_of(image, result))

@@ -47,8 +47,12 @@ def test_sound_files_of_every_encoding_run(encoding: Callable[..., Path], tmp_pa
 
 
 @pytest.mark.parametrize("apart", [True, False], ids=["apart", "beside the weights themselves"])
-@pytest.mark.parametrize("place", ["/etc/passwd", "../secret.bin", "beside.bin", "a/../../b", "link.bin", ""])
-def test_weights_in_other_files_are_never_looked_for(place: str, apart: bool, model: onnx.ModelProto) -> None:
+@pytest.mark.parametrize(
+    "place", ["/etc/passwd", "../secret.bin", "beside.bin", "a/../../b", "link.bin", ""]
+)
+def test_weights_in_other_files_are_never_looked_for(
+    place: str, apart: bool, model: onnx.ModelProto
+) -> None:
     tensor = model.graph.initializer[0]
     tensor.external_data.add(key="location", value=place)
     if apart:
@@ -101,14 +105,18 @@ def typed(kind: int) -> Change:
         (lambda m: m.ClearField("graph"), "an input and an output"),
     ],
 )
-def test_what_a_file_states_but_does_not_hold_is_refused(change: Change, words: str, model: onnx.ModelProto) -> None:
+def test_what_a_file_states_but_does_not_hold_is_refused(
+    change: Change, words: str, model: onnx.ModelProto
+) -> None:
     change(model)
     for to_run in (True, False):
         assert words in refusal(model, to_run)
 
 
 def constant(name: str, *values: float, kind: type = np.int64) -> onnx.NodeProto:
-    return helper.make_node("Constant", [], [name], value=numpy_helper.from_array(np.array(values, kind)))
+    return helper.make_node(
+        "Constant", [], [name], value=numpy_helper.from_array(np.array(values, kind))
+    )
 
 
 def ends(*names: str, kind: int = TensorProto.BOOL) -> list[onnx.ValueInfoProto]:
@@ -135,19 +143,34 @@ def filled(to: str, by: str = "n") -> onnx.NodeProto:
         ([constant("n", 2**27 + 1), filled("a"), filled("b")], "what constants fill"),
         ([SIZE_5000, filled("a"), filled("b", by="a")], "a computed one"),
         (
-            [SIZE_3000, filled("a"), node("Concat", "a", "a", to="b", axis=0), node("Add", "b", "b", to="c")],
+            [
+                SIZE_3000,
+                filled("a"),
+                node("Concat", "a", "a", to="b", axis=0),
+                node("Add", "b", "b", to="c"),
+            ],
             "Concat b of constants alone",
         ),
         ([constant("n", 9, 9), node("Expand", "n", "n")], "constants alone"),
-        ([constant("n", 9, 9), constant("i", 7), node("Gather", "n", "i")], "Gather y of constants alone"),
+        (
+            [constant("n", 9, 9), constant("i", 7), node("Gather", "n", "i")],
+            "Gather y of constants alone",
+        ),
         ([node("RandomNormal", shape=[2**20, 2**20])], "values"),
         ([constant("n", 1, 1, 2**20, 2**20), node("Expand", "image", "n")], "Expand"),
         ([constant("n", 1, 1, 2000, 1), node("Tile", "image", "n")], "enlargements"),
         ([constant("n", *[9**9] * 8), node("Pad", "image", "n")], "enlargements"),
-        ([constant("s", 1, 1, 1e6, 1e6, kind=np.float32), node("Resize", "image", "", "s")], "enlargements"),
+        (
+            [constant("s", 1, 1, 1e6, 1e6, kind=np.float32), node("Resize", "image", "", "s")],
+            "enlargements",
+        ),
         ([constant("a", 1, 1, 9, 9), node("Neg", "a", to="b"), node("Expand", "image", "b")], "-9"),
         (
-            [constant("a", 1, 1, 2**14, 2**14), node("Mul", "a", "a", to="b"), node("Expand", "image", "b")],
+            [
+                constant("a", 1, 1, 2**14, 2**14),
+                node("Mul", "a", "a", to="b"),
+                node("Expand", "image", "b"),
+            ],
             "268435456",
         ),
         ([SIZE_5000, filled("a"), node("Expand", "image", "a")], "a computed one in Expand"),
@@ -159,7 +182,9 @@ def test_what_a_runtime_would_do_for_an_untrusted_file_is_refused(
     nodes: list[onnx.NodeProto], words: str, model: onnx.ModelProto
 ) -> None:
     model.graph.node.extend(nodes)
-    model.opset_import.extend(helper.make_opsetid(domain, 1) for domain in {n.domain for n in nodes if n.domain})
+    model.opset_import.extend(
+        helper.make_opsetid(domain, 1) for domain in {n.domain for n in nodes if n.domain}
+    )
     with patch("onnx.checker.check_model"):  # some are refused by it too, in other words
         assert words in refusal(model)
 
@@ -182,7 +207,8 @@ def test_unknown_opsets_are_refused_and_batches_where_images_come_singly(
 
 def test_functions_and_sparse_weights_are_refused(model: onnx.ModelProto) -> None:
     values, places = (
-        numpy_helper.from_array(np.array([1], kind), name) for kind, name in ((np.float32, "v"), (int, "i"))
+        numpy_helper.from_array(np.array([1], kind), name)
+        for kind, name in ((np.float32, "v"), (int, "i"))
     )
     sparse = helper.make_sparse_tensor(values, places, [2**40])
     model.graph.sparse_initializer.append(sparse)
@@ -198,7 +224,10 @@ def test_a_file_of_absurd_size_is_not_read(tmp_path: Path) -> None:
     path = tmp_path / "huge.onnx"
     with path.open("wb") as stream:
         stream.truncate(FILE_BYTES + 1)  # sparse: it takes no disk
-    with patch.object(Path, "read_bytes", side_effect=AssertionError), pytest.raises(ModelError, match="more than"):
+    with (
+        patch.object(Path, "read_bytes", side_effect=AssertionError),
+        pytest.raises(ModelError, match="more than"),
+    ):
         load_onnx(path)
 
 
@@ -224,7 +253,9 @@ def test_a_network_that_fails_on_an_image_is_one_sentence(tmp_path: Path) -> Non
     sketch.node("Add", "image", sketch.constant(np.zeros((1, 1, 5, 5), np.float32)))
     other = sketch.save(tmp_path / "a.onnx", "add0")
     sketch = Sketch(1)
-    smaller = sketch.save(tmp_path / "b.onnx", sketch.node("MaxPool", "image", kernel_shape=[2, 2], strides=[2, 2]))
+    smaller = sketch.save(
+        tmp_path / "b.onnx", sketch.node("MaxPool", "image", kernel_shape=[2, 2], strides=[2, 2])
+    )
     for path in (other, smaller):
         with pytest.raises(ModelError, match="its own size"):
             run(open_session(path, 1), IMAGE)
@@ -253,7 +284,9 @@ def test_a_long_chain_of_activations_is_followed_in_a_moment(tmp_path: Path) -> 
     sketch = Sketch(1)
     scale = sketch.constant(np.array(0.5, np.float32))
     zero = sketch.constant(np.array(0, np.int8))
-    last = sketch.node("DequantizeLinear", sketch.node("QuantizeLinear", "image", scale, zero), scale, zero)
+    last = sketch.node(
+        "DequantizeLinear", sketch.node("QuantizeLinear", "image", scale, zero), scale, zero
+    )
     for _ in range(1200):
         last = sketch.node("Relu", last)
     place(read_network(sketch.save(tmp_path / "long.onnx", last), 32), load_dpu("vck190"))
@@ -262,7 +295,11 @@ def test_a_long_chain_of_activations_is_followed_in_a_moment(tmp_path: Path) -> 
 def test_there_is_one_door() -> None:
     """What opens an ONNX file, and what hands one to a runtime, each stand in one place."""
     root = Path(__file__).parents[2]
-    doors = {"onnx.load": set[str](), "ParseFromString(": set[str](), "InferenceSession(": set[str]()}
+    doors = {
+        "onnx.load": set[str](),
+        "ParseFromString(": set[str](),
+        "InferenceSession(": set[str](),
+    }
     for folder in ("deploy", "model", "profiles", "quant"):
         for path in (root / folder).rglob("*.py"):
             for word, places in doors.items():
@@ -271,7 +308,11 @@ def test_there_is_one_door() -> None:
     assert doors == {
         "onnx.load": set(),
         # A digest looks only for the names of files beside a network.
-        "ParseFromString(": {"quant/reading/external.py", "quant/reading/folding.py", "quant/onnx_file.py"},
+        "ParseFromString(": {
+            "quant/reading/external.py",
+            "quant/reading/folding.py",
+            "quant/onnx_file.py",
+        },
         # The processor is asked with a model of our own making, before any file comes in.
         # The scripts that run on a board by themselves open what they are told to.
         "InferenceSession(": {

@@ -23,20 +23,31 @@ TWO = Window(strides=(2, 2), pads=(1, 1, 1, 1))
 PAIR = ("QuantizeLinear", "DequantizeLinear")
 
 
-def conv(source: str, output: str, shape: tuple[int, int], activation: str = "none", **more: Any) -> ops.Conv:
+def conv(
+    source: str, output: str, shape: tuple[int, int], activation: str = "none", **more: Any
+) -> ops.Conv:
     generator = np.random.default_rng(len(output))
-    weight, bias = (generator.normal(0, 0.2, size).astype(np.float32) for size in ((*shape, 3, 3), shape[:1]))
+    weight, bias = (
+        generator.normal(0, 0.2, size).astype(np.float32) for size in ((*shape, 3, 3), shape[:1])
+    )
     kind = {"window": ONE, "activation": Activation[activation], **more}
     return ops.Conv(f"{output}.conv", source, output, weight, bias, **kind)
 
 
 def plain() -> Graph:
-    return conv(PLANES, "a", (5, 3), "relu"), conv("a", "bb", (4, 5), "leaky_relu"), conv("bb", CORRECTION, (1, 4))
+    return (
+        conv(PLANES, "a", (5, 3), "relu"),
+        conv("a", "bb", (4, 5), "leaky_relu"),
+        conv("bb", CORRECTION, (1, 4)),
+    )
 
 
 def residual() -> Graph:
     block = conv(PLANES, "a", (4, 3)), conv("a", "bb", (4, 4), "relu6"), conv("bb", "ccc", (4, 4))
-    sums = ops.Add("add", ("a", "ccc"), "sum", Activation.relu), ops.Add("twice", ("sum", "sum"), "double")
+    sums = (
+        ops.Add("add", ("a", "ccc"), "sum", Activation.relu),
+        ops.Add("twice", ("sum", "sum"), "double"),
+    )
     return *block, *sums, conv("double", CORRECTION, (1, 4))
 
 
@@ -59,7 +70,9 @@ NETWORKS = pytest.mark.parametrize("network", [plain, residual, unet, pools])
 @NETWORKS
 @settings(max_examples=8, deadline=None)
 @given(data=st.data(), tile_px=st.sampled_from([5, 9, 17, 31]), seed=st.integers(0, 99))
-def test_the_host_files_bits(network: Callable[[], Graph], data: st.DataObject, tile_px: int, seed: int) -> None:
+def test_the_host_files_bits(
+    network: Callable[[], Graph], data: st.DataObject, tile_px: int, seed: int
+) -> None:
     bits = {name: data.draw(st.integers(2, 7)) for name in ops.tensors(network())}
     core = build_core(network(), {PLANES: PLANES_FRAC_BITS, **bits})
     image = np.random.default_rng(seed).random((1, 1, tile_px, tile_px), np.float32)
@@ -67,19 +80,27 @@ def test_the_host_files_bits(network: Callable[[], Graph], data: st.DataObject, 
     host = host_model(core, {})
     for optimise in (True, False):
         found = open_session(model, optimise=optimise).run(None, {PLANES: planes_of(image)})[0]
-        np.testing.assert_array_equal(found, correction(core, core.ends.split(image), half_even=True))
+        np.testing.assert_array_equal(
+            found, correction(core, core.ends.split(image), half_even=True)
+        )
         by_host = run(open_session(host, optimise=optimise), image)
         np.testing.assert_array_equal(core.ends.finished(image, found), by_host)
 
 
 @NETWORKS
 def test_the_layout_of_amds_quantiser(network: Callable[[], Graph]) -> None:
-    core = build_core(network(), {PLANES: PLANES_FRAC_BITS, **dict.fromkeys(ops.tensors(network()), 5)})
+    core = build_core(
+        network(), {PLANES: PLANES_FRAC_BITS, **dict.fromkeys(ops.tensors(network()), 5)}
+    )
     model = vint8_model(core, {}, 9)
     onnx.checker.check_model(model, full_check=True)
     assert [(each.domain, each.version) for each in model.opset_import] == [("", 17)]
     assert model.producer_name == "beers-deploy"
-    assert all(d.dim_value for v in (*model.graph.input, *model.graph.output) for d in v.type.tensor_type.shape.dim)
+    assert all(
+        d.dim_value
+        for v in (*model.graph.input, *model.graph.output)
+        for d in v.type.tensor_type.shape.dim
+    )
     nodes = model.graph.node
     held = constants(model)
     readers = Counter(name for node in nodes for name in node.input)
@@ -94,4 +115,6 @@ def test_the_layout_of_amds_quantiser(network: Callable[[], Graph]) -> None:
             feeds = {written[name] for name in node.input if name in written}
             assert feeds == {"Conv" if node.op_type == "LeakyRelu" else "DequantizeLinear"}
     scaled = {(node.input[1], node.input[0]) for node in nodes if node.op_type == "QuantizeLinear"}
-    assert len({scale for scale, _ in scaled}) == len({tensor for _, tensor in scaled}) == len(scaled)
+    assert (
+        len({scale for scale, _ in scaled}) == len({tensor for _, tensor in scaled}) == len(scaled)
+    )

@@ -1,4 +1,6 @@
-"""What is trained held to the integer reference: the same whole numbers, whatever the parameters have become."""
+"""What is trained held to the integer reference: the same whole numbers, whatever the parameters
+have become.
+"""
 
 from collections.abc import Sequence
 
@@ -23,7 +25,9 @@ def moved(core: IntCore) -> TrainableCore:
 
 
 def hold_to_reference(trainable: TrainableCore, planes: np.ndarray) -> None:
-    """Fail where a tensor differs; a correction in copies may by half a unit where a fine copy holds it."""
+    """Fail where a tensor differs; a correction in copies may by half a unit where a fine copy
+    holds it.
+    """
     core = trainable.core()
     wanted, _ = run_core(core, planes)
     with torch.no_grad():
@@ -37,11 +41,17 @@ def hold_to_reference(trainable: TrainableCore, planes: np.ndarray) -> None:
     if ends.copies == 1:
         np.testing.assert_allclose(result, whole, rtol=1e-6)
         return
-    fine = _fine(np.split(np.abs(wanted[CORRECTION]), ends.copies, axis=1), windows=bool(ends.offsets))
-    assert fine.any() or not ends.offsets  # windows hold all, the fine one of two gains what is small
+    fine = _fine(
+        np.split(np.abs(wanted[CORRECTION]), ends.copies, axis=1), windows=bool(ends.offsets)
+    )
+    assert (
+        fine.any() or not ends.offsets
+    )  # windows hold all, the fine one of two gains what is small
     assert np.abs(result - whole)[fine].max(initial=0) <= 0.501 * core.scale(CORRECTION)
 
 
 def _fine(sizes: Sequence[np.ndarray], windows: bool) -> np.ndarray:
-    """Where one of the fine copies holds the value: all but the first of windows, the first of two gains."""
+    """Where one of the fine copies holds the value: all but the first of windows, the first of two
+    gains.
+    """
     return np.asarray(np.min(sizes[1:] if windows else sizes[:1], axis=0) <= FINE_MAX)

@@ -52,7 +52,9 @@ def quickly_quantised(float_onnx: onnx.ModelProto) -> Quantised:
 
 
 @pytest.fixture(scope="session")
-def pair(float_onnx: onnx.ModelProto, quantised: Quantised, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def pair(
+    float_onnx: onnx.ModelProto, quantised: Quantised, tmp_path_factory: pytest.TempPathFactory
+) -> list[Path]:
     """The two files."""
     return saved(float_onnx, quantised, tmp_path_factory.mktemp("pair"))
 

@@ -32,13 +32,17 @@ def look(subject: Subject, names: list[str], stages: tuple[str, ...]) -> list[St
     return run_battery(subject, [BY_NAME[name] for name in names], stages, side_px=SIDE_PX)
 
 
-@pytest.mark.parametrize("case", [case for case in CASES if not case.large], ids=lambda case: str(case.name))
+@pytest.mark.parametrize(
+    "case", [case for case in CASES if not case.large], ids=lambda case: str(case.name)
+)
 def test_a_small_network_passes_every_case(case: Case, subject: Subject) -> None:
     results = look(subject, [case.name], tuple(STAGES))
     assert not [(o.stage, o.verdict, o.reason) for o in results if o.failed]
 
 
-@pytest.mark.parametrize("name", ["full scale", "steps", "NaN pixels", "nodata stripes", "1 x 1", "flat 1 x N"])
+@pytest.mark.parametrize(
+    "name", ["full scale", "steps", "NaN pixels", "nodata stripes", "1 x 1", "flat 1 x N"]
+)
 def test_a_network_at_half_resolution_passes(name: str, coarse: Subject) -> None:
     """At odd sizes too, which are extended to whole places."""
     results = look(coarse, [name], tuple(STAGES))
@@ -60,7 +64,9 @@ def test_the_shipped_networks_at_half_resolution_are_calm(variant: str) -> None:
         assert abs(float(moved[30:-30, 30:-30].mean())) < 0.08 * FULL_DN
 
 
-@pytest.mark.parametrize("name", ["steps", "snow", "nodata stripes", "beyond 12 bits", "flat 1 x N"])
+@pytest.mark.parametrize(
+    "name", ["steps", "snow", "nodata stripes", "beyond 12 bits", "flat 1 x N"]
+)
 def test_the_shipped_network_passes(name: str, shipped: Subject) -> None:
     results = run_battery(shipped, [BY_NAME[name]], ["float32", "INT8", "tiling"], side_px=48)
     assert not [(o.stage, o.verdict) for o in results if o.failed]
@@ -99,7 +105,9 @@ def test_a_broken_float_network_fails(
     assert any(measure.check.startswith(check) for measure in result.failed), result.verdict
 
 
-def test_a_network_with_a_nan_among_its_weights_is_not_opened(float_onnx: onnx.ModelProto, tmp_path: Path) -> None:
+def test_a_network_with_a_nan_among_its_weights_is_not_opened(
+    float_onnx: onnx.ModelProto, tmp_path: Path
+) -> None:
     save_onnx(changed(float_onnx, "body.0.second.weight", one_nan), tmp_path / "broken.onnx")
     with pytest.raises(ModelError, match=r"1 NaN or infinite in body\.0\.second\.weight"):
         open_subject(tmp_path / "broken.onnx", None)
@@ -160,7 +168,9 @@ def test_cases_are_drawn_from_their_seed_and_say_what_is_wrong_with_them(case: C
         assert sound == (case.pixels == "sound")
 
 
-def test_the_command_writes_its_figures_and_fails_by_exit_code(pair: list[Path], tmp_path: Path) -> None:
+def test_the_command_writes_its_figures_and_fails_by_exit_code(
+    pair: list[Path], tmp_path: Path
+) -> None:
     few = ["--cases", "night,NaN pixels", "--stages", "float32,INT8,tiling", "--side", "24"]
     files = ["--json", str(tmp_path / "s.json"), "--out", str(tmp_path / "s.md")]
     done("stress", pair[0], pair[1], *few, *files)
@@ -198,5 +208,7 @@ def test_the_page_of_stability_is_fresh() -> None:
     wanted = [maker.OPENING.strip(), *maker.stage_lines(), *maker.limitation_lines()]
     assert [text for text in wanted if text.strip() not in page] == []
     lines = re.findall(rf"^- {': .+?, '.join(STAGES)}: .+?\. (.+)\.$", page, re.MULTILINE)
-    assert sorted(name for line in lines for name in line.split("; ")) == sorted(case.name for case in CASES)
+    assert sorted(name for line in lines for name in line.split("; ")) == sorted(
+        case.name for case in CASES
+    )
     assert "FAILED" not in page

@@ -95,7 +95,9 @@ def test_an_injection_leaves_the_target_alone(memory: str, target: FaultTarget) 
     assert not np.array_equal(restored(injected), fault_free)
     np.testing.assert_array_equal(restored(injected), restored(injected))
     np.testing.assert_array_equal(image, before)
-    np.testing.assert_array_equal(restored(Injected(target.core, SOUND, target.pairs[0][0], 0)), fault_free)
+    np.testing.assert_array_equal(
+        restored(Injected(target.core, SOUND, target.pairs[0][0], 0)), fault_free
+    )
 
 
 def test_at_half_resolution_maps_have_a_bit_for_each_channel_of_each_place(coarse: Subject) -> None:
@@ -112,7 +114,11 @@ def test_at_half_resolution_maps_have_a_bit_for_each_channel_of_each_place(coars
 @pytest.mark.parametrize("variant", ["convbeers-xs", "convbeers-s", "convbeers"])
 def test_all_guards_cost_under_two_per_cent_on_the_board(variant: str) -> None:
     core = as_stored(open_subject(Path(variant), None).core)
-    relus = {op.output: 96 for op in core.ops if isinstance(op, IntConv) and op.activation is Activation.relu}
+    relus = {
+        op.output: 96
+        for op in core.ops
+        if isinstance(op, IntConv) and op.activation is Activation.relu
+    }
     dpu = load_dpu("vck190", None)
     target = FaultTarget(core, Guards(relus, 1024.0, checksums(core)), ())
     found = price_rows(target, predict_file(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
@@ -120,7 +126,11 @@ def test_all_guards_cost_under_two_per_cent_on_the_board(variant: str) -> None:
     assert together == pytest.approx(sum(parts))
     assert 0 < db(found[-1], "of a tile, if nothing hides") < 2
     assert db(found[-1], "frame rate lost beside the DPU") == 0
-    assert all(figure.mode == "predicted" and figure.interval for row in found for figure in row.figures.values())
+    assert all(
+        figure.mode == "predicted" and figure.interval
+        for row in found
+        for figure in row.figures.values()
+    )
 
 
 def test_the_command(pair: list[Path], tmp_path: Path) -> None:
@@ -149,7 +159,11 @@ def test_the_command(pair: list[Path], tmp_path: Path) -> None:
     ],
 )
 def test_wrong_arguments(
-    arguments: list[str], said: str, pair: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arguments: list[str],
+    said: str,
+    pair: list[Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     files = {"FLOAT": str(pair[0]), "INT8": str(pair[1])}

@@ -36,7 +36,9 @@ def test_no_image_leaves_the_integer_bounds(quantised: Quantised) -> None:
 
 def test_an_accumulator_that_overflows_is_found(quantised: Quantised) -> None:
     op = quantised.core.convolutions[0]
-    huge = replace(op, bias=np.full(len(op.bias), 2**31, np.int64), bias_frac_bits=op.weight_frac_bits + 7)
+    huge = replace(
+        op, bias=np.full(len(op.bias), 2**31, np.int64), bias_frac_bits=op.weight_frac_bits + 7
+    )
     core = replace(quantised.core, ops=(huge, *quantised.core.ops[1:]))
     assert layer_bounds(core)[0].bits >= INT32_BITS
 
@@ -50,8 +52,12 @@ def test_shipped_accumulators_cannot_overflow(path: Path) -> None:
 def test_a_core_is_read_back_from_its_file(quantised: Quantised) -> None:
     core = read_core(quantised.host)
     image = images(3, (19, 26), False).astype(np.float32)
-    whole = Ends(gains=2).merge(correction(core, split(image), half_even=True), core.scale(CORRECTION))
-    np.testing.assert_array_equal(np.clip(image + whole, 0, 1), run(open_session(quantised.host), image))
+    whole = Ends(gains=2).merge(
+        correction(core, split(image), half_even=True), core.scale(CORRECTION)
+    )
+    np.testing.assert_array_equal(
+        np.clip(image + whole, 0, 1), run(open_session(quantised.host), image)
+    )
 
 
 def test_another_spelling_has_no_core(quantised: Quantised, float_onnx: onnx.ModelProto) -> None:

@@ -1,4 +1,6 @@
-"""Arithmetic against its definition, written another way: SSIM's variances, a bias in whole numbers, an inverse."""
+"""Arithmetic against its definition, written another way: SSIM's variances, a bias in whole
+numbers, an inverse.
+"""
 
 from dataclasses import replace
 
@@ -31,7 +33,8 @@ def ssim_by_two_passes(image: np.ndarray, reference: np.ndarray, data_range: flo
     from_x = x - mean_x[..., None, None]
     from_y = y - mean_y[..., None, None]
     var_x, var_y, both = (
-        (a * b * weights).sum((2, 3)) for a, b in ((from_x, from_x), (from_y, from_y), (from_x, from_y))
+        (a * b * weights).sum((2, 3))
+        for a, b in ((from_x, from_x), (from_y, from_y), (from_x, from_y))
     )
     c1 = (0.01 * data_range) ** 2
     c2 = (0.03 * data_range) ** 2
@@ -46,10 +49,14 @@ def ssim_by_two_passes(image: np.ndarray, reference: np.ndarray, data_range: flo
     sigma=st.floats(1e-5, 0.01),
     data_range=st.sampled_from([1.0, 4095.0]),
 )
-def test_ssim_is_that_of_its_definition(seed: int, level: float, sigma: float, data_range: float) -> None:
+def test_ssim_is_that_of_its_definition(
+    seed: int, level: float, sigma: float, data_range: float
+) -> None:
     noise = np.random.default_rng(seed).standard_normal((2, 23, 31))
     image, other = (data_range * (level + sigma * noise)).astype(np.float32)
-    assert ssim(image, other, data_range) == pytest.approx(ssim_by_two_passes(image, other, data_range), abs=1e-12)
+    assert ssim(image, other, data_range) == pytest.approx(
+        ssim_by_two_passes(image, other, data_range), abs=1e-12
+    )
 
 
 def biased(core: IntCore, generator: np.random.Generator) -> IntCore:
@@ -66,7 +73,9 @@ def biased(core: IntCore, generator: np.random.Generator) -> IntCore:
 
 @pytest.mark.parametrize("shape", [(17, 20), (1, 1), (1, 19), (12, 2)])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_both_files_hold_every_bias_at_its_scale(seed: int, shape: tuple[int, int], quantised: Quantised) -> None:
+def test_both_files_hold_every_bias_at_its_scale(
+    seed: int, shape: tuple[int, int], quantised: Quantised
+) -> None:
     generator = np.random.default_rng(seed)
     core = biased(quantised.core, generator)
     image = generator.uniform(0.3, 0.7, (1, 1, *shape)).astype(np.float32)

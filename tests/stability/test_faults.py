@@ -1,4 +1,6 @@
-"""Bit flips: as many as were asked for, wherever they fall; and guards, which keep what they promise."""
+"""Bit flips: as many as were asked for, wherever they fall; and guards, which keep what they
+promise.
+"""
 
 from dataclasses import replace
 
@@ -35,7 +37,12 @@ from beers_deploy.studies.stress.faults import (
 )
 from tests.quant.quick import image
 
-KINDS = {"int8": (np.int8, 8), "maps": (np.int16, 8), "pixels": (np.uint16, 12), "shifts": (np.int16, 6)}
+KINDS = {
+    "int8": (np.int8, 8),
+    "maps": (np.int16, 8),
+    "pixels": (np.uint16, 12),
+    "shifts": (np.int16, 6),
+}
 
 
 def flipped(a: np.ndarray, b: np.ndarray, bits: int) -> int:
@@ -74,7 +81,9 @@ def test_the_rate_is_that_of_a_megabit() -> None:
 def test_the_stored_bias_is_int8_and_the_network_the_same(quantised: Quantised) -> None:
     stored = as_stored(quantised.core)
     assert all(op.bias.dtype == np.int8 for op in stored.convolutions)
-    assert weight_bits(stored) == 8 * sum(op.weight.size + op.bias.size for op in stored.convolutions)
+    assert weight_bits(stored) == 8 * sum(
+        op.weight.size + op.bias.size for op in stored.convolutions
+    )
     planes = split(image())
     before = run_core(quantised.core, planes)[0]
     after = run_core(stored, planes)[0]
@@ -105,7 +114,9 @@ def test_every_shift_is_what_the_core_uses(core: IntCore) -> None:
 def test_numbers_that_the_board_could_not_store_are_refused(quantised: Quantised) -> None:
     op = quantised.core.convolutions[0]
     odd = replace(op, bias=np.full(len(op.bias), 100_001), bias_frac_bits=op.bias_frac_bits)
-    far = replace(op, weight_frac_bits=op.weight_frac_bits + 40, bias_frac_bits=op.bias_frac_bits + 40)
+    far = replace(
+        op, weight_frac_bits=op.weight_frac_bits + 40, bias_frac_bits=op.bias_frac_bits + 40
+    )
     for wrong in (odd, far):
         with pytest.raises(ModelError, match=op.name):
             as_stored(replace(quantised.core, ops=(wrong, *quantised.core.ops[1:])))
@@ -113,7 +124,9 @@ def test_numbers_that_the_board_could_not_store_are_refused(quantised: Quantised
 
 def test_maps_have_the_channels_that_run(quantised: Quantised) -> None:
     tensors, _ = run_core(quantised.core, split(image()))
-    assert {name: tensor.shape[1] for name, tensor in tensors.items()} == map_channels(quantised.core)
+    assert {name: tensor.shape[1] for name, tensor in tensors.items()} == map_channels(
+        quantised.core
+    )
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +137,8 @@ def guards(core: IntCore) -> Guards:
 def test_calibration_patches_pass_untouched(core: IntCore, guards: Guards) -> None:
     for seed in range(3):
         bare, clamped = (
-            run_core(core, split(image(seed=seed)), faults=f)[0] for f in (SOUND, guarded(SOUND, guards))
+            run_core(core, split(image(seed=seed)), faults=f)[0]
+            for f in (SOUND, guarded(SOUND, guards))
         )
         np.testing.assert_array_equal(bare[CORRECTION], clamped[CORRECTION])
         correction = merged_correction(core, bare)
@@ -132,7 +146,9 @@ def test_calibration_patches_pass_untouched(core: IntCore, guards: Guards) -> No
 
 
 def test_bounds_are_the_next_ones_that_hold_what_was_seen(core: IntCore) -> None:
-    """A dark image leaves room below 96 units; a bright one fills int8, and such a ReLU gets no bound."""
+    """A dark image leaves room below 96 units; a bright one fills int8, and such a ReLU gets no
+    bound.
+    """
     dark = [split(0.1 * image(seed=seed)) for seed in range(2)]
     guards = learn_guards(core, dark)
     runs = [run_core(core, planes)[0] for planes in dark]
@@ -146,9 +162,13 @@ def test_bounds_are_the_next_ones_that_hold_what_was_seen(core: IntCore) -> None
 
 
 def test_a_clamped_result_keeps_its_bound_whatever_the_weights(core: IntCore) -> None:
-    some = Guards({op.output: 24 for op in core.convolutions if op.activation is Activation.relu}, 64.0, {})
+    some = Guards(
+        {op.output: 24 for op in core.convolutions if op.activation is Activation.relu}, 64.0, {}
+    )
     injected = flip_weights(core, 2000, np.random.default_rng(0))
-    bare, clamped = (run_core(injected, split(image(seed=9)), faults=f)[0] for f in (SOUND, guarded(SOUND, some)))
+    bare, clamped = (
+        run_core(injected, split(image(seed=9)), faults=f)[0] for f in (SOUND, guarded(SOUND, some))
+    )
     assert max(int(bare[name].max()) for name in some.relu6) > 24
     assert max(int(clamped[name].max()) for name in some.relu6) == 24
     limited = some.limit(merged_correction(core, clamped))
@@ -158,7 +178,9 @@ def test_a_clamped_result_keeps_its_bound_whatever_the_weights(core: IntCore) ->
 
 def test_faults_enter_memory_after_the_clamp(core: IntCore) -> None:
     name = next(op.output for op in core.convolutions if op.activation is Activation.relu)
-    faults = Faults({}, lambda found, tensor: np.full_like(tensor, 127) if found == name else tensor)
+    faults = Faults(
+        {}, lambda found, tensor: np.full_like(tensor, 127) if found == name else tensor
+    )
     tensors, _ = run_core(core, split(image()), faults=guarded(faults, Guards({name: 3}, 1.0, {})))
     assert (tensors[name] == 127).all()
 
@@ -168,7 +190,9 @@ def test_every_single_flip_is_found_and_the_layer_scrubbed(core: IntCore, guards
     for op in core.convolutions:
         for _ in range(8):
             injected = with_ops(core, {op.name: flip_conv(op, 1, generator)})
-            wrong = {name for name, sum_ in checksums(injected).items() if sum_ != guards.checksums[name]}
+            wrong = {
+                name for name, sum_ in checksums(injected).items() if sum_ != guards.checksums[name]
+            }
             assert wrong == {op.name}
             assert checksums(scrubbed(injected, core, guards.checksums)) == guards.checksums
 
@@ -186,10 +210,14 @@ def test_a_wrong_shift_is_used(core: IntCore) -> None:
     meant = shifts_of(core)
     planes = split(image(seed=2))
     sound = run_core(core, planes)[0][CORRECTION]
-    np.testing.assert_array_equal(run_core(core, planes, faults=Faults(meant))[0][CORRECTION], sound)
+    np.testing.assert_array_equal(
+        run_core(core, planes, faults=Faults(meant))[0][CORRECTION], sound
+    )
     for key in (key for key in meant if key[1] == "shift_cut"):
         for wrong in (-32, 31):
-            assert not np.array_equal(run_core(core, planes, faults=Faults({key: wrong}))[0][CORRECTION], sound)
+            assert not np.array_equal(
+                run_core(core, planes, faults=Faults({key: wrong}))[0][CORRECTION], sound
+            )
 
 
 def test_shifts_as_wrong_as_can_be_keep_every_sign() -> None:

@@ -1,4 +1,5 @@
-"""What surrounds a network, on the hard cases of `stress`: simulator, traditional pipeline, losses and metrics.
+"""What surrounds a network, on the hard cases of `stress`: simulator, traditional pipeline, losses
+and metrics.
 
 Figures or refusals, never a wrong number; losses and their gradients finite and bounded.
 """
@@ -49,7 +50,9 @@ def images(case: Case, side_px: int = 32) -> list[np.ndarray]:
 def sensor_of(case: Case) -> Instrument:
     """The profile's sensor, with the case's own MTF."""
     sensor = load_sensor(SENSOR).nominal()
-    return replace(sensor, mtf_nyquist={"MTF 0.1 %": 0.001, "MTF 60 %": 0.6}.get(case.name, sensor.mtf_nyquist))
+    return replace(
+        sensor, mtf_nyquist={"MTF 0.1 %": 0.001, "MTF 60 %": 0.6}.get(case.name, sensor.mtf_nyquist)
+    )
 
 
 def radiance_of(image: np.ndarray, sensor: Instrument) -> np.ndarray:
@@ -79,7 +82,9 @@ def test_the_simulator_gives_digital_numbers_and_the_same_ones_again(case: Case)
 
 @named(SOUND)
 def test_the_signal_is_that_of_the_formulas(case: Case) -> None:
-    """Before noise and digitising: its mean is kept, and it rings and amplifies no more than its kernel can."""
+    """Before noise and digitising: its mean is kept, and it rings and amplifies no more than its
+    kernel can.
+    """
     sensor = sensor_of(case)
     for image in images(case):
         dn = signal(image, sensor)
@@ -96,7 +101,9 @@ def test_the_signal_is_that_of_the_formulas(case: Case) -> None:
 def signal(image: np.ndarray, sensor: Instrument) -> np.ndarray:
     radiance = radiance_of(image, sensor)
     height, width = radiance.shape
-    sampled = sample(scene_spectrum(radiance), sensor_transfer(height, width, RATIO, sensor), width, RATIO)
+    sampled = sample(
+        scene_spectrum(radiance), sensor_transfer(height, width, RATIO, sensor), width, RATIO
+    )
     return np.asarray(sampled * np.float32(sensor.gain_dn_per_radiance))
 
 
@@ -118,9 +125,19 @@ def test_a_scene_that_lacks_pixels_is_refused(case: Case, tmp_path: Path) -> Non
         read_scene(tmp_path / "scene.tif", sensor_of(case))
 
 
-TRADITIONAL = ("full scale", "hot pixel", "night", "NaN pixels", "1 x 1", "MTF 0.1 %", "beyond 12 bits")
+TRADITIONAL = (
+    "full scale",
+    "hot pixel",
+    "night",
+    "NaN pixels",
+    "1 x 1",
+    "MTF 0.1 %",
+    "beyond 12 bits",
+)
 GROUPS_DN = 200.0
-"""A change in the last bit can tip which patches NL-Bayes groups: a pixel then moves by what the others say."""
+"""A change in the last bit can tip which patches NL-Bayes groups: a pixel then moves by what the
+others say.
+"""
 
 
 @named([BY_NAME[name] for name in TRADITIONAL])
@@ -135,7 +152,9 @@ def test_the_traditional_pipeline_is_calm(case: Case) -> None:
         assert np.array_equal(result, restored(image, chain), equal_nan=True)
         torch.set_num_threads(1)
         strips = [torch.from_numpy(image[top : top + 13]) for top in range(0, len(image), 13)]
-        joined = torch.cat(list(restore_strips(strips, len(image), chain.fitted_to(strips)))).numpy()
+        joined = torch.cat(
+            list(restore_strips(strips, len(image), chain.fitted_to(strips)))
+        ).numpy()
         assert np.array_equal(result, joined, equal_nan=True)
         assert np.array_equal(result[~known], image[~known], equal_nan=True)
         if case.pixels == "sound":
@@ -152,7 +171,9 @@ def faithful(image: np.ndarray, result: np.ndarray, chain: Chain) -> None:
 
 
 def restored(image: np.ndarray, chain: Chain) -> np.ndarray:
-    return np.asarray(restore_traditional(torch.from_numpy(np.asarray(image, np.float32)), chain).numpy())
+    return np.asarray(
+        restore_traditional(torch.from_numpy(np.asarray(image, np.float32)), chain).numpy()
+    )
 
 
 def noisy(image: np.ndarray) -> np.ndarray:
@@ -185,7 +206,8 @@ def test_the_loss_is_its_formula_and_its_gradient_is_bounded(case: Case) -> None
             assert torch.equal(gradient, gradient_again)
             exact = by_formula(weights, other.double(), reference.double())
             assert value == pytest.approx(exact, rel=1e-4, abs=1e-4 * NOISE_DN / FULL_DN)
-            # Of the mean size of F, orthonormal, each pixel moves every F by 1 / sqrt(pixels) at most: proven.
+            # Of the mean size of F, orthonormal, each pixel moves every F by 1 / sqrt(pixels) at
+            # most: proven.
             allowed = 1 + weights.fft * math.sqrt(gradient.numel())
             assert gradient.numel() * float(gradient.abs().max()) <= allowed * (1 + 1e-4)
 
@@ -212,7 +234,12 @@ def test_ssim_is_bounded_symmetric_and_precise(case: Case) -> None:
         value = ssim(image, other, FULL_DN)
         assert abs(value) <= 1 + 1e-9
         assert ssim(image, image, FULL_DN) == pytest.approx(1, abs=1e-9)
-        assert value == pytest.approx(ssim(image.astype(float), other.astype(float), FULL_DN), abs=1e-9)
+        assert value == pytest.approx(
+            ssim(image.astype(float), other.astype(float), FULL_DN), abs=1e-9
+        )
         assert value == pytest.approx(ssim(other, image, FULL_DN), abs=1e-6)
-        assert abs(ssim(image, np.where(other < FULL_DN, other + 1, other - 1), FULL_DN) - value) < 0.05
+        assert (
+            abs(ssim(image, np.where(other < FULL_DN, other + 1, other - 1), FULL_DN) - value)
+            < 0.05
+        )
         assert math.isinf(psnr_db(image, image, FULL_DN))

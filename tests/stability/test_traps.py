@@ -1,4 +1,6 @@
-"""docs/explanation/traps.md is complete, and the controls that other tests lack: the trap itself, sprung."""
+"""docs/explanation/traps.md is complete, and the controls that other tests lack: the trap itself,
+sprung.
+"""
 
 import math
 import re
@@ -12,7 +14,12 @@ from torch import Tensor
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.mtf import gamma_from_mtf, mtf
-from beers_deploy.model.traditional.nl_bayes import QUALITIES, estimate_groups, first_pass, second_pass
+from beers_deploy.model.traditional.nl_bayes import (
+    QUALITIES,
+    estimate_groups,
+    first_pass,
+    second_pass,
+)
 from beers_deploy.model.traditional.noise import Noise
 from beers_deploy.model.traditional.pipeline import Chain, Order, restore_traditional
 from beers_deploy.profiles import load_sensor
@@ -35,7 +42,9 @@ def missing_tests(rows: dict[int, list[tuple[str, str]]]) -> list[str]:
     absent = [f"{number} has no test" for number, named in rows.items() if not named]
     for path, name in (test for named in rows.values() for test in named):
         file = ROOT / path
-        if not file.is_file() or not re.search(rf"^def {name}\(", file.read_text(encoding="utf-8"), re.MULTILINE):
+        if not file.is_file() or not re.search(
+            rf"^def {name}\(", file.read_text(encoding="utf-8"), re.MULTILINE
+        ):
             absent.append(f"{path}::{name}")
     return absent
 
@@ -46,7 +55,9 @@ def test_every_trap_has_a_test_and_every_test_is_there() -> None:
     assert missing_tests(rows) == []
 
 
-@pytest.mark.parametrize(("mtf_nyquist", "diagonal"), [(0.07, 0.0179), (0.25, 0.108), (0.001, 4.4e-5)])
+@pytest.mark.parametrize(
+    ("mtf_nyquist", "diagonal"), [(0.07, 0.0179), (0.25, 0.108), (0.001, 4.4e-5)]
+)
 def test_trap_2_the_diagonal_is_no_product_of_the_axes(mtf_nyquist: float, diagonal: float) -> None:
     value = float(mtf(0.5, 0.5, mtf_nyquist))
     assert value == pytest.approx(diagonal, rel=0.01)
@@ -158,8 +169,12 @@ def test_trap_18_one_generator_for_all_would_change_every_draw() -> None:
 
 
 def test_threads_change_no_bit_of_the_compensation() -> None:
-    """A transform on several threads adds in another order: seen at this size, in 0.0002 W/m2/sr/um (measured)."""
-    image = torch.from_numpy(np.random.default_rng(0).uniform(0, 400, (96, 96)).astype(np.float32))[:60, :71]
+    """A transform on several threads adds in another order: seen at this size, in 0.0002 W/m2/sr/um
+    (measured).
+    """
+    image = torch.from_numpy(np.random.default_rng(0).uniform(0, 400, (96, 96)).astype(np.float32))[
+        :60, :71
+    ]
     results = []
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)  # the fixture puts it back

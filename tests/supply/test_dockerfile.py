@@ -15,7 +15,9 @@ def instructions(dockerfile: str) -> list[tuple[str, str]]:
     """Each instruction's word and its arguments; comments left out, continued lines joined."""
     text = re.sub(r"(?m)^\s*#.*\n", "", dockerfile).replace("\\\n", " ")
     return [
-        (word.upper(), rest) for word, _, rest in (line.strip().partition(" ") for line in text.splitlines()) if word
+        (word.upper(), rest)
+        for word, _, rest in (line.strip().partition(" ") for line in text.splitlines())
+        if word
     ]
 
 
@@ -24,23 +26,43 @@ def test_bases_are_pinned_packages_hashed_and_root_is_not_used() -> None:
     stages = {rest.partition(" AS ")[2] for word, rest in found if word == "FROM"}
     bases = {rest.partition(" AS ")[0] for word, rest in found if word == "FROM"}
     assert all(PINNED.fullmatch(base) for base in bases - stages)
-    assert re.fullmatch(r"[1-9]\d*(:[1-9]\d*)?", [rest for word, rest in found if word == "USER"][-1])
-    assert not [rest for word, rest in found if word == "ADD" or (word == "RUN" and FETCHES.search(rest))]
-    copied = [rest.split()[:-1] for word, rest in found if word == "COPY" and not rest.startswith("--from=")]
+    assert re.fullmatch(
+        r"[1-9]\d*(:[1-9]\d*)?", [rest for word, rest in found if word == "USER"][-1]
+    )
+    assert not [
+        rest for word, rest in found if word == "ADD" or (word == "RUN" and FETCHES.search(rest))
+    ]
+    copied = [
+        rest.split()[:-1]
+        for word, rest in found
+        if word == "COPY" and not rest.startswith("--from=")
+    ]
     assert not {".", "/", "*"} & {name for names in copied for name in names}
     steps = [part.strip() for word, rest in found if word == "RUN" for part in rest.split("&&")]
     assert all(SOUND_INSTALL.search(step) for step in steps if "pip install" in step)
 
 
 def test_every_folder_of_the_package_reaches_the_image() -> None:
-    copies = [rest.split() for word, rest in instructions((ROOT / "Dockerfile").read_text()) if word == "COPY"]
+    copies = [
+        rest.split()
+        for word, rest in instructions((ROOT / "Dockerfile").read_text())
+        if word == "COPY"
+    ]
     copied = {name for names in copies if not names[0].startswith("--") for name in names[:-1]}
-    let_in = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    let_in = {
+        line[1:]
+        for line in (ROOT / ".dockerignore").read_text().splitlines()
+        if line.startswith("!")
+    }
     assert {"setup.py", "profiles", "model", "quant", "deploy"} <= copied <= let_in
     assert all((ROOT / name).exists() for name in copied)
 
 
 def test_it_starts_the_command() -> None:
-    (start,) = (rest for word, rest in instructions((ROOT / "Dockerfile").read_text()) if word == "ENTRYPOINT")
+    (start,) = (
+        rest
+        for word, rest in instructions((ROOT / "Dockerfile").read_text())
+        if word == "ENTRYPOINT"
+    )
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     assert json.loads(start) == list(scripts)

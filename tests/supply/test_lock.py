@@ -1,4 +1,6 @@
-"""The locks hold what pyproject.toml asks for, each version once, by its hashes; the core's is part of the other."""
+"""The locks hold what pyproject.toml asks for, each version once, by its hashes; the core's is part
+of the other.
+"""
 
 import re
 import tomllib
@@ -8,22 +10,34 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[2]
-PIN = re.compile(r"(?P<name>[\w.-]+)==(?P<version>[\w.!]+)(?P<hashes>( --hash=sha256:[0-9a-f]{64})+)")
+PIN = re.compile(
+    r"(?P<name>[\w.-]+)==(?P<version>[\w.!]+)(?P<hashes>( --hash=sha256:[0-9a-f]{64})+)"
+)
 
 PINNED = re.compile(r"(?m)^[\w.-]+==[\w.!]+")
 
 
 def asked_for(*extras: str) -> list[str]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    wanted = [each for extra in extras for each in project["project"]["optional-dependencies"][extra]]
+    wanted = [
+        each for extra in extras for each in project["project"]["optional-dependencies"][extra]
+    ]
     return [*project["project"]["dependencies"], *wanted, *project["build-system"]["requires"]]
 
 
 def faults(lock: str, wanted: list[str]) -> list[str]:
     """What is wrong with a lock, a sentence each."""
-    lines = [line for line in re.sub(r"\s*\\\n\s*", " ", lock).splitlines() if line and not line.startswith("#")]
+    lines = [
+        line
+        for line in re.sub(r"\s*\\\n\s*", " ", lock).splitlines()
+        if line and not line.startswith("#")
+    ]
     found = [f"no pin with its hashes: {line[:60]}" for line in lines if not PIN.fullmatch(line)]
-    pins = {canonicalize_name(pin["name"]): pin["version"] for line in lines if (pin := PIN.fullmatch(line))}
+    pins = {
+        canonicalize_name(pin["name"]): pin["version"]
+        for line in lines
+        if (pin := PIN.fullmatch(line))
+    }
     for requirement in map(Requirement, wanted):
         version = pins.get(canonicalize_name(requirement.name))
         if version is None or not requirement.specifier.contains(version, prereleases=True):
@@ -32,7 +46,9 @@ def faults(lock: str, wanted: list[str]) -> list[str]:
 
 
 def test_the_locks_satisfy_the_project() -> None:
-    whole, core = ((ROOT / name).read_text() for name in ("requirements.lock", "requirements-core.lock"))
+    whole, core = (
+        (ROOT / name).read_text() for name in ("requirements.lock", "requirements-core.lock")
+    )
     assert faults(whole, asked_for("study", "torch")) == []
     assert faults(core, asked_for()) == []
     assert set(PINNED.findall(core)) < set(PINNED.findall(whole))

@@ -1,4 +1,6 @@
-"""What is said of systems, in pyproject.toml, workflows and pages, is one thing; and no module needs one of them."""
+"""What is said of systems, in pyproject.toml, workflows and pages, is one thing; and no module
+needs one of them.
+"""
 
 import ast
 import re
@@ -13,14 +15,30 @@ from packaging.version import Version
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("deploy", "model", "quant", "profiles")
 OF_ONE_SYSTEM = {
-    "fcntl", "grp", "msvcrt", "nt", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty", "winreg",
-}  # fmt: skip
+    "fcntl",
+    "grp",
+    "msvcrt",
+    "nt",
+    "posix",
+    "pty",
+    "pwd",
+    "resource",
+    "syslog",
+    "termios",
+    "tty",
+    "winreg",
+}
 TORCH = re.compile(r"pip install[^\n]*?[ '\"]torch((?:[<>=!~]=?[\d.]+,?)+)")
-VERSIONS = [Version(text) for text in ("2.4.1", "2.5.0", "2.9.1", "2.13.0", "2.13.1", "2.14.0", "2.15.0", "3.0.0")]
+VERSIONS = [
+    Version(text)
+    for text in ("2.4.1", "2.5.0", "2.9.1", "2.13.0", "2.13.1", "2.14.0", "2.15.0", "3.0.0")
+]
 
 
 def asked_for(name: str) -> SpecifierSet:
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "optional-dependencies"
+    ]
     return next(found.specifier for found in map(Requirement, extras[name]) if found.name == name)
 
 
@@ -31,7 +49,12 @@ def pages() -> list[Path]:
 def test_torch_is_asked_for_by_a_range_with_both_ends() -> None:
     asked = asked_for("torch")
     assert {specifier.operator for specifier in asked} == {">=", "<"}
-    assert [str(version) for version in VERSIONS if version in asked] == ["2.5.0", "2.9.1", "2.13.0", "2.13.1"]
+    assert [str(version) for version in VERSIONS if version in asked] == [
+        "2.5.0",
+        "2.9.1",
+        "2.13.0",
+        "2.13.1",
+    ]
     assert Version("2.13.0+cpu") in asked
 
 
@@ -55,11 +78,19 @@ def test_the_workflow_and_its_page_name_the_same_systems() -> None:
 
 
 def bound_to_a_system(source: str) -> list[str]:
-    """What a module imports on opening that only some systems have, and text files that it opens in whatever code."""
+    """What a module imports on opening that only some systems have, and text files that it opens in
+    whatever code.
+    """
     tree = ast.parse(source)
-    imported = [alias.name for node in tree.body if isinstance(node, ast.Import) for alias in node.names]
+    imported = [
+        alias.name for node in tree.body if isinstance(node, ast.Import) for alias in node.names
+    ]
     imported += [str(node.module) for node in tree.body if isinstance(node, ast.ImportFrom)]
-    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)]
+    calls = [
+        node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
+    ]
     unsaid = [
         ast.unparse(call)
         for call in calls

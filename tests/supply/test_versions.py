@@ -1,7 +1,8 @@
-"""The oldest versions of the dependencies that pyproject.toml allows run the main commands, as those installed do.
+"""The oldest versions of the dependencies that pyproject.toml allows run the main commands, as
+those installed do.
 
-`.ci/run` runs the tests in a new environment, which has the newest versions. The oldest are installed without
-PyTorch, because these commands work without it.
+`.ci/run` runs the tests in a new environment, which has the newest versions. The oldest are
+installed without PyTorch, because these commands work without it.
 """
 
 import shutil
@@ -35,8 +36,12 @@ SAMPLES = 4
 
 
 def lowest_versions() -> list[str]:
-    """Return `name==version` of each core dependency, by the lower bound that pyproject.toml declares."""
-    declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
+    """Return `name==version` of each core dependency, by the lower bound that pyproject.toml
+    declares.
+    """
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "dependencies"
+    ]
     pins = []
     for requirement in map(Requirement, declared):
         (lowest,) = (each.version for each in requirement.specifier if each.operator == ">=")
@@ -45,9 +50,12 @@ def lowest_versions() -> list[str]:
 
 
 def pip(python: Path, *words: object) -> subprocess.CompletedProcess[str]:
-    # Bytecode is compiled where it is imported: to compile all of SciPy takes longer than to install it.
+    # Bytecode is compiled where it is imported: to compile all of SciPy takes longer than to
+    # install it.
     options = ("--quiet", "--disable-pip-version-check", "--no-compile", *map(str, words))
-    return subprocess.run([python, "-m", "pip", "install", *options], capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [python, "-m", "pip", "install", *options], capture_output=True, text=True, check=False
+    )
 
 
 def copied_project(folder: Path) -> Path:
@@ -83,15 +91,24 @@ def folder(tmp_path: Path) -> Path:
     """A raw image, a scene, a small network and samples for it."""
     rng = np.random.default_rng(0)
     for name, side_px in (("raw.tif", SIDE_PX), ("scene.tif", SCENE_PX)):
-        tifffile.imwrite(tmp_path / name, rng.integers(400, 3000, (side_px, side_px)).astype(np.uint16))
-    np.save(tmp_path / "samples.npy", rng.uniform(0, 1, (SAMPLES, 1, SIDE_PX, SIDE_PX)).astype(np.float32))
+        tifffile.imwrite(
+            tmp_path / name, rng.integers(400, 3000, (side_px, side_px)).astype(np.uint16)
+        )
+    np.save(
+        tmp_path / "samples.npy",
+        rng.uniform(0, 1, (SAMPLES, 1, SIDE_PX, SIDE_PX)).astype(np.float32),
+    )
     sketch = Sketch(channels=1)
     features = sketch.node("Relu", weighted(sketch, rng, "image", 8, 1))
-    sketch.save(tmp_path / "float.onnx", sketch.node("Add", "image", weighted(sketch, rng, features, 1, 8)))
+    sketch.save(
+        tmp_path / "float.onnx", sketch.node("Add", "image", weighted(sketch, rng, features, 1, 8))
+    )
     return tmp_path
 
 
-def weighted(sketch: Sketch, rng: np.random.Generator, source: str, outputs: int, inputs: int) -> str:
+def weighted(
+    sketch: Sketch, rng: np.random.Generator, source: str, outputs: int, inputs: int
+) -> str:
     weight = sketch.constant(rng.normal(0, 0.1, (outputs, inputs, 3, 3)).astype(np.float32))
     return sketch.node("Conv", source, weight, pads=[1] * 4)
 
@@ -101,12 +118,30 @@ def run_main_commands(python: Path, folder: Path) -> None:
         command = [str(python), "-m", "beers_deploy", *words]
         ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         # A verdict on so small a network may be negative.
-        assert ran.returncode in (0, 1), f"{' '.join(words)}\n{ran.stdout[-2000:]}{ran.stderr[-2000:]}"
+        assert ran.returncode in (0, 1), (
+            f"{' '.join(words)}\n{ran.stdout[-2000:]}{ran.stderr[-2000:]}"
+        )
 
     done("--help")
     done("restore", "--help")
-    done("restore", "raw.tif", "float32.tif", "--network", "convbeers-xs", "--sensor", "pleiades-degraded")
-    done("restore", "raw.tif", "int8.tif", "--network", "convbeers-xs-int8", "--sensor", "pleiades-degraded")
+    done(
+        "restore",
+        "raw.tif",
+        "float32.tif",
+        "--network",
+        "convbeers-xs",
+        "--sensor",
+        "pleiades-degraded",
+    )
+    done(
+        "restore",
+        "raw.tif",
+        "int8.tif",
+        "--network",
+        "convbeers-xs-int8",
+        "--sensor",
+        "pleiades-degraded",
+    )
     done("simulate", "scene.tif", "--sensor", "pleiades-degraded", "--out", "pairs")
     done("quantize", "float.onnx", "--samples", "samples.npy", "--out", "int8.onnx")
     done("gate", "float.onnx", "int8.onnx", "--samples", "samples.npy", "--json", "gate.json")

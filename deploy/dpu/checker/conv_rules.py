@@ -12,14 +12,19 @@ from beers_deploy.dpu.graph import Operation
 def conv_kernel(op: Operation, dpu: Dpu) -> Finding | None:
     """Kernel height and width are {conv[kernel]} ({conv[kernel].source})."""
     limit = dpu.limit("conv", "kernel")
-    remedy = f"use a kernel of at most {limit.high:g}, or stack small ones: two 3 x 3 see as far as one 5 x 5"
+    remedy = (
+        f"use a kernel of at most {limit.high:g}, or stack small ones: two 3 x 3 see as "
+        "far as one 5 x 5"
+    )
     return beyond_range("kernel", op.window.kernel, limit, remedy)
 
 
 def conv_stride(op: Operation, dpu: Dpu) -> Finding | None:
     """Strides are {conv[stride]} ({conv[stride].source})."""
     limit = dpu.limit("conv", "stride")
-    remedy = f"use a stride of at most {limit.high:g}, or two convolutions whose strides multiply to it"
+    remedy = (
+        f"use a stride of at most {limit.high:g}, or two convolutions whose strides multiply to it"
+    )
     return beyond_range("stride", op.window.stride, limit, remedy)
 
 
@@ -34,15 +39,19 @@ def conv_padding(op: Operation, dpu: Dpu) -> Finding | None:
     room = [(k - 1) * d for k, d in zip(window.kernel, window.dilation, strict=True)] * 2
     if all(0 <= pad <= most for pad, most in zip(window.pads, room, strict=True)):
         return None
-    remedy = "pad at most (kernel - 1) * dilation here and the rest with a Pad node of constant mode"
+    remedy = (
+        "pad at most (kernel - 1) * dilation here and the rest with a Pad node of constant mode"
+    )
     return Finding(f"pads {window.pads} exceed {tuple(room)}, (kernel - 1) * dilation", remedy)
 
 
 def conv_weight_bank(op: Operation, dpu: Dpu) -> Finding | None:
-    """Weights fit the parameter buffer's depth of {memory[weight_bank_depth]} ({memory[weight_bank_depth].source}).
+    """Weights fit the parameter buffer's depth of {memory[weight_bank_depth]}
+    ({memory[weight_bank_depth].source}).
 
-    The depth is kernel height * width * ceil(input channels / {array[input_channel_parallel]}) * ceil(output channels
-    at a time / {memory[weight_banks]}) + {conv[weight_bias_depth]} for the bias.
+    The depth is kernel height * width * ceil(input channels / {array[input_channel_parallel]}) *
+    ceil(output channels at a time / {memory[weight_banks]}) + {conv[weight_bias_depth]} for the
+    bias.
     """
     area = op.window.kernel[0] * op.window.kernel[1]
     inputs = groups_of(op.channels[0], dpu.input_parallel)
@@ -51,18 +60,28 @@ def conv_weight_bank(op: Operation, dpu: Dpu) -> Finding | None:
     most = dpu.whole("memory", "weight_bank_depth")
     if depth <= most:
         return None
-    remedy = "use a smaller kernel or fewer input channels (a 1 x 1 convolution before it can reduce them)"
-    return Finding(f"weights are too large for the parameter buffer: depth {depth} of {most}", remedy)
+    remedy = (
+        "use a smaller kernel or fewer input channels (a 1 x 1 convolution before it can "
+        "reduce them)"
+    )
+    return Finding(
+        f"weights are too large for the parameter buffer: depth {depth} of {most}", remedy
+    )
 
 
 def conv_window(op: Operation, dpu: Dpu) -> Finding | None:
-    """Kernel area * ceil(ic / {conv[window_channels]}) is at most {conv[window_max]} ({conv[window_max].source})."""
+    """Kernel area * ceil(ic / {conv[window_channels]}) is at most {conv[window_max]}
+    ({conv[window_max].source}).
+    """
     area = op.window.kernel[0] * op.window.kernel[1]
     size = area * groups_of(op.channels[0], max(dpu.whole("conv", "window_channels"), 1))
     most = dpu.whole("conv", "window_max")
     if size <= most:
         return None
-    return Finding(f"window of {size} exceeds {most}", f"keep kernel height * width within {most}, such as 8 x 8")
+    return Finding(
+        f"window of {size} exceeds {most}",
+        f"keep kernel height * width within {most}, such as 8 x 8",
+    )
 
 
 def conv_area(op: Operation, dpu: Dpu) -> Finding | None:
@@ -83,15 +102,22 @@ def conv_dilation(op: Operation, dpu: Dpu) -> Finding | None:
     if max(op.window.dilation) == 1 or size <= most:
         return None
     remedy = f"use a dilation of at most {most // op.channels[0]}, or fewer input channels"
-    return Finding(f"dilation {max(op.window.dilation)} * {op.channels[0]} input channels exceeds {most}", remedy)
+    return Finding(
+        f"dilation {max(op.window.dilation)} * {op.channels[0]} input channels exceeds {most}",
+        remedy,
+    )
 
 
 def conv_groups(op: Operation, dpu: Dpu) -> Finding | None:
-    """A convolution has one group, or as many as input channels: depthwise ({documents[operators]}, conv2d)."""
+    """A convolution has one group, or as many as input channels: depthwise ({documents[operators]},
+    conv2d).
+    """
     if op.kind != "grouped conv":
         return None
     groups = op.attributes.get("group")
-    remedy = "use group = 1 with zeros where groups do not meet, or one convolution a group and a concat"
+    remedy = (
+        "use group = 1 with zeros where groups do not meet, or one convolution a group and a concat"
+    )
     return Finding(f"{groups} groups for {op.channels[0]} input channels", remedy)
 
 
@@ -112,7 +138,9 @@ def depthwise_kernel(op: Operation, dpu: Dpu) -> Finding | None:
 def depthwise_stride(op: Operation, dpu: Dpu) -> Finding | None:
     """Strides are {depthwise[stride]} ({depthwise[stride].source})."""
     limit = dpu.limit("depthwise", "stride")
-    return beyond_range("stride", op.window.stride, limit, f"use a stride of at most {limit.high:g}")
+    return beyond_range(
+        "stride", op.window.stride, limit, f"use a stride of at most {limit.high:g}"
+    )
 
 
 def depthwise_padding(op: Operation, dpu: Dpu) -> Finding | None:
@@ -129,7 +157,9 @@ def depthwise_channels(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def transposed_kernel(op: Operation, dpu: Dpu) -> Finding | None:
-    """Kernel / stride, rounded down and up, is {transposed[kernel_per_stride]} ({documents[operators]})."""
+    """Kernel / stride, rounded down and up, is {transposed[kernel_per_stride]}
+    ({documents[operators]}).
+    """
     limit = dpu.limit("transposed", "kernel_per_stride")
     pairs = list(zip(op.window.kernel, op.window.stride, strict=True))
     if not outside(tuple(n for k, s in pairs for n in (k // s, groups_of(k, s))), limit):
@@ -144,11 +174,15 @@ def transposed_output_padding(op: Operation, dpu: Dpu) -> Finding | None:
     if max(op.window.output_padding) == dpu.whole("transposed", "output_padding"):
         return None
     reason = f"the DPU does not support output_padding {op.window.output_padding}"
-    return Finding(reason, "use an even kernel, such as 4 x 4 with stride 2 and padding 1: it needs none")
+    return Finding(
+        reason, "use an even kernel, such as 4 x 4 with stride 2 and padding 1: it needs none"
+    )
 
 
 def transposed_padding(op: Operation, dpu: Dpu) -> Finding | None:
-    """Padding on each side is 0 to the kernel's side ({documents[operators]}, transposed-conv2d)."""
+    """Padding on each side is 0 to the kernel's side ({documents[operators]},
+    transposed-conv2d).
+    """
     room = op.window.kernel * 2
     if all(0 <= pad <= most for pad, most in zip(op.window.pads, room, strict=True)):
         return None
@@ -167,8 +201,13 @@ def alu_padding(op: Operation, dpu: Dpu, table: str) -> Finding | None:
     end = dpu.limit(table, "pad_end")
     if not outside(op.window.pads[:2], begin) and not outside(op.window.pads[2:], end):
         return None
-    reason = f"pads {op.window.pads} are not in the DPU's range: top, left {begin}; bottom, right {end}"
-    return Finding(reason, f"pad at most {begin.high:g} at top and left, the rest with a Pad node of constant mode")
+    reason = (
+        f"pads {op.window.pads} are not in the DPU's range: top, left {begin}; bottom, right {end}"
+    )
+    return Finding(
+        reason,
+        f"pad at most {begin.high:g} at top and left, the rest with a Pad node of constant mode",
+    )
 
 
 def _channels(op: Operation, dpu: Dpu) -> Finding | None:

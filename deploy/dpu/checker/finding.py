@@ -17,7 +17,10 @@ class Finding:
 
 
 Rule = Callable[[Operation, Dpu], Finding | None]
-"""One rule of the DPU: None when the node keeps it. Its docstring is the rule's text, {table[key]} its limits."""
+"""One rule of the DPU: None when the node keeps it.
+
+Its docstring is the rule's text, {table[key]} its limits.
+"""
 
 
 def outside(values: tuple[int, ...], limit: Constant) -> bool:

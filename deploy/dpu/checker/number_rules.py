@@ -22,52 +22,86 @@ def on_integers(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def symmetric(op: Operation, dpu: Dpu) -> Finding | None:
-    """Tensors are int8 around zero, or the same numbers as uint8 around 128 ({documents[numbers]})."""
+    """Tensors are int8 around zero, or the same numbers as uint8 around 128
+    ({documents[numbers]}).
+    """
     faults = [
         f"{role} {scale.integer_type} around {scale.zero_points[0]}"
         for role, scale in op.scales.items()
-        if not scale.symmetric or (scale.integer_type == "int32" and role.startswith(("input", "output")))
+        if not scale.symmetric
+        or (scale.integer_type == "int32" and role.startswith(("input", "output")))
     ]
-    return Finding("; ".join(faults), f"calibrate with a zero point of 0; {AGAIN}") if faults else None
+    return (
+        Finding("; ".join(faults), f"calibrate with a zero point of 0; {AGAIN}") if faults else None
+    )
 
 
 def int8_alone(op: Operation, dpu: Dpu) -> Finding | None:
     """Tensors are int8 around {numbers[zero_point]} ({numbers[zero_point].source})."""
     wanted = {dpu.value("numbers", "zero_point")}
     others = {r: s for r, s in op.scales.items() if r != "bias"}
-    faults = [r for r, s in others.items() if s.integer_type != "int8" or set(s.zero_points) != wanted]
-    return Finding(f"{', '.join(faults)}: not int8 around 0", f"quantise to int8; {AGAIN}") if faults else None
+    faults = [
+        r for r, s in others.items() if s.integer_type != "int8" or set(s.zero_points) != wanted
+    ]
+    return (
+        Finding(f"{', '.join(faults)}: not int8 around 0", f"quantise to int8; {AGAIN}")
+        if faults
+        else None
+    )
 
 
 def per_tensor(op: Operation, dpu: Dpu) -> Finding | None:
     """A tensor has one scale, not one a channel ({documents[quantiser]})."""
-    faults = [f"{role} has {len(scale.scales)} scales" for role, scale in op.scales.items() if len(scale.scales) != 1]
-    return Finding("; ".join(faults), f"quantise with one scale a tensor; {AGAIN}") if faults else None
+    faults = [
+        f"{role} has {len(scale.scales)} scales"
+        for role, scale in op.scales.items()
+        if len(scale.scales) != 1
+    ]
+    return (
+        Finding("; ".join(faults), f"quantise with one scale a tensor; {AGAIN}") if faults else None
+    )
 
 
 def power_of_two(op: Operation, dpu: Dpu) -> Finding | None:
     """Scales are powers of two ({documents[quantiser]})."""
     single = {role: scale for role, scale in op.scales.items() if len(scale.scales) == 1}
-    faults = [f"{role} scale {scale.scales[0]:.4g}" for role, scale in single.items() if scale.frac_bits is None]
+    faults = [
+        f"{role} scale {scale.scales[0]:.4g}"
+        for role, scale in single.items()
+        if scale.frac_bits is None
+    ]
     remedy = f"round each scale to 2^-n; {AGAIN}, and so does AMD Quark's XINT8"
     return Finding("; ".join(faults), remedy) if faults else None
 
 
 def one_format(op: Operation, dpu: Dpu) -> Finding | None:
-    """Who writes a tensor and who reads it give it the same scale and zero point ({documents[quantiser]})."""
-    faults = [f"{role} is {' and '.join(map(_words, formats))}" for role, formats in op.disputed.items()]
-    return Finding("; ".join(faults), f"give each tensor one scale and zero point; {AGAIN}") if faults else None
+    """Who writes a tensor and who reads it give it the same scale and zero point
+    ({documents[quantiser]}).
+    """
+    faults = [
+        f"{role} is {' and '.join(map(_words, formats))}" for role, formats in op.disputed.items()
+    ]
+    return (
+        Finding("; ".join(faults), f"give each tensor one scale and zero point; {AGAIN}")
+        if faults
+        else None
+    )
 
 
 def shift_cut(op: Operation, dpu: Dpu) -> Finding | None:
     """Weight + input - output fractional bits: {numbers[shift_cut]} ({documents[quantiser]})."""
     cut = _cut(op)
     limit = dpu.limit("numbers", "shift_cut")
-    return None if cut is None or not outside((cut,), limit) else Finding(f"shift_cut {cut}, allowed {limit}", MOVE)
+    return (
+        None
+        if cut is None or not outside((cut,), limit)
+        else Finding(f"shift_cut {cut}, allowed {limit}", MOVE)
+    )
 
 
 def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
-    """Weight + input - bias fractional bits: at most {numbers[shift_bias_max]} ({documents[quantiser]}).
+    """Weight + input - bias fractional bits: at most {numbers[shift_bias_max]}
+    ({documents[quantiser]}).
 
     And at least min(0, shift_cut + 8 - {numbers[accumulator_bits]}).
     """
@@ -79,11 +113,17 @@ def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
     low = min(0, cut + 8 - dpu.whole("numbers", "accumulator_bits"))
     high = dpu.whole("numbers", "shift_bias_max")
     shift = product - bias
-    return None if low <= shift <= high else Finding(f"shift_bias {shift}, allowed {low} to {high}", MOVE)
+    return (
+        None
+        if low <= shift <= high
+        else Finding(f"shift_bias {shift}, allowed {low} to {high}", MOVE)
+    )
 
 
 def bias_width(op: Operation, dpu: Dpu) -> Finding | None:
-    """A bias shifted to the products' scale fits {numbers[bias_bits]} bits ({numbers[bias_bits].source})."""
+    """A bias shifted to the products' scale fits {numbers[bias_bits]} bits
+    ({numbers[bias_bits].source}).
+    """
     product = product_frac_bits(op)
     frac_bits = _frac_bits(op, "bias")
     values = op.constants.get("bias")
@@ -93,19 +133,29 @@ def bias_width(op: Operation, dpu: Dpu) -> Finding | None:
     most = 2 ** (dpu.whole("numbers", "bias_bits") - 1) - 1
     size = largest * 2.0 ** (product - frac_bits)
     remedy = "train with smaller biases, or with larger weights behind a smaller scale"
-    return None if size <= most else Finding(f"a bias of {size:g} in units of the products, at most {most}", remedy)
+    return (
+        None
+        if size <= most
+        else Finding(f"a bias of {size:g} in units of the products, at most {most}", remedy)
+    )
 
 
 def shift_read(op: Operation, dpu: Dpu) -> Finding | None:
-    """The fractional bits of an add's inputs lie {numbers[shift_read]} apart ({documents[quantiser]})."""
+    """The fractional bits of an add's inputs lie {numbers[shift_read]} apart
+    ({documents[quantiser]}).
+    """
     inputs = _inputs(op)
     limit = dpu.limit("numbers", "shift_read")
     shift = max(inputs) - min(inputs) if inputs else 0
-    return Finding(f"shift_read {shift}, allowed {limit}", MOVE) if outside((shift,), limit) else None
+    return (
+        Finding(f"shift_read {shift}, allowed {limit}", MOVE) if outside((shift,), limit) else None
+    )
 
 
 def shift_write(op: Operation, dpu: Dpu) -> Finding | None:
-    """An add's coarsest input - output fractional bits: {numbers[shift_write]} ({documents[quantiser]})."""
+    """An add's coarsest input - output fractional bits: {numbers[shift_write]}
+    ({documents[quantiser]}).
+    """
     inputs = _inputs(op)
     output = _frac_bits(op, "output")
     limit = dpu.limit("numbers", "shift_write")
@@ -137,7 +187,9 @@ def _frac_bits(op: Operation, role: str) -> int | None:
 
 def _inputs(op: Operation) -> list[int]:
     """Of the tensors and constants that an element-wise operator reads."""
-    frac_bits = (_frac_bits(op, role) for role in op.scales if role.startswith(("input", "constant")))
+    frac_bits = (
+        _frac_bits(op, role) for role in op.scales if role.startswith(("input", "constant"))
+    )
     return [p for p in frac_bits if p is not None]
 
 
@@ -150,7 +202,10 @@ def _cut(op: Operation) -> int | None:
 def _words(scale: Scale) -> str:
     scales = ", ".join(f"{s:.9g}" for s in scale.scales[:1])
     zeros = scale.zero_points[:1]
-    return f"{scale.integer_type} at scale {scales or 'unknown'} around {zeros[0] if zeros else 'nothing'}"
+    return (
+        f"{scale.integer_type} at scale {scales or 'unknown'} around "
+        f"{zeros[0] if zeros else 'nothing'}"
+    )
 
 
 BYTES = ("int8", "uint8")
@@ -158,30 +213,47 @@ BYTES = ("int8", "uint8")
 
 
 def int8_constants(op: Operation, dpu: Dpu) -> Finding | None:
-    """Weights, and constants that are added, multiplied or joined, are stored as int8 ({documents[numbers]})."""
+    """Weights, and constants that are added, multiplied or joined, are stored as int8
+    ({documents[numbers]}).
+    """
     kinds = {role: _kind(values) for role, values in op.constants.items() if role != "bias"}
     faults = [f"{role} is {kind}" for role, kind in kinds.items() if kind not in BYTES]
-    faults += [f"{role} has no scale" for role, kind in kinds.items() if kind in BYTES and role not in op.scales]
-    return Finding("; ".join(faults), f"store it as int8 with a scale 2^-n; {AGAIN}") if faults else None
+    faults += [
+        f"{role} has no scale"
+        for role, kind in kinds.items()
+        if kind in BYTES and role not in op.scales
+    ]
+    return (
+        Finding("; ".join(faults), f"store it as int8 with a scale 2^-n; {AGAIN}")
+        if faults
+        else None
+    )
 
 
 def int8_bias(op: Operation, dpu: Dpu) -> Finding | None:
-    """A bias is int8 with a scale of its own, not int32 at the products' scale ({documents[quantiser]}).
+    """A bias is int8 with a scale of its own, not int32 at the products' scale
+    ({documents[quantiser]}).
 
-    The operator QLinearConv demands int32: its bias has a rule of its own. Judged where weights are in 8 bits.
+    The operator QLinearConv demands int32: its bias has a rule of its own. Judged where weights are
+    in 8 bits.
     """
     whole = _kind(op.constants.get("weight")) in BYTES
     if "bias" not in op.constants or op.op_type == "QLinearConv" or not whole:
         return None
     kind = _kind(op.constants["bias"])
-    return None if kind == "int8" else Finding(f"its bias is {kind}", f"quantise the bias to int8; {AGAIN}")
+    return (
+        None
+        if kind == "int8"
+        else Finding(f"its bias is {kind}", f"quantise the bias to int8; {AGAIN}")
+    )
 
 
 def int32_bias(op: Operation, dpu: Dpu) -> Finding | None:
-    """A QLinearConv's int32 bias is int8 << k, k at most {numbers[shift_bias_max]} ({documents[quantiser]}).
+    """A QLinearConv's int32 bias is int8 << k, k at most {numbers[shift_bias_max]}
+    ({documents[quantiser]}).
 
-    One k for all values: weight + input - bias fractional bits. Another bias of this form is as legal. Judged where
-    the products have a scale.
+    One k for all values: weight + input - bias fractional bits. Another bias of this form is as
+    legal. Judged where the products have a scale.
     """
     if "bias" not in op.constants or op.op_type != "QLinearConv" or product_frac_bits(op) is None:
         return None
@@ -191,10 +263,15 @@ def int32_bias(op: Operation, dpu: Dpu) -> Finding | None:
     if values is None or _kind(values) != "int32":
         return Finding(f"its bias is {_kind(values)}", remedy)
     shift = min(high, _spare_bits(values))
-    low, top = (int(end) for end in ((values >> shift).min(initial=0), (values >> shift).max(initial=0)))
+    low, top = (
+        int(end) for end in ((values >> shift).min(initial=0), (values >> shift).max(initial=0))
+    )
     if low >= -128 and top <= 127:
         return None
-    return Finding(f"its bias is {low} to {top} shifted left by {shift}, allowed -128 to 127 by 0 to {high}", remedy)
+    return Finding(
+        f"its bias is {low} to {top} shifted left by {shift}, allowed -128 to 127 by 0 to {high}",
+        remedy,
+    )
 
 
 def _kind(values: np.ndarray | None) -> str:

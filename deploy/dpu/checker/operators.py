@@ -1,8 +1,9 @@
-"""The DPU's rules by kind of operation, their texts, and the judgement of one node: all broken rules, not the first.
+"""The DPU's rules by kind of operation, their texts, and the judgement of one node: all broken
+rules, not the first.
 
-A rule is a small function (`conv_rules`, `other_rules`, `number_rules`) whose docstring is its text, filled in with
-the limits of the target profile: text, check and documentation cannot drift apart. A rule holds on the targets that
-state what its text names, so no rule knows a board's name.
+A rule is a small function (`conv_rules`, `other_rules`, `number_rules`) whose docstring is its
+text, filled in with the limits of the target profile: text, check and documentation cannot drift
+apart. A rule holds on the targets that state what its text names, so no rule knows a board's name.
 """
 
 import inspect
@@ -45,7 +46,11 @@ RULES: Mapping[Kind, tuple[Rule, ...]] = {
         conv_rules.transposed_channels,
     ),
     "pool": (other_rules.pool_kernel, other_rules.pool_stride, other_rules.pool_padding),
-    "activation": (other_rules.activation_place, other_rules.activation_of_sums, other_rules.leaky_relu_alpha),
+    "activation": (
+        other_rules.activation_place,
+        other_rules.activation_of_sums,
+        other_rules.leaky_relu_alpha,
+    ),
     "add": (other_rules.elementwise_channels,),
     "mul": (other_rules.elementwise_channels, other_rules.mul_constant),
     "concat": (),
@@ -57,7 +62,11 @@ RULES: Mapping[Kind, tuple[Rule, ...]] = {
 }
 """What a node of each kind has to keep, float or quantised."""
 
-SIZES: tuple[Rule, ...] = (other_rules.map_exists, other_rules.maps_aligned, other_rules.map_in_memory)
+SIZES: tuple[Rule, ...] = (
+    other_rules.map_exists,
+    other_rules.maps_aligned,
+    other_rules.map_in_memory,
+)
 """What the tile's size has to allow every node."""
 
 EVERY: tuple[Rule, ...] = (other_rules.operator_domain, other_rules.int8_operator, *SIZES)
@@ -110,33 +119,45 @@ def _broken(op: Operation, dpu: Dpu, quantised: bool) -> tuple[Broken, ...]:
     if quantised and op.kind not in ("other", "argmax"):  # whose results are no numbers of 8 bits
         rules += NUMBERS + SHIFTS.get(op.kind, ())
     findings = ((rule, rule(op, dpu)) for rule in rules if applies(rule, dpu))
-    return tuple(Broken(rule_name(rule), rule_text(rule, dpu), found) for rule, found in findings if found)
+    return tuple(
+        Broken(rule_name(rule), rule_text(rule, dpu), found) for rule, found in findings if found
+    )
 
 
 def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:
-    """The operation as it is written, then what else a compiler may take it as, each to be held against the rules.
+    """The operation as it is written, then what else a compiler may take it as, each to be held
+    against the rules.
 
-    A fully connected layer is a convolution as large as its map, and as well one of 1 x 1 over the flattened map:
-    a matrix product becomes a convolution once that fits the hardware (UG1414 1.4.1, Operators Supported by
-    TensorFlow). Its outputs do not meet, so they may be computed in parts. That they are is inferred from a rate:
-    Ultrafast lanes' last layer has 14472 outputs, and at 392 images a second with one thread (Vitis-AI 2.5,
-    model_zoo/README.md, VCK190) the DPU's batch of six leaves the processor 15 ms for 356 MFLOP, more than its two
-    cores can do.
+    A fully connected layer is a convolution as large as its map, and as well one of 1 x 1 over the
+    flattened map: a matrix product becomes a convolution once that fits the hardware (UG1414 1.4.1,
+    Operators Supported by TensorFlow). Its outputs do not meet, so they may be computed in parts.
+    That they are is inferred from a rate: Ultrafast lanes' last layer has 14472 outputs, and at 392
+    images a second with one thread (Vitis-AI 2.5, model_zoo/README.md, VCK190) the DPU's batch of
+    six leaves the processor 15 ms for 356 MFLOP, more than its two cores can do.
     """
     yield op
-    if "array" in dpu.tables and fully_connected(op):  # an NPU's file does not state the array that it would fit
+    if "array" in dpu.tables and fully_connected(
+        op
+    ):  # an NPU's file does not state the array that it would fit
         values = math.prod(op.in_shapes[0] or ())
         outputs = min(op.channels[1], dpu.channels_max)
         part = replace(op, channels=(op.channels[0], outputs), out_shape=(outputs, 1, 1))
         yield part
-        yield replace(part, in_shapes=((values, 1, 1),), window=Window(), channels=(values, outputs))
+        yield replace(
+            part, in_shapes=((values, 1, 1),), window=Window(), channels=(values, outputs)
+        )
 
 
 def fully_connected(op: Operation) -> bool:
     """Whether a convolution is as large as its map, and so has a result of one pixel."""
     shape = op.in_shapes[0] if op.in_shapes else None
     window = op.window
-    whole = shape is not None and window.kernel == shape[1:] and window.dilation == (1, 1) and not any(window.pads)
+    whole = (
+        shape is not None
+        and window.kernel == shape[1:]
+        and window.dilation == (1, 1)
+        and not any(window.pads)
+    )
     return op.kind == "conv" and whole
 
 
@@ -162,7 +183,9 @@ def rule_name(rule: Callable[..., object]) -> str:
 
 
 def applies(rule: Callable[..., object], dpu: Dpu) -> bool:
-    """Whether the target states every constant that the rule's text names: a rule of other DPUs it does not."""
+    """Whether the target states every constant that the rule's text names: a rule of other DPUs it
+    does not.
+    """
     facts = _facts(dpu)
     return all(key in facts.get(table, {}) for table, key in _named(rule))
 
@@ -173,7 +196,9 @@ def rule_text(rule: Callable[..., object], dpu: Dpu) -> str:
 
 
 def _facts(dpu: Dpu) -> Mapping[str, Mapping[str, object]]:
-    """What texts name: constants, what is fused where, documents, and the limits that follow from constants."""
+    """What texts name: constants, what is fused where, documents, and the limits that follow from
+    constants.
+    """
     facts: dict[str, Mapping[str, object]] = {**dpu.tables}
     if "channel_groups" in facts.get("array", {}):
         facts["limits"] = {"channels": dpu.channels_max}
@@ -185,11 +210,15 @@ def _template(rule: Callable[..., object]) -> str:
     text = inspect.getdoc(rule)
     if text is None:
         remedy = "start it without -OO and PYTHONOPTIMIZE=2"
-        raise MachineError("Python", expected="docstrings, where the rules' texts stand", got="none", remedy=remedy)
+        raise MachineError(
+            "Python", expected="docstrings, where the rules' texts stand", got="none", remedy=remedy
+        )
     return " ".join(text.split())
 
 
 @cache
 def _named(rule: Callable[..., object]) -> tuple[tuple[str, str], ...]:
-    """Tables and keys of the constants in the rule's text: "{conv[kernel].source}" names ("conv", "kernel")."""
+    """Tables and keys of the constants in the rule's text: "{conv[kernel].source}" names ("conv",
+    "kernel").
+    """
     return tuple(re.findall(r"{(\w+)\[(\w+)]", _template(rule)))

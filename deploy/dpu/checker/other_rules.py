@@ -1,4 +1,6 @@
-"""What the DPU demands of pools, activations, element-wise operators and moves of pixels: one rule, one function."""
+"""What the DPU demands of pools, activations, element-wise operators and moves of pixels: one rule,
+one function.
+"""
 
 import math
 
@@ -23,12 +25,22 @@ MANUAL = {
     "HardSwish": "hard-swish",
 }
 """The activations of ONNX as manuals name them."""
-PLACE = {"conv": "conv", "transposed": "conv", "depthwise": "depthwise", "pool": "pool", "add": "sum", "mul": "sum"}
+PLACE = {
+    "conv": "conv",
+    "transposed": "conv",
+    "depthwise": "depthwise",
+    "pool": "pool",
+    "add": "sum",
+    "mul": "sum",
+}
 """Behind which operations something may be fused, and under which name a profile lists it."""
 INSTEAD = {
     "Sub": "fold the minus sign into the weights before it, and add",
     "Neg": "fold the minus sign into the weights before it",
-    "Div": "fold the division into the weights of the convolution before it, or multiply by the reciprocal",
+    "Div": (
+        "fold the division into the weights of the convolution before it, or multiply by the "
+        "reciprocal"
+    ),
     "Exp": "leave it to the host, behind the network",
     "Sigmoid": "use HardSigmoid",
     "Tanh": "use HardSigmoid, scaled by the weights behind it",
@@ -41,13 +53,24 @@ INSTEAD = {
     "ReduceMean": "use GlobalAveragePool",
     "Transpose": "keep the layout (N, C, H, W) throughout",
     "Slice": "use a convolution that picks these channels or pixels",
-    "Gather": "to pick fixed channels, use a 1 x 1 convolution; what is picked by value stays with the host",
+    "Gather": (
+        "to pick fixed channels, use a 1 x 1 convolution; what is picked by value stays "
+        "with the host"
+    ),
     "Gemm": "write it as a 1 x 1 convolution",
-    "MatMul": "write it as a 1 x 1 convolution where one factor is constant; else leave it to the host",
-    "DFT": "use a convolution of at most 16 x 16 where the filter is short; else leave it to the host",
+    "MatMul": (
+        "write it as a 1 x 1 convolution where one factor is constant; else leave it to the host"
+    ),
+    "DFT": (
+        "use a convolution of at most 16 x 16 where the filter is short; else leave it to the host"
+    ),
     "TopK": "leave it to the host: the DPU does not compare values across a map",
-    "LayerNormalization": "train without normalisation, or with one that folds into the convolution",
-    "InstanceNormalization": "train without normalisation, or with one that folds into the convolution",
+    "LayerNormalization": (
+        "train without normalisation, or with one that folds into the convolution"
+    ),
+    "InstanceNormalization": (
+        "train without normalisation, or with one that folds into the convolution"
+    ),
     "BatchNormalization": "fold it into the convolution before it",
 }
 
@@ -56,31 +79,49 @@ def known_operator(op: Operation, dpu: Dpu) -> Finding | None:
     """Only operators of the supported list run on the DPU ({documents[operators]})."""
     if is_foreign(op.op_type):  # `operator_domain` names it
         return None
-    remedy = INSTEAD.get(op.op_type, "leave it to the host before or behind the network, or do without it")
+    remedy = INSTEAD.get(
+        op.op_type, "leave it to the host before or behind the network, or do without it"
+    )
     return Finding(f"{op.op_type} always runs on the CPU", remedy)
 
 
 def operator_domain(op: Operation, dpu: Dpu) -> Finding | None:
-    """An operator is ONNX's, or onnxruntime's on integers: its domain belongs to its name (ONNX IR, Operators)."""
+    """An operator is ONNX's, or onnxruntime's on integers: its domain belongs to its name (ONNX IR,
+    Operators).
+    """
     if not is_foreign(op.op_type):
         return None
     domain, _, name = op.op_type.rpartition(SEPARATOR)
-    return Finding(f"{op.op_type} is no operator of ONNX, whatever its name", foreign_remedy(domain, name))
+    return Finding(
+        f"{op.op_type} is no operator of ONNX, whatever its name", foreign_remedy(domain, name)
+    )
 
 
 def int8_operator(op: Operation, dpu: Dpu) -> Finding | None:
-    """The NPU computes an operator in INT8 unless it is one of {npu[no_int8]} ({npu[no_int8].source})."""
+    """The NPU computes an operator in INT8 unless it is one of {npu[no_int8]}
+    ({npu[no_int8].source}).
+    """
     if op.op_type not in dpu.target.npu["no_int8"].value:
         return None
-    remedy = INSTEAD.get(op.op_type, "leave it to the host, or train with another, such as LeakyReLU for PReLU")
-    return Finding(f"AMD's table has N/A for {op.op_type} in INT8; left in float it would be BF16", remedy)
+    remedy = INSTEAD.get(
+        op.op_type, "leave it to the host, or train with another, such as LeakyReLU for PReLU"
+    )
+    return Finding(
+        f"AMD's table has N/A for {op.op_type} in INT8; left in float it would be BF16", remedy
+    )
 
 
 def shuffle_place(op: Operation, dpu: Dpu) -> Finding | None:
-    """A pixel shuffle or its inverse stands behind a convolution or its activation ({documents[operators]})."""
+    """A pixel shuffle or its inverse stands behind a convolution or its activation
+    ({documents[operators]}).
+    """
     if op.follows in CONVOLUTIONS or op.follows == "activation":
         return None
-    other = "a nearest Resize and a convolution" if op.op_type == "DepthToSpace" else "a strided convolution"
+    other = (
+        "a nearest Resize and a convolution"
+        if op.op_type == "DepthToSpace"
+        else "a strided convolution"
+    )
     remedy = f"move it right behind a convolution, or use {other}"
     return Finding(f"{op.op_type} stands behind {op.follows or 'the input'}", remedy)
 
@@ -93,7 +134,11 @@ def shuffle_channels(op: Operation, dpu: Dpu) -> Finding | None:
 
 def argmax_channels(op: Operation, dpu: Dpu) -> Finding | None:
     """ArgMax compares at most {argmax[channels_max]} channels ({argmax[channels_max].source})."""
-    return _too_many(op.channels[0], dpu.whole("argmax", "channels_max"), "leave it to the host, behind the network")
+    return _too_many(
+        op.channels[0],
+        dpu.whole("argmax", "channels_max"),
+        "leave it to the host, behind the network",
+    )
 
 
 def elementwise_channels(op: Operation, dpu: Dpu) -> Finding | None:
@@ -114,7 +159,9 @@ def pool_kernel(op: Operation, dpu: Dpu) -> Finding | None:
 
 def pool_stride(op: Operation, dpu: Dpu) -> Finding | None:
     """Pool strides are {pool[stride]} ({pool[stride].source})."""
-    return beyond_range("stride", op.window.stride, dpu.limit("pool", "stride"), "pool in two steps")
+    return beyond_range(
+        "stride", op.window.stride, dpu.limit("pool", "stride"), "pool in two steps"
+    )
 
 
 def pool_padding(op: Operation, dpu: Dpu) -> Finding | None:
@@ -128,15 +175,19 @@ def pool_padding(op: Operation, dpu: Dpu) -> Finding | None:
 def activation_place(op: Operation, dpu: Dpu) -> Finding | None:
     """Right behind a convolution are fused: {activations[conv]} ({activations[conv].source}).
 
-    Behind a depthwise one: {activations[depthwise]} ({activations[depthwise].source}). Behind a pool:
-    {activations[pool]} ({activations[pool].source}). Behind anything: {activations[alone]}
+    Behind a depthwise one: {activations[depthwise]} ({activations[depthwise].source}). Behind a
+    pool: {activations[pool]} ({activations[pool].source}). Behind anything: {activations[alone]}
     ({activations[alone].source}).
     """
     place = PLACE.get(op.follows or "")
     fused = dpu.target.activations[place].value if place else ()
     if place == "sum" or MANUAL[op.op_type] in (*fused, *dpu.target.activations["alone"].value):
         return None
-    remedy = f"use {' or '.join(fused)} there" if fused else "move it right behind the convolution or add before"
+    remedy = (
+        f"use {' or '.join(fused)} there"
+        if fused
+        else "move it right behind the convolution or add before"
+    )
     return Finding(f"{op.op_type} stands behind {op.follows or 'the input'}", remedy)
 
 
@@ -152,7 +203,9 @@ def activation_of_sums(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def leaky_relu_alpha(op: Operation, dpu: Dpu) -> Finding | None:
-    """LeakyReLU has alpha = 26 / 256 = {leaky_relu[alpha].low} ({documents[operators]}, leaky_relu)."""
+    """LeakyReLU has alpha = 26 / 256 = {leaky_relu[alpha].low} ({documents[operators]},
+    leaky_relu).
+    """
     given = op.attributes.get("alpha", 0.01)
     wanted = dpu.value("leaky_relu", "alpha")
     is_leaky = op.op_type in ("LeakyRelu", "QLinearLeakyRelu")
@@ -163,11 +216,15 @@ def leaky_relu_alpha(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def mul_constant(op: Operation, dpu: Dpu) -> Finding | None:
-    """A constant factor is one number a channel, a 1 x 1 depthwise convolution ({documents[operators]}, mul)."""
+    """A constant factor is one number a channel, a 1 x 1 depthwise convolution
+    ({documents[operators]}, mul).
+    """
     shape = op.constant_shape or ()
     if sum(size > 1 for size in shape) <= 1 and (len(shape) < 2 or max(shape[-2:]) == 1):
         return None
-    return Finding(f"a constant factor of shape {shape}", "use one factor a channel, shape (1, C, 1, 1)")
+    return Finding(
+        f"a constant factor of shape {shape}", "use one factor a channel, shape (1, C, 1, 1)"
+    )
 
 
 CORNERS = "coordinate_transformation_mode"
@@ -178,7 +235,9 @@ def pad_mode(op: Operation, dpu: Dpu) -> Finding | None:
     mode = op.attributes.get("mode", "constant")
     if mode == "constant":
         return None
-    return Finding(f"pad mode {mode}", "use zero padding inside the convolution, or pad the image on the host")
+    return Finding(
+        f"pad mode {mode}", "use zero padding inside the convolution, or pad the image on the host"
+    )
 
 
 def resize_mode(op: Operation, dpu: Dpu) -> Finding | None:
@@ -187,11 +246,14 @@ def resize_mode(op: Operation, dpu: Dpu) -> Finding | None:
     corners = op.attributes.get(CORNERS, "half_pixel")
     if mode == "linear" or (mode == "nearest" and corners != "align_corners"):
         return None
-    return Finding(f"resize mode {mode} with {corners}", "use nearest with coordinate mode asymmetric")
+    return Finding(
+        f"resize mode {mode} with {corners}", "use nearest with coordinate mode asymmetric"
+    )
 
 
 def resize_scale(op: Operation, dpu: Dpu) -> Finding | None:
-    """Bilinear scales are one power of two, {resize[bilinear_scale]} ({resize[bilinear_scale].source}).
+    """Bilinear scales are one power of two, {resize[bilinear_scale]}
+    ({resize[bilinear_scale].source}).
 
     With half-pixel centres {resize[half_pixel_scale]} ({resize[half_pixel_scale].source}).
     """
@@ -204,20 +266,27 @@ def resize_scale(op: Operation, dpu: Dpu) -> Finding | None:
     scales = {after[1] / before[1], after[2] / before[2]}
     if scales <= {2.0, 4.0, 8.0} and len(scales) == 1 and limit.low <= min(scales) <= limit.high:
         return None
-    reason = f"bilinear scale {' x '.join(f'{s:g}' for s in sorted(scales))}, the DPU's are powers of two, {limit}"
+    reason = (
+        f"bilinear scale {' x '.join(f'{s:g}' for s in sorted(scales))}, the DPU's are "
+        f"powers of two, {limit}"
+    )
     return Finding(reason, "scale by 2 several times, or use nearest")
 
 
 def resize_channels(op: Operation, dpu: Dpu) -> Finding | None:
     """Resize takes at most {limits[channels]} channels ({documents[operators]})."""
-    return _too_many(op.channels[0], dpu.channels_max, "reduce them with a 1 x 1 convolution before")
+    return _too_many(
+        op.channels[0], dpu.channels_max, "reduce them with a 1 x 1 convolution before"
+    )
 
 
 WINDOWED = {"conv", "grouped conv", "depthwise", "transposed", "pool"}
 
 
 def map_exists(op: Operation, dpu: Dpu) -> Finding | None:
-    """The tile is large enough for every window: each map keeps at least one pixel (ONNX 1.17, Conv and MaxPool)."""
+    """The tile is large enough for every window: each map keeps at least one pixel (ONNX 1.17, Conv
+    and MaxPool).
+    """
     before = op.in_shapes[0] if op.in_shapes else None
     if op.kind not in WINDOWED or before is None or op.out_shape is not None:
         return None
@@ -227,16 +296,22 @@ def map_exists(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def maps_aligned(op: Operation, dpu: Dpu) -> Finding | None:
-    """Maps that meet in an add, mul or concat have one height and width, or 1 x 1 (ONNX 1.17, Add and Concat)."""
+    """Maps that meet in an add, mul or concat have one height and width, or 1 x 1 (ONNX 1.17, Add
+    and Concat).
+    """
     sizes = {(shape[1], shape[2]) for shape in op.in_shapes if shape is not None}
     if op.kind not in ("add", "mul", "concat") or len(sizes - {(1, 1)}) < 2:
         return None
-    remedy = "use a tile whose side is a multiple of the network's total stride, or pad the smaller map"
+    remedy = (
+        "use a tile whose side is a multiple of the network's total stride, or pad the smaller map"
+    )
     return Finding(" and ".join(map(shown, sorted(sizes))) + " meet", remedy)
 
 
 def map_in_memory(op: Operation, dpu: Dpu) -> Finding | None:
-    """A map, for all images of a batch, fits {tile[memory_bytes].low:.0f} bytes ({tile[memory_bytes].source})."""
+    """A map, for all images of a batch, fits {tile[memory_bytes].low:.0f} bytes
+    ({tile[memory_bytes].source}).
+    """
     most = dpu.value("tile", "memory_bytes")
     size = math.prod(op.out_shape) * dpu.batch if op.out_shape else 0
     if size <= most:

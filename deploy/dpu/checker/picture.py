@@ -1,4 +1,6 @@
-"""The picture of a placed network: its nodes from top to bottom, each in the colour of its device."""
+"""The picture of a placed network: its nodes from top to bottom, each in the
+colour of its device.
+"""
 
 import textwrap
 from html import escape
@@ -42,13 +44,18 @@ def require_picture(path: Path | None) -> None:
     """Refuse a file name that is neither .svg nor .html."""
     if path is not None and path.suffix not in (".svg", ".html"):
         remedy = "name it so; every browser opens both"
-        raise OptionError("picture", expected="a file ending in .svg or .html", got=path.name, remedy=remedy)
+        raise OptionError(
+            "picture", expected="a file ending in .svg or .html", got=path.name, remedy=remedy
+        )
 
 
 def write_picture(placement: Placement, title: str, path: Path) -> None:
     """Write the picture, whole or not at all; as a page where the name ends in .html."""
     svg = draw(placement, title)
-    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{escape(visible(title))}</title>{VIEWPORT}'
+    head = (
+        '<!doctype html><html lang="en"><meta '
+        f'charset="utf-8"><title>{escape(visible(title))}</title>{VIEWPORT}'
+    )
     write_text(path, f"{head}<body>{svg}</body></html>\n" if path.suffix == ".html" else svg)
 
 
@@ -82,7 +89,9 @@ def _lines(node: PlacedNode) -> list[str]:
     channels, height_px, width_px = node.op.out_shape or (0, 0, 0)
     maps = f"{channels} map{'s' if channels > 1 else ''} of {width_px} x {height_px}"
     shape = maps if node.op.out_shape else "shape unknown"
-    return textwrap.wrap("; ".join(f"{b.rule}: {b.finding.reason}" for b in node.broken) or shape, LINE_LETTERS)
+    return textwrap.wrap(
+        "; ".join(f"{b.rule}: {b.finding.reason}" for b in node.broken) or shape, LINE_LETTERS
+    )
 
 
 def _node(axes: "Axes", y: int, node: PlacedNode, anchor: str) -> None:
@@ -109,7 +118,9 @@ def _edges(axes: "Axes", nodes: tuple[PlacedNode, ...], tops: list[int]) -> None
     for row, node in enumerate(nodes):
         for start in (writer[name] for name in node.op.inputs if name in writer):
             path = _path(tops[start], tops[row], row - start)
-            axes.add_patch(PathPatch(path, facecolor="none", edgecolor=EDGE, linewidth=1.5, gid="edge"))
+            axes.add_patch(
+                PathPatch(path, facecolor="none", edgecolor=EDGE, linewidth=1.5, gid="edge")
+            )
 
 
 def _path(start_y: int, end_y: int, rows: int) -> "Outline":

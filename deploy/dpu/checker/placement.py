@@ -6,8 +6,9 @@ A network on this board has three parts:
 2. dpu-core: everything from the first convolution to the last, and int8 nodes right behind it.
 3. host-back: making numbers of integers, adding the correction to the 12-bit image, clipping.
 
-What of the core the DPU cannot take goes to the CPU, as the vendor's compiler places it. At the ends of a float file
-that costs time and no more; between two parts of the DPU it would cut the core.
+What of the core the DPU cannot take goes to the CPU, as the vendor's compiler places it. At the
+ends of a float file that costs time and no more; between two parts of the DPU it would cut the
+core.
 """
 
 from collections.abc import Iterable, Sequence
@@ -26,11 +27,24 @@ SCALING = {"Mul", "Div", "Add", "Sub", "Clip", "Cast", "Round", "Floor", "Identi
 """What a float file may do to the image before the network and to the result behind it."""
 
 SHAPING = {
-    "ArgMax", "DepthToSpace", "Flatten", "Gather", "NonMaxSuppression", "Reshape", "Sigmoid", "Slice", "Softmax",
-    "Split", "Squeeze", "TopK", "Transpose", "Unsqueeze",
-}  # fmt: skip
-"""What a float file may do to the result behind the network: it moves numbers, compares them or makes scores of
-them."""
+    "ArgMax",
+    "DepthToSpace",
+    "Flatten",
+    "Gather",
+    "NonMaxSuppression",
+    "Reshape",
+    "Sigmoid",
+    "Slice",
+    "Softmax",
+    "Split",
+    "Squeeze",
+    "TopK",
+    "Transpose",
+    "Unsqueeze",
+}
+"""What a float file may do to the result behind the network: it moves numbers, compares them or
+makes scores of them.
+"""
 
 DECODING = {"Exp", "Pow", "Sigmoid", "Slice", "Softplus", "Split", "Sqrt", "Tanh", "Transpose"}
 """What it may do to make boxes of the result, which `quant.graph.tail` leaves to the host too."""
@@ -40,7 +54,9 @@ FLOAT_NOTE = "a float file: judged as if its tensors had 8 bits, its final add l
 
 @dataclass(frozen=True)
 class PlacedNode:
-    """A node with its part, its device and, where it should run on the DPU and cannot, the rules it breaks."""
+    """A node with its part, its device and, where it should run on the DPU and cannot, the rules it
+    breaks.
+    """
 
     op: Operation
     part: Part
@@ -51,7 +67,9 @@ class PlacedNode:
 
 @dataclass(frozen=True)
 class Cut:
-    """A tensor that crosses between the DPU and a processor, as int8; its size None where its shape is unknown."""
+    """A tensor that crosses between the DPU and a processor, as int8; its size None where its shape
+    is unknown.
+    """
 
     tensor: str
     size_bytes: int | None
@@ -78,12 +96,16 @@ class Placement:
 
     @property
     def cutting(self) -> tuple[PlacedNode, ...]:
-        """Those of them that part the core in two; of a quantised file all, whose numbers can be made again."""
+        """Those of them that part the core in two; of a quantised file all, whose numbers can be
+        made again.
+        """
         if not self.note:
             return self.failed
         operations = tuple(node.op for node in self.nodes)
         starts = {node.op.output for node in self.nodes if node.device == "DPU"}
-        behind, before = (_reached(operations, starts, forwards=forwards) for forwards in (True, False))
+        behind, before = (
+            _reached(operations, starts, forwards=forwards) for forwards in (True, False)
+        )
         return tuple(node for node in self.failed if node.op.output in behind & before)
 
     @property
@@ -114,9 +136,13 @@ def _device(part: Part, breaks_rules: bool) -> Device:
 
 
 def _parts(network: Network) -> list[Part]:
-    """A node before the first or behind the last convolution is the host's if it is one of the host's kinds."""
+    """A node before the first or behind the last convolution is the host's if it is one of the
+    host's kinds.
+    """
     operations = network.operations
-    behind, before = (_reached(operations, _convolved(network), forwards=forwards) for forwards in (True, False))
+    behind, before = (
+        _reached(operations, _convolved(network), forwards=forwards) for forwards in (True, False)
+    )
     parts: list[Part] = []
     finished: set[str] = set()
     for op in operations:
@@ -134,8 +160,12 @@ def _parts(network: Network) -> list[Part]:
     return parts
 
 
-def _left_to_the_host(network: Network, parts: list[Part], broken: list[tuple[Broken, ...]]) -> list[Part]:
-    """Behind the last convolution, what reads a result of the CPU stays with it: it is not handed over again."""
+def _left_to_the_host(
+    network: Network, parts: list[Part], broken: list[tuple[Broken, ...]]
+) -> list[Part]:
+    """Behind the last convolution, what reads a result of the CPU stays with it: it is not handed
+    over again.
+    """
     before = _reached(network.operations, _convolved(network), forwards=False)
     given: set[str] = set()
     found: list[Part] = []
@@ -153,7 +183,9 @@ def _convolved(network: Network) -> set[str]:
 
 
 def _reached(operations: Sequence[Operation], starts: set[str], *, forwards: bool) -> set[str]:
-    """The results computed from one of `starts`, these included (forwards), or that one is computed from."""
+    """The results computed from one of `starts`, these included (forwards), or that one is computed
+    from.
+    """
     found: set[str] = set()
     for op in operations if forwards else reversed(operations):
         reads = op.inputs if forwards else op.outputs
@@ -163,25 +195,37 @@ def _reached(operations: Sequence[Operation], starts: set[str], *, forwards: boo
 
 
 def _is_host_front(op: Operation, network: Network, *, trails: bool) -> bool:
-    """In a quantised file whatever leads to the core; in a float file scaling, mirroring, and pixels to channels."""
-    mirrors = op.op_type == "Pad" and op.inputs[0] in network.inputs and op.attributes.get("mode") == "reflect"
+    """In a quantised file whatever leads to the core; in a float file scaling, mirroring, and
+    pixels to channels.
+    """
+    mirrors = (
+        op.op_type == "Pad"
+        and op.inputs[0] in network.inputs
+        and op.attributes.get("mode") == "reflect"
+    )
     moves = (op.op_type == "SpaceToDepth" or mirrors) and not trails
     return network.quantised or op.op_type in SCALING or moves
 
 
 def _is_host_back(op: Operation, network: Network, *, leads: bool) -> bool:
-    """In a quantised file what is float again; in a float file the add of the image, scaling, shaping."""
+    """In a quantised file what is float again; in a float file the add of the image, scaling,
+    shaping.
+    """
     if op.kind in CONVOLUTIONS:
         return False
     if network.quantised:
         return not op.integer and (op.kind == "dequantise" or op.op_type in SCALING)
     if op.op_type in SHAPING | DECODING:
         return not leads
-    return op.op_type in SCALING and (bool(set(op.inputs) & set(network.inputs)) or len(op.inputs) == 1)
+    return op.op_type in SCALING and (
+        bool(set(op.inputs) & set(network.inputs)) or len(op.inputs) == 1
+    )
 
 
 def _subgraphs(operations: tuple[Operation, ...], devices: list[Device]) -> list[int]:
-    """Pieces that run in one go: neighbours on one device that no other device's node stands between."""
+    """Pieces that run in one go: neighbours on one device that no other device's node stands
+    between.
+    """
     depth: dict[str, tuple[bool, int]] = {}
     parents: dict[str, str] = {}
     for op, device in zip(operations, devices, strict=True):
@@ -200,7 +244,9 @@ def _root(parents: dict[str, str], name: str) -> str:
     root = name
     while parents.get(root, root) != root:
         root = parents[root]
-    while name != root:  # the way is walked once: in a long chain each node would walk all of it again
+    while (
+        name != root
+    ):  # the way is walked once: in a long chain each node would walk all of it again
         parents[name], name = root, parents[name]
     return root
 

@@ -1,4 +1,6 @@
-"""What to know of a placed network besides the rules: one remark, one function, whose docstring is its text."""
+"""What to know of a placed network besides the rules: one remark, one function, whose docstring is
+its text.
+"""
 
 import math
 from collections.abc import Callable
@@ -15,15 +17,27 @@ Remark = Callable[[Placement, Dpu, int], str]
 
 
 def fix2float(placement: Placement, dpu: Dpu, tile_px: int) -> str:
-    """The DPU's results are int8: the last conversion, fix2float, runs on the CPU (Vitis-AI 3.0, xcompiler)."""
+    """The DPU's results are int8: the last conversion, fix2float, runs on the CPU (Vitis-AI 3.0,
+    xcompiler).
+    """
     leaving = ", ".join(cut.tensor for cut in placement.cuts if not cut.onto_dpu)
-    return leaving and f"what leaves the DPU is int8 ({leaving}); making it float runs on the CPU, for every tile"
+    return (
+        leaving
+        and f"what leaves the DPU is int8 ({leaving}); making it float runs on the CPU, for "
+        "every tile"
+    )
 
 
 def subgraphs(placement: Placement, dpu: Dpu, tile_px: int) -> str:
-    """Every DPU subgraph is started by the CPU, and its maps cross memory both ways (Vitis-AI 3.0, xcompiler)."""
+    """Every DPU subgraph is started by the CPU, and its maps cross memory both ways (Vitis-AI 3.0,
+    xcompiler).
+    """
     count = placement.dpu_subgraphs
-    return f"{count} DPU subgraphs: the CPU starts each, and carries maps between them" if count > 1 else ""
+    return (
+        f"{count} DPU subgraphs: the CPU starts each, and carries maps between them"
+        if count > 1
+        else ""
+    )
 
 
 def streaming(placement: Placement, dpu: Dpu, tile_px: int) -> str:
@@ -38,18 +52,24 @@ def streaming(placement: Placement, dpu: Dpu, tile_px: int) -> str:
         return ""
     kept_px = math.isqrt(room * tile_px * tile_px // max(large))
     return (
-        f"{len(large)} of {len(sizes)} maps exceed {room / 2**20:g} MiB, the largest has {max(large) / 1e6:.1f} MB: "
+        f"{len(large)} of {len(sizes)} maps exceed {room / 2**20:g} MiB, the largest has "
+        f"{max(large) / 1e6:.1f} MB: "
         f"they stream through memory; tiles of {kept_px} px and less would keep every map on chip"
     )
 
 
 def shuffles(placement: Placement, dpu: Dpu, tile_px: int) -> str:
-    """A pixel shuffle inside compiles, but has given wrong numbers on a board (Vitis-AI issues 1486, 1199).
+    """A pixel shuffle inside compiles, but has given wrong numbers on a board (Vitis-AI issues
+    1486, 1199).
 
     Its inverse as torch writes it, PixelUnshuffle, has run on the CPU.
     """
     names = ", ".join(op.name for op in placement.core if op.kind == "pixel shuffle")
-    return names and f"{names}: has given wrong numbers on a board; compare the board's results with this file's"
+    return (
+        names
+        and f"{names}: has given wrong numbers on a board; compare the board's results with "
+        "this file's"
+    )
 
 
 def unread(placement: Placement, dpu: Dpu, tile_px: int) -> str:
@@ -60,13 +80,21 @@ def unread(placement: Placement, dpu: Dpu, tile_px: int) -> str:
 
 
 def depthwise(placement: Placement, dpu: Dpu, tile_px: int) -> str:
-    """Depthwise convolutions are legal and slow: AMD's YOLOX-nano has them rewritten as dense ones (Vitis AI 6.3)."""
+    """Depthwise convolutions are legal and slow: AMD's YOLOX-nano has them rewritten as dense ones
+    (Vitis AI 6.3).
+    """
     count = sum(op.kind == "depthwise" for op in placement.core)
-    return f"{count} depthwise convolutions, legal but slow: AMD's YOLOX-nano has dense ones instead" if count else ""
+    return (
+        f"{count} depthwise convolutions, legal but slow: AMD's YOLOX-nano has dense ones instead"
+        if count
+        else ""
+    )
 
 
 def float_islands(placement: Placement, dpu: Dpu, tile_px: int) -> str:
-    """What a quantised file leaves in float is computed in BF16 (Xilinx/ross-ai-assistant, vai-fe-args)."""
+    """What a quantised file leaves in float is computed in BF16 (Xilinx/ross-ai-assistant,
+    vai-fe-args).
+    """
     names = ", ".join(node.op.name for node in placement.nodes if is_island(node, placement))
     return names and f"{names}: left in float between integers; keep few such, at the ends"
 
@@ -81,7 +109,10 @@ def is_island(node: PlacedNode, placement: Placement) -> bool:
 
 def unknown(placement: Placement, dpu: Dpu, tile_px: int) -> str:
     """AMD publishes no limits of kernels, strides, channels or sizes for VINT8 (UG1787 6.2)."""
-    return "no limits published: whether it compiles, fits the memory or stays in one part only AMD's compiler says"
+    return (
+        "no limits published: whether it compiles, fits the memory or stays in one part only "
+        "AMD's compiler says"
+    )
 
 
 REMARKS: tuple[Remark, ...] = (fix2float, subgraphs, streaming, shuffles)

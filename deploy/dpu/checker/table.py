@@ -1,7 +1,7 @@
 """`check`: where each node of a network goes, as rows of results and as a few lines.
 
-Of an NPU AMD publishes a table of operators, Y or N/A, and no limits. Where its nodes would run is the table's word:
-nothing here has seen the compiler.
+Of an NPU AMD publishes a table of operators, Y or N/A, and no limits. Where its nodes would run is
+the table's word: nothing here has seen the compiler.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,9 @@ OTHERS_NOTE = "quantised by operators that are not ONNX's: judged without their 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Checked(Table):
-    """Every node of a network on the host, the DPU or the CPU. It is true where the core runs whole on the DPU.
+    """Every node of a network on the host, the DPU or the CPU.
+
+    It is true where the core runs whole on the DPU.
 
     Attributes:
         placement: the nodes, in order.
@@ -49,7 +51,10 @@ class Checked(Table):
     @property
     def title(self) -> str:
         """What was asked."""
-        return f"{self.network.input.name} on {self.dpu.target.name} {self.dpu.name}, tile {self.tile_px}"
+        return (
+            f"{self.network.input.name} on {self.dpu.target.name} {self.dpu.name}, tile "
+            f"{self.tile_px}"
+        )
 
     @property
     def lines(self) -> list[str]:
@@ -57,20 +62,31 @@ class Checked(Table):
         placement = self.placement
         npu = self.dpu.target.npu
         lines = [] if npu else _crossings(placement)
-        lines += [f"{name}: {text}" for name, text in remarks_on(placement, self.dpu, self.tile_px).items()]
+        lines += [
+            f"{name}: {text}"
+            for name, text in remarks_on(placement, self.dpu, self.tile_px).items()
+        ]
         if placement.note:
             refused = refusal(self.network.model)
             note = OTHERS_NOTE if is_quantised(self.network.model) else placement.note
-            lines += [note, f"'quantize' does not take it: {refused}" if refused else "'quantize' takes it"]
+            lines += [
+                note,
+                f"'quantize' does not take it: {refused}" if refused else "'quantize' takes it",
+            ]
         failed = "; ".join(str(check) for check in self.checks if not check.passed)
         sound = "no rule is broken, not compiled" if npu else "the core runs whole on the DPU"
         return [*lines, f"check FAILED: {failed}" if failed else f"check passed: {sound}"]
 
 
 def check(
-    network: NetworkLike, board: BoardLike = DEFAULT_TARGET, *, dpu: str | None = None, tile: int | None = None
+    network: NetworkLike,
+    board: BoardLike = DEFAULT_TARGET,
+    *,
+    dpu: str | None = None,
+    tile: int | None = None,
 ) -> Checked:
-    """Place every node of a network on the host, the DPU or the CPU, and say which rules are broken.
+    """Place every node of a network on the host, the DPU or the CPU, and say which rules are
+    broken.
 
     Args:
         network: float, INT8 or a board's core, anyone's.
@@ -114,7 +130,10 @@ def _rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
 
 
 def legality(placement: Placement, *, npu: bool = False) -> Check:
-    """The verdict on a network: no node of its core may break a rule. What an NPU refuses is not known."""
+    """The verdict on a network: no node of its core may break a rule.
+
+    What an NPU refuses is not known.
+    """
     name = "nodes that break a rule" if npu else "nodes the DPU refuses"
     failed = placement.failed
     first = f"{failed[0].op.name}: {failed[0].broken[0].finding.reason}" if failed else ""
@@ -122,13 +141,20 @@ def legality(placement: Placement, *, npu: bool = False) -> Check:
 
 
 def _file_checks(model: onnx.ModelProto, dpu: Dpu) -> list[Check]:
-    """What a VINT8 file must keep as a whole; none of a float file or a host's, which no compiler is given."""
+    """What a VINT8 file must keep as a whole; none of a float file or a host's, which no compiler
+    is given.
+    """
     if not is_quantised(model) or KEY in metadata(model):
         return []
     opset = max(each.version for each in model.opset_import if each.domain in ("", "ai.onnx"))
     most = dpu.limit("file", "opset_max")
     named = [*model.graph.input, *model.graph.output]
-    sides = [f"{v.name} {d.dim_param}" for v in named for d in v.type.tensor_type.shape.dim if not d.dim_value]
+    sides = [
+        f"{v.name} {d.dim_param}"
+        for v in named
+        for d in v.type.tensor_type.shape.dim
+        if not d.dim_value
+    ]
     return [
         Check("opset", opset, most.low, "opset", detail=most.source),
         Check("sizes left open", len(sides), 0, "size", detail=", ".join(sides)),
@@ -140,17 +166,25 @@ def _crossings(placement: Placement) -> list[str]:
     lines = [f"device subgraphs: {pieces}, DPU subgraphs: {placement.dpu_subgraphs}"]
     for cut in placement.cuts:
         size = "a size unknown" if cut.size_bytes is None else f"{cut.size_bytes / 1e6:.2f} MB"
-        lines.append(f"{'to' if cut.onto_dpu else 'from'} the DPU: {cut.tensor}, {size} an image as int8")
+        lines.append(
+            f"{'to' if cut.onto_dpu else 'from'} the DPU: {cut.tensor}, {size} an image as int8"
+        )
     return lines
 
 
 def _node_rows(node: PlacedNode, placement: Placement, dpu: Dpu) -> list[Row]:
     words = {"operator": node.op.op_type, "part": node.part, "device": node.device}
     if dpu.target.npu:
-        words |= {"part": node.part.removeprefix("dpu-"), "device": _npu_words(node, placement, dpu)}
+        words |= {
+            "part": node.part.removeprefix("dpu-"),
+            "device": _npu_words(node, placement, dpu),
+        }
     if not node.broken:
         return [Row("nodes", node.op.name, {}, words)]
-    broken = [{"rule": b.text, "reason": b.finding.reason, "remedy": b.finding.remedy} for b in node.broken]
+    broken = [
+        {"rule": b.text, "reason": b.finding.reason, "remedy": b.finding.remedy}
+        for b in node.broken
+    ]
     return [Row("nodes", node.op.name, {}, {**words, **why}) for why in broken]
 
 
@@ -162,7 +196,11 @@ def _npu_words(node: PlacedNode, placement: Placement, dpu: Dpu) -> str:
         return "refused"
     if is_island(node, placement):
         return "float, BF16 by the compiler's default"
-    return "NPU by AMD's table" if node.op.op_type in dpu.target.npu["int8"].value else "not read in AMD's table"
+    return (
+        "NPU by AMD's table"
+        if node.op.op_type in dpu.target.npu["int8"].value
+        else "not read in AMD's table"
+    )
 
 
 def _subgraph_rows(placement: Placement) -> list[Row]:
@@ -171,15 +209,30 @@ def _subgraph_rows(placement: Placement) -> list[Row]:
         found.setdefault(node.subgraph, []).append(node)
     rows = []
     for number, members in found.items():
-        words = {"device": members[0].device, "first": members[0].op.name, "last": members[-1].op.name}
-        rows.append(Row("subgraphs", f"subgraph {number}", {"nodes": _count(len(members), "node")}, words))
+        words = {
+            "device": members[0].device,
+            "first": members[0].op.name,
+            "last": members[-1].op.name,
+        }
+        rows.append(
+            Row("subgraphs", f"subgraph {number}", {"nodes": _count(len(members), "node")}, words)
+        )
     return rows
 
 
 def _cut_row(cut: Cut) -> Row:
     unit = "byte/image"
-    size = unavailable(unit, "its shape is unknown") if cut.size_bytes is None else _count(cut.size_bytes, unit)
-    return Row("cuts", cut.tensor, {"size": size}, {"direction": "onto the DPU" if cut.onto_dpu else "off the DPU"})
+    size = (
+        unavailable(unit, "its shape is unknown")
+        if cut.size_bytes is None
+        else _count(cut.size_bytes, unit)
+    )
+    return Row(
+        "cuts",
+        cut.tensor,
+        {"size": size},
+        {"direction": "onto the DPU" if cut.onto_dpu else "off the DPU"},
+    )
 
 
 def _count(value: int, unit: str) -> Figure:

@@ -1,7 +1,8 @@
 """How long a network takes on a DPU, and at what power.
 
 - `work`: what each layer computes and moves, counted from shapes;
-- `model`: the constants of a target's [cost], and the times of layers, host and processor that follow;
+- `model`: the constants of a target's [cost], and the times of layers, host and processor that
+  follow;
 - `latency`: the prediction with its interval, power;
 - `own_runs`: the constants corrected by runs of a user's own board.
 

@@ -1,12 +1,13 @@
 """How long a network takes on the DPU, layer by layer, how far off that may be, and at what power.
 
-Counts come from `work`, the formula from `model`, constants and widths from the target's [cost], where
-`benchmarks/cost_model` writes what it finds on published networks. None of them is ConvBEERS: the paper's own figure
-is what the model is compared with, never what it is made from.
+Counts come from `work`, the formula from `model`, constants and widths from the target's [cost],
+where `benchmarks/cost_model` writes what it finds on published networks. None of them is ConvBEERS:
+the paper's own figure is what the model is compared with, never what it is made from.
 
-The interval is FPS e^-width to FPS e^width, so wide that nine of ten families of networks, each left out of the fit
-once, lie inside. It has one width where the host sets the rate, one for small maps, one for large ones, and the
-widest where a network lies beyond all that were fitted (docs/explanation/cost-model.md).
+The interval is FPS e^-width to FPS e^width, so wide that nine of ten families of networks, each
+left out of the fit once, lie inside. It has one width where the host sets the rate, one for small
+maps, one for large ones, and the widest where a network lies beyond all that were fitted
+(docs/explanation/cost-model.md).
 """
 
 import math
@@ -58,7 +59,8 @@ class LayerCost:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the model says of one network on one configuration; `note` says what was assumed of the file.
+    """What the model says of one network on one configuration; `note` says what was assumed of the
+    file.
 
     Attributes:
         dpu: the configuration, its constants corrected by a user's runs where there are any.
@@ -104,7 +106,9 @@ class Prediction:
 
     @property
     def fps_interval(self) -> Interval:
-        """Least and most images a second: the host at its slowest and at its fastest, and the width."""
+        """Least and most images a second: the host at its slowest and at its fastest, and the
+        width.
+        """
         fast, slow = (self.rate(self.batch_time_s, host_s) for host_s in self._host_ends_s)
         return slow / self.spread, fast * self.spread
 
@@ -116,9 +120,11 @@ class Prediction:
 
     @property
     def latency_s(self) -> float:
-        """From the first image of a batch to the last result, with one thread: one core, then one core of the host.
+        """From the first image of a batch to the last result, with one thread: one core, then one
+        core of the host.
 
-        Its error is about that of the rate (docs/reference/boards.md), and it shares the rate's width.
+        Its error is about that of the rate (docs/reference/boards.md), and it shares the rate's
+        width.
         """
         return self._latency_s(self.host_s)
 
@@ -144,7 +150,9 @@ class Prediction:
         return rest_s + low_s, rest_s + high_s
 
     def rate(self, batch_time_s: float, host_s: float) -> float:
-        """Images a second if a batch took that long on the DPU, and an image that long on the host."""
+        """Images a second if a batch took that long on the DPU, and an image
+        that long on the host.
+        """
         return frame_rate(batch_time_s / self.batch, host_s, self.dpu.value("cost", "crowding"))
 
     @property
@@ -158,8 +166,11 @@ class Prediction:
         return sum(layer.work.map_bytes for layer in self.layers)
 
 
-def predict(placement: Placement, dpu: Dpu, task: Task | None = None, step_px: float = 0.0) -> Prediction:
-    """Predict a network whose convolutions the DPU runs; what it refuses at the ends of a float file the host does.
+def predict(
+    placement: Placement, dpu: Dpu, task: Task | None = None, step_px: float = 0.0
+) -> Prediction:
+    """Predict a network whose convolutions the DPU runs; what it refuses at the ends of a float
+    file the host does.
 
     Args:
         placement: where its nodes run.
@@ -170,16 +181,24 @@ def predict(placement: Placement, dpu: Dpu, task: Task | None = None, step_px: f
     if placement.cutting:
         names = ", ".join(node.op.name for node in placement.cutting[:3])
         remedy = "run 'beers-deploy check' for the reasons and remedies"
-        raise ModelError("cost model", expected="a core that runs whole on the DPU", got=names, remedy=remedy)
+        raise ModelError(
+            "cost model", expected="a core that runs whole on the DPU", got=names, remedy=remedy
+        )
     constants = Constants.of(dpu)
     structure = Structure.of(dpu)
     works = count_work(placement.core, dpu)
     if not any(work.operations for work in works):
         remedy = "give a network with convolutions"
-        raise ModelError("cost model", expected="work for the DPU", got="no convolution", remedy=remedy)
+        raise ModelError(
+            "cost model", expected="work for the DPU", got="no convolution", remedy=remedy
+        )
     columns = Layers.of(works, dpu)
     speed, host_speed = (own_speed(dpu, part) for part in OWN_SPEEDS)
-    times = columns.compute_s(constants), columns.memory_s(constants), columns.time_s(constants, structure)
+    times = (
+        columns.compute_s(constants),
+        columns.memory_s(constants),
+        columns.time_s(constants, structure),
+    )
     parts = zip(works, *((each / speed).tolist() for each in times), strict=True)
     layers = tuple(LayerCost(*part) for part in parts)
     refused = [node.op for node in placement.failed]
@@ -210,16 +229,26 @@ def predict(placement: Placement, dpu: Dpu, task: Task | None = None, step_px: f
     )
 
 
-WIDTHS = {kind: f"width_{kind.replace(' ', '_')}" for kind in ("host", "small maps", "large maps", "outside")}
+WIDTHS = {
+    kind: f"width_{kind.replace(' ', '_')}"
+    for kind in ("host", "small maps", "large maps", "outside")
+}
 """Where [cost] keeps half the width of an interval, in ln(FPS)."""
 ROUNDED = 1e-3
-"""How far [cost] rounds the ends of the fitted range: the largest fitted network is not beyond it."""
+"""How far [cost] rounds the ends of the fitted range: the largest fitted
+network is not beyond it.
+"""
 
 
 def _outside(core: Sequence[Operation], map_bytes: float, dpu: Dpu) -> tuple[str, ...]:
-    """What of a network lies beyond the fitted ones, each with the end of the range that it passes."""
+    """What of a network lies beyond the fitted ones, each with the end of the
+    range that it passes.
+    """
     operations = sum(op.operations for op in core)
-    values = {"map_bytes": ("largest map", map_bytes, 1e-6, "MB"), "operations": ("work", operations, 1e-9, "GOP")}
+    values = {
+        "map_bytes": ("largest map", map_bytes, 1e-6, "MB"),
+        "operations": ("work", operations, 1e-9, "GOP"),
+    }
     found = []
     for key, (name, value, scale, unit) in values.items():
         most = dpu.limit("cost", f"fitted_{key}").high
@@ -229,7 +258,9 @@ def _outside(core: Sequence[Operation], map_bytes: float, dpu: Dpu) -> tuple[str
 
 
 def dpu_power(dpu: Dpu) -> Figure:
-    """Power in W while the DPU runs, with the range assumed for it; unavailable where none is published."""
+    """Power in W while the DPU runs, with the range assumed for it; unavailable where none is
+    published.
+    """
     if "dpu_run_w" not in dpu.tables.get("power", {}):
         return unavailable("W", f"no power of {dpu.target.name} under its DPU is published")
     anchor = dpu.limit("power", "dpu_run_w")
@@ -249,7 +280,9 @@ def layer_energy_j(layer: LayerCost, dpu: Dpu) -> Interval:
 
 
 def counted_power(prediction: Prediction) -> Figure:
-    """Power of products and traffic at the predicted rate, in W; its range is that of the published figures."""
+    """Power of products and traffic at the predicted rate, in W; its range is that of the published
+    figures.
+    """
     dpu = prediction.dpu
     ends_j = zip(*(layer_energy_j(layer, dpu) for layer in prediction.layers), strict=True)
     low, high = (sum(end_j) * prediction.fps for end_j in ends_j)

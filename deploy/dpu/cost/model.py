@@ -1,11 +1,10 @@
 """The formula of the cost model, and its constants, which stand in a target's [cost].
 
-compute = array operations / (peak array_efficiency) + lane steps / lanes
-memory  = longer of (weights + maps) / port and cores (weights + batch handlers maps) / (DDR memory_efficiency)
-layer   = longer of the two + (1 - overlap) shorter of the two + layer_s
-batch   = sum of layers
-host    = host_image_s + bytes in / rate + bytes out / rate + values of the task / its rate
-rate    = 1 / (dpu^crowding + host^crowding)^(1 / crowding)
+compute = array operations / (peak array_efficiency) + lane steps / lanes memory  = longer of
+(weights + maps) / port and cores (weights + batch handlers maps) / (DDR memory_efficiency) layer
+= longer of the two + (1 - overlap) shorter of the two + layer_s batch   = sum of layers host    =
+host_image_s + bytes in / rate + bytes out / rate + values of the task / its rate rate    = 1 /
+(dpu^crowding + host^crowding)^(1 / crowding)
 """
 
 import math
@@ -28,9 +27,12 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class Constants:
-    """What is fitted. Hardware is never among it, so a board may be predicted with another's of the same kind.
+    """What is fitted.
 
-    The first four are the DPU's. Rates of the host are those of one of its cores; a value is one number of a result.
+    Hardware is never among it, so a board may be predicted with another's of the same kind.
+
+    The first four are the DPU's. Rates of the host are those of one of its cores; a value is one
+    number of a result.
     """
 
     array_efficiency: float
@@ -66,7 +68,9 @@ class Constants:
 
 NAMES = tuple(field.name for field in fields(Constants))
 OWN_SPEEDS = ("dpu_speed", "host_speed")
-"""How many times as fast as the constants say an owner's DPU and host are: `own_runs` adds them to [cost]."""
+"""How many times as fast as the constants say an owner's DPU and host are: `own_runs` adds them to
+[cost].
+"""
 
 
 def own_speed(dpu: Dpu, part: str) -> float:
@@ -81,7 +85,9 @@ class Structure:
     overlap: float
     """Share of the shorter of compute and memory that is hidden behind the longer."""
     crowding: float
-    """Exponent q of (dpu^q + host^q)^(1/q): 2 where the two get in each other's way, large where they do not."""
+    """Exponent q of (dpu^q + host^q)^(1/q): 2 where the two get in each other's way, large where
+    they do not.
+    """
 
     @classmethod
     def of(cls, dpu: Dpu) -> Self:
@@ -109,12 +115,21 @@ class Layers:
         array = dpu.engine_ops_per_s
         lanes = dpu.lane_steps_per_s
         columns = [
-            (w.array_operations / array, w.lane_steps / lanes, w.weight_bytes, w.map_bytes, w.launched) for w in works
+            (
+                w.array_operations / array,
+                w.lane_steps / lanes,
+                w.weight_bytes,
+                w.map_bytes,
+                w.launched,
+            )
+            for w in works
         ]
         clock_hz = dpu.value("array", "pl_clock_hz")
         memory = dpu.limit("memory", "ddr_bytes_per_s").high
         board = (clock_hz, memory, dpu.handlers, dpu.cores)
-        return cls(*np.array([(*row, *board) for row in columns], dtype=np.float64).reshape(-1, 9).T)
+        return cls(
+            *np.array([(*row, *board) for row in columns], dtype=np.float64).reshape(-1, 9).T
+        )
 
     def compute_s(self, constants: Constants) -> Array:
         """Time of the array and of the engines beside it, (n,): all batch handlers work at once."""
@@ -125,18 +140,24 @@ class Layers:
         port = constants.port_bytes_per_cycle * self.pl_clock_hz
         shared = constants.memory_efficiency * self.memory_bytes_per_s
         shared_s = (self.weight_bytes + self.handlers * self.map_bytes) / shared
-        return np.maximum((self.weight_bytes + self.map_bytes) / port, (1.0 if alone else self.cores) * shared_s)
+        return np.maximum(
+            (self.weight_bytes + self.map_bytes) / port, (1.0 if alone else self.cores) * shared_s
+        )
 
     def time_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
         """Time of each layer, for a batch (n,)."""
         compute = self.compute_s(constants)
         memory = self.memory_s(constants, alone=alone)
-        busy: Array = np.maximum(compute, memory) + (1 - structure.overlap) * np.minimum(compute, memory)
+        busy: Array = np.maximum(compute, memory) + (1 - structure.overlap) * np.minimum(
+            compute, memory
+        )
         return busy + constants.layer_s * self.launched
 
 
 Regime = Literal["host", "small maps", "large maps"]
-"""What sets the rate: the host; or the DPU, on maps of at most LARGE_MAP_BYTES, or with larger ones."""
+"""What sets the rate: the host; or the DPU, on maps of at most LARGE_MAP_BYTES, or with larger
+ones.
+"""
 LARGE_MAP_BYTES = 2 << 20
 
 
@@ -155,11 +176,17 @@ def frame_rate(dpu_s: float, host_s: float, crowding: float) -> float:
 
 
 Task = Literal["copy", "argmax", "softmax", "sort", "image"]
-"""What the host does with the results: reads them and no more (copy); finds the best of classes (argmax, softmax);
-ranks boxes or key points (sort); makes pixels of them (image)."""
+"""What the host does with the results: reads them and no more (copy); finds the best of classes
+(argmax, softmax); ranks boxes or key points (sort); makes pixels of them (image).
+"""
 TASKS = get_args(Task)
 
-OPERATORS: dict[str, Task] = {"ArgMax": "argmax", "Softmax": "softmax", "NonMaxSuppression": "sort", "TopK": "sort"}
+OPERATORS: dict[str, Task] = {
+    "ArgMax": "argmax",
+    "Softmax": "softmax",
+    "NonMaxSuppression": "sort",
+    "TopK": "sort",
+}
 """What tells the task in a file."""
 
 BANDS = 4
@@ -167,7 +194,8 @@ BANDS = 4
 
 
 def host_work(bytes_in: float, bytes_out: float, values: float, task: Task) -> Array:
-    """Units of the host's work for one image, (7,): 1, bytes in, bytes out, values of each task but copying.
+    """Units of the host's work for one image, (7,): 1, bytes in, bytes out, values of each task but
+    copying.
 
     An image needs no other reading of its bytes than becoming pixels.
     """
@@ -176,13 +204,17 @@ def host_work(bytes_in: float, bytes_out: float, values: float, task: Task) -> A
 
 
 def placed_work(placement: Placement, task: Task) -> Array:
-    """Units of the host's work for a network of a file, (7,): the task takes every value of the results."""
+    """Units of the host's work for a network of a file, (7,): the task takes every value of the
+    results.
+    """
     onto, back = _crossing_bytes(placement)
     return host_work(onto, back, back, task)
 
 
 def task_of(placement: Placement) -> Task:
-    """What a file tells of the host; one result of few bands, no smaller than the image, becomes an image."""
+    """What a file tells of the host; one result of few bands, no smaller than the image, becomes an
+    image.
+    """
     behind = [node.op.op_type for node in placement.nodes if node.part == "host-back"]
     found = next((OPERATORS[name] for name in behind if name in OPERATORS), None)
     onto, back = _crossing_bytes(placement)
@@ -202,18 +234,26 @@ def _gives_an_image(placement: Placement) -> bool:
 
 
 FLOAT_BYTES = 4
-"""The vendor's operators on the CPU work on float32 (Vitis-AI 3.0, xcompiler: fix2float in front of them)."""
+"""The vendor's operators on the CPU work on float32 (Vitis-AI 3.0, xcompiler: fix2float in front of
+them).
+"""
 INSTRUCTIONS = 20.0
-"""Of plain code for a value of a result: four loads, their weights, their sum and its address (assumed)."""
+"""Of plain code for a value of a result: four loads, their weights, their sum and its address
+(assumed).
+"""
 PRODUCT_INSTRUCTIONS = 2.0
-"""Of plain code for an operation: two loads, a product with its sum and a step of the loop count as two (assumed)."""
+"""Of plain code for an operation: two loads, a product with its sum and a step of the loop count as
+two (assumed).
+"""
 
 
 def refused_interval_s(operations: Sequence[Operation], dpu: Dpu) -> Interval:
-    """Time that the board's processor takes for operations that the DPU refuses: one image, all cores, in s.
+    """Time that the board's processor takes for operations that the DPU refuses: one image, all
+    cores, in s.
 
-    None of it is fitted: no published rate tells such work apart. The least is what the processor's published rates
-    allow, products as a good library does them and every number moved once; the most is plain code, number by number.
+    None of it is fitted: no published rate tells such work apart. The least is what the processor's
+    published rates allow, products as a good library does them and every number moved once; the
+    most is plain code, number by number.
     """
     if not operations:
         return 0.0, 0.0
@@ -233,7 +273,9 @@ def _core_s(op: Operation, dpu: Dpu) -> Interval:
 
 
 def _plain_work_s(operations: float, moved_values: float, results: float, dpu: Dpu) -> Interval:
-    """Time of one core for float32 work, least and most: as a good library does it, and number by number."""
+    """Time of one core for float32 work, least and most: as a good library does it, and number by
+    number.
+    """
     keys = ("clock_ghz", "product_flops_per_cycle", "moved_bytes_per_s", "decoding_mips_per_ghz")
     clock, products, moved, decoding = (dpu.limit("cpu", key) for key in keys)
     moved_bytes = FLOAT_BYTES * moved_values
@@ -244,10 +286,11 @@ def _plain_work_s(operations: float, moved_values: float, results: float, dpu: D
 
 
 def consistency_interval_s(pixels: float, dpu: Dpu) -> Interval:
-    """Time that the board's processor takes for the consistency step on so many pixels: all cores, in s.
+    """Time that the board's processor takes for the consistency step on so many pixels: all cores,
+    in s.
 
-    None of it is fitted. The raw and the restored image are read and the result is written; the step's other numbers
-    stay in the caches.
+    None of it is fitted. The raw and the restored image are read and the result is written; the
+    step's other numbers stay in the caches.
     """
     low_s, high_s = _plain_work_s(2 * PRODUCTS_PER_PX * pixels, 3 * pixels, pixels, dpu)
     cores = dpu.whole("cpu", "cores")

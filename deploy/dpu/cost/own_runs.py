@@ -1,9 +1,10 @@
 """Runs of a user's own board: `bench --measured board.json` corrects the cost model by two factors.
 
-The DPU's factor comes from given over predicted rates of the runs that the DPU bounds, the host's from the others. A
-ratio tells more of its network than of the board: the variance among networks of one board, each left out of the fit,
-is SCATTER times that among boards. So n runs move a factor by n / (n + SCATTER) of the mean of their logarithms. A
-part that no run is bound by keeps its constants, and the interval stays that of the published networks: measured in
+The DPU's factor comes from given over predicted rates of the runs that the DPU bounds, the host's
+from the others. A ratio tells more of its network than of the board: the variance among networks of
+one board, each left out of the fit, is SCATTER times that among boards. So n runs move a factor by
+n / (n + SCATTER) of the mean of their logarithms. A part that no run is bound by keeps its
+constants, and the interval stays that of the published networks: measured in
 docs/explanation/cost-model.md.
 """
 
@@ -27,7 +28,9 @@ EXAMPLE = 'write [{"model": "core.onnx", "configuration": "C32B3", "tile_px": 64
 RUNS = 1000
 TILE_PX = (16, 1 << 16)
 FAR = 10_000
-"""Most runs; least and most of a tile's side; and how many times off a rate of this network may be predicted."""
+"""Most runs; least and most of a tile's side; and how many times off a rate of this network may be
+predicted.
+"""
 POWER_W = (0.01, 1000.0)
 SCATTER = 3
 """Variance of networks over that of boards, of ln(predicted / published): 0.13^2 and 0.07^2."""
@@ -36,7 +39,9 @@ KEYS = {"model", "configuration", "tile_px", "fps", "power_w", "provider"}
 
 @dataclass(frozen=True)
 class Run:
-    """One entry of the file: a network placed on a configuration, the rate given for it and the one predicted."""
+    """One entry of the file: a network placed on a configuration, the rate given for it and the one
+    predicted.
+    """
 
     name: str
     placement: Placement
@@ -63,8 +68,12 @@ class OwnRuns:
     def factor_rows(self) -> list[Row]:
         """The two factors."""
         factors = (("DPU", self.dpu_factor), ("host", self.host_factor))
-        found = {name: predicted(value, "x", (value, value), self.source) for name, value in factors}
-        return [Row("correction", name, {"given / predicted": figure}) for name, figure in found.items()]
+        found = {
+            name: predicted(value, "x", (value, value), self.source) for name, value in factors
+        }
+        return [
+            Row("correction", name, {"given / predicted": figure}) for name, figure in found.items()
+        ]
 
     def run_rows(self) -> list[Row]:
         """The rate given for each run, and what was predicted before and after the correction."""
@@ -75,17 +84,28 @@ class OwnRuns:
             figures = {"given": published(run.fps, "frame/s", self.source)}
             for key, prediction in {"shipped": before, "corrected": after}.items():
                 off = 100 * (prediction.fps / run.fps - 1)
-                figures[key] = predicted(prediction.fps, "frame/s", prediction.fps_interval, f"cost model, {key}")
+                figures[key] = predicted(
+                    prediction.fps, "frame/s", prediction.fps_interval, f"cost model, {key}"
+                )
                 figures[f"{key} is off by"] = predicted(off, "%", (off, off), "arithmetic")
-            rows.append(Row("runs", f"{run.name}, {before.dpu.name}", figures, {"bound": before.regime}))
+            rows.append(
+                Row("runs", f"{run.name}, {before.dpu.name}", figures, {"bound": before.regime})
+            )
         return rows
 
 
 def read_own_runs(path: Path, dpu: Dpu) -> OwnRuns:
     """Compare the runs in a file with what is predicted of them on `dpu`'s board."""
-    runs = [_run(entry, path, f"{path.name}, run {number}", dpu) for number, entry in enumerate(_read(path), 1)]
-    ratios = [(run.predicted.regime == "host", math.log(run.fps / run.predicted.fps)) for run in runs]
-    on_dpu, host = (_factor([ratio for bound, ratio in ratios if bound is on_host]) for on_host in (False, True))
+    runs = [
+        _run(entry, path, f"{path.name}, run {number}", dpu)
+        for number, entry in enumerate(_read(path), 1)
+    ]
+    ratios = [
+        (run.predicted.regime == "host", math.log(run.fps / run.predicted.fps)) for run in runs
+    ]
+    on_dpu, host = (
+        _factor([ratio for bound, ratio in ratios if bound is on_host]) for on_host in (False, True)
+    )
     return OwnRuns(f"{len(runs)} runs in {path.name}, drawn to 1", runs, on_dpu, host)
 
 
@@ -102,7 +122,11 @@ def _read(path: Path) -> Sequence[Mapping[str, object]]:
         got = missing or str(error)
         remedy = "check the path" if missing else EXAMPLE
         raise OptionError(str(path), expected="a file of JSON", got=got, remedy=remedy) from error
-    if not isinstance(runs, list) or not 0 < len(runs) <= RUNS or not all(isinstance(run, dict) for run in runs):
+    if (
+        not isinstance(runs, list)
+        or not 0 < len(runs) <= RUNS
+        or not all(isinstance(run, dict) for run in runs)
+    ):
         expected = f"a list of 1 to {RUNS} runs"
         got = type(runs).__name__
         raise OptionError(str(path), expected=expected, got=got, remedy=EXAMPLE)
@@ -116,11 +140,17 @@ def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run
     if entry.get("provider") == "CPUExecutionProvider":
         expected = "a run of the board"
         got = "one of onnxruntime's CPU provider"
-        raise OptionError(where, expected=expected, got=got, remedy="measure it with the board's provider")
+        raise OptionError(
+            where, expected=expected, got=got, remedy="measure it with the board's provider"
+        )
     tile_px = _number(entry.get("tile_px", 640), "tile_px", TILE_PX, where)
     if tile_px != int(tile_px):
-        raise OptionError(where, expected="tile_px in whole pixels", got=str(tile_px), remedy=EXAMPLE)
-    dpu = Dpu(board.target, *board.target.configuration(str(entry.get("configuration", "")) or None))
+        raise OptionError(
+            where, expected="tile_px in whole pixels", got=str(tile_px), remedy=EXAMPLE
+        )
+    dpu = Dpu(
+        board.target, *board.target.configuration(str(entry.get("configuration", "")) or None)
+    )
     model = path.parent / str(entry["model"])
     placement = place(read_network(model, int(tile_px)), dpu)
     prediction = predict(placement, dpu)
@@ -131,7 +161,11 @@ def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run
 
 
 def _number(value: object, key: str, ends: tuple[float, float], where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not ends[0] <= value <= ends[1]:
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or not ends[0] <= value <= ends[1]
+    ):
         expected = f"{key} of {ends[0]:g} to {ends[1]:g}"
         raise OptionError(where, expected=expected, got=repr(value), remedy=EXAMPLE)
     return float(value)

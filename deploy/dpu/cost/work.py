@@ -9,16 +9,23 @@ from beers_deploy.dpu.checker.finding import groups_of
 from beers_deploy.dpu.graph import Operation, Shape
 
 FUSED = ("activation", "quantise", "dequantise", "pixel shuffle")
-"""Kinds that cost nothing: done on the way out of the operation before; a pixel shuffle is where its results go."""
+"""Kinds that cost nothing: done on the way out of the operation before; a pixel shuffle is where
+its results go.
+"""
 UNSTARTED = ("add", "mul", "concat")
 """Kinds without a start of their own: behind the operation before, or no more than places."""
 BURST_BYTES = 64
-"""The least that the memory moves at a time: eight beats of 64 bit DDR4, sixteen of 32 bit LPDDR4."""
+"""The least that the memory moves at a time: eight beats of 64 bit DDR4,
+sixteen of 32 bit LPDDR4.
+"""
 AUGMENTATION = 2
-"""Channels of several columns that the array takes in side by side, over input_channel_parallel: up to 32 of the
-DPUCZDX8G and DPUCVDX8G, 64 of the DPUCV2DX8G (Vitis-AI master, targets/*.prototxt)."""
+"""Channels of several columns that the array takes in side by side, over input_channel_parallel: up
+to 32 of the DPUCZDX8G and DPUCVDX8G, 64 of the DPUCV2DX8G (Vitis-AI master, targets/*.prototxt).
+"""
 SHARING = 2
-"""Readers of one result up to which the DPU keeps it; with more of them it passes through memory."""
+"""Readers of one result up to which the DPU keeps it; with more of them it
+passes through memory.
+"""
 
 
 @dataclass(frozen=True)
@@ -29,7 +36,9 @@ class Work:
     kind: str
     operations: int
     array_operations: int  # computed by the array, used or not
-    lane_steps: int  # values that the ALU or the element-wise engine takes in, unused lanes included
+    lane_steps: (
+        int  # values that the ALU or the element-wise engine takes in, unused lanes included
+    )
     weight_bytes: int
     load_map_bytes: int
     store_map_bytes: int
@@ -57,7 +66,9 @@ def count_work(operations: Sequence[Operation], dpu: Dpu) -> tuple[Work, ...]:
     for op in operations:
         if op.kind not in FUSED:
             counts = op.operations, _array_operations(op, dpu), _lane_steps(op, dpu)
-            found.append(Work(op.name, op.kind, *counts, op.weight_bytes, flow.load(op), flow.store(op)))
+            found.append(
+                Work(op.name, op.kind, *counts, op.weight_bytes, flow.load(op), flow.store(op))
+            )
     return tuple(found)
 
 
@@ -68,7 +79,9 @@ def _array_operations(op: Operation, dpu: Dpu) -> int:
     """
     if op.kind not in ("conv", "transposed"):
         return 0
-    pixels = _positions(op.out_shape, dpu.whole("array", "pixel_parallel"), dpu.whole("array", "column_parallel"))
+    pixels = _positions(
+        op.out_shape, dpu.whole("array", "pixel_parallel"), dpu.whole("array", "column_parallel")
+    )
     inputs = op.window.kernel[0] * _row_inputs(op.channels[0], op.window.kernel[1], dpu)
     return 2 * inputs * _up(op.channels[1], dpu.output_parallel) * pixels
 
@@ -76,7 +89,8 @@ def _array_operations(op: Operation, dpu: Dpu) -> int:
 def _row_inputs(channels: int, columns: int, dpu: Dpu) -> int:
     """Inputs that a row of a window takes, used or not.
 
-    Where there are few channels, several columns of the window are taken in side by side (channel augmentation).
+    Where there are few channels, several columns of the window are taken in side by side (channel
+    augmentation).
     """
     together = min(max(AUGMENTATION * dpu.input_parallel // channels, 1), columns)
     full, rest = divmod(columns, together)
@@ -85,7 +99,11 @@ def _row_inputs(channels: int, columns: int, dpu: Dpu) -> int:
 
 
 def _lane_steps(op: Operation, dpu: Dpu) -> int:
-    if op.kind not in ("depthwise", "pool", "add", "mul") or not op.in_shapes or op.in_shapes[0] is None:
+    if (
+        op.kind not in ("depthwise", "pool", "add", "mul")
+        or not op.in_shapes
+        or op.in_shapes[0] is None
+    ):
         return 0
     passes = max(op.channels[1] // max(op.channels[0], 1), 1) if op.kind == "depthwise" else 1
     taps = op.window.kernel[0] * op.window.kernel[1] * passes
@@ -95,7 +113,9 @@ def _lane_steps(op: Operation, dpu: Dpu) -> int:
 
 
 def _positions(shape: Shape | None, rows: int, columns: int = 1) -> int:
-    """Output pixels, filled up to the rows, and to the columns of them, that are computed at a time."""
+    """Output pixels, filled up to the rows, and to the columns of them, that are computed at a
+    time.
+    """
     return _up(shape[1], rows) * _up(shape[2], columns) if shape else 0
 
 
@@ -104,13 +124,14 @@ def _up(count: int, size: int) -> int:
 
 
 class _Flow:
-    """Which results pass through memory: what banks cannot hold, or not for long, and what a concat joins.
+    """Which results pass through memory: what banks cannot hold, or not for long, and what a concat
+    joins.
 
-    An add or mul of maps that fit the chip is fused with the operation before it. Of larger ones it is a pass of its
-    own: two maps loaded, one stored, each operand stored by what made it.
+    An add or mul of maps that fit the chip is fused with the operation before it. Of larger ones it
+    is a pass of its own: two maps loaded, one stored, each operand stored by what made it.
 
-    What a concat joins, and what a pixel shuffle moves, is stored pixel by pixel between what others store: a pixel's
-    channels take whole bursts.
+    What a concat joins, and what a pixel shuffle moves, is stored pixel by pixel between what
+    others store: a pixel's channels take whole bursts.
     """
 
     def __init__(self, operations: Sequence[Operation], dpu: Dpu) -> None:
@@ -123,7 +144,9 @@ class _Flow:
         computing = [op for op in operations if op.kind not in FUSED]
         self._order = {name: when for when, op in enumerate(computing) for name in op.outputs}
         self._shapes = {op.output: op.out_shape for op in computing}
-        self._reads = {name: {self._root(i) for i in op.inputs} for op in computing for name in op.outputs}
+        self._reads = {
+            name: {self._root(i) for i in op.inputs} for op in computing for name in op.outputs
+        }
         self._readers = Counter(self._root(name) for op in computing for name in op.inputs)
         self._concats = {op.output for op in computing if op.kind == "concat"}
         self._pieces = self._piece_channels(operations)
@@ -131,10 +154,14 @@ class _Flow:
         self._passes = {op.output for op in sums if self._is_pass(op)}
         reading = [op for op in computing if op.output in self._passes | self._concats]
         self._stored = {self._root(name) for op in reading for name in op.inputs}
-        self._sums = {self._root(self._fused(op)): op.output for op in sums if op.output not in self._passes}
+        self._sums = {
+            self._root(self._fused(op)): op.output for op in sums if op.output not in self._passes
+        }
 
     def load(self, op: Operation) -> int:
-        """Bytes read: all operands but the one that an add is fused with, and what that one has read already."""
+        """Bytes read: all operands but the one that an add is fused with, and what that one has
+        read already.
+        """
         if op.kind == "concat":
             return 0
         if op.output in self._passes:
@@ -144,7 +171,11 @@ class _Flow:
             fused = self._root(self._fused(op))
             here = {fused, *self._reads.get(fused, ())}
         fed = zip(op.inputs, op.in_shapes, strict=True)
-        return sum(_size(shape) for name, shape in fed if self._root(name) not in here and self._leaves(name))
+        return sum(
+            _size(shape)
+            for name, shape in fed
+            if self._root(name) not in here and self._leaves(name)
+        )
 
     def store(self, op: Operation) -> int:
         """Bytes written; a fused add's are those of the operation that it is fused with."""
@@ -160,12 +191,19 @@ class _Flow:
         return size // piece * _up(piece, BURST_BYTES) if piece else size
 
     def _piece_channels(self, operations: Sequence[Operation]) -> dict[str, int]:
-        """Channels of a pixel that lie in one piece, by result; a shuffle at a network's end is left to the host."""
+        """Channels of a pixel that lie in one piece, by result; a shuffle at a network's end is
+        left to the host.
+        """
         found: dict[str, int] = {}
         for op in operations:
             taken = next(iter(op.in_shapes), None)
             given = op.out_shape
-            if op.kind == "pixel shuffle" and taken and given and self._readers[self._root(op.output)]:
+            if (
+                op.kind == "pixel shuffle"
+                and taken
+                and given
+                and self._readers[self._root(op.output)]
+            ):
                 found[self._root(op.output)] = min(taken[0], given[0])
             if op.kind == "concat":
                 fed = zip(op.inputs, op.in_shapes, strict=True)
@@ -173,7 +211,9 @@ class _Flow:
         return found
 
     def _is_pass(self, op: Operation) -> bool:
-        return len(op.inputs) == 2 and op.in_shapes[0] == op.in_shapes[1] and not self._fits(op.output)
+        return (
+            len(op.inputs) == 2 and op.in_shapes[0] == op.in_shapes[1] and not self._fits(op.output)
+        )
 
     def _fused(self, add: Operation) -> str:
         """The operand of an add that is made last."""
@@ -193,7 +233,9 @@ class _Flow:
 
 
 def kept_bytes(dpu: Dpu) -> float:
-    """The largest result that stays on the chip: a group of banks is read while another is written."""
+    """The largest result that stays on the chip: a group of banks is read while
+    another is written.
+    """
     return dpu.value("memory", "feature_map_bytes") * dpu.value("memory", "feature_map_groups") / 2
 
 

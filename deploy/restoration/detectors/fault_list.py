@@ -1,8 +1,8 @@
 """A list of faulty detectors, as a file.
 
-The list is a CSV file, `column,row` or `column,row,band`, as `restore --fix-detectors` writes and reads it. Columns
-and rows count from 0, bands from 1; without a band a line holds for all. A row of `*` stands for the whole column,
-and a column of `*` for the whole row.
+The list is a CSV file, `column,row` or `column,row,band`, as `restore --fix-detectors` writes and
+reads it. Columns and rows count from 0, bands from 1; without a band a line holds for all. A row of
+`*` stands for the whole column, and a column of `*` for the whole row.
 """
 
 import hashlib
@@ -68,7 +68,9 @@ class FaultList:
         columns = sum(fault.row < 0 for fault in self.faults)
         rows = sum(fault.column < 0 for fault in self.faults)
         counts = {"pixel": len(self.faults) - columns - rows, "column": columns, "row": rows}
-        words = [f"{count} {name}{'s' if count > 1 else ''}" for name, count in counts.items() if count]
+        words = [
+            f"{count} {name}{'s' if count > 1 else ''}" for name, count in counts.items() if count
+        ]
         return ", ".join(words) or "none"
 
     @property
@@ -77,7 +79,9 @@ class FaultList:
         return {"detectors replaced": self.words} if self.faults else {}
 
     def mask(self, raster: Raster, start: int, stop: int) -> np.ndarray:
-        """Return where pixels of rows `start` to `stop` (excluded) are faulty, bool (bands, rows, width)."""
+        """Return where pixels of rows `start` to `stop` (excluded) are faulty, bool (bands, rows,
+        width).
+        """
         flags = np.zeros((raster.bands, stop - start, raster.width_px), bool)
         columns, rows, bands = self._numbers.T
         single = (columns >= 0) & (start <= rows) & (rows < stop)
@@ -96,7 +100,9 @@ class FaultList:
 
 
 def list_beside(out: Path, wanted: str) -> Path | None:
-    """Return where the list of found faults is written, beside the restored image; None if none are searched for."""
+    """Return where the list of found faults is written, beside the restored image; None if none are
+    searched for.
+    """
     return out.with_name(f"{out.stem}.detectors.csv") if wanted == FOUND else None
 
 
@@ -121,7 +127,9 @@ def read_list(path: Path, raster: Raster) -> FaultList:
         got = f"{path}: {error.strerror or error}"
         raise OptionError(OPTION, expected=expected, got=got, remedy=remedy) from error
     except UnicodeDecodeError as error:
-        raise OptionError(OPTION, expected=expected, got=f"{path}, which is no text", remedy=remedy) from error
+        raise OptionError(
+            OPTION, expected=expected, got=f"{path}, which is no text", remedy=remedy
+        ) from error
     faults = []
     for number, line in enumerate(lines, 1):
         cells = tuple(cell.strip() for cell in line.split(","))
@@ -138,14 +146,23 @@ def _fault(where: str, line: str, cells: tuple[str, ...], raster: Raster) -> Fau
     sizes = raster.width_px, raster.height_px, raster.bands + 1
     expected = "column,row or column,row,band"
     numbers = [_number(cell) for cell in cells]
-    if len(numbers) not in (2, 3) or None in numbers or numbers[:2] == [-1, -1] or numbers[2:] in ([-1], [0]):
+    if (
+        len(numbers) not in (2, 3)
+        or None in numbers
+        or numbers[:2] == [-1, -1]
+        or numbers[2:] in ([-1], [0])
+    ):
         got = repr(line[:40])
-        raise OptionError(OPTION, expected=expected, got=f"{where}: {got}", remedy="correct or delete the line")
+        raise OptionError(
+            OPTION, expected=expected, got=f"{where}: {got}", remedy="correct or delete the line"
+        )
     placed = [number for number in numbers if number is not None]
     if any(number >= size for number, size in zip(placed, sizes, strict=False)):
         image = f"{raster.width_px} columns, {raster.height_px} rows and {raster.bands} bands"
         got = f"{where}: {line.strip()}"
-        raise OptionError(OPTION, expected=f"pixels of an image of {image}", got=got, remedy="count from 0")
+        raise OptionError(
+            OPTION, expected=f"pixels of an image of {image}", got=got, remedy="count from 0"
+        )
     return Fault(*placed)
 
 

@@ -1,7 +1,7 @@
 """Replace faulty detectors' pixels while an image's rows are read, before anything else sees them.
 
-The faults are those of a list, or found in a pass over the whole image before the first row is restored: so the same
-command, resumed or not, replaces the same pixels.
+The faults are those of a list, or found in a pass over the whole image before the first row is
+restored: so the same command, resumed or not, replaces the same pixels.
 """
 
 from collections.abc import Iterator
@@ -22,7 +22,9 @@ REACH_PX = 16
 STRIP_PX = 256
 """Rows that are searched at a time."""
 WRONG_GAIN = 0.05
-"""Gain from which a single column or row is replaced: a smaller one is for an equalisation to correct."""
+"""Gain from which a single column or row is replaced: a smaller one is for an equalisation to
+correct.
+"""
 MANY = 0.01
 """Share of the pixels from which they are no single faults."""
 ONE_SIDED = 1e-3
@@ -35,7 +37,9 @@ WAYS = (
     ((-1, -1), (1, 1), ASLANT),
     ((-1, 1), (1, -1), ASLANT),
 )
-"""Rows and columns of a step to either side, and the weight: along a row, along a column, aslant."""
+"""Rows and columns of a step to either side, and the weight: along a row, along
+a column, aslant.
+"""
 
 
 def faults_of(source: Source, wanted: str, name: str, log: Log) -> FaultList:
@@ -50,7 +54,10 @@ def faults_of(source: Source, wanted: str, name: str, log: Log) -> FaultList:
     if not wanted:
         return FaultList(())
     found = find_faults(source, name) if wanted == FOUND else read_list(Path(wanted), source.raster)
-    log(f"faulty detectors: {found.words} {'found' if wanted == FOUND else 'listed'}, to be interpolated")
+    log(
+        f"faulty detectors: {found.words} {'found' if wanted == FOUND else 'listed'}, to be "
+        "interpolated"
+    )
     return found
 
 
@@ -62,7 +69,8 @@ def fixed(source: Source, faults: FaultList) -> Source:
 def find_faults(source: Source, name: str) -> FaultList:
     """Find dead and wrong pixels, columns and rows in all rows of an image.
 
-    Columns, and rows that are off but not dead, are judged in the strips that `look_at_detectors` reads.
+    Columns, and rows that are off but not dead, are judged in the strips that `look_at_detectors`
+    reads.
 
     Args:
         source: the image.
@@ -83,7 +91,11 @@ def find_faults(source: Source, name: str) -> FaultList:
             raise ImageError(name, expected="few faulty pixels", got=got, remedy=remedy)
     columns = {(fault.column, fault.band) for fault in lines if fault.row < 0}
     rows = {(fault.row, fault.band) for fault in lines if fault.column < 0}
-    alone = {each for each in pixels if (each.column, each.band) not in columns and (each.row, each.band) not in rows}
+    alone = {
+        each
+        for each in pixels
+        if (each.column, each.band) not in columns and (each.row, each.band) not in rows
+    }
     return FaultList(tuple(sorted(lines | alone)))
 
 
@@ -109,15 +121,17 @@ def _found_in_strips(source: Source) -> Iterator[Fault]:
             dead = np.flatnonzero(constant_columns(pixels.T)) + start
             places = wrong_pixels(pixels, steps[band]) + np.array([start, 0])
             yield from (Fault(-1, int(row), number) for row in dead if top <= row < stop)
-            yield from (Fault(int(column), int(row), number) for row, column in places if top <= row < stop)
+            yield from (
+                Fault(int(column), int(row), number) for row, column in places if top <= row < stop
+            )
 
 
 class FixedSource:
     """An image whose faulty pixels are replaced by interpolation between sound neighbours.
 
-    A pixel is interpolated along its row and along its column, between the nearest sound pixels within `REACH_PX`;
-    the shorter way counts more. Where neither has any, the diagonals count. Where no sound pixel is in reach it
-    stays, and so does a missing one.
+    A pixel is interpolated along its row and along its column, between the nearest sound pixels
+    within `REACH_PX`; the shorter way counts more. Where neither has any, the diagonals count.
+    Where no sound pixel is in reach it stays, and so does a missing one.
     """
 
     def __init__(self, source: Source, faults: FaultList) -> None:
@@ -128,7 +142,9 @@ class FixedSource:
         self.veil: Plane | None = source.veil
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), masked where the image is."""
+        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), masked where the
+        image is.
+        """
         raster = self.raster
         if not self.faults.mask(raster, start, stop).any():
             return self._source.read(start, stop)
@@ -151,10 +167,14 @@ class FixedSource:
         """As the image's own, and the rows around with their flags."""
         raster = self.raster
         row_bytes = raster.bands * raster.width_px * (raster.dtype.itemsize + 4)
-        return self._source.held_bytes(rows_px + 2 * REACH_PX) + (rows_px + 2 * REACH_PX) * row_bytes
+        return (
+            self._source.held_bytes(rows_px + 2 * REACH_PX) + (rows_px + 2 * REACH_PX) * row_bytes
+        )
 
 
-def replace_pixels(plane: np.ndarray, bad: np.ndarray, sound: np.ndarray, nodata: float | None = None) -> None:
+def replace_pixels(
+    plane: np.ndarray, bad: np.ndarray, sound: np.ndarray, nodata: float | None = None
+) -> None:
     """Replace pixels of a plane in place.
 
     Args:
@@ -169,13 +189,18 @@ def replace_pixels(plane: np.ndarray, bad: np.ndarray, sound: np.ndarray, nodata
     closest = np.zeros(len(places))
     distance = np.full(len(places), np.inf)
     for one, other, weight in WAYS:
-        (left, near), (right, far) = (_nearest(plane, sound, places, np.array(side)) for side in (one, other))
+        (left, near), (right, far) = (
+            _nearest(plane, sound, places, np.array(side)) for side in (one, other)
+        )
         both = np.isfinite(near) & np.isfinite(far)
         either = np.isfinite(near) | np.isfinite(far)
         single = np.where(near <= far, left, right)
         with np.errstate(invalid="ignore"):
             between = (left * far + right * near) / (near + far)
-        share = np.where(both, 1 / (near + far), np.where(either, ONE_SIDED / np.minimum(near, far), 0)) * weight
+        share = (
+            np.where(both, 1 / (near + far), np.where(either, ONE_SIDED / np.minimum(near, far), 0))
+            * weight
+        )
         total += share * np.where(both, between, single)
         weights += share
         closest = np.where(np.minimum(near, far) < distance, single, closest)
@@ -184,7 +209,9 @@ def replace_pixels(plane: np.ndarray, bad: np.ndarray, sound: np.ndarray, nodata
     result = total[reached] / weights[reached]
     result = (np.rint(result) if plane.dtype.kind in "ui" else result).astype(plane.dtype)
     if nodata is not None:
-        result = np.where(result == plane.dtype.type(nodata), closest[reached].astype(plane.dtype), result)
+        result = np.where(
+            result == plane.dtype.type(nodata), closest[reached].astype(plane.dtype), result
+        )
     rows, columns = places[reached].T
     plane[rows, columns] = result
 
@@ -192,7 +219,9 @@ def replace_pixels(plane: np.ndarray, bad: np.ndarray, sound: np.ndarray, nodata
 def _nearest(
     plane: np.ndarray, sound: np.ndarray, places: np.ndarray, side: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the value of the nearest sound pixel to one side of each place, and how far it is; inf without one."""
+    """Return the value of the nearest sound pixel to one side of each place, and how far it is; inf
+    without one.
+    """
     values = np.zeros(len(places))
     distances = np.full(len(places), np.inf)
     for steps in range(1, REACH_PX + 1):

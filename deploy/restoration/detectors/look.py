@@ -1,8 +1,9 @@
-"""A look for faults of detectors in strips of an image: gains of columns and rows, dead ones, wrong single pixels.
+"""A look for faults of detectors in strips of an image: gains of columns and rows, dead ones, wrong
+single pixels.
 
-Restoration sharpens what stands alone: a column whose gain is off by 1 % comes out off by near 2 %. So `restore`
-warns of it, and `info` shows what was found. Strips over the whole width, spread evenly from top to bottom, are read:
-of a large image `LOOKED_PX` pixels of all bands together.
+Restoration sharpens what stands alone: a column whose gain is off by 1 % comes out off by near 2 %.
+So `restore` warns of it, and `info` shows what was found. Strips over the whole width, spread
+evenly from top to bottom, are read: of a large image `LOOKED_PX` pixels of all bands together.
 """
 
 from collections.abc import Iterator
@@ -87,7 +88,9 @@ def as_floats(raster: Raster, stored: np.ndarray) -> np.ndarray:
 
 
 def value_steps(source: Source) -> list[float]:
-    """Return the step between the values of each band, 0 of floats: 64 of a 10-bit image stored in 16 bits."""
+    """Return the step between the values of each band, 0 of floats: 64 of a 10-bit image stored in
+    16 bits.
+    """
     raster = source.raster
     if raster.dtype.kind == "f":
         return [0.0] * raster.bands
@@ -132,7 +135,9 @@ class _Found:
         self._columns.append(measure_lines(pixels[within], inner))
         rows = []
         for section in _sections(pixels.shape[1]):
-            rows.append(measure_lines(pixels[:, section].T.copy(), valid[:, section].T.copy()).of(within))
+            rows.append(
+                measure_lines(pixels[:, section].T.copy(), valid[:, section].T.copy()).of(within)
+            )
             self._phases.append(measure_phases(pixels[within, section], inner[:, section]))
         self._rows.append(join_blocks(rows))
         self._row_numbers += range(top + within.start, top + within.stop)

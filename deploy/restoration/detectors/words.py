@@ -54,8 +54,10 @@ def _of_band(band: BandFaults) -> Iterator[str]:
     if len(band.pixels):
         places = [f"column {column}, row {row}" for row, column in band.pixels[:NAMED].tolist()]
         yield (
-            f"{_count(len(band.pixels), 'pixel')} of {band.looked_px}, alone as no light is: hot, dead or "
-            f"hit by a particle ({_some(places, len(band.pixels))}); restoration sharpens that; {FIX} such pixels"
+            f"{_count(len(band.pixels), 'pixel')} of {band.looked_px}, alone as no light is: "
+            "hot, dead or "
+            f"hit by a particle ({_some(places, len(band.pixels))}); restoration sharpens that; "
+            f"{FIX} such pixels"
         )
 
 
@@ -65,18 +67,23 @@ def _of_lines(name: str, lines: Stripes) -> Iterator[str]:
         places = [str(line) for line in lines.dead[:NAMED]]
         yield (
             f"{_count(len(lines.dead), f'dead {one}')}, constant where the others vary "
-            f"({one} {_some(places, len(lines.dead))}); restoration sharpens that; {FIX} such {name}"
+            f"({one} {_some(places, len(lines.dead))}); restoration sharpens that; {FIX} such "
+            f"{name}"
         )
     kinds = {True: "gains", False: "offsets", None: "gains or offsets"}[lines.grows_with_level]
     remedy = ", ".join(filter(None, (EQUALISE, EFFECTS[name])))
     if lines.seen and lines.spread is not None:
         worst = f", {one} {lines.off[0].index} by {lines.off[0].gain:+.2%}" if lines.off else ""
-        yield f"the {kinds} of {name} differ by {lines.spread:.2%} rms of the level{worst}; {SHARPENS}: {remedy}"
+        yield (
+            f"the {kinds} of {name} differ by {lines.spread:.2%} rms of the level{worst}; "
+            f"{SHARPENS}: {remedy}"
+        )
     elif lines.off:
         places = [f"{one} {line.index} by {line.gain:+.2%}" for line in lines.off[:NAMED]]
         verb = "is" if len(lines.off) == 1 else "are"
         yield (
-            f"{_count(len(lines.off), one)} {verb} off in gain or offset ({_some(places, len(lines.off))}); "
+            f"{_count(len(lines.off), one)} {verb} off in gain or offset "
+            f"({_some(places, len(lines.off))}); "
             f"{SHARPENS}: {EQUALISE}, or list them for {OPTION}"
         )
 
@@ -117,8 +124,12 @@ def _figures(band: BandFaults) -> dict[str, Figure]:
     return {
         **{f"{name} differ by": _spread(found, rms) for name, found in lines.items()},
         "2 x 2 pattern": measured(100 * pattern, "%", f"the strongest of three, {rms}"),
-        "lines off": measured(sum(len(each.off) for each in lines.values()), "1", f"single columns and rows, {how}"),
-        "dead lines": measured(sum(len(each.dead) for each in lines.values()), "1", f"columns and rows, {how}"),
+        "lines off": measured(
+            sum(len(each.off) for each in lines.values()), "1", f"single columns and rows, {how}"
+        ),
+        "dead lines": measured(
+            sum(len(each.dead) for each in lines.values()), "1", f"columns and rows, {how}"
+        ),
         "wrong pixels": measured(len(band.pixels), "1", f"single ones, {how}"),
     }
 

@@ -1,8 +1,9 @@
 """What restores a tile: a network, the facts of an image, and the two steps around the network.
 
-`Restorer.read` takes a strip of rows from a `Source`, `Restorer.tile` runs the network on one tile of it, at each
-exposure that its pixels ask for, and `Restorer.finish` makes the restored pixels agree with the raw ones and stores
-them. `deploy.restoration.tiles.rows` calls these for all tiles of an image.
+`Restorer.read` takes a strip of rows from a `Source`, `Restorer.tile` runs the network on one tile
+of it, at each exposure that its pixels ask for, and `Restorer.finish` makes the restored pixels
+agree with the raw ones and stores them. `deploy.restoration.tiles.rows` calls these for all tiles
+of an image.
 """
 
 from dataclasses import dataclass
@@ -31,7 +32,8 @@ Window = tuple[slice, slice, slice]
 class Tile(NamedTuple):
     """The kept pixels of a tile, (bands, h, w), and what was seen of them.
 
-    Of `Restorer.tile` they are float32, NaN where a pixel is missing; of `Restorer.finish` as stored.
+    Of `Restorer.tile` they are float32, NaN where a pixel is missing; of `Restorer.finish` as
+    stored.
     """
 
     pixels: np.ndarray
@@ -40,10 +42,12 @@ class Tile(NamedTuple):
 
 @dataclass(frozen=True)
 class Strip:
-    """Rows of an image from `top` on: `pixels` (bands, rows, width) as stored, and which are missing.
+    """Rows of an image from `top` on: `pixels` (bands, rows, width) as stored, and which are
+    missing.
 
-    `missing` is bool of the same shape, or None where no pixel is missing; `above` says whether a known pixel is
-    above full scale. `left` is the first column, where the strip does not begin at the image's border.
+    `missing` is bool of the same shape, or None where no pixel is missing; `above` says whether a
+    known pixel is above full scale. `left` is the first column, where the strip does not begin at
+    the image's border.
     """
 
     top: int
@@ -66,12 +70,12 @@ class Restorer:
         raster: the image's facts.
         networks: the network at its exposures; one for all groups of bands, or one for each.
         full_scale: the pixel value that is 1.0 to the network.
-        tiling: how the network meets an image; missing pixels are filled from no farther away than its halo, so what
-            lies beyond, filled or not, is nothing that a known pixel sees.
+        tiling: how the network meets an image; missing pixels are filled from no farther away than
+            its halo, so what lies beyond, filled or not, is nothing that a known pixel sees.
         name: of the image, for messages.
         clips: whether values above full scale are clipped and counted; else they are an error.
-        consistency: the consistency step, one for all bands or one for each; empty where it is left out, None for a
-            band without it.
+        consistency: the consistency step, one for all bands or one for each; empty where it is left
+            out, None for a band without it.
     """
 
     raster: Raster
@@ -100,7 +104,9 @@ class Restorer:
         """The strip that tiles from row `start` to `stop` (excluded) need."""
         start = max(start - self.margin_px, 0)
         stop = min(stop + self.margin_px, self.raster.height_px)
-        return checked_strip(self.raster, start, source.read(start, stop), self.full_scale, self.name, self.clips)
+        return checked_strip(
+            self.raster, start, source.read(start, stop), self.full_scale, self.name, self.clips
+        )
 
     def tile(self, strip: Strip, group: int, rows: Span, columns: Span) -> Tile:
         """Run the network of one group of bands on the tile that reads `rows` and `columns`.
@@ -121,7 +127,13 @@ class Restorer:
         return Tile(np.where(missing, np.float32(np.nan), restored.pixels), tally)
 
     def finish(
-        self, strip: Strip, restored: np.ndarray, at: tuple[int, int], group: int, rows: Span, columns: Span
+        self,
+        strip: Strip,
+        restored: np.ndarray,
+        at: tuple[int, int],
+        group: int,
+        rows: Span,
+        columns: Span,
     ) -> Tile:
         """Take the consistency step and store the kept pixels of a tile.
 
@@ -149,11 +161,17 @@ class Restorer:
         known = None if missing is None else ~missing
         tally = Tally.of(raw, self._shares(kept), seen, known)
         if self.consistency:
-            squared = float(np.nansum(np.square((kept - given) / self.full_scale), dtype=np.float64))
+            squared = float(
+                np.nansum(np.square((kept - given) / self.full_scale), dtype=np.float64)
+            )
             tally = tally.changed_from(Tally.of(raw, self._shares(given), seen, known), squared)
-        result = as_stored(self.raster, kept if missing is None else np.nan_to_num(kept), self.full_scale)
+        result = as_stored(
+            self.raster, kept if missing is None else np.nan_to_num(kept), self.full_scale
+        )
         if missing is not None:
-            result = np.where(missing, self._unrestored(strip, missing, bands, rows, columns), result)
+            result = np.where(
+                missing, self._unrestored(strip, missing, bands, rows, columns), result
+            )
         return Tile(result, tally)
 
     def _shares(self, pixels: np.ndarray) -> np.ndarray:
@@ -161,7 +179,13 @@ class Restorer:
         return np.asarray(np.nan_to_num(pixels).astype(np.float64) / self.full_scale)
 
     def _change(
-        self, strip: Strip, restored: np.ndarray, at: tuple[int, int], bands: slice, rows: Span, columns: Span
+        self,
+        strip: Strip,
+        restored: np.ndarray,
+        at: tuple[int, int],
+        bands: slice,
+        rows: Span,
+        columns: Span,
     ) -> np.ndarray:
         """What the consistency step adds to the kept pixels, (bands, h, w)."""
         top = max(rows.keep_start - RAW_REACH_PX, 0)
@@ -175,8 +199,13 @@ class Restorer:
             Placed(self.raster.height_px, at[0], rows.keep_start, rows.keep_stop),
             Placed(self.raster.width_px, at[1], columns.keep_start, columns.keep_stop),
         )
-        steps = [self.consistency[band % len(self.consistency)] for band in range(bands.start, bands.stop)]
-        change = np.zeros((len(steps), *(placed.keep_stop - placed.keep_start for placed in sides)), np.float32)
+        steps = [
+            self.consistency[band % len(self.consistency)]
+            for band in range(bands.start, bands.stop)
+        ]
+        change = np.zeros(
+            (len(steps), *(placed.keep_stop - placed.keep_start for placed in sides)), np.float32
+        )
         for number, step in enumerate(steps):
             if step is not None:
                 change[number] = step.correction(raw[number], restored[number], *sides, (top, left))
@@ -199,8 +228,12 @@ class Restorer:
             missing = np.repeat(missing.any(axis=0, keepdims=True), tiling.channels_out, axis=0)
         return missing.repeat(scale, axis=1).repeat(scale, axis=2) if scale > 1 else missing
 
-    def _unrestored(self, strip: Strip, missing: np.ndarray, bands: slice, rows: Span, columns: Span) -> np.ndarray:
-        """What missing pixels are stored as: as they were, or the nodata value where bands do not correspond."""
+    def _unrestored(
+        self, strip: Strip, missing: np.ndarray, bands: slice, rows: Span, columns: Span
+    ) -> np.ndarray:
+        """What missing pixels are stored as: as they were, or the nodata value where bands do not
+        correspond.
+        """
         tiling = self.tiling
         scale = int(self.tiling.scale)
         if tiling.channels_in != tiling.channels_out:
@@ -211,31 +244,49 @@ class Restorer:
         return stored.repeat(scale, axis=1).repeat(scale, axis=2) if scale > 1 else stored
 
     def _window(self, strip: Strip, bands: slice, rows: Span, columns: Span) -> np.ndarray:
-        """What the network sees of a tile, (bands, h, w): missing pixels filled, extended to the lattice."""
+        """What the network sees of a tile, (bands, h, w): missing pixels filled, extended to the
+        lattice.
+        """
         if strip.missing is None:
             down = slice(rows.start - strip.top, rows.stop - strip.top)
-            window = strip.pixels[bands, down, columns.start - strip.left : columns.stop - strip.left]
+            window = strip.pixels[
+                bands, down, columns.start - strip.left : columns.stop - strip.left
+            ]
         else:
             window = self._filled(strip, strip.missing, bands, rows, columns)
         if strip.above:
             window = np.minimum(window, window.dtype.type(self.full_scale))
-        lack = rows.stop - rows.start - window.shape[1], columns.stop - columns.start - window.shape[2]
-        return np.pad(window, ((0, 0), (0, lack[0]), (0, lack[1])), mode="edge") if any(lack) else window
+        lack = (
+            rows.stop - rows.start - window.shape[1],
+            columns.stop - columns.start - window.shape[2],
+        )
+        return (
+            np.pad(window, ((0, 0), (0, lack[0]), (0, lack[1])), mode="edge")
+            if any(lack)
+            else window
+        )
 
-    def _filled(self, strip: Strip, flags: np.ndarray, bands: slice, rows: Span, columns: Span) -> np.ndarray:
+    def _filled(
+        self, strip: Strip, flags: np.ndarray, bands: slice, rows: Span, columns: Span
+    ) -> np.ndarray:
         """A window with its missing pixels filled, as far as the image goes."""
         radius_px = self.tiling.halo_px
-        # Beyond the last pixel a slice ends by itself; before the first one it would begin at the other end.
+        # Beyond the last pixel a slice ends by itself; before the first one it would begin at the
+        # other end.
         left = max(columns.start - strip.left - radius_px, 0)
         right = columns.stop - strip.left + radius_px
         top = max(rows.start - radius_px, 0) - strip.top
         bottom = rows.stop + radius_px - strip.top
         around = (bands, slice(max(top, 0), bottom), slice(left, right))
         planes = zip(strip.pixels[around], flags[around], strict=True)
-        filled = np.stack([fill_from_nearest(pixels, missing, radius_px) for pixels, missing in planes])
+        filled = np.stack(
+            [fill_from_nearest(pixels, missing, radius_px) for pixels, missing in planes]
+        )
         above = rows.start - strip.top - max(top, 0)
         aside = columns.start - strip.left - left
-        return filled[:, above : above + rows.stop - rows.start, aside : aside + columns.stop - columns.start]
+        return filled[
+            :, above : above + rows.stop - rows.start, aside : aside + columns.stop - columns.start
+        ]
 
 
 def _within(span: Span) -> slice:
@@ -243,7 +294,13 @@ def _within(span: Span) -> slice:
 
 
 def checked_strip(
-    raster: Raster, top: int, pixels: np.ndarray, full_scale: float, name: str, clips: bool = False, left: int = 0
+    raster: Raster,
+    top: int,
+    pixels: np.ndarray,
+    full_scale: float,
+    name: str,
+    clips: bool = False,
+    left: int = 0,
 ) -> Strip:
     """Rows from `top` on, (bands, rows, width) as stored, and which of their pixels are missing."""
     missing = raster.missing(pixels) if raster.may_miss else None
@@ -254,17 +311,22 @@ def checked_strip(
     low, high = (float(extreme(pixels, where=known, initial=0)) for extreme in (np.min, np.max))
     if low < 0 or (high > full_scale and not (clips and np.isfinite(high))):
         where = f"{name}, rows {top} to {top + pixels.shape[1] - 1}"
-        remedy = "give the sensor's highest number as `full_scale`, or mark missing pixels as nodata"
+        remedy = (
+            "give the sensor's highest number as `full_scale`, or mark missing pixels as nodata"
+        )
         got = f"values from {low:g} to {high:g}"
         remedy = remedy_outside(low, high, remedy)
-        raise ImageError(where, expected=f"digital numbers of 0 to {full_scale:g}", got=got, remedy=remedy)
+        raise ImageError(
+            where, expected=f"digital numbers of 0 to {full_scale:g}", got=got, remedy=remedy
+        )
     return Strip(top, pixels, missing, high > full_scale, left)
 
 
 def as_stored(raster: Raster, restored: np.ndarray, full_scale: float) -> np.ndarray:
     """Restored pixels of any shape in the output's type: rounded where that is an integer.
 
-    A restored pixel that falls on the nodata value, which would read as missing, takes the number beside it.
+    A restored pixel that falls on the nodata value, which would read as missing, takes the number
+    beside it.
     """
     result = np.rint(restored) if raster.out_dtype.kind == "u" else restored
     result = result.astype(raster.out_dtype)

@@ -38,7 +38,8 @@ class ExposedNetwork:
     """A network for one exposure or several.
 
     Attributes:
-        infers: the network ready to run, by factor: the one for a sensor of so many times the gain. 1 is among them.
+        infers: the network ready to run, by factor: the one for a sensor of so many times the gain.
+            1 is among them.
         radius_px: receptive radius, within which the brightest pixel decides.
         offset: the pixel value of the dark.
     """
@@ -63,7 +64,9 @@ class ExposedNetwork:
         inside = (slice(None), *(slice(each.start * scale, each.stop * scale) for each in kept))
         if len(self.infers) == 1:
             restored = restore_window(window, self.infers[1], full_scale)
-            _require_shape(restored, (tiling.channels_out, *(side * scale for side in window.shape[1:])))
+            _require_shape(
+                restored, (tiling.channels_out, *(side * scale for side in window.shape[1:]))
+            )
             return Exposed(restored[inside], 1, 0)
         image = np.asarray(window[0], np.float32)
         chosen = choose_factors(image, self.infers, self.radius_px, full_scale, self.offset)[kept]
@@ -79,8 +82,11 @@ class ExposedNetwork:
         if factor == 1:
             return restore_window(image[None], self.infers[1], full_scale)
         offset = np.float32(self.offset)
-        # What exceeds full scale lies beyond the network's reach of every pixel that takes this factor.
-        brighter = np.clip((image - offset) * np.float32(factor) + offset, 0, np.float32(full_scale))
+        # What exceeds full scale lies beyond the network's reach of every pixel that takes this
+        # factor.
+        brighter = np.clip(
+            (image - offset) * np.float32(factor) + offset, 0, np.float32(full_scale)
+        )
         restored = restore_window(brighter[None], self.infers[factor], full_scale)
         return np.asarray((restored - offset) / np.float32(factor) + offset)
 
@@ -130,6 +136,11 @@ def restore_window(dn: np.ndarray, infer: Infer, full_scale: float = MAX_DN) -> 
     with np.errstate(over="ignore"):  # what overflows is refused
         restored = infer(image)[0] * np.float32(full_scale)
     if not np.isfinite(restored).all():
-        raise ImageError("restored tile", expected="finite pixels", got="NaN", remedy="check the model with 'gate'")
+        raise ImageError(
+            "restored tile",
+            expected="finite pixels",
+            got="NaN",
+            remedy="check the model with 'gate'",
+        )
     restored = np.clip(restored, 0, np.float32(full_scale))
     return np.asarray(restored[0] if dn.ndim == 2 else restored)

@@ -1,7 +1,7 @@
 """A lazy array of Dask restored tile by tile, on this machine or on the workers of a cluster.
 
-A tile is two tasks: the network on its window, and what stores its pixels, once the network has run on the tiles that
-the consistency step reaches.
+A tile is two tasks: the network on its window, and what stores its pixels, once the network has run
+on the tiles that the consistency step reaches.
 """
 
 from dataclasses import dataclass
@@ -51,9 +51,13 @@ class Task:
 
     def restorer(self, window: np.ndarray) -> Restorer:
         """What restores the tiles of a window of pixels (bands, h, w)."""
-        extent = self.raster.extent(window)._replace(whole=True)  # a tile alone is no proof of radiances
+        extent = self.raster.extent(window)._replace(
+            whole=True
+        )  # a tile alone is no proof of radiances
         full_scale = full_scale_of(NAME, self.raster, [extent], self.asked, self.bits).value
-        return Restorer(self.raster, self.networks, full_scale, self.tiling, NAME, consistency=self.consistency)
+        return Restorer(
+            self.raster, self.networks, full_scale, self.tiling, NAME, consistency=self.consistency
+        )
 
 
 def _packed(options: Options, network: onnx.ModelProto) -> Packed:
@@ -61,7 +65,8 @@ def _packed(options: Options, network: onnx.ModelProto) -> Packed:
 
 
 def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
-    """A lazy (bands, H, W) array of Dask; errors in options and model come at once, in pixels when it is computed.
+    """A lazy (bands, H, W) array of Dask; errors in options and model come at once, in pixels when
+    it is computed.
 
     A tile is finished from its own pixels and those that the network gave of the tiles around it.
     """
@@ -69,19 +74,25 @@ def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
     delayed: Any = import_module("dask").delayed
     network = load_onnx(options.model)
     plan = plan_for(network, raster.shape, options)
-    # What the type alone decides comes at once. Pixels may only lead to a refusal later, not to another scale.
+    # What the type alone decides comes at once. Pixels may only lead to a refusal later, not to
+    # another scale.
     full_scale = full_scale_of(NAME, raster, (), options.full_scale, options.sensor_bits).value
     about = options, raster, plan.tiling, full_scale
     packed = partial(_packed, options)
     exposed = exposed_networks([packed(network)], *about, packed)
     steps, _ = consistency_steps(*about)
-    task = delayed(Task(raster, exposed, options.full_scale, options.sensor_bits, plan.tiling, steps))
+    task = delayed(
+        Task(raster, exposed, options.full_scale, options.sensor_bits, plan.tiling, steps)
+    )
     reach_px = REACH_PX if steps else 0
     tile = delayed(restore_tile)
     finish = delayed(finish_tile)
     groups = range(plan.groups)
     margin_px = max(raster.fill_margin_px(plan.radius_px), RAW_REACH_PX if steps else 0)
-    read = {place: _read(bands, plan, margin_px, *place) for place in product(groups, plan.rows, plan.columns)}
+    read = {
+        place: _read(bands, plan, margin_px, *place)
+        for place in product(groups, plan.rows, plan.columns)
+    }
     restored = {place: tile(task, *read[place], *place[1:]) for place in read}
 
     def block(group: int, row: Span, column: Span) -> Any:
@@ -93,17 +104,28 @@ def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
         sides = ((span.keep_stop - span.keep_start) * plan.scale for span in (row, column))
         return da.from_delayed(finished, (plan.tiling.channels_out, *sides), raster.out_dtype)
 
-    return da.block([[[block(g, row, column) for column in plan.columns] for row in plan.rows] for g in groups])
+    return da.block(
+        [[[block(g, row, column) for column in plan.columns] for row in plan.rows] for g in groups]
+    )
 
 
 def _near(other: Span, span: Span, reach_px: int) -> bool:
-    """Whether what is kept of one tile lies within reach of what is kept of another, along one side."""
-    return other.keep_stop > span.keep_start - reach_px and other.keep_start < span.keep_stop + reach_px
+    """Whether what is kept of one tile lies within reach of what is kept of another, along one
+    side.
+    """
+    return (
+        other.keep_stop > span.keep_start - reach_px
+        and other.keep_start < span.keep_stop + reach_px
+    )
 
 
-def _read(bands: Any, plan: Plan, margin_px: int, group: int, row: Span, column: Span) -> tuple[Any, int, int]:
+def _read(
+    bands: Any, plan: Plan, margin_px: int, group: int, row: Span, column: Span
+) -> tuple[Any, int, int]:
     """What a tile reads: a lazy window (bands, h, w), and the row and column of its first pixel."""
-    rows, columns = (slice(max(span.start - margin_px, 0), span.stop + margin_px) for span in (row, column))
+    rows, columns = (
+        slice(max(span.start - margin_px, 0), span.stop + margin_px) for span in (row, column)
+    )
     count = plan.tiling.channels_in
     pixels = bands[group * count : (group + 1) * count, rows, columns]
     # One task for both tasks of the tile: chunks are read once.
@@ -114,8 +136,12 @@ def _itself(pixels: np.ndarray) -> np.ndarray:
     return pixels
 
 
-def restore_tile(task: Task, window: np.ndarray, top: int, left: int, row: Span, column: Span) -> np.ndarray:
-    """Run the network on one tile: the kept pixels (bands, h, w) float32, of a window that begins at (top, left)."""
+def restore_tile(
+    task: Task, window: np.ndarray, top: int, left: int, row: Span, column: Span
+) -> np.ndarray:
+    """Run the network on one tile: the kept pixels (bands, h, w) float32, of a window that begins
+    at (top, left).
+    """
     restorer = task.restorer(window)
     strip = checked_strip(task.raster, top, window, restorer.full_scale, NAME, left=left)
     return restorer.tile(strip, 0, row, column).pixels

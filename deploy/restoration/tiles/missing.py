@@ -4,18 +4,24 @@ import numpy as np
 
 
 def fill_from_nearest(pixels: np.ndarray, missing: np.ndarray, reach_px: int) -> np.ndarray:
-    """(h, w) pixels where each `missing` one is a copy of a known one at most `reach_px` rows and columns away.
+    """(h, w) pixels where each `missing` one is a copy of a known one at most `reach_px` rows and
+    columns away.
 
-    The nearest known pixel of the row, then the nearest filled one of the column; 0 where there is none in reach. So
-    a filled pixel depends on nothing farther away, and a window gives just what the whole image gives.
+    The nearest known pixel of the row, then the nearest filled one of the column; 0 where there is
+    none in reach. So a filled pixel depends on nothing farther away, and a window gives just what
+    the whole image gives.
     """
     filled, missing = _along_rows(pixels, missing, reach_px)
     filled, missing = _along_rows(filled.T, missing.T, reach_px)
     return np.asarray(np.where(missing, 0, filled).T)
 
 
-def _along_rows(pixels: np.ndarray, missing: np.ndarray, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Filled pixels, and where none was in reach; of two at the same distance the left one is taken."""
+def _along_rows(
+    pixels: np.ndarray, missing: np.ndarray, reach_px: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Filled pixels, and where none was in reach; of two at the same distance the left one is
+    taken.
+    """
     width = pixels.shape[1]
     far = width + reach_px + 1  # out of reach from every pixel: no known one on that side
     here = np.arange(width)

@@ -1,9 +1,11 @@
-"""The one tile loop: whatever restores an image by a network, from a file or an array, runs what stands here.
+"""The one tile loop: whatever restores an image by a network, from a file or an array, runs what
+stands here.
 
-A `Source` gives a strip of rows, `Restorer.tile` runs the network on one tile of it, and `Restorer.finish` takes the
-consistency step once the tiles around are there. `restore_rows` yields finished rows of tiles in order: the next
-strip is read ahead, and several tiles are in work at a time. `restore_array`, `restore_floats` and `restore_dn`
-gather the rows of an image in memory; `deploy.restoration.run` writes those of a file.
+A `Source` gives a strip of rows, `Restorer.tile` runs the network on one tile of it, and
+`Restorer.finish` takes the consistency step once the tiles around are there. `restore_rows` yields
+finished rows of tiles in order: the next strip is read ahead, and several tiles are in work at a
+time. `restore_array`, `restore_floats` and `restore_dn` gather the rows of an image in memory;
+`deploy.restoration.run` writes those of a file.
 """
 
 from collections import deque
@@ -27,11 +29,15 @@ from beers_deploy.restoration.tiles.engine import Restorer, Strip, Tile
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 
 Steps = tuple[Consistency | None, ...]
-"""The consistency step, one for all bands or one for each; empty where it is left out, None for a band without it."""
+"""The consistency step, one for all bands or one for each; empty where it is left out, None for a
+band without it.
+"""
 
 
 class RestoredRow(NamedTuple):
-    """A row of tiles: its `span` in the image, restored `pixels` (bands, rows, width), and what was seen of them."""
+    """A row of tiles: its `span` in the image, restored `pixels` (bands, rows, width), and what was
+    seen of them.
+    """
 
     span: Span
     pixels: np.ndarray
@@ -39,7 +45,9 @@ class RestoredRow(NamedTuple):
 
 
 class NetworkRow(NamedTuple):
-    """A row of tiles as the network gave it: `pixels` (bands, rows, width) float32, NaN where they are missing."""
+    """A row of tiles as the network gave it: `pixels` (bands, rows, width) float32, NaN where they
+    are missing.
+    """
 
     span: Span
     strip: Strip
@@ -80,23 +88,32 @@ class HeldRows:
         while self.parts and self.top + self.parts[0].shape[1] <= row:
             self.top += self.parts.popleft().shape[1]
         if self.parts and self.top < row:
-            self.parts[0] = self.parts[0][:, row - self.top :].copy()  # or the whole of it would stay in memory
+            self.parts[0] = self.parts[0][
+                :, row - self.top :
+            ].copy()  # or the whole of it would stay in memory
             self.top = row
 
 
 def restore_rows(
-    source: Source, plan: Plan, restorer: Restorer, rows: Sequence[Span], tick: Callable[[], None], at_once: int = 1
+    source: Source,
+    plan: Plan,
+    restorer: Restorer,
+    rows: Sequence[Span],
+    tick: Callable[[], None],
+    at_once: int = 1,
 ) -> Generator[RestoredRow, None, None]:
     """Restore rows of tiles in order, `at_once` tiles at a time; `tick` is called once a tile.
 
-    The network also runs on rows of tiles before the first one, as far as the consistency step reaches.
+    The network also runs on rows of tiles before the first one, as far as the consistency step
+    reaches.
     """
     if not rows:
         return
     reach_px = restorer.reach_px
     first = rows[0].keep_start
     wanted = rows_to_run(plan, restorer, rows)
-    # A single reader, since a source keeps what it decoded for the rows before, for the next ones to take.
+    # A single reader, since a source keeps what it decoded for the rows before, for the next ones
+    # to take.
     with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(at_once) as pool:
         try:
             waiting = deque[NetworkRow]()
@@ -108,12 +125,16 @@ def restore_rows(
                 held.add(row)
                 if first <= row.span.keep_start < rows[-1].keep_stop:
                     waiting.append(row)
-                while waiting and held.bottom >= min(waiting[0].span.keep_stop + reach_px, plan.height_px):
+                while waiting and held.bottom >= min(
+                    waiting[0].span.keep_stop + reach_px, plan.height_px
+                ):
                     yield _finished(waiting.popleft(), held, plan, restorer, pool)
                     next_row = waiting[0].span.keep_start if waiting else held.bottom
                     held.forget_above(next_row - reach_px)
         finally:
-            pool.shutdown(cancel_futures=True)  # or the tiles of two rows would still be restored after an error
+            pool.shutdown(
+                cancel_futures=True
+            )  # or the tiles of two rows would still be restored after an error
 
 
 def rows_to_run(plan: Plan, restorer: Restorer, rows: Sequence[Span]) -> list[Span]:
@@ -133,14 +154,19 @@ def _network_rows(
     pools: tuple[Executor, Executor],
     tick: Callable[[], None],
 ) -> Iterator[NetworkRow]:
-    """Run the network on rows of tiles. A row is begun before the one before it is finished, so no thread waits."""
+    """Run the network on rows of tiles.
+
+    A row is begun before the one before it is finished, so no thread waits.
+    """
     reader, pool = pools
     coming = [reader.submit(restorer.read, source, row.start, row.stop) for row in rows[:1]]
     begun: deque[tuple[Span, Strip, Iterator[Tile]]] = deque()
     for number, row in enumerate(rows):
         strip = coming.pop().result()
         following = rows[number + 1 : number + 2]
-        coming += [reader.submit(restorer.read, source, each.start, each.stop) for each in following]
+        coming += [
+            reader.submit(restorer.read, source, each.start, each.stop) for each in following
+        ]
         begun.append((row, strip, _tiles(strip, row, plan, restorer, pool)))
         if len(begun) > 1:
             yield _network_row(*begun.popleft(), plan, tick)
@@ -148,19 +174,26 @@ def _network_rows(
         yield _network_row(*begun.popleft(), plan, tick)
 
 
-def _tiles(strip: Strip, row: Span, plan: Plan, restorer: Restorer, pool: Executor) -> Iterator[Tile]:
+def _tiles(
+    strip: Strip, row: Span, plan: Plan, restorer: Restorer, pool: Executor
+) -> Iterator[Tile]:
     """The tiles of one row, in the order of `places`."""
     return pool.map(lambda place: restorer.tile(strip, place[0], row, place[1]), places(plan))
 
 
-def _network_row(row: Span, strip: Strip, tiles: Iterable[Tile], plan: Plan, tick: Callable[[], None]) -> NetworkRow:
+def _network_row(
+    row: Span, strip: Strip, tiles: Iterable[Tile], plan: Plan, tick: Callable[[], None]
+) -> NetworkRow:
     pixels = np.empty(
-        (plan.out_shape[0], (row.keep_stop - row.keep_start) * plan.scale, plan.out_shape[2]), np.float32
+        (plan.out_shape[0], (row.keep_stop - row.keep_start) * plan.scale, plan.out_shape[2]),
+        np.float32,
     )
     return NetworkRow(row, strip, pixels, _gathered(tiles, pixels, plan, tick))
 
 
-def _finished(row: NetworkRow, held: HeldRows, plan: Plan, restorer: Restorer, pool: Executor) -> RestoredRow:
+def _finished(
+    row: NetworkRow, held: HeldRows, plan: Plan, restorer: Restorer, pool: Executor
+) -> RestoredRow:
     """Finish a row of tiles, tile by tile, once all that they need is held."""
     count = plan.tiling.channels_out
     reach_px = restorer.reach_px
@@ -173,7 +206,9 @@ def _finished(row: NetworkRow, held: HeldRows, plan: Plan, restorer: Restorer, p
         if not reach_px:
             across = slice(columns.keep_start * plan.scale, columns.keep_stop * plan.scale)
             at = row.span.keep_start, columns.keep_start
-            return restorer.finish(row.strip, row.pixels[bands, :, across], at, group, row.span, columns)
+            return restorer.finish(
+                row.strip, row.pixels[bands, :, across], at, group, row.span, columns
+            )
         left = max(columns.keep_start - reach_px, 0)
         around = held.window(bands, rows, slice(left, columns.keep_stop + reach_px))
         return restorer.finish(row.strip, around, (top, left), group, row.span, columns)
@@ -183,7 +218,9 @@ def _finished(row: NetworkRow, held: HeldRows, plan: Plan, restorer: Restorer, p
     return RestoredRow(row.span, pixels, tally)
 
 
-def _gathered(tiles: Iterable[Tile], pixels: np.ndarray, plan: Plan, tick: Callable[[], None]) -> Tally:
+def _gathered(
+    tiles: Iterable[Tile], pixels: np.ndarray, plan: Plan, tick: Callable[[], None]
+) -> Tally:
     """Put the tiles of a row into `pixels` (bands, rows, width); return what was seen of all."""
     tally = Tally()
     count = plan.tiling.channels_out
@@ -196,12 +233,18 @@ def _gathered(tiles: Iterable[Tile], pixels: np.ndarray, plan: Plan, tick: Calla
 
 
 def places(plan: Plan) -> list[tuple[int, Span]]:
-    """Group of bands and columns of every tile in a row of tiles, in the order in which they are restored."""
+    """Group of bands and columns of every tile in a row of tiles, in the order in which they are
+    restored.
+    """
     return list(product(range(plan.groups), plan.columns))
 
 
 def restore_array(
-    source: Source, plan: Plan, restorer: Restorer, at_once: int = 1, look: Callable[[Tally], object] | None = None
+    source: Source,
+    plan: Plan,
+    restorer: Restorer,
+    at_once: int = 1,
+    look: Callable[[Tally], object] | None = None,
 ) -> np.ndarray:
     """Restore all rows of an image: the plan's `out_shape` of the raster's `out_dtype`.
 
@@ -223,16 +266,23 @@ def restore_array(
 
 
 def restore_floats(
-    dn: np.ndarray, network: Infer | ExposedNetwork, plan: Plan, max_dn: float = MAX_DN, consistency: Steps = ()
+    dn: np.ndarray,
+    network: Infer | ExposedNetwork,
+    plan: Plan,
+    max_dn: float = MAX_DN,
+    consistency: Steps = (),
 ) -> np.ndarray:
-    """Restore (H, W) digital numbers of 0 to `max_dn` to float32, not rounded: what `restore` writes of floats.
+    """Restore (H, W) digital numbers of 0 to `max_dn` to float32, not rounded: what `restore`
+    writes of floats.
 
     NaN is a missing pixel, and stays.
     """
     if plan.out_shape != (1, *dn.shape):
         got = f"one of {times(plan.out_shape)}"
         remedy = "restore files with it, or arrays by beers_deploy.library"
-        raise ModelError("ONNX model", expected=f"a result of {times(dn.shape)}", got=got, remedy=remedy)
+        raise ModelError(
+            "ONNX model", expected=f"a result of {times(dn.shape)}", got=got, remedy=remedy
+        )
     pixels = np.asarray(dn, np.float32)[None]
     _, height_px, width_px = pixels.shape
     raster = Raster(1, height_px, width_px, pixels.dtype)
@@ -242,7 +292,13 @@ def restore_floats(
 
 
 def restore_dn(
-    dn: np.ndarray, network: Infer | ExposedNetwork, plan: Plan, max_dn: float = MAX_DN, consistency: Steps = ()
+    dn: np.ndarray,
+    network: Infer | ExposedNetwork,
+    plan: Plan,
+    max_dn: float = MAX_DN,
+    consistency: Steps = (),
 ) -> np.ndarray:
-    """Restore (H, W) digital numbers of 0 to `max_dn` to whole ones, float32: what `restore` writes of integers."""
+    """Restore (H, W) digital numbers of 0 to `max_dn` to whole ones, float32: what `restore` writes
+    of integers.
+    """
     return np.asarray(np.rint(restore_floats(dn, network, plan, max_dn, consistency)))

@@ -1,11 +1,13 @@
-"""A sensor profile from raw frames of the sensor's own: what `characterise` does between options and TOML.
+"""A sensor profile from raw frames of the sensor's own: what `characterise` does between options
+and TOML.
 
 - `frames`: which frames, what one digital number is, where the dark lies
 - `instrument`: noise and MTF, with intervals
 - `profile`: the TOML file
 
-Gain, ground sampling distance, black level, and bits unless pixels are clipped at full scale, are asked for or
-assumed. Where no edge gives an MTF, the user's word or an assumption stands in its place, marked so.
+Gain, ground sampling distance, black level, and bits unless pixels are clipped at full scale, are
+asked for or assumed. Where no edge gives an MTF, the user's word or an assumption stands in its
+place, marked so.
 """
 
 import math
@@ -28,7 +30,14 @@ from beers_deploy.studies.characterise.frames import cut_box, open_frames
 from beers_deploy.studies.characterise.instrument import Mtf, measure_mtf, measure_noise, snr_at
 from beers_deploy.studies.characterise.profile import PARTS, Characterised, profile_toml
 
-__all__ = ["Characterised", "MeasuredSensor", "Stated", "characterise", "characterize", "profile_toml"]
+__all__ = [
+    "Characterised",
+    "MeasuredSensor",
+    "Stated",
+    "characterise",
+    "characterize",
+    "profile_toml",
+]
 
 FULL_SCALE_RADIANCE = 400.0
 """W/m2/sr/um, where no gain is given."""
@@ -55,10 +64,17 @@ class Stated:
     def __post_init__(self) -> None:
         for option, value in (("gain", self.gain), ("gsd", self.gsd_m)):
             if value is not None and not 0 < value < math.inf:
-                raise OptionError(option, expected="a finite number above 0", got=f"{value:g}", remedy="correct it")
+                raise OptionError(
+                    option,
+                    expected="a finite number above 0",
+                    got=f"{value:g}",
+                    remedy="correct it",
+                )
 
 
-def characterise(images: Sequence[Path], edges: Sequence[str] = (), stated: Stated | None = None) -> Characterised:
+def characterise(
+    images: Sequence[Path], edges: Sequence[str] = (), stated: Stated | None = None
+) -> Characterised:
     """Measure a sensor on its own frames.
 
     Args:
@@ -75,7 +91,9 @@ def characterise(images: Sequence[Path], edges: Sequence[str] = (), stated: Stat
         mtf = measure_mtf(frames, regions, noise.model)
     gain = stated.gain or frames.full_scale_dn / FULL_SCALE_RADIANCE
     low, high = (snr_at(noise.model, frames.full_scale_dn / part, gain) for part in PARTS)
-    return Characterised(frames, noise, mtf, (low, high), gain, stated.gain is not None, stated.gsd_m, stated.mtf)
+    return Characterised(
+        frames, noise, mtf, (low, high), gain, stated.gain is not None, stated.gsd_m, stated.mtf
+    )
 
 
 class MeasuredSensor(Sensor):
@@ -98,18 +116,21 @@ def characterize(
     """Measure MTF and noise of a sensor on its own raw images.
 
     Args:
-        images: one or several, each a path (a folder holds several) or an array (H, W) of whole digital numbers, of
-            one sensor at one setting.
+        images: one or several, each a path (a folder holds several) or an array (H, W) of whole
+            digital numbers, of one sensor at one setting.
         bits: of a digital number; None where clipped pixels must tell.
         gain: DN per W/m2/sr/um; None assumes 400 W/m2/sr/um at full scale.
         gsd_m: ground sampling distance; None assumes one.
         black_level: value of the dark; None counts 0 as dark.
-        mtf: contrast at Nyquist across and along the track, where it is known; None measures the whole curve.
+        mtf: contrast at Nyquist across and along the track, where it is known; None measures the
+            whole curve.
         edges: boxes with one straight edge as FILE:X,Y,WIDTH,HEIGHT; none searches for edges.
-        progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
+        progress: a function that is told each step, False for silence, None for a bar or lines on
+            standard error.
 
     Raises:
-        ImageError: images that are not raw, or that do not hold what is needed; the message says what that is.
+        ImageError: images that are not raw, or that do not hold what is needed; the message says
+            what that is.
         OptionError: an option that contradicts the pixels.
 
     Examples:
@@ -121,7 +142,10 @@ def characterize(
     several = images if isinstance(images, list | tuple) else [images]
     stated = Stated(bits, gain, gsd_m, black_level, mtf)
     with TemporaryDirectory(prefix="beers-deploy-") as folder, reporting(progress):
-        paths = [_as_file(image, Path(folder) / f"image{number}.tif") for number, image in enumerate(several)]
+        paths = [
+            _as_file(image, Path(folder) / f"image{number}.tif")
+            for number, image in enumerate(several)
+        ]
         found = characterise(paths, edges, stated)
         profile = Path(folder) / "measured.toml"
         profile.write_text(profile_toml(found), encoding="utf-8")
@@ -129,7 +153,9 @@ def characterize(
         arguments: dict[str, float | str | None] = {"bits": bits, "gain": gain, "gsd": gsd_m}
         arguments |= {"black_level": black_level, "mtf": ",".join(map(str, mtf)) if mtf else None}
         arguments["edge"] = ", ".join(edges) or None
-        evidence = Table("characterise", arguments, tuple(map(input_of, found.frames.paths)), tuple(found.rows()))
+        evidence = Table(
+            "characterise", arguments, tuple(map(input_of, found.frames.paths)), tuple(found.rows())
+        )
     object.__setattr__(sensor, "evidence", evidence)
     return sensor
 

@@ -1,4 +1,6 @@
-"""The raw frames of one camera: which files they are, what one digital number is, and where the dark lies."""
+"""The raw frames of one camera: which files they are, what one digital number is, and where the
+dark lies.
+"""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -18,10 +20,14 @@ BOX_PX = 2 * int(HALF_PX) + 1
 MAX_DN = 65535
 CLIPPED_PIXELS = 10
 PILE = 4
-"""Pixels at one value, 2^n - 1, and how many times as many as just below: what shows that it is full scale."""
+"""Pixels at one value, 2^n - 1, and how many times as many as just below: what shows that it is
+full scale.
+"""
 DARKEST_PERCENT = 0.01
 DARK_SHARE = 0.02
-"""Where the darkest pixels of all frames lie above this share of full scale, a black level is probable."""
+"""Where the darkest pixels of all frames lie above this share of full scale, a black level is
+probable.
+"""
 
 
 @dataclass(frozen=True)
@@ -85,9 +91,13 @@ def open_frames(images: Sequence[Path], bits: int | None, black_level: float | N
         bits: of a digital number, or of a stored value; None where clipped pixels must tell.
         black_level: the stored value of the dark; None counts 0 as dark.
     """
-    paths = tuple(path for image in images for path in (list_images(image) if image.is_dir() else [image]))
+    paths = tuple(
+        path for image in images for path in (list_images(image) if image.is_dir() else [image])
+    )
     if not paths:
-        raise ImageError("images", expected="one or several", got="none", remedy="give raw images of one sensor")
+        raise ImageError(
+            "images", expected="one or several", got="none", remedy="give raw images of one sensor"
+        )
     if len({path.resolve() for path in paths}) < len(paths):
         got = "one of them twice"
         remedy = "give each once: a second look at the same pixels knows nothing new"
@@ -101,7 +111,12 @@ def open_frames(images: Sequence[Path], bits: int | None, black_level: float | N
     middle_dn = float(np.median([look.middle for look in looks])) / step
     if not 0 <= black_dn < max(middle_dn, 1.0):
         expected = f"a value from 0 to below the images' median, {middle_dn * step:g}"
-        raise OptionError("black_level", expected=expected, got=f"{black_level:g}", remedy="give that of dark frames")
+        raise OptionError(
+            "black_level",
+            expected=expected,
+            got=f"{black_level:g}",
+            remedy="give that of dark frames",
+        )
     return Frames(paths, step, settled, bits is not None, black_dn, darkest_dn)
 
 
@@ -131,8 +146,16 @@ def _look(path: Path) -> _Look:
     step = int(np.gcd.reduce(values))
     apart = int(np.gcd.reduce(values - values.min()))
     if apart > 1 and step % apart:
-        remedy = f"divide it by {apart}: {apart - 1} of {apart} values never occur, so they are no digital numbers"
-        raise ImageError(str(path), expected="digital numbers in steps of 1", got=f"steps of {apart}", remedy=remedy)
+        remedy = (
+            f"divide it by {apart}: {apart - 1} of {apart} values never occur, so they are "
+            "no digital numbers"
+        )
+        raise ImageError(
+            str(path),
+            expected="digital numbers in steps of 1",
+            got=f"steps of {apart}",
+            remedy=remedy,
+        )
     # Of a constant image nothing can be said.
     step = step if apart else 1
     count = int((values == largest).sum())
@@ -148,16 +171,22 @@ def _settled_bits(stated: int | None, largest: int, step: int, piled: bool) -> i
     largest_dn = largest // step
     if stated is None:
         if not piled or largest_dn != 2 ** largest_dn.bit_length() - 1:
-            expected = "`bits` beside images that are not clipped at full scale, or are stored in 8 bits"
+            expected = (
+                "`bits` beside images that are not clipped at full scale, or are stored in 8 bits"
+            )
             remedy = "give the digitiser's, such as 12"
-            raise OptionError("bits", expected=expected, got=f"values up to {largest}", remedy=remedy)
+            raise OptionError(
+                "bits", expected=expected, got=f"values up to {largest}", remedy=remedy
+            )
         return largest_dn.bit_length()
     # 16 bits of values in steps of 64 are 10 bits of digital numbers.
     shift = step.bit_length() - 1
     bits = stated - shift if step == 2**shift and largest <= 2**stated - 1 else stated
     if largest_dn > 2**bits - 1:
         expected = f"digital numbers up to {2**bits - 1}"
-        raise OptionError("bits", expected=expected, got=f"{largest_dn}", remedy="give the bits of the raw image")
+        raise OptionError(
+            "bits", expected=expected, got=f"{largest_dn}", remedy="give the bits of the raw image"
+        )
     return bits
 
 
@@ -172,10 +201,16 @@ def read_raw(path: Path) -> np.ndarray:
     pixels: np.ndarray = np.ma.getdata(rows)[0]
     if raster.may_miss:
         pixels = np.where(raster.missing(rows)[0], 0, pixels)
-    if (pixels.dtype.kind == "f" and (pixels != np.rint(pixels)).any()) or pixels.min() < 0 or pixels.max() > MAX_DN:
+    if (
+        (pixels.dtype.kind == "f" and (pixels != np.rint(pixels)).any())
+        or pixels.min() < 0
+        or pixels.max() > MAX_DN
+    ):
         got = f"{pixels.dtype} from {float(pixels.min()):.4g} to {float(pixels.max()):.4g}"
         remedy = "give the raw image: what was resampled, calibrated or scaled has lost its noise"
-        raise ImageError(str(path), expected=f"whole digital numbers from 0 to {MAX_DN}", got=got, remedy=remedy)
+        raise ImageError(
+            str(path), expected=f"whole digital numbers from 0 to {MAX_DN}", got=got, remedy=remedy
+        )
     return pixels
 
 
@@ -184,15 +219,24 @@ def cut_box(words: str, frames: Frames) -> np.ndarray:
     parts = re.fullmatch(r"(.*):(\d{1,8}),(\d{1,8}),(\d{1,8}),(\d{1,8})", words, re.ASCII)
     if parts is None:
         expected = "FILE:X,Y,WIDTH,HEIGHT in whole pixels"
-        raise OptionError("edge", expected=expected, got=repr(words), remedy="write raw.tif:1200,340,60,60")
+        raise OptionError(
+            "edge", expected=expected, got=repr(words), remedy="write raw.tif:1200,340,60,60"
+        )
     path = Path(parts[1])
     left, top, width, height = map(int, parts.groups()[1:])
     if path not in frames.paths:
         remedy = "name it as the argument does"
-        raise OptionError("edge", expected="one of the images that are given", got=repr(parts[1]), remedy=remedy)
+        raise OptionError(
+            "edge", expected="one of the images that are given", got=repr(parts[1]), remedy=remedy
+        )
     pixels = frames.read(path)
     region = pixels[top : top + height, left : left + width]
     if region.shape != (height, width) or min(region.shape) < BOX_PX:
-        expected = f"a box of {BOX_PX} x {BOX_PX} pixels or more inside its {pixels.shape[1]} x {pixels.shape[0]}"
-        raise OptionError("edge", expected=expected, got=words, remedy="X,Y is the upper left pixel, from 0")
+        expected = (
+            f"a box of {BOX_PX} x {BOX_PX} pixels or more inside its {pixels.shape[1]} x "
+            f"{pixels.shape[0]}"
+        )
+        raise OptionError(
+            "edge", expected=expected, got=words, remedy="X,Y is the upper left pixel, from 0"
+        )
     return region

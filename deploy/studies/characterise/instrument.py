@@ -18,7 +18,14 @@ from beers_deploy.model.metrics.edge_curve import (
     measure_curve,
     search_curve,
 )
-from beers_deploy.model.metrics.noise_line import Blocks, NoiseModel, cut_blocks, cut_pair, fit_noise_model, join
+from beers_deploy.model.metrics.noise_line import (
+    Blocks,
+    NoiseModel,
+    cut_blocks,
+    cut_pair,
+    fit_noise_model,
+    join,
+)
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.progress import steps
 from beers_deploy.profiles.errors import ImageError
@@ -29,29 +36,44 @@ from beers_deploy.studies.characterise.frames import Frames
 SEED = 0
 AXES = ("across", "along")
 OWN_LEAK = 0.1
-"""Of the finest detail of one frame, what may be texture where its noise is held against the others'."""
+"""Of the finest detail of one frame, what may be texture where its noise is held against the
+others'.
+"""
 STILL_STRUCTURE = 2.0
 STILL_DRIFT = 0.02
-"""Of the difference of two frames of a still scene: structure over noise, and the largest change of level."""
+"""Of the difference of two frames of a still scene: structure over noise, and the largest change of
+level.
+"""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """The noise of frames, above the dark, and whether it comes from pairs of frames of one still scene."""
+    """The noise of frames, above the dark, and whether it comes from pairs of frames of one still
+    scene.
+    """
 
     model: NoiseModel
     pairs: int
 
 
 def measure_noise(frames: Frames) -> Noise:
-    """Fit the noise line to all frames, or to the differences of those that show one still scene."""
-    each = [_above_dark(join([_cut(tile, frames) for tile in frames.tiles(path)]), frames) for path in frames.paths]
+    """Fit the noise line to all frames, or to the differences of those that
+    show one still scene.
+    """
+    each = [
+        _above_dark(join([_cut(tile, frames) for tile in frames.tiles(path)]), frames)
+        for path in frames.paths
+    ]
     still = [_above_dark(blocks, frames) for blocks in _still_pairs(frames)]
     model = fit_noise_model(join(still or each), np.random.default_rng(SEED), incomplete=True)
     if isinstance(model, Refusal):
         expected = "blurred, raw ground, from dark to bright"
-        remedy = "give more raw images of plain ground, dark and bright, neither restored nor resampled"
-        raise ImageError(f"noise of {frames.name}", expected=expected, got=model.reason, remedy=remedy)
+        remedy = (
+            "give more raw images of plain ground, dark and bright, neither restored nor resampled"
+        )
+        raise ImageError(
+            f"noise of {frames.name}", expected=expected, got=model.reason, remedy=remedy
+        )
     if not still:
         _require_one_sensor(frames, each, math.sqrt(math.prod(model.measured_dn)))
     return Noise(model, len(still))
@@ -74,10 +96,16 @@ def _still_pairs(frames: Frames) -> list[Blocks]:
         first = frames.read(one)
         second = frames.read(other)
         level = float(np.median(first))
-        if first.shape != second.shape or abs(float(np.median(second)) - level) > STILL_DRIFT * level:
+        if (
+            first.shape != second.shape
+            or abs(float(np.median(second)) - level) > STILL_DRIFT * level
+        ):
             continue
         blocks = cut_pair(first, second, frames.full_scale_dn)
-        if blocks.mean.size and float(np.median(blocks.structure / np.maximum(blocks.fine, 1e-9))) < STILL_STRUCTURE:
+        if (
+            blocks.mean.size
+            and float(np.median(blocks.structure / np.maximum(blocks.fine, 1e-9))) < STILL_STRUCTURE
+        ):
             found.append(blocks)
     return found
 
@@ -99,7 +127,9 @@ def _require_one_sensor(frames: Frames, each: Sequence[Blocks], dn: float) -> No
         low, high = (f"{seen[name].value:.3g} DN^2 in {name}" for name in (least, most))
         got = f"a variance of {low} and {high} at {dn:.4g} DN above the dark"
         remedy = "characterise them apart: they differ in gain, or one was processed"
-        raise ImageError("images", expected="images of one sensor at one setting", got=got, remedy=remedy)
+        raise ImageError(
+            "images", expected="images of one sensor at one setting", got=got, remedy=remedy
+        )
 
 
 @dataclass(frozen=True)
@@ -118,7 +148,8 @@ def measure_mtf(frames: Frames, boxes: Mapping[str, np.ndarray], noise: NoiseMod
 
     Args:
         frames: of the camera.
-        boxes: pixels (h, w) with one edge each, by the words that name them; none searches all frames.
+        boxes: pixels (h, w) with one edge each, by the words that name them; none searches all
+            frames.
         noise: of the pixels, above the dark.
     """
 
@@ -144,7 +175,9 @@ def measure_mtf(frames: Frames, boxes: Mapping[str, np.ndarray], noise: NoiseMod
     return Mtf(curves, reasons)
 
 
-def _pointed_at(frames: Frames, boxes: Mapping[str, np.ndarray], variance: Variance) -> dict[str, list[Edge]]:
+def _pointed_at(
+    frames: Frames, boxes: Mapping[str, np.ndarray], variance: Variance
+) -> dict[str, list[Edge]]:
     """The edges in boxes, those near the horizontal turned upright."""
     edges: dict[str, list[Edge]] = {axis: [] for axis in AXES}
     for words, region in boxes.items():
@@ -154,7 +187,12 @@ def _pointed_at(frames: Frames, boxes: Mapping[str, np.ndarray], variance: Varia
             edge = Refusal("clipped pixels")
         if isinstance(edge, Refusal):
             expected = "one straight edge, from side to side"
-            raise ImageError(f"edge {words}", expected=expected, got=edge.reason, remedy="box another, or tighter")
+            raise ImageError(
+                f"edge {words}",
+                expected=expected,
+                got=edge.reason,
+                remedy="box another, or tighter",
+            )
         edges["along" if lies else "across"].append(edge)
     return edges
 
@@ -181,12 +219,17 @@ def _too_wide(curve: MtfCurve) -> str:
     """Why a curve is not written, and what would help."""
     value, (low, high) = curve.at(NYQUIST)
     count = f"{curve.edges} edge{'' if curve.edges == 1 else 's'}"
-    odd = f"; these differ from the others: {', '.join(curve.contradicting)}" if curve.contradicting else ""
+    odd = (
+        f"; these differ from the others: {', '.join(curve.contradicting)}"
+        if curve.contradicting
+        else ""
+    )
     missing = f"about {curve.missing_edges} more such edges would do"
     if curve.missing_edges == MOST_MISSING:
         missing = "that is hardly any contrast, and more edges would not help"
     return (
-        f"{count} leave {value:.2%} [{low:.2%}, {high:.2%}] at Nyquist, wider than a factor of {WIDEST:g}: "
+        f"{count} leave {value:.2%} [{low:.2%}, {high:.2%}] at Nyquist, wider than a factor of "
+        f"{WIDEST:g}: "
         f"{missing}{odd}"
     )
 

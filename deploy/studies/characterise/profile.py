@@ -1,4 +1,6 @@
-"""What was measured of a camera as figures, as sentences for its user, and as a profile: a TOML file."""
+"""What was measured of a camera as figures, as sentences for its user, and as a profile: a TOML
+file.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -62,10 +64,14 @@ class Characterised:
                 figures[f"MTF {axis} {words}"] = figure
         for snr in self.snrs:
             source = _blocks(self.noise) + (", extrapolated" if snr.extrapolated else "")
-            figures[f"SNR at {snr.radiance:g} W/m2/sr/um"] = measured(snr.value, "ratio", source, snr.interval)
+            figures[f"SNR at {snr.radiance:g} W/m2/sr/um"] = measured(
+                snr.value, "ratio", source, snr.interval
+            )
         for (low, high), value in zip(pairwise(SPECTRUM), self.noise.model.spectrum, strict=True):
             name = f"noise from {low:g} to {high:.2g} cycles per pixel"
-            figures[name] = measured(value, "ratio", "variance over that beyond 0.55 cycles per pixel")
+            figures[name] = measured(
+                value, "ratio", "variance over that beyond 0.55 cycles per pixel"
+            )
         return [Row("sensor", "measured sensor", figures)]
 
     def notes(self) -> Iterator[str]:
@@ -74,22 +80,26 @@ class Characterised:
         model = self.noise.model
         if frames.step > 1:
             yield (
-                f"the values are multiples of {frames.step}: they count as {frames.bits}-bit numbers; "
+                f"the values are multiples of {frames.step}: they count as {frames.bits}-bit "
+                "numbers; "
                 f"restore these frames with --full-scale {frames.stored_full_scale}"
             )
         if frames.hides_black:
             yield (
-                f"0 counts as dark, but the darkest pixels have {frames.darkest_dn * frames.step:g}: if the camera "
+                "0 counts as dark, but the darkest pixels have "
+                f"{frames.darkest_dn * frames.step:g}: if the camera "
                 "adds a black level, state it as --black-level, or the SNR in the dark is too high"
             )
         if not model.white:
             yield (
-                f"the noise is not white: at middle frequencies it is {model.colour:.2f} times as strong as at the "
+                f"the noise is not white: at middle frequencies it is {model.colour:.2f} times "
+                "as strong as at the "
                 f"finest. {_colour_consequence(model.colour)}"
             )
         if model.one_level:
             yield (
-                f"the frames show one level of light, near {model.measured_dn[1]:.4g} DN above the dark: all noise "
+                f"the frames show one level of light, near {model.measured_dn[1]:.4g} DN above "
+                "the dark: all noise "
                 "there is taken for that of photons; give frames of other brightness as well"
             )
         yield from self._notes_on_edges()
@@ -102,7 +112,8 @@ class Characterised:
                 yield f"these edges differ from the others: {', '.join(curve.contradicting)}"
         if self.stated_mtf is None and not self.mtf.curves:
             yield (
-                "the profile's MTF is an assumption: state what you know as --mtf, or point at straight edges as "
+                "the profile's MTF is an assumption: state what you know as --mtf, or point at "
+                "straight edges as "
                 "--edge FILE:X,Y,WIDTH,HEIGHT"
             )
 
@@ -111,11 +122,13 @@ def _colour_consequence(colour: float) -> str:
     """What noise that is not white means for a restoration, which takes it for white."""
     if colour > 1:
         return (
-            "The profile states the stronger part. Filtering or compression after the detector causes this: a "
+            "The profile states the stronger part. Filtering or compression after the detector "
+            "causes this: a "
             "restoration leaves grain of some pixels' size"
         )
     return (
-        "The profile states the stronger part. Unequal readout channels or interference cause this: equalise the "
+        "The profile states the stronger part. Unequal readout channels or interference cause "
+        "this: equalise the "
         "frames first, or a restoration smooths more than it need"
     )
 
@@ -127,37 +140,54 @@ def _blocks(noise: Noise) -> str:
 
 
 def profile_toml(found: Characterised) -> str:
-    """The profile as its TOML file; the source of what was measured has its interval, and any doubt."""
+    """The profile as its TOML file; the source of what was measured has its interval, and any
+    doubt.
+    """
     frames = found.frames
     images = printable(frames.name)
-    clipped = "given" if frames.bits_stated else f"pixels clipped at {frames.stored_full_scale} in {images}"
+    clipped = (
+        "given"
+        if frames.bits_stated
+        else f"pixels clipped at {frames.stored_full_scale} in {images}"
+    )
     if frames.step > 1:
         clipped += f"; stored in steps of {frames.step}"
     gain = (
-        f"full scale {frames.full_scale_dn} DN counts as 400 W/m2/sr/um; pixels do not tell the gain, and to a "
+        f"full scale {frames.full_scale_dn} DN counts as 400 W/m2/sr/um; pixels do not tell the "
+        "gain, and to a "
         "network only noise over full scale matters"
     )
     tables: dict[str, dict[str, object]] = {
         "grid": {
             "gsd_m": _given(found.gsd_m, GSD_M, "no pixel depends on it; state it"),
-            "oversampling": _constant(OVERSAMPLING, "assumed", "for simulations alone: scene pixels a pixel"),
+            "oversampling": _constant(
+                OVERSAMPLING, "assumed", "for simulations alone: scene pixels a pixel"
+            ),
         },
         "mtf": _mtf_table(found, images),
         "noise": _noise_table(found, images),
         "digitiser": {
             "bits": _constant(frames.bits, "stated" if frames.bits_stated else "measured", clipped),
-            "gain_dn_per_radiance": _given(found.gain if found.gain_stated else None, found.gain, gain),
+            "gain_dn_per_radiance": _given(
+                found.gain if found.gain_stated else None, found.gain, gain
+            ),
         },
     }
     if frames.black_dn:
-        tables["offset"] = {"offset_dn": _constant(frames.black_dn, "stated", "given on the command line")}
+        tables["offset"] = {
+            "offset_dn": _constant(frames.black_dn, "stated", "given on the command line")
+        }
     return sensor_toml(f"Measured on {images}.", tables)
 
 
 def _mtf_table(found: Characterised, images: str) -> dict[str, object]:
-    """Measured curves, what the user states, or an assumption; an axis without a curve has the other's."""
+    """Measured curves, what the user states, or an assumption; an axis without a curve has the
+    other's.
+    """
     if found.stated_mtf is not None:
-        across, along = (_constant(value, "stated", "given on the command line") for value in found.stated_mtf)
+        across, along = (
+            _constant(value, "stated", "given on the command line") for value in found.stated_mtf
+        )
         return {"mtf_nyquist": across, "mtf_nyquist_along": along}
     if not found.mtf.curves:
         middle = load_sensor(BLIND).nominal().mtf_nyquist
@@ -182,26 +212,40 @@ def _edges(curve: MtfCurve) -> str:
 
 def _intervals(curve: MtfCurve) -> str:
     """The interval of each contrast, in the order of the table."""
-    return ", ".join(f"{low:.3g} to {high:.3g}" for low, high in zip(curve.low, curve.high, strict=True))
+    return ", ".join(
+        f"{low:.3g} to {high:.3g}" for low, high in zip(curve.low, curve.high, strict=True)
+    )
 
 
 def _noise_table(found: Characterised, images: str) -> dict[str, object]:
-    """The SNRs are linear ratios without the rounding to whole DN; the darker one is kept within physics."""
+    """The SNRs are linear ratios without the rounding to whole DN; the darker one is kept within
+    physics.
+    """
     model = found.noise.model
     dark, bright = (dn / found.gain for dn in model.measured_dn)
     low, high = found.snrs
     bounds = snr_0_bounds(low.radiance, high.radiance, high.value)
     inside = min(max(low.value, bounds[0] * (1 + MARGIN)), bounds[1] * (1 - MARGIN))
     table = dict[str, object]()
-    for number, (snr, value, part) in enumerate(zip(found.snrs, (inside, high.value), PARTS, strict=True)):
-        source = f"{_blocks(found.noise)} in {images}, 95 % interval {snr.interval[0]:.3g} to {snr.interval[1]:.3g}"
+    for number, (snr, value, part) in enumerate(
+        zip(found.snrs, (inside, high.value), PARTS, strict=True)
+    ):
+        source = (
+            f"{_blocks(found.noise)} in {images}, 95 % interval {snr.interval[0]:.3g} to "
+            f"{snr.interval[1]:.3g}"
+        )
         if snr.extrapolated:
             source += f"; extrapolated from {dark:.3g} to {bright:.3g} W/m2/sr/um"
         if not model.white:
-            source += f"; not white, {model.colour:.2f} times as strong at middle frequencies as at the finest"
+            source += (
+                f"; not white, {model.colour:.2f} times as strong at middle frequencies "
+                "as at the finest"
+            )
         if model.one_level:
             source += "; seen at one level of light, and how the noise grows with light is assumed"
-        table[f"radiance_{number}"] = _constant(float(f"{snr.radiance:.10g}"), "inferred", f"1/{part} of full scale")
+        table[f"radiance_{number}"] = _constant(
+            float(f"{snr.radiance:.10g}"), "inferred", f"1/{part} of full scale"
+        )
         table[f"snr_{number}"] = _constant(float(f"{value:.8g}"), "measured", source)
     return table
 

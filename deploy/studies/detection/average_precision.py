@@ -1,9 +1,10 @@
 """Average precision, precision and recall, by class and by size, with a bootstrap over sites.
 
-Boxes are matched once, in pixels of the scene. Every figure is then a sum over images, each times its weight: with
-weights of 1 the average precision is that of pycocotools, the reference code of the COCO evaluation; with the counts
-of a bootstrap draw it is that of the images drawn (Everingham et al., IJCV 111, 2015, section 3.5). A mean average
-precision is no mean over images, so each draw is scored anew.
+Boxes are matched once, in pixels of the scene. Every figure is then a sum over images, each times
+its weight: with weights of 1 the average precision is that of pycocotools, the reference code of
+the COCO evaluation; with the counts of a bootstrap draw it is that of the images drawn (Everingham
+et al., IJCV 111, 2015, section 3.5). A mean average precision is no mean over images, so each draw
+is scored anew.
 """
 
 import math
@@ -21,7 +22,9 @@ OVERLAPS = np.linspace(0.5, 0.95, 10)
 RECALLS = np.linspace(0.0, 1.0, 101)
 """Where COCO reads precision off, to average it."""
 CONFIDENCES = np.linspace(0.0, 1.0, 1001)
-"""Where precision and recall are read off: a detection counts up to the confidence that is its score."""
+"""Where precision and recall are read off: a detection counts up to the confidence that is its
+score.
+"""
 SIZES_PX = {
     "all": (0.0, math.inf),
     "under 16 px": (0.0, 16.0),
@@ -35,7 +38,9 @@ FEW_SITES = 10
 """Below it the percentiles of a bootstrap are too narrow to be trusted, and it is said."""
 
 Figures = Mapping[str, np.ndarray]
-"""The figures of a row by name, (1 + draws,) each: on all images, then on each draw; NaN where there is no object."""
+"""The figures of a row by name, (1 + draws,) each: on all images, then on each draw; NaN where
+there is no object.
+"""
 
 
 @dataclass(frozen=True)
@@ -60,24 +65,34 @@ class Hits:
 
 
 def find_hits(truths: Sequence[Boxes], found: Sequence[Boxes], classes: int) -> Hits:
-    """Match what was found with what is labelled, once for all figures, by the rules of the COCO evaluation.
+    """Match what was found with what is labelled, once for all figures, by the rules of the COCO
+    evaluation.
 
-    The best scored detection is matched first, with the free object of its class that it overlaps most. What lies in
-    an ignored box counts neither way; nor do objects of another size, and detections of one that found none. Every
-    detection counts, where COCO takes the best 100 of a class: aerial images hold more objects than photographs do.
+    The best scored detection is matched first, with the free object of its class that it overlaps
+    most. What lies in an ignored box counts neither way; nor do objects of another size, and
+    detections of one that found none. Every detection counts, where COCO takes the best 100 of a
+    class: aerial images hold more objects than photographs do.
 
     Args:
-        truths: labelled boxes of each image; images without any belong to them: what is found there is false.
+        truths: labelled boxes of each image; images without any belong to them: what is found there
+            is false.
         found: what was found on each image, in the same px, of the same classes.
         classes: how many there are.
     """
-    scores, kinds = (np.concatenate([getattr(one, part) for one in found]) for part in ("scores", "classes"))
+    scores, kinds = (
+        np.concatenate([getattr(one, part) for one in found]) for part in ("scores", "classes")
+    )
     order = np.argsort(-scores, kind="stable")
     image = np.repeat(np.arange(len(found)), [len(one) for one in found])
     matches = [match(*each)[:2] for each in zip(truths, found, strict=True)]
-    hits, ignored = (np.concatenate(parts, axis=-1)[..., order] for parts in zip(*matches, strict=True))
+    hits, ignored = (
+        np.concatenate(parts, axis=-1)[..., order] for parts in zip(*matches, strict=True)
+    )
     counts = [
-        [np.bincount(truth.classes[~passed], minlength=classes) for passed in truth.ignored | _of_other_size(truth)]
+        [
+            np.bincount(truth.classes[~passed], minlength=classes)
+            for passed in truth.ignored | _of_other_size(truth)
+        ]
         for truth in truths
     ]
     return Hits(image[order], kinds[order], scores[order], hits, ignored, np.stack(counts, axis=-1))
@@ -92,33 +107,43 @@ def match(truth: Boxes, found: Boxes) -> tuple[np.ndarray, np.ndarray, np.ndarra
     """Match the N boxes found on an image with its M labelled ones, by `SIZES_PX` and `OVERLAPS`.
 
     Returns:
-        Which of those found are hits, and which count neither way, (S, 10, N); which objects are taken, (S, 10, M).
+        Which of those found are hits, and which count neither way, (S, 10, N); which objects are
+            taken, (S, 10, M).
     """
     passed = np.repeat((truth.ignored | _of_other_size(truth))[:, None], len(OVERLAPS), axis=1)
     ignored = np.repeat(_of_other_size(found)[:, None], len(OVERLAPS), axis=1)
     hits = np.zeros_like(ignored)
     taken = np.zeros_like(passed)
-    overlaps = iou(found.corners, truth.corners, truth.ignored) * (found.classes[:, None] == truth.classes)
+    overlaps = iou(found.corners, truth.corners, truth.ignored) * (
+        found.classes[:, None] == truth.classes
+    )
     for one in np.argsort(-found.scores, kind="stable"):
         if overlaps[one].max(initial=0) < OVERLAPS[0]:
             continue
         free = (overlaps[one] >= OVERLAPS[:, None]) & ~(taken & ~truth.ignored)
         at = np.nonzero(free.any(axis=-1))
-        best = np.where(free, overlaps[one] + ~passed, 0.0).argmax(axis=-1)[at]  # what counts goes first
+        best = np.where(free, overlaps[one] + ~passed, 0.0).argmax(axis=-1)[
+            at
+        ]  # what counts goes first
         hits[*at, one], ignored[*at, one] = ~passed[*at, best], passed[*at, best]
         taken[*at, best] = True
     return hits, ignored, taken
 
 
 def site_weights(sites: Sequence[str], seed: int, draws: int = DRAWS) -> np.ndarray:
-    """How often each image counts, (1 + draws, I): once, then as often as each draw with replacement has its site."""
+    """How often each image counts, (1 + draws, I): once, then as often as each draw with
+    replacement has its site.
+    """
     names, site = np.unique(np.array(sites), return_inverse=True)
-    counts = np.random.default_rng(seed).multinomial(len(names), np.full(len(names), 1 / len(names)), size=draws)
+    counts = np.random.default_rng(seed).multinomial(
+        len(names), np.full(len(names), 1 / len(names)), size=draws
+    )
     return np.vstack([np.ones(len(sites), np.int64), counts[:, site]])
 
 
 def interval(values: np.ndarray, sites: int) -> tuple[float, float] | None:
-    """The interval at 95 % of a figure, or of a difference of two, (1 + draws,): percentiles of its draws.
+    """The interval at 95 % of a figure, or of a difference of two, (1 + draws,): percentiles of its
+    draws.
 
     Of fewer than `LEAST_SITES` different sites there is none: it could not be trusted.
     """
@@ -129,18 +154,26 @@ def interval(values: np.ndarray, sites: int) -> tuple[float, float] | None:
 
 
 def sites_note(sites: int) -> str:
-    """What a reader must know of intervals over so many sites, in a sentence; empty where there is nothing to say."""
-    few = f"Only {sites} sites: the intervals are too narrow to be trusted." if sites < FEW_SITES else ""
+    """What a reader must know of intervals over so many sites, in a sentence; empty where there is
+    nothing to say.
+    """
+    few = (
+        f"Only {sites} sites: the intervals are too narrow to be trusted."
+        if sites < FEW_SITES
+        else ""
+    )
     return too_few(sites) or few
 
 
 def score_rows(
     rows: Mapping[str, Hits], names: Sequence[str], weights: np.ndarray
 ) -> tuple[dict[str, Figures], float]:
-    """Every figure of every row, and the confidence at which `precision` and `recall` are read in all of them.
+    """Every figure of every row, and the confidence at which `precision` and `recall` are read in
+    all of them.
 
     Args:
-        rows: of the same images; the confidence is that of the best F1 of the first one on all images.
+        rows: of the same images; the confidence is that of the best F1 of the first one on all
+            images.
         names: of the classes.
         weights: (W, I), how often each image counts, as `site_weights` gives it.
     """
@@ -148,18 +181,22 @@ def score_rows(
     return {row: score(hits, names, weights, confidence) for row, hits in rows.items()}, confidence
 
 
-def score(hits: Hits, names: Sequence[str], weights: np.ndarray, confidence: float = 0.0) -> Figures:
+def score(
+    hits: Hits, names: Sequence[str], weights: np.ndarray, confidence: float = 0.0
+) -> Figures:
     """Every figure of a row, (W,) each.
 
     Args:
         hits: of the row.
         names: of the classes.
         weights: (W, I) whole numbers, how often each image counts.
-        confidence: where `precision` and `recall` are read; `own precision` and `own recall` are read at
-            `own confidence`, that of the row's best F1.
+        confidence: where `precision` and `recall` are read; `own precision` and `own recall` are
+            read at `own confidence`, that of the row's best F1.
     """
     every = len(OVERLAPS)
-    by_class = np.array([precisions(hits, kind, weights, ALL, every).mean(axis=-1) for kind in range(len(names))])
+    by_class = np.array(
+        [precisions(hits, kind, weights, ALL, every).mean(axis=-1) for kind in range(len(names))]
+    )
     curves = _confidence_curves(hits, weights)
     fixed = np.searchsorted(CONFIDENCES, np.nan_to_num(confidence) - 1e-9)
     own = np.argmax(curves[2], axis=-1)  # 0 where nothing is labelled, and there the curves are NaN
@@ -172,15 +209,25 @@ def score(hits: Hits, names: Sequence[str], weights: np.ndarray, confidence: flo
         "own confidence": np.where(np.isnan(own_f1), np.nan, CONFIDENCES[own]),
         "own precision": own_precision,
         "own recall": own_recall,
-        **{f"mAP50 of {name}": values for name, values in zip(names, by_class[..., 0], strict=True)},
-        **{f"mAP50 {name}": map50(hits, weights, size) for size, name in enumerate(SIZES_PX) if size != ALL},
+        **{
+            f"mAP50 of {name}": values for name, values in zip(names, by_class[..., 0], strict=True)
+        },
+        **{
+            f"mAP50 {name}": map50(hits, weights, size)
+            for size, name in enumerate(SIZES_PX)
+            if size != ALL
+        },
     }
 
 
 def map50(hits: Hits, weights: np.ndarray, size: int = ALL) -> np.ndarray:
-    """Average precision at an overlap of one half alone, mean over classes, (W,); arguments as of `score`."""
+    """Average precision at an overlap of one half alone, mean over classes, (W,); arguments as of
+    `score`.
+    """
     kinds = range(hits.objects.shape[1])
-    return mean_known(np.array([precisions(hits, kind, weights, size)[:, 0].mean(axis=-1) for kind in kinds]))
+    return mean_known(
+        np.array([precisions(hits, kind, weights, size)[:, 0].mean(axis=-1) for kind in kinds])
+    )
 
 
 def mean_known(values: np.ndarray) -> np.ndarray:
@@ -188,8 +235,11 @@ def mean_known(values: np.ndarray) -> np.ndarray:
     return np.asarray(np.ma.filled(np.ma.masked_invalid(values).mean(axis=0), np.nan))
 
 
-def precisions(hits: Hits, kind: int, weights: np.ndarray, size: int = ALL, levels: int = 1) -> np.ndarray:
-    """Precision of a class at each of `RECALLS`, (W, levels, 101): the best at that recall or more (COCO).
+def precisions(
+    hits: Hits, kind: int, weights: np.ndarray, size: int = ALL, levels: int = 1
+) -> np.ndarray:
+    """Precision of a class at each of `RECALLS`, (W, levels, 101): the best at that recall or more
+    (COCO).
 
     Args:
         hits: of a row.
@@ -213,13 +263,16 @@ def precisions(hits: Hits, kind: int, weights: np.ndarray, size: int = ALL, leve
             true = np.cumsum(each[hit])
             so_far = np.cumsum(each)[hit]
             precision = np.divide(true, so_far, out=np.zeros(len(true)), where=so_far > 0)
-            best = np.append(np.maximum.accumulate(precision[::-1])[::-1], 0.0)  # beyond the last hit there is none
+            best = np.append(
+                np.maximum.accumulate(precision[::-1])[::-1], 0.0
+            )  # beyond the last hit there is none
             found[draw, level] = best[np.searchsorted(true / totals[draw], RECALLS)]
     return found
 
 
 def _confidence_curves(hits: Hits, weights: np.ndarray) -> np.ndarray:
-    """Precision, recall and F1 at an overlap of half, (3, W, 1001): means over the classes that have an object.
+    """Precision, recall and F1 at an overlap of half, (3, W, 1001): means over the classes that
+    have an object.
 
     Precision is 1 of a class of which nothing is found, as Ultralytics has it.
     """

@@ -1,7 +1,8 @@
-"""Boxes on an image: how much two overlap, which of several on one object stays, and how they follow an image's size.
+"""Boxes on an image: how much two overlap, which of several on one object stays, and how they
+follow an image's size.
 
-Coordinates are continuous pixels: pixel i covers [i, i + 1), so a box around the first pixel is 0, 0, 1, 1. Readers
-bring every other convention to this one (`labels`).
+Coordinates are continuous pixels: pixel i covers [i, i + 1), so a box around the first pixel is 0,
+0, 1, 1. Readers bring every other convention to this one (`labels`).
 """
 
 from dataclasses import dataclass, replace
@@ -13,13 +14,16 @@ from skimage.transform import resize
 from beers_deploy.profiles.errors import OptionError
 
 LEAST_VISIBLE = 0.3
-"""Share of a box inside the image below which finding it counts neither for nor against a detector."""
+"""Share of a box inside the image below which finding it counts neither for nor
+against a detector.
+"""
 PADDING = 114 / 255
 OVERLAP = 0.7
 MOST = 300
 CANDIDATES = 30_000
-"""As Ultralytics validates: the grey around an image, the overlap above which the lower scored of two boxes goes, the
-boxes kept of an image, and those looked at, best scores first."""
+"""As Ultralytics validates: the grey around an image, the overlap above which the lower scored of
+two boxes goes, the boxes kept of an image, and those looked at, best scores first.
+"""
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,8 @@ class Boxes:
         corners: (N, 4) float64: left, top, right and bottom in px.
         classes: (N,) int64 into a tuple of names that is kept elsewhere.
         scores: (N,) float64 confidence in 0 to 1; 1 of what is labelled.
-        ignored: (N,) bool: what is found inside such a box counts neither for nor against a detector.
+        ignored: (N,) bool: what is found inside such a box counts neither for nor against a
+            detector.
     """
 
     corners: np.ndarray
@@ -40,9 +45,15 @@ class Boxes:
 
     @classmethod
     def of(
-        cls, corners: ArrayLike, classes: ArrayLike, scores: ArrayLike | None = None, ignored: ArrayLike | None = None
+        cls,
+        corners: ArrayLike,
+        classes: ArrayLike,
+        scores: ArrayLike | None = None,
+        ignored: ArrayLike | None = None,
     ) -> "Boxes":
-        """Boxes of any array-like; without scores they are labelled ones, and none is ignored unless it is said."""
+        """Boxes of any array-like; without scores they are labelled ones, and none is ignored
+        unless it is said.
+        """
         found = np.asarray(corners, np.float64).reshape(-1, 4)
         count = len(found)
         return cls(
@@ -57,15 +68,21 @@ class Boxes:
 
     def __getitem__(self, which: np.ndarray | slice) -> "Boxes":
         """The boxes that a mask, indices or a slice choose."""
-        return Boxes(self.corners[which], self.classes[which], self.scores[which], self.ignored[which])
+        return Boxes(
+            self.corners[which], self.classes[which], self.scores[which], self.ignored[which]
+        )
 
     def renamed(self, classes: np.ndarray) -> "Boxes":
-        """Boxes whose class c becomes `classes[c]`; those of a class that becomes -1 are left out."""
+        """Boxes whose class c becomes `classes[c]`; those of a class that
+        becomes -1 are left out.
+        """
         new = np.asarray(classes, np.int64)[self.classes]
         return Boxes(self.corners, new, self.scores, self.ignored)[new >= 0]
 
     def clipped(self, height_px: float, width_px: float) -> "Boxes":
-        """The parts inside an image: what lies outside whole is left out, what is mostly outside is ignored."""
+        """The parts inside an image: what lies outside whole is left out, what is mostly outside is
+        ignored.
+        """
         limits = np.array([width_px, height_px, width_px, height_px])
         inside = np.clip(self.corners, 0, limits)
         known = areas(inside)
@@ -75,12 +92,15 @@ class Boxes:
 
 
 def areas(corners: np.ndarray) -> np.ndarray:
-    """(N,) areas in px2 of (N, 4) corners; 0 where a right or lower edge lies before its opposite."""
+    """(N,) areas in px2 of (N, 4) corners; 0 where a right or lower edge lies
+    before its opposite.
+    """
     return np.asarray(np.prod(np.maximum(corners[:, 2:] - corners[:, :2], 0), axis=1))
 
 
 def iou(one: np.ndarray, other: np.ndarray, ignored: np.ndarray | bool = False) -> np.ndarray:
-    """(N, M) overlaps, 0 to 1, of (N, 4) and (M, 4) corners: intersection over union; 0 of two boxes without area.
+    """(N, M) overlaps, 0 to 1, of (N, 4) and (M, 4) corners: intersection over union; 0 of two
+    boxes without area.
 
     Args:
         one: corners.
@@ -96,7 +116,9 @@ def iou(one: np.ndarray, other: np.ndarray, ignored: np.ndarray | bool = False) 
 
 
 def suppress(found: Boxes) -> Boxes:
-    """Non-maximum suppression within each class: what stays of boxes as a detector gives them, best score first."""
+    """Non-maximum suppression within each class: what stays of boxes as a detector gives them, best
+    score first.
+    """
     left = np.argsort(-found.scores, kind="stable")[:CANDIDATES]
     kept = list[int]()
     while len(left) and len(kept) < MOST:
@@ -110,9 +132,11 @@ def suppress(found: Boxes) -> Boxes:
 
 
 class Letterbox:
-    """How an image of any size goes into a detector's square input: enlarged or shrunk alike, centred, padded grey.
+    """How an image of any size goes into a detector's square input: enlarged or shrunk alike,
+    centred, padded grey.
 
-    Shrinking samples bilinearly without a filter in front, as Ultralytics does when it trains and runs.
+    Shrinking samples bilinearly without a filter in front, as Ultralytics does when it trains and
+    runs.
 
     Args:
         height_px: of the image.
@@ -130,14 +154,19 @@ class Letterbox:
         top = (size_px - height) // 2
         left = (size_px - width) // 2
         self._border = (top, size_px - height - top), (left, size_px - width - left), (0, 0)
-        # By axis, for the sides are rounded to whole pixels: one gain for both would be off by up to half a pixel.
+        # By axis, for the sides are rounded to whole pixels: one gain for both would be off by up
+        # to half a pixel.
         self._gain = np.tile([width / width_px, height / height_px], 2)
         self._shift = np.tile([left, top], 2)
 
     def image(self, rgb: np.ndarray) -> np.ndarray:
-        """The input, (3, size_px, size_px) float32, of an image (height_px, width_px, 3) in 0 to 1."""
+        """The input, (3, size_px, size_px) float32, of an image (height_px,
+        width_px, 3) in 0 to 1.
+        """
         same = self._inner == rgb.shape[:2]
-        fitted = rgb if same else resize(rgb, self._inner, order=1, mode="edge", anti_aliasing=False)
+        fitted = (
+            rgb if same else resize(rgb, self._inner, order=1, mode="edge", anti_aliasing=False)
+        )
         padded = np.pad(fitted.astype(np.float32), self._border, constant_values=PADDING)
         return np.ascontiguousarray(padded.transpose(2, 0, 1))
 

@@ -1,8 +1,10 @@
-"""Detectors as Ultralytics exports them to ONNX: what a file says of itself, and boxes by onnxruntime on the CPU.
+"""Detectors as Ultralytics exports them to ONNX: what a file says of itself, and boxes by
+onnxruntime on the CPU.
 
-Two layouts are read (docs.ultralytics.com/integrations/onnx, and files of its 8.4.190): raw, 1 x (4 + classes) x
-anchors, centre, size and a score of each class; and final, 1 x N x 6, corners, score and class, of `nms=True` or of a
-network that needs no suppression. Both take RGB in 0 to 1 on a grey letterbox, and answer in px of the input.
+Two layouts are read (docs.ultralytics.com/integrations/onnx, and files of its 8.4.190): raw, 1 x (4
++ classes) x anchors, centre, size and a score of each class; and final, 1 x N x 6, corners, score
+and class, of `nms=True` or of a network that needs no suppression. Both take RGB in 0 to 1 on a
+grey letterbox, and answer in px of the input.
 """
 
 import ast
@@ -22,9 +24,13 @@ from beers_deploy.quant.session import open_session
 from beers_deploy.studies.detection.boxes import MOST, Boxes, Letterbox, suppress
 
 LEAST_SCORE = 1e-3
-"""Below it a detection is none, as Ultralytics validates: average precision needs the doubtful ones."""
+"""Below it a detection is none, as Ultralytics validates: average precision needs the doubtful
+ones.
+"""
 CUT = 0.01
-"""A file that drops detections only below this confidence loses next to nothing of its average precision."""
+"""A file that drops detections only below this confidence loses next to nothing of its average
+precision.
+"""
 LITERAL = 1 << 16
 """Characters of a Python literal in the metadata; the names of 1 200 classes take half of it."""
 ROUNDING = 1e-3
@@ -40,7 +46,8 @@ class Detector:
     Attributes:
         names: of its classes, in its order.
         size_px: side of its square input.
-        flag: why its average precision comes out too low, in a sentence; empty where nothing is cut.
+        flag: why its average precision comes out too low, in a sentence; empty where nothing is
+            cut.
     """
 
     names: tuple[str, ...]
@@ -49,7 +56,8 @@ class Detector:
     _run: Callable[[np.ndarray], np.ndarray]
 
     def detect(self, rgb: np.ndarray) -> Boxes:
-        """What it finds on an image (H, W, 3) float32 in 0 to 1, the best scored first, 300 boxes at most.
+        """What it finds on an image (H, W, 3) float32 in 0 to 1, the best scored first, 300 boxes
+        at most.
 
         Returns:
             Boxes in px of the image, cut at its borders.
@@ -61,9 +69,13 @@ class Detector:
         return Boxes.of(inside.corners, inside.classes, inside.scores)
 
     def decoded(self, output: np.ndarray) -> Boxes:
-        """Boxes in px of the input, suppressed, of an answer (1, 4 + classes, anchors) raw, or (1, N, 6) final."""
+        """Boxes in px of the input, suppressed, of an answer (1, 4 + classes, anchors) raw, or (1,
+        N, 6) final.
+        """
         if not _is_read(output.shape, len(self.names)):
-            raise _refused("an answer of the sizes that its file states", " x ".join(map(str, output.shape)))
+            raise _refused(
+                "an answer of the sizes that its file states", " x ".join(map(str, output.shape))
+            )
         if not np.isfinite(output).all():
             raise _refused("finite boxes and scores", "NaN or infinity")
         final = output.shape[2] == 6  # raw are at least the 21 anchors of an input of 32 px
@@ -100,7 +112,9 @@ def _answer(session: InferenceSession, path: Path, image: np.ndarray) -> np.ndar
     except Exception as error:  # onnxruntime raises a class of its own for each status code
         got = " ".join(str(error).split())[:160]
         remedy = "export it again, for one size of image"
-        raise ModelError(str(path), expected="a detector that runs", got=got, remedy=remedy) from error
+        raise ModelError(
+            str(path), expected="a detector that runs", got=got, remedy=remedy
+        ) from error
 
 
 def _literal(text: str) -> Any:
@@ -116,14 +130,19 @@ def _require_layout(model: onnx.ModelProto, task: Any, classes: int, path: Path)
     outputs = [_sizes(value) for value in model.graph.output]
     if task == "detect" and channels == [3] and len(outputs) == 1 and _is_read(outputs[0], classes):
         return
-    read = f"for RGB, 1 x {4 + classes} x anchors for {classes} classes (raw) or 1 x N x 6 (nms=True or end2end)"
+    read = (
+        f"for RGB, 1 x {4 + classes} x anchors for {classes} classes (raw) or 1 x N x 6 "
+        "(nms=True or end2end)"
+    )
     shapes = ", ".join(" x ".join(map(str, sizes)) for sizes in outputs)
     got = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}"
     raise _refused(f"a detector's output as Ultralytics exports it {read}", got, path)
 
 
 def _is_read(shape: Sequence[int], classes: int) -> bool:
-    """Whether an output is raw or final, of one image; 0 stands for a size that a file leaves open."""
+    """Whether an output is raw or final, of one image; 0 stands for a size that
+    a file leaves open.
+    """
     return len(shape) == 3 and shape[0] in (0, 1) and (shape[1] == 4 + classes or shape[2] == 6)
 
 
@@ -147,16 +166,26 @@ def _size_px(fixed: int | None, stated: Any, asked: int | None, path: Path) -> i
 
 
 def _flag(model: onnx.ModelProto) -> str:
-    """What suppression inside the file costs; the confidence it cuts at stands nowhere but in its graph."""
+    """What suppression inside the file costs; the confidence it cuts at stands nowhere but in its
+    graph.
+    """
     if not any(node.op_type == "NonMaxSuppression" for node in model.graph.node):
         return ""
     known = constants(model)
     compared = (node.input for node in model.graph.node if node.op_type == "Greater")
-    limits = [known[name].max() for names in compared for name in names if name in known and known[name].size]
+    limits = [
+        known[name].max()
+        for names in compared
+        for name in names
+        if name in known and known[name].size
+    ]
     if limits and max(limits) <= CUT:
         return ""
     where = f"confidence {max(limits):.3g}" if limits else "an unknown confidence"
-    effect = f"The detector's own suppression drops what lies below {where}, so average precision is too low"
+    effect = (
+        f"The detector's own suppression drops what lies below {where}, so average "
+        "precision is too low"
+    )
     return f"{effect}: export it without nms, or with conf=0.001."
 
 
@@ -165,7 +194,9 @@ def _raw(output: np.ndarray) -> Boxes:
     classes, anchors = np.nonzero(output[4:] > LEAST_SCORE)
     middle = output[:2, anchors].T.astype(np.float64)
     half = output[2:4, anchors].T.astype(np.float64) / 2
-    return Boxes.of(np.hstack([middle - half, middle + half]), classes, output[4 + classes, anchors])
+    return Boxes.of(
+        np.hstack([middle - half, middle + half]), classes, output[4 + classes, anchors]
+    )
 
 
 def _final(output: np.ndarray, classes: int) -> Boxes:
@@ -182,21 +213,31 @@ def _refused(expected: str, got: str, path: Path | str = "detector") -> ModelErr
 
 
 def letters(name: str) -> str:
-    """The letters and digits of a class's name, without case: tools spell the same ones differently."""
+    """The letters and digits of a class's name, without case: tools spell the same ones
+    differently.
+    """
     return "".join(c for c in name.casefold() if c.isalnum())
 
 
 def class_names(found: Any) -> tuple[str, ...]:
-    """Names of classes from a list, or a table by number from 0; none where what was found is something else."""
-    names = [found.get(number) for number in range(len(found))] if isinstance(found, dict) else found
-    if not isinstance(names, list) or not all(isinstance(name, str) and letters(name) for name in names):
+    """Names of classes from a list, or a table by number from 0; none where what was found is
+    something else.
+    """
+    names = (
+        [found.get(number) for number in range(len(found))] if isinstance(found, dict) else found
+    )
+    if not isinstance(names, list) or not all(
+        isinstance(name, str) and letters(name) for name in names
+    ):
         return ()
     return tuple(str(name).strip() for name in names)
 
 
 def parse_classes(text: str) -> dict[str, str]:
     """Read LABELLED=DETECTOR,...: which class of the detector a labelled class is."""
-    pairs = [[part.strip() for part in entry.split("=")] for entry in text.split(",") if entry.strip()]
+    pairs = [
+        [part.strip() for part in entry.split("=")] for entry in text.split(",") if entry.strip()
+    ]
     sound = pairs and all(len(pair) == 2 and all(map(letters, pair)) for pair in pairs)
     if not sound or len({letters(pair[0]) for pair in pairs}) < len(pairs):
         expected = "LABELLED=DETECTOR,..., each labelled class once"
@@ -205,8 +246,11 @@ def parse_classes(text: str) -> dict[str, str]:
     return dict(pairs)
 
 
-def class_numbers(labelled: Sequence[str], detector: Sequence[str], given: Mapping[str, str]) -> np.ndarray:
-    """For each labelled class its number among the detector's: of the one given, else of the one of the same letters.
+def class_numbers(
+    labelled: Sequence[str], detector: Sequence[str], given: Mapping[str, str]
+) -> np.ndarray:
+    """For each labelled class its number among the detector's: of the one given, else of the one of
+    the same letters.
 
     Args:
         labelled: names in the order of the labels' numbers.
@@ -220,16 +264,27 @@ def class_numbers(labelled: Sequence[str], detector: Sequence[str], given: Mappi
     if len(number) < len(detector):
         expected = "classes told apart by their letters"
         got = "two classes of the same letters"
-        raise OptionError("detector", expected=expected, got=got, remedy="export one whose classes differ")
-    for whose, asked, names in (("the labelled", given, labelled), ("the detector's", given.values(), detector)):
+        raise OptionError(
+            "detector", expected=expected, got=got, remedy="export one whose classes differ"
+        )
+    for whose, asked, names in (
+        ("the labelled", given, labelled),
+        ("the detector's", given.values(), detector),
+    ):
         for name in asked:
             if letters(name) not in map(letters, names):
                 expected = f"one of {whose} classes ({', '.join(names)})"
-                raise OptionError(OPTION, expected=expected, got=repr(name), remedy="correct the name")
+                raise OptionError(
+                    OPTION, expected=expected, got=repr(name), remedy="correct the name"
+                )
     known = {letters(name): letters(own) for name, own in given.items()}
-    numbers = np.array([number.get(known.get(letters(name), letters(name)), -1) for name in labelled], np.int64)
+    numbers = np.array(
+        [number.get(known.get(letters(name), letters(name)), -1) for name in labelled], np.int64
+    )
     if not (numbers >= 0).any():
         expected = f"a labelled class that the detector knows ({', '.join(detector)})"
         remedy = f"say which is which: {OPTION} LABELLED=DETECTOR"
-        raise OptionError(OPTION, expected=expected, got=", ".join(labelled) or "none", remedy=remedy)
+        raise OptionError(
+            OPTION, expected=expected, got=", ".join(labelled) or "none", remedy=remedy
+        )
     return numbers

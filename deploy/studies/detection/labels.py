@@ -2,12 +2,13 @@
 
 Boxes are in continuous pixels of the image, pixel i covering [i, i + 1):
 
-- VOC, an XML file an image (Everingham et al., VOC2012 development kit; DIOR: Li et al., arXiv 1909.00133): corners
-  count pixels from 1 and belong to the box.
-- COCO, one JSON file (Lin et al., arXiv 1405.0312; cocodataset.org/#format-data): left, top, width, height in px.
-- YOLO, a text file an image (docs.ultralytics.com/datasets/detect): `class cx cy w h`, or `class x y x y x y ...` of
-  an outline, which an upright box encloses, as shares of the image; names in data.yaml or classes.txt; an image
-  without a file shows no object.
+- VOC, an XML file an image (Everingham et al., VOC2012 development kit; DIOR: Li et al., arXiv
+  1909.00133): corners count pixels from 1 and belong to the box.
+- COCO, one JSON file (Lin et al., arXiv 1405.0312; cocodataset.org/#format-data): left, top, width,
+  height in px.
+- YOLO, a text file an image (docs.ultralytics.com/datasets/detect): `class cx cy w h`, or `class x
+  y x y x y ...` of an outline, which an upright box encloses, as shares of the image; names in
+  data.yaml or classes.txt; an image without a file shows no object.
 """
 
 import math
@@ -27,11 +28,15 @@ from beers_deploy.studies.detection.boxes import Boxes, areas
 from beers_deploy.studies.detection.detector import class_names, letters
 
 SPLITS = ("test", "val", "valid", "train")
-"""Where no split is asked for, the first that is there: what a detector was trained on comes last."""
+"""Where no split is asked for, the first that is there: what a detector was
+trained on comes last.
+"""
 LAYOUTS = "labels as VOC (.xml), COCO (.json) or YOLO (.txt)"
 LABEL_BYTES = 1 << 23
 NAMES_BYTES = 1 << 16
-"""Limits of a file of labels (25 000 boxes of XML), and of data.yaml, of which PyYAML reads so much in 0.4 s."""
+"""Limits of a file of labels (25 000 boxes of XML), and of data.yaml, of which PyYAML reads so much
+in 0.4 s.
+"""
 SPAN = 1e-3
 """By how much a share of YOLO's may pass 0 or 1: tools write six digits or fewer."""
 HORIZONTAL = "Horizontal Bounding Boxes"
@@ -42,7 +47,9 @@ Box = tuple[str, Sequence[float], bool]
 
 
 class LabelledSet(NamedTuple):
-    """Image files by name with their boxes, the names of the classes, and a sentence on each kind of box left out."""
+    """Image files by name with their boxes, the names of the classes, and a sentence on each kind
+    of box left out.
+    """
 
     images: list[tuple[Path, Boxes]]
     names: list[str]
@@ -50,7 +57,9 @@ class LabelledSet(NamedTuple):
 
 
 class _File(NamedTuple):
-    """The labels of one image; `size_px` is the height and width that they were made for, 0 where they say none."""
+    """The labels of one image; `size_px` is the height and width that they were made for, 0 where
+    they say none.
+    """
 
     image: Path
     source: Path
@@ -58,12 +67,15 @@ class _File(NamedTuple):
     size_px: tuple[float, float] = (0, 0)
 
 
-def read_labelled(images: Path, labels: Path | None = None, split: str | None = None) -> LabelledSet:
+def read_labelled(
+    images: Path, labels: Path | None = None, split: str | None = None
+) -> LabelledSet:
     """Labelled images of a folder.
 
     Args:
         images: the folder of the images, or the top of a tree as VOC, DIOR or YOLO have it.
-        labels: a folder of label files, one an image, or COCO's JSON; None looks where each layout keeps them.
+        labels: a folder of label files, one an image, or COCO's JSON; None looks where each layout
+            keeps them.
         split: which part of a tree; None takes `test` if there is one.
     """
     if labels is None and (images / "Annotations").is_dir() and any(images.glob("JPEGImages*")):
@@ -72,11 +84,15 @@ def read_labelled(images: Path, labels: Path | None = None, split: str | None = 
     where = labels or _labels_near(images, folder)
     if where.suffix.lower() == ".json":
         return _labelled_set(*_read_coco(where, folder))
-    return _labelled_set(_read_each(list_images(folder), where, (where, where.parent, folder, images)))
+    return _labelled_set(
+        _read_each(list_images(folder), where, (where, where.parent, folder, images))
+    )
 
 
 def _image_folder(top: Path, split: str | None) -> Path:
-    """Where the images of a split lie: TOP/images/SPLIT, TOP/SPLIT/images or TOP/SPLIT, else TOP or TOP/images."""
+    """Where the images of a split lie: TOP/images/SPLIT, TOP/SPLIT/images or TOP/SPLIT, else TOP or
+    TOP/images.
+    """
     if split is None and _holds(top, IMAGE_SUFFIXES):
         return top
     for name in (split,) if split else SPLITS:
@@ -89,7 +105,9 @@ def _image_folder(top: Path, split: str | None) -> Path:
 
 
 def _labels_near(top: Path, folder: Path) -> Path:
-    """Where the labels of a folder's images lie: in the place of `images`, beside them, or in a file of JSON."""
+    """Where the labels of a folder's images lie: in the place of `images`, beside them, or in a
+    file of JSON.
+    """
     parts = folder.relative_to(top).parts
     swapped = top.joinpath(*("labels" if part == "images" else part for part in parts))
     for path in (swapped, folder, top / "labels", top / "Annotations", top):
@@ -105,12 +123,16 @@ def _labels_near(top: Path, folder: Path) -> Path:
 
 
 def _holds(folder: Path, suffixes: Iterable[str], but: str = "") -> bool:
-    return folder.is_dir() and any(p.suffix.lower() in suffixes and p.name != but for p in folder.iterdir())
+    return folder.is_dir() and any(
+        p.suffix.lower() in suffixes and p.name != but for p in folder.iterdir()
+    )
 
 
 def _read_each(images: Sequence[Path], where: Path, named_in: Sequence[Path]) -> list[_File]:
     if not where.is_dir():
-        raise _faulty(where, LAYOUTS, "another file" if where.exists() else "no such folder", "give a folder")
+        raise _faulty(
+            where, LAYOUTS, "another file" if where.exists() else "no such folder", "give a folder"
+        )
     there = {path.name for path in where.iterdir()}
     missing = [f"{image.stem}.xml" for image in images if f"{image.stem}.xml" not in there]
     if not missing:
@@ -142,7 +164,9 @@ def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> Labelled
         images.append((one.image, inside))
     if not any(len(truth) for _, truth in images):
         got = f"none on {len(images)} images"
-        raise OptionError("labels", expected="one object at least", got=got, remedy="check the labels")
+        raise OptionError(
+            "labels", expected="one object at least", got=got, remedy="check the labels"
+        )
     told = [*notes, *_remarks([truth for _, truth in images], lost)]
     return LabelledSet(images, names, told)
 
@@ -162,16 +186,37 @@ def _remarks(truths: Sequence[Boxes], lost: Sequence[str]) -> list[str]:
     ignored = sum(int(truth.ignored.sum()) for truth in truths)
     first = lost[0] if lost else ""
     remarks = (
-        (empty, f"Images without a labelled object, all found there is false: {empty} of {len(truths)}."),
-        (lost, f"Boxes left out, without area inside their image: {len(lost)}, the first in {first}."),
-        (ignored, f"Boxes that count neither way, difficult, a crowd or visible by less than 30 %: {ignored}."),
+        (
+            empty,
+            (
+                f"Images without a labelled object, all found there is false: {empty} of "
+                f"{len(truths)}."
+            ),
+        ),
+        (
+            lost,
+            f"Boxes left out, without area inside their image: {len(lost)}, the first in {first}.",
+        ),
+        (
+            ignored,
+            (
+                "Boxes that count neither way, difficult, a crowd or visible by less than 30 %: "
+                f"{ignored}."
+            ),
+        ),
     )
     return [sentence for said, sentence in remarks if said]
 
 
 def _read_voc_tree(folder: Path, split: str | None) -> list[_File]:
-    """The labels of a split of VOC's or DIOR's folders; None takes `test`, or all where there is none."""
-    images = {p.stem: p for p in sorted(folder.glob("JPEGImages*/*")) if p.suffix.lower() in IMAGE_SUFFIXES}
+    """The labels of a split of VOC's or DIOR's folders; None takes `test`, or all where there is
+    none.
+    """
+    images = {
+        p.stem: p
+        for p in sorted(folder.glob("JPEGImages*/*"))
+        if p.suffix.lower() in IMAGE_SUFFIXES
+    }
     labels = folder / "Annotations"
     labels = labels / HORIZONTAL if (labels / HORIZONTAL).is_dir() else labels
     lists = {path.stem: path for path in sorted((folder / "ImageSets" / "Main").glob("*.txt"))}
@@ -181,7 +226,12 @@ def _read_voc_tree(folder: Path, split: str | None) -> list[_File]:
         # A list of one class has a number behind each name.
         stems = sorted({line.split()[0] for line in _lines(lists[wanted])})
     elif split:
-        raise _faulty(folder, f"one of its splits ({', '.join(lists) or 'none'})", repr(split), "name one of them")
+        raise _faulty(
+            folder,
+            f"one of its splits ({', '.join(lists) or 'none'})",
+            repr(split),
+            "name one of them",
+        )
     missing = [stem for stem in stems if stem not in images]
     if missing:
         got = f"{len(missing)} of {len(stems)} missing, the first {missing[0]!r}"
@@ -196,9 +246,15 @@ def _read_voc(image: Path, labels: Path) -> _File:
     except (ValueError, LookupError, RecursionError) as error:  # lookup: of an encoding
         raise _faulty(labels, "plain XML", " ".join(str(error).split())[:100]) from error
     if root.tag != "annotation":
-        raise _faulty(labels, "Pascal VOC, an 'annotation'", f"<{root.tag}>"[:80], "give labels of VOC")
-    height, width = _numbers([root.findtext(f"size/{name}", "0") for name in ("height", "width")], labels, "size")
-    return _File(image, labels, [_voc_box(entry, labels) for entry in root.iter("object")], (height, width))
+        raise _faulty(
+            labels, "Pascal VOC, an 'annotation'", f"<{root.tag}>"[:80], "give labels of VOC"
+        )
+    height, width = _numbers(
+        [root.findtext(f"size/{name}", "0") for name in ("height", "width")], labels, "size"
+    )
+    return _File(
+        image, labels, [_voc_box(entry, labels) for entry in root.iter("object")], (height, width)
+    )
 
 
 def _voc_box(entry: ET.Element, path: Path) -> Box:
@@ -207,40 +263,66 @@ def _voc_box(entry: ET.Element, path: Path) -> Box:
         raise _faulty(path, "a name for every object", "none")
     corners = [entry.findtext(f"bndbox/{corner}", "none") for corner in CORNERS]
     left, top, right, bottom = _numbers(corners, path, f"{', '.join(CORNERS)} of a {name!r}")
-    return name, (left - 1, top - 1, right, bottom), (entry.findtext("difficult") or "0").strip() == "1"
+    return (
+        name,
+        (left - 1, top - 1, right, bottom),
+        (entry.findtext("difficult") or "0").strip() == "1",
+    )
 
 
 def _read_coco(labels: Path, folder: Path) -> tuple[list[_File], list[str]]:
-    """The labels of every image that is both listed and in the folder, and a sentence about those that are not."""
+    """The labels of every image that is both listed and in the folder, and a sentence about those
+    that are not.
+    """
     try:
         content: Any = read_json(labels)
         names = {entry["id"]: str.strip(entry["name"]) for entry in content["categories"]}
         boxes: dict[Any, list[Box]] = {entry["id"]: [] for entry in content["images"]}
         for entry in content["annotations"]:
             left, top, width, height = map(float, entry["bbox"])
-            box = names[entry["category_id"]], (left, top, left + width, top + height), bool(entry.get("iscrowd", 0))
+            box = (
+                names[entry["category_id"]],
+                (left, top, left + width, top + height),
+                bool(entry.get("iscrowd", 0)),
+            )
             boxes[entry["image_id"]].append(box)
         files = [
-            _File(path, labels, boxes[entry["id"]], (float(entry.get("height") or 0), float(entry.get("width") or 0)))
+            _File(
+                path,
+                labels,
+                boxes[entry["id"]],
+                (float(entry.get("height") or 0), float(entry.get("width") or 0)),
+            )
             for entry in content["images"]
             if (path := _inside(folder, entry["file_name"]))
         ]
     except (OSError, LookupError, TypeError, ValueError, OverflowError) as error:
         got = f"{type(error).__name__}: {' '.join(str(error).split())[:100]}"
         remedy = "give COCO's JSON file"
-        raise _faulty(labels, "COCO's lists of images, annotations and categories", got, remedy) from error
+        raise _faulty(
+            labels, "COCO's lists of images, annotations and categories", got, remedy
+        ) from error
     listed = len(content["images"])
     if not files:
-        raise _faulty(labels, f"its images in {folder}", f"none of {listed}", "give the folder that holds them")
+        raise _faulty(
+            labels,
+            f"its images in {folder}",
+            f"none of {listed}",
+            "give the folder that holds them",
+        )
     absent = listed - len(files)
-    return files, [f"{absent} of {listed} images in {labels.name} are not in the folder."] if absent else []
+    return files, [
+        f"{absent} of {listed} images in {labels.name} are not in the folder."
+    ] if absent else []
 
 
 def _inside(folder: Path, name: str) -> Path | None:
     """The file of that name in the folder, or of its last part; nothing outside the folder."""
     if ".." in Path(name).parts or Path(name).is_absolute():
         return None
-    return next((path for path in (folder / name, folder / Path(name).name) if path.is_file()), None)
+    return next(
+        (path for path in (folder / name, folder / Path(name).name) if path.is_file()), None
+    )
 
 
 def _read_yolo(image: Path, labels: Path, names: Sequence[str]) -> _File:
@@ -269,7 +351,9 @@ def _yolo_box(line: str, path: Path, names: Sequence[str], size_px: tuple[int, i
 
 
 def yolo_names(folders: Sequence[Path]) -> tuple[str, ...]:
-    """Names of the classes, in their order, from the first data.yaml or classes.txt in some folders."""
+    """Names of the classes, in their order, from the first data.yaml or classes.txt in some
+    folders.
+    """
     for folder in folders:
         for path in (*sorted(folder.glob("*.yaml")), *sorted(folder.glob("*.yml"))):
             if found := _yaml_names(path):
@@ -278,7 +362,9 @@ def yolo_names(folders: Sequence[Path]) -> tuple[str, ...]:
             return tuple(line.strip() for line in _lines(folder / "classes.txt"))
     expected = "data.yaml or classes.txt with the names of the classes"
     places = ", ".join(map(str, folders))
-    raise OptionError("YOLO labels", expected=expected, got=f"neither in {places}", remedy="add one")
+    raise OptionError(
+        "YOLO labels", expected=expected, got=f"neither in {places}", remedy="add one"
+    )
 
 
 def _yaml_names(path: Path) -> tuple[str, ...]:
@@ -288,7 +374,9 @@ def _yaml_names(path: Path) -> tuple[str, ...]:
     except ImportError as error:
         got = "no such package"
         remedy = "pip install 'beers-deploy[detect]', or write classes.txt"
-        raise MissingExtraError(str(path), expected="PyYAML to read it", got=got, remedy=remedy) from error
+        raise MissingExtraError(
+            str(path), expected="PyYAML to read it", got=got, remedy=remedy
+        ) from error
     text = _read_bytes(path, NAMES_BYTES)
     try:
         content: Any = yaml.safe_load(text)
@@ -303,14 +391,20 @@ def _yaml_names(path: Path) -> tuple[str, ...]:
 
 
 def _lines(path: Path) -> list[str]:
-    return [line for line in _read_bytes(path).decode("utf-8-sig", "replace").splitlines() if line.strip()]
+    return [
+        line
+        for line in _read_bytes(path).decode("utf-8-sig", "replace").splitlines()
+        if line.strip()
+    ]
 
 
 def _read_bytes(path: Path, limit_bytes: int = LABEL_BYTES) -> bytes:
     try:
         return read_whole(path, limit_bytes)
     except (OSError, ValueError) as error:
-        raise _faulty(path, "a file of labels", getattr(error, "strerror", None) or str(error)) from error
+        raise _faulty(
+            path, "a file of labels", getattr(error, "strerror", None) or str(error)
+        ) from error
 
 
 def _numbers(texts: Sequence[str], path: Path, what: str) -> list[float]:

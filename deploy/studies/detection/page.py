@@ -10,7 +10,13 @@ from beers_deploy.model.io.pictures import grid, picture_url
 from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.report.plots import SERIES, Curve, curves_svg, data_url
-from beers_deploy.studies.detection.average_precision import ALL, RECALLS, match, mean_known, precisions
+from beers_deploy.studies.detection.average_precision import (
+    ALL,
+    RECALLS,
+    match,
+    mean_known,
+    precisions,
+)
 from beers_deploy.studies.detection.boxes import Boxes
 from beers_deploy.studies.detection.study import REFERENCE, Comparison
 from beers_deploy.studies.detection.tables import BY_SIZE, MAIN, PAPER_NOTES, headline
@@ -25,19 +31,30 @@ FALSE = "#ffd21f"
 """Colours of boxes."""
 
 CAPTIONS = {
-    MAIN: "Precision and recall at the confidence of the reference's best F1, the one a deployed detector is set to. "
-    "Gains and losses are of mAP50, on the same images; where their interval holds 0, there is none.",
+    MAIN: "Precision and recall at the confidence of the reference's best F1, the one a "
+    "deployed detector is set to. "
+    "Gains and losses are of mAP50, on the same images; where their interval holds 0, there is "
+    "none.",
     BY_SIZE: "Root of a box's area, in pixels of the scene.",
 }
 NOTES = (
-    "mAP50: average precision at an overlap of half, mean over classes; mAP50-95: mean over 0.5 to 0.95 (COCO).",
-    "Share of loss regained: gain over what degradation took; unavailable where that loss cannot be told from 0.",
+    (
+        "mAP50: average precision at an overlap of half, mean over classes; mAP50-95: mean over "
+        "0.5 "
+        "to 0.95 (COCO)."
+    ),
+    (
+        "Share of loss regained: gain over what degradation took; unavailable where that loss "
+        "cannot be told from 0."
+    ),
     "The detector is fixed, and was trained for none of the degraded or restored images.",
     "It is shown one panchromatic band in all three, under one stretch for all rows of a scene.",
 )
 
 
-def write_page(compared: Sequence[Comparison], rows: Sequence[Row], notes: Sequence[str], path: Path) -> None:
+def write_page(
+    compared: Sequence[Comparison], rows: Sequence[Row], notes: Sequence[str], path: Path
+) -> None:
     """Write the page of a study, whole or not at all.
 
     Args:
@@ -46,7 +63,10 @@ def write_page(compared: Sequence[Comparison], rows: Sequence[Row], notes: Seque
         notes: what a reader must know besides.
         path: of the page.
     """
-    tables = [Section(name, each, CAPTIONS.get(name.split(",")[0], "")) for name, each in by_table(rows).items()]
+    tables = [
+        Section(name, each, CAPTIONS.get(name.split(",")[0], ""))
+        for name, each in by_table(rows).items()
+    ]
     truths = [each.scene.truth for each in compared[0].scenes]
     objects = sum(int((~truth.ignored).sum()) for truth in truths)
     title = f"What restoration buys a detector: {objects} objects on {len(truths)} images"
@@ -66,28 +86,41 @@ def curves(compared: Sequence[Comparison]) -> Picture:
 def _curve(found: Comparison, row: str) -> Curve:
     hits = found.hits[row]
     once = np.ones((1, len(found.scenes)), np.int64)
-    values = mean_known(np.array([precisions(hits, kind, once)[0, 0] for kind in range(len(found.names))]))
+    values = mean_known(
+        np.array([precisions(hits, kind, once)[0, 0] for kind in range(len(found.names))])
+    )
     points = tuple(zip(RECALLS.tolist(), values.tolist(), strict=True))
     return Curve(row, list(found.hits).index(row) % len(SERIES), row == REFERENCE, points)
 
 
 def crops(compared: Sequence[Comparison]) -> list[Picture]:
     """The same crops of the scenes that lose most objects: a row a sensor and a column a method."""
-    lost = [sum(int(_lost(found, number).sum()) for found in compared) for number in range(len(compared[0].scenes))]
+    lost = [
+        sum(int(_lost(found, number).sum()) for found in compared)
+        for number in range(len(compared[0].scenes))
+    ]
     chosen = np.argsort(-np.array(lost), kind="stable")[:PICTURES]
     return [_picture(compared, int(number)) for number in chosen]
 
 
 def _lost(found: Comparison, number: int) -> np.ndarray:
     """(M,) objects of a scene that are found on the reference and not on degraded images."""
-    return np.asarray(_matched(found, REFERENCE, number)[-1] & ~_matched(found, DEGRADED, number)[-1])
+    return np.asarray(
+        _matched(found, REFERENCE, number)[-1] & ~_matched(found, DEGRADED, number)[-1]
+    )
 
 
-def _matched(found: Comparison, row: str, number: int) -> tuple[Boxes, np.ndarray, np.ndarray, np.ndarray]:
-    """The boxes on a scene that reach the table's confidence; hits, ignored ones, and objects taken, by half."""
+def _matched(
+    found: Comparison, row: str, number: int
+) -> tuple[Boxes, np.ndarray, np.ndarray, np.ndarray]:
+    """The boxes on a scene that reach the table's confidence; hits, ignored ones, and objects
+    taken, by half.
+    """
     boxes = found.boxes[row][number]
     sure = boxes[boxes.scores >= found.confidence]
-    hits, ignored, taken = (flags[ALL, 0] for flags in match(found.scenes[number].scene.truth, sure))
+    hits, ignored, taken = (
+        flags[ALL, 0] for flags in match(found.scenes[number].scene.truth, sure)
+    )
     return sure, hits, ignored, taken
 
 
@@ -95,35 +128,47 @@ def _picture(compared: Sequence[Comparison], number: int) -> Picture:
     middle = _middle(compared[0], number)
     rows = [[_cell(found, row, number, middle) for row in found.methods] for found in compared]
     caption = (
-        f"Rows: {' and '.join(found.name for found in compared)}. {CROP_PX} pixels of the sensor a side, enlarged "
-        f"{ZOOM} times, one display for all. Boxes at the confidence of the table: green found, red missed, "
+        f"Rows: {' and '.join(found.name for found in compared)}. {CROP_PX} pixels of the "
+        "sensor a side, enlarged "
+        f"{ZOOM} times, one display for all. Boxes at the confidence of the table: green found, "
+        "red missed, "
         "yellow false."
     )
     image = np.asarray(grid(list(compared[0].methods), rows, 1))
-    return Picture(f"{compared[0].scenes[number].scene.name}: what is found", picture_url(image), caption)
+    return Picture(
+        f"{compared[0].scenes[number].scene.name}: what is found", picture_url(image), caption
+    )
 
 
 def _middle(found: Comparison, number: int) -> np.ndarray:
-    """(2,) x and y in scene pixels of the object, a lost one if there is any, with most such near it."""
+    """(2,) x and y in scene pixels of the object, a lost one if there is any, with most such near
+    it.
+    """
     truth = found.scenes[number].scene.truth
     lost = _lost(found, number)
     shown = truth.corners[lost] if lost.any() else truth.corners
     if not len(shown):
         return np.zeros(2)
     middles = (shown[:, :2] + shown[:, 2:]) / 2
-    near = np.abs(middles[:, None] - middles[None]).max(-1) < CROP_PX * found.sensors.oversampling / 2
+    near = (
+        np.abs(middles[:, None] - middles[None]).max(-1) < CROP_PX * found.sensors.oversampling / 2
+    )
     return np.asarray(middles[int(near.sum(axis=1).argmax())])
 
 
 def _cell(found: Comparison, row: str, number: int, middle: np.ndarray) -> np.ndarray:
-    """An enlarged crop around a place of the scene, what is missed, falsely found and found drawn over it."""
+    """An enlarged crop around a place of the scene, what is missed, falsely found and found drawn
+    over it.
+    """
     scene = found.scenes[number]
     ratio = found.sensors.oversampling
     truth, (boxes, hits, ignored, taken) = scene.scene.truth, _matched(found, row, number)
     rgb = np.rint(255 * scene.shown(found.methods[row])).astype(np.uint8)
     most = np.maximum(np.array(rgb.shape[1::-1]) - CROP_PX, 0)
     left, top = corner = np.clip(middle / ratio - CROP_PX / 2, 0, most).astype(int).tolist()
-    crop = Image.fromarray(rgb).crop((left, top, left + CROP_PX, top + CROP_PX))  # black beyond the image
+    crop = Image.fromarray(rgb).crop(
+        (left, top, left + CROP_PX, top + CROP_PX)
+    )  # black beyond the image
     picture = crop.resize((CROP_PX * ZOOM, CROP_PX * ZOOM), Image.Resampling.NEAREST)
     draw = ImageDraw.Draw(picture)
     shown = (

@@ -1,9 +1,11 @@
-"""Synthetic scenes with known objects: vehicles, ships, aircraft and tanks on plots of ground between streets.
+"""Synthetic scenes with known objects: vehicles, ships, aircraft and tanks on plots of ground
+between streets.
 
-The world is that of the simulator's procedural scene, its radiances and its texture, drawn at 0.25 m a pixel and
-turned as a whole: of three scene pixels a sensor makes one of 0.75 m, in which a car is 6 pixels long. Objects are
-polygons in metres around (0, 0), the nose along x, sized as common types: cars of 3.8 to 5.2 m, lorries and buses to
-14 m, ships of 9 to 70 m, aircraft of 12 to 38 m span, tanks of 5 to 15 m radius.
+The world is that of the simulator's procedural scene, its radiances and its texture, drawn at 0.25
+m a pixel and turned as a whole: of three scene pixels a sensor makes one of 0.75 m, in which a car
+is 6 pixels long. Objects are polygons in metres around (0, 0), the nose along x, sized as common
+types: cars of 3.8 to 5.2 m, lorries and buses to 14 m, ships of 9 to 70 m, aircraft of 12 to 38 m
+span, tanks of 5 to 15 m radius.
 """
 
 import math
@@ -37,12 +39,16 @@ Part = tuple[list[Point], float]
 """A polygon in metres and its radiance; of several the first is the lowest."""
 
 
-def synthetic_scene(generator: np.random.Generator, height_px: int, width_px: int) -> tuple[np.ndarray, Boxes]:
+def synthetic_scene(
+    generator: np.random.Generator, height_px: int, width_px: int
+) -> tuple[np.ndarray, Boxes]:
     """Draw a scene of that many pixels of 0.25 m, the same for the same generator state.
 
     Returns:
-        Radiance (H, W) float32 in W/m2/sr/um, and the boxes of its objects, of `CLASSES`: exactly their pixels, their
-        shadows left out. Every object lies whole within the scene, touches no other, and nothing covers it.
+        Radiance (H, W) float32 in W/m2/sr/um, and the boxes of its objects, of `CLASSES`: exactly
+            their pixels, their
+        shadows left out. Every object lies whole within the scene, touches no other, and nothing
+            covers it.
     """
     canvas = Canvas(height_px, width_px, generator)
     angle, (x, y) = generator.uniform(-0.5, 0.5), generator.uniform(-0.5, 0.5, 2) * PLOT_M
@@ -53,7 +59,9 @@ def synthetic_scene(generator: np.random.Generator, height_px: int, width_px: in
     half_m = (PLOT_M - STREET_M) / 2 - KERB_M
     turn = drawing.turn
     plots = [Plot(canvas, turn(*world(u, v), angle), half_m) for v in places for u in places]
-    strips = [Plot(canvas, turn(*world(p + PLOT_M / 2, 0), angle + math.pi / 2), reach) for p in places]
+    strips = [
+        Plot(canvas, turn(*world(p + PLOT_M / 2, 0), angle + math.pi / 2), reach) for p in places
+    ]
     strips += [Plot(canvas, turn(*world(0, p + PLOT_M / 2), angle), reach) for p in places]
     for strip in strips:
         _street(strip)
@@ -72,13 +80,18 @@ class Canvas:
         self.corners: list[tuple[int, int, int, int]] = []
         self.classes: list[int] = []
         self.size = width_px, height_px
-        self._image, self._taken = Image.new("F", self.size, drawing.GRASS), Image.new("L", self.size, 0)
+        self._image, self._taken = (
+            Image.new("F", self.size, drawing.GRASS),
+            Image.new("L", self.size, 0),
+        )
         self.draw = ImageDraw.Draw(self._image)
 
     def textured(self) -> np.ndarray:
         """The radiance (H, W) float32 with the ground's texture."""
         width, height = self.size
-        return np.asarray(np.asarray(self._image) * drawing.texture(height, width, self.generator), np.float32)
+        return np.asarray(
+            np.asarray(self._image) * drawing.texture(height, width, self.generator), np.float32
+        )
 
     def is_free(self, left: float, top: float, right: float, bottom: float) -> bool:
         """Whether no object stands in a rectangle, in pixels."""
@@ -88,14 +101,18 @@ class Canvas:
     def put(self, kind: int, polygons: list[Part], shadow_px: float) -> None:
         """Draw an object of polygons in pixels, over the shadow that it throws right and down."""
         for polygon, _ in polygons:
-            self.draw.polygon([drawing.shift(point, shadow_px) for point in polygon], fill=drawing.SHADOW)
+            self.draw.polygon(
+                [drawing.shift(point, shadow_px) for point in polygon], fill=drawing.SHADOW
+            )
         own = Image.new("L", self.size, 0)
         for polygon, paint in polygons:
             self.draw.polygon(polygon, fill=paint)
             ImageDraw.Draw(own).polygon(polygon, fill=255)
         self._taken.paste(255, mask=own)
         self.classes.append(kind)
-        self.corners.append(own.getbbox() or (0, 0, 0, 0))  # of the pixels that Pillow fills, not of the polygons
+        self.corners.append(
+            own.getbbox() or (0, 0, 0, 0)
+        )  # of the pixels that Pillow fills, not of the polygons
 
 
 @dataclass(frozen=True)
@@ -111,8 +128,12 @@ class Plot:
         """The canvas's own generator."""
         return self.canvas.generator
 
-    def rectangle(self, x: float, y: float, width: float, height: float, radiance: float, by: float = 0) -> None:
-        """Fill a rectangle of the plot from its corner (x, y), moved right and down in the scene `by` pixels."""
+    def rectangle(
+        self, x: float, y: float, width: float, height: float, radiance: float, by: float = 0
+    ) -> None:
+        """Fill a rectangle of the plot from its corner (x, y), moved right and down in the scene
+        `by` pixels.
+        """
         corners = [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
         moved = [drawing.shift(self._pixel(*corner), by) for corner in corners]
         self.canvas.draw.polygon(moved, fill=radiance)
@@ -124,7 +145,9 @@ class Plot:
     def line(self, start: Point, end: Point, radiance: float, width_m: float) -> None:
         """Draw a line on the plot."""
         width_px = max(round(width_m / SCENE_GSD_M), 1)
-        self.canvas.draw.line([self._pixel(*start), self._pixel(*end)], fill=radiance, width=width_px)
+        self.canvas.draw.line(
+            [self._pixel(*start), self._pixel(*end)], fill=radiance, width=width_px
+        )
 
     def tree(self, x: float, y: float) -> None:
         """Draw a tree of 1.5 to 3.5 m radius, unless an object stands there."""
@@ -133,8 +156,12 @@ class Plot:
         if self.canvas.is_free(*drawing.around(*middle, 2 * radius)):
             drawing.tree(self.canvas.draw, *middle, radius, self.random)
 
-    def put(self, kind: int, parts: list[Part], x: float, y: float, turned: float, height_m: float) -> bool:
-        """Put an object at (x, y), turned, if it lies whole within plot and scene and clear of others."""
+    def put(
+        self, kind: int, parts: list[Part], x: float, y: float, turned: float, height_m: float
+    ) -> bool:
+        """Put an object at (x, y), turned, if it lies whole within plot and scene and clear of
+        others.
+        """
         own = drawing.turn(x, y, turned)
         shadow_px = height_m / SCENE_GSD_M
         outlines = [[own(*point) for point in polygon] for polygon, _ in parts]
@@ -142,11 +169,19 @@ class Plot:
         points = np.concatenate(polygons)
         low = points.min(0) - GAP_PX
         high = points.max(0) + GAP_PX + shadow_px
-        if np.abs(np.concatenate(outlines)).max() > self.half_m or low.min() < 0 or (high >= self.canvas.size).any():
+        if (
+            np.abs(np.concatenate(outlines)).max() > self.half_m
+            or low.min() < 0
+            or (high >= self.canvas.size).any()
+        ):
             return False
         if not self.canvas.is_free(*low, *high):
             return False
-        self.canvas.put(kind, [(each, paint) for each, (_, paint) in zip(polygons, parts, strict=True)], shadow_px)
+        self.canvas.put(
+            kind,
+            [(each, paint) for each, (_, paint) in zip(polygons, parts, strict=True)],
+            shadow_px,
+        )
         return True
 
     def scatter(self, count: int, put: Callable[[float, float], bool]) -> None:
@@ -163,7 +198,10 @@ def vehicle(generator: np.random.Generator) -> list[Part]:
     """A car, or with 1 in 5 a lorry or bus: the body and, of cars, the windscreen."""
     paint = generator.choice(PAINTS)
     if generator.random() < 0.2:
-        return [(drawing.rectangle(generator.uniform(4, 7), 1.25), paint), (_band(3.0, 3.5, 1.2), 0.5 * paint)]
+        return [
+            (drawing.rectangle(generator.uniform(4, 7), 1.25), paint),
+            (_band(3.0, 3.5, 1.2), 0.5 * paint),
+        ]
     body = drawing.rectangle(generator.uniform(1.9, 2.6), generator.uniform(0.85, 1.0))
     return [(body, paint), (_band(0.4, 1.1, 0.8), 20.0)]
 
@@ -173,10 +211,14 @@ def ship(generator: np.random.Generator) -> list[Part]:
     half = 0.5 * math.exp(generator.uniform(math.log(9), math.log(70)))
     wide = half / generator.uniform(3, 5)
     hull = generator.uniform(50, 160)
-    outline = [(x * half, y * wide) for x, y in ((-1, -0.8), (-0.9, -1), (0.5, -1), (0.8, -0.6), (1, 0))]
+    outline = [
+        (x * half, y * wide) for x, y in ((-1, -0.8), (-0.9, -1), (0.5, -1), (0.8, -0.6), (1, 0))
+    ]
     parts = [(outline + [(x, -y) for x, y in reversed(outline[:-1])], hull)]
     for start, end in pairwise(np.linspace(-0.45, 0.55, int(generator.integers(2, 6))) * half):
-        parts.append((_band(start + 0.04 * half, end, 0.7 * wide), hull * generator.uniform(0.4, 1.6)))
+        parts.append(
+            (_band(start + 0.04 * half, end, 0.7 * wide), hull * generator.uniform(0.4, 1.6))
+        )
     return [*parts, (_band(-0.85 * half, -0.55 * half, 0.75 * wide), generator.uniform(170, 260))]
 
 
@@ -212,12 +254,18 @@ def tank(radius_m: float, generator: np.random.Generator) -> list[Part]:
 
 
 def _swept(front: float, half_span: float, chord: float, sweep: float) -> list[Point]:
-    """A wing from tip to tip: its leading edge at x = front in the middle, `sweep` further back at the tips."""
+    """A wing from tip to tip: its leading edge at x = front in the middle, `sweep` further back at
+    the tips.
+    """
     tip = front - sweep
     return [
-        (front, 0.0), (tip, half_span), (tip - 0.35 * chord, half_span), (front - chord, 0.0),
-        (tip - 0.35 * chord, -half_span), (tip, -half_span),
-    ]  # fmt: skip
+        (front, 0.0),
+        (tip, half_span),
+        (tip - 0.35 * chord, half_span),
+        (front - chord, 0.0),
+        (tip - 0.35 * chord, -half_span),
+        (tip, -half_span),
+    ]
 
 
 def _band(start: float, end: float, half_wide: float) -> list[Point]:
@@ -231,7 +279,9 @@ def _disc(x: float, y: float, radius: float, corners: int = 32) -> list[Point]:
 
 def _street(strip: Plot) -> None:
     reach = strip.half_m
-    strip.rectangle(-reach, -STREET_M / 2 - KERB_M, 2 * reach, STREET_M + 2 * KERB_M, drawing.CONCRETE * 0.8)
+    strip.rectangle(
+        -reach, -STREET_M / 2 - KERB_M, 2 * reach, STREET_M + 2 * KERB_M, drawing.CONCRETE * 0.8
+    )
     strip.rectangle(-reach, -STREET_M / 2, 2 * reach, STREET_M, drawing.ASPHALT)
     for u in np.arange(-reach, reach, 8.0):
         strip.line((u, 0.0), (u + 3.4, 0.0), drawing.WHITE * 0.7, 0.3)
@@ -252,7 +302,9 @@ def _harbour(plot: Plot) -> None:
     pier = plot.random.uniform(-0.4, 0.4) * half
     plot.rectangle(pier, -half, 4.0, plot.random.uniform(0.4, 1.3) * half, drawing.CONCRETE * 0.8)
     for _ in range(int(plot.random.integers(0, 6))):
-        plot.put(VEHICLE, vehicle(plot.random), plot.random.uniform(-half, half), 3.5 - half, 0.0, 0.8)
+        plot.put(
+            VEHICLE, vehicle(plot.random), plot.random.uniform(-half, half), 3.5 - half, 0.0, 0.8
+        )
 
     def sail(x: float, y: float) -> bool:
         moored = plot.random.choice([0, math.pi / 2])
@@ -292,8 +344,12 @@ def _tank_farm(plot: Plot) -> None:
             x = start + step * column
             y = start + step * row
             for side in (-0.48 * step, 0.48 * step):
-                plot.line((x + side, y - 0.48 * step), (x + side, y + 0.48 * step), drawing.CONCRETE, 0.8)
-                plot.line((x - 0.48 * step, y + side), (x + 0.48 * step, y + side), drawing.CONCRETE, 0.8)
+                plot.line(
+                    (x + side, y - 0.48 * step), (x + side, y + 0.48 * step), drawing.CONCRETE, 0.8
+                )
+                plot.line(
+                    (x - 0.48 * step, y + side), (x + 0.48 * step, y + side), drawing.CONCRETE, 0.8
+                )
             if plot.random.random() < 0.75:
                 own = radius * plot.random.choice([1.0, 1.0, 0.6])
                 plot.put(TANK, tank(own, plot.random), x, y, 0.0, 0.35 * own)
@@ -338,12 +394,20 @@ def _house(plot: Plot, x: float, y: float, long: float, wide: float) -> None:
 
 
 def _scatter(
-    plot: Plot, kind: int, make: Callable[[np.random.Generator], list[Part]], counts: tuple[int, int], height_m: float
+    plot: Plot,
+    kind: int,
+    make: Callable[[np.random.Generator], list[Part]],
+    counts: tuple[int, int],
+    height_m: float,
 ) -> None:
-    """Some objects of a kind anywhere on a plot, turned anyhow; `counts` are the least and the most."""
+    """Some objects of a kind anywhere on a plot, turned anyhow; `counts` are the least and the
+    most.
+    """
     plot.scatter(
         int(plot.random.integers(*counts, endpoint=True)),
-        lambda x, y: plot.put(kind, make(plot.random), x, y, plot.random.uniform(0, math.tau), height_m),
+        lambda x, y: plot.put(
+            kind, make(plot.random), x, y, plot.random.uniform(0, math.tau), height_m
+        ),
     )
 
 

@@ -1,7 +1,8 @@
-"""What a fixed detector finds on the same scenes: as the reference sensor sees them, degraded, and restored.
+"""What a fixed detector finds on the same scenes: as the reference sensor sees them, degraded, and
+restored.
 
-scene -> acquisition, whole -> restoration -> one display for all rows, stretched as the reference asks -> detector ->
-boxes back on the scene -> average precision.
+scene -> acquisition, whole -> restoration -> one display for all rows, stretched as the reference
+asks -> detector -> boxes back on the scene -> average precision.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +20,13 @@ from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import read_scene
 from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.profiles.sensor_file import load_sensor, reference_beside
-from beers_deploy.studies.detection.average_precision import Figures, Hits, find_hits, score_rows, site_weights
+from beers_deploy.studies.detection.average_precision import (
+    Figures,
+    Hits,
+    find_hits,
+    score_rows,
+    site_weights,
+)
 from beers_deploy.studies.detection.boxes import Boxes
 from beers_deploy.studies.detection.detector import Detector, class_numbers
 from beers_deploy.studies.detection.labels import read_labelled
@@ -30,7 +37,9 @@ REFERENCE = "reference"
 """The row of the scenes as the reference sensor sees them."""
 
 SIDE_PX = 768
-"""Of a synthetic scene: 256 pixels a side of a sensor that makes one of three, the input of the embedded detector."""
+"""Of a synthetic scene: 256 pixels a side of a sensor that makes one of three, the input of the
+embedded detector.
+"""
 
 
 @dataclass(frozen=True)
@@ -42,7 +51,8 @@ class LabelledScene:
         site: where it lies; scenes of one site are alike.
         truth: labelled boxes in scene pixels, of the detector's classes.
         path: of the file; None of a synthetic scene.
-        radiance: the scene (H, W) in W/m2/sr/um; a picture's white stands for the full scale of the sensor given.
+        radiance: the scene (H, W) in W/m2/sr/um; a picture's white stands for the full scale of the
+            sensor given.
     """
 
     name: str
@@ -67,7 +77,9 @@ class SensorPair:
 
 @dataclass(frozen=True)
 class AcquiredScene:
-    """A scene in front of two sensors, under one draw of them and of the noise; acquired once it is asked for."""
+    """A scene in front of two sensors, under one draw of them and of the noise; acquired once it is
+    asked for.
+    """
 
     scene: LabelledScene
     sensors: SensorPair
@@ -84,7 +96,8 @@ class AcquiredScene:
         return self._acquired(self.sensors.degraded, DEGRADED)
 
     def shown(self, method: Method | None) -> np.ndarray:
-        """What a detector is given, (h, w, 3) float32 in 0 to 1: restored by a method; the reference for None.
+        """What a detector is given, (h, w, 3) float32 in 0 to 1: restored by a method; the
+        reference for None.
 
         Every row's image of a scene is shown alike, stretched as the reference asks.
         """
@@ -147,7 +160,8 @@ def run_study(
     seed: int = 0,
     say: Log = no_log,
 ) -> list[Comparison]:
-    """Show a detector the same scenes as the reference sees them, degraded and restored, under each sensor.
+    """Show a detector the same scenes as the reference sees them, degraded and restored, under each
+    sensor.
 
     Args:
         detector: that is shown the pictures.
@@ -159,18 +173,30 @@ def run_study(
         say: is told what a user should know on the way.
     """
     told = once(say)
-    pairs = [SensorPair(each, reference_beside(each, reference, told)) for each in map(load_sensor, sensors)]
-    rows = [{name: method_named(name, pair.degraded, pair.reference, told) for name in methods} for pair in pairs]
+    pairs = [
+        SensorPair(each, reference_beside(each, reference, told))
+        for each in map(load_sensor, sensors)
+    ]
+    rows = [
+        {name: method_named(name, pair.degraded, pair.reference, told) for name in methods}
+        for pair in pairs
+    ]
     return [_compared(detector, scenes, *each, seed) for each in zip(pairs, rows, strict=True)]
 
 
 def _compared(
-    detector: Detector, scenes: Sequence[LabelledScene], sensors: SensorPair, methods: Mapping[str, Method], seed: int
+    detector: Detector,
+    scenes: Sequence[LabelledScene],
+    sensors: SensorPair,
+    methods: Mapping[str, Method],
+    seed: int,
 ) -> Comparison:
     rows = {REFERENCE: None, **methods}
     boxes: dict[str, list[Boxes]] = {row: [] for row in rows}
     with steps(f"detecting, {sensors.degraded.name}", len(scenes) * len(rows)) as bar:
-        for each in acquired(scenes, sensors, seed):  # let go of after its rows: thousands would fill the memory
+        for each in acquired(
+            scenes, sensors, seed
+        ):  # let go of after its rows: thousands would fill the memory
             for row, method in rows.items():
                 boxes[row].append(each.boxes(detector, method))
                 bar.advance(1, row)
@@ -179,12 +205,20 @@ def _compared(
     sites = [scene.site for scene in scenes]
     hits = {row: find_hits(truths, found, len(names)) for row, found in boxes.items()}
     scores = score_rows(hits, names, site_weights(sites, seed))
-    return Comparison(sensors, rows, list(acquired(scenes, sensors, seed)), boxes, hits, *scores, names)
+    return Comparison(
+        sensors, rows, list(acquired(scenes, sensors, seed)), boxes, hits, *scores, names
+    )
 
 
-def acquired(scenes: Sequence[LabelledScene], sensors: SensorPair, seed: int) -> "map[AcquiredScene]":
+def acquired(
+    scenes: Sequence[LabelledScene], sensors: SensorPair, seed: int
+) -> "map[AcquiredScene]":
     """Every scene in front of the sensors, the noise drawn by the seed and the scene's number."""
-    return map(lambda number, scene: AcquiredScene(scene, sensors, Draw(seed, number)), range(len(scenes)), scenes)
+    return map(
+        lambda number, scene: AcquiredScene(scene, sensors, Draw(seed, number)),
+        range(len(scenes)),
+        scenes,
+    )
 
 
 def synthetic_scenes(
@@ -222,9 +256,14 @@ def synthetic_labelled(number: int, seed: int, classes: np.ndarray) -> LabelledS
 
 
 def labelled_scenes(
-    names: Sequence[str], given: Mapping[str, str], images: Path, labels: Path | None = None, split: str | None = None
+    names: Sequence[str],
+    given: Mapping[str, str],
+    images: Path,
+    labels: Path | None = None,
+    split: str | None = None,
 ) -> tuple[list[LabelledScene], list[str]]:
-    """The labelled pictures of a folder as scenes, read when they are looked at, and sentences on what is left out.
+    """The labelled pictures of a folder as scenes, read when they are looked at, and sentences on
+    what is left out.
 
     Args:
         names: of the classes that the detector knows.
@@ -240,10 +279,16 @@ def labelled_scenes(
 
 
 def _of_file(path: Path, truth: Boxes) -> LabelledScene:
-    return LabelledScene(path.name, site_of(path.name), truth, path, lambda sensor: read_scene(path, sensor).radiance)
+    return LabelledScene(
+        path.name, site_of(path.name), truth, path, lambda sensor: read_scene(path, sensor).radiance
+    )
 
 
 def left_out(labelled: Sequence[str], numbers: np.ndarray) -> list[str]:
     """A sentence on the labelled classes that the detector does not know, where there are such."""
     names = ", ".join(name for name, number in zip(labelled, numbers, strict=True) if number < 0)
-    return [f"Not known to the detector and left out: {names}. What it finds there counts as false."] if names else []
+    return (
+        [f"Not known to the detector and left out: {names}. What it finds there counts as false."]
+        if names
+        else []
+    )

@@ -30,21 +30,35 @@ REGAINED = "share of loss regained"
 
 
 def detection_rows(found: Comparison) -> list[Row]:
-    """The tables of one sensor: the answer, each row at its own confidence, by class and by size."""
-    labelled = [name for name in found.names if not isnan(found.figures[REFERENCE][f"mAP50 of {name}"][0])]
+    """The tables of one sensor: the answer, each row at its own confidence, by
+    class and by size.
+    """
+    labelled = [
+        name for name in found.names if not isnan(found.figures[REFERENCE][f"mAP50 of {name}"][0])
+    ]
     by_class = {name: f"mAP50 of {name}" for name in labelled}
     by_size = {name: f"mAP50 {name}" for name in list(SIZES_PX)[1:]}
     return [
         *(_main_row(found, row) for row in found.methods),
         *(_own_row(found, row) for row in found.methods),
-        *(Row(f"{BY_CLASS}, {found.name}", row, _values(found, row, by_class)) for row in found.methods),
-        *(Row(f"{BY_SIZE}, {found.name}", row, _values(found, row, by_size)) for row in found.methods),
+        *(
+            Row(f"{BY_CLASS}, {found.name}", row, _values(found, row, by_class))
+            for row in found.methods
+        ),
+        *(
+            Row(f"{BY_SIZE}, {found.name}", row, _values(found, row, by_size))
+            for row in found.methods
+        ),
     ]
 
 
 def _main_row(found: Comparison, row: str) -> Row:
-    """Precision and recall at one confidence for all rows; gains and losses in mAP50, paired by draw."""
-    figures = _values(found, row, {name: name for name in ("mAP50", "mAP50-95", "precision", "recall")})
+    """Precision and recall at one confidence for all rows; gains and losses in mAP50, paired by
+    draw.
+    """
+    figures = _values(
+        found, row, {name: name for name in ("mAP50", "mAP50-95", "precision", "recall")}
+    )
     reference, degraded, own = (found.figures[name]["mAP50"] for name in (REFERENCE, DEGRADED, row))
     method = found.methods[row]
     words = {"sensor": method.sensor_known} if method else {}
@@ -58,7 +72,9 @@ def _main_row(found: Comparison, row: str) -> Row:
 
 
 def verdict(difference: np.ndarray, sites: int) -> str:
-    """What a paired difference (1 + draws,) over so many sites says: one whose interval holds 0 is none."""
+    """What a paired difference (1 + draws,) over so many sites says: one whose interval holds 0 is
+    none.
+    """
     ends = interval(difference, sites)
     if ends is None:
         return "not known: no interval"
@@ -68,7 +84,9 @@ def verdict(difference: np.ndarray, sites: int) -> str:
 
 
 def _regained(found: Comparison, gain: np.ndarray, loss: np.ndarray) -> Figure:
-    """The share of a loss that a gain makes good; unavailable where the loss cannot be told from 0."""
+    """The share of a loss that a gain makes good; unavailable where the loss
+    cannot be told from 0.
+    """
     if too_few(found.sites):
         return unavailable(PERCENT, too_few(found.sites))
     if verdict(loss, found.sites) not in ("a gain", "a loss"):
@@ -79,7 +97,9 @@ def _regained(found: Comparison, gain: np.ndarray, loss: np.ndarray) -> Figure:
 def _own_row(found: Comparison, row: str) -> Row:
     figures = _values(found, row, {"precision": "own precision", "recall": "own recall"})
     own = float(found.figures[row]["own confidence"][0])
-    known = unavailable("ratio", NO_OBJECT) if isnan(own) else measured(own, "ratio", "largest mean F1")
+    known = (
+        unavailable("ratio", NO_OBJECT) if isnan(own) else measured(own, "ratio", "largest mean F1")
+    )
     return Row(f"{OWN}, {found.name}", row, {**figures, "confidence": known})
 
 
@@ -88,7 +108,9 @@ def _values(found: Comparison, row: str, keys: Mapping[str, str]) -> dict[str, F
 
 
 def _figure(found: Comparison, values: np.ndarray, unit: str = PERCENT) -> Figure:
-    """A share of 0 to 1, or a difference of two, (1 + draws,), times 100; its interval where sites are enough."""
+    """A share of 0 to 1, or a difference of two, (1 + draws,), times 100; its interval where sites
+    are enough.
+    """
     if isnan(values[0]):
         return unavailable(unit, NO_OBJECT)
     source = f"{len(found.scenes)} images of {found.sites} sites"
@@ -115,16 +137,31 @@ PAPER = {
 def paper_rows() -> list[Row]:
     """The paper's table as printed, with what differs."""
     keys = ("mAP50", "mAP90 (sic)", "precision", "recall")
-    printed = {name: [published(value, PERCENT, SOURCE) for value in values] for name, values in PAPER.items()}
+    printed = {
+        name: [published(value, PERCENT, SOURCE) for value in values]
+        for name, values in PAPER.items()
+    }
     words = {"what differs": DIFFERS}
-    return [Row(PAPER_TABLE, name, dict(zip(keys, each, strict=True)), words) for name, each in printed.items()]
+    return [
+        Row(PAPER_TABLE, name, dict(zip(keys, each, strict=True)), words)
+        for name, each in printed.items()
+    ]
 
 
 PAPER_NOTES = (
-    "The paper retrains its detector for each row; here one detector is shown all of them: another question.",
+    (
+        "The paper retrains its detector for each row; here one detector is shown all of them: "
+        "another question."
+    ),
     "The paper's split of DIOR is its own, of one run each, and no interval is given.",
-    "mAP90 (sic): the paper does not define it. At 0.69 to 0.71 of mAP50 in all rows it is likely mAP50-95.",
-    "The paper's precision of 63.80 is doubtful: F1 is 5.1 points below mAP50 there, elsewhere 1.1 to 2.2 above.",
+    (
+        "mAP90 (sic): the paper does not define it. At 0.69 to 0.71 of mAP50 in all rows it is "
+        "likely mAP50-95."
+    ),
+    (
+        "The paper's precision of 63.80 is doubtful: F1 is 5.1 points below mAP50 there, elsewhere "
+        "1.1 to 2.2 above."
+    ),
 )
 
 
@@ -140,6 +177,9 @@ def _sentence(found: Comparison) -> str:
     last = list(rows.values())[-1]
     if GAIN in last.figures:
         share = last.figures[REGAINED]
-        text += f"; {last.name} changes it by {last.figures[GAIN]} points ({last.text['against degraded']}"
+        text += (
+            f"; {last.name} changes it by {last.figures[GAIN]} points "
+            f"({last.text['against degraded']}"
+        )
         text += f", {share} % of the loss regained)" if share.value is not None else ")"
     return f"{text} (measured)."

@@ -1,7 +1,9 @@
 """Methods compared on the same pairs and targets: scores with intervals, by image and by site.
 
-- `methods`: what a method is, and the one of a name; `pairs`: degraded and reference images, simulated or read;
+- `methods`: what a method is, and the one of a name; `pairs`: degraded and reference images,
+  simulated or read;
 - `scores`: figures of one method on pairs;
 - `targets`: its figures on edges, flat fields, points and patterns whose truth is known;
-- `run`: an evaluation of several, and its page; `sweep`: the same under other sensors, known as they are or wrongly.
+- `run`: an evaluation of several, and its page; `sweep`: the same under other sensors, known as
+  they are or wrongly.
 """

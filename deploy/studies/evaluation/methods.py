@@ -1,7 +1,7 @@
 """The methods that can be compared, by name, and what each of them knows of the sensor.
 
-They are the input itself, the traditional pipeline in both orders and three qualities, other libraries' ways, and
-networks.
+They are the input itself, the traditional pipeline in both orders and three qualities, other
+libraries' ways, and networks.
 """
 
 from collections.abc import Callable, Mapping
@@ -37,8 +37,15 @@ DECONVOLVE_FIRST: Final = "deconvolve-first"
 
 ORDERS: dict[str, Order] = {TRADITIONAL: "denoise-first", DECONVOLVE_FIRST: "deconvolve-first"}
 CHAINS: dict[str, tuple[str, Order]] = {
-    **{f"{name}-{quality}": (quality, order) for name, order in ORDERS.items() for quality in QUALITIES},
-    **{name: ("standard", order) for name, order in (ORDERS | dict.fromkeys(PEERS, ORDERS[TRADITIONAL])).items()},
+    **{
+        f"{name}-{quality}": (quality, order)
+        for name, order in ORDERS.items()
+        for quality in QUALITIES
+    },
+    **{
+        name: ("standard", order)
+        for name, order in (ORDERS | dict.fromkeys(PEERS, ORDERS[TRADITIONAL])).items()
+    },
 }
 """Quality and order of each traditional pipeline, by name, and of its peers."""
 WITHOUT_NETWORK = (DEGRADED, *CHAINS)
@@ -57,7 +64,8 @@ class Method:
         name: in tables.
         restore: what it does.
         sensor_known: what it knows of the sensor when it does so, in words.
-        specialise: how it restores when it knows another sensor; None where what it does depends on none.
+        specialise: how it restores when it knows another sensor; None where what it does depends on
+            none.
     """
 
     name: str
@@ -73,7 +81,9 @@ class Method:
 
 
 def method_without_network(name: str, degraded: Instrument, reference: Instrument) -> Method:
-    """Return the method of WITHOUT_NETWORK: the input itself, or a traditional method that knows both sensors."""
+    """Return the method of WITHOUT_NETWORK: the input itself, or a traditional method that knows
+    both sensors.
+    """
     if name == DEGRADED:
         return Method(name, lambda dn: dn, "the input itself")
     (quality, order), run = CHAINS[name], PEERS.get(name, restore_traditional)
@@ -86,14 +96,19 @@ def method_without_network(name: str, degraded: Instrument, reference: Instrumen
 
 
 EXPECTED = (
-    f"degraded, {TRADITIONAL}, {DECONVOLVE_FIRST} (each also with -fast or -best), {', '.join(PEERS)}, "
-    f"a shipped network ({', '.join(shipped_names())}, each also with -int8, and with @SENSOR or @blind to know "
+    f"degraded, {TRADITIONAL}, {DECONVOLVE_FIRST} (each also with -fast or -best), "
+    f"{', '.join(PEERS)}, "
+    f"a shipped network ({', '.join(shipped_names())}, each also with -int8, and with @SENSOR "
+    "or @blind to know "
     "another), or an ONNX or safetensors file"
 )
 
 
-def method_named(name: str, degraded: Sensor, reference: Sensor, log: Log = no_log, around: Around = BOTH) -> Method:
-    """The method of that name; the traditional ones know both sensors, a shipped network the degraded one.
+def method_named(
+    name: str, degraded: Sensor, reference: Sensor, log: Log = no_log, around: Around = BOTH
+) -> Method:
+    """The method of that name; the traditional ones know both sensors, a shipped network the
+    degraded one.
 
     Args:
         name: as in EXPECTED.
@@ -116,7 +131,11 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, log: Log = no_l
         return Method(name, restore, knowledge_of(model, degraded.name))
     model = found.model(sensor, network.endswith(INT8))
     warn_outside(sensor, found.kernels, log)
-    specialise = None if other else _network_specialise(network, found, degraded, reference.nominal(), around, log)
+    specialise = (
+        None
+        if other
+        else _network_specialise(network, found, degraded, reference.nominal(), around, log)
+    )
     restore = _conditioned_restore(network, found, sensor, reference.nominal(), around)
     return Method(name, restore, knowledge_of(model, degraded.name), specialise)
 
@@ -140,7 +159,10 @@ def _conditioned_restore(
     """A conditioned network for one sensor, with its exposures."""
     int8 = name.endswith(INT8)
     factors = factors_for(sensor.nominal()) if around.exposure else (1,)
-    models = {factor: network.model(brightened(sensor, factor) if factor > 1 else sensor, int8) for factor in factors}
+    models = {
+        factor: network.model(brightened(sensor, factor) if factor > 1 else sensor, int8)
+        for factor in factors
+    }
     brighter = {factor: model for factor, model in models.items() if factor > 1}
     return with_steps(models[1], brighter, sensor, reference, around)
 
@@ -171,8 +193,15 @@ def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:
 def profile_of(sensor: Instrument, like: Sensor) -> Sensor:
     """A profile of which every draw is that sensor, in the grid of another profile."""
     across, along = sensor.mtf_axes
-    numbers = {"mtf_nyquist": across, "mtf_nyquist_along": along, "alpha": sensor.alpha, "beta": sensor.beta}
+    numbers = {
+        "mtf_nyquist": across,
+        "mtf_nyquist_along": along,
+        "alpha": sensor.alpha,
+        "beta": sensor.beta,
+    }
     numbers |= {"gain_dn_per_radiance": sensor.gain_dn_per_radiance, "bits": float(sensor.bits)}
-    constants = {name: Constant(value, "assumed", "a sensor drawn") for name, value in numbers.items()}
+    constants = {
+        name: Constant(value, "assumed", "a sensor drawn") for name, value in numbers.items()
+    }
     noise = {"snr_0": None, "snr_1": None}
     return replace(like, name="drawn", **constants, **noise, response=sensor.response)  # type: ignore[arg-type]

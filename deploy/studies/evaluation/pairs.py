@@ -1,4 +1,6 @@
-"""Pairs of a degraded and a reference image: simulated from scenes, or read from a folder that `simulate` wrote."""
+"""Pairs of a degraded and a reference image: simulated from scenes, or read from a folder that
+`simulate` wrote.
+"""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -22,12 +24,14 @@ OVERSAMPLINGS = (4, 2)
 
 @dataclass(frozen=True)
 class NamedPair:
-    """Two acquisitions of one scene, (H, W) float32 digital numbers of the same units, and the scene's name.
+    """Two acquisitions of one scene, (H, W) float32 digital numbers of the same units, and the
+    scene's name.
 
     Attributes:
         place: its site, where one is known by more than the name.
         oversampling: scene pixels per pixel, where the pair was simulated here.
-        noise_free: the reference without noise and rounding, (H, W) float32, where the pair was simulated here.
+        noise_free: the reference without noise and rounding, (H, W) float32, where the pair was
+            simulated here.
     """
 
     name: str
@@ -46,7 +50,8 @@ class NamedPair:
 def pairs_of_scenes(
     images: Path | None, degraded: Sensor, reference: Sensor, seed: int, brightness: float = 1.0
 ) -> tuple[list[NamedPair], list[str]]:
-    """Simulate pairs of the scenes of a folder, or of drawn ones, and return them with notes for the reader.
+    """Simulate pairs of the scenes of a folder, or of drawn ones, and return them with notes for
+    the reader.
 
     Args:
         images: the folder; drawn scenes if None.
@@ -139,19 +144,26 @@ def oversamplings_of(profile: Sensor) -> tuple[int, ...]:
 
 
 def oversampling_note(pairs: Sequence[NamedPair], profile: Sensor) -> str:
-    """A sentence where pairs were simulated at another oversampling than the profile's; else nothing."""
+    """A sentence where pairs were simulated at another oversampling than the profile's; else
+    nothing.
+    """
     own = int(profile.oversampling.low)
     counts = Counter(pair.oversampling for pair in pairs if pair.oversampling is not None)
     if not set(counts) - {own}:
         return ""
-    used = " and ".join(f"{ratio} ({count} of {len(pairs)} images)" for ratio, count in sorted(counts.items())[::-1])
+    used = " and ".join(
+        f"{ratio} ({count} of {len(pairs)} images)" for ratio, count in sorted(counts.items())[::-1]
+    )
     return (
-        f"Scene pixels per pixel: {used}, where {profile.name} states {own}; at most {OVERSAMPLINGS[0]} are taken, "
+        f"Scene pixels per pixel: {used}, where {profile.name} states {own}; at most "
+        f"{OVERSAMPLINGS[0]} are taken, "
         f"and {OVERSAMPLINGS[1]} of small images ('simulate' keeps the profile's)."
     )
 
 
-def read_pairs(folder: Path, max_dn: int = MAX_DN, recipe: PairsRecipe | None = None) -> list[NamedPair]:
+def read_pairs(
+    folder: Path, max_dn: int = MAX_DN, recipe: PairsRecipe | None = None
+) -> list[NamedPair]:
     """Read FOLDER/degraded/NAME.tif beside FOLDER/reference/NAME.tif, mono images of 0 to max_dn.
 
     With the recipe beside them, the sites are those of the scenes that it names.

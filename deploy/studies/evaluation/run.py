@@ -1,4 +1,5 @@
-"""`evaluate`: restorations compared on the same pairs, from names, networks and functions to rows and a page.
+"""`evaluate`: restorations compared on the same pairs, from names, networks and functions to rows
+and a page.
 
 The page has the tables, and the same crops of every method with their errors beside the reference.
 """
@@ -15,7 +16,14 @@ from PIL import Image
 from beers_deploy.model.dataset import profiles_for, read_pairs_recipe
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.images import list_images
-from beers_deploy.model.io.pictures import busiest_windows, error_row, grid, picture_url, stretch_of, strip_row
+from beers_deploy.model.io.pictures import (
+    busiest_windows,
+    error_row,
+    grid,
+    picture_url,
+    stretch_of,
+    strip_row,
+)
 from beers_deploy.model.metrics.bootstrap import too_few
 from beers_deploy.model.progress import Log, Progress, no_log, once, reporting
 from beers_deploy.network import Network, NetworkLike, SensorLike
@@ -28,7 +36,13 @@ from beers_deploy.restoration.method import Around, Restore
 from beers_deploy.restoration.sensor_check import WINDOW_PX, held_against
 from beers_deploy.results import Table
 from beers_deploy.studies.evaluation import scores, targets
-from beers_deploy.studies.evaluation.methods import DEGRADED, Method, knowledge_of, method_named, with_steps
+from beers_deploy.studies.evaluation.methods import (
+    DEGRADED,
+    Method,
+    knowledge_of,
+    method_named,
+    with_steps,
+)
 from beers_deploy.studies.evaluation.pairs import (
     NamedPair,
     check_brightness,
@@ -44,7 +58,8 @@ Methods = Mapping[str, NetworkLike | Restore] | Sequence[str]
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Evaluation(Table):
-    """Methods compared on the same pairs: means, sites, images, and other sensors where they were asked for.
+    """Methods compared on the same pairs: means, sites, images, and other sensors where they were
+    asked for.
 
     Attributes:
         sensors: of the degraded and of the reference images.
@@ -60,7 +75,10 @@ class Evaluation(Table):
     def title(self) -> str:
         """The two sensors, and how many images."""
         degraded, reference = self.sensors
-        return f"{degraded.name} -> {reference.name}, {len(self.pairs)} image{'' if len(self.pairs) == 1 else 's'}"
+        return (
+            f"{degraded.name} -> {reference.name}, {len(self.pairs)} "
+            f"image{'' if len(self.pairs) == 1 else 's'}"
+        )
 
     @property
     def mean(self) -> list[Row]:
@@ -74,7 +92,9 @@ class Evaluation(Table):
         Those of single images are for the document alone.
         """
         tables = by_table(self.rows).items()
-        return {name: rows for name, rows in tables if name != "mean" and not name.startswith("images")}
+        return {
+            name: rows for name, rows in tables if name != "mean" and not name.startswith("images")
+        }
 
     def report(self, folder: str | os.PathLike[str]) -> Path:
         """Write report.html and pictures into a folder; returns the page's path."""
@@ -103,35 +123,42 @@ def evaluate(
     """Compare restorations on the same pairs and targets; the degraded input is always a row.
 
     Args:
-        methods: names such as "traditional" or "convbeers-s-int8"; or a mapping of the name in the table to such a
-            name, a network, or a function of an image (H, W) of digital numbers.
+        methods: names such as "traditional" or "convbeers-s-int8"; or a mapping of the name in the
+            table to such a name, a network, or a function of an image (H, W) of digital numbers.
         pairs: simulated ones, or a folder with degraded/ and reference/; None simulates them.
         images: folder of scenes to simulate pairs from; drawn ones if None.
         sensor: of the degraded images; of pairs the one that made them, else the default one.
         reference: the sensor that is aimed at.
         lpips: weights of SqueezeNet 1.1, or a folder of backbones, for LPIPS.
         sweep: whether other blurs, noises and gains are looked at too.
-        brightness: factors of the scenes' radiance before they are acquired, above 0 and up to 1; tables of a factor
-            other than 1 have it in their name. 1 is always evaluated.
-        strict: whether pairs are refused whose degraded images contradict the sensor, instead of a note.
+        brightness: factors of the scenes' radiance before they are acquired, above 0 and up to 1;
+            tables of a factor other than 1 have it in their name. 1 is always evaluated.
+        strict: whether pairs are refused whose degraded images contradict the sensor, instead of a
+            note.
         consistency: whether networks take the consistency step where they know the sensor.
         exposure: whether shipped networks restore dark parts at a higher exposure.
         seed: of every random draw.
-        progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
+        progress: a function that is told each step, False for silence, None for a bar or lines on
+            standard error.
         log: is told where a reference is taken in other units than it states.
 
     Raises:
-        OptionError: no such method; or a brightness out of range, or with pairs, which are as they are.
+        OptionError: no such method; or a brightness out of range, or with pairs, which are as they
+            are.
         ImageError: pairs that cannot be read, or differ in size.
         ProfileError: no such sensor.
 
     Examples:
         >>> pair = bd.simulate(size=96)
-        >>> found = bd.evaluate({"mine": lambda image: image, "convbeers-xs": "convbeers-xs"}, [pair])
+        >>> found = bd.evaluate({"mine": lambda image: image, "convbeers-xs": "convbeers-xs"},
+            [pair])
         >>> [row.name for row in found.mean][:3]
         ['degraded', 'mine', 'convbeers-xs']
     """
-    asked = {DEGRADED: DEGRADED, **(methods if isinstance(methods, Mapping) else {name: name for name in methods})}
+    asked = {
+        DEGRADED: DEGRADED,
+        **(methods if isinstance(methods, Mapping) else {name: name for name in methods}),
+    }
     folder = Path(pairs) if isinstance(pairs, str | os.PathLike) else None
     made = None if pairs is None or isinstance(pairs, str | os.PathLike) else list(pairs)
     if made and sensor is None:
@@ -168,8 +195,18 @@ def evaluate(
             swept += run_sweep(ways, scenes, *sensors, seed, factor).rows
     few = too_few(len({pair.site for pair in loaded}))
     notes = [note for note in (few, scores.inner_note(loaded), *said) if note]
-    arguments: dict[str, object] = {"images": images, "pairs": folder, "sensor": sensors[0].name, "lpips": lpips}
-    arguments |= {"reference": sensors[1].name, "methods": ",".join(asked), "sweep": sweep, "seed": seed}
+    arguments: dict[str, object] = {
+        "images": images,
+        "pairs": folder,
+        "sensor": sensors[0].name,
+        "lpips": lpips,
+    }
+    arguments |= {
+        "reference": sensors[1].name,
+        "methods": ",".join(asked),
+        "sweep": sweep,
+        "seed": seed,
+    }
     arguments |= {"consistency": consistency, "exposure": exposure}
     arguments["brightness"] = ",".join(f"{factor:g}" for factor in factors)
     return Evaluation(
@@ -218,13 +255,19 @@ def _seen(pairs: Sequence[NamedPair], sensor: Sensor, name: str, strict: bool, l
     """The degraded images held against the sensor that they are said to be from."""
     chosen = pairs[:: -(-len(pairs) // HELD)]
     windows = [pair.degraded[:WINDOW_PX, :WINDOW_PX] for pair in chosen]
-    check = held_against(windows, sensor, sensor.nominal().max_dn).settled(name, sensor.name, strict, log)
+    check = held_against(windows, sensor, sensor.nominal().max_dn).settled(
+        name, sensor.name, strict, log
+    )
     return Row("sensor of the degraded images", sensor.name, check.figures, check.text)
 
 
-def _inputs(asked: Iterable[str], weights: Path | None, scenes: Path | None, pairs: Path | None) -> Iterator[Path]:
+def _inputs(
+    asked: Iterable[str], weights: Path | None, scenes: Path | None, pairs: Path | None
+) -> Iterator[Path]:
     """The files that the figures rest on: networks, weights of LPIPS, scenes or pairs."""
-    yield from (path for path in (*map(Path, asked), *([weights] if weights else [])) if path.is_file())
+    yield from (
+        path for path in (*map(Path, asked), *([weights] if weights else [])) if path.is_file()
+    )
     folders: list[Path] = []
     if scenes:
         folders = [scenes]
@@ -239,7 +282,11 @@ def _named(number: int, pair: Pair) -> NamedPair:
 
 
 def _method(
-    name: str, given: NetworkLike | Restore, sensors: tuple[Sensor, Sensor], log: Log, around: Around
+    name: str,
+    given: NetworkLike | Restore,
+    sensors: tuple[Sensor, Sensor],
+    log: Log,
+    around: Around,
 ) -> Method:
     if isinstance(given, str):
         return replace(method_named(given, *sensors, log, around), name=name)
@@ -247,7 +294,9 @@ def _method(
         return Method(name, given, "what the function knows")
     network = Network.load(cast("NetworkLike", given), sensor=sensors[0])
     known = knowledge_of(network.model, sensors[0].name)
-    return Method(name, with_steps(network.model, {}, sensors[0], sensors[1].nominal(), around), known)
+    return Method(
+        name, with_steps(network.model, {}, sensors[0], sensors[1].nominal(), around), known
+    )
 
 
 SITES = 4
@@ -278,7 +327,10 @@ def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, fl
     crops = {name: image[top : top + side, left : left + side] for name, image in whole.items()}
     errors = {name: np.abs(crop - crops["reference"]) for name, crop in crops.items()}
     white = max(float(np.percentile(errors[methods[0].name], 99)), 1.0)
-    rows = [strip_row(crops.values(), stretch_of(crops["reference"])), error_row(errors.values(), white)]
+    rows = [
+        strip_row(crops.values(), stretch_of(crops["reference"])),
+        error_row(errors.values(), white),
+    ]
     return np.asarray(grid(list(crops), rows, ZOOM)), white
 
 
@@ -290,7 +342,8 @@ def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -
         with whole_file(out / f"{pair.site}.png") as temporary:
             Image.fromarray(strip).save(temporary, "PNG", optimize=True)
         caption = (
-            f"{CROP_PX} pixels a side, enlarged {ZOOM} times, one grey scale for all. Below: size of the error "
+            f"{CROP_PX} pixels a side, enlarged {ZOOM} times, one grey scale for all. Below: "
+            "size of the error "
             f"against the reference, black none, white {white:.0f} DN and more."
         )
         made.append(Picture(pair.site, picture_url(strip), caption))
@@ -315,37 +368,57 @@ def caption_of(table: str) -> str:
 
 
 MEAN_CAPTION = (
-    "Intervals: 95 % bootstrap over sites for image figures, none below five sites; 90 % for the MTF. What a "
-    "method knows of the sensor stands beside it: one that knows it has an advantage that it may not have in orbit. "
-    "Inner PSNR leaves out a border on every side. The bias of the mean is the mean of the restored inner pixels "
-    "over that of the reference (without noise, where there is one) minus 1; the largest bias is that of one image."
+    "Intervals: 95 % bootstrap over sites for image figures, none below five sites; 90 % for "
+    "the MTF. What a "
+    "method knows of the sensor stands beside it: one that knows it has an advantage that it "
+    "may not have in orbit. "
+    "Inner PSNR leaves out a border on every side. The bias of the mean is the mean of the "
+    "restored inner pixels "
+    "over that of the reference (without noise, where there is one) minus 1; the largest bias "
+    "is that of one image."
 )
 DIMMED_CAPTION = (
-    "The radiance of the scenes was multiplied by this factor before the sensors acquired them. MTF, SNR and targets "
+    "The radiance of the scenes was multiplied by this factor before the sensors acquired them. "
+    "MTF, SNR and targets "
     "do not depend on it."
 )
 TARGETS_CAPTION = (
-    "Faint things whose truth is known, restored and compared with what the reference sensor would acquire without "
+    "Faint things whose truth is known, restored and compared with what the reference sensor "
+    "would acquire without "
     "noise; 90 % intervals. Flux: the light that a point adds to the restored image in a square of "
-    f"{targets.APERTURE_PX} pixels a side, over what it adds to the reference; 100 % is right. 'Points of 12 on 20' "
-    "raise the mean radiance of one pixel by 12 W/m2/sr/um on a background of 20. Bars and zone plates, on a "
-    f"background of {targets.PATTERN_BACKGROUND:g} W/m2/sr/um: the contrast that is left, as a share of the "
-    "reference's; 1 is as the reference, 0 is nothing, below 0 is reversed. Their name has the contrast of the scene "
+    f"{targets.APERTURE_PX} pixels a side, over what it adds to the reference; 100 % is right. "
+    "'Points of 12 on 20' "
+    "raise the mean radiance of one pixel by 12 W/m2/sr/um on a background of 20. Bars and zone "
+    "plates, on a "
+    f"background of {targets.PATTERN_BACKGROUND:g} W/m2/sr/um: the contrast that is left, as a "
+    "share of the "
+    "reference's; 1 is as the reference, 0 is nothing, below 0 is reversed. Their name has the "
+    "contrast of the scene "
     "(amplitude over background). Zone plates are measured from "
     f"{targets.ZONE_BAND[0]} to {targets.ZONE_BAND[1]} cycles per pixel."
 )
 SITES_CAPTION = (
-    "PSNR is over full scale and leaves out pixels that clipped in the input or the reference. The bias of the mean "
+    "PSNR is over full scale and leaves out pixels that clipped in the input or the reference. "
+    "The bias of the mean "
     "is that of inner pixels against the reference."
 )
 SWEEP_CAPTION = (
-    "One image of each site. The chain and every network that can know a sensor know that of the row, unless it says "
-    "that another one is supposed. Of gains and losses the interval is that of differences on the same images."
+    "One image of each site. The chain and every network that can know a sensor know that of "
+    "the row, unless it says "
+    "that another one is supposed. Of gains and losses the interval is that of differences on "
+    "the same images."
 )
 NOTES = (
     "MTF at Nyquist is measured on restored slanted edges.",
-    "SNR is measured in restored flat fields, where nothing is to be seen: a denoiser may reach any SNR there.",
-    "The paper's rows were printed for another test set; its LPIPS network is not stated. They do not compare.",
+    (
+        "SNR is measured in restored flat fields, where nothing is to be seen: a denoiser may "
+        "reach "
+        "any SNR there."
+    ),
+    (
+        "The paper's rows were printed for another test set; its LPIPS network is not stated. They "
+        "do not compare."
+    ),
     "LPIPS-squeeze treats the panchromatic image as grey, values over full scale.",
 )
 
@@ -355,4 +428,7 @@ def headline(mean: Sequence[Row]) -> str:
     ours = [row for row in mean if row.figures["PSNR"].mode == "measured"]
     best = max(ours, key=lambda row: row.figures["PSNR"].value or 0.0)
     degraded = ours[0].figures["PSNR"]
-    return f"Best by PSNR: {best.name}, {best.figures['PSNR']} dB; the degraded input has {degraded} dB (measured)."
+    return (
+        f"Best by PSNR: {best.name}, {best.figures['PSNR']} dB; the degraded input has "
+        f"{degraded} dB (measured)."
+    )

@@ -1,7 +1,8 @@
 """Figures of one method on pairs of images: scores of each image, their means, and means by site.
 
-Scores of inner pixels leave out a border on every side. At the border of an image a method sees less than its
-receptive field, and the borders of small images make up much of them; a swath has hardly any border.
+Scores of inner pixels leave out a border on every side. At the border of an image a method sees
+less than its receptive field, and the borders of small images make up much of them; a swath has
+hardly any border.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,7 +31,8 @@ def perceptual_distances(place: Path | None) -> dict[str, Perceptual | str]:
     """LPIPS-squeeze or the reason why not, and LPIPS-vgg and DISTS where VGG16 is found.
 
     Args:
-        place: a file with SqueezeNet 1.1, or a folder with any of the backbones; None asks the environment.
+        place: a file with SqueezeNet 1.1, or a folder with any of the backbones; None asks the
+            environment.
     """
     found: dict[str, Perceptual | str] = {"LPIPS-squeeze": not_found("squeeze")}
     networks = ("squeeze", "vgg") if place is None or place.is_dir() else ("squeeze",)
@@ -56,14 +58,22 @@ BIAS = "bias of the mean"
 LARGEST_BIAS = "largest bias of the mean"
 DETAILS: tuple[str, ...] = (NOISE_FREE, INNER, INNER_NOISE_FREE, "PSNR gain", BIAS)
 """Scores that say more about PSNR, or about the level of an image."""
-UNITS = {"PSNR": "dB", "SSIM": "ratio", **dict.fromkeys(DETAILS, "dB"), BIAS: "%", LARGEST_BIAS: "%"}
+UNITS = {
+    "PSNR": "dB",
+    "SSIM": "ratio",
+    **dict.fromkeys(DETAILS, "dB"),
+    BIAS: "%",
+    LARGEST_BIAS: "%",
+}
 READ = "pairs read from files hold no reference without noise"
 IDENTICAL = "infinite: identical to the reference"
 BLACK = "the reference is black"
 
 INNER_BORDER_PX = 57
-"""Border that inner pixels leave out: the receptive radius of the largest shipped network (38 px), and the reach of
-the consistency step (19 px). It is the same for all methods, so that their rows compare."""
+"""Border that inner pixels leave out: the receptive radius of the largest shipped network (38 px),
+and the reach of the consistency step (19 px). It is the same for all methods, so that their rows
+compare.
+"""
 
 
 def inner_border_px(height: int, width: int) -> int:
@@ -77,7 +87,8 @@ def inner_note(pairs: Sequence[NamedPair]) -> str:
     if not small:
         return ""
     return (
-        f"Inner pixels leave out {INNER_BORDER_PX} px on every side, and a quarter of the shorter side of small "
+        f"Inner pixels leave out {INNER_BORDER_PX} px on every side, and a quarter of the "
+        "shorter side of small "
         f"images ({small} of {len(pairs)})."
     )
 
@@ -92,7 +103,8 @@ def inner(image: np.ndarray) -> np.ndarray:
 def bias_percent(
     dn: np.ndarray, wanted: np.ndarray, unclipped: np.ndarray | None = None, offset_dn: float = 0.0
 ) -> float:
-    """Return by how much the mean of the inner pixels differs from the wanted one, in %; NaN for a black image.
+    """Return by how much the mean of the inner pixels differs from the wanted one, in %; NaN for a
+    black image.
 
     Args:
         dn: the restored image (H, W), digital numbers.
@@ -129,7 +141,9 @@ class Instruments:
         scores[NOISE_FREE] = None if clean is None else self._psnr_db(dn, clean, pair)
         inside = replace(pair, degraded=inner(pair.degraded), reference=inner(pair.reference))
         scores[INNER] = self._psnr_db(inner(dn), inside.reference, inside)
-        scores[INNER_NOISE_FREE] = None if clean is None else self._psnr_db(inner(dn), inner(clean), inside)
+        scores[INNER_NOISE_FREE] = (
+            None if clean is None else self._psnr_db(inner(dn), inner(clean), inside)
+        )
         scores["PSNR gain"] = psnr - before if psnr != before else 0.0
         unclipped = (pair.reference < self.max_dn) & (pair.degraded < self.max_dn)
         level = pair.reference if clean is None else clean
@@ -144,12 +158,18 @@ class Instruments:
         return fidelity_db(dn, wanted, pair.degraded, self.max_dn)
 
     def figure(
-        self, key: str, value: float | None, source: str, interval: tuple[float, float] | None = None
+        self,
+        key: str,
+        value: float | None,
+        source: str,
+        interval: tuple[float, float] | None = None,
     ) -> Figure:
         """A score as a figure; unavailable with the reason where there is none."""
         unit = UNITS.get(key, DISTANCE)
         if value is None:
-            return unavailable(unit, READ if key in (NOISE_FREE, INNER_NOISE_FREE) else str(self.perceptual[key]))
+            return unavailable(
+                unit, READ if key in (NOISE_FREE, INNER_NOISE_FREE) else str(self.perceptual[key])
+            )
         if not np.isfinite(value):
             return unavailable(unit, BLACK if key == BIAS else IDENTICAL)
         return measured(value, unit, source, interval)
@@ -157,11 +177,15 @@ class Instruments:
     def means(
         self, scores: Sequence[Mapping[str, float | None]], sites: Sequence[str], seed: int
     ) -> dict[str, Figure]:
-        """The mean of each score over the images that have it, with the bootstrap interval over their sites."""
+        """The mean of each score over the images that have it, with the bootstrap interval over
+        their sites.
+        """
         figures = {}
         for key, first in scores[0].items():
             both = ((each[key], site) for each, site in zip(scores, sites, strict=True))
-            usable = [(value, site) for value, site in both if value is not None and np.isfinite(value)]
+            usable = [
+                (value, site) for value, site in both if value is not None and np.isfinite(value)
+            ]
             if not usable:
                 figures[key] = self.figure(key, first, "")
                 continue
@@ -171,18 +195,24 @@ class Instruments:
             figures[key] = self.figure(key, float(np.mean(values)), source, interval)
             if key == BIAS:
                 largest, site = max(usable, key=lambda each: abs(each[0]))
-                figures[LARGEST_BIAS] = self.figure(LARGEST_BIAS, largest, f"one pair of site {site}")
+                figures[LARGEST_BIAS] = self.figure(
+                    LARGEST_BIAS, largest, f"one pair of site {site}"
+                )
         return figures
 
 
-def score(method: Method, pairs: Sequence[NamedPair], instruments: Instruments, seed: int) -> list[Row]:
+def score(
+    method: Method, pairs: Sequence[NamedPair], instruments: Instruments, seed: int
+) -> list[Row]:
     """The mean row of a method, then one row an image."""
     rows = []
     scores = []
     with steps(method.name, len(pairs)) as bar:
         for pair in pairs:
             values = instruments.score(method.restore(pair.degraded), pair)
-            figures = {key: instruments.figure(key, value, "one pair") for key, value in values.items()}
+            figures = {
+                key: instruments.figure(key, value, "one pair") for key, value in values.items()
+            }
             rows.append(Row("images", f"{method.name}: {pair.name}", figures, {"site": pair.site}))
             scores.append(values)
             bar.advance()
@@ -193,7 +223,11 @@ def score(method: Method, pairs: Sequence[NamedPair], instruments: Instruments, 
 def site_rows(rows: Sequence[Row]) -> list[Row]:
     """Return tables by site of every score but the gain: a row a site, a column a method."""
     images = [row for row in rows if row.table == "images"]
-    there = [key for key in images[0].figures if any(row.figures[key].value is not None for row in images)]
+    there = [
+        key
+        for key in images[0].figures
+        if any(row.figures[key].value is not None for row in images)
+    ]
     keys = [key for key in there if key != "PSNR gain"]
     sites = dict.fromkeys(row.text["site"] for row in images)
     by_site = {site: [row for row in images if row.text["site"] == site] for site in sites}
@@ -206,7 +240,9 @@ def _site_row(key: str, site: str, images: Sequence[Row]) -> Row:
         here = [row.figures[key] for row in images if row.name.startswith(f"{method}: ")]
         values = [figure.value for figure in here if figure.value is not None]
         source = f"mean {key} of {len(values)} pairs"
-        figures[method] = measured(float(np.mean(values)), here[0].unit, source) if values else here[0]
+        figures[method] = (
+            measured(float(np.mean(values)), here[0].unit, source) if values else here[0]
+        )
     return Row(f"{key} by site", site, figures, {"images": str(len(here))})
 
 
@@ -233,7 +269,9 @@ def paper_rows() -> list[Row]:
     rows = []
     for name, values in PAPER.items():
         figures = {
-            key: unavailable(unit, "the paper: did not converge") if value is None else published(value, unit, SOURCE)
+            key: unavailable(unit, "the paper: did not converge")
+            if value is None
+            else published(value, unit, SOURCE)
             for (key, unit), value in zip(PAPER_UNITS.items(), values, strict=True)
         }
         rows.append(Row("mean", name, figures, {"sensor": NOTE}))

@@ -1,6 +1,8 @@
-"""The sweep: the same methods under sensors of other blur, noise and gain, each known as it is, or known wrongly.
+"""The sweep: the same methods under sensors of other blur, noise and gain, each known as it is, or
+known wrongly.
 
-Its tables: PSNR, MTF, the gain over the traditional pipeline, and what a wrongly known sensor costs.
+Its tables: PSNR, MTF, the gain over the traditional pipeline, and what a wrongly known sensor
+costs.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,8 +18,20 @@ from beers_deploy.model.progress import steps
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.profiles.figures import Figure, Row, measured
 from beers_deploy.profiles.sensor import Instrument, Sensor, noise_from_snr
-from beers_deploy.studies.evaluation.methods import DEGRADED, TRADITIONAL, WITHOUT_NETWORK, Method, method_named
-from beers_deploy.studies.evaluation.pairs import NamedPair, oversamplings_of, scenes_at, simulate_pairs, table_at
+from beers_deploy.studies.evaluation.methods import (
+    DEGRADED,
+    TRADITIONAL,
+    WITHOUT_NETWORK,
+    Method,
+    method_named,
+)
+from beers_deploy.studies.evaluation.pairs import (
+    NamedPair,
+    oversamplings_of,
+    scenes_at,
+    simulate_pairs,
+    table_at,
+)
 from beers_deploy.studies.evaluation.scores import NOISE_FREE
 from beers_deploy.studies.evaluation.targets import acquire_edges, restored_mtf
 
@@ -29,7 +43,9 @@ NOISE = ((15.0, 50.0), (25.0, 55.0), (30.0, 80.0), (70.0, 150.0), (90.0, 190.0))
 
 
 def conditions(nominal: Instrument, profile: Sensor) -> dict[str, Instrument]:
-    """The nominal sensor; other MTFs, both axes alike or not; other SNRs; both at once; and one with another gain."""
+    """The nominal sensor; other MTFs, both axes alike or not; other SNRs; both at once; and one
+    with another gain.
+    """
     low = _noisy(nominal, profile, 25, 55)
     worst = _noisy(nominal, profile, 15, 50)
     weak = replace(nominal, gain_dn_per_radiance=0.7 * nominal.gain_dn_per_radiance)
@@ -45,7 +61,9 @@ def conditions(nominal: Instrument, profile: Sensor) -> dict[str, Instrument]:
 
 
 def suppositions(nominal: Instrument, profile: Sensor) -> dict[str, dict[str, Instrument]]:
-    """Sensors known wrongly: by the name of the condition that holds, what is supposed in its place."""
+    """Sensors known wrongly: by the name of the condition that holds, what is supposed in its
+    place.
+    """
     mtf = {value: {f"MTF {value:.0%}": _sharp(nominal, value)} for value in (0.05, 0.07, 0.10)}
     # SNR is radiance over sigma: with k times as much of it, the variance is k^2 times smaller.
     thirds = {
@@ -82,12 +100,14 @@ def run_sweep(
     """Try the input, the chain and every network under every condition, on one scene of each site.
 
     Args:
-        methods: of which the networks are run, each condition's sensor known where they can know it.
+        methods: of which the networks are run, each condition's sensor known where they can know
+            it.
         images: folder of the scenes; drawn ones if None.
         profile: of the sensor that the conditions depart from.
         reference: profile of the sensor that is aimed at.
         seed: of every random draw.
-        brightness: factor of the scenes' radiance. The MTF is measured at 1 alone: edges do not depend on it.
+        brightness: factor of the scenes' radiance. The MTF is measured at 1 alone: edges do not
+            depend on it.
     """
     psnr = dict[Key, np.ndarray]()
     mtf = dict[Key, Figure]()
@@ -103,7 +123,9 @@ def run_sweep(
     trials = {name: _trials(name, sensor, tried, profile) for name, sensor in sensors.items()}
     with steps("sweep", sum(map(len, trials.values()))) as bar:
         for name, sensor in sensors.items():
-            pairs, _ = simulate_pairs(list(scenes.values()), sensor, aim.in_units_of(sensor), seed, ratios)
+            pairs, _ = simulate_pairs(
+                list(scenes.values()), sensor, aim.in_units_of(sensor), seed, ratios
+            )
             edges = acquire_edges(sensor, seed) if brightness == 1 else []
             for supposed, other, method in trials[name]:
                 key = (name, supposed, method.name)
@@ -118,7 +140,9 @@ def run_sweep(
 def _trials(
     name: str, sensor: Instrument, methods: Sequence[Method], profile: Sensor
 ) -> list[tuple[str, Instrument, Method]]:
-    """Return name, sensor and method for each supposed sensor; the second of `methods` is the pipeline."""
+    """Return name, sensor and method for each supposed sensor; the second of `methods` is the
+    pipeline.
+    """
     nominal = profile.nominal()
     units = replace(nominal, gain_dn_per_radiance=sensor.gain_dn_per_radiance)
     drifted = [] if name == NOMINAL else [(NOMINAL, units, methods[1])]
@@ -134,7 +158,9 @@ def _psnr_db(method: Method, pairs: Sequence[NamedPair], max_dn: int) -> np.ndar
     for pair in pairs:
         dn = method.restore(pair.degraded)
         wanted = (pair.reference, pair.noise_free)
-        found.append([fidelity_db(dn, image, pair.degraded, max_dn) for image in wanted if image is not None])
+        found.append(
+            [fidelity_db(dn, image, pair.degraded, max_dn) for image in wanted if image is not None]
+        )
     return np.array(found).T
 
 
@@ -150,8 +176,10 @@ class Found:
     """What a sweep measured, trial by trial.
 
     Attributes:
-        psnr: in dB, (2, N): each image against the reference, and against the reference without noise.
-        mtf: after restoration, where the sensor is known as it is, and of the pipeline that supposes the nominal one.
+        psnr: in dB, (2, N): each image against the reference, and against the reference without
+            noise.
+        mtf: after restoration, where the sensor is known as it is, and of the pipeline that
+            supposes the nominal one.
         sites: of the images, (N,).
         seed: of the bootstrap.
         brightness: factor of the scenes' radiance.
@@ -171,15 +199,22 @@ class Found:
     @property
     def networks(self) -> list[str]:
         """Names of the methods that are neither the input nor the pipeline."""
-        return [name for name in dict.fromkeys(name for *_, name in self.psnr) if name not in (DEGRADED, TRADITIONAL)]
+        return [
+            name
+            for name in dict.fromkeys(name for *_, name in self.psnr)
+            if name not in (DEGRADED, TRADITIONAL)
+        ]
 
     @property
     def rows(self) -> list[Row]:
         """Every table, a row a condition; and of the gains a row a network over all conditions.
 
-        The MTF does not depend on the scenes, so it is left out where their brightness is not their own.
+        The MTF does not depend on the scenes, so it is left out where their brightness is not their
+        own.
         """
-        psnr, clean = ({key: self._mean(both[k]) for key, both in self.psnr.items()} for k in (0, 1))
+        psnr, clean = (
+            {key: self._mean(both[k]) for key, both in self.psnr.items()} for k in (0, 1)
+        )
         tables = [("sweep, PSNR", psnr), (f"sweep, {NOISE_FREE}", clean)]
         if self.brightness == 1:
             tables.append(("sweep, MTF at Nyquist", dict(self.mtf)))
@@ -192,36 +227,63 @@ class Found:
         return [replace(row, table=table_at(self.brightness, row.table)) for row in rows]
 
     def _columns(self, truth: str) -> dict[str, Key]:
-        """The input, the pipeline that knows the truth, the one that knows the nominal sensor, and each network."""
-        chains = {TRUTH_KNOWN: (truth, truth, TRADITIONAL), NOMINAL_KNOWN: (truth, NOMINAL, TRADITIONAL)}
+        """The input, the pipeline that knows the truth, the one that knows the nominal sensor, and
+        each network.
+        """
+        chains = {
+            TRUTH_KNOWN: (truth, truth, TRADITIONAL),
+            NOMINAL_KNOWN: (truth, NOMINAL, TRADITIONAL),
+        }
         networks = {name: (truth, truth, name) for name in self.networks}
         return {DEGRADED: (truth, truth, DEGRADED), **chains, **networks}
 
     def _gains(self) -> list[Row]:
-        """How far each network is ahead of the pipeline that knows the truth: by condition, then over all of them."""
-        psnr = {(truth, name): both[0] for (truth, supposed, name), both in self.psnr.items() if truth == supposed}
+        """How far each network is ahead of the pipeline that knows the truth: by condition, then
+        over all of them.
+        """
+        psnr = {
+            (truth, name): both[0]
+            for (truth, supposed, name), both in self.psnr.items()
+            if truth == supposed
+        }
         gains = {
             truth: {name: psnr[truth, name] - psnr[truth, TRADITIONAL] for name in self.networks}
             for truth in self.conditions
         }
-        rows = [Row("sweep, gain over the pipeline", truth, self._means(each)) for truth, each in gains.items()]
-        over_all = [self._over_all(n, {truth: each[n] for truth, each in gains.items()}) for n in self.networks]
+        rows = [
+            Row("sweep, gain over the pipeline", truth, self._means(each))
+            for truth, each in gains.items()
+        ]
+        over_all = [
+            self._over_all(n, {truth: each[n] for truth, each in gains.items()})
+            for n in self.networks
+        ]
         return [*rows, *over_all] if over_all else []
 
     def _over_all(self, network: str, gains: Mapping[str, np.ndarray]) -> Row:
         least = min(gains, key=lambda truth: float(gains[truth].mean()))
         mean = self._mean(np.mean(list(gains.values()), axis=0))
         figures = {f"mean of {len(gains)} conditions": mean, "least": self._mean(gains[least])}
-        return Row("sweep, gain over the pipeline, all conditions", network, figures, {"least at": least})
+        return Row(
+            "sweep, gain over the pipeline, all conditions", network, figures, {"least at": least}
+        )
 
     def _wrong(self) -> list[Row]:
-        """PSNR where each method supposes another sensor than the true one, and what it loses by that."""
+        """PSNR where each method supposes another sensor than the true one, and what it loses by
+        that.
+        """
         pairs = dict.fromkeys(key[:2] for key in self.psnr if key[1] not in (key[0], NOMINAL))
         psnr = []
         lost = []
         for truth, supposed in pairs:
-            wrong = {key[2]: values[0] for key, values in self.psnr.items() if key[:2] == (truth, supposed)}
-            cost = {name: self.psnr[truth, truth, name][0] - values for name, values in wrong.items()}
+            wrong = {
+                key[2]: values[0]
+                for key, values in self.psnr.items()
+                if key[:2] == (truth, supposed)
+            }
+            cost = {
+                name: self.psnr[truth, truth, name][0] - values for name, values in wrong.items()
+            }
             shown = f"{truth}, supposed {supposed}"
             psnr.append(Row("sweep, sensor known wrongly", shown, self._means(wrong)))
             lost.append(Row("sweep, lost by a sensor known wrongly", shown, self._means(cost)))
@@ -231,6 +293,12 @@ class Found:
         return {name: self._mean(each) for name, each in values.items()}
 
     def _mean(self, values: np.ndarray) -> Figure:
-        """The mean of (N,) dB, an image each: of differences on the same images the interval is a paired one."""
-        interval, words = site_interval(values.tolist(), self.sites, np.random.default_rng(self.seed))
-        return measured(float(values.mean()), "dB", f"mean of {len(values)} pairs, {words}", interval)
+        """The mean of (N,) dB, an image each: of differences on the same images the interval is a
+        paired one.
+        """
+        interval, words = site_interval(
+            values.tolist(), self.sites, np.random.default_rng(self.seed)
+        )
+        return measured(
+            float(values.mean()), "dB", f"mean of {len(values)} pairs, {words}", interval
+        )

@@ -1,14 +1,16 @@
-"""Figures of one method on targets whose truth is known: MTF, noise, flux of points and transfer of faint contrast.
+"""Figures of one method on targets whose truth is known: MTF, noise, flux of points and transfer of
+faint contrast.
 
 The degraded sensor acquires every target as it acquires scenes, and the method restores it.
 
-1. Slanted edges with a step of 160 W/m2/sr/um give the MTF at Nyquist. A method that adapts to its input may treat
-   faint texture otherwise, so 4. and 5. are needed too.
+1. Slanted edges with a step of 160 W/m2/sr/um give the MTF at Nyquist. A method that adapts to its
+  input may treat faint texture otherwise, so 4. and 5. are needed too.
 2. Flat fields give the SNR where there is nothing to see.
-3. Points of light on a flat background give the flux: the light of a point after restoration over the light in the
-   image that the reference sensor acquires without noise.
-4. Sinusoidal bars, and 5. zone plates, give the contrast transfer: the slope of the least-squares fit of the restored
-   image on the image that the reference sensor acquires without noise. It is 1 if the method reaches the reference.
+3. Points of light on a flat background give the flux: the light of a point after restoration over
+  the light in the image that the reference sensor acquires without noise.
+4. Sinusoidal bars, and 5. zone plates, give the contrast transfer: the slope of the least-squares
+  fit of the restored image on the image that the reference sensor acquires without noise. It is 1
+  if the method reaches the reference.
 
 Restored images are measured away from their borders.
 """
@@ -48,7 +50,8 @@ class Points:
         background: radiance in W/m2/sr/um.
         seen: the image that the degraded sensor acquires, (H, W) digital numbers.
         flat: the same without points, acquired with the same random draws.
-        wanted: the light of the points alone as the reference sensor sees it without noise, (H, W) digital numbers.
+        wanted: the light of the points alone as the reference sensor sees it without noise, (H, W)
+            digital numbers.
     """
 
     background: float
@@ -107,30 +110,44 @@ def acquire_targets(sensor: Instrument, reference: Instrument, seed: int) -> Tar
     for radiance in RADIANCES:
         field = np.full((FLAT_PX, FLAT_PX), radiance, np.float32)
         flats.append((radiance, _acquire(field, sensor, next(draws), ratio=1)))
-    points = [_acquire_points(background, *sensors, next(draws)) for background in POINT_BACKGROUNDS]
+    points = [
+        _acquire_points(background, *sensors, next(draws)) for background in POINT_BACKGROUNDS
+    ]
     patterns = [_acquire_pattern(*each, *sensors, next(draws)) for each in _pattern_scenes()]
     return Targets(sensor, acquire_edges(sensor, seed), flats, points, patterns)
 
 
-def _acquire(scene: np.ndarray, sensor: Instrument, draw: Draw, ratio: int = OVERSAMPLING) -> np.ndarray:
-    return acquire(scene_spectrum(scene), scene.shape[1], sensor, ratio, draw, "degraded", margin_px=0)
+def _acquire(
+    scene: np.ndarray, sensor: Instrument, draw: Draw, ratio: int = OVERSAMPLING
+) -> np.ndarray:
+    return acquire(
+        scene_spectrum(scene), scene.shape[1], sensor, ratio, draw, "degraded", margin_px=0
+    )
 
 
 def _without_noise(scene: np.ndarray, sensor: Instrument, draw: Draw) -> np.ndarray:
     spectrum = scene_spectrum(scene)
-    return acquire(spectrum, scene.shape[1], sensor, OVERSAMPLING, draw, "reference", margin_px=0, skip=NOISE)
+    return acquire(
+        spectrum, scene.shape[1], sensor, OVERSAMPLING, draw, "reference", margin_px=0, skip=NOISE
+    )
 
 
 def mean_figures(method: Method, targets: Targets) -> dict[str, Figure]:
-    """Return MTF at Nyquist in % and SNR in flat fields of the restored targets, for the table of means."""
+    """Return MTF at Nyquist in % and SNR in flat fields of the restored targets, for the table of
+    means.
+    """
     figures = {"MTF at Nyquist": restored_mtf(method, targets.edges, targets.sensor.max_dn)}
     for radiance, flat in targets.flats:
-        figures[snr_name(radiance)] = flat_figure(_middle(method.restore(flat)) - targets.sensor.offset_dn)
+        figures[snr_name(radiance)] = flat_figure(
+            _middle(method.restore(flat)) - targets.sensor.offset_dn
+        )
     return figures
 
 
 def target_row(method: Method, targets: Targets) -> Row:
-    """Return the row of a method in the table of targets: flux of points, and contrast transfer of patterns."""
+    """Return the row of a method in the table of targets: flux of points, and contrast transfer of
+    patterns.
+    """
     figures: dict[str, Figure] = {}
     for points in targets.points:
         figures |= flux_figures(method, points)
@@ -143,7 +160,9 @@ def target_row(method: Method, targets: Targets) -> Row:
 def interval_of_mean(values: Sequence[float]) -> tuple[float, float]:
     """Return the 90 % interval of the mean of two or more independent values (Student's t)."""
     mean = float(np.mean(values))
-    reach = float(stdtrit(len(values) - 1, 0.95)) * float(np.std(values, ddof=1)) / len(values) ** 0.5
+    reach = (
+        float(stdtrit(len(values) - 1, 0.95)) * float(np.std(values, ddof=1)) / len(values) ** 0.5
+    )
     return mean - reach, mean + reach
 
 
@@ -166,7 +185,9 @@ def acquire_edges(sensor: Instrument, seed: int) -> Edges:
 
 def restored_mtf(method: Method, edges: Edges, max_dn: int) -> Figure:
     """Return the MTF at Nyquist in % of the edges that the method restored."""
-    return mtf_figure([edge_mtf(_middle(method.restore(edge)), angle, max_dn) for angle, edge in edges])
+    return mtf_figure(
+        [edge_mtf(_middle(method.restore(edge)), angle, max_dn) for angle, edge in edges]
+    )
 
 
 def _middle(image: np.ndarray) -> np.ndarray:
@@ -175,11 +196,15 @@ def _middle(image: np.ndarray) -> np.ndarray:
 
 
 def mtf_figure(found: Sequence[float | Refusal]) -> Figure:
-    """Return the mean over the edges with its 90 % interval; unavailable if most edges were refused."""
+    """Return the mean over the edges with its 90 % interval; unavailable if most edges were
+    refused.
+    """
     values = [100 * each for each in found if not isinstance(each, Refusal)]
     refused = [each for each in found if isinstance(each, Refusal)]
     if len(values) < max(len(refused), 2):
-        return unavailable("%", f"{len(refused)} of {len(found)} edges refused: {refused[0].reason}")
+        return unavailable(
+            "%", f"{len(refused)} of {len(found)} edges refused: {refused[0].reason}"
+        )
     source = f"{len(values)} of {len(found)} simulated slanted edges, 90 % interval of the mean"
     return measured(float(np.mean(values)), "%", source, interval_of_mean(values))
 
@@ -202,7 +227,9 @@ def flat_figure(flat: np.ndarray) -> Figure:
     deviation = float(flat.std(dtype=np.float64, ddof=1))
     if deviation <= 1e-6 * mean:
         return unavailable("ratio", "nothing is left of the noise in a flat field")
-    return measured(mean / deviation, "ratio", f"one flat field of {flat.shape[1]} x {flat.shape[0]}, L / sigma")
+    return measured(
+        mean / deviation, "ratio", f"one flat field of {flat.shape[1]} x {flat.shape[0]}, L / sigma"
+    )
 
 
 # Points of light
@@ -214,8 +241,11 @@ POINT_RADIANCES = (12.0, 40.0, 120.0)
 POINTS_A_SIDE = 6
 POINT_STEP_PX = 48
 APERTURE_PX = 33
-"""Side of the square over which the light of a point is added up. A restoration may move light by its receptive
-field, and the consistency step by two of its blocks, 16 px."""
+"""Side of the square over which the light of a point is added up.
+
+A restoration may move light by its receptive field, and the consistency step by two of its blocks,
+16 px.
+"""
 
 
 def flux_name(radiance: float, background: float) -> str:
@@ -223,7 +253,9 @@ def flux_name(radiance: float, background: float) -> str:
     return f"flux of points of {radiance:g} on {background:g} W/m2/sr/um"
 
 
-def _acquire_points(background: float, sensor: Instrument, reference: Instrument, draw: Draw) -> Points:
+def _acquire_points(
+    background: float, sensor: Instrument, reference: Instrument, draw: Draw
+) -> Points:
     flat = np.full((POINTS_A_SIDE * POINT_STEP_PX * OVERSAMPLING,) * 2, background, np.float32)
     scene = flat.copy()
     generator = draw.generator("points")
@@ -247,8 +279,9 @@ def _point_radiance(row: int, column: int) -> float:
 def flux_figures(method: Method, points: Points) -> dict[str, Figure]:
     """Return the flux in % of the points of each radiance.
 
-    The background is what the method makes of the same flat field with the same random draws. Its noise is nearly the
-    same at each pixel, so the difference measures far better than a ring around the point would.
+    The background is what the method makes of the same flat field with the same random draws. Its
+    noise is nearly the same at each pixel, so the difference measures far better than a ring around
+    the point would.
     """
     light = method.restore(points.seen).astype(np.float64) - method.restore(points.flat)
     values: dict[float, list[float]] = {radiance: [] for radiance in POINT_RADIANCES}
@@ -258,7 +291,10 @@ def flux_figures(method: Method, points: Points) -> dict[str, Figure]:
         values[_point_radiance(row, column)].append(flux)
     figures = {}
     for radiance, each in values.items():
-        source = f"mean of {len(each)} points in {APERTURE_PX} x {APERTURE_PX} px, 90 % interval of the mean"
+        source = (
+            f"mean of {len(each)} points in {APERTURE_PX} x {APERTURE_PX} px, 90 % "
+            "interval of the mean"
+        )
         name = flux_name(radiance, points.background)
         figures[name] = measured(float(np.mean(each)), "%", source, interval_of_mean(each))
     return figures
@@ -292,7 +328,9 @@ ZONE_NYQUIST_PX = 96
 
 
 def _pattern_scenes() -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Return name, contrast (S, S) in scene pixels and the mask (H, W) of measured pixels of each pattern."""
+    """Return name, contrast (S, S) in scene pixels and the mask (H, W) of measured pixels of each
+    pattern.
+    """
     return [*_bars(), *_zone_plates()]
 
 
@@ -303,7 +341,8 @@ def _bars() -> list[tuple[str, np.ndarray, np.ndarray]]:
     middle[place, place] = True
     bars = []
     for contrast, period_px in product(BAR_CONTRASTS, BAR_PERIODS_PX):
-        # The crests lie on the centres of pixels: otherwise bars of a period of 2 px would be lost in the sampling.
+        # The crests lie on the centres of pixels: otherwise bars of a period of 2 px would be lost
+        # in the sampling.
         wave = np.cos(2 * math.pi * _places_px(BARS_PX) / period_px)
         across = np.broadcast_to(contrast * wave, (wave.size, wave.size))
         name = f"bars of {contrast:.0%}, period {period_px:.3g} px"
@@ -317,29 +356,44 @@ def _zone_plates() -> list[tuple[str, np.ndarray, np.ndarray]]:
     ring = (frequency >= ZONE_BAND[0]) & (frequency <= ZONE_BAND[1])
     radius_px = _radius_px(ZONE_PX, OVERSAMPLING)
     chirp = np.cos(math.pi / 2 * radius_px**2 / ZONE_NYQUIST_PX) * (radius_px < ZONE_NYQUIST_PX)
-    return [(f"zone plate of {contrast:.0%}", contrast * chirp, ring) for contrast in ZONE_CONTRASTS]
+    return [
+        (f"zone plate of {contrast:.0%}", contrast * chirp, ring) for contrast in ZONE_CONTRASTS
+    ]
 
 
 def _places_px(side_px: int, ratio: int = OVERSAMPLING) -> np.ndarray:
-    """Return where the scene pixels of a side lie, in pixels: 0 is the centre of the first pixel."""
+    """Return where the scene pixels of a side lie, in pixels: 0 is the centre
+    of the first pixel.
+    """
     return (np.arange(side_px * ratio) - (ratio - 1) / 2) / ratio
 
 
 def _radius_px(side_px: int, ratio: int) -> np.ndarray:
-    """Return the distance of every scene pixel from the middle, (side_px * ratio,) * 2, in pixels."""
+    """Return the distance of every scene pixel from the middle, (side_px *
+    ratio,) * 2, in pixels.
+    """
     place = _places_px(side_px, ratio) - (side_px - 1) / 2
     return np.hypot(place[:, None], place)
 
 
 def _acquire_pattern(
-    name: str, contrast: np.ndarray, mask: np.ndarray, sensor: Instrument, reference: Instrument, draw: Draw
+    name: str,
+    contrast: np.ndarray,
+    mask: np.ndarray,
+    sensor: Instrument,
+    reference: Instrument,
+    draw: Draw,
 ) -> Pattern:
     scene = (PATTERN_BACKGROUND * (1 + contrast)).astype(np.float32)
-    return Pattern(name, _acquire(scene, sensor, draw), _without_noise(scene, reference, draw), mask)
+    return Pattern(
+        name, _acquire(scene, sensor, draw), _without_noise(scene, reference, draw), mask
+    )
 
 
 def transfer_figure(method: Method, patterns: Sequence[Pattern]) -> Figure:
-    """Return the mean contrast transfer over the quarters of each pattern, with its 90 % interval."""
+    """Return the mean contrast transfer over the quarters of each pattern, with
+    its 90 % interval.
+    """
     values: list[float] = []
     for pattern in patterns:
         values += _transfers(method.restore(pattern.seen), pattern)
@@ -348,7 +402,9 @@ def transfer_figure(method: Method, patterns: Sequence[Pattern]) -> Figure:
 
 
 def _transfers(restored: np.ndarray, pattern: Pattern) -> list[float]:
-    """Return the slope of the least-squares fit of a restored pattern on the wanted one, in each quarter."""
+    """Return the slope of the least-squares fit of a restored pattern on the wanted one, in each
+    quarter.
+    """
     slopes = []
     height, width = restored.shape
     for number in range(4):

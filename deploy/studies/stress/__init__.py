@@ -1,6 +1,8 @@
 """Hard cases and bit flips against a network and its INT8 file: `beers-deploy stress`.
 
-- `cases` draws the hard cases; `networks` opens the pair and looks at a case at each stage, by the `checks`;
+- `cases` draws the hard cases; `networks` opens the pair and looks at a case at each stage, by the
+  `checks`;
 - `battery` runs every case through every stage, tells what held, and writes tables as Markdown;
-- `faults` flips bits and guards against them; `bit_flips` says what flips cost and what the guards do.
+- `faults` flips bits and guards against them; `bit_flips` says what flips cost and what the guards
+  do.
 """

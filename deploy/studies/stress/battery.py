@@ -1,4 +1,6 @@
-"""Every case through every stage: what was measured, what it is judged to be, and the tables of both."""
+"""Every case through every stage: what was measured, what it is judged to be, and the tables of
+both.
+"""
 
 import math
 import zlib
@@ -22,7 +24,9 @@ from beers_deploy.studies.stress.networks import STAGES, Subject
 
 @dataclass(frozen=True)
 class StageResult:
-    """One case at one stage: the worst of each check over its images, or why the stage was not looked at."""
+    """One case at one stage: the worst of each check over its images, or why the stage was not
+    looked at.
+    """
 
     case: Case
     stage: str
@@ -32,7 +36,9 @@ class StageResult:
     @property
     def broken(self) -> list[tuple[Measure, Limitation | None]]:
         """What does not hold, each with the known limitation that explains it."""
-        return [(m, limitation_of(self.stage, self.case.name, m)) for m in self.measures if not m.holds]
+        return [
+            (m, limitation_of(self.stage, self.case.name, m)) for m in self.measures if not m.holds
+        ]
 
     @property
     def limitations(self) -> list[Limitation]:
@@ -76,7 +82,9 @@ def run_battery(
     with one_thread_per_operation(), steps("stressing", len(cases) * len(stages)) as bar:
         for case in cases:
             # Seeded by its name: a case draws the same images whichever others are asked for.
-            images = case.draw(side_px, np.random.default_rng([seed, zlib.crc32(case.name.encode())]))
+            images = case.draw(
+                side_px, np.random.default_rng([seed, zlib.crc32(case.name.encode())])
+            )
             for stage in stages:
                 measures = [] if reasons[stage] else _measures(subject, case, stage, images)
                 results.append(StageResult(case, stage, tuple(worst(measures)), reasons[stage]))
@@ -96,7 +104,9 @@ def _cannot_be_looked_at(subject: Subject, stage: str) -> str:
     return ""
 
 
-def _measures(subject: Subject, case: Case, stage: str, images: Iterable[np.ndarray]) -> list[Measure]:
+def _measures(
+    subject: Subject, case: Case, stage: str, images: Iterable[np.ndarray]
+) -> list[Measure]:
     try:
         return [measure for image in images for measure in STAGES[stage](subject, case, image)]
     except BeersError as error:  # a network that refuses a sound image has failed
@@ -122,7 +132,9 @@ def chosen(names: str | None, known: Iterable[str], option: str) -> list[str]:
     for name in wanted:
         if name not in every:
             expected = f"some of {', '.join(every)}"
-            raise OptionError(option, expected=expected, got=repr(name), remedy="separate them by commas")
+            raise OptionError(
+                option, expected=expected, got=repr(name), remedy="separate them by commas"
+            )
     return wanted
 
 
@@ -132,7 +144,12 @@ INTERVALS = "proven for every image: interval arithmetic on the file's own weigh
 
 def shown_rows(subject: Subject, results: Sequence[StageResult]) -> list[Row]:
     """The tables of a battery in reading order, its findings left out."""
-    return [*battery_rows(results), *worst_rows(results), *limitation_rows(results), *layer_rows(subject)]
+    return [
+        *battery_rows(results),
+        *worst_rows(results),
+        *limitation_rows(results),
+        *layer_rows(subject),
+    ]
 
 
 def battery_rows(results: Iterable[StageResult]) -> list[Row]:
@@ -148,7 +165,9 @@ def worst_rows(results: Iterable[StageResult]) -> list[Row]:
     found: dict[str, list[tuple[Measure, str]]] = {}
     for result in results:
         for measure in result.measures:
-            found.setdefault(f"{result.stage}: {measure.check}", []).append((measure, result.case.name))
+            found.setdefault(f"{result.stage}: {measure.check}", []).append(
+                (measure, result.case.name)
+            )
     rows = []
     for name, seen in found.items():
         largest, case = max(seen, key=lambda each: _excess(each[0]))
@@ -164,8 +183,14 @@ def limitation_rows(results: Iterable[StageResult]) -> list[Row]:
     for result in results:
         for measure, limit in result.broken:
             name = f"{limit.name} ({result.stage}, {measure.check})" if limit else ""
-            if limit and (name not in rows or measure.value > (rows[name].figures["largest"].value or 0)):
-                text = {"in": result.case.name, "fails beyond": f"{limit.ceiling:g}", "means": limit.meaning}
+            if limit and (
+                name not in rows or measure.value > (rows[name].figures["largest"].value or 0)
+            ):
+                text = {
+                    "in": result.case.name,
+                    "fails beyond": f"{limit.ceiling:g}",
+                    "means": limit.meaning,
+                }
                 rows[name] = Row("limitations", name, {"largest": _figure(measure)}, text)
     return list(rows.values())
 
@@ -185,14 +210,19 @@ def _figure(measure: Measure) -> Figure:
 
 
 def layer_rows(subject: Subject) -> list[Row]:
-    """Each integer layer: bits that its accumulator needs at most, and whether it might saturate."""
+    """Each integer layer: bits that its accumulator needs at most, and whether
+    it might saturate.
+    """
     if _cannot_be_looked_at(subject, "INT8 reference"):
         return []
     rows = []
     for bound in layer_bounds(subject.core):
         bits = predicted(bound.bits, "bits", (bound.bits, bound.bits), INTERVALS)
         overflows = "no" if bound.bits < INT32_BITS else "YES"
-        text = {"can it overflow int32": overflows, "can it saturate int8": "perhaps" if bound.saturates else "never"}
+        text = {
+            "can it overflow int32": overflows,
+            "can it saturate int8": "perhaps" if bound.saturates else "never",
+        }
         rows.append(Row("integer layers", bound.name, {"accumulator": bits}, text))
     return rows
 
@@ -206,12 +236,16 @@ TITLES = {  # of the sections that are shown, by the names of their tables in th
     "guards": "What guards cost on the board",
 }
 NOTES = {
-    "battery": "`ok`: every check holds; `limit`: only what a known limitation explains does not; `-`: not looked "
+    "battery": "`ok`: every check holds; `limit`: only what a known limitation explains does "
+    "not; `-`: not looked "
     "at, for whole numbers know no missing pixels and the others are refused before.",
-    "bit flips": "PSNR, mean and range over patches and injections; one kind of memory at a time. `clamped`: ReLU6 "
-    "and the limit of the correction. `all guards`: scrubbing and triple modular redundancy too, before the image; "
+    "bit flips": "PSNR, mean and range over patches and injections; one kind of memory at a "
+    "time. `clamped`: ReLU6 "
+    "and the limit of the correction. `all guards`: scrubbing and triple modular redundancy "
+    "too, before the image; "
     "what flips in the weights after that stays for this tile.",
-    "guards": "ReLU6 only where calibration stays below 96 units. Three rows are the host's time; the DPU is busy "
+    "guards": "ReLU6 only where calibration stays below 96 units. Three rows are the host's "
+    "time; the DPU is busy "
     "meanwhile, so nothing is lost while the host has time left.",
     "integer layers": "Intervals of whole numbers through the file's weights: true of every image.",
 }
@@ -221,15 +255,24 @@ def markdown(rows: Sequence[Row]) -> str:
     """A section for each table."""
     parts = []
     for table, found in by_table(rows).items():
-        parts += [f"## {TITLES[table]}\n", *([NOTES[table], ""] if table in NOTES else []), *table_lines(found), ""]
+        parts += [
+            f"## {TITLES[table]}\n",
+            *([NOTES[table], ""] if table in NOTES else []),
+            *table_lines(found),
+            "",
+        ]
     return "\n".join(parts)
 
 
 def table_lines(rows: Sequence[Row]) -> list[str]:
-    """The lines of one table; unit and mode stand in its head where they are those of a whole column."""
+    """The lines of one table; unit and mode stand in its head where they are those of a whole
+    column.
+    """
     found = list(rows)
     words = words_of(list(rows))
-    common = {key: (unit_of(key, found), common_mode(key, found)) for row in found for key in row.figures}
+    common = {
+        key: (unit_of(key, found), common_mode(key, found)) for row in found for key in row.figures
+    }
     abouts = {key: ", ".join(filter(None, both)) for key, both in common.items()}
     lines = [["", *(f"{key} ({about})" if about else key for key, about in abouts.items()), *words]]
     lines.append(["---"] * len(lines[0]))
@@ -249,4 +292,6 @@ def _reason(line: str) -> str:
 def _cell(figure: Figure | None, unit: str, mode: str) -> str:
     if figure is None or figure.value is None:
         return "" if figure is None else "-"
-    return " ".join([str(figure), *([] if unit else [figure.unit]), *([] if mode else [figure.mode])])
+    return " ".join(
+        [str(figure), *([] if unit else [figure.unit]), *([] if mode else [figure.mode])]
+    )

@@ -1,7 +1,7 @@
 """`stress --bit-flips`: what bit flips cost, and what guards buy back and cost.
 
-Flips are injected into weights, shifts, feature maps or the image, one kind of memory at a time; the DPU's arithmetic
-then runs in whole numbers.
+Flips are injected into weights, shifts, feature maps or the image, one kind of memory at a time;
+the DPU's arithmetic then runs in whole numbers.
 """
 
 import statistics
@@ -35,7 +35,8 @@ def flip_rows(subject: Subject, source: Calibration, board: str) -> list[Row]:
 
     Args:
         subject: with an INT8 network.
-        source: of the patches that flips are tried on, one an injection into each kind of memory at each rate.
+        source: of the patches that flips are tried on, one an injection into each kind of memory at
+            each rate.
         board: whose cost model prices the guards.
     """
     _ = subject.core  # refused before anything is drawn
@@ -62,7 +63,9 @@ class FaultTarget:
 
 
 def make_target(subject: Subject, source: Calibration) -> FaultTarget:
-    """The core as the board stores it, guards that calibration patches teach, and other patches to try it on."""
+    """The core as the board stores it, guards that calibration patches teach, and other patches to
+    try it on.
+    """
     core = faults.as_stored(subject.core)
     taught = replace(source, patches=CALIBRATION_PATCHES)
     tried = replace(source, seed=source.seed + HELD_OUT_SEED)
@@ -90,7 +93,9 @@ def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
         bare, clamped = (_quality_db(sound, guards, reference) for guards in (None, target.guards))
         clean.append((bare, clamped, clamped))
     rows = [_curve_row("none", [(0, quality) for quality in clean], "patches")]
-    with steps("turning bits over", sum(len(m.rates) * m.times * draws for m in faults.MEMORIES.values())) as bar:
+    with steps(
+        "turning bits over", sum(len(m.rates) * m.times * draws for m in faults.MEMORIES.values())
+    ) as bar:
         for name, memory in faults.MEMORIES.items():
             for rate in memory.rates:
                 found = []
@@ -101,15 +106,21 @@ def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
     return rows
 
 
-def _quality_db(injected: faults.Injected, guards: faults.Guards | None, reference: np.ndarray) -> float:
+def _quality_db(
+    injected: faults.Injected, guards: faults.Guards | None, reference: np.ndarray
+) -> float:
     return psnr_db(faults.restored(injected, guards), reference, 1.0)
 
 
-def _drawn(target: FaultTarget, name: str, rate: float, draw: int, seed: int, clean: Quality) -> tuple[int, Quality]:
+def _drawn(
+    target: FaultTarget, name: str, rate: float, draw: int, seed: int, clean: Quality
+) -> tuple[int, Quality]:
     """The bits that one injection into a memory flipped, and what is left of the quality."""
     (image, reference), memory = target.pairs[draw % len(target.pairs)], faults.MEMORIES[name]
     # Keyed by what is drawn, so that a draw is the same whatever else runs.
-    generator = np.random.default_rng([seed, draw, list(faults.MEMORIES).index(name), memory.rates.index(rate)])
+    generator = np.random.default_rng(
+        [seed, draw, list(faults.MEMORIES).index(name), memory.rates.index(rate)]
+    )
     injected = memory.inject(target.core, image, rate, generator)
     # No flip, no change: the fault-free figures stand, at no cost.
     if injected.flips == 0:
@@ -125,9 +136,14 @@ def _curve_row(name: str, draws: Sequence[tuple[int, Quality]], kind: str) -> Ro
     source = f"integer reference, mean and range of {len(draws)} {kind}"
     flips = measured(float(np.mean([count for count, _ in draws])), "bits", source)
     figures = {"flips": flips}
-    for guards, values in zip(SETS, zip(*(quality for _, quality in draws), strict=True), strict=True):
-        # Exact before it is rounded once: the mean of the same values is the same, however often each stands there.
-        figures[guards] = measured(statistics.mean(values), "dB", source, (min(values), max(values)))
+    for guards, values in zip(
+        SETS, zip(*(quality for _, quality in draws), strict=True), strict=True
+    ):
+        # Exact before it is rounded once: the mean of the same values is the same, however often
+        # each stands there.
+        figures[guards] = measured(
+            statistics.mean(values), "dB", source, (min(values), max(values))
+        )
     return Row("bit flips", name, figures)
 
 
@@ -157,21 +173,29 @@ def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Ro
         "triple modular redundancy of the shifts": (copies_s, READ),
         "all guards": (limit_s + scrubbing_s + copies_s, f"{INSTRUCTED}; {READ}"),
     }
-    return [_price_row(name, time_s, source, prediction, spread) for name, (time_s, source) in guards.items()]
+    return [
+        _price_row(name, time_s, source, prediction, spread)
+        for name, (time_s, source) in guards.items()
+    ]
 
 
 def _price_row(name: str, time_s: float, source: str, prediction: Prediction, spread: float) -> Row:
     tile_s = prediction.batch_time_s / prediction.batch
     slow, fast = prediction.fps_interval
-    # The host prepares the next tile while the DPU runs: only what does not fit beside it costs frames.
+    # The host prepares the next tile while the DPU runs: only what does not fit beside it costs
+    # frames.
     before_s = max(tile_s, prediction.host_s)
     beside_s = max(tile_s, prediction.host_s + time_s)
     times_s = (time_s / spread, time_s * spread)
     most = 100 * time_s * spread * fast
     figures = {
         "time": predicted(1e3 * time_s, "ms/tile", (1e3 * times_s[0], 1e3 * times_s[1]), source),
-        "of a tile, if nothing hides": predicted(100 * time_s / tile_s, "%", (100 * times_s[0] * slow, most), source),
-        "frame rate lost beside the DPU": predicted(100 * (1 - before_s / beside_s), "%", (0.0, most), source),
+        "of a tile, if nothing hides": predicted(
+            100 * time_s / tile_s, "%", (100 * times_s[0] * slow, most), source
+        ),
+        "frame rate lost beside the DPU": predicted(
+            100 * (1 - before_s / beside_s), "%", (0.0, most), source
+        ),
     }
     return Row("guards", name, figures)
 

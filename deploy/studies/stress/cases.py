@@ -1,4 +1,5 @@
-"""The hard cases: images (H, W) float32 in digital numbers of 12 bits that an instrument meets, or a fault makes.
+"""The hard cases: images (H, W) float32 in digital numbers of 12 bits that an instrument meets, or
+a fault makes.
 
 The same generator draws the same images.
 """
@@ -28,7 +29,11 @@ def flat(*levels: float) -> Draw:
 def steps(side: int, _: np.random.Generator) -> list[np.ndarray]:
     """Steps from black to full scale, upright, lying and slanted: three images (side, side)."""
     row, column = np.mgrid[:side, :side]
-    return [_two(column >= side // 2), _two(row >= side // 2), _two(column + 0.2 * row >= 0.6 * side)]
+    return [
+        _two(column >= side // 2),
+        _two(row >= side // 2),
+        _two(column + 0.2 * row >= 0.6 * side),
+    ]
 
 
 def checkerboard(side: int, _: np.random.Generator) -> list[np.ndarray]:
@@ -130,7 +135,9 @@ def narrow(_: int, __: np.random.Generator) -> list[np.ndarray]:
 
 
 def ground(side: int, generator: np.random.Generator, mtf_nyquist: float = DRAWN_MTF) -> np.ndarray:
-    """Rectangles of all sizes and brightnesses, seen through an MTF: (side, side), whole numbers of 0 to 4095."""
+    """Rectangles of all sizes and brightnesses, seen through an MTF: (side, side), whole numbers of
+    0 to 4095.
+    """
     image = _filled(side, generator.uniform(800, 1600))
     for _ in range(40):
         top, left = generator.integers(0, side, 2)
@@ -160,7 +167,8 @@ class Case:
         name: short, as in the tables.
         draw: makes its
         pixels: "sound", or what is wrong with them: "missing" (NaN), "infinite", "beyond" 12 bits.
-        flat: every pixel of an image is the same: the mean must be kept, there is nothing to restore.
+        flat: every pixel of an image is the same: the mean must be kept, there is nothing to
+            restore.
         large: only what must hold of one run is looked at.
     """
 

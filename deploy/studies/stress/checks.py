@@ -45,15 +45,19 @@ def out_of_range(image: np.ndarray) -> Measure:
 
 
 def differing(check: str, image: np.ndarray, other: np.ndarray) -> Measure:
-    """How many pixels of two images (H, W) are not the same, bit for bit; NaN is the same as NaN."""
+    """How many pixels of two images (H, W) are not the same, bit for bit; NaN
+    is the same as NaN.
+    """
     same = (image == other) | (np.isnan(image) & np.isnan(other))
     return Measure(check, float((~same).sum()), 0, "px")
 
 
 def ringing(image: np.ndarray, source: np.ndarray, radius_px: int, allowed: float) -> Measure:
-    """How far pixels (H, W) leave the range of the source's pixels within the radius, over the contrast there.
+    """How far pixels (H, W) leave the range of the source's pixels within the radius, over the
+    contrast there.
 
-    One per cent of full scale does not count, and contrast is ten per cent at least: flat ground has none.
+    One per cent of full scale does not count, and contrast is ten per cent at least: flat ground
+    has none.
     """
     low, high = local_range(source, radius_px)
     # Rounding and noise leave the range by a little on any ground.
@@ -63,13 +67,19 @@ def ringing(image: np.ndarray, source: np.ndarray, radius_px: int, allowed: floa
 
 
 def local_range(image: np.ndarray, radius_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest and the largest pixel (H, W) within the radius along both axes, the image (H, W) ending there."""
+    """The smallest and the largest pixel (H, W) within the radius along both axes, the image (H, W)
+    ending there.
+    """
     square = np.ones((2 * radius_px + 1, 2 * radius_px + 1))
     return erosion(image, square), dilation(image, square)
 
 
-def gain(work: Work, source: np.ndarray, result: np.ndarray, generator: np.random.Generator) -> float:
-    """Largest change of a pixel (H, W), in DN, for a change of 1 DN: of one pixel, and of all by random signs."""
+def gain(
+    work: Work, source: np.ndarray, result: np.ndarray, generator: np.random.Generator
+) -> float:
+    """Largest change of a pixel (H, W), in DN, for a change of 1 DN: of one pixel, and of all by
+    random signs.
+    """
     one = np.zeros(source.shape, np.float32)
     one[source.shape[0] // 2, source.shape[1] // 2] = 1
     signs = generator.choice(np.array([-1, 1], np.float32), source.shape)
@@ -94,7 +104,9 @@ def refused(work: Callable[[], object]) -> Measure:
 
 
 def inside(image: np.ndarray, margin_px: int) -> np.ndarray:
-    """An image (H, W) without so many pixels on each side; the whole where nothing would be left."""
+    """An image (H, W) without so many pixels on each side; the whole where
+    nothing would be left.
+    """
     if min(image.shape) <= 2 * margin_px + 1:
         return image
     return image[margin_px : image.shape[0] - margin_px, margin_px : image.shape[1] - margin_px]
@@ -141,21 +153,25 @@ LIMITATIONS: tuple[Limitation, ...] = (
         "narrow images",
         ("ringing", "mean moved", "border"),
         1000,
-        "Of an image narrower than the receptive radius every pixel has padding in reach: brightness is not kept.",
+        "Of an image narrower than the receptive radius every pixel has padding in reach: "
+        "brightness is not kept.",
         ("1 x 1", "1 x N", "flat 1 x N"),
     ),
     Limitation(
         "border",
         ("border",),
         500,
-        "At the image's border zero padding looks like a black edge to the network; within its receptive radius "
-        "bright flat ground is off, in INT8 more, which clips the correction that float makes there.",
+        "At the image's border zero padding looks like a black edge to the network; within its "
+        "receptive radius "
+        "bright flat ground is off, in INT8 more, which clips the correction that float makes "
+        "there.",
     ),
     Limitation(
         "clipped corrections",
         ("mean error against float",),
         410,
-        "int8 holds corrections of about half of full scale at most; where float makes larger ones, on full contrast "
+        "int8 holds corrections of about half of full scale at most; where float makes larger "
+        "ones, on full contrast "
         "between single pixels, INT8 sharpens less.",
         stages=("INT8",),
     ),
@@ -163,7 +179,8 @@ LIMITATIONS: tuple[Limitation, ...] = (
         "isolated pixels",
         ("ringing",),
         200,
-        "A single pixel unlike all around it is taken for a blurred point and driven beyond its value, to black or "
+        "A single pixel unlike all around it is taken for a blurred point and driven beyond its "
+        "value, to black or "
         "full scale at most.",
         ("snow", "glint", "hot pixel", "SNR 3"),
     ),
@@ -173,7 +190,11 @@ LIMITATIONS: tuple[Limitation, ...] = (
 def limitation_of(stage: str, case: str, measure: Measure) -> Limitation | None:
     """The limitation that explains a measure which does not hold, or None."""
     for limit in LIMITATIONS:
-        known = stage in limit.stages and measure.check in limit.checks and (not limit.cases or case in limit.cases)
+        known = (
+            stage in limit.stages
+            and measure.check in limit.checks
+            and (not limit.cases or case in limit.cases)
+        )
         if known and measure.value <= limit.ceiling:
             return limit
     return None

@@ -1,7 +1,8 @@
-"""Bit flips (single-event upsets) in weights, shifts, feature maps and the image, and cheap guards against them.
+"""Bit flips (single-event upsets) in weights, shifts, feature maps and the image, and cheap guards
+against them.
 
-The guards: ReLU6 in place of ReLU, a limit of the correction, scrubbing of the weights by their checksums, triple
-modular redundancy of the shifts.
+The guards: ReLU6 in place of ReLU, a limit of the correction, scrubbing of the weights by their
+checksums, triple modular redundancy of the shifts.
 """
 
 import math
@@ -30,8 +31,11 @@ def flip_count(bits: int, per_megabit: float, generator: np.random.Generator) ->
     return int(generator.binomial(bits, min(per_megabit / MEGABIT, 1.0)))
 
 
-def flip_bits(values: np.ndarray, count: int, generator: np.random.Generator, bits: int = INT8_BITS) -> np.ndarray:
-    """A copy of whole numbers, two's complement where their type is signed, with `count` bits flipped.
+def flip_bits(
+    values: np.ndarray, count: int, generator: np.random.Generator, bits: int = INT8_BITS
+) -> np.ndarray:
+    """A copy of whole numbers, two's complement where their type is signed, with `count` bits
+    flipped.
 
     Args:
         values: of any shape and integer type that holds them.
@@ -40,10 +44,13 @@ def flip_bits(values: np.ndarray, count: int, generator: np.random.Generator, bi
         bits: how many one number has in memory.
     """
     choices = values.size * bits
-    places, which = divmod(generator.choice(choices, min(count, choices), replace=False, shuffle=False), bits)
+    places, which = divmod(
+        generator.choice(choices, min(count, choices), replace=False, shuffle=False), bits
+    )
     # As unsigned bits of the memory's width: the sign comes back at the end.
     raw = (values.ravel().astype(np.int64) & ((1 << bits) - 1)).copy()
-    # `at`, because two flips may fall into one number, and plain indexing would keep the last alone.
+    # `at`, because two flips may fall into one number, and plain indexing would keep the last
+    # alone.
     np.bitwise_xor.at(raw, places, np.left_shift(1, which))
     if np.issubdtype(values.dtype, np.signedinteger):
         raw = np.where(raw >> (bits - 1) == 1, raw - (1 << bits), raw)
@@ -51,11 +58,15 @@ def flip_bits(values: np.ndarray, count: int, generator: np.random.Generator, bi
 
 
 def as_stored(core: IntCore) -> IntCore:
-    """The core with its bias in int8, at the finest scale that holds it: what the board keeps in memory."""
+    """The core with its bias in int8, at the finest scale that holds it: what the board keeps in
+    memory.
+    """
     for (op, field), shift in shifts_of(core).items():
         if not -(1 << (SHIFT_BITS - 1)) <= shift < 1 << (SHIFT_BITS - 1):
             raise _refuse(f"{field} {shift} at {op}")
-    return replace(core, ops=tuple(_narrow(op) if isinstance(op, IntConv) else op for op in core.ops))
+    return replace(
+        core, ops=tuple(_narrow(op) if isinstance(op, IntConv) else op for op in core.ops)
+    )
 
 
 def _narrow(op: IntConv) -> IntConv:
@@ -65,13 +76,19 @@ def _narrow(op: IntConv) -> IntConv:
     while (np.clip(bias >> shift, INT8_MIN, INT8_MAX) != bias >> shift).any():
         shift += 1
     if ((bias >> shift) << shift != bias).any():
-        raise _refuse(f"a bias of {int(np.abs(bias).max())} at {op.name}, finer than its size allows")
-    return replace(op, bias=(bias >> shift).astype(np.int8), bias_frac_bits=op.bias_frac_bits - shift)
+        raise _refuse(
+            f"a bias of {int(np.abs(bias).max())} at {op.name}, finer than its size allows"
+        )
+    return replace(
+        op, bias=(bias >> shift).astype(np.int8), bias_frac_bits=op.bias_frac_bits - shift
+    )
 
 
 def _refuse(got: str) -> ModelError:
     remedy = "make it with 'beers-deploy quantize'"
-    return ModelError("INT8 core", expected="bias and shifts as the board stores them", got=got, remedy=remedy)
+    return ModelError(
+        "INT8 core", expected="bias and shifts as the board stores them", got=got, remedy=remedy
+    )
 
 
 def weight_bits(core: IntCore) -> int:
@@ -82,16 +99,23 @@ def weight_bits(core: IntCore) -> int:
 def flip_weights(core: IntCore, count: int, generator: np.random.Generator) -> IntCore:
     """The core with `count` bits of its weights and bias flipped, wherever they fall."""
     sizes = np.array([op.weight.size + op.bias.size for op in core.convolutions])
-    # How many of the bits fall into each layer, as if all were drawn from one memory without replacement.
+    # How many of the bits fall into each layer, as if all were drawn from one memory without
+    # replacement.
     share = generator.multivariate_hypergeometric(sizes * INT8_BITS, count)
-    hit = {op.name: flip_conv(op, int(n), generator) for op, n in zip(core.convolutions, share, strict=True) if n}
+    hit = {
+        op.name: flip_conv(op, int(n), generator)
+        for op, n in zip(core.convolutions, share, strict=True)
+        if n
+    }
     return with_ops(core, hit)
 
 
 def flip_conv(op: IntConv, count: int, generator: np.random.Generator) -> IntConv:
     """The convolution with `count` bits of weights and bias flipped."""
     stored = flip_bits(np.concatenate([op.weight.ravel(), op.bias]), count, generator)
-    return replace(op, weight=stored[: op.weight.size].reshape(op.weight.shape), bias=stored[op.weight.size :])
+    return replace(
+        op, weight=stored[: op.weight.size].reshape(op.weight.shape), bias=stored[op.weight.size :]
+    )
 
 
 def with_ops(core: IntCore, others: Mapping[str, IntConv]) -> IntCore:
@@ -105,14 +129,20 @@ def map_channels(core: IntCore) -> dict[str, int]:
 
 
 def shifts_of(core: IntCore) -> Shifts:
-    """The shifts of every operation, but for an add's shift_read: 0 where a stream shares one scale."""
-    named = [(op.name, *shift) for op in core.ops for shift in op_shifts(op, core.frac_bits, SHIFTS)]
+    """The shifts of every operation, but for an add's shift_read: 0 where a stream shares one
+    scale.
+    """
+    named = [
+        (op.name, *shift) for op in core.ops for shift in op_shifts(op, core.frac_bits, SHIFTS)
+    ]
     return {(op, field): value for op, field, value, _ in named if field != "shift_read"}
 
 
 def bits_apart(shifts: Shifts, others: Shifts) -> int:
     """In how many bits two sets of shifts differ, six bits a shift."""
-    return sum(((shifts[key] ^ others[key]) & ((1 << SHIFT_BITS) - 1)).bit_count() for key in shifts)
+    return sum(
+        ((shifts[key] ^ others[key]) & ((1 << SHIFT_BITS) - 1)).bit_count() for key in shifts
+    )
 
 
 def flip_shifts(shifts: Shifts, count: int, generator: np.random.Generator) -> Shifts:
@@ -146,25 +176,34 @@ class Guards:
 
 
 def learn_guards(core: IntCore, planes: Iterable[np.ndarray]) -> Guards:
-    """Guards from what a fault-free core reaches on calibration patches, planes (N, 3, H, W) each."""
+    """Guards from what a fault-free core reaches on calibration patches, planes
+    (N, 3, H, W) each.
+    """
     relus = {op.output: 0 for op in core.convolutions if op.activation is Activation.relu}
     largest_dn = 0.0
     for each in planes:
         tensors, _ = run_core(core, each)
         relus = {name: max(peak, int(tensors[name].max())) for name, peak in relus.items()}
         largest_dn = max(largest_dn, MAX_DN * float(np.abs(merged_correction(core, tensors)).max()))
-    fitting = {name: [bound for bound in RELU6_UNITS if bound >= peak] for name, peak in relus.items()}
+    fitting = {
+        name: [bound for bound in RELU6_UNITS if bound >= peak] for name, peak in relus.items()
+    }
     bounds = {name: min(each) for name, each in fitting.items() if each}
     return Guards(bounds, 2.0 ** math.ceil(math.log2(max(largest_dn, 1.0))), checksums(core))
 
 
 def checksums(core: IntCore) -> dict[str, int]:
     """CRC-32 of each convolution's weights and bias."""
-    return {op.name: zlib.crc32(op.bias.tobytes(), zlib.crc32(op.weight.tobytes())) for op in core.convolutions}
+    return {
+        op.name: zlib.crc32(op.bias.tobytes(), zlib.crc32(op.weight.tobytes()))
+        for op in core.convolutions
+    }
 
 
 def scrubbed(core: IntCore, sound: IntCore, known: Mapping[str, int]) -> IntCore:
-    """The core after scrubbing: every convolution whose checksum is not the known one comes from a sound copy."""
+    """The core after scrubbing: every convolution whose checksum is not the known one comes from a
+    sound copy.
+    """
     wrong = {name for name, _ in checksums(core).items() - known.items()}
     return with_ops(core, {op.name: op for op in sound.convolutions if op.name in wrong})
 
@@ -203,7 +242,9 @@ class Injected:
 
 
 def restored(injected: Injected, guards: Guards | None = None) -> np.ndarray:
-    """The restored image (1, 1, H, W) in [0, 1]; guards turn the ReLU6 and the limit of the correction on."""
+    """The restored image (1, 1, H, W) in [0, 1]; guards turn the ReLU6 and the limit of the
+    correction on.
+    """
     faults = guarded(injected.faults, guards) if guards else injected.faults
     tensors, _ = run_core(injected.core, injected.core.ends.split(injected.image), faults=faults)
     correction = merged_correction(injected.core, tensors)
@@ -211,26 +252,39 @@ def restored(injected: Injected, guards: Guards | None = None) -> np.ndarray:
     return np.asarray(injected.core.ends.finished(injected.image, correction), np.float32)
 
 
-def _weights(core: IntCore, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
+def _weights(
+    core: IntCore, image: np.ndarray, per_megabit: float, generator: np.random.Generator
+) -> Injected:
     flips = flip_count(weight_bits(core), per_megabit, generator)
     return Injected(flip_weights(core, flips, generator), SOUND, image, flips)
 
 
-def _shifts(core: IntCore, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
+def _shifts(
+    core: IntCore, image: np.ndarray, per_megabit: float, generator: np.random.Generator
+) -> Injected:
     wrong = _flip_copy(core, per_megabit, generator)
     return Injected(core, Faults(wrong), image, bits_apart(wrong, shifts_of(core)))
 
 
 def _flip_copy(core: IntCore, per_megabit: float, generator: np.random.Generator) -> Shifts:
     shifts = shifts_of(core)
-    return flip_shifts(shifts, flip_count(SHIFT_BITS * len(shifts), per_megabit, generator), generator)
+    return flip_shifts(
+        shifts, flip_count(SHIFT_BITS * len(shifts), per_megabit, generator), generator
+    )
 
 
-def _maps(core: IntCore, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
-    """Faults enter every tensor once, between the operation that writes it and those that read it."""
+def _maps(
+    core: IntCore, image: np.ndarray, per_megabit: float, generator: np.random.Generator
+) -> Injected:
+    """Faults enter every tensor once, between the operation that writes it and
+    those that read it.
+    """
     places = image[0, 0].size // core.ends.place_px**2
     channels = map_channels(core)
-    counts = {name: flip_count(INT8_BITS * places * n, per_megabit, generator) for name, n in channels.items()}
+    counts = {
+        name: flip_count(INT8_BITS * places * n, per_megabit, generator)
+        for name, n in channels.items()
+    }
     seed = int(generator.integers(2**63))
     # The same bits whenever it runs, clamped or not.
     seeds = {name: [seed, number] for number, name in enumerate(counts)}
@@ -243,7 +297,9 @@ def _maps(core: IntCore, image: np.ndarray, per_megabit: float, generator: np.ra
     return Injected(core, Faults({}, touch), image, sum(counts.values()))
 
 
-def _image(core: IntCore, image: np.ndarray, per_megabit: float, generator: np.random.Generator) -> Injected:
+def _image(
+    core: IntCore, image: np.ndarray, per_megabit: float, generator: np.random.Generator
+) -> Injected:
     flips = flip_count(PIXEL_BITS * image.size, per_megabit, generator)
     dn = flip_bits(np.rint(image * MAX_DN).astype(np.uint16), flips, generator, PIXEL_BITS)
     return Injected(core, SOUND, (dn / np.float32(MAX_DN)).astype(np.float32), flips)
@@ -254,10 +310,13 @@ class Memory:
     """One kind of memory, and how faults are injected into it.
 
     Attributes:
-        inject: into a core as the board stores it and an image (1, 1, H, W), at a rate of flips in a megabit.
+        inject: into a core as the board stores it and an image (1, 1, H, W), at a rate of flips in
+            a megabit.
         rates: bit flips in a megabit, of 10^6, that are tried.
-        times: so many times the draws asked for, where few of them flip a bit; those that do not cost nothing.
-        kept: whether it lives longer than a tile, so that scrubbing has something to compare it with.
+        times: so many times the draws asked for, where few of them flip a bit; those that do not
+            cost nothing.
+        kept: whether it lives longer than a tile, so that scrubbing has something to compare it
+            with.
     """
 
     inject: Callable[[IntCore, np.ndarray, float, np.random.Generator], Injected]
@@ -276,7 +335,11 @@ MEMORIES = {
 
 
 def corrected(
-    injected: Injected, sound: IntCore, guards: Guards, per_megabit: float, generator: np.random.Generator
+    injected: Injected,
+    sound: IntCore,
+    guards: Guards,
+    per_megabit: float,
+    generator: np.random.Generator,
 ) -> Injected:
     """The network as scrubbing and triple modular redundancy leave it before the next image.
 

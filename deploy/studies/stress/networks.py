@@ -1,4 +1,6 @@
-"""The pair of networks under test, opened once, and what each stage of the battery looks at on a hard case."""
+"""The pair of networks under test, opened once, and what each stage of the battery looks at on a
+hard case.
+"""
 
 import math
 from collections.abc import Callable
@@ -22,7 +24,16 @@ from beers_deploy.profiles.errors import BeersError, ModelError
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import read_core
-from beers_deploy.quant.graph import CORRECTION, IMAGE, Activation, Add, Conv, Graph, correction_graph, image_channels
+from beers_deploy.quant.graph import (
+    CORRECTION,
+    IMAGE,
+    Activation,
+    Add,
+    Conv,
+    Graph,
+    correction_graph,
+    image_channels,
+)
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.onnx_file import any_size, load_onnx, require_quantised
 from beers_deploy.quant.session import open_session, run
@@ -50,7 +61,9 @@ class Network:
         return tiling_of(any_size(self.model))
 
     def extended(self, image: np.ndarray) -> np.ndarray:
-        """An image (N, 1, H, W) with copies of its last row and column, up to what the network takes whole."""
+        """An image (N, 1, H, W) with copies of its last row and column, up to what the network
+        takes whole.
+        """
         lack = [self.tiling.whole_px(side) - side for side in image.shape[2:]]
         return np.pad(image, ((0, 0), (0, 0), (0, lack[0]), (0, lack[1])), mode="edge")
 
@@ -61,7 +74,9 @@ class Network:
         return partial(run, self._opened[threads])
 
     def restore(self, image: np.ndarray, threads: int = 1, tile_px: int = WHOLE_PX) -> np.ndarray:
-        """As `restore` restores digital numbers (H, W) float: tiled, missing pixels kept, clipped, not rounded."""
+        """As `restore` restores digital numbers (H, W) float: tiled, missing pixels kept, clipped,
+        not rounded.
+        """
         plan = make_plan((1, *image.shape), tile_px, self.tiling.halo_px, self.tiling)
         return restore_floats(image, self.infer(threads), plan, FULL_DN)
 
@@ -102,13 +117,20 @@ class Subject:
         return self.int8
 
 
-def open_subject(float_path: Path | None, int8_path: Path | None, sensor: str = SENSOR, say: Log = no_log) -> Subject:
+def open_subject(
+    float_path: Path | None, int8_path: Path | None, sensor: str = SENSOR, say: Log = no_log
+) -> Subject:
     """The files given, or a shipped network in both precisions by its name, told the sensor."""
     if int8_path is None and (float_path is None or not (float_path.suffix or float_path.exists())):
         float_path, int8_path = pair_of(float_path, None)
     known = load_sensor(sensor)
-    paths = [float_file(float_path, known, say), *([int8_file(int8_path, known, say)] if int8_path else [])]
-    networks = [Network(load(path)) for load, path in zip((float_model, load_onnx), paths, strict=False)]
+    paths = [
+        float_file(float_path, known, say),
+        *([int8_file(int8_path, known, say)] if int8_path else []),
+    ]
+    networks = [
+        Network(load(path)) for load, path in zip((float_model, load_onnx), paths, strict=False)
+    ]
     for path, network, wanted in zip(paths, networks, (False, True), strict=False):
         require_quantised(network.model, str(path), wanted)
         _ = network.tiling  # refuses what cannot be tiled before anything runs
@@ -131,7 +153,9 @@ def in_torch(graph: Graph, image: Tensor) -> Tensor:
 
 
 def steepest_signs(graph: Graph, image: np.ndarray) -> np.ndarray:
-    """The change (H, W) of -1, 0 or 1 that moves the middle pixel most, to first order: its gradient's signs."""
+    """The change (H, W) of -1, 0 or 1 that moves the middle pixel most, to first order: its
+    gradient's signs.
+    """
     pixels = torch.from_numpy(image)[None, None].requires_grad_()
     middle = in_torch(graph, pixels)[0, 0, image.shape[0] // 2, image.shape[1] // 2]
     (gradient,) = torch.autograd.grad(middle, pixels)
@@ -142,7 +166,9 @@ GAIN_DN = 16.0
 STEEPEST_DN = 64.0
 FLOAT32_DN = 0.05
 INT8_GAIN_DN = 128.0
-"""A change of 1 DN can move a rounding in every layer, and a pixel from the fine gain to the coarse one."""
+"""A change of 1 DN can move a rounding in every layer, and a pixel from the fine gain to the coarse
+one.
+"""
 ROUNDING_DN = 128.0
 """What the DPU's tie rounding (half up) may change: one unit in any layer, carried on."""
 MORE_THREADS = 2
@@ -153,7 +179,9 @@ LARGE_CORE_PX = 250
 
 
 def float32(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
-    """The float network in float32, and against float64 where it is plain convolutions, on an image (H, W) in DN."""
+    """The float network in float32, and against float64 where it is plain convolutions, on an image
+    (H, W) in DN.
+    """
     network = subject.float32
     graph = subject.graph
     measures = restoration(network, case, image, GAIN_DN)
@@ -174,11 +202,15 @@ def int8(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure
     measures = restoration(network, case, image, INT8_GAIN_DN)
     if case.pixels == "sound" and not case.large:
         apart = np.abs(network.restore(image) - subject.float32.restore(image))
-        measures.append(checks.Measure("mean error against float", float(apart.mean()), checks.FLAT_DN))
+        measures.append(
+            checks.Measure("mean error against float", float(apart.mean()), checks.FLAT_DN)
+        )
     return measures
 
 
-def restoration(network: Network, case: Case, image: np.ndarray, gain_dn: float) -> list[checks.Measure]:
+def restoration(
+    network: Network, case: Case, image: np.ndarray, gain_dn: float
+) -> list[checks.Measure]:
     """What must hold of any network on an image (H, W) in DN, by whatever it is run."""
     if case.pixels in ("infinite", "beyond"):
         return [checks.refused(lambda: network.restore(image))]
@@ -188,7 +220,9 @@ def restoration(network: Network, case: Case, image: np.ndarray, gain_dn: float)
     if case.large:
         return measures
     measures.append(checks.differing("runs differ", result, network.restore(image)))
-    measures.append(checks.differing("threads differ", result, network.restore(image, MORE_THREADS)))
+    measures.append(
+        checks.differing("threads differ", result, network.restore(image, MORE_THREADS))
+    )
     if case.pixels == "missing":
         return [*measures, checks.differing("missing moved", result[~known], image[~known])]
     largest = checks.gain(network.restore, image, result, np.random.default_rng(0))
@@ -205,15 +239,21 @@ def reference(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Me
     crop = network.extended(_fractions(image[:CROP_PX, :CROP_PX]))
     planes = core.ends.split(crop)
     (even, reports), (up, _) = run_core(core, planes, half_even=True), run_core(core, planes)
-    by_rule, on_board = (core.ends.finished(crop, merged_correction(core, each))[0, 0] for each in (even, up))
+    by_rule, on_board = (
+        core.ends.finished(crop, merged_correction(core, each))[0, 0] for each in (even, up)
+    )
     # A peak above its proof would mean that the proof is wrong, not the network.
     over = max(report.peak_bits - report.proven_bits for report in reports)
     can = {bound.name for bound in layer_bounds(core) if bound.saturates}
-    unproven = [report.name for report in reports if report.saturated > 0 and report.name not in can]
+    unproven = [
+        report.name for report in reports if report.saturated > 0 and report.name not in can
+    ]
     return [
         checks.not_finite(by_rule),
         checks.differing("runtime differs", by_rule, network.infer()(crop)[0, 0]),
-        checks.Measure("DPU's tie rounding", FULL_DN * float(np.abs(on_board - by_rule).max()), ROUNDING_DN),
+        checks.Measure(
+            "DPU's tie rounding", FULL_DN * float(np.abs(on_board - by_rule).max()), ROUNDING_DN
+        ),
         checks.Measure("accumulator beyond its proof", over, 0, "bits"),
         checks.Measure("saturation not reported", len(unproven), 0, "layers"),
     ]
@@ -224,10 +264,18 @@ def _fractions(image: np.ndarray) -> np.ndarray:
 
 
 def tiling(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
-    """Both networks, tiled by several plans, against the whole image (H, W); plans refuse unsound pixels."""
+    """Both networks, tiled by several plans, against the whole image (H, W); plans refuse unsound
+    pixels.
+    """
     measures = []
-    for name, network in [("float32", subject.float32), *([("INT8", subject.int8)] if subject.int8 else [])]:
-        plans = [2 * network.tiling.halo_px + core for core in ((LARGE_CORE_PX,) if case.large else CORES_PX)]
+    for name, network in [
+        ("float32", subject.float32),
+        *([("INT8", subject.int8)] if subject.int8 else []),
+    ]:
+        plans = [
+            2 * network.tiling.halo_px + core
+            for core in ((LARGE_CORE_PX,) if case.large else CORES_PX)
+        ]
         ways = [partial(network.restore, image, tile_px=tile_px) for tile_px in plans]
         if case.pixels in ("infinite", "beyond"):
             measures += [checks.refused(way) for way in ways]
@@ -239,4 +287,9 @@ def tiling(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measu
 
 Stage = Callable[[Subject, Case, np.ndarray], list[checks.Measure]]
 
-STAGES: dict[str, Stage] = {"float32": float32, "INT8": int8, "INT8 reference": reference, "tiling": tiling}
+STAGES: dict[str, Stage] = {
+    "float32": float32,
+    "INT8": int8,
+    "INT8 reference": reference,
+    "tiling": tiling,
+}

@@ -1,1 +1,3 @@
-"""What accuracy costs in time: operating points measured on the same images, and which of them to take."""
+"""What accuracy costs in time: operating points measured on the same images, and which of them to
+take.
+"""

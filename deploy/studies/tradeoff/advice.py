@@ -1,10 +1,11 @@
-"""Choose a point: the front of quality against cost, limits such as `latency<=20s`, and one recommended line.
+"""Choose a point: the front of quality against cost, limits such as `latency<=20s`, and one
+recommended line.
 
-Points of all boards are compared in one list, and ties are broken by the points' own figures and names. So the order
-in which boards were named changes nothing.
+Points of all boards are compared in one list, and ties are broken by the points' own figures and
+names. So the order in which boards were named changes nothing.
 
-Two points are compared on the same images: by the bootstrap interval, over whole sites, of the mean difference of
-their scores. Their own intervals show how images differ, which the points share.
+Two points are compared on the same images: by the bootstrap interval, over whole sites, of the mean
+difference of their scores. Their own intervals show how images differ, which the points share.
 """
 
 import math
@@ -67,7 +68,9 @@ class Measured:
     images: Sequence[Scores] = field(default=(), repr=False)
 
     def value(self, key: str) -> float:
-        """A figure's value; NaN where there is none to compare: a published one was found on other images."""
+        """A figure's value; NaN where there is none to compare: a published one was found on other
+        images.
+        """
         figure = self.figures.get(key)
         if figure is None or figure.value is None or figure.mode == "published":
             return math.nan
@@ -89,9 +92,16 @@ def placed(points: Iterable[Measured], cost: str) -> list[Measured]:
 
 
 def _rank(point: Measured, cost: str) -> tuple[float, float, float, str]:
-    """Return the sort key of a point: its cost, then what breaks ties without regard to the order of the points."""
+    """Return the sort key of a point: its cost, then what breaks ties without regard to the order
+    of the points.
+    """
     latency_s = point.value(LATENCY)
-    return point.value(cost), -point.value(PSNR), math.inf if math.isnan(latency_s) else latency_s, point.name
+    return (
+        point.value(cost),
+        -point.value(PSNR),
+        math.inf if math.isnan(latency_s) else latency_s,
+        point.name,
+    )
 
 
 def pareto_front(points: Sequence[Measured], cost: str) -> list[Measured]:
@@ -116,7 +126,9 @@ class Comparison:
     seed: int
 
     def difference(self, a: Measured, b: Measured) -> Figure:
-        """The PSNR of `a` less that of `b`, with the interval of the paired difference; none below five sites."""
+        """The PSNR of `a` less that of `b`, with the interval of the paired difference; none below
+        five sites.
+        """
         pairs = zip(a.images, b.images, strict=True)
         differences = [(x[PSNR] or 0.0) - (y[PSNR] or 0.0) for x, y in pairs]
         if not any(differences):  # the same pictures, on however few sites
@@ -144,8 +156,9 @@ def verdict(difference: Figure) -> str:
 def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
     """Return the cost of `a` divided by that of `b`, with an interval.
 
-    Two predictions of one board share most of their error: the interval of a ratio of latencies is the board's
-    `pair_width`, and nothing where only the count of tiles differs. Predictions of two boards share none of it.
+    Two predictions of one board share most of their error: the interval of a ratio of latencies is
+    the board's `pair_width`, and nothing where only the count of tiles differs. Predictions of two
+    boards share none of it.
     """
     value = a.value(cost) / b.value(cost)
     source = f"{cost} over that of {b.name}"
@@ -186,7 +199,9 @@ def front_rows(front: Sequence[Measured], cost: str, compare: Comparison) -> lis
 
 
 def figures_to_compare(point: Measured, cost: str) -> dict[str, Figure]:
-    """Return the figures by which points are compared: PSNR, the cost, and power and energy of a board."""
+    """Return the figures by which points are compared: PSNR, the cost, and power and energy of a
+    board.
+    """
     keys = dict.fromkeys((PSNR, cost, "board power", "board energy"))
     return {key: point.figures[key] for key in keys if key in point.figures}
 
@@ -209,8 +224,12 @@ class Constraint:
         return f"{self.key} {'<=' if self.at_most else '>='} {self.limit:g}{self._unit}"
 
     def in_words(self, value: float) -> str:
-        """Return a value of the figure with its unit, with as many digits as tell it apart from the limit."""
-        digits = next((count for count in range(3, 9) if float(f"{value:.{count}g}") != self.limit), 9)
+        """Return a value of the figure with its unit, with as many digits as tell it apart from the
+        limit.
+        """
+        digits = next(
+            (count for count in range(3, 9) if float(f"{value:.{count}g}") != self.limit), 9
+        )
         return f"{number(value, digits)}{self._unit}"
 
     @property
@@ -218,7 +237,9 @@ class Constraint:
         return "" if self.unit in BARE_UNITS else f" {self.unit}"
 
     def violation(self, point: Measured) -> float:
-        """By what share of the limit a point misses it: 0 where it keeps it, endless without such a figure."""
+        """By what share of the limit a point misses it: 0 where it keeps it, endless without such a
+        figure.
+        """
         over = point.value(self.key) - self.limit
         miss = over if self.at_most else -over
         return math.inf if math.isnan(miss) else max(miss, 0.0) / (abs(self.limit) or 1.0)
@@ -242,25 +263,35 @@ def _parse(option: str, text: str) -> Constraint:
         raise OptionError(option, expected=expected, got=repr(text), remedy=remedy)
     if found["name"] not in NAMES:
         expected = f"one of {', '.join(NAMES)}"
-        raise OptionError(option, expected=expected, got=repr(found["name"]), remedy="correct the name")
+        raise OptionError(
+            option, expected=expected, got=repr(found["name"]), remedy="correct the name"
+        )
     key, unit = NAMES[found["name"]]
     if found["unit"] not in ("", unit.lower()):
         remedy = f"write {found['name']}{found['side']}{found['limit']}{unit}"
-        raise OptionError(option, expected=f"{key} in {unit}", got=repr(found["unit"]), remedy=remedy)
+        raise OptionError(
+            option, expected=f"{key} in {unit}", got=repr(found["unit"]), remedy=remedy
+        )
     return Constraint(key, found["side"] == "<=", float(found["limit"]), unit)
 
 
 def chosen_cost(points: Sequence[Measured], budget: Sequence[Constraint]) -> str:
-    """The cost that the budget names; else the first that any point has, the board's latency before all."""
+    """The cost that the budget names; else the first that any point has, the board's latency before
+    all.
+    """
     named = (constraint.key for constraint in budget if constraint.key in COSTS)
     had = (key for key in COSTS if any(not math.isnan(point.value(key)) for point in points))
     return next(named, next(had, COSTS[0]))
 
 
 def recommend(
-    points: Sequence[Measured], budget: Sequence[Constraint], need: Sequence[Constraint], compare: Comparison
+    points: Sequence[Measured],
+    budget: Sequence[Constraint],
+    need: Sequence[Constraint],
+    compare: Comparison,
 ) -> tuple[Measured | None, str]:
-    """Recommend the best PSNR within a budget, or the cheapest point that is not significantly worse.
+    """Recommend the best PSNR within a budget, or the cheapest point that is not significantly
+    worse.
 
     For a need without a budget, the cheapest point is recommended.
 
@@ -280,21 +311,31 @@ def recommend(
     if not kept:
         return None, f"nothing to recommend{limits}{nearest(placed(points, cost), constraints)}"
     taken, best = choose(kept, compare, cheapest=bool(need) and not budget)
-    line = f"recommended{limits}: {_words(taken, [PSNR, cost, *(each.key for each in constraints)])}"
+    line = (
+        f"recommended{limits}: {_words(taken, [PSNR, cost, *(each.key for each in constraints)])}"
+    )
     gain = compare.difference(best, taken)
     if (budget or not need) and best is not taken and (gain.value or 0.0) >= WORTH_A_WORD_DB:
         line += f"; {best.name} has {gain} dB more, {verdict(gain)}"
-    unsure = [str(each) for each in constraints if not each.holds_throughout(taken.figures[each.key])]
+    unsure = [
+        str(each) for each in constraints if not each.holds_throughout(taken.figures[each.key])
+    ]
     verb = "holds" if len(unsure) == 1 else "hold"
-    return taken, line + (f"; {' and '.join(unsure)} {verb} by value, not over the whole interval" if unsure else "")
+    return taken, line + (
+        f"; {' and '.join(unsure)} {verb} by value, not over the whole interval" if unsure else ""
+    )
 
 
-def within(points: Iterable[Measured], constraints: Sequence[Constraint], cost: str) -> list[Measured]:
+def within(
+    points: Iterable[Measured], constraints: Sequence[Constraint], cost: str
+) -> list[Measured]:
     """Return the points that keep every constraint by value, sorted by increasing cost."""
     return [point for point in placed(points, cost) if not _violation(point, constraints)]
 
 
-def choose(kept: Sequence[Measured], compare: Comparison, *, cheapest: bool) -> tuple[Measured, Measured]:
+def choose(
+    kept: Sequence[Measured], compare: Comparison, *, cheapest: bool
+) -> tuple[Measured, Measured]:
     """Choose among points that keep the constraints.
 
     Args:
@@ -311,11 +352,14 @@ def choose(kept: Sequence[Measured], compare: Comparison, *, cheapest: bool) -> 
     return next(point for point in kept if not significant(compare.difference(best, point))), best
 
 
-def affordable(points: Sequence[Measured], constraints: Sequence[Constraint], cost: str) -> Sequence[Measured]:
-    """Return the points that keep the limits on figures other than PSNR and cost; all points if none does.
+def affordable(
+    points: Sequence[Measured], constraints: Sequence[Constraint], cost: str
+) -> Sequence[Measured]:
+    """Return the points that keep the limits on figures other than PSNR and cost; all points if
+    none does.
 
-    The front shows PSNR against one cost. Without this, a point that the budget excludes for another reason, such as
-    its power, would hide those that can be recommended.
+    The front shows PSNR against one cost. Without this, a point that the budget excludes for
+    another reason, such as its power, would hide those that can be recommended.
     """
     others = [each for each in constraints if each.key not in (PSNR, cost)]
     return within(points, others, cost) or points
@@ -336,7 +380,10 @@ def nearest(points: Sequence[Measured], constraints: Sequence[Constraint]) -> st
 
 
 def _words(point: Measured, keys: Sequence[str]) -> str:
-    return f"{point.name}: {', '.join(f'{key} {_figure(point.figures[key])}' for key in dict.fromkeys(keys))}"
+    return (
+        f"{point.name}: "
+        f"{', '.join(f'{key} {_figure(point.figures[key])}' for key in dict.fromkeys(keys))}"
+    )
 
 
 def _figure(figure: Figure) -> str:

@@ -1,4 +1,6 @@
-"""What each board offers within the budget: its best point compared with the recommended one, or why it has none."""
+"""What each board offers within the budget: its best point compared with the recommended one, or
+why it has none.
+"""
 
 import math
 from collections.abc import Sequence
@@ -44,7 +46,8 @@ class Question:
 def board_rows(
     points: Sequence[Measured], boards: Sequence[str], taken: Measured | None, asked: Question
 ) -> list[Row]:
-    """Return a row for each board: the figures of its best point, and how it compares with the recommended one.
+    """Return a row for each board: the figures of its best point, and how it compares with the
+    recommended one.
 
     Args:
         points: of all boards.
@@ -67,18 +70,26 @@ def board_rows(
         else:
             best, _ = choose(kept, asked.compare, cheapest=bool(asked.need) and not asked.budget)
             verdict = _compared(best, taken, cost, asked.compare)
-        rows.append(Row(TABLE, board, figures_to_compare(best, cost), {"point": best.name, VERDICT: verdict}))
+        rows.append(
+            Row(
+                TABLE, board, figures_to_compare(best, cost), {"point": best.name, VERDICT: verdict}
+            )
+        )
     return rows
 
 
 def refusals(points: Sequence[Measured], board: str) -> list[str]:
     """Say which networks a board's DPU refuses, and why."""
     refused = (each for each in points if each.point is not None and each.point.refused_by == board)
-    return [f"{each.name} does not fit its DPU: {each.point.reason}" for each in refused if each.point]
+    return [
+        f"{each.name} does not fit its DPU: {each.point.reason}" for each in refused if each.point
+    ]
 
 
 def lines(rows: Sequence[Row]) -> list[str]:
-    """Return the rows as sentences: those of several boards, and that of a single one only if it has no point."""
+    """Return the rows as sentences: those of several boards, and that of a single one only if it
+    has no point.
+    """
     shown = [row for row in rows if len(rows) > 1 or not row.figures]
     return [f"{row.name}: {_sentence(row)}" for row in shown]
 
@@ -95,7 +106,9 @@ def why_not(points: Sequence[Measured], constraints: Sequence[Constraint], cost:
     missed = [each for each in constraints if all(each.violation(point) for point in here)]
     if missed:
         return "; ".join(_missed(each, here) for each in missed)
-    return f"no point keeps {' and '.join(map(str, constraints))} at once{nearest(here, constraints)}"
+    return (
+        f"no point keeps {' and '.join(map(str, constraints))} at once{nearest(here, constraints)}"
+    )
 
 
 def _missed(constraint: Constraint, points: Sequence[Measured]) -> str:
@@ -106,7 +119,10 @@ def _missed(constraint: Constraint, points: Sequence[Measured]) -> str:
     closest = min(known, key=constraint.violation)
     extreme = "least" if constraint.at_most else "most"
     found = closest.value(constraint.key)
-    return f"no point within {constraint}: the {extreme} is {constraint.in_words(found)} ({closest.name})"
+    return (
+        f"no point within {constraint}: the {extreme} is {constraint.in_words(found)} "
+        f"({closest.name})"
+    )
 
 
 def _compared(point: Measured, taken: Measured | None, cost: str, compare: Comparison) -> str:

@@ -1,6 +1,8 @@
-"""What is measured of each variant, once, on the same images; kept in one JSON file from one run to the next.
+"""What is measured of each variant, once, on the same images; kept in one JSON file from one run to
+the next.
 
-A measurement is kept under the SHA-256 of what it depends on: the inputs and the version of this tool.
+A measurement is kept under the SHA-256 of what it depends on: the inputs and the version of this
+tool.
 """
 
 import hashlib
@@ -40,13 +42,29 @@ from beers_deploy.restoration.plan import Plan, make_plan
 from beers_deploy.restoration.runtime import Packed, open_runtime
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork, tiles_by_factor
 from beers_deploy.restoration.tiles.rows import restore_dn
-from beers_deploy.studies.detection.average_precision import find_hits, interval, map50, site_weights
+from beers_deploy.studies.detection.average_precision import (
+    find_hits,
+    interval,
+    map50,
+    site_weights,
+)
 from beers_deploy.studies.detection.detector import Detector, open_detector, parse_classes
-from beers_deploy.studies.detection.study import LabelledScene, SensorPair, acquired, labelled_scenes
+from beers_deploy.studies.detection.study import (
+    LabelledScene,
+    SensorPair,
+    acquired,
+    labelled_scenes,
+)
 from beers_deploy.studies.evaluation.methods import Method
 from beers_deploy.studies.evaluation.pairs import NamedPair
 from beers_deploy.studies.evaluation.scores import DETAILS, Instruments, perceptual_distances
-from beers_deploy.studies.tradeoff.points import HALO_STEP_PX, Point, Variant, model_of, tiling_of_file
+from beers_deploy.studies.tradeoff.points import (
+    HALO_STEP_PX,
+    Point,
+    Variant,
+    model_of,
+    tiling_of_file,
+)
 
 Scores = Mapping[str, float | None]
 """Figures of one image by name; None where an instrument is not there."""
@@ -91,13 +109,17 @@ class Measurements:
         except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
             expected = "measurements that this command kept"
             remedy = "remove it: they are made anew"
-            raise OptionError(str(path), expected=expected, got="another file", remedy=remedy) from error
+            raise OptionError(
+                str(path), expected=expected, got="another file", remedy=remedy
+            ) from error
 
     def make(self, key: str, measure: Callable[[], Any]) -> Any:
         """What was measured under a key; measured now, and written, where there is nothing."""
         if key not in self.kept:
             self.kept[key] = measure()
-            write_text(self.path, json.dumps({"version": __version__, "measurements": self.kept}) + "\n")
+            write_text(
+                self.path, json.dumps({"version": __version__, "measurements": self.kept}) + "\n"
+            )
         return self.kept[key]
 
 
@@ -122,7 +144,9 @@ class Benchmark:
     @cached_property
     def instruments(self) -> Instruments:
         """PSNR, SSIM and LPIPS."""
-        return Instruments({LPIPS: perceptual_distances(self.lpips)[LPIPS]}, self.degraded.nominal().max_dn)
+        return Instruments(
+            {LPIPS: perceptual_distances(self.lpips)[LPIPS]}, self.degraded.nominal().max_dn
+        )
 
     @cached_property
     def digest(self) -> str:
@@ -140,16 +164,24 @@ class Benchmark:
         """Digest of what a variant's pictures depend on."""
         if variant.file is not None:
             sensors = self.degraded, self.reference
-            files = [network_sha256(path) for path in (variant.file, *(path for _, path in variant.brighter))]
+            files = [
+                network_sha256(path)
+                for path in (variant.file, *(path for _, path in variant.brighter))
+            ]
             return key_of(files=files, sensors=sensors)
         return key_of(method=variant.method, sensors=[self.degraded, self.reference])
 
-    def scores(self, point: Point, exact: Restore, kept: Measurements) -> list[dict[str, float | None]]:
-        """Scores of each image: those of the variant, or with seams where the halo is too small for exact ones."""
+    def scores(
+        self, point: Point, exact: Restore, kept: Measurements
+    ) -> list[dict[str, float | None]]:
+        """Scores of each image: those of the variant, or with seams where the halo is too small for
+        exact ones.
+        """
         about: dict[str, object] = {"scores": self.depends(point.variant), "images": self.digest}
         if point.halo_px is None:
             return list(kept.make(key_of(**about), lambda: self.score(exact)))
-        # The images may be smaller than the tile. Then points with other tiles, as of another board, share a score.
+        # The images may be smaller than the tile. Then points with other tiles, as of another
+        # board, share a score.
         cuts = sorted({tiles_of_point(point, pair.degraded.shape).tile_px for pair in self.pairs})
         about |= {"tile_px": cuts, "halo_px": point.halo_px}
         return list(kept.make(key_of(**about), lambda: self._with_seams(point, exact)))
@@ -158,7 +190,9 @@ class Benchmark:
         return self.score(restore_in_tiles(point, self.degraded, self.reference), exact)
 
     def runs(self, point: Point) -> float:
-        """How often the network of a point runs on a tile of the images, once for each exposure; a mean."""
+        """How often the network of a point runs on a tile of the images, once for each exposure; a
+        mean.
+        """
         if not point.variant.brighter:
             return 1.0
         sensor = self.degraded.nominal()
@@ -172,8 +206,12 @@ class Benchmark:
             runs += sum(counts.values())
         return runs / tiles
 
-    def score(self, restore: Restore, exact: Restore | None = None) -> list[dict[str, float | None]]:
-        """Scores of every pair; and how far, in DN, a restoration with seams is from the exact one given."""
+    def score(
+        self, restore: Restore, exact: Restore | None = None
+    ) -> list[dict[str, float | None]]:
+        """Scores of every pair; and how far, in DN, a restoration with seams is from the exact one
+        given.
+        """
         found = []
         for pair in self.pairs:
             restored = restore(pair.degraded)
@@ -199,7 +237,10 @@ def restore_in_tiles(point: Point, degraded: Sensor, reference: Sensor) -> Resto
     file = point.variant.file or Path()
     sensor = degraded.nominal()
     infer, _ = open_runtime(Runtime.onnxruntime, model_of(file), threads=0)
-    others = {factor: Packed(path.read_bytes(), Runtime.onnxruntime, 0) for factor, path in point.variant.brighter}
+    others = {
+        factor: Packed(path.read_bytes(), Runtime.onnxruntime, 0)
+        for factor, path in point.variant.brighter
+    }
     network = ExposedNetwork({1: infer, **others}, tiling_of_file(file).halo_px, sensor.offset_dn)
     steps = (Consistency.of(sensor, reference.nominal().in_units_of(sensor), sensor.max_dn),)
 
@@ -210,7 +251,9 @@ def restore_in_tiles(point: Point, degraded: Sensor, reference: Sensor) -> Resto
 
 
 def tiles_of_point(point: Point, shape: tuple[int, ...]) -> Plan:
-    """The tiles of a point on an image (H, W); one that is no larger than a tile is cut in two along each side."""
+    """The tiles of a point on an image (H, W); one that is no larger than a tile is cut in two
+    along each side.
+    """
     tiling = tiling_of_file(point.variant.file or Path())
     halo_px = tiling.halo_px if point.halo_px is None else point.halo_px
     half_px = HALO_STEP_PX * -(-(min(shape) // 2) // HALO_STEP_PX) + 2 * halo_px
@@ -236,7 +279,9 @@ class Labelled:
     notes: Sequence[str]
 
     @classmethod
-    def open(cls, images: Path, detector: Path | None, classes: str | None, benchmark: Benchmark) -> "Labelled":
+    def open(
+        cls, images: Path, detector: Path | None, classes: str | None, benchmark: Benchmark
+    ) -> "Labelled":
         """Read the labels and open the detector; no image is read yet.
 
         Args:
@@ -247,15 +292,21 @@ class Labelled:
         """
         file = detector or DETECTOR
         opened = open_detector(file)
-        scenes, notes = labelled_scenes(opened.names, parse_classes(classes) if classes else {}, images)
+        scenes, notes = labelled_scenes(
+            opened.names, parse_classes(classes) if classes else {}, images
+        )
         files = [sha256(each.path) for each in scenes if each.path]
         seen = [files, *((each.site, each.truth.corners, each.truth.classes) for each in scenes)]
         sensors = benchmark.degraded, benchmark.reference
         digest = key_of(detector=sha256(file), scenes=seen, seed=benchmark.seed, sensors=sensors)
-        return cls(opened, scenes, benchmark, digest, [each for each in (opened.flag, *notes) if each])
+        return cls(
+            opened, scenes, benchmark, digest, [each for each in (opened.flag, *notes) if each]
+        )
 
     def measure(self, method: Method) -> dict[str, object]:
-        """mAP50 of the detector on every scene as a method restores it, and its interval over sites."""
+        """mAP50 of the detector on every scene as a method restores it, and its interval over
+        sites.
+        """
         sensors = SensorPair(self.benchmark.degraded, self.benchmark.reference)
         seed = self.benchmark.seed
         found = [each.boxes(self.detector, method) for each in acquired(self.scenes, sensors, seed)]
@@ -275,8 +326,12 @@ class Labelled:
             return unavailable("%", "no labelled object")
         sites = len({each.site for each in self.scenes})
         ends = stored["interval"]
-        source = f"{len(self.scenes)} labelled images of {sites} sites, interval by bootstrap over sites"
-        return measured(100 * stored["value"], "%", source, (100 * ends[0], 100 * ends[1]) if ends else None)
+        source = (
+            f"{len(self.scenes)} labelled images of {sites} sites, interval by bootstrap over sites"
+        )
+        return measured(
+            100 * stored["value"], "%", source, (100 * ends[0], 100 * ends[1]) if ends else None
+        )
 
 
 TILE_PX = 256
@@ -286,17 +341,29 @@ ROUNDS = 9
 def measure_host(
     methods: Mapping[Variant, Method], benchmark: Benchmark, kept: Measurements
 ) -> dict[Variant, dict[str, Figure]]:
-    """What each variant takes on this machine, all timed together on a drawn scene as the sensor sees it."""
-    tile = drawn_acquisition(Swath(TILE_PX, TILE_PX), benchmark.degraded, benchmark.reference, benchmark.seed)
+    """What each variant takes on this machine, all timed together on a drawn scene as the sensor
+    sees it.
+    """
+    tile = drawn_acquisition(
+        Swath(TILE_PX, TILE_PX), benchmark.degraded, benchmark.reference, benchmark.seed
+    )
     names = [benchmark.depends(variant) for variant in methods]
-    machine = f"{platform.machine()} {processor_name() or platform.processor()} x {psutil.cpu_count()}"
+    machine = (
+        f"{platform.machine()} {processor_name() or platform.processor()} x {psutil.cpu_count()}"
+    )
     key = key_of(times=names, tile=tile, machine=machine)
-    times = kept.make(key, lambda: host_times([method.restore for method in methods.values()], tile))
-    return {variant: host_figures(each, tile.size) for variant, each in zip(methods, times, strict=True)}
+    times = kept.make(
+        key, lambda: host_times([method.restore for method in methods.values()], tile)
+    )
+    return {
+        variant: host_figures(each, tile.size) for variant, each in zip(methods, times, strict=True)
+    }
 
 
 def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float]]:
-    """Seconds that each method takes for a tile on this machine, interleaved, after one run for warm-up."""
+    """Seconds that each method takes for a tile on this machine, interleaved, after one run for
+    warm-up.
+    """
     calls = [partial(restore, tile) for restore in restores]
     for call in calls:
         call()
@@ -305,14 +372,21 @@ def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float
 
 def host_figures(times_s: Sequence[float], pixels: int) -> dict[str, Figure]:
     """Median and 90th percentile for a million pixels, in s."""
-    source = f"{len(times_s)} runs of a tile of {TILE_PX} x {TILE_PX}, interleaved with the other methods"
+    source = (
+        f"{len(times_s)} runs of a tile of {TILE_PX} x {TILE_PX}, interleaved with the "
+        "other methods"
+    )
     values = np.asarray(times_s) * 1e6 / pixels
-    return {f"host p{p}": measured(float(np.percentile(values, p)), "s/Mpx", source) for p in (50, 90)}
+    return {
+        f"host p{p}": measured(float(np.percentile(values, p)), "s/Mpx", source) for p in (50, 90)
+    }
 
 
 PATCHES = 32
 PATCH_PX = 96
-"""Calibration of a network that comes without INT8: fewer and smaller patches than `quantize` takes."""
+"""Calibration of a network that comes without INT8: fewer and smaller patches than `quantize`
+takes.
+"""
 
 
 def make_int8(file: Path, folder: Path, scenes: Path | None, sensor: Sensor, seed: int) -> Path:
@@ -329,7 +403,9 @@ def make_int8(file: Path, folder: Path, scenes: Path | None, sensor: Sensor, see
     said = metadata(model).get("sensor", "")
     known = load_sensor(said) if said in sensor_names() else sensor
     seen = [sha256(path) for path in list_images(scenes)] if scenes else []
-    key = key_of(network=network_sha256(file), scenes=seen, sensor=known, seed=seed, size=[PATCHES, PATCH_PX])
+    key = key_of(
+        network=network_sha256(file), scenes=seen, sensor=known, seed=seed, size=[PATCHES, PATCH_PX]
+    )
     path = folder / f"{file.stem}-int8-{key[:16]}.onnx"
     if not path.is_file():
         patches = Calibration(known, scenes, PATCHES, PATCH_PX, seed)

@@ -1,4 +1,6 @@
-"""What a study found, and its page: the recommended line, the plot with its front, boards, and all points."""
+"""What a study found, and its page: the recommended line, the plot with its front, boards, and all
+points.
+"""
 
 import os
 from collections.abc import Sequence
@@ -24,23 +26,28 @@ FILES = ("tradeoff.html", "tradeoff.svg")
 SHOWN_WORDS = ("board", "configuration", "tile", "halo", "sensor")
 
 BOARDS_CAPTION = (
-    "The best point of each board within the budget, chosen as the recommended one is, or why no point of that board "
+    "The best point of each board within the budget, chosen as the recommended one is, or why "
+    "no point of that board "
     "keeps the limits. The difference in PSNR is on the same images."
 )
 FRONT_CAPTION = (
-    "Of the points on all boards that keep the budget's other limits, none is both cheaper and better than one of "
-    "these. A gain is the difference in PSNR on the same images from the next cheaper point, a ratio the cost over "
+    "Of the points on all boards that keep the budget's other limits, none is both cheaper and "
+    "better than one of "
+    "these. A gain is the difference in PSNR on the same images from the next cheaper point, a "
+    "ratio the cost over "
     "that of the same point."
 )
 POINTS_CAPTION = (
-    "Press a heading to sort by it, again to reverse. A swath on a board is predicted; images and times on this "
+    "Press a heading to sort by it, again to reverse. A swath on a board is predicted; images "
+    "and times on this "
     "machine are measured."
 )
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Tradeoff(Table):
-    """What accuracy costs in time: the recommended point, the Pareto front, and every point with its figures.
+    """What accuracy costs in time: the recommended point, the Pareto front, and every point with
+    its figures.
 
     Attributes:
         boards: the names of all boards that were compared.
@@ -84,7 +91,8 @@ class Tradeoff(Table):
         )
 
     def plot(self, figure: str | None = None, ax: "Axes | None" = None) -> "Axes":
-        """Plot PSNR of every point against its cost, with the front, the recommended point and the budget.
+        """Plot PSNR of every point against its cost, with the front, the recommended point and the
+        budget.
 
         Args:
             figure: given, bars of that figure instead, as of any table.
@@ -106,7 +114,9 @@ class Tradeoff(Table):
 
     @property
     def lines(self) -> list[str]:
-        """The recommendation, then for each board how its best point compares, or why it has none."""
+        """The recommendation, then for each board how its best point compares,
+        or why it has none.
+        """
         return [self.line, *lines(self.board_rows)]
 
     def __str__(self) -> str:
@@ -117,7 +127,12 @@ def report_of(study: Tradeoff, svg: str) -> Report:
     """The page in reading order."""
     picture = Picture(f"{PSNR} against {study.cost}", data_url(svg), CAPTION)
     points = [
-        Row("points", each.name, each.figures, {word: each.text.get(word, "") for word in SHOWN_WORDS})
+        Row(
+            "points",
+            each.name,
+            each.figures,
+            {word: each.text.get(word, "") for word in SHOWN_WORDS},
+        )
         for each in study.points
     ]
     tables = [
@@ -126,4 +141,6 @@ def report_of(study: Tradeoff, svg: str) -> Report:
         Section(f"All {len(points)} points", points, POINTS_CAPTION),
     ]
     headline = f"{study.line[0].upper()}{study.line[1:]}."
-    return Report("What accuracy costs in time", headline, tables, [picture], study.notes, sorts=True)
+    return Report(
+        "What accuracy costs in time", headline, tables, [picture], study.notes, sorts=True
+    )

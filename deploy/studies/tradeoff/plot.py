@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 SIZE_PX = (560, 520)
 TEXT_PX = 15
-"""Of the plot: wide enough for a desk, and its words large enough on a telephone, where it is scaled down."""
+"""Of the plot: wide enough for a desk, and its words large enough on a telephone, where it is
+scaled down.
+"""
 FRONT_PX2 = 90
 OTHERS_PX2 = 34
 RING_PX2 = 330
@@ -35,15 +37,18 @@ AT_LEAST = "\N{GREATER-THAN OR EQUAL TO}"
 HOST = "this machine"
 RIGHT = 0.97
 EDGE_PX = 8
-"""Where the axes end as a share of the figure, unless a label needs room; and what is left free at the edge, because
-a browser's font may be wider than the one that was measured."""
+"""Where the axes end as a share of the figure, unless a label needs room; and what is left free at
+the edge, because a browser's font may be wider than the one that was measured.
+"""
 LEGEND_COLUMNS = 2
 LEGEND_ROW = 0.045
 """Of the legend, the height of a row as a share of the figure."""
 
 CAPTION = (
-    "Numbers are those of the front's table; the line is the front, small marks lie below it. The ring is around the "
-    "recommended point, dashed lines are the limits of budget and need. Upright bars: 95 % interval of the gain in "
+    "Numbers are those of the front's table; the line is the front, small marks lie below it. "
+    "The ring is around the "
+    "recommended point, dashed lines are the limits of budget and need. Upright bars: 95 % "
+    "interval of the gain in "
     "PSNR over the next cheaper point of the front. Bars across: interval of the cost."
 )
 
@@ -73,7 +78,9 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Series:
-    """Points that look alike: those of one network, of the pipelines, or of other libraries, on one board."""
+    """Points that look alike: those of one network, of the pipelines, or of other libraries, on one
+    board.
+    """
 
     name: str
     board: str
@@ -85,7 +92,9 @@ class Series:
 def plot_svg(drawn: Drawn) -> Markup:
     """Return the plot as an SVG file, with the numbers of the front's members."""
     with look():
-        return svg_of(figure_of(drawn), f"{PSNR} against {drawn.cost}; numbers as in the table of the front")
+        return svg_of(
+            figure_of(drawn), f"{PSNR} against {drawn.cost}; numbers as in the table of the front"
+        )
 
 
 def figure_of(drawn: Drawn) -> "Figure":
@@ -107,7 +116,9 @@ def figure_of(drawn: Drawn) -> "Figure":
 
 
 def _make_room(axes: "Axes") -> None:
-    """Narrow the axes until the last label below them, which is centred on its tick, ends within the figure."""
+    """Narrow the axes until the last label below them, which is centred on its tick, ends within
+    the figure.
+    """
     figure = axes.figure
     width_px = figure.bbox.width
     box = axes.get_tightbbox()
@@ -117,7 +128,9 @@ def _make_room(axes: "Axes") -> None:
 
 
 def draw(axes: "Axes", drawn: Drawn) -> None:
-    """Draw points, front, limits and recommended point; the numbers are left to whoever sizes the axes."""
+    """Draw points, front, limits and recommended point; the numbers are left to whoever sizes the
+    axes.
+    """
     axes.set(xscale="log", xlabel=_label(drawn, drawn.cost), ylabel=_label(drawn, PSNR))
     found = list(series(drawn))
     for each in found:
@@ -134,7 +147,9 @@ def draw(axes: "Axes", drawn: Drawn) -> None:
 
 
 def series(drawn: Drawn) -> Iterator[Series]:
-    """Yield the points by what they look like: a colour for each network, and of several boards a marker for each."""
+    """Yield the points by what they look like: a colour for each network, and of several boards a
+    marker for each.
+    """
     names: dict[str, int] = {}
     groups: dict[tuple[str, str], list[Measured]] = {}
     for point in placed(drawn.points, drawn.cost):
@@ -156,9 +171,16 @@ def _kind(point: Measured) -> str:
 
 def _scatter(axes: "Axes", each: Series, drawn: Drawn) -> None:
     for large in (False, True):  # the front's last, so that they lie on top
-        x, y = _places([point for point in each.points if (point in drawn.front) == large], drawn.cost)
+        x, y = _places(
+            [point for point in each.points if (point in drawn.front) == large], drawn.cost
+        )
         size, alpha = (FRONT_PX2, 1.0) if large else (OTHERS_PX2, PALE)
-        style: dict[str, Any] = {"c": each.colour, "marker": each.marker, "alpha": alpha, "zorder": 2 + large}
+        style: dict[str, Any] = {
+            "c": each.colour,
+            "marker": each.marker,
+            "alpha": alpha,
+            "zorder": 2 + large,
+        }
         axes.scatter(x, y, s=size, linewidths=0, **style)
 
 
@@ -175,11 +197,18 @@ def _draw_front(axes: "Axes", drawn: Drawn) -> None:
         gain = row.figures.get("PSNR gain")
         if gain is not None and gain.interval is not None:
             before = y - (gain.value or 0.0)
-            axes.plot([x, x], [before + end for end in gain.interval], color=LIGHT["soft"], lw=1.5, zorder=1)
+            axes.plot(
+                [x, x],
+                [before + end for end in gain.interval],
+                color=LIGHT["soft"],
+                lw=1.5,
+                zorder=1,
+            )
 
 
 def _draw_limits(axes: "Axes", drawn: Drawn) -> None:
-    """Draw the limits on cost and PSNR as dashed lines with their words; the axes keep their range if one is outside.
+    """Draw the limits on cost and PSNR as dashed lines with their words; the axes keep their range
+    if one is outside.
 
     A limit on another figure, such as power, has no place in the plot.
     """
@@ -191,7 +220,14 @@ def _draw_limits(axes: "Axes", drawn: Drawn) -> None:
             words = f"{AT_MOST if limit.at_most else AT_LEAST} {limit.in_words(limit.limit)}"
             right = limit.limit > np.sqrt(low * high)
             place: dict[str, Any] = {"ha": "right" if right else "left", "va": "bottom"}
-            axes.annotate(words, (limit.limit, 1.0), (0, 3), ("data", "axes fraction"), "offset points", **place)
+            axes.annotate(
+                words,
+                (limit.limit, 1.0),
+                (0, 3),
+                ("data", "axes fraction"),
+                "offset points",
+                **place,
+            )
         elif limit.key == PSNR and axes.get_ylim()[0] <= limit.limit <= axes.get_ylim()[1]:
             axes.axhline(limit.limit, **style)
 
@@ -200,12 +236,19 @@ def _draw_best(axes: "Axes", drawn: Drawn) -> None:
     if drawn.best is None:
         return
     x, y = _places([drawn.best], drawn.cost)
-    style: dict[str, Any] = {"facecolors": "none", "edgecolors": LIGHT["ink"], "linewidths": 1.8, "zorder": 4}
+    style: dict[str, Any] = {
+        "facecolors": "none",
+        "edgecolors": LIGHT["ink"],
+        "linewidths": 1.8,
+        "zorder": 4,
+    }
     axes.scatter(x, y, s=RING_PX2, label=RECOMMENDED, **style)
 
 
 def _draw_legend(axes: "Axes", found: Sequence[Series], drawn: Drawn) -> None:
-    """Add what the legend names, as marks without a point: networks by colour, and of several boards the markers."""
+    """Add what the legend names, as marks without a point: networks by colour, and of several
+    boards the markers.
+    """
     several = len(drawn.boards) > 1
     networks = {each.name: (each.colour, MARKERS[0] if several else each.marker) for each in found}
     boards = {each.board: (LIGHT["soft"], each.marker) for each in found} if several else {}
@@ -214,7 +257,9 @@ def _draw_legend(axes: "Axes", found: Sequence[Series], drawn: Drawn) -> None:
 
 
 def _draw_numbers(axes: "Axes", drawn: Drawn) -> None:
-    """Write the members' numbers next to their marks; one label for neighbours whose marks lie on one another."""
+    """Write the members' numbers next to their marks; one label for neighbours whose marks lie on
+    one another.
+    """
     groups: list[tuple[int, int, Measured]] = []
     for number, point in enumerate(drawn.front, 1):
         if groups and _distance_px(axes, point, groups[-1][2], drawn.cost) < NEAR_PX:

@@ -1,8 +1,9 @@
-"""Operating points: which networks are compared, in which tiles, halos and configurations, and what a board takes.
+"""Operating points: which networks are compared, in which tiles, halos and configurations, and what
+a board takes.
 
-A variant is a method in one precision, measured once. A point is a variant where it runs: an INT8 network on one
-configuration of a board's DPU, in tiles with a halo; a traditional pipeline on a board's processor; or anything on
-this machine alone.
+A variant is a method in one precision, measured once. A point is a variant where it runs: an INT8
+network on one configuration of a board's DPU, in tiles with a halo; a traditional pipeline on a
+board's processor; or anything on this machine alone.
 """
 
 import math
@@ -97,11 +98,16 @@ class Point:
         if self.dpu is None:
             return f"{self.variant.name}, processor of {self.board.name}"
         halo = "exact" if self.halo_px is None else self.halo_px
-        return f"{self.variant.name}, {self.board.name} {self.dpu.name}, tile {self.tile_px}, halo {halo}"
+        return (
+            f"{self.variant.name}, {self.board.name} {self.dpu.name}, tile {self.tile_px}, "
+            f"halo {halo}"
+        )
 
 
 def parse_targets(text: str) -> tuple[str, ...]:
-    """Read the boards of `--target`: one, several with commas, or all shipped ones, the default first."""
+    """Read the boards of `--target`: one, several with commas, or all shipped ones, the default
+    first.
+    """
     if text == "all":
         return DEFAULT_TARGET, *(name for name in board_names() if name != DEFAULT_TARGET)
     names = tuple(name.strip() for name in text.split(","))
@@ -112,7 +118,10 @@ def parse_targets(text: str) -> tuple[str, ...]:
 
 
 def network_variants(
-    names: Iterable[str], sensor: Sensor, make_int8: Callable[[Path], Path], log: Callable[[str], None]
+    names: Iterable[str],
+    sensor: Sensor,
+    make_int8: Callable[[Path], Path],
+    log: Callable[[str], None],
 ) -> list[Variant]:
     """Networks in float32 and INT8; shipped ones with the sensor's profile, INT8 files as they are.
 
@@ -120,14 +129,17 @@ def network_variants(
         names: shipped names, ONNX and safetensors files.
         sensor: that acquires the images.
         make_int8: quantises a float network's file, and says where it wrote the result.
-        log: is told which network has no INT8, and what of the sensor lies outside the range that was trained.
+        log: is told which network has no INT8, and what of the sensor lies outside the range that
+            was trained.
     """
     different = dict.fromkeys(each.strip() for each in names)
     found = [variant for name in different for variant in _variants(name, sensor, make_int8, log)]
     shown = [variant.name for variant in found]
     if len(set(shown)) < len(shown):
         twice = max(shown, key=shown.count)
-        raise OptionError("network", expected="names that differ", got=f"two {twice!r}", remedy="rename one file")
+        raise OptionError(
+            "network", expected="names that differ", got=f"two {twice!r}", remedy="rename one file"
+        )
     return found
 
 
@@ -136,7 +148,9 @@ def _variants(
 ) -> Iterator[Variant]:
     path = Path(name)
     if name not in shipped_names() and path.suffix not in (".onnx", ".safetensors"):
-        expected = f"a shipped network ({', '.join(shipped_names())}), or an ONNX or safetensors file"
+        expected = (
+            f"a shipped network ({', '.join(shipped_names())}), or an ONNX or safetensors file"
+        )
         raise OptionError("network", expected=expected, got=repr(name), remedy="correct that name")
     given = float_file(path, sensor, log)
     model = float_model(given)
@@ -148,7 +162,9 @@ def _variants(
     if name in shipped_names():
         yield Variant(method, FLOAT, given, tuple(brighter_files(path, sensor).items()))
         made = int8_file(path, sensor)
-        yield Variant(method, INT8, made, tuple(brighter_files(Path(f"{name}{SUFFIX}"), sensor).items()))
+        yield Variant(
+            method, INT8, made, tuple(brighter_files(Path(f"{name}{SUFFIX}"), sensor).items())
+        )
         return
     yield Variant(method, FLOAT, given)
     try:
@@ -166,10 +182,14 @@ def _require_tiles(name: str, tiling: Tiling) -> None:
         fixed = ", fixed to one tile size" if tiling.fixed_px is not None else ""
         expected = f"a network of one band in tiles of any multiple of {HALO_STEP_PX} px"
         remedy = "export it with free sizes, or bench it by itself"
-        raise OptionError("network", expected=expected, got=f"{name}, {tiling.words}{fixed}", remedy=remedy)
+        raise OptionError(
+            "network", expected=expected, got=f"{name}, {tiling.words}{fixed}", remedy=remedy
+        )
 
 
-def points_of(networks: Iterable[Variant], boards: Sequence[TargetProfile], whole: Swath) -> list[Point]:
+def points_of(
+    networks: Iterable[Variant], boards: Sequence[TargetProfile], whole: Swath
+) -> list[Point]:
     """Where networks, traditional pipelines and other libraries' ways are looked at.
 
     Args:
@@ -184,7 +204,8 @@ def points_of(networks: Iterable[Variant], boards: Sequence[TargetProfile], whol
 
 
 def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swath) -> list[Point]:
-    """Return where a network is compared: in INT8 in each configuration of every board, in the default in more tiles.
+    """Return where a network is compared: in INT8 in each configuration of every board, in the
+    default in more tiles.
 
     Every board is treated alike, so that the order of the boards changes nothing.
     """
@@ -201,7 +222,9 @@ def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swa
 
 
 def _on_board(variant: Variant, board: TargetProfile, whole: Swath) -> list[Point]:
-    """Return the fastest tile in each configuration; in the default one the paper's tile and smaller halos too."""
+    """Return the fastest tile in each configuration; in the default one the paper's tile and
+    smaller halos too.
+    """
     default = dpu_of(board)
     others = [dpu_of(board, name) for name in board.configurations if name != default.name]
     fastest_px = fastest_tile_px(variant, default, whole)
@@ -213,10 +236,14 @@ def _on_board(variant: Variant, board: TargetProfile, whole: Swath) -> list[Poin
 
 
 def fastest_tile_px(variant: Variant, dpu: Dpu, whole: Swath) -> int:
-    """The tile with exact seams, no larger than the paper's, in which the swath is predicted to take least time."""
+    """The tile with exact seams, no larger than the paper's, in which the swath is predicted to
+    take least time.
+    """
     radius = radius_px(variant)
     sides = range(TILE_STEP_PX * (2 * radius // TILE_STEP_PX + 1), TILE_PX + 1, TILE_STEP_PX)
-    swaths = [replace(whole, tile_px=side_px, halo_px=radius, consistency=True) for side_px in sides]
+    swaths = [
+        replace(whole, tile_px=side_px, halo_px=radius, consistency=True) for side_px in sides
+    ]
     times = {swath.tile_px: dpu_latency(variant, dpu, swath).value or math.inf for swath in swaths}
     return min(times, key=lambda side_px: times[side_px], default=TILE_PX)
 
@@ -229,7 +256,9 @@ def dpu_latency(variant: Variant, dpu: Dpu, swath: Swath) -> Figure:
         dpu: that it runs on.
         swath: with its tiles and their halo.
     """
-    prediction = predict(place(_graph(variant.file or Path(), swath.tile_px), dpu), dpu, step_px=swath.step_px)
+    prediction = predict(
+        place(_graph(variant.file or Path(), swath.tile_px), dpu), dpu, step_px=swath.step_px
+    )
     return swath_latency(prediction, math.ceil(swath.tiles * swath.runs / prediction.batch))
 
 
@@ -267,7 +296,9 @@ CHAIN = "traditional-standard"
 """The chain whose time on a board's processor a target states."""
 
 
-def board_figures(point: Point, whole: Swath, slower: float | None = None, runs: float = 1.0) -> dict[str, Figure]:
+def board_figures(
+    point: Point, whole: Swath, slower: float | None = None, runs: float = 1.0
+) -> dict[str, Figure]:
     """The figures of a point's board; unavailable, with the reason, where it has none.
 
     Args:
@@ -290,7 +321,9 @@ def board_figures(point: Point, whole: Swath, slower: float | None = None, runs:
             source = f"{latency.source}; times of the chains here: {slower:.2f} of {CHAIN}"
             latency = predicted(latency.value * slower, "s", (low_s, high_s), source)
     else:
-        latency = unavailable("s", point.reason or "no time of this method on the board's processor is stated")
+        latency = unavailable(
+            "s", point.reason or "no time of this method on the board's processor is stated"
+        )
     if latency.value is None:
         return {key: unavailable(unit, latency.reason) for key, unit in UNITS.items()}
     work = energy(latency, power), efficiency(whole.pixels, latency, power)

@@ -1,4 +1,6 @@
-"""One study: variants, what is measured of each, points with their figures, a front and a recommendation."""
+"""One study: variants, what is measured of each, points with their figures, a front and a
+recommendation.
+"""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -31,7 +33,13 @@ from beers_deploy.studies.evaluation.methods import Method, method_named
 from beers_deploy.studies.evaluation.pairs import pairs_of_scenes
 from beers_deploy.studies.tradeoff import advice
 from beers_deploy.studies.tradeoff.boards import Question, board_rows
-from beers_deploy.studies.tradeoff.measure import Benchmark, Labelled, Measurements, make_int8, measure_host
+from beers_deploy.studies.tradeoff.measure import (
+    Benchmark,
+    Labelled,
+    Measurements,
+    make_int8,
+    measure_host,
+)
 from beers_deploy.studies.tradeoff.page import Tradeoff
 from beers_deploy.studies.tradeoff.points import (
     CHAIN,
@@ -64,26 +72,31 @@ def tradeoff(
     progress: Progress = None,
     log: Log = no_log,
 ) -> Tradeoff:
-    """Measure networks and traditional pipelines on the same images, predict their runs, and recommend a point.
+    """Measure networks and traditional pipelines on the same images, predict their runs, and
+    recommend a point.
 
     Args:
         networks: shipped names, files, or networks in memory; float ones are quantised on the way.
         images: folder of held-out scenes to simulate from; drawn ones if None.
         sensor: of the degraded images.
         reference: the sensor that is aimed at; the shipped one if None.
-        board: one or several, compared in one front; "all" for the shipped ones. Their order changes nothing.
+        board: one or several, compared in one front; "all" for the shipped ones. Their order
+            changes nothing.
         size: (width, height) of the swath in pixels, or as text.
         budget: what can be afforded, such as "latency<=20s".
         need: what must be reached, such as "psnr>=44".
         lpips: weights of SqueezeNet 1.1, or a folder of backbones, for LPIPS.
         calibration: folder of scenes to quantise networks on; drawn ones if None.
-        labelled: folder of labelled pictures for a detector, whose mAP50 is then a figure of each point.
+        labelled: folder of labelled pictures for a detector, whose mAP50 is then a figure of each
+            point.
         detector: ONNX file; the embedded one if None.
         classes: labelled classes under the detector's names, such as "car=vehicle".
         seed: of every random draw.
         cache: folder of measurements that a later run goes on with; None keeps none.
-        progress: a function that is told each step, False for silence, None for a bar or lines on standard error.
-        log: is told which network has no INT8, and what of the sensor lies outside the range that was trained.
+        progress: a function that is told each step, False for silence, None for a bar or lines on
+            standard error.
+        log: is told which network has no INT8, and what of the sensor lies outside the range that
+            was trained.
 
     Raises:
         BeersError: a network, an image, a profile or weights that cannot be used.
@@ -99,7 +112,9 @@ def tradeoff(
     for each in boards:
         Constants.of(dpu_of(each))  # a board without them is refused before anything is measured
     limits = advice.parse_constraints("budget", budget), advice.parse_constraints("need", need)
-    scenes, weights, calibrated = (None if path is None else Path(path) for path in (images, lpips, calibration))
+    scenes, weights, calibrated = (
+        None if path is None else Path(path) for path in (images, lpips, calibration)
+    )
     degraded = Sensor.load(sensor)
     aim = Sensor.load(reference or REFERENCE).in_units_of(degraded)
     names = [each if isinstance(each, str) else str(Network.load(each).file) for each in networks]
@@ -107,7 +122,9 @@ def tradeoff(
     with keep as folder, reporting(progress):
         kept = Measurements.open(Path(folder) / "measurements.json")
         swath = Swath(*width_height)
-        quantise = partial(make_int8, folder=Path(folder) / "int8", scenes=calibrated, sensor=degraded, seed=seed)
+        quantise = partial(
+            make_int8, folder=Path(folder) / "int8", scenes=calibrated, sensor=degraded, seed=seed
+        )
         points = points_of(network_variants(names, degraded, quantise, log), boards, swath)
         pairs, said = pairs_of_scenes(scenes, degraded, aim, seed)
         benchmark = Benchmark(pairs, degraded, aim, weights, seed)
@@ -117,16 +134,39 @@ def tradeoff(
         for row in published_rows():  # as printed; the paper's images are others
             figures = {f"board {key}": figure for key, figure in row.figures.items()}
             measured.append(advice.Measured(row.name, figures, {"board": PAPER_TARGET}))
-    notes = (*_notes(benchmark, [each.name for each in boards]), *(pictures.notes if pictures else ()), *said)
+    notes = (
+        *_notes(benchmark, [each.name for each in boards]),
+        *(pictures.notes if pictures else ()),
+        *said,
+    )
     files = [path for path in map(Path, names) if path.is_file()]
     files += [path for folder in (scenes, calibrated) if folder for path in list_images(folder)]
     files += [path for path in (find_backbone("squeeze", weights), detector) if path]
     files += [scene.path for scene in pictures.scenes if scene.path] if pictures else []
-    arguments: dict[str, object] = {"images": images, "sensor": degraded.name, "reference": aim.name, "need": need}
-    arguments |= {"size": "x".join(map(str, width_height)), "budget": budget, "calibration": calibration}
-    arguments |= {"seed": seed, "target": ",".join(each.name for each in boards), "network": ",".join(names)}
-    arguments |= {"labelled": labelled, "detector": detector, "classes": classes} if labelled else {}
-    about: dict[str, Any] = {"arguments": arguments, "inputs": tuple(map(input_of, files)), "notes": notes}
+    arguments: dict[str, object] = {
+        "images": images,
+        "sensor": degraded.name,
+        "reference": aim.name,
+        "need": need,
+    }
+    arguments |= {
+        "size": "x".join(map(str, width_height)),
+        "budget": budget,
+        "calibration": calibration,
+    }
+    arguments |= {
+        "seed": seed,
+        "target": ",".join(each.name for each in boards),
+        "network": ",".join(names),
+    }
+    arguments |= (
+        {"labelled": labelled, "detector": detector, "classes": classes} if labelled else {}
+    )
+    about: dict[str, Any] = {
+        "arguments": arguments,
+        "inputs": tuple(map(input_of, files)),
+        "notes": notes,
+    }
     asked = Question(*limits, advice.Comparison(benchmark.sites, seed))
     return weigh(measured, [each.name for each in boards], asked, **about)
 
@@ -136,10 +176,14 @@ def _require_different(boards: Sequence[TargetProfile]) -> None:
     names = [each.name for each in boards]
     if len(set(names)) < len(names):
         twice = max(names, key=names.count)
-        raise OptionError("board", expected="boards, each once", got=f"two {twice!r}", remedy="leave one out")
+        raise OptionError(
+            "board", expected="boards, each once", got=f"two {twice!r}", remedy="leave one out"
+        )
 
 
-def weigh(points: Sequence[advice.Measured], boards: Sequence[str], asked: Question, **about: Any) -> Tradeoff:
+def weigh(
+    points: Sequence[advice.Measured], boards: Sequence[str], asked: Question, **about: Any
+) -> Tradeoff:
     """Find the front, the recommendation, and what each board offers.
 
     Args:
@@ -156,7 +200,14 @@ def weigh(points: Sequence[advice.Measured], boards: Sequence[str], asked: Quest
     name, figures = (best.name, best.figures) if best else ("none", {})
     every = (Row("points", point.name, point.figures, point.text) for point in points)
     rows = (Row("recommended", name, figures, {"line": line}), *by_board, *numbered, *every)
-    about |= {"points": points, "front": front, "front_rows": numbered, "cost": cost, "best": best, "line": line}
+    about |= {
+        "points": points,
+        "front": front,
+        "front_rows": numbered,
+        "cost": cost,
+        "best": best,
+        "line": line,
+    }
     about |= {"boards": tuple(boards), "board_rows": by_board, "constraints": asked.constraints}
     return Tradeoff("tradeoff", rows=rows, **about)
 
@@ -192,7 +243,9 @@ def _measured(
         runs = benchmark.runs(point) if point.dpu is not None else 1.0
         figures = host[point.variant] | board_figures(point, swath, slower, runs)
         if point.dpu is not None:
-            figures["network runs"] = measured_figure(runs, "run/tile", "exposures that tiles of the images ask for")
+            figures["network runs"] = measured_figure(
+                runs, "run/tile", "exposures that tiles of the images ask for"
+            )
         measured.figures.update(figures)
     return found
 
@@ -209,7 +262,9 @@ def _methods(variants: Sequence[Variant], benchmark: Benchmark, log: Log) -> dic
 
 
 def _method_name(variant: Variant) -> str:
-    """What `method_named` calls a variant: a shipped network by its name, which brings its exposures."""
+    """What `method_named` calls a variant: a shipped network by its name, which brings its
+    exposures.
+    """
     if variant.brighter:
         return variant.method + (SUFFIX if variant.precision == INT8 else "")
     return str(variant.file or variant.method)
@@ -231,13 +286,23 @@ def _text(point: Point, method: Method) -> dict[str, str]:
 def _notes(benchmark: Benchmark, boards: Sequence[str]) -> Iterator[str]:
     sites = len(set(benchmark.sites))
     names = ", ".join(boards)
-    yield f"No board was used: figures of {names} are predicted, but for the paper's, which are published."
-    yield f"PSNR is the mean over {len(benchmark.pairs)} images of {sites} sites; clipped pixels are left out."
     yield (
-        "Gains are differences on the same images from the next cheaper point of the front, with 95 % bootstrap "
+        f"No board was used: figures of {names} are predicted, but for the paper's, which are "
+        "published."
+    )
+    yield (
+        f"PSNR is the mean over {len(benchmark.pairs)} images of {sites} sites; clipped "
+        "pixels are left out."
+    )
+    yield (
+        "Gains are differences on the same images from the next cheaper point of the front, "
+        "with 95 % bootstrap "
         "intervals over whole sites; one whose interval holds 0 is not significant."
     )
     if too_few(sites):
         yield too_few(sites)
-    yield "Exact halos give the same pictures in tiles of any size; smaller ones were measured in the point's tiles."
+    yield (
+        "Exact halos give the same pictures in tiles of any size; smaller ones were measured "
+        "in the point's tiles."
+    )
     yield "The chains know both sensors; what a network knows of them stands beside it."

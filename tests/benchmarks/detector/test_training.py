@@ -9,7 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.detector.network import Decoding, DetectorNetwork, detector_to_onnx
-from benchmarks.detector.training import DetectorRecipe, Picture, drawn_picture, picture_of, train_detector, turned
+from benchmarks.detector.training import (
+    DetectorRecipe,
+    Picture,
+    drawn_picture,
+    picture_of,
+    train_detector,
+    turned,
+)
 
 SIDE_PX = 64
 NAMES = ("bright", "dark")
@@ -55,7 +62,10 @@ def test_it_finds_what_it_never_saw(trained: tuple[DetectorNetwork, list[float]]
 
 def test_the_same_seed_gives_the_same_weights_and_another_gives_others() -> None:
     pictures = [squares(k) for k in range(3)]
-    runs = [train_detector(pictures, 2, DetectorRecipe(steps=3, batch=2, seed=s)).state_dict() for s in (0, 0, 1)]
+    runs = [
+        train_detector(pictures, 2, DetectorRecipe(steps=3, batch=2, seed=s)).state_dict()
+        for s in (0, 0, 1)
+    ]
     assert all(torch.equal(a, b) for a, b in zip(runs[0].values(), runs[1].values(), strict=True))
     assert not torch.equal(runs[0]["tail.weight"], runs[2]["tail.weight"])
 

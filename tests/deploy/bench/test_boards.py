@@ -45,7 +45,9 @@ def names(rows: list[Row]) -> list[str]:
     return [row.name for row in rows]
 
 
-def test_all_boards_stand_in_one_table_with_their_processors_and_the_papers_rows(network: Path) -> None:
+def test_all_boards_stand_in_one_table_with_their_processors_and_the_papers_rows(
+    network: Path,
+) -> None:
     found = bench(network, "all")
     swept = [row for row in found.rows if row.table == "sweep"]
     assert [name.split()[0] for name in names(swept)] == board_names()
@@ -97,15 +99,21 @@ def test_a_network_that_is_not_tiled_is_predicted_by_the_frame(classifier: Path)
 
 def test_a_frame_need_not_be_square(tmp_path: Path, classifier: Path) -> None:
     model = onnx.load(classifier)
-    for side, size in zip(model.graph.input[0].type.tensor_type.shape.dim[2:], (32, 96), strict=True):
+    for side, size in zip(
+        model.graph.input[0].type.tensor_type.shape.dim[2:], (32, 96), strict=True
+    ):
         side.dim_value = size
     onnx.save(model, tmp_path / "wide.onnx")
     dpu = load_dpu("vck190", None)
-    square, wide = (frame_row(predict_file(path, dpu, None)) for path in (classifier, tmp_path / "wide.onnx"))
+    square, wide = (
+        frame_row(predict_file(path, dpu, None)) for path in (classifier, tmp_path / "wide.onnx")
+    )
     assert (wide.figures["work"].value or 0) > 2.5 * (square.figures["work"].value or 0)
 
 
-def test_one_configuration_or_runs_beside_all_boards_are_refused(network: Path, tmp_path: Path) -> None:
+def test_one_configuration_or_runs_beside_all_boards_are_refused(
+    network: Path, tmp_path: Path
+) -> None:
     with pytest.raises(OptionError, match="dpu: expected"):
         bench(network, "all", config="C32B3")
     with pytest.raises(OptionError, match="measured"):
@@ -123,7 +131,9 @@ def test_a_stated_task_of_the_host_is_that_of_every_row(classifier: Path, networ
     )
     for before, after in zip(plain, ranked, strict=True):
         assert (
-            (after.figures["one-thread latency"].value or 0) > (before.figures["one-thread latency"].value or 0) > 0
+            (after.figures["one-thread latency"].value or 0)
+            > (before.figures["one-thread latency"].value or 0)
+            > 0
         )
 
 
@@ -138,7 +148,9 @@ def test_the_exposures_of_an_image_are_counted_whatever_the_bits_of_the_sensor(
     sensor = load_sensor("pleiades-degraded")
     gain = sensor.gain_dn_per_radiance.low * 2 ** (bits - 12)
     sensor = sensor.replace(bits=bits, gain_dn_per_radiance=gain)
-    pixels = np.full((128, 256), 2000, np.uint16)  # too bright for x4, unless full scale is that of 14 bits
+    pixels = np.full(
+        (128, 256), 2000, np.uint16
+    )  # too bright for x4, unless full scale is that of 14 bits
     pixels[:, :128] = 200  # dark enough for x8, far from bright ground as well
     tifffile.imwrite(tmp_path / "image.tif", pixels)
     found = bench(network, size=None, image=tmp_path / "image.tif", full_scale=4095, sensor=sensor)

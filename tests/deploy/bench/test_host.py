@@ -59,7 +59,8 @@ def test_the_other_precision_is_a_shipped_network_of_the_same_variant() -> None:
     assert back is not None
     assert is_quantised(back)
     shapes = (
-        [t.dims for t in m.graph.initializer if len(t.dims) == 4] for m in (float_model(shipped_pair()[0]), float32)
+        [t.dims for t in m.graph.initializer if len(t.dims) == 4]
+        for m in (float_model(shipped_pair()[0]), float32)
     )
     assert len({str(s) for s in shapes}) == 1
 
@@ -67,12 +68,16 @@ def test_the_other_precision_is_a_shipped_network_of_the_same_variant() -> None:
 def test_a_network_of_another_make_runs_alone(tmp_path: Path) -> None:
     path = float_convbeers(tmp_path / "f.onnx", 1, 8)
     assert other_precision(load_onnx(path)) is None
-    assert [row.name for row in host_rows(path, QUICK, 32, 1) if row.table == "host"] == ["f, 32 x 32"]
+    assert [row.name for row in host_rows(path, QUICK, 32, 1) if row.table == "host"] == [
+        "f, 32 x 32"
+    ]
 
 
 def test_memory_that_is_taken_is_seen() -> None:
     before = resident_bytes()
-    block = mmap(-1, 40_000_000)  # from the system: an allocator may still hold what earlier tests freed
+    block = mmap(
+        -1, 40_000_000
+    )  # from the system: an allocator may still hold what earlier tests freed
     np.frombuffer(block, np.uint8).fill(1)
     assert 30e6 < resident_bytes() - before < 200e6
 

@@ -10,7 +10,13 @@ import tifffile
 from beers_deploy.bench import board as boards
 from beers_deploy.bench.board import TRAFFIC
 from beers_deploy.bench.swath import Swath, efficiency, parse_size, predict_file
-from beers_deploy.bench.tables import layer_rows, parse_tiles, predicted_rows, published_rows, sweep_rows
+from beers_deploy.bench.tables import (
+    layer_rows,
+    parse_tiles,
+    predicted_rows,
+    published_rows,
+    sweep_rows,
+)
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import measured, predicted, unavailable
@@ -104,7 +110,9 @@ def test_layer_rows_have_the_columns_of_vaitrace_and_sum_to_their_last(tmp_path:
 def test_small_tiles_keep_maps_on_chip_and_cost_work(tmp_path: Path) -> None:
     path = integer_convbeers(tmp_path / "net.onnx", 1, 64)
     rows = sweep_rows(path, Swath(700, 600, halo_px=5), [DPU], [640, 128, 64])
-    assert [row.name for row in rows] == [f"vck190 C32B3, tiles of {tile}" for tile in (640, 128, 64)]
+    assert [row.name for row in rows] == [
+        f"vck190 C32B3, tiles of {tile}" for tile in (640, 128, 64)
+    ]
     kept, factors = ([value(row, key) for row in rows] for key in ("layers on chip", "work factor"))
     assert kept[0] == 0 < kept[1] <= kept[2]
     assert 1 < factors[1] < factors[2]
@@ -116,9 +124,25 @@ def test_small_tiles_keep_maps_on_chip_and_cost_work(tmp_path: Path) -> None:
 def test_all_configurations_are_swept(tmp_path: Path) -> None:
     model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
     out = tmp_path / "out.json"
-    done(*("bench", model, "--size", "41x33", "--tile", "64,32", "--dpu", "all", "--no-traditional", "--json", out))
+    done(
+        *(
+            "bench",
+            model,
+            "--size",
+            "41x33",
+            "--tile",
+            "64,32",
+            "--dpu",
+            "all",
+            "--no-traditional",
+            "--json",
+            out,
+        )
+    )
     swept = [str(row["name"]) for row in valid(out)["rows"] if row["table"] == "sweep"]
-    assert swept == [f"vck190 {name}, tiles of {tile}" for name in DPU.target.configurations for tile in (64, 32)]
+    assert swept == [
+        f"vck190 {name}, tiles of {tile}" for name in DPU.target.configurations for tile in (64, 32)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -128,7 +152,9 @@ def test_all_configurations_are_swept(tmp_path: Path) -> None:
         (parse_tiles, "tile", ["", "640,", "640,8", "640;320", "-64"]),
     ],
 )
-def test_bad_sizes_and_tiles_are_refused(parse: Callable[[str], object], said: str, texts: list[str]) -> None:
+def test_bad_sizes_and_tiles_are_refused(
+    parse: Callable[[str], object], said: str, texts: list[str]
+) -> None:
     for text in texts:
         with pytest.raises(OptionError, match=said):
             parse(text)
@@ -168,10 +194,14 @@ def test_a_board_is_named_with_or_without_its_model(tmp_path: Path) -> None:
     model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
     tables = []
     for name in ("vck190-model", "vck190"):
-        output = done("bench", model, "--target", name, "--size", "600x400", "--tile", 64, "--no-traditional")
+        output = done(
+            "bench", model, "--target", name, "--size", "600x400", "--tile", 64, "--no-traditional"
+        )
         tables.append([line for line in output.splitlines() if "C32B3" in line])
     assert tables[0] == tables[1] != []
-    assert done("check", model, "--target", "vck190-model") == done("check", model, "--target", "vck190")
+    assert done("check", model, "--target", "vck190-model") == done(
+        "check", model, "--target", "vck190"
+    )
 
 
 def test_the_paper_counts_fractions() -> None:
@@ -182,13 +212,25 @@ def test_the_paper_counts_fractions() -> None:
 
 @pytest.mark.parametrize(
     ("halo_px", "tiles"),
-    [(0, 330), (11, 330), (12, 345), (20, 345), (21, 368), (25, 368), (26, 384), (35, 384), (38, 384)],
+    [
+        (0, 330),
+        (11, 330),
+        (12, 345),
+        (20, 345),
+        (21, 368),
+        (25, 368),
+        (26, 384),
+        (35, 384),
+        (38, 384),
+    ],
 )
 def test_whole_tiles_of_the_published_swath(halo_px: int, tiles: int) -> None:
     assert Swath(13600, 9016, 640, halo_px).tiles == tiles
 
 
-def test_a_file_that_is_replaced_during_the_run_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_is_replaced_during_the_run_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its digest would be that of a network for which nothing was predicted."""
     model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
     out = tmp_path / "out.json"
@@ -200,6 +242,8 @@ def test_a_file_that_is_replaced_during_the_run_is_refused(tmp_path: Path, monke
         return found
 
     monkeypatch.setattr(boards, "bench_board", replaced)
-    said = refused("bench", model, "--size", "41x33", "--tile", 32, "--no-traditional", "--json", out)
+    said = refused(
+        "bench", model, "--size", "41x33", "--tile", 32, "--no-traditional", "--json", out
+    )
     assert "net.onnx: expected a file that stays as it is" in said
     assert not out.exists()

@@ -7,7 +7,9 @@ import pytest
 
 from beers_deploy.bench.timing import interleaved, timed
 
-counters = pytest.mark.skipif(sys.platform == "win32", reason="Linux's counters have names that Windows refuses")
+counters = pytest.mark.skipif(
+    sys.platform == "win32", reason="Linux's counters have names that Windows refuses"
+)
 
 
 def counter(root: Path, energy_uj: int, name: str = "package-0") -> Path:
@@ -20,7 +22,9 @@ def counter(root: Path, energy_uj: int, name: str = "package-0") -> Path:
 
 
 @counters
-@pytest.mark.parametrize(("before", "after", "joules"), [(200_000, 700_000, 0.5), (900_000, 100_000, 0.2)])
+@pytest.mark.parametrize(
+    ("before", "after", "joules"), [(200_000, 700_000, 0.5), (900_000, 100_000, 0.2)]
+)
 def test_power_is_energy_over_time_also_of_a_counter_that_starts_again(
     before: int, after: int, joules: float, tmp_path: Path
 ) -> None:

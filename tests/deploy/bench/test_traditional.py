@@ -41,7 +41,9 @@ def test_the_boards_processor_holds_the_papers_run_and_lacks_what_its_file_lacks
     low, high = figures["latency"].interval or (0, 0)
     assert low < 1724 < high
     assert figures["power"].mode == "published"
-    assert figures["efficiency"].interval == pytest.approx((SWATH.pixels / high / 22.5, SWATH.pixels / low / 22.5))
+    assert figures["efficiency"].interval == pytest.approx(
+        (SWATH.pixels / high / 22.5, SWATH.pixels / low / 22.5)
+    )
     bare = processor_row(SWATH, replace(board, tables={}))
     assert "chain_s_per_mpx" in bare.figures["latency"].reason
 

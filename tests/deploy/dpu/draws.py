@@ -1,4 +1,6 @@
-"""What stands between two convolutions of a small network, drawn by one call, and the rules that the whole breaks."""
+"""What stands between two convolutions of a small network, drawn by one call, and the rules that
+the whole breaks.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +18,11 @@ TILE_PX = 288
 
 
 def broken_rules(path: Path, dpu: Dpu = DPU, tile_px: int = TILE_PX) -> list[str]:
-    return [broken.rule for node in place(read_network(path, tile_px), dpu).nodes for broken in node.broken]
+    return [
+        broken.rule
+        for node in place(read_network(path, tile_px), dpu).nodes
+        for broken in node.broken
+    ]
 
 
 def between_convs(tmp_path: Path, draw: Draw, dpu: Dpu = DPU, channels: int = 8) -> list[str]:
@@ -42,7 +48,9 @@ def conv(*weight: int, **attributes: Value) -> Draw:
 
 
 def transposed(*weight: int, **attributes: Value) -> Draw:
-    return lambda sketch, source: sketch.node("ConvTranspose", source, sketch.weight(*weight), **attributes)
+    return lambda sketch, source: sketch.node(
+        "ConvTranspose", source, sketch.weight(*weight), **attributes
+    )
 
 
 def node(op_type: str, **attributes: Value) -> Draw:
@@ -55,7 +63,11 @@ def scaled(*shape: int) -> Draw:
 
 def resized(scale: float, **attributes: Value) -> Draw:
     return lambda sketch, source: sketch.node(
-        "Resize", source, "", sketch.constant(np.array([1, 1, scale, scale], np.float32)), **attributes
+        "Resize",
+        source,
+        "",
+        sketch.constant(np.array([1, 1, scale, scale], np.float32)),
+        **attributes,
     )
 
 
@@ -65,8 +77,12 @@ def padded(mode: str) -> Draw:
 
 
 def behind_conv(op_type: str, **attributes: Value) -> Draw:
-    return lambda sketch, source: sketch.node(op_type, sketch.conv(source, (8, 8, 3, 3)), **attributes)
+    return lambda sketch, source: sketch.node(
+        op_type, sketch.conv(source, (8, 8, 3, 3)), **attributes
+    )
 
 
 def behind_sum(op_type: str, **attributes: Value) -> Draw:
-    return lambda sketch, source: sketch.node(op_type, sketch.node("Add", source, source), **attributes)
+    return lambda sketch, source: sketch.node(
+        op_type, sketch.node("Add", source, source), **attributes
+    )

@@ -14,7 +14,9 @@ class Sketch:
     """A network under construction; every method returns the name of its result."""
 
     def __init__(self, channels: int = 8) -> None:
-        self.input = helper.make_tensor_value_info("image", TensorProto.FLOAT, ["N", channels, "H", "W"])
+        self.input = helper.make_tensor_value_info(
+            "image", TensorProto.FLOAT, ["N", channels, "H", "W"]
+        )
         self.nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
 
@@ -26,7 +28,9 @@ class Sketch:
     def node(self, op_type: str, *inputs: str, domain: Value = "", **attributes: Value) -> str:
         name = f"{op_type.lower()}{len(self.nodes)}"
         node = helper.make_node(op_type, list(inputs), [name], name=name, domain=str(domain))
-        node.attribute.extend(helper.make_attribute(key, value) for key, value in attributes.items())
+        node.attribute.extend(
+            helper.make_attribute(key, value) for key, value in attributes.items()
+        )
         self.nodes.append(node)
         return name
 
@@ -38,7 +42,10 @@ class Sketch:
         return self.node("Conv", source, self.weight(*weight), **given)
 
     def save(self, path: Path, *results: str) -> Path:
-        ends = [helper.make_tensor_value_info(r, TensorProto.FLOAT, ["N", "C", "H2", "W2"]) for r in results]
+        ends = [
+            helper.make_tensor_value_info(r, TensorProto.FLOAT, ["N", "C", "H2", "W2"])
+            for r in results
+        ]
         graph = helper.make_graph(self.nodes, "sketch", [self.input], ends, self.constants)
         opsets = [helper.make_opsetid("", 17), helper.make_opsetid("com.microsoft", 1)]
         onnx.save_model(helper.make_model(graph, opset_imports=opsets, ir_version=8), path)
@@ -62,13 +69,20 @@ class IntegerSketch(Sketch):
 
     def __init__(self, channels: int = 1, scale: float = 2.0**-7, zero: int = 0) -> None:
         super().__init__(channels)
-        self.numbers = (self.constant(np.array(scale, np.float32)), self.constant(np.array(zero, np.int8)))
+        self.numbers = (
+            self.constant(np.array(scale, np.float32)),
+            self.constant(np.array(zero, np.int8)),
+        )
 
     def quantised(self, source: str) -> str:
         return self.node("QuantizeLinear", source, *self.numbers)
 
     def qconv(
-        self, source: str, weight: tuple[int, ...], weight_scale: float = 2.0**-7, bias: np.ndarray | None = None
+        self,
+        source: str,
+        weight: tuple[int, ...],
+        weight_scale: float = 2.0**-7,
+        bias: np.ndarray | None = None,
     ) -> str:
         pads = [weight[2] // 2, weight[3] // 2] * 2
         kernel = self.constant(np.ones(weight, np.int8))
@@ -83,7 +97,9 @@ class IntegerSketch(Sketch):
         return self.node("QLinearAdd", *feeds, domain="com.microsoft")
 
 
-def integer_convbeers(path: Path, blocks: int, features: int, weight_scale: float = 2.0**-7) -> Path:
+def integer_convbeers(
+    path: Path, blocks: int, features: int, weight_scale: float = 2.0**-7
+) -> Path:
     """The host's integer encoding, one int8 plane in, the correction added to the image behind."""
     s = IntegerSketch()
     wide = (features, features, 3, 3)
@@ -92,12 +108,16 @@ def integer_convbeers(path: Path, blocks: int, features: int, weight_scale: floa
         inner = s.node("Relu", s.qconv(stream, wide, weight_scale))
         stream = s.qadd(stream, s.qconv(inner, wide, weight_scale))
     deep = s.qadd(head, s.qconv(stream, wide, weight_scale))
-    correction = s.node("DequantizeLinear", s.qconv(deep, (1, features, 3, 3), weight_scale), *s.numbers)
+    correction = s.node(
+        "DequantizeLinear", s.qconv(deep, (1, features, 3, 3), weight_scale), *s.numbers
+    )
     return s.save(path, s.node("Add", "image", correction))
 
 
 def board_convbeers(path: Path, blocks: int, features: int) -> Path:
-    """The board's QDQ encoding of the core by itself, int8 weights and bias through DequantizeLinear."""
+    """The board's QDQ encoding of the core by itself, int8 weights and bias through
+    DequantizeLinear.
+    """
     s = IntegerSketch()
 
     def pair(source: str) -> str:
@@ -105,7 +125,12 @@ def board_convbeers(path: Path, blocks: int, features: int) -> Path:
 
     def conv(source: str, *weight: int) -> str:
         feeds = (s.constant(np.ones(shape, np.int8)) for shape in (weight, weight[:1]))
-        return s.node("Conv", source, *(s.node("DequantizeLinear", f, *s.numbers) for f in feeds), pads=[1] * 4)
+        return s.node(
+            "Conv",
+            source,
+            *(s.node("DequantizeLinear", f, *s.numbers) for f in feeds),
+            pads=[1] * 4,
+        )
 
     stream = head = pair(conv(pair("image"), features, 1, 3, 3))
     for _ in range(blocks):
@@ -118,22 +143,38 @@ def board_convbeers(path: Path, blocks: int, features: int) -> Path:
 class QdqSketch(Sketch):
     """A sketch in QDQ encoding, every tensor with a scale of its own: 2^-n is its scale."""
 
-    def scale(self, frac_bits: float | list[float], zero: int = 0, kind: type = np.int8) -> tuple[str, str]:
+    def scale(
+        self, frac_bits: float | list[float], zero: int = 0, kind: type = np.int8
+    ) -> tuple[str, str]:
         scales = 2.0 ** -np.array(frac_bits, np.float64)
-        return self.constant(scales.astype(np.float32)), self.constant(np.full(scales.shape, zero, kind))
+        return self.constant(scales.astype(np.float32)), self.constant(
+            np.full(scales.shape, zero, kind)
+        )
 
-    def pair(self, source: str, frac_bits: float = 7, zero: int = 0, read: tuple[float, int] | None = None) -> str:
-        """A tensor quantised and dequantised; `read` is the scale and the zero point of who reads another."""
+    def pair(
+        self,
+        source: str,
+        frac_bits: float = 7,
+        zero: int = 0,
+        read: tuple[float, int] | None = None,
+    ) -> str:
+        """A tensor quantised and dequantised; `read` is the scale and the zero point of who reads
+        another.
+        """
         numbers = self.scale(frac_bits, zero)
         read_numbers = numbers if read is None else self.scale(*read)
-        return self.node("DequantizeLinear", self.node("QuantizeLinear", source, *numbers), *read_numbers)
+        return self.node(
+            "DequantizeLinear", self.node("QuantizeLinear", source, *numbers), *read_numbers
+        )
 
     def stored(self, value: np.ndarray, frac_bits: float | list[float] = 7) -> str:
         """A constant seen as float; one of float32 as it is."""
         name = self.constant(value)
         if value.dtype == np.float32:
             return name
-        return self.node("DequantizeLinear", name, *self.scale(frac_bits, 0, value.dtype.type), axis=0)
+        return self.node(
+            "DequantizeLinear", name, *self.scale(frac_bits, 0, value.dtype.type), axis=0
+        )
 
     def qdq_conv(
         self,

@@ -1,4 +1,6 @@
-"""Each board by its own file: what one refuses and another takes, what a remedy repairs, whose manual is named."""
+"""Each board by its own file: what one refuses and another takes, what a remedy repairs, whose
+manual is named.
+"""
 
 import re
 from collections.abc import Callable
@@ -24,7 +26,15 @@ from beers_deploy.profiles.figures import predicted
 from beers_deploy.profiles.target import board_names, npu_names
 from beers_deploy.quant.core import SHIFTS, target_shifts
 from beers_deploy.quant.onnx_file import load_onnx
-from tests.deploy.dpu.draws import Draw, behind_conv, behind_sum, between_convs, broken_rules, conv, node
+from tests.deploy.dpu.draws import (
+    Draw,
+    behind_conv,
+    behind_sum,
+    between_convs,
+    broken_rules,
+    conv,
+    node,
+)
 from tests.deploy.dpu.graphs import Sketch
 
 DPUS = {name: load_dpu(name) for name in board_names()}
@@ -57,14 +67,39 @@ def in_two(first: Draw, second: Draw) -> Draw:
     return lambda s, x: second(s, first(s, x))
 
 
-# What only these boards refuse, with the rule, the network, the same with the remedy followed, and its channels.
+# What only these boards refuse, with the rule, the network, the same with the remedy followed, and
+# its channels.
 CASES: list[tuple[tuple[str, ...], str, Draw, Draw, int]] = [
-    (ZYNQ, "conv weight bank", conv(8, 1312, 5, 5), in_two(conv(1296, 1312, 1, 1), conv(8, 1296, 5, 5)), 1312),
-    ((*ZYNQ, "vek280"), "depthwise kernel", depthwise(64, 33), in_two(depthwise(64, 1), depthwise(1, 33)), 8),
-    (ZYNQ, "activation place", behind_depthwise("LeakyRelu", alpha=ALPHA), behind_depthwise("Relu"), 8),
+    (
+        ZYNQ,
+        "conv weight bank",
+        conv(8, 1312, 5, 5),
+        in_two(conv(1296, 1312, 1, 1), conv(8, 1296, 5, 5)),
+        1312,
+    ),
+    (
+        (*ZYNQ, "vek280"),
+        "depthwise kernel",
+        depthwise(64, 33),
+        in_two(depthwise(64, 1), depthwise(1, 33)),
+        8,
+    ),
+    (
+        ZYNQ,
+        "activation place",
+        behind_depthwise("LeakyRelu", alpha=ALPHA),
+        behind_depthwise("Relu"),
+        8,
+    ),
     (ZYNQ, "activation of sums", behind_sum("LeakyRelu", alpha=ALPHA), behind_sum("Relu"), 8),
     (("vek280",), "conv area", conv(8, 8, 8, 8, pads=[3] * 4), conv(8, 8, 7, 7), 8),
-    (("vek280",), "depthwise kernel", depthwise(21, 21), in_two(depthwise(21, 1), depthwise(1, 21)), 8),
+    (
+        ("vek280",),
+        "depthwise kernel",
+        depthwise(21, 21),
+        in_two(depthwise(21, 1), depthwise(1, 21)),
+        8,
+    ),
     (("vek280",), "activation place", prelu, behind_conv("Relu"), 8),
     (("vek280",), "activation of sums", in_two(added, prelu), behind_sum("Relu"), 8),
     (("vck190",), "conv window", conv(8, 8, 9, 8), conv(8, 8, 7, 7), 8),
@@ -126,7 +161,9 @@ def test_more_channels_than_others_take(tmp_path: Path) -> None:
 
 
 def wide(kernel: tuple[int, int], channels: int) -> Operation:
-    return Operation("c", "Conv", "conv", ("in",), ("out",), window=Window(kernel), channels=(channels, 8))
+    return Operation(
+        "c", "Conv", "conv", ("in",), ("out",), window=Window(kernel), channels=(channels, 8)
+    )
 
 
 @given(st.integers(1, 16), st.integers(1, 16), st.integers(1, 8192))
@@ -137,7 +174,9 @@ def test_weights_fit_by_each_manuals_formula(height: int, width: int, channels: 
     depths = {"zcu102": area * -(-channels // 16), "vek280": area * -(-channels // 32) * 8 + 4}
     depths["vck190"] = area * -(-channels // 16) * 2
     most = {"zcu102": 2048, "vek280": 65528, "vck190": 8192}
-    assert {n: conv_weight_bank(op, DPUS[n]) is None for n in most} == {n: depths[n] <= most[n] for n in most}
+    assert {n: conv_weight_bank(op, DPUS[n]) is None for n in most} == {
+        n: depths[n] <= most[n] for n in most
+    }
     assert (conv_area(op, DPUS["vek280"]) is None) == (256 * area <= 13760)
 
 
@@ -145,7 +184,9 @@ def test_weights_fit_by_each_manuals_formula(height: int, width: int, channels: 
 def test_every_text_names_the_boards_own_dpu(name: str) -> None:
     own = next(kind for kind, boards in KINDS.items() if name in boards)
     rules: list[Callable[..., object]] = [*all_rules(), *REMARKS]
-    texts = {rule_name(rule): rule_text(rule, DPUS[name]) for rule in rules if applies(rule, DPUS[name])}
+    texts = {
+        rule_name(rule): rule_text(rule, DPUS[name]) for rule in rules if applies(rule, DPUS[name])
+    }
     assert {kind for text in texts.values() for kind in re.findall(r"DPUC\w*8G", text)} == {own}
     assert not [text for text in texts.values() if "{" in text or "(" not in text]
 
@@ -169,7 +210,9 @@ def test_a_batch_has_an_image_for_each_batch_handler_of_each_core() -> None:
 @pytest.mark.parametrize("size", load_target("zcu102").configurations)
 @pytest.mark.parametrize("name", ZYNQ)
 def test_a_smaller_dpu_has_a_smaller_array_and_smaller_banks(name: str, size: str) -> None:
-    """PG338: the name is the operations of a cycle; banks of the width of the channels, 2048 deep."""
+    """PG338: the name is the operations of a cycle; banks of the width of the
+    channels, 2048 deep.
+    """
     dpu = load_dpu(name, size)
     clock_hz = load_target(name).value("array", "pl_clock_hz")
     lanes = dpu.input_parallel
@@ -185,12 +228,16 @@ def test_a_smaller_dpu_has_a_smaller_array_and_smaller_banks(name: str, size: st
 @pytest.mark.parametrize("variant", shipped_names())
 def test_the_shipped_files_run_whole_on_every_board(variant: str) -> None:
     network = network_of(load_onnx(shipped_pair(variant)[1]), 128)
-    assert {name: place(network, dpu).dpu_subgraphs for name, dpu in DPUS.items()} == dict.fromkeys(DPUS, 1)
+    assert {name: place(network, dpu).dpu_subgraphs for name, dpu in DPUS.items()} == dict.fromkeys(
+        DPUS, 1
+    )
     assert [node for dpu in DPUS.values() for node in place(network, dpu).failed] == []
 
 
 def test_every_board_has_the_shifts_of_the_quantiser() -> None:
-    assert {name: target_shifts(dpu.target) for name, dpu in DPUS.items()} == dict.fromkeys(DPUS, SHIFTS)
+    assert {name: target_shifts(dpu.target) for name, dpu in DPUS.items()} == dict.fromkeys(
+        DPUS, SHIFTS
+    )
 
 
 def test_power_that_nobody_published_is_unavailable_and_so_is_what_follows() -> None:
@@ -210,4 +257,6 @@ def test_pixels_become_channels_behind_a_convolution(tmp_path: Path) -> None:
     for name, dpu in DPUS.items():
         assert between_convs(tmp_path, unshuffled, dpu) == []
         assert between_convs(tmp_path, behind, dpu) == ["shuffle place"]
-        assert between_convs(tmp_path, deep, dpu) == ([] if name == "vek280" else ["shuffle channels"])
+        assert between_convs(tmp_path, deep, dpu) == (
+            [] if name == "vek280" else ["shuffle channels"]
+        )

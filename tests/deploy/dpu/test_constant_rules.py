@@ -1,4 +1,6 @@
-"""The constants of integer kernels: whose int32 bias the DPU can hold, and who reads a tensor as it was written."""
+"""The constants of integer kernels: whose int32 bias the DPU can hold, and who reads a tensor as it
+was written.
+"""
 
 from functools import cache
 from pathlib import Path
@@ -31,9 +33,13 @@ HALF = Scale((0.5,), (0,), "int8")
 
 
 def rules(model: onnx.ModelProto) -> set[str]:
-    """Broken by the nodes themselves: what a file says of its integers is taken out, as of another tool."""
+    """Broken by the nodes themselves: what a file says of its integers is taken out, as of another
+    tool.
+    """
     del model.metadata_props[:]
-    return {broken.rule for node in place(network_of(model, 64), DPU).nodes for broken in node.broken}
+    return {
+        broken.rule for node in place(network_of(model, 64), DPU).nodes for broken in node.broken
+    }
 
 
 @cache
@@ -56,11 +62,16 @@ def own_file() -> onnx.ModelProto:
 def kept(values: list[int]) -> bool:
     bias = {"bias": np.array(values, np.int32)}
     scales = dict.fromkeys(("input 0", "weight", "output"), HALF)
-    op = Operation("op", "QLinearConv", "conv", ("in",), ("out",), integer=True, scales=scales, constants=bias)
+    op = Operation(
+        "op", "QLinearConv", "conv", ("in",), ("out",), integer=True, scales=scales, constants=bias
+    )
     return number_rules.int32_bias(op, DPU) is None
 
 
-@given(st.one_of(st.lists(st.integers(-128, 127)), st.lists(st.integers(-300, 300))), st.integers(0, 18))
+@given(
+    st.one_of(st.lists(st.integers(-128, 127)), st.lists(st.integers(-300, 300))),
+    st.integers(0, 18),
+)
 def test_a_bias_passes_where_some_shift_makes_it_int8(values: list[int], shift: int) -> None:
     values = [value << shift for value in values]
     shifts = [k for k in range(17) if all(v % 2**k == 0 and -128 <= v >> k <= 127 for v in values)]
@@ -77,7 +88,9 @@ def test_a_bias_passes_where_some_shift_makes_it_int8(values: list[int], shift: 
         (np.random.default_rng(0).integers(-(2**30), 2**30, 4).tolist(), {"int32 bias"}),
     ],
 )
-def test_the_bias_of_an_integer_kernel_is_looked_at(tmp_path: Path, bias: list[int], broken: set[str]) -> None:
+def test_the_bias_of_an_integer_kernel_is_looked_at(
+    tmp_path: Path, bias: list[int], broken: set[str]
+) -> None:
     s = IntegerSketch()
     inner = s.qconv(s.quantised("image"), (4, 1, 3, 3), bias=np.array(bias, np.int32))
     path = s.save(tmp_path / "b.onnx", s.node("DequantizeLinear", inner, *s.numbers))
@@ -111,13 +124,23 @@ def test_a_bias_with_one_more_on_a_value_is_refused() -> None:
 
 @pytest.mark.parametrize(
     ("op_type", "place"),
-    [("QLinearConv", 1), ("QLinearConv", 2), ("QLinearAdd", 1), ("QLinearAdd", 4), ("DequantizeLinear", 1)],
+    [
+        ("QLinearConv", 1),
+        ("QLinearConv", 2),
+        ("QLinearAdd", 1),
+        ("QLinearAdd", 4),
+        ("DequantizeLinear", 1),
+    ],
 )
-def test_who_reads_a_tensor_otherwise_than_it_was_written_is_refused(op_type: str, place: int) -> None:
+def test_who_reads_a_tensor_otherwise_than_it_was_written_is_refused(
+    op_type: str, place: int
+) -> None:
     """The last node of a kind, with 4 times the scale at a place, or a zero point one less."""
     model = own_file()
     node = [n for n in model.graph.node if n.op_type == op_type][-1]
-    value = numpy_helper.to_array(next(t for t in model.graph.initializer if t.name == node.input[place]))
+    value = numpy_helper.to_array(
+        next(t for t in model.graph.initializer if t.name == node.input[place])
+    )
     spoilt = value * 4 if value.dtype == np.float32 else value - 1
     model.graph.initializer.append(numpy_helper.from_array(spoilt.astype(value.dtype), "spoilt"))
     node.input[place] = "spoilt"

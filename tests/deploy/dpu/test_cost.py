@@ -30,7 +30,9 @@ def papers_prediction(papers: Path) -> Prediction:
 
 
 def test_the_papers_network(papers_prediction: Prediction) -> None:
-    """35 convolutions and 17 adds; every map of 26.2 MB goes out and in, and each add loads two and stores one."""
+    """35 convolutions and 17 adds; every map of 26.2 MB goes out and in, and each add loads two and
+    stores one.
+    """
     assert papers_prediction.operations == pytest.approx(997.5e9, rel=1e-3)
     wide = 64 * 640 * 640
     image = 640 * 640
@@ -47,7 +49,9 @@ def test_the_interval_holds_the_published_figure(papers_prediction: Prediction) 
 @pytest.mark.parametrize("fps", [PAPER_FPS, 42.0, 98965.0])
 def test_no_constant_is_the_published_figure(fps: float) -> None:
     """What the model is compared with must not be in it."""
-    constants = [c for table in ("cost", "array", "memory") for c in DPU.target.tables[table].values()]
+    constants = [
+        c for table in ("cost", "array", "memory") for c in DPU.target.tables[table].values()
+    ]
     assert not [c for c in constants if math.isclose(c.low, fps) or math.isclose(c.high, fps)]
 
 
@@ -62,14 +66,17 @@ def test_layers_sum_to_the_batch(tmp_path: Path, configuration: str) -> None:
 
 def test_the_three_encodings_cost_the_same(tmp_path: Path) -> None:
     makers = (float_convbeers, integer_convbeers, board_convbeers)
-    costs = [predict_file(make(tmp_path / f"{k}.onnx", 2, 32), DPU, 192) for k, make in enumerate(makers)]
+    costs = [
+        predict_file(make(tmp_path / f"{k}.onnx", 2, 32), DPU, 192) for k, make in enumerate(makers)
+    ]
     assert len({(c.batch_time_s, c.operations, c.streamed_bytes) for c in costs}) == 1
 
 
 def test_maps_that_fit_the_banks_do_not_stream(tmp_path: Path) -> None:
     """64 channels of 128 x 128 are exactly 1 MiB; one pixel more streams.
 
-    Even so three operations read the head's result: it is written once and read by a convolution and two adds.
+    Even so three operations read the head's result: it is written once and read by a convolution
+    and two adds.
     """
     path = float_convbeers(tmp_path / "f.onnx", 1, 64)
     assert predict_file(path, DPU, 128).streamed_bytes == 2 * 128 * 128 + 4 * 64 * 128 * 128
@@ -78,13 +85,17 @@ def test_maps_that_fit_the_banks_do_not_stream(tmp_path: Path) -> None:
 
 def test_unused_channels_take_time_all_the_same(tmp_path: Path) -> None:
     """20 channels into 20 take the array as long as 32 into 32."""
-    narrow, full = (predict_file(float_convbeers(tmp_path / f"{n}.onnx", 1, n), DPU, 96) for n in (20, 32))
+    narrow, full = (
+        predict_file(float_convbeers(tmp_path / f"{n}.onnx", 1, n), DPU, 96) for n in (20, 32)
+    )
     assert narrow.layers[1].work.array_use == pytest.approx(20 * 20 / (32 * 32))
     assert full.layers[1].work.array_use == 1
     assert narrow.layers[1].compute_s == pytest.approx(full.layers[1].compute_s)
 
 
-@pytest.mark.parametrize(("board", "rows", "columns"), [("vck190", 8, 4), ("zcu102", 8, 1), ("vek280", 4, 8)])
+@pytest.mark.parametrize(
+    ("board", "rows", "columns"), [("vck190", 8, 4), ("zcu102", 8, 1), ("vek280", 4, 8)]
+)
 def test_rows_and_columns_that_do_not_fill_the_array_take_time_all_the_same(
     tmp_path: Path, board: str, rows: int, columns: int
 ) -> None:
@@ -97,9 +108,15 @@ def test_rows_and_columns_that_do_not_fill_the_array_take_time_all_the_same(
 @pytest.mark.parametrize(
     ("board", "taken_in", "given_out"), [("vck190", 32, 32), ("zcu102", 16, 16), ("vek280", 32, 32)]
 )
-def test_first_layers_gather_their_window(tmp_path: Path, board: str, taken_in: int, given_out: int) -> None:
+def test_first_layers_gather_their_window(
+    tmp_path: Path, board: str, taken_in: int, given_out: int
+) -> None:
     """One channel by three columns fill what is taken in at a time, not three of them."""
-    head = predict_file(float_convbeers(tmp_path / "f.onnx", 1, 32), load_dpu(board), 96).layers[0].work
+    head = (
+        predict_file(float_convbeers(tmp_path / "f.onnx", 1, 32), load_dpu(board), 96)
+        .layers[0]
+        .work
+    )
     assert given_out == load_dpu(board).output_parallel
     assert head.array_operations == 2 * 3 * taken_in * 32 * 96 * 96
 
@@ -130,12 +147,16 @@ def test_what_three_branches_read_passes_through_memory(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("channels", [(16, 48), (64, 100), (200, 3)])
-def test_what_a_concat_joins_is_stored_in_bursts_and_read_back(tmp_path: Path, channels: tuple[int, int]) -> None:
+def test_what_a_concat_joins_is_stored_in_bursts_and_read_back(
+    tmp_path: Path, channels: tuple[int, int]
+) -> None:
     s = Sketch(8)
     joined = s.node("Concat", *(s.conv("image", (count, 8, 3, 3)) for count in channels), axis=1)
     works = works_of(s, s.conv(joined, (8, sum(channels), 1, 1)), tmp_path / "n.onnx", 33)
     stored = [BURST_BYTES * math.ceil(count / BURST_BYTES) for count in channels]
-    assert [work.store_map_bytes for work in works] == [33 * 33 * count for count in (*stored, 0, 8)]
+    assert [work.store_map_bytes for work in works] == [
+        33 * 33 * count for count in (*stored, 0, 8)
+    ]
     assert works[-1].load_map_bytes == 33 * 33 * sum(channels)
 
 
@@ -159,7 +180,9 @@ def test_an_add_of_maps_beyond_the_chip_is_a_pass_of_its_own(
 
 @pytest.mark.parametrize("block", [2, 4])
 def test_a_pixel_shuffle_costs_the_bursts_of_its_pieces(tmp_path: Path, block: int) -> None:
-    """Three channels of a pixel in a burst of their own; at the network's end it is left to the host."""
+    """Three channels of a pixel in a burst of their own; at the network's end it is left to the
+    host.
+    """
     stored = {}
     for place_in, ends in (("end", True), ("middle", False)):
         s = Sketch(3)
@@ -176,7 +199,9 @@ def test_a_transposed_convolution_runs_over_the_zeros_between_its_pixels(tmp_pat
     plain = Sketch(32)
     enlarged = grown.node("ConvTranspose", "image", grown.weight(32, 32, 2, 2), strides=[2, 2])
     (work,) = works_of(grown, enlarged, tmp_path / "n.onnx", 64)
-    (other,) = works_of(plain, plain.conv("image", (32, 32, 2, 2), pads=[0, 0, 1, 1]), tmp_path / "p.onnx", 128)
+    (other,) = works_of(
+        plain, plain.conv("image", (32, 32, 2, 2), pads=[0, 0, 1, 1]), tmp_path / "p.onnx", 128
+    )
     assert work.array_operations == other.array_operations == 4 * work.operations
 
 
@@ -189,12 +214,20 @@ def test_each_layer_names_its_bound(papers_prediction: Prediction) -> None:
 
 
 def test_the_interval_is_that_of_the_regime(tmp_path: Path) -> None:
-    """3 blocks of 32 at 128 x 128 have small maps, at 640 x 640 large ones; 1024 x 1024 lies beyond all fitted."""
+    """3 blocks of 32 at 128 x 128 have small maps, at 640 x 640 large ones; 1024 x 1024 lies beyond
+    all fitted.
+    """
     path = float_convbeers(tmp_path / "f.onnx", 3, 32)
     small, large, outside = (predict_file(path, DPU, side) for side in (128, 640, 1024))
-    for prediction, name in ((small, "width_small_maps"), (large, "width_large_maps"), (outside, "width_outside")):
+    for prediction, name in (
+        (small, "width_small_maps"),
+        (large, "width_large_maps"),
+        (outside, "width_outside"),
+    ):
         spread = math.exp(DPU.value("cost", name))
-        assert prediction.fps_interval == pytest.approx((prediction.fps / spread, prediction.fps * spread))
+        assert prediction.fps_interval == pytest.approx(
+            (prediction.fps / spread, prediction.fps * spread)
+        )
     assert (small.outside, large.outside) == ((), ())
     assert any("largest map" in word for word in outside.outside)
     assert DPU.value("cost", "width_outside") >= DPU.value("cost", "width_large_maps")
@@ -203,7 +236,9 @@ def test_the_interval_is_that_of_the_regime(tmp_path: Path) -> None:
 def test_a_host_that_is_slower_sets_the_rate(tmp_path: Path) -> None:
     """A network of one small layer: the host cannot bring its images fast enough."""
     sketch = Sketch(8)
-    prediction = predict_file(sketch.save(tmp_path / "s.onnx", sketch.conv("image", (1, 8, 1, 1))), DPU, 640)
+    prediction = predict_file(
+        sketch.save(tmp_path / "s.onnx", sketch.conv("image", (1, 8, 1, 1))), DPU, 640
+    )
     dpu_s = prediction.batch_time_s / prediction.batch
     assert prediction.host_s > dpu_s
     assert prediction.regime == "host"
@@ -241,7 +276,9 @@ def test_regimes() -> None:
 
 
 def test_latency_is_that_of_one_core_and_one_thread(tmp_path: Path) -> None:
-    """Cores share the memory and the host: alone a core and a thread are no slower than among others."""
+    """Cores share the memory and the host: alone a core and a thread are no slower than among
+    others.
+    """
     path = float_convbeers(tmp_path / "n.onnx", 2, 16)
     three = load_dpu("zcu102")
     one = load_dpu("kv260")
@@ -250,7 +287,9 @@ def test_latency_is_that_of_one_core_and_one_thread(tmp_path: Path) -> None:
     assert (three.handlers, one.handlers) == (1, 1)
     assert found.alone_s <= found.batch_time_s
     assert single.alone_s == pytest.approx(single.batch_time_s)
-    assert found.latency_s == pytest.approx(found.alone_s + found.host_s * three.whole("cpu", "cores"))
+    assert found.latency_s == pytest.approx(
+        found.alone_s + found.host_s * three.whole("cpu", "cores")
+    )
     assert three.handlers / found.latency_s < found.fps
 
 

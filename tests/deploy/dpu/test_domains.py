@@ -1,4 +1,6 @@
-"""An operator of another domain, or of a function of the file, is refused whatever its name and place."""
+"""An operator of another domain, or of a function of the file, is refused whatever its name and
+place.
+"""
 
 from pathlib import Path
 
@@ -44,7 +46,9 @@ def network(path: Path, place: str, domain: str) -> Path:
     return path
 
 
-@given(place=st.sampled_from(PLACES), domain=st.sampled_from(DOMAINS), board=st.sampled_from(BOARDS))
+@given(
+    place=st.sampled_from(PLACES), domain=st.sampled_from(DOMAINS), board=st.sampled_from(BOARDS)
+)
 def test_a_foreign_domain_is_not_legal_and_not_run(
     tmp_path_factory: pytest.TempPathFactory, place: str, domain: str, board: str
 ) -> None:
@@ -93,10 +97,16 @@ def test_a_function_of_the_file_is_no_operator_of_onnx(domain: str, tmp_path: Pa
 def test_a_constant_of_another_domain_is_not_dropped(tmp_path: Path) -> None:
     sketch = Sketch(8)
     half = helper.make_node(
-        "Constant", [], ["half"], domain="my.ops", value=numpy_helper.from_array(np.array(0.5, np.float32))
+        "Constant",
+        [],
+        ["half"],
+        domain="my.ops",
+        value=numpy_helper.from_array(np.array(0.5, np.float32)),
     )
     sketch.nodes.append(half)
-    path = sketch.save(tmp_path / "a.onnx", sketch.conv(sketch.node("Mul", sketch.conv("image"), "half")))
+    path = sketch.save(
+        tmp_path / "a.onnx", sketch.conv(sketch.node("Mul", sketch.conv("image"), "half"))
+    )
     model = onnx.load_model(path)
     model.opset_import.append(helper.make_opsetid("my.ops", 1))
     onnx.save_model(model, path)
@@ -121,7 +131,9 @@ def test_onnxruntimes_optimised_file_names_the_remedy(tmp_path: Path) -> None:
     assert "give the file that onnxruntime read" in refused_by_load(path)
 
 
-@given(st.sampled_from(sorted(INTEGER_OPERATORS)), st.sampled_from(["", "ai.onnx", "com.microsoft"]))
+@given(
+    st.sampled_from(sorted(INTEGER_OPERATORS)), st.sampled_from(["", "ai.onnx", "com.microsoft"])
+)
 def test_onnxruntimes_operators_on_integers_keep_their_names(op_type: str, domain: str) -> None:
     node = helper.make_node(op_type, ["x"], ["y"], domain=domain)
     assert operator_name(node) == op_type

@@ -26,14 +26,21 @@ def shape(op: Operation) -> tuple[tuple[int, int], tuple[int, int]]:
 def test_a_layer_as_large_as_its_map_is_also_one_pixel_of_all_its_values(tmp_path: Path) -> None:
     op = placed(tmp_path / "n.onnx", (10, 8, 20, 20), 20).op
     assert fully_connected(op)
-    assert [shape(form) for form in forms(op, DPU)][1:] == [((20, 20), (8, 10)), ((1, 1), (3200, 10))]
+    assert [shape(form) for form in forms(op, DPU)][1:] == [
+        ((20, 20), (8, 10)),
+        ((1, 1), (3200, 10)),
+    ]
 
 
 @pytest.mark.parametrize(
     ("weight", "tile_px", "rules"),
     [
         ((10, 8, 20, 20), 20, set()),  # larger than any kernel, 3200 values
-        ((10, 8, 20, 20), 21, {"conv kernel", "conv window"}),  # the same kernel, but a result of four pixels
+        (
+            (10, 8, 20, 20),
+            21,
+            {"conv kernel", "conv window"},
+        ),  # the same kernel, but a result of four pixels
         ((10, 11, 20, 20), 20, {"conv kernel", "conv window"}),  # 4400 values
         ((14472, 16, 1, 1), 1, set()),  # in four parts
         ((14472, 16, 1, 1), 2, {"conv channels"}),

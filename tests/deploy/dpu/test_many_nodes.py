@@ -1,4 +1,6 @@
-"""Reading and checking takes a number of steps that is linear in the number of nodes, whatever way it goes."""
+"""Reading and checking takes a number of steps that is linear in the number of nodes, whatever way
+it goes.
+"""
 
 import sys
 from collections.abc import Callable
@@ -17,11 +19,15 @@ TraceFunction = Callable[[FrameType, str, Any], Any]
 FEWEST = 60
 """Nodes: the number is doubled twice."""
 QUADRATIC = 2.5
-"""A linear step takes twice as many more for the second doubling as for the first, a quadratic one four times."""
+"""A linear step takes twice as many more for the second doubling as for the first, a quadratic one
+four times.
+"""
 
 
 def steps(model: onnx.ModelProto, path: Path) -> int:
-    """Count the instructions of Python that this package carries out; time would depend on the machine."""
+    """Count the instructions of Python that this package carries out; time would depend on the
+    machine.
+    """
     onnx.save_model(model, path)
     count = 0
 
@@ -49,5 +55,7 @@ def steps(model: onnx.ModelProto, path: Path) -> int:
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_steps_grow_with_the_nodes(kind: Callable[[Chain], None], tmp_path: Path) -> None:
     steps(network(kind, FEWEST), tmp_path / "a.onnx")  # what is read once a process
-    few, more, most = (steps(network(kind, FEWEST * times), tmp_path / "a.onnx") for times in (1, 2, 4))
+    few, more, most = (
+        steps(network(kind, FEWEST * times), tmp_path / "a.onnx") for times in (1, 2, 4)
+    )
     assert most - more < QUADRATIC * (more - few)

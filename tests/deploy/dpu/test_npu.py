@@ -1,4 +1,6 @@
-"""A board with an NPU: AMD's table and the format decide, notes say the rest, and nothing is predicted."""
+"""A board with an NPU: AMD's table and the format decide, notes say the rest, and nothing is
+predicted.
+"""
 
 import json
 from collections.abc import Callable
@@ -64,7 +66,8 @@ def faults(found: Checked) -> set[str]:
     return broken | {each.name for each in found.checks[1:] if not each.passed}
 
 
-# What DPUs must keep too is in test_number_graphs.py; that it applies here is told in docs/reference/operators.md.
+# What DPUs must keep too is in test_number_graphs.py; that it applies here is told in
+# docs/reference/operators.md.
 REFUSED: dict[str, tuple[Draw, Draw]] = {
     "int8 alone": (activated("Relu", 128, np.uint8), activated("Relu")),
     "int8 operator": (activated("PRelu"), activated("LeakyRelu")),
@@ -74,26 +77,45 @@ REFUSED: dict[str, tuple[Draw, Draw]] = {
 
 @pytest.mark.parametrize("rule", REFUSED)
 def test_each_case_is_refused_for_its_rule_and_passes_without_it(rule: str, tmp_path: Path) -> None:
-    wrong, right = (bd.check(written(tmp_path / "n.onnx", draw), "vek385") for draw in REFUSED[rule])
+    wrong, right = (
+        bd.check(written(tmp_path / "n.onnx", draw), "vek385") for draw in REFUSED[rule]
+    )
     assert (faults(wrong), bool(wrong)) == ({rule}, False)
     assert (faults(right), bool(right)) == (set(), True)
 
 
 def test_an_open_size_and_a_new_opset_are_refused(tmp_path: Path) -> None:
-    assert faults(bd.check(written(tmp_path / "n.onnx", conv(), side=None), "vek385")) == {"sizes left open"}
+    assert faults(bd.check(written(tmp_path / "n.onnx", conv(), side=None), "vek385")) == {
+        "sizes left open"
+    }
     assert bd.check(written(tmp_path / "n.onnx", conv(), opset=20), "vek385")
-    said = done("check", written(tmp_path / "n.onnx", conv(), opset=21), "--target", "vek385", code=1)
+    said = done(
+        "check", written(tmp_path / "n.onnx", conv(), opset=21), "--target", "vek385", code=1
+    )
     assert "check FAILED: opset 21 (Xilinx" in said.splitlines()[-1]
 
 
 def mixed(s: QdqSketch, x: str) -> str:
-    """A depthwise convolution, one left in float, and an operator that the table as read does not have."""
-    deep = s.pair(s.node("Conv", x, s.stored(np.ones((4, 1, 3, 3), np.int8)), group=4, pads=[1] * 4))
-    return s.qdq_conv(s.pair(s.node("Sub", s.pair(s.node("Conv", deep, s.weight(4, 4, 1, 1))), deep)))
+    """A depthwise convolution, one left in float, and an operator that the table as read does not
+    have.
+    """
+    deep = s.pair(
+        s.node("Conv", x, s.stored(np.ones((4, 1, 3, 3), np.int8)), group=4, pads=[1] * 4)
+    )
+    return s.qdq_conv(
+        s.pair(s.node("Sub", s.pair(s.node("Conv", deep, s.weight(4, 4, 1, 1))), deep))
+    )
 
 
 def test_what_is_legal_but_worth_knowing_is_a_note(tmp_path: Path) -> None:
-    said = done("check", written(tmp_path / "n.onnx", mixed), "--target", "vek385", "--json", tmp_path / "o.json")
+    said = done(
+        "check",
+        written(tmp_path / "n.onnx", mixed),
+        "--target",
+        "vek385",
+        "--json",
+        tmp_path / "o.json",
+    )
     rows = valid(tmp_path / "o.json")["rows"]
     devices = {row["text"]["device"] for row in rows if row["table"] == "nodes"}
     by_default = "float, BF16 by the compiler's default"
@@ -105,7 +127,9 @@ def test_what_is_legal_but_worth_knowing_is_a_note(tmp_path: Path) -> None:
 
 
 def test_no_limit_of_a_dpu_is_applied(tmp_path: Path) -> None:
-    """Channels that every DPU refuses, and a kernel as large as its map, which would be asked for the array."""
+    """Channels that every DPU refuses, and a kernel as large as its map, which would be asked for
+    the array.
+    """
     s = QdqSketch(4)
     narrow = s.conv(s.conv("image", (9000, 4, 1, 1)), (4, 9000, 1, 1))
     path = s.save(tmp_path / "n.onnx", s.conv(narrow, (4, 4, 31, 31), pads=[0] * 4))
@@ -114,13 +138,19 @@ def test_no_limit_of_a_dpu_is_applied(tmp_path: Path) -> None:
 
 
 def test_nothing_is_predicted_and_what_is_published_is_quoted(tmp_path: Path) -> None:
-    assert "a target with a DPU" in refused("tradeoff", "--target", "vek385", "--out", tmp_path / "study")
-    assert "a board with a DPU" in refused("check", "--target", "vek385", "--picture", tmp_path / "p.svg")
+    assert "a target with a DPU" in refused(
+        "tradeoff", "--target", "vek385", "--out", tmp_path / "study"
+    )
+    assert "a board with a DPU" in refused(
+        "check", "--target", "vek385", "--picture", tmp_path / "p.svg"
+    )
     assert "none beside vek385" in refused("check", "--target", "vek385", "--dpu", "C32B3")
     done("bench", "convbeers-xs", "--target", "vek385", "--json", tmp_path / "o.json")
     own, *quoted = valid(tmp_path / "o.json")["rows"]
     assert {figure["mode"] for figure in own["figures"].values()} == {"unavailable"}
-    found = [(figure["mode"], figure["value"]) for row in quoted for figure in row["figures"].values()]
+    found = [
+        (figure["mode"], figure["value"]) for row in quoted for figure in row["figures"].values()
+    ]
     assert found == [("published", value) for value in (10.69, 23.363, 1.56, 265.49)]
 
 
@@ -128,7 +158,16 @@ def test_quantize_writes_vint8_and_what_the_compiler_is_told(tmp_path: Path) -> 
     network, samples, core = (tmp_path / name for name in ("f.onnx", "s.npy", "core.onnx"))
     onnx.save(to_onnx(plain(Variant(blocks=1, features=4), seed=3), {}), network)
     np.save(samples, np.random.default_rng(0).random((4, 1, 48, 48), np.float32))
-    words = ["quantize", network, "--samples", samples, "--out", tmp_path / "i.onnx", "--target", "vek385"]
+    words = [
+        "quantize",
+        network,
+        "--samples",
+        samples,
+        "--out",
+        tmp_path / "i.onnx",
+        "--target",
+        "vek385",
+    ]
     assert "--tile" in refused(*words, "--board-file", core)
     assert "--board-file" in refused(*words, "--tile", 33)
     done(*words, "--board-file", core, "--tile", 33)
@@ -140,7 +179,15 @@ def test_quantize_writes_vint8_and_what_the_compiler_is_told(tmp_path: Path) -> 
 
 
 def test_export_writes_vint8_of_a_shipped_network(tmp_path: Path) -> None:
-    words = ["export", "--network", "convbeers-half-xs-int8", "--out", tmp_path / "i.onnx", "--target", "vek385"]
+    words = [
+        "export",
+        "--network",
+        "convbeers-half-xs-int8",
+        "--out",
+        tmp_path / "i.onnx",
+        "--target",
+        "vek385",
+    ]
     core = ["--board-file", tmp_path / "core.onnx"]
     assert "--board-file" in refused(*words)
     assert "--tile" in refused(*words, *core)

@@ -1,4 +1,6 @@
-"""Each rule of numbers with a small QDQ file that breaks it alone, and the same file with the remedy followed."""
+"""Each rule of numbers with a small QDQ file that breaks it alone, and the same file with the
+remedy followed.
+"""
 
 import math
 from collections.abc import Callable
@@ -25,7 +27,9 @@ def conv(**numbers: object) -> Draw:
 
 
 def added(one: float, other: float, output: float) -> Draw:
-    return lambda s, x: s.pair(s.node("Add", s.qdq_conv(x, output=one), s.qdq_conv(x, output=other)), output)
+    return lambda s, x: s.pair(
+        s.node("Add", s.qdq_conv(x, output=one), s.qdq_conv(x, output=other)), output
+    )
 
 
 def pooled(output: float) -> Draw:
@@ -68,7 +72,10 @@ CASES: dict[str, tuple[Draw, Draw]] = {
     "shift write": (added(7, 7, 23), added(7, 7, 22)),
     "shift write: to the coarser": (added(7, 7, -9), added(7, 7, -8)),
     "same scale": (pooled(6), pooled(7)),
-    "power of two: of an addend": (combined("Add", np.int8, -math.log2(0.01)), combined("Add", np.int8)),
+    "power of two: of an addend": (
+        combined("Add", np.int8, -math.log2(0.01)),
+        combined("Add", np.int8),
+    ),
     "shift read: of an addend": (combined("Add", np.int8, 23), combined("Add", np.int8, 22)),
     "int8 constants: weights in float": (conv(weight_kind=np.float32), conv()),
     "int8 constants: weights of int32": (conv(weight_kind=np.int32), conv()),
@@ -91,15 +98,22 @@ def remedies(path: Path, draw: Draw) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_each_rule_refuses_its_file_alone_and_following_the_remedy_passes(tmp_path: Path, case: str) -> None:
-    (found, sound), rule = (remedies(tmp_path / "n.onnx", draw) for draw in CASES[case]), case.split(":")[0]
+def test_each_rule_refuses_its_file_alone_and_following_the_remedy_passes(
+    tmp_path: Path, case: str
+) -> None:
+    (found, sound), rule = (
+        (remedies(tmp_path / "n.onnx", draw) for draw in CASES[case]),
+        case.split(":")[0],
+    )
     assert list(found) == [rule]
     assert (MOVE if rule.startswith("shift") else AGAIN) in found[rule]
     assert sound == {}
 
 
 def test_two_nodes_may_read_the_same_constant_at_two_scales(tmp_path: Path) -> None:
-    """As an optimiser leaves them that stores equal bytes once: each has its own copy on the board."""
+    """As an optimiser leaves them that stores equal bytes once: each has its
+    own copy on the board.
+    """
 
     def draw(s: QdqSketch, x: str) -> str:
         weight = s.constant(np.ones((4, 4, 3, 3), np.int8))
@@ -114,14 +128,18 @@ def test_two_nodes_may_read_the_same_constant_at_two_scales(tmp_path: Path) -> N
 
 def test_weights_that_other_nodes_compute_are_refused(tmp_path: Path) -> None:
     def draw(s: QdqSketch, x: str) -> str:
-        return s.pair(s.node("Conv", x, s.pair(s.weight(4, 4, 3, 3)), kernel_shape=[3, 3], pads=[1] * 4))
+        return s.pair(
+            s.node("Conv", x, s.pair(s.weight(4, 4, 3, 3)), kernel_shape=[3, 3], pads=[1] * 4)
+        )
 
     assert AGAIN in remedies(tmp_path / "n.onnx", draw)["int8 constants"]
 
 
 def test_only_a_bias_may_be_int32() -> None:
     for role, kept in (("bias", True), ("input 0", False), ("output", False)):
-        op = Operation("op", "Conv", "conv", ("in",), ("out",), scales={role: Scale((0.5,), (0,), "int32")})
+        op = Operation(
+            "op", "Conv", "conv", ("in",), ("out",), scales={role: Scale((0.5,), (0,), "int32")}
+        )
         assert (number_rules.symmetric(op, DPU) is None) == kept
 
 

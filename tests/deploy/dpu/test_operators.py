@@ -38,20 +38,32 @@ CASES: dict[str, tuple[Draw, Draw]] = {
         conv(8, 8, 3, 1, dilations=[512, 1], pads=[513, 0, 513, 0]),
     ),
     "conv groups": (conv(8, 4, 3, 3, group=2), conv(8, 8, 3, 3)),
-    "depthwise kernel": (conv(8, 1, 257, 1, group=8, pads=[15, 0, 15, 0]), conv(8, 1, 255, 1, group=8, pads=[0] * 4)),
+    "depthwise kernel": (
+        conv(8, 1, 257, 1, group=8, pads=[15, 0, 15, 0]),
+        conv(8, 1, 255, 1, group=8, pads=[0] * 4),
+    ),
     "depthwise stride": (conv(8, 1, 3, 3, group=8, strides=[257, 1]), conv(8, 1, 3, 3, group=8)),
     "depthwise padding": (
         conv(8, 1, 3, 3, group=8, pads=[16, 1, 1, 1]),
         conv(8, 1, 3, 3, group=8, pads=[15, 1, 9, 9]),
     ),
-    "transposed kernel": (transposed(8, 8, 2, 2, strides=[3, 3]), transposed(8, 8, 4, 4, strides=[2, 2])),
+    "transposed kernel": (
+        transposed(8, 8, 2, 2, strides=[3, 3]),
+        transposed(8, 8, 4, 4, strides=[2, 2]),
+    ),
     "transposed output padding": (
         transposed(8, 8, 3, 3, strides=[2, 2], output_padding=[1, 1]),
         transposed(8, 8, 4, 4, strides=[2, 2], pads=[1, 1, 1, 1]),
     ),
-    "transposed padding": (transposed(8, 8, 2, 2, pads=[3, 0, 0, 0]), transposed(8, 8, 2, 2, pads=[2, 0, 0, 0])),
+    "transposed padding": (
+        transposed(8, 8, 2, 2, pads=[3, 0, 0, 0]),
+        transposed(8, 8, 2, 2, pads=[2, 0, 0, 0]),
+    ),
     "pool kernel": (node("MaxPool", kernel_shape=[257, 1]), node("MaxPool", kernel_shape=[17, 1])),
-    "pool stride": (node("MaxPool", kernel_shape=[2, 2], strides=[257, 1]), node("MaxPool", kernel_shape=[2, 2])),
+    "pool stride": (
+        node("MaxPool", kernel_shape=[2, 2], strides=[257, 1]),
+        node("MaxPool", kernel_shape=[2, 2]),
+    ),
     "pool padding": (
         node("MaxPool", kernel_shape=[20, 20], pads=[16, 0, 0, 0]),
         node("MaxPool", kernel_shape=[20, 20], pads=[15, 0, 0, 0]),
@@ -61,7 +73,10 @@ CASES: dict[str, tuple[Draw, Draw]] = {
         lambda s, x: s.node("MaxPool", s.node("Relu", x), kernel_shape=[2, 2]),
     ),
     "activation of sums": (behind_sum("HardSwish"), behind_sum("Relu")),
-    "leaky relu alpha": (behind_conv("LeakyRelu", alpha=0.1), behind_conv("LeakyRelu", alpha=26 / 256)),
+    "leaky relu alpha": (
+        behind_conv("LeakyRelu", alpha=0.1),
+        behind_conv("LeakyRelu", alpha=26 / 256),
+    ),
     "mul constant": (scaled(1, 8, 3, 3), scaled(1, 8, 1, 1)),
     "pad mode": (padded("reflect"), padded("constant")),
     "resize mode": (resized(2, mode="cubic"), resized(2, mode="nearest")),
@@ -77,7 +92,13 @@ CASES: dict[str, tuple[Draw, Draw]] = {
         lambda s, x: s.node("Relu", s.conv(x)),
     ),
 }
-WIDE = {"conv channels", "conv weight bank", "depthwise channels", "transposed channels", "resize channels"}
+WIDE = {
+    "conv channels",
+    "conv weight bank",
+    "depthwise channels",
+    "transposed channels",
+    "resize channels",
+}
 WIDE |= {"elementwise channels", "shuffle channels"}
 OTHERS = {"conv area", "int8 operator", "int8 alone", "bias width"}
 """Rules of other boards: tests/deploy/dpu/test_boards.py, test_npu.py."""
@@ -90,7 +111,9 @@ def test_every_rule_has_a_case() -> None:
 
 
 @pytest.mark.parametrize("rule", CASES)
-def test_each_rule_refuses_its_case_alone_and_following_the_remedy_passes(tmp_path: Path, rule: str) -> None:
+def test_each_rule_refuses_its_case_alone_and_following_the_remedy_passes(
+    tmp_path: Path, rule: str
+) -> None:
     assert [between_convs(tmp_path, draw) for draw in CASES[rule]] == [[rule], []]
 
 
@@ -133,7 +156,9 @@ def test_a_tile_that_the_stride_does_not_divide(tmp_path: Path) -> None:
     sketch = Sketch(8)
     stream = sketch.conv("image")
     half = sketch.node("MaxPool", stream, kernel_shape=[2, 2], strides=[2, 2])
-    path = sketch.save(tmp_path / "u.onnx", sketch.conv(sketch.node("Add", stream, resized(2)(sketch, half))))
+    path = sketch.save(
+        tmp_path / "u.onnx", sketch.conv(sketch.node("Add", stream, resized(2)(sketch, half)))
+    )
     assert broken_rules(path, tile_px=21) == ["maps aligned"]
     assert broken_rules(path, tile_px=22) == []
 
@@ -148,7 +173,9 @@ def test_a_factor_for_a_whole_channel_meets_any_map(tmp_path: Path) -> None:
 
 def test_a_tile_that_the_memory_cannot_hold(tmp_path: Path) -> None:
     sketch = Sketch(1)
-    path = sketch.save(tmp_path / "m.onnx", sketch.conv(sketch.conv("image", (64, 1, 3, 3)), (1, 64, 3, 3)))
+    path = sketch.save(
+        tmp_path / "m.onnx", sketch.conv(sketch.conv("image", (64, 1, 3, 3)), (1, 64, 3, 3))
+    )
     node = place(read_network(path, 7001), DPU).nodes[0]
     assert [broken.rule for broken in node.broken] == ["map in memory"]
     allowed_px = int(7001 * float(node.broken[0].finding.remedy.split()[-4]))
@@ -173,7 +200,8 @@ def test_a_float_convolution_in_a_quantised_file_is_refused(tmp_path: Path) -> N
     sketch = IntegerSketch()
     first = sketch.qconv(sketch.quantised("image"), (4, 1, 3, 3))
     path = sketch.save(
-        tmp_path / "f.onnx", sketch.conv(sketch.node("DequantizeLinear", first, *sketch.numbers), (1, 4, 3, 3))
+        tmp_path / "f.onnx",
+        sketch.conv(sketch.node("DequantizeLinear", first, *sketch.numbers), (1, 4, 3, 3)),
     )
     assert "on integers" in broken_rules(path)
 

@@ -1,4 +1,6 @@
-"""Runs of an owner's board correct the cost model by one factor for the DPU and one for the host."""
+"""Runs of an owner's board correct the cost model by one factor for the DPU and
+one for the host.
+"""
 
 import json
 from pathlib import Path
@@ -28,7 +30,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def runs_of(folder: Path, **times_as_fast: float) -> OwnRuns:
     """A run of each network named, so many times as fast as predicted."""
     runs = [
-        {"model": f"{name}.onnx", "tile_px": 320, "fps": factor * predict_file(folder / f"{name}.onnx", DPU, 320).fps}
+        {
+            "model": f"{name}.onnx",
+            "tile_px": 320,
+            "fps": factor * predict_file(folder / f"{name}.onnx", DPU, 320).fps,
+        }
         for name, factor in times_as_fast.items()
     ]
     (folder / "board.json").write_text(json.dumps(runs))
@@ -36,11 +42,15 @@ def runs_of(folder: Path, **times_as_fast: float) -> OwnRuns:
 
 
 def test_each_part_is_corrected_by_the_runs_that_it_bounds(folder: Path) -> None:
-    """One run tells more of its network than of the board: of the logarithm, a fourth is the board's."""
+    """One run tells more of its network than of the board: of the logarithm, a fourth is the
+    board's.
+    """
     found = runs_of(folder, deep=0.5, flat=2.0)
     assert (found.dpu_factor, found.host_factor) == pytest.approx((0.5**0.25, 2.0**0.25))
     for row in found.run_rows():
-        before, after = (abs(row.figures[f"{key} is off by"].value or 0) for key in ("shipped", "corrected"))
+        before, after = (
+            abs(row.figures[f"{key} is off by"].value or 0) for key in ("shipped", "corrected")
+        )
         assert after < before
 
 
@@ -49,13 +59,17 @@ def test_more_runs_move_a_factor_further(folder: Path, count: int) -> None:
     runs_of(folder, deep=0.5)
     entry = json.loads((folder / "board.json").read_text())
     (folder / "board.json").write_text(json.dumps(count * entry))
-    assert read_own_runs(folder / "board.json", DPU).dpu_factor == pytest.approx(0.5 ** (count / (count + SCATTER)))
+    assert read_own_runs(folder / "board.json", DPU).dpu_factor == pytest.approx(
+        0.5 ** (count / (count + SCATTER))
+    )
 
 
 def test_a_part_without_runs_keeps_its_constants(folder: Path) -> None:
     found = runs_of(folder, deep=0.5)
     assert found.host_factor == 1.0
-    before, after = (predict_file(folder / "deep.onnx", dpu, 320) for dpu in (DPU, found.applied(DPU)))
+    before, after = (
+        predict_file(folder / "deep.onnx", dpu, 320) for dpu in (DPU, found.applied(DPU))
+    )
     assert after.batch_time_s == pytest.approx(2**0.25 * before.batch_time_s)
     assert after.host_s == pytest.approx(before.host_s)
     assert after.width == before.width

@@ -40,9 +40,11 @@ def test_every_node_is_drawn_in_its_devices_colour_and_says_which(tmp_path: Path
     assert devices == ["DPU", "CPU", "DPU"]
     assert labels == devices
     assert [style_of(box)["fill"] for box in boxes] == [FILLS[device] for device in devices]
-    assert [group.findtext(f"{SVG}title") for group in root.iter(f"{SVG}g") if group.get("class") == "dot"] == [
-        f"{node.op.op_type}  {node.op.name}" for node in placement.nodes
-    ]
+    assert [
+        group.findtext(f"{SVG}title")
+        for group in root.iter(f"{SVG}g")
+        if group.get("class") == "dot"
+    ] == [f"{node.op.op_type}  {node.op.name}" for node in placement.nodes]
     words = [t.text or "" for t in root.iter(f"{SVG}text")]
     assert "Sigmoid always runs on the CPU" in " ".join(words)
     assert words[0] == "a < b & c"
@@ -65,7 +67,9 @@ def test_every_word_is_seen_on_a_phone(blocks: int, tmp_path: Path) -> None:
         assert all(other - one >= 13 for one, other in pairwise(rows)), "lines below each other"
         assert float(root.get("height") or 0) > max(rows)
         for path in of_class(root, "edge", "path"):
-            assert all(float(number) >= 0 for number in re.findall(r"-?[0-9.]+", path.get("d") or ""))
+            assert all(
+                float(number) >= 0 for number in re.findall(r"-?[0-9.]+", path.get("d") or "")
+            )
     for node in broken.nodes:
         assert node.op.name in draw(broken, "net")
 
@@ -76,7 +80,9 @@ def test_edges_join_writers_to_readers(tmp_path: Path) -> None:
     reads = sum(name in written for node in placement.nodes for name in node.op.inputs)
     edges = of_class(drawn(placement), "edge", "path")
     assert len(edges) == reads
-    assert sum("C" in (edge.get("d") or "") for edge in edges) == 3  # two blocks' skips and the long one
+    assert (
+        sum("C" in (edge.get("d") or "") for edge in edges) == 3
+    )  # two blocks' skips and the long one
 
 
 def test_fills_are_light_enough_for_black_text_and_apart_in_brightness() -> None:

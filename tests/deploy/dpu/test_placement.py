@@ -6,7 +6,13 @@ from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import FLOAT_NOTE, Placement, place
 from beers_deploy.dpu.checker.remarks import remarks_on
 from beers_deploy.dpu.reading import read_network
-from tests.deploy.dpu.graphs import IntegerSketch, Sketch, board_convbeers, float_convbeers, integer_convbeers
+from tests.deploy.dpu.graphs import (
+    IntegerSketch,
+    Sketch,
+    board_convbeers,
+    float_convbeers,
+    integer_convbeers,
+)
 
 DPU = load_dpu("vck190")
 
@@ -29,7 +35,10 @@ def test_the_integer_file_has_three_parts_and_one_subgraph(tmp_path: Path) -> No
     assert set(parts[1:-2]) == {"dpu-core"}
     assert placement.dpu_subgraphs == 1
     assert not placement.failed
-    assert [(cut.size_bytes, cut.onto_dpu) for cut in placement.cuts] == [(53 * 53, True), (53 * 53, False)]
+    assert [(cut.size_bytes, cut.onto_dpu) for cut in placement.cuts] == [
+        (53 * 53, True),
+        (53 * 53, False),
+    ]
     remarks = remarks_on(placement, DPU, 53)
     assert placement.cuts[1].tensor in remarks["fix2float"]
     assert "subgraphs" not in remarks
@@ -68,7 +77,12 @@ def test_a_branch_past_the_cpu_does_not_join_what_it_parts(tmp_path: Path) -> No
 
 def test_two_heads_of_one_input_are_two_subgraphs(tmp_path: Path) -> None:
     sketch = Sketch(8)
-    assert placed(sketch.save(tmp_path / "t.onnx", sketch.conv("image"), sketch.conv("image"))).dpu_subgraphs == 2
+    assert (
+        placed(
+            sketch.save(tmp_path / "t.onnx", sketch.conv("image"), sketch.conv("image"))
+        ).dpu_subgraphs
+        == 2
+    )
 
 
 def test_scaling_in_front_is_the_hosts_but_other_operators_are_refused(tmp_path: Path) -> None:
@@ -83,11 +97,15 @@ def test_scaling_in_front_is_the_hosts_but_other_operators_are_refused(tmp_path:
     assert [node.device for node in placement.nodes] == ["CPU", "DPU"]
 
 
-def test_pixels_are_moved_to_channels_and_back_by_the_host_at_the_ends_alone(tmp_path: Path) -> None:
+def test_pixels_are_moved_to_channels_and_back_by_the_host_at_the_ends_alone(
+    tmp_path: Path,
+) -> None:
     sketch = Sketch(2)
     apart = sketch.conv(sketch.node("SpaceToDepth", "image", blocksize=2))
     inside = sketch.conv(sketch.node("DepthToSpace", apart, blocksize=2), (8, 2, 3, 3))
-    placement = placed(sketch.save(tmp_path / "p.onnx", sketch.node("DepthToSpace", inside, blocksize=2)), 20)
+    placement = placed(
+        sketch.save(tmp_path / "p.onnx", sketch.node("DepthToSpace", inside, blocksize=2)), 20
+    )
     assert [node.part for node in placement.nodes] == ["host-front", *["dpu-core"] * 3, "host-back"]
     assert placement.failed == ()
     assert remarks_on(placement, DPU, 20)["shuffles"].startswith(placement.nodes[2].op.name)
@@ -97,7 +115,9 @@ def test_what_a_classifier_ends_in_is_the_hosts(tmp_path: Path) -> None:
     sketch = Sketch(8)
     pooled = sketch.node("GlobalAveragePool", sketch.conv("image"))
     scores = sketch.node("Gemm", sketch.node("Flatten", pooled), sketch.weight(8, 3))
-    model = onnx.load_model(sketch.save(tmp_path / "c.onnx", sketch.node("Softmax", scores, axis=1)))
+    model = onnx.load_model(
+        sketch.save(tmp_path / "c.onnx", sketch.node("Softmax", scores, axis=1))
+    )
     del model.graph.output[0].type.tensor_type.shape.dim[2:]
     onnx.save_model(model, tmp_path / "c.onnx")
     placement = placed(tmp_path / "c.onnx")

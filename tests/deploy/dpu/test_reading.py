@@ -34,12 +34,15 @@ def test_three_encodings_are_one_network(tmp_path: Path) -> None:
     tail = spelt[0][-2]
     assert head[4] == (1, 24)
     assert tail[4] == (24, 1)
-    # The head differs in what stands before it (a quantiser or nothing), the global add in which files hold it.
+    # The head differs in what stands before it (a quantiser or nothing), the global add in which
+    # files hold it.
     assert [row[:-1] for row in spelt[0]] == [row[:-1] for row in spelt[1]]
     assert [row[:-1] for row in spelt[0][:-1]] == [row[:-1] for row in spelt[2]]
 
 
-def test_a_board_file_keeps_only_the_conversions_at_its_border_and_its_numbers(tmp_path: Path) -> None:
+def test_a_board_file_keeps_only_the_conversions_at_its_border_and_its_numbers(
+    tmp_path: Path,
+) -> None:
     first, *middle, last = read_network(board_convbeers(tmp_path / "b.onnx", 3, 8), 64).operations
     assert (first.kind, last.kind) == ("quantise", "dequantise")
     assert {op.kind for op in middle}.isdisjoint(("quantise", "dequantise"))
@@ -59,7 +62,9 @@ def test_a_board_file_keeps_only_the_conversions_at_its_border_and_its_numbers(t
         ({"auto_pad": "SAME_UPPER", "strides": [2, 2], "pads": [0, 0, 0, 0]}, (5, 19, 19)),
     ],
 )
-def test_convolution_shapes(tmp_path: Path, attributes: dict[str, list[int]], expected: tuple[int, int, int]) -> None:
+def test_convolution_shapes(
+    tmp_path: Path, attributes: dict[str, list[int]], expected: tuple[int, int, int]
+) -> None:
     sketch = Sketch(3)
     path = sketch.save(tmp_path / "c.onnx", sketch.conv("image", (5, 3, 3, 3), **attributes))
     assert read_network(path, 37).operations[0].out_shape == expected
@@ -68,9 +73,13 @@ def test_convolution_shapes(tmp_path: Path, attributes: dict[str, list[int]], ex
 def test_shapes_go_on_past_operators_of_onnxruntime_and_odd_ones(tmp_path: Path) -> None:
     sketch = Sketch(4)
     apart = sketch.node("SpaceToDepth", sketch.conv("image", (4, 4, 3, 3)), blocksize=2)
-    up = sketch.node("ConvTranspose", apart, sketch.weight(16, 6, 4, 4), strides=[2, 2], pads=[1, 1, 1, 1])
+    up = sketch.node(
+        "ConvTranspose", apart, sketch.weight(16, 6, 4, 4), strides=[2, 2], pads=[1, 1, 1, 1]
+    )
     joined = sketch.node("Concat", up, up, axis=1)
-    path = sketch.save(tmp_path / "o.onnx", sketch.node("MaxPool", joined, kernel_shape=[2, 2], strides=[2, 2]))
+    path = sketch.save(
+        tmp_path / "o.onnx", sketch.node("MaxPool", joined, kernel_shape=[2, 2], strides=[2, 2])
+    )
     shapes = [op.out_shape for op in read_network(path, 30).operations]
     assert shapes == [(4, 30, 30), (16, 15, 15), (6, 30, 30), (12, 30, 30), (12, 15, 15)]
 
@@ -113,7 +122,9 @@ def test_inputs_that_are_no_images_are_refused(tmp_path: Path) -> None:
         lambda s: s.node("QuantizeLinear", "image", s.constant(np.zeros(0, np.float32))),
     ],
 )
-def test_nodes_that_cannot_be_never_end_in_a_traceback(tmp_path: Path, draw: Callable[[Sketch], str]) -> None:
+def test_nodes_that_cannot_be_never_end_in_a_traceback(
+    tmp_path: Path, draw: Callable[[Sketch], str]
+) -> None:
     sketch = Sketch(2)
     path = sketch.save(tmp_path / "x.onnx", draw(sketch))
     with contextlib.suppress(ModelError):
@@ -121,19 +132,27 @@ def test_nodes_that_cannot_be_never_end_in_a_traceback(tmp_path: Path, draw: Cal
 
 
 @pytest.mark.parametrize("on_board", [False, True])
-def test_the_core_of_a_network_at_half_resolution_has_maps_of_half_the_tile(on_board: bool, tmp_path: Path) -> None:
-    """In the host's file the core is only described, and the board's begins behind the rearranging."""
+def test_the_core_of_a_network_at_half_resolution_has_maps_of_half_the_tile(
+    on_board: bool, tmp_path: Path
+) -> None:
+    """In the host's file the core is only described, and the board's begins
+    behind the rearranging.
+    """
     made = quantised_half_resolution()
     model = board_model(made.core, {}) if on_board else made.host
     save_onnx(model, tmp_path / "half.onnx")
-    convolutions = [op for op in read_network(tmp_path / "half.onnx", 64).operations if op.kind == "conv"]
+    convolutions = [
+        op for op in read_network(tmp_path / "half.onnx", 64).operations if op.kind == "conv"
+    ]
     assert {op.out_shape[1:] for op in convolutions if op.out_shape} == {(32, 32)}
     assert convolutions[0].channels[0] == 3 * 4
     with pytest.raises(ModelError, match="expected a tile of a multiple of 2 px, got 63 px"):
         read_network(tmp_path / "half.onnx", 63)
 
 
-def test_a_core_at_half_resolution_that_is_fixed_to_a_tile_is_fixed_to_half_of_it(tmp_path: Path) -> None:
+def test_a_core_at_half_resolution_that_is_fixed_to_a_tile_is_fixed_to_half_of_it(
+    tmp_path: Path,
+) -> None:
     model = quantised_half_resolution()
     fixed = board_model(model.core, {}, 64)
     assert [d.dim_value for d in fixed.graph.input[0].type.tensor_type.shape.dim[2:]] == [32, 32]

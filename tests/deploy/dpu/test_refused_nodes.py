@@ -24,7 +24,9 @@ def segmenter(path: Path, where: str, scale: float = 8.0, behind: str = "") -> P
     deep = sketch.conv("image", (32, 3, 3, 3), strides=[8, 8])
     scores = sketch.conv(deep, (19, 32, 1, 1))
     sizes = sketch.constant(np.array([1, 1, scale, scale], np.float32))
-    last = sketch.node("Resize", scores, "", sizes, mode="linear", coordinate_transformation_mode=where)
+    last = sketch.node(
+        "Resize", scores, "", sizes, mode="linear", coordinate_transformation_mode=where
+    )
     return sketch.save(path, sketch.node(behind, last) if behind else last)
 
 
@@ -34,7 +36,9 @@ def predicted(path: Path) -> Prediction:
 
 def test_what_the_dpu_enlarges_costs_the_processor_nothing(tmp_path: Path) -> None:
     """UG1414: eight times with corners in place, not with half pixels."""
-    on_dpu, on_cpu = (predicted(segmenter(tmp_path / f"{w}.onnx", w)) for w in ("asymmetric", "half_pixel"))
+    on_dpu, on_cpu = (
+        predicted(segmenter(tmp_path / f"{w}.onnx", w)) for w in ("asymmetric", "half_pixel")
+    )
     assert (on_dpu.refused, on_dpu.refused_s) == ((), (0.0, 0.0))
     assert len(on_cpu.refused) == 1
     assert 0 < on_cpu.refused_s[0] < on_cpu.refused_s[1]
@@ -74,9 +78,14 @@ def test_numbers_that_the_dpu_refuses_are_no_work_for_the_processor(tmp_path: Pa
 
 
 @pytest.mark.parametrize("board", ["vck190", "zcu102", "kv260"])
-def test_time_is_in_proportion_to_the_work_and_lies_between_peak_and_plain_code(tmp_path: Path, board: str) -> None:
+def test_time_is_in_proportion_to_the_work_and_lies_between_peak_and_plain_code(
+    tmp_path: Path, board: str
+) -> None:
     dpu = load_dpu(board)
-    ops = [read_network(segmenter(tmp_path / f"{px}.onnx", "half_pixel"), px).operations[-1] for px in (128, 256)]
+    ops = [
+        read_network(segmenter(tmp_path / f"{px}.onnx", "half_pixel"), px).operations[-1]
+        for px in (128, 256)
+    ]
     (low, high), larger = (refused_interval_s([op], dpu) for op in ops)
     assert larger == pytest.approx((4 * low, 4 * high))
     assert refused_interval_s(ops[:1] * 3, dpu) == pytest.approx((3 * low, 3 * high))
@@ -98,7 +107,9 @@ def test_what_it_runs_is_said_with_its_time(tmp_path: Path) -> None:
 
 
 def heads(path: Path, *ends: str) -> Path:
-    """Two maps of 255 channels, a half and a quarter of the size, the image's pixels first moved to channels."""
+    """Two maps of 255 channels, a half and a quarter of the size, the image's pixels first moved to
+    channels.
+    """
     sketch = Sketch(3)
     apart = sketch.node("SpaceToDepth", "image", blocksize=2)
     half = sketch.conv(apart, (16, 12, 3, 3))
@@ -114,7 +125,9 @@ def test_several_heads_are_copied_and_are_no_image(tmp_path: Path, ends: tuple[s
     path = heads(tmp_path / "h.onnx", *ends)
     placement = place(read_network(path, 64), DPU)
     assert placement.failed == ()
-    assert sum(cut.size_bytes or 0 for cut in placement.cuts if not cut.onto_dpu) == 255 * (32**2 + 16**2)
+    assert sum(cut.size_bytes or 0 for cut in placement.cuts if not cut.onto_dpu) == 255 * (
+        32**2 + 16**2
+    )
     found = predict_file(path, DPU, 64)
     assert (found.task, found.refused) == ("copy", ())
 
@@ -122,6 +135,8 @@ def test_several_heads_are_copied_and_are_no_image(tmp_path: Path, ends: tuple[s
 def test_results_of_few_bands_become_an_image_and_scores_do_not(tmp_path: Path) -> None:
     for channels, block, task in ((12, 2, "image"), (76, 2, "copy")):
         sketch = Sketch(3)
-        last = sketch.node("DepthToSpace", sketch.conv("image", (channels, 3, 3, 3)), blocksize=block)
+        last = sketch.node(
+            "DepthToSpace", sketch.conv("image", (channels, 3, 3, 3)), blocksize=block
+        )
         path = sketch.save(tmp_path / f"{channels}.onnx", last)
         assert predict_file(path, DPU, 64).task == task

@@ -1,4 +1,6 @@
-"""Files that other quantisers write: read without a crash, refused for what the DPU cannot compute, and no more."""
+"""Files that other quantisers write: read without a crash, refused for what the DPU cannot compute,
+and no more.
+"""
 
 import itertools
 from pathlib import Path
@@ -23,7 +25,9 @@ class RandomSketch(Sketch):
     """Weights that calibrate to sensible scales."""
 
     def weight(self, *shape: int) -> str:
-        return self.constant(np.random.default_rng(len(self.constants)).normal(0, 0.1, shape).astype(np.float32))
+        return self.constant(
+            np.random.default_rng(len(self.constants)).normal(0, 0.1, shape).astype(np.float32)
+        )
 
     def biased(self, source: str, *shape: int) -> str:
         return self.node("Conv", source, self.weight(*shape), self.weight(shape[0]), pads=[1] * 4)
@@ -40,7 +44,11 @@ def float_file(path: Path) -> Path:
 
 
 def quantised(
-    path: Path, form: QuantFormat, kind: QuantType, per_channel: bool = False, symmetric: bool = False
+    path: Path,
+    form: QuantFormat,
+    kind: QuantType,
+    per_channel: bool = False,
+    symmetric: bool = False,
 ) -> Path:
     options = {"ActivationSymmetric": symmetric}
     kinds = {"activation_type": kind, "weight_type": QuantType.QInt8}
@@ -62,9 +70,16 @@ def test_onnxruntimes_files_are_refused_for_their_numbers_alone(
     tmp_path: Path, form: QuantFormat, kind: QuantType, per_channel: bool
 ) -> None:
     signed = kind == QuantType.QInt8
-    placement = place(read_network(quantised(tmp_path / "q.onnx", form, kind, per_channel, signed), TILE_PX), DPU)
-    expected = {"power of two"} | ({"per tensor"} if per_channel else set()) | (set() if signed else {"symmetric"})
-    # Its QDQ files hold int32 biases, its QOperator files the transposed convolution's weights in float.
+    placement = place(
+        read_network(quantised(tmp_path / "q.onnx", form, kind, per_channel, signed), TILE_PX), DPU
+    )
+    expected = (
+        {"power of two"}
+        | ({"per tensor"} if per_channel else set())
+        | (set() if signed else {"symmetric"})
+    )
+    # Its QDQ files hold int32 biases, its QOperator files the transposed convolution's weights in
+    # float.
     expected |= {"int8 bias"} if form == QuantFormat.QDQ else {"int8 constants"}
     assert rules(placement) == expected
     core = [node.op for node in placement.nodes if node.part == "dpu-core"]
@@ -88,20 +103,29 @@ def test_a_vendors_power_of_two_file_passes_whole(tmp_path: Path, kind: QuantTyp
 def with_scales(model: onnx.ModelProto) -> onnx.ModelProto:
     """Scales rounded to powers of two, uint8 around 128, and int8 biases of 7 fractional bits."""
     arrays = {t.name: numpy_helper.to_array(t) for t in model.graph.initializer}
-    for node in (n for n in model.graph.node if n.op_type in ("QuantizeLinear", "DequantizeLinear")):
+    for node in (
+        n for n in model.graph.node if n.op_type in ("QuantizeLinear", "DequantizeLinear")
+    ):
         value, scale, zero = node.input
         arrays[scale] = np.exp2(np.round(np.log2(arrays[scale]))).astype(np.float32)
         if arrays[zero].dtype == np.uint8:
             arrays[zero] = np.full_like(arrays[zero], 128)
         if value in arrays and arrays[value].dtype == np.int32:
-            arrays[value], arrays[zero] = np.ones(arrays[value].shape, np.int8), np.zeros((), np.int8)
+            arrays[value], arrays[zero] = (
+                np.ones(arrays[value].shape, np.int8),
+                np.zeros((), np.int8),
+            )
             arrays[scale] = np.array(2.0**-7, np.float32)
     del model.graph.initializer[:]
-    model.graph.initializer.extend(numpy_helper.from_array(array, name) for name, array in arrays.items())
+    model.graph.initializer.extend(
+        numpy_helper.from_array(array, name) for name, array in arrays.items()
+    )
     return model
 
 
-def test_nodes_of_a_quantiser_that_onnx_does_not_know_are_named_with_a_remedy(tmp_path: Path) -> None:
+def test_nodes_of_a_quantiser_that_onnx_does_not_know_are_named_with_a_remedy(
+    tmp_path: Path,
+) -> None:
     s = Sketch(4)
     fixed = s.node("FixNeuron", s.conv("image", (4, 4, 3, 3)), domain="com.vai.quantize")
     path = s.save(tmp_path / "v.onnx", s.conv(fixed, (4, 4, 3, 3)))

@@ -12,7 +12,14 @@ import pytest
 import torch
 
 import beers_deploy as bd
-from beers_deploy.kit.golden import INDEX, Golden, compare_golden, files_of, read_golden, write_golden
+from beers_deploy.kit.golden import (
+    INDEX,
+    Golden,
+    compare_golden,
+    files_of,
+    read_golden,
+    write_golden,
+)
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import BeersError
 from beers_deploy.quant.core import IntConv, IntCore
@@ -32,7 +39,9 @@ def network(name: str) -> bd.Network:
         return bd.Network.load(name)
     samples = np.random.default_rng(0).random((4, 1, 32, 32), dtype=np.float32)
     with one_guess():
-        return bd.quantize(to_onnx(name, build(name, torch.Generator().manual_seed(0))), samples, progress=False)
+        return bd.quantize(
+            to_onnx(name, build(name, torch.Generator().manual_seed(0))), samples, progress=False
+        )
 
 
 @pytest.fixture(scope="module", params=[*SHIPPED, *USERS])
@@ -51,7 +60,9 @@ def middle(core: IntCore) -> IntConv:
 
 
 def with_middle(core: IntCore, **other: Any) -> IntCore:
-    return replace(core, ops=tuple(replace(op, **other) if op is middle(core) else op for op in core.ops))
+    return replace(
+        core, ops=tuple(replace(op, **other) if op is middle(core) else op for op in core.ops)
+    )
 
 
 def flipped(values: np.ndarray, place: tuple[int, ...], bit: int) -> np.ndarray:
@@ -91,7 +102,9 @@ def bordered(planes: np.ndarray) -> np.ndarray:
 
 
 def at_middle(core: IntCore, change: Callable[[np.ndarray], np.ndarray]) -> Layer:
-    return lambda op, whole: change(saturated(whole)) if op.name == middle(core).name else saturated(whole)
+    return lambda op, whole: (
+        change(saturated(whole)) if op.name == middle(core).name else saturated(whole)
+    )
 
 
 def swapped(values: np.ndarray) -> np.ndarray:
@@ -102,18 +115,30 @@ def swapped(values: np.ndarray) -> np.ndarray:
 
 Board = Callable[[IntCore, np.ndarray], dict[str, np.ndarray]]
 FAULTS: dict[str, tuple[Board, str, str]] = {
-    "ties": (lambda core, planes: board(core, planes, half_even=True), "first", "ties are rounded to even instead"),
+    "ties": (
+        lambda core, planes: board(core, planes, half_even=True),
+        "first",
+        "ties are rounded to even instead",
+    ),
     "bias": (
-        lambda core, planes: board(with_middle(core, bias=flipped(middle(core).bias, (1,), 3)), planes),
+        lambda core, planes: board(
+            with_middle(core, bias=flipped(middle(core).bias, (1,), 3)), planes
+        ),
         "middle",
         "bit 3 of the bias of channel 1 is flipped",
     ),
     "weight": (
-        lambda core, planes: board(with_middle(core, weight=flipped(middle(core).weight, (0, 0, 0, 0), 6)), planes),
+        lambda core, planes: board(
+            with_middle(core, weight=flipped(middle(core).weight, (0, 0, 0, 0), 6)), planes
+        ),
         "middle",
         "bit 6 of weight [0, 0, 0, 0] is flipped",
     ),
-    "halo": (lambda core, planes: board(core, bordered(planes)), PLANES, "the outer 3 px of the planes are zeros"),
+    "halo": (
+        lambda core, planes: board(core, bordered(planes)),
+        PLANES,
+        "the outer 3 px of the planes are zeros",
+    ),
     "channels": (
         lambda core, planes: board(core, planes, at_middle(core, swapped)),
         "middle",
@@ -125,14 +150,18 @@ FAULTS: dict[str, tuple[Board, str, str]] = {
         "is taken as 2^1 times what it is",
     ),
     "row": (
-        lambda core, planes: board(core, planes, at_middle(core, lambda values: np.roll(values, 1, 2))),
+        lambda core, planes: board(
+            core, planes, at_middle(core, lambda values: np.roll(values, 1, 2))
+        ),
         "middle",
         "the tile is shifted by 1 px down",
     ),
 }
 
 
-def results(golden: Golden, folder: Path, run: Board, kept: Callable[[str], bool] = lambda _: True) -> Path:
+def results(
+    golden: Golden, folder: Path, run: Board, kept: Callable[[str], bool] = lambda _: True
+) -> Path:
     """What a board writes of some tensors, in a folder."""
     for case, sound in golden.cases.items():
         (folder / case).mkdir(parents=True)
@@ -151,7 +180,9 @@ def test_a_sound_board_differs_nowhere(vectors: Path, golden: Golden, tmp_path: 
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_is_named_at_its_first_layer(fault: str, vectors: Path, golden: Golden, tmp_path: Path) -> None:
+def test_a_fault_is_named_at_its_first_layer(
+    fault: str, vectors: Path, golden: Golden, tmp_path: Path
+) -> None:
     run, place, words = FAULTS[fault]
     found = compare_golden(vectors, results(golden, tmp_path / "r", run))
     where = {"first": golden.core.ops[0].name, "middle": middle(golden.core).name}.get(place, place)
@@ -165,13 +196,22 @@ def test_adds_that_wrap_are_named(tmp_path: Path) -> None:
     golden = read_golden(vectors)
     seen = results(golden, tmp_path / "r", lambda core, planes: board(core, planes, wrapped))
     first = next(op.name for op in golden.core.ops if isinstance(op, Add))
-    assert f"{first}, as if results beyond int8 wrap around" in compare_golden(vectors, seen).checks[0].detail
+    assert (
+        f"{first}, as if results beyond int8 wrap around"
+        in compare_golden(vectors, seen).checks[0].detail
+    )
 
 
-def test_of_the_last_layer_alone_a_rule_is_still_named(vectors: Path, golden: Golden, tmp_path: Path) -> None:
+def test_of_the_last_layer_alone_a_rule_is_still_named(
+    vectors: Path, golden: Golden, tmp_path: Path
+) -> None:
     run = FAULTS["ties"][0]
     last = golden.core.ops[-1].output
-    said = compare_golden(vectors, results(golden, tmp_path / "r", run, lambda name: name == last)).checks[0].detail
+    said = (
+        compare_golden(vectors, results(golden, tmp_path / "r", run, lambda name: name == last))
+        .checks[0]
+        .detail
+    )
     assert "were not handed out" in said
     assert "ties are rounded to even instead of up, in every layer" in said
 
@@ -189,7 +229,10 @@ def test_results_are_taken_as_boards_write_them(tmp_path: Path) -> None:
     np.save(seen / two, (sound[second] + 128).astype(np.uint8))
     np.save(seen / three, (sound[third] * golden.core.scale(third)).astype(np.float32))
     assert compare_golden(vectors, tmp_path / "r")
-    for values, said in ((sound[third][:, :1], "expected shape"), (sound[third] + 0.3, "whole multiples")):
+    for values, said in (
+        (sound[third][:, :1], "expected shape"),
+        (sound[third] + 0.3, "whole multiples"),
+    ):
         np.save(seen / three, values)
         with pytest.raises(BeersError, match=said):
             compare_golden(vectors, tmp_path / "r")
@@ -210,7 +253,9 @@ def test_the_command_writes_and_compares(tmp_path: Path) -> None:
     assert "the first to differ is joined" in done("golden", seen, "--compare", out, code=1)
     assert "expected one of --out and --compare" in refused("golden", seen)
     assert "golden.json: expected the index" in refused("golden", seen, "--compare", seen)
-    assert "multiple of 2 px" in refused("golden", "convbeers-half-xs", "--tile", 33, "--out", tmp_path / "x")
+    assert "multiple of 2 px" in refused(
+        "golden", "convbeers-half-xs", "--tile", 33, "--out", tmp_path / "x"
+    )
     np.save(out / "noise" / "00-planes.npy", np.zeros((1, 4, 38, 38), np.int8))
     assert "other numbers in noise" in refused("golden", seen, "--compare", out)
 
@@ -256,15 +301,21 @@ def test_arrays_that_are_no_tensors_are_refused(kind: str, copied: Path, tmp_pat
     refused("golden", tmp_path / "seen", "--compare", copied)
 
 
-def test_an_index_leads_nowhere_else_and_its_claims_are_no_inputs(copied: Path, tmp_path: Path) -> None:
+def test_an_index_leads_nowhere_else_and_its_claims_are_no_inputs(
+    copied: Path, tmp_path: Path
+) -> None:
     shutil.copytree(copied / "noise", tmp_path / "seen" / "noise")
     index = json.loads((copied / INDEX).read_text())
     (copied / INDEX).write_text(json.dumps(index | {"network": {"name": 5, "sha256": "0" * 64}}))
     found = compare_golden(copied, tmp_path / "seen")
     assert found.to_dict()["inputs"][0] == Network.load(copied / "int8.onnx").input._asdict()  # type: ignore[index]
     shutil.copytree(copied / "noise", tmp_path / "noise")
-    (copied / INDEX).write_text(json.dumps(index | {"cases": {"../noise": index["cases"]["noise"]}}))
-    assert "got a damaged one (ValueError: the case '../noise')" in refused("golden", tmp_path, "--compare", copied)
+    (copied / INDEX).write_text(
+        json.dumps(index | {"cases": {"../noise": index["cases"]["noise"]}})
+    )
+    assert "got a damaged one (ValueError: the case '../noise')" in refused(
+        "golden", tmp_path, "--compare", copied
+    )
 
 
 def test_older_vectors_do_not_stay(copied: Path) -> None:

@@ -19,12 +19,27 @@ def test_runs_are_added_to_the_list(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     model, out, rail = (tmp_path / name for name in ("core.onnx", "board.json", "power1_input"))
     board_convbeers(model, 1, 8)
     rail.write_text("22500000\n")
-    common = (model, "--provider", "CPUExecutionProvider", "--tile", 37, "--frames", 7, "--out", out)
+    common = (
+        model,
+        "--provider",
+        "CPUExecutionProvider",
+        "--tile",
+        37,
+        "--frames",
+        7,
+        "--out",
+        out,
+    )
     assert run(monkeypatch, *common, "--configuration", "C32B1") == 0
     more = ("--threads", 3, "--batch", 2, "--power-file", rail, "--power-file", rail)
     assert run(monkeypatch, *common, *more) == 0
     first, second = json.loads(out.read_text())
-    said = {"model": "core.onnx", "configuration": "C32B1", "tile_px": 37, "provider": "CPUExecutionProvider"}
+    said = {
+        "model": "core.onnx",
+        "configuration": "C32B1",
+        "tile_px": 37,
+        "provider": "CPUExecutionProvider",
+    }
     assert first == {**said, "fps": first["fps"]}
     assert set(second) == {*first, "power_w"}
     assert second["power_w"] == 45
@@ -35,7 +50,16 @@ def test_the_same_provider_gives_the_same_numbers(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model = board_convbeers(tmp_path / "core.onnx", 1, 8)
-    options = ("--provider", "CPUExecutionProvider", "--tile", 24, "--frames", 3, "--out", tmp_path / "b.json")
+    options = (
+        "--provider",
+        "CPUExecutionProvider",
+        "--tile",
+        24,
+        "--frames",
+        3,
+        "--out",
+        tmp_path / "b.json",
+    )
     assert run(monkeypatch, model, *options) == 0
     assert "0.0 % of values differ" in capsys.readouterr().out
 
@@ -47,7 +71,9 @@ def test_throughput_leaves_the_first_calls_latency_out() -> None:
 
 
 def test_calls_in_flight_end_as_often_as_asked(tmp_path: Path) -> None:
-    session = measure.open_session(board_convbeers(tmp_path / "core.onnx", 1, 8), "CPUExecutionProvider", {})
+    session = measure.open_session(
+        board_convbeers(tmp_path / "core.onnx", 1, 8), "CPUExecutionProvider", {}
+    )
     stamps, _ = measure.run_threads(session, measure.make_feed(session, 1, 16), 11, 4, [])
     assert len(stamps) == 11
     assert stamps == sorted(stamps)

@@ -9,9 +9,13 @@ from beers_deploy.report.plots import FONT_PX, look
 
 
 def text_width(text: str, size_px: float = FONT_PX) -> float:
-    """Width of a line in pixels, in matplotlib's own font: wider than those that a browser takes in its place."""
+    """Width of a line in pixels, in matplotlib's own font: wider than those that a browser takes in
+    its place.
+    """
     with look():
-        width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(size=size_px), ismath=False)
+        width, _, _ = text_to_path.get_text_width_height_descent(
+            text, FontProperties(size=size_px), ismath=False
+        )
     return float(width)
 
 

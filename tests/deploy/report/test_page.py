@@ -13,19 +13,28 @@ def lines(rows: list[Row]) -> list[list[str]]:
     """The texts of a page's table, line by line, cell by cell."""
     page = render(Report("A page", "Its headline", [Section("A table", rows)], [], []))
     cells = [
-        re.findall(r"<t[dh]\b[^>]*>(.*?)</t[dh]>", line, re.DOTALL) for line in re.findall(r"(?s)<tr>.*?</tr>", page)
+        re.findall(r"<t[dh]\b[^>]*>(.*?)</t[dh]>", line, re.DOTALL)
+        for line in re.findall(r"(?s)<tr>.*?</tr>", page)
     ]
-    return [[" ".join(unescape(re.sub("<.*?>", " ", cell)).split()) for cell in line] for line in cells]
+    return [
+        [" ".join(unescape(re.sub("<.*?>", " ", cell)).split()) for cell in line] for line in cells
+    ]
 
 
 def rows_of(figures: int, count: int) -> list[Row]:
     return [
-        Row("t", f"row <{k}>", {f"figure {n}": measured(100 * k + n, "s", "a watch") for n in range(figures)})
+        Row(
+            "t",
+            f"row <{k}>",
+            {f"figure {n}": measured(100 * k + n, "s", "a watch") for n in range(figures)},
+        )
         for k in range(count)
     ]
 
 
-@pytest.mark.parametrize(("figures", "count"), [(1, 1), (WIDE, 2), (WIDE + 1, 2), (WIDE + 1, WIDE + 3)])
+@pytest.mark.parametrize(
+    ("figures", "count"), [(1, 1), (WIDE, 2), (WIDE + 1, 2), (WIDE + 1, WIDE + 3)]
+)
 def test_every_figure_stands_where_its_row_and_name_meet(figures: int, count: int) -> None:
     rows = rows_of(figures, count)
     (_, *columns), *body = lines(rows)
@@ -41,9 +50,14 @@ def test_every_figure_stands_where_its_row_and_name_meet(figures: int, count: in
 @pytest.mark.parametrize("figures", [2, WIDE + 2])
 def test_words_and_what_is_missing_are_told(figures: int) -> None:
     row = Row(
-        "t", "one", {**rows_of(figures, 1)[0].figures, "power": unavailable("W", "no meter")}, {"note": "so & so"}
+        "t",
+        "one",
+        {**rows_of(figures, 1)[0].figures, "power": unavailable("W", "no meter")},
+        {"note": "so & so"},
     )
-    text = render(Report("A page", "Its headline", [Section("A table", [row], "How to read it")], [], []))
+    text = render(
+        Report("A page", "Its headline", [Section("A table", [row], "How to read it")], [], [])
+    )
     assert "so &amp; so" in text
     assert "no meter" in text
     assert "How to read it" in text

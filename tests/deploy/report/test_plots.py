@@ -9,7 +9,9 @@ from beers_deploy.report.plots import DARK, LIGHT, look, new_figure, round_value
 
 
 @given(st.floats(-6, 6), st.floats(0.01, 12), st.integers(3, 16), st.booleans())
-def test_ticks_are_few_rising_and_on_the_axis(start: float, decades: float, most: int, logarithmic: bool) -> None:
+def test_ticks_are_few_rising_and_on_the_axis(
+    start: float, decades: float, most: int, logarithmic: bool
+) -> None:
     low = 10**start
     high = 10 ** (start + decades)
     values = round_values(low, high, most, logarithmic=logarithmic)
@@ -52,5 +54,7 @@ def test_every_colour_of_an_svg_follows_the_screen() -> None:
 
 def test_the_users_settings_for_matplotlib_change_nothing() -> None:
     plain = drawn()
-    with rc_context({"lines.linewidth": 9, "font.size": 30, "axes.grid": False, "svg.fonttype": "path"}):
+    with rc_context(
+        {"lines.linewidth": 9, "font.size": 30, "axes.grid": False, "svg.fonttype": "path"}
+    ):
         assert drawn() == plain

@@ -20,7 +20,9 @@ SPLIT = 64, 80
 
 def digital_numbers(bits: int = 12, bands: int = BANDS) -> np.ndarray:
     """Noise (bands, height, width) uint16 of 0 to full scale."""
-    return np.random.default_rng(bits).integers(0, 1 << bits, (bands, HEIGHT, WIDTH)).astype(np.uint16)
+    return (
+        np.random.default_rng(bits).integers(0, 1 << bits, (bands, HEIGHT, WIDTH)).astype(np.uint16)
+    )
 
 
 def profile(bands: int = BANDS) -> dict[str, Any]:
@@ -30,10 +32,17 @@ def profile(bands: int = BANDS) -> dict[str, Any]:
 
 
 def write(path: Path, pixels: np.ndarray, driver: str, **options: Any) -> Path:
-    """An image (bands, height, width) with names and gains of its bands, where the format holds them."""
+    """An image (bands, height, width) with names and gains of its bands, where the format holds
+    them.
+    """
     bands, height, width = pixels.shape
-    about = profile(bands) | {"dtype": pixels.dtype.name, "width": width, "height": height} | options
-    with warnings.catch_warnings(action="ignore"), rasterio.open(path, "w", driver=driver, **about) as file:
+    about = (
+        profile(bands) | {"dtype": pixels.dtype.name, "width": width, "height": height} | options
+    )
+    with (
+        warnings.catch_warnings(action="ignore"),
+        rasterio.open(path, "w", driver=driver, **about) as file,
+    ):
         file.write(pixels)
         if driver == "GTiff":
             file.descriptions = [f"B{k}" for k in range(bands)]
@@ -43,7 +52,9 @@ def write(path: Path, pixels: np.ndarray, driver: str, **options: Any) -> Path:
 
 def write_tiff(path: Path, pixels: np.ndarray, **options: Any) -> Path:
     """A TIFF in tiles."""
-    return write(path, pixels, "GTiff", tiled=True, blockxsize=TILE_PX, blockysize=TILE_PX, **options)
+    return write(
+        path, pixels, "GTiff", tiled=True, blockxsize=TILE_PX, blockysize=TILE_PX, **options
+    )
 
 
 def write_jp2(path: Path, pixels: np.ndarray, **options: Any) -> Path:
@@ -57,7 +68,14 @@ def write_cog(path: Path, pixels: np.ndarray) -> Path:
     write_tiff(path.with_name("plain.tif"), pixels)
     from rasterio.shutil import copy
 
-    copy(path.with_name("plain.tif"), path, driver="COG", BLOCKSIZE=128, COMPRESS="DEFLATE", PREDICTOR=2)
+    copy(
+        path.with_name("plain.tif"),
+        path,
+        driver="COG",
+        BLOCKSIZE=128,
+        COMPRESS="DEFLATE",
+        PREDICTOR=2,
+    )
     path.with_name("plain.tif").unlink()
     with rasterio.open(path) as file:
         assert file.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
@@ -83,12 +101,17 @@ def write_vrt(path: Path, pixels: np.ndarray, more: str = "") -> Path:
     place = rasterio.transform.from_origin(3e5 + 1 / 3, 4.8e6 + 1 / 7, 0.7, 0.7).to_gdal()
     body = "".join(
         f'<VRTRasterBand dataType="UInt16" band="{band}">{more}'
-        + "".join(source(name, band, row, column, rows, columns) for name, row, column, rows, columns in tiles)
+        + "".join(
+            source(name, band, row, column, rows, columns)
+            for name, row, column, rows, columns in tiles
+        )
         + "</VRTRasterBand>"
         for band in range(1, bands + 1)
     )
     where = f"<SRS>EPSG:32631</SRS><GeoTransform>{', '.join(map(repr, place))}</GeoTransform>"
-    path.write_text(f'<VRTDataset rasterXSize="{width}" rasterYSize="{height}">{where}{body}</VRTDataset>')
+    path.write_text(
+        f'<VRTDataset rasterXSize="{width}" rasterYSize="{height}">{where}{body}</VRTDataset>'
+    )
     return path
 
 
@@ -96,19 +119,24 @@ def source(name: str, band: int, row: int, column: int, rows: int, columns: int)
     """One tile of a mosaic."""
     size = f'xSize="{columns}" ySize="{rows}"'
     return (
-        f'<SimpleSource><SourceFilename relativeToVRT="1">{name}</SourceFilename><SourceBand>{band}</SourceBand>'
-        f'<SrcRect xOff="0" yOff="0" {size}/><DstRect xOff="{column}" yOff="{row}" {size}/></SimpleSource>'
+        "<SimpleSource><SourceFilename "
+        f'relativeToVRT="1">{name}</SourceFilename><SourceBand>{band}</SourceBand>'
+        f'<SrcRect xOff="0" yOff="0" {size}/><DstRect xOff="{column}" yOff="{row}" '
+        f"{size}/></SimpleSource>"
     )
 
 
 def write_dimap(path: Path, pixels: np.ndarray, bits: int = 12, more: str = "") -> Path:
-    """A DIMAP index of two tiles beside it, one above the other, with bits, gains and rational polynomials."""
+    """A DIMAP index of two tiles beside it, one above the other, with bits, gains and rational
+    polynomials.
+    """
     bands, height, width = pixels.shape
     for k in range(2):
         part = pixels[:, k * TILE_PX * 2 : (k + 1) * TILE_PX * 2]
         write_tiff(path.with_name(f"IMG_R{k + 1}C1.TIF"), part, crs=None, transform=None)
     tiles = "".join(
-        f'<Data_File tile_R="{k}" tile_C="1"><DATA_FILE_PATH href="IMG_R{k}C1.TIF"/></Data_File>' for k in (1, 2)
+        f'<Data_File tile_R="{k}" tile_C="1"><DATA_FILE_PATH href="IMG_R{k}C1.TIF"/></Data_File>'
+        for k in (1, 2)
     )
     gains = "".join(
         f"<Band_Radiance><BAND_ID>B{k}</BAND_ID><GAIN>9.{k}</GAIN><BIAS>0.{k}</BIAS></Band_Radiance>"
@@ -120,17 +148,20 @@ def write_dimap(path: Path, pixels: np.ndarray, bits: int = 12, more: str = "") 
 </Metadata_Identification>
 <Dataset_Content><Dataset_Components>
 <Component><COMPONENT_TITLE>RPC Model</COMPONENT_TITLE><COMPONENT_PATH href="RPC.XML"/></Component>
-<Component><COMPONENT_TITLE>Preview</COMPONENT_TITLE><COMPONENT_PATH href="not-delivered.JPG"/></Component>
+<Component><COMPONENT_TITLE>Preview</COMPONENT_TITLE>
+<COMPONENT_PATH href="not-delivered.JPG"/></Component>
 </Dataset_Components></Dataset_Content>
 <Geoposition><Geoposition_Insert><ULXMAP>{3e5 + 1 / 3!r}</ULXMAP><ULYMAP>{4.8e6 + 1 / 7!r}</ULYMAP>
 <XDIM>0.7</XDIM><YDIM>0.7</YDIM></Geoposition_Insert>
 <Geoposition_Models><Rational_Function_Model><Component><COMPONENT_TITLE>RPC Model</COMPONENT_TITLE>
-<COMPONENT_PATH href="RPC.XML"/></Component></Rational_Function_Model></Geoposition_Models></Geoposition>
+<COMPONENT_PATH href="RPC.XML"/></Component></Rational_Function_Model>
+</Geoposition_Models></Geoposition>
 <Coordinate_Reference_System><Projected_CRS><PROJECTED_CRS_CODE>EPSG:32631</PROJECTED_CRS_CODE></Projected_CRS>
 </Coordinate_Reference_System>
 <Raster_Data><Data_Access><Data_Files>{tiles}</Data_Files></Data_Access>
 <Raster_Dimensions><NROWS>{height}</NROWS><NCOLS>{width}</NCOLS><NBANDS>{bands}</NBANDS><Tile_Set><NTILES>2</NTILES>
-<Regular_Tiling><NTILES_SIZE nrows="{2 * TILE_PX}" ncols="{width}"/><NTILES_COUNT ntiles_R="2" ntiles_C="1"/>
+<Regular_Tiling><NTILES_SIZE nrows="{2 * TILE_PX}" ncols="{width}"/>
+<NTILES_COUNT ntiles_R="2" ntiles_C="1"/>
 <OVERLAP_ROW>0</OVERLAP_ROW><OVERLAP_COL>0</OVERLAP_COL></Regular_Tiling></Tile_Set></Raster_Dimensions>
 <Raster_Encoding><NBITS>{bits}</NBITS></Raster_Encoding></Raster_Data>
 <Radiometric_Data>{more}<Radiometric_Calibration><Instrument_Calibration><Band_Measurement_List>{gains}
@@ -141,8 +172,13 @@ def write_dimap(path: Path, pixels: np.ndarray, bits: int = 12, more: str = "") 
         for kind in ("SAMP_NUM_COEFF", "SAMP_DEN_COEFF", "LINE_NUM_COEFF", "LINE_DEN_COEFF")
         for k in range(1, 21)
     )
-    offsets = "LONG_SCALE LONG_OFF LAT_SCALE LAT_OFF HEIGHT_SCALE HEIGHT_OFF SAMP_SCALE SAMP_OFF LINE_SCALE LINE_OFF"
-    validity = "".join(f"<{name}>{k + 1 / 3!r}</{name}>" for k, name in enumerate(offsets.split(), 1))
+    offsets = (
+        "LONG_SCALE LONG_OFF LAT_SCALE LAT_OFF HEIGHT_SCALE HEIGHT_OFF SAMP_SCALE "
+        "SAMP_OFF LINE_SCALE LINE_OFF"
+    )
+    validity = "".join(
+        f"<{name}>{k + 1 / 3!r}</{name}>" for k, name in enumerate(offsets.split(), 1)
+    )
     path.with_name("RPC.XML").write_text(
         "<Dimap_Document><Rational_Function_Model><Global_RFM>"
         f"<Inverse_Model>{coefficients}<ERR_BIAS_X>0.1</ERR_BIAS_X><ERR_BIAS_Y>0.1</ERR_BIAS_Y></Inverse_Model>"

@@ -22,7 +22,9 @@ def noise(*shape: int, seed: int = 1) -> np.ndarray:
     return np.random.default_rng(seed).integers(1, 4096, shape).astype(np.uint16)
 
 
-def restored(folder: Path, pixels: np.ndarray, options: Options, **written: Any) -> tuple[np.ndarray, Row]:
+def restored(
+    folder: Path, pixels: np.ndarray, options: Options, **written: Any
+) -> tuple[np.ndarray, Row]:
     """Write pixels, restore them, and read the result again."""
     tifffile.imwrite(folder / "in.tif", pixels, **written)
     row = restore_file(folder / "in.tif", folder / "out.tif", options)
@@ -31,9 +33,21 @@ def restored(folder: Path, pixels: np.ndarray, options: Options, **written: Any)
 
 def begin(image: Path, out: Path, *options: object) -> subprocess.Popen[str]:
     """Start a run on one thread."""
-    command = [sys.executable, "-c", "from beers_deploy.cli import app; app()", "restore", image, out, "--threads", 1]
+    command = [
+        sys.executable,
+        "-c",
+        "from beers_deploy.cli import app; app()",
+        "restore",
+        image,
+        out,
+        "--threads",
+        1,
+    ]
     return subprocess.Popen(
-        list(map(str, [*command, *options])), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        list(map(str, [*command, *options])),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
     )
 
 

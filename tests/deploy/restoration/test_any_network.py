@@ -65,7 +65,9 @@ def noise(path: Path, size: tuple[int, int] = SIZE) -> np.ndarray:
 
 
 def whole(path: Path, pixels: np.ndarray) -> np.ndarray:
-    """The result without the engine: the image extended by copies of its last row and column, and cut again."""
+    """The result without the engine: the image extended by copies of its last row and column, and
+    cut again.
+    """
     model, (height, width) = load_onnx(path), pixels.shape[-2:]
     tiling = tiling_of(model)
     bands = pixels.reshape(-1, height, width)
@@ -120,7 +122,9 @@ def test_missing_pixels_stay_and_spoil_no_others(path: Path, tmp_path: Path) -> 
     pixels[..., -3:, -5:] = 0
     pixels[(0, 5, 5) if pixels.ndim == 3 else (5, 5)] = 0
     nodata: dict[str, Any] = {"extratags": [(42113, "s", 0, "0", True)]}
-    tiled, one = (by_file(pixels, tmp_path, Options(path, side, threads=1), **nodata) for side in (56, 500))
+    tiled, one = (
+        by_file(pixels, tmp_path, Options(path, side, threads=1), **nodata) for side in (56, 500)
+    )
     np.testing.assert_array_equal(tiled, one)
     tiling = tiling_of(load_onnx(path))
     missing = pixels == 0
@@ -152,16 +156,28 @@ def test_a_run_that_was_stopped_is_resumed_to_the_same_bytes(path: Path, tmp_pat
 
 REFUSED: dict[str, tuple[Callable[[], onnx.ModelProto], type[Exception], str]] = {
     "classifier": (
-        lambda: graph([helper.make_node("GlobalAveragePool", ["image"], ["restored"], name="head")]),
+        lambda: graph(
+            [helper.make_node("GlobalAveragePool", ["image"], ["restored"], name="head")]
+        ),
         ModelError,
         "GlobalAveragePool head, which looks at the whole image",
     ),
     "segmentation": (
-        lambda: graph([helper.make_node("MaxPool", ["image"], ["restored"], kernel_shape=[2, 2], strides=[2, 2])]),
+        lambda: graph(
+            [
+                helper.make_node(
+                    "MaxPool", ["image"], ["restored"], kernel_shape=[2, 2], strides=[2, 2]
+                )
+            ]
+        ),
         ModelError,
         "expected a result of the image's size or a multiple, got one of 1/2",
     ),
-    "4 bands": (four_bands, OptionError, "expected an image of 4 bands, as the network takes them, got 1"),
+    "4 bands": (
+        four_bands,
+        OptionError,
+        "expected an image of 4 bands, as the network takes them, got 1",
+    ),
 }
 
 
@@ -176,7 +192,9 @@ def test_what_cannot_be_restored_is_refused_in_one_sentence(name: str, tmp_path:
 
 def test_halos_and_tiles_off_the_lattice_are_refused_or_rounded() -> None:
     tiling = Tiling(8, 4)
-    with pytest.raises(OptionError, match=r"halo: expected a multiple of 4 px.*got 7 px.*8 is exact"):
+    with pytest.raises(
+        OptionError, match=r"halo: expected a multiple of 4 px.*got 7 px.*8 is exact"
+    ):
         make_plan((1, 100, 100), 40, 7, tiling)
     with pytest.raises(OptionError, match="20 px at least, got 19 px"):
         make_plan((1, 100, 100), 19, 8, tiling)
@@ -187,7 +205,9 @@ def test_a_result_of_another_shape_than_the_file_says_is_refused(tmp_path: Path)
     model = espcn()
     model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = 2
     path = saved(model, tmp_path)
-    with pytest.raises(ModelError, match="expected a result of 2 x 60 x 60, as its file says, got 1 x 60 x 60"):
+    with pytest.raises(
+        ModelError, match="expected a result of 2 x 60 x 60, as its file says, got 1 x 60 x 60"
+    ):
         by_file(np.ones((30, 30), np.uint16), tmp_path, Options(path, 40))
 
 
@@ -209,7 +229,10 @@ def test_places_on_earth_stay_where_they_are(keys: tuple[int, ...]) -> None:
     def by_tie(given: dict[int, Any], column: float, row: float) -> list[float]:
         point = given[33922]
         size = given[33550]
-        return [point[3] + (column + middle - point[0]) * size[0], point[4] - (row + middle - point[1]) * size[1]]
+        return [
+            point[3] + (column + middle - point[0]) * size[0],
+            point[4] - (row + middle - point[1]) * size[1],
+        ]
 
     def by_matrix(given: dict[int, Any], column: float, row: float) -> list[float]:
         m = given[34264]

@@ -18,7 +18,16 @@ SECOND = "blind"
 
 def restored(image: Path, sensor: str, *more: str) -> tuple[np.ndarray, str]:
     out = image.with_name("out.tif")
-    words = ["restore", str(image), str(out), "--network", "convbeers-xs", "--sensor", sensor, *more]
+    words = [
+        "restore",
+        str(image),
+        str(out),
+        "--network",
+        "convbeers-xs",
+        "--sensor",
+        sensor,
+        *more,
+    ]
     said = done(*words)
     return tifffile.imread(out), said
 
@@ -36,7 +45,12 @@ def test_each_band_has_its_own_network(names: tuple[str, str], tmp_path: Path) -
 
 
 def test_bands_without_names_are_taken_in_order(tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "in.tif", images.digital_numbers(), planarconfig="separate", photometric="minisblack")
+    tifffile.imwrite(
+        tmp_path / "in.tif",
+        images.digital_numbers(),
+        planarconfig="separate",
+        photometric="minisblack",
+    )
     with open_source(tmp_path / "in.tif") as source:
         assert source.raster.bands == 2
         assert band_names(source.raster) == ()
@@ -65,14 +79,24 @@ def test_a_cog_names_the_sensors_in_the_order_of_the_bands(tmp_path: Path) -> No
 )
 def test_what_does_not_fit_is_refused(sensor: str, words: str, tmp_path: Path) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    arguments = ["restore", str(image), str(tmp_path / "out.tif"), "--network", "convbeers-xs", "--sensor", sensor]
+    arguments = [
+        "restore",
+        str(image),
+        str(tmp_path / "out.tif"),
+        "--network",
+        "convbeers-xs",
+        "--sensor",
+        sensor,
+    ]
     assert words in refused(*arguments)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
 
 
 def test_names_are_read_from_no_bomb() -> None:
     bomb = '<!DOCTYPE a [<!ENTITY b "x">]><a><Item sample="0" role="description">&b;</Item></a>'
-    assert band_names(Raster(1, 9, 9, np.dtype(np.uint16), None, ((42112, 2, 0, bomb, True),))) == ()
+    assert (
+        band_names(Raster(1, 9, 9, np.dtype(np.uint16), None, ((42112, 2, 0, bomb, True),))) == ()
+    )
     assert parse_sensors("my.toml") == {"": "my.toml"}
     with pytest.raises(OptionError):
         parse_sensors("=a,B1=b")

@@ -1,4 +1,6 @@
-"""Cloud-Optimised GeoTIFFs: valid, with the pixels and the place of the plain output, and what was done."""
+"""Cloud-Optimised GeoTIFFs: valid, with the pixels and the place of the plain output, and what was
+done.
+"""
 
 import sys
 from dataclasses import replace
@@ -34,7 +36,9 @@ def both(folder: Path, pixels: np.ndarray, options: Options) -> tuple[Path, Path
 
 
 @pytest.mark.parametrize("compression", Compression)
-def test_it_is_valid_and_holds_the_same(compression: Compression, model: Path, tmp_path: Path) -> None:
+def test_it_is_valid_and_holds_the_same(
+    compression: Compression, model: Path, tmp_path: Path
+) -> None:
     pixels = np.tile(images.digital_numbers(), (1, 4, 5))
     if compression is Compression.none:
         pixels = pixels.astype(np.float32)
@@ -45,7 +49,9 @@ def test_it_is_valid_and_holds_the_same(compression: Compression, model: Path, t
     assert (valid, errors, warnings) == (True, [], [])
     with rasterio.open(plain) as before, rasterio.open(cog) as after:
         np.testing.assert_array_equal(after.read(), before.read())
-        np.testing.assert_allclose(after.transform, images.profile()["transform"], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            after.transform, images.profile()["transform"], rtol=0, atol=1e-9
+        )
         assert after.crs == rasterio.CRS.from_epsg(32631)
         assert (after.descriptions, after.scales) == (("B0", "B1"), (0.1, 0.2))
         assert after.overviews(1) == [2]
@@ -98,7 +104,9 @@ def test_a_run_stopped_while_it_is_written_goes_on(
             restore_file(image, tmp_path / "out.tif", options)
     assert (tmp_path / "out.tif").read_bytes() == b"the old one"
     calls: list[str] = []
-    monkeypatch.setattr("beers_deploy.restoration.tiles.exposures.restore_window", lambda *_: calls.append("tile"))
+    monkeypatch.setattr(
+        "beers_deploy.restoration.tiles.exposures.restore_window", lambda *_: calls.append("tile")
+    )
     restore_file(image, tmp_path / "out.tif", replace(options, resume=True))
     assert calls == []
     assert (tmp_path / "out.tif").read_bytes() == (tmp_path / "expected.tif").read_bytes()
@@ -114,7 +122,9 @@ def test_it_is_valid_at_any_size(height: int, width: int, model: Path, tmp_path:
     assert cogeo.cog_validate(tmp_path / "out.tif")[0]
 
 
-def test_without_rasterio_it_is_one_sentence(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_rasterio_it_is_one_sentence(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
     monkeypatch.setitem(sys.modules, "rasterio", None)
     with pytest.raises(MachineError, match=r"cog.*pip install 'beers-deploy\[gdal\]'"):
@@ -126,7 +136,9 @@ def test_without_rasterio_it_is_one_sentence(model: Path, tmp_path: Path, monkey
 def test_the_disk_is_asked_for_all_that_stands_on_it_at_a_time(
     shape: tuple[int, int, int], model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One byte less is refused before any work; what was asked for is taken, and tags and indexes beside it."""
+    """One byte less is refused before any work; what was asked for is taken, and tags and indexes
+    beside it.
+    """
     image = images.write_tiff(tmp_path / "in.tif", np.full(shape, 700, np.uint16))
     out = tmp_path / "out.tif"
     options = Options(model, tile_px=256, cog=True, compression=Compression.none)

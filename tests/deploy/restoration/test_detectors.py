@@ -1,4 +1,6 @@
-"""Faulty detectors are told, listed, replaced before restoration and written; what does not fit is refused."""
+"""Faulty detectors are told, listed, replaced before restoration and written; what does not fit is
+refused.
+"""
 
 from pathlib import Path
 
@@ -52,13 +54,17 @@ def source_of(pixels: np.ndarray, nodata: float | None = None) -> ArraySource:
 def read(source: FixedSource, step_px: int = 7) -> np.ndarray:
     """Read all rows, some at a time."""
     height = source.raster.height_px
-    return np.concatenate([source.read(top, min(top + step_px, height)) for top in range(0, height, step_px)], axis=1)
+    return np.concatenate(
+        [source.read(top, min(top + step_px, height)) for top in range(0, height, step_px)], axis=1
+    )
 
 
 def test_all_kinds_are_found_in_each_band() -> None:
     assert list(find_faults(source_of(faulty()), "image").faults) == FAULTS
     bands = np.stack([ground(HEIGHT, WIDTH, seed=3), faulty()])
-    assert set(find_faults(source_of(bands), "image").faults) == {Fault(f.column, f.row, 2) for f in FAULTS}
+    assert set(find_faults(source_of(bands), "image").faults) == {
+        Fault(f.column, f.row, 2) for f in FAULTS
+    }
 
 
 def test_the_same_is_found_in_floats_with_missing_pixels() -> None:
@@ -67,7 +73,10 @@ def test_the_same_is_found_in_floats_with_missing_pixels() -> None:
     assert list(find_faults(source_of(pixels), "image").faults) == FAULTS
     hidden = faulty()
     hidden[:10, :30] = 0
-    assert list(find_faults(source_of(hidden, nodata=0.0), "image").faults) == [Fault(-1, 100), Fault(80, 20)]
+    assert list(find_faults(source_of(hidden, nodata=0.0), "image").faults) == [
+        Fault(-1, 100),
+        Fault(80, 20),
+    ]
 
 
 @settings(deadline=None, max_examples=20)
@@ -133,12 +142,16 @@ def test_what_no_sound_pixel_is_near_stays() -> None:
 
 
 lists = st.lists(
-    st.builds(Fault, st.integers(-1, 9), st.integers(0, 7), st.integers(0, 3)) | st.just(Fault(3, -1)), min_size=1
+    st.builds(Fault, st.integers(-1, 9), st.integers(0, 7), st.integers(0, 3))
+    | st.just(Fault(3, -1)),
+    min_size=1,
 )
 
 
 @given(lists)
-def test_a_list_is_read_as_it_was_written(tmp_path_factory: pytest.TempPathFactory, faults: list[Fault]) -> None:
+def test_a_list_is_read_as_it_was_written(
+    tmp_path_factory: pytest.TempPathFactory, faults: list[Fault]
+) -> None:
     path = tmp_path_factory.getbasetemp() / "list.csv"
     written = FaultList(tuple(sorted(set(faults))))
     path.write_text(written.text)
@@ -192,9 +205,18 @@ def test_an_image_full_of_single_pixels_has_no_single_faults() -> None:
 def test_sentences_name_kind_place_and_remedy() -> None:
     pixels = faulty().astype(np.float64)
     pixels[:, ::2] *= 1.04
-    said = sentences(look_at_detectors(source_of(np.rint(np.minimum(pixels, 4095)).astype(np.uint16)), 5000))
+    said = sentences(
+        look_at_detectors(source_of(np.rint(np.minimum(pixels, 4095)).astype(np.uint16)), 5000)
+    )
     assert all("look at the detectors: " in sentence for sentence in said)
-    for words in ("1 dead column", "column 40", "1 dead row", "row 100", "column 80, row 20", "alternate columns"):
+    for words in (
+        "1 dead column",
+        "column 40",
+        "1 dead row",
+        "row 100",
+        "column 80, row 20",
+        "alternate columns",
+    ):
         assert any(words in sentence for sentence in said), words
     assert not sentences(look_at_detectors(source_of(ground(HEIGHT, WIDTH)), 4095))
 
@@ -233,7 +255,9 @@ def test_a_restoration_sees_the_replaced_pixels(image: Path, model: Path, tmp_pa
     assert not (tmp_path / "again.detectors.csv").exists()
 
 
-def test_a_stopped_run_goes_on_with_the_same_faults_and_no_others(image: Path, model: Path, tmp_path: Path) -> None:
+def test_a_stopped_run_goes_on_with_the_same_faults_and_no_others(
+    image: Path, model: Path, tmp_path: Path
+) -> None:
     (tmp_path / "list.csv").write_text("7,8\n")
     out = tmp_path / "out.tif"
     options = Options(model, 64, fix_detectors="found")
@@ -260,6 +284,8 @@ def test_commands_say_it(image: Path, model: Path, tmp_path: Path) -> None:
     assert "2 pixels, 1 column, 1 row found" in said
     assert "look at the detectors" not in said
     before = out.read_bytes()
-    assert "--fix-detectors" in refused("restore", image, out, *network, "--fix-detectors", tmp_path / "none.csv")
+    assert "--fix-detectors" in refused(
+        "restore", image, out, *network, "--fix-detectors", tmp_path / "none.csv"
+    )
     assert "input" in refused("restore", image, out, *network, "--fix-detectors", out)
     assert out.read_bytes() == before

@@ -47,7 +47,10 @@ def test_rows_are_the_same_however_many_tiles_are_in_work(at_once: int) -> None:
 
 
 def test_as_many_tiles_are_in_work_as_were_asked_for() -> None:
-    """Each call waits for a second one: one at a time would wait in vain. Two bands make their number even."""
+    """Each call waits for a second one: one at a time would wait in vain.
+
+    Two bands make their number even.
+    """
     together = threading.Barrier(2, timeout=10)
 
     def patient(image: np.ndarray) -> np.ndarray:
@@ -58,7 +61,8 @@ def test_as_many_tiles_are_in_work_as_were_asked_for() -> None:
 
 
 @pytest.mark.parametrize(
-    ("factor", "error", "words"), [(np.nan, ImageError, "finite pixels"), (1, KeyboardInterrupt, "a stop")]
+    ("factor", "error", "words"),
+    [(np.nan, ImageError, "finite pixels"), (1, KeyboardInterrupt, "a stop")],
 )
 def test_after_an_error_or_a_stop_no_further_tile_is_begun(
     factor: float, error: type[BaseException], words: str
@@ -87,4 +91,6 @@ def test_tiles_share_the_threads_evenly(threads: int, tiles: int) -> None:
     assert 1 <= count <= min(AT_ONCE, max(tiles, 1))
     assert cores % count == 0
     if count > 1:
-        assert session_threads(threads, count) - 1 + count == cores  # onnxruntime's own threads, and the callers
+        assert (
+            session_threads(threads, count) - 1 + count == cores
+        )  # onnxruntime's own threads, and the callers

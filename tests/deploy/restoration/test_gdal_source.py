@@ -1,4 +1,6 @@
-"""What GDAL reads: the same pixels and the same place on Earth as of a TIFF, whatever the format."""
+"""What GDAL reads: the same pixels and the same place on Earth as of a TIFF,
+whatever the format.
+"""
 
 import sys
 import warnings
@@ -51,12 +53,16 @@ def test_the_place_on_earth_is_kept(name: str, model: Path, tmp_path: Path) -> N
     image = images.FORMATS[name](tmp_path / name, images.digital_numbers())
     restore_file(image, tmp_path / "out.tif", Options(model))
     with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
-        np.testing.assert_allclose(after.transform, images.profile()["transform"], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            after.transform, images.profile()["transform"], rtol=0, atol=1e-9
+        )
         assert after.crs == before.crs == rasterio.CRS.from_epsg(32631)
 
 
 @pytest.mark.parametrize("cog", [False, True])
-def test_polynomials_bits_and_gains_of_a_dimap_are_kept(cog: bool, model: Path, tmp_path: Path) -> None:
+def test_polynomials_bits_and_gains_of_a_dimap_are_kept(
+    cog: bool, model: Path, tmp_path: Path
+) -> None:
     image = images.write_dimap(tmp_path / "DIM.XML", images.digital_numbers(10), bits=10)
     with open_source(image) as source:
         assert source.raster.bits == 10
@@ -81,7 +87,8 @@ def test_names_and_gains_of_bands_are_kept(model: Path, tmp_path: Path) -> None:
 
 def test_ground_control_points_are_kept(model: Path, tmp_path: Path) -> None:
     points = "".join(
-        f'<GCP Id="{k}" Pixel="{17 * k}" Line="{9 * k * k}" X="{k / 3!r}" Y="{45 - k / 7!r}" Z="0"/>'
+        f'<GCP Id="{k}" Pixel="{17 * k}" Line="{9 * k * k}" X="{k / 3!r}" Y="{45 - k / 7!r}" '
+        'Z="0"/>'
         for k in range(5)
     )
     image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
@@ -127,7 +134,9 @@ def test_the_cache_is_counted_with_the_blocks_of_a_mosaic_s_tiles(tmp_path: Path
     (tmp_path / "a.vrt").write_text(f"<VRTDataset {size}>{bands}</VRTDataset>")
     for image, block_px in ((one, images.TILE_PX), (tmp_path / "a.vrt", 140)):
         with open_source(image) as source:
-            assert source.held_bytes(rows) == (rows + 2 * block_px) * images.BANDS * images.WIDTH * 2
+            assert (
+                source.held_bytes(rows) == (rows + 2 * block_px) * images.BANDS * images.WIDTH * 2
+            )
             assert source.held_bytes(1) == LEAST_CACHE_BYTES
 
 
@@ -173,7 +182,10 @@ def test_a_tile_is_no_output(model: Path, tmp_path: Path) -> None:
     before = tile.read_bytes()
     with pytest.raises(BeersError, match="an input of this run"):
         restore_file(image, tile, Options(model))
-    for words in (["restore", str(image), str(out), "--json", str(tile)], ["info", str(image), "--json", str(tile)]):
+    for words in (
+        ["restore", str(image), str(out), "--json", str(tile)],
+        ["info", str(image), "--json", str(tile)],
+    ):
         assert "an input of this run" in refused(*words)
     assert tile.read_bytes() == before
 
@@ -182,7 +194,9 @@ def test_a_changed_tile_makes_another_image(tmp_path: Path) -> None:
     image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
     with open_source(image) as source:
         before = fingerprint(source.files)
-    images.write_jp2(tmp_path / "R64C80.jp2", np.zeros((2, images.HEIGHT - 64, images.WIDTH - 80), np.uint16))
+    images.write_jp2(
+        tmp_path / "R64C80.jp2", np.zeros((2, images.HEIGHT - 64, images.WIDTH - 80), np.uint16)
+    )
     assert fingerprint(source.files) != before
 
 
@@ -191,7 +205,9 @@ def test_alpha_and_masks_of_gdal_s_formats_are_missing_pixels(tmp_path: Path) ->
     hidden = np.zeros((images.HEIGHT, images.WIDTH), bool)
     hidden[30:50, 40:] = True
     pixels[1] = np.where(hidden, 0, 4095)
-    images.write_jp2(tmp_path / "alpha.jp2", pixels, NBITS=12, PHOTOMETRIC="MINISBLACK", ALPHA="YES")
+    images.write_jp2(
+        tmp_path / "alpha.jp2", pixels, NBITS=12, PHOTOMETRIC="MINISBLACK", ALPHA="YES"
+    )
     images.write_jp2(tmp_path / "beside.jp2", pixels[:1], NBITS=12)
     tifffile.imwrite(tmp_path / "beside.jp2.msk", np.where(hidden, 0, 255).astype(np.uint8))
     for name, veil in (("alpha.jp2", "unassalpha"), ("beside.jp2", "mask")):
@@ -209,7 +225,11 @@ def test_a_cog_keeps_mask_and_alpha(model: Path, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "mask.tif", pixels)
     both = np.stack([pixels, ~hidden * 4095]).astype(np.uint16)
     tifffile.imwrite(
-        tmp_path / "alpha.tif", both, photometric="minisblack", planarconfig="separate", extrasamples=[2]
+        tmp_path / "alpha.tif",
+        both,
+        photometric="minisblack",
+        planarconfig="separate",
+        extrasamples=[2],
     )
     tifffile.imwrite(tmp_path / "mask.tif.msk", np.where(hidden, 0, 255).astype(np.uint8))
     for name in ("mask", "alpha"):

@@ -60,18 +60,26 @@ REFUSED = {
     "network path": (vrt(naming("/vsicurl/http://localhost/a.tif")), "vsicurl"),
     "part of a file": (vrt(naming("GTIFF_DIR:1:tile.tif")), "GTIFF_DIR"),
     "XML in a name": (vrt(naming("&lt;GDAL_WMS/&gt;")), "GDAL_WMS"),
-    "as an attribute": (vrt('<SimpleSource SourceFilename="/vsicurl/http://a"/>'), "/vsicurl/http://a"),
+    "as an attribute": (
+        vrt('<SimpleSource SourceFilename="/vsicurl/http://a"/>'),
+        "/vsicurl/http://a",
+    ),
     "no image": (vrt(naming("notes.txt")), "another file, notes.txt"),
     "a service": (vrt(naming("service.xml")), "another file, service.xml"),
     "bomb": (BOMB + vrt("<Description>&b;</Description>"), "a document type"),
     "no XML": ("<VRTDataset", "plain XML"),
-    "unknown letters": ('<?xml version="1.0" encoding="UTFZ8"?>' + vrt(""), "unknown encoding: UTFZ8"),
+    "unknown letters": (
+        '<?xml version="1.0" encoding="UTFZ8"?>' + vrt(""),
+        "unknown encoding: UTFZ8",
+    ),
     "another root": ("<vrtdataset/>", "is no VRTDataset"),
 }
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_an_index_that_leads_elsewhere_is_refused(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_index_that_leads_elsewhere_is_refused(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = folder_of(tmp_path)
     monkeypatch.chdir(tmp_path)
     text, words = REFUSED[case]
@@ -100,7 +108,9 @@ def test_a_bomb_in_utf_16_is_seen(tmp_path: Path) -> None:
         index_files(folder / "a.vrt")
 
 
-def test_a_circle_ends_and_a_large_index_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_circle_ends_and_a_large_index_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = folder_of(tmp_path)
     (folder / "a.vrt").write_text(vrt(naming("b.vrt")))
     (folder / "b.vrt").write_text(vrt(naming("a.vrt") + ONE))
@@ -111,7 +121,8 @@ def test_a_circle_ends_and_a_large_index_is_refused(tmp_path: Path, monkeypatch:
 
 
 CODE = """<VRTDataset rasterXSize="9" rasterYSize="9">
-<VRTRasterBand dataType="UInt16" band="1" subClass="VRTDerivedRasterBand"><PixelFunctionType>run</PixelFunctionType>
+<VRTRasterBand dataType="UInt16" band="1" subClass="VRTDerivedRasterBand">
+<PixelFunctionType>run</PixelFunctionType>
 <PixelFunctionLanguage>Python</PixelFunctionLanguage>
 <PixelFunctionCode><![CDATA[
 def run(in_ar, out_ar, *rest, **more):
@@ -143,7 +154,9 @@ def test_code_in_an_index_is_never_run(trusted: bool, tmp_path: Path) -> None:
         ("<Dimap_Document>", BOMB + "<Dimap_Document>", "document type"),
     ],
 )
-def test_a_dimap_that_leads_elsewhere_is_refused(before: str, after: str, words: str, tmp_path: Path) -> None:
+def test_a_dimap_that_leads_elsewhere_is_refused(
+    before: str, after: str, words: str, tmp_path: Path
+) -> None:
     folder = folder_of(tmp_path)
     index = images.write_dimap(folder / "DIM.XML", images.digital_numbers())
     text = index.read_text()
@@ -173,7 +186,9 @@ def test_a_trusted_index_reaches_outside_and_to_urls(tmp_path: Path) -> None:
     index.write_text(vrt(naming("../outside.tif")))
     with open_source(index, trusted=True) as source:
         assert source.read(0, 9).sum() == 81
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Silent, directory=tmp_path)) as server:
+    with http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0), partial(Silent, directory=tmp_path)
+    ) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         url = f"/vsicurl/http://127.0.0.1:{server.server_port}/outside.tif"
         index.write_text(vrt(naming(url)))

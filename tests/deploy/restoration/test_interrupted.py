@@ -1,4 +1,6 @@
-"""Files may be damaged or replaced between two runs: the pixels are right, or one sentence says why."""
+"""Files may be damaged or replaced between two runs: the pixels are right, or one sentence says
+why.
+"""
 
 import os
 from collections.abc import Callable, Iterator
@@ -102,7 +104,9 @@ def image(tmp_path: Path) -> Path:
     return tmp_path / "in.tif"
 
 
-def test_damaged_rows_are_made_again_and_it_is_said(image: Path, model: Path, tmp_path: Path) -> None:
+def test_damaged_rows_are_made_again_and_it_is_said(
+    image: Path, model: Path, tmp_path: Path
+) -> None:
     whole = tmp_path / "whole.tif"
     out = tmp_path / "out.tif"
     restore_file(image, whole, Options(model, TILE_PX))
@@ -133,7 +137,8 @@ def write_mask(image: Path, hidden_rows: int) -> None:
 
 
 def write_nodata(image: Path, value: int) -> None:
-    text = f"<PAMDataset><PAMRasterBand><NoDataValue>{value}</NoDataValue></PAMRasterBand></PAMDataset>"
+    band = f"<PAMRasterBand><NoDataValue>{value}</NoDataValue></PAMRasterBand>"
+    text = f"<PAMDataset>{band}</PAMDataset>"
     image.with_name("in.tif.aux.xml").write_text(text)
 
 
@@ -143,13 +148,23 @@ def flip_the_middle(image: Path) -> None:
 
 BESIDE: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], None]]] = {
     "middle": ("in.tif", lambda _: None, flip_the_middle),
-    "mask": ("in.tif.msk", lambda image: write_mask(image, 300), lambda image: write_mask(image, 340)),
-    "nodata": ("in.tif.aux.xml", lambda image: write_nodata(image, 1000), lambda image: write_nodata(image, 2000)),
+    "mask": (
+        "in.tif.msk",
+        lambda image: write_mask(image, 300),
+        lambda image: write_mask(image, 340),
+    ),
+    "nodata": (
+        "in.tif.aux.xml",
+        lambda image: write_nodata(image, 1000),
+        lambda image: write_nodata(image, 2000),
+    ),
 }
 
 
 @pytest.mark.parametrize("kind", BESIDE)
-def test_whatever_is_read_is_part_of_the_job(kind: str, image: Path, model: Path, tmp_path: Path) -> None:
+def test_whatever_is_read_is_part_of_the_job(
+    kind: str, image: Path, model: Path, tmp_path: Path
+) -> None:
     name, before, after = BESIDE[kind]
     out = tmp_path / "out.tif"
     before(image)
@@ -167,7 +182,9 @@ def test_whatever_is_read_is_part_of_the_job(kind: str, image: Path, model: Path
     assert out.read_bytes() == (tmp_path / "whole.tif").read_bytes()
 
 
-def test_a_sidecar_that_comes_or_goes_is_another_image(image: Path, model: Path, tmp_path: Path) -> None:
+def test_a_sidecar_that_comes_or_goes_is_another_image(
+    image: Path, model: Path, tmp_path: Path
+) -> None:
     with stopped_after(40):
         restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX))
     write_nodata(image, 1000)

@@ -80,7 +80,9 @@ def test_a_disk_without_locks_locks_nothing_and_is_left_clean(
     assert not folder.exists()
 
 
-def test_a_folder_that_never_comes_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_never_comes_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Such as a drive that is not there: no run that just ended took it along."""
 
     def missing(self: Path, *_: object, **__: object) -> None:
@@ -115,9 +117,15 @@ def test_new_folders_above_go_with_it_unless_something_was_written_there(tmp_pat
     assert [path.name for path in tmp_path.rglob("*")] == ["new", "below", "out"]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows removes no file that is open: nothing can come between")
-def test_a_run_that_ends_just_then_takes_no_lock_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between opening the file and locking it, the run that held it ends: the lock must be on the new file."""
+@pytest.mark.skipif(
+    sys.platform == "win32", reason="Windows removes no file that is open: nothing can come between"
+)
+def test_a_run_that_ends_just_then_takes_no_lock_along(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between opening the file and locking it, the run that held it ends: the lock must be on the
+    new file.
+    """
     import fcntl
 
     folder = tmp_path / ".out.part"

@@ -1,4 +1,6 @@
-"""One engine: one image is restored to the same pixels, whichever command or function restores it."""
+"""One engine: one image is restored to the same pixels, whichever command or
+function restores it.
+"""
 
 import warnings
 from collections.abc import Callable
@@ -37,7 +39,9 @@ SMALL_HALOS_PX = {"float": 2, "int8": 8}
 
 @pytest.fixture(params=TILES_PX)
 def precision(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Of the network; evaluate and the trade-off's scores take tiles so small that the image has many."""
+    """Of the network; evaluate and the trade-off's scores take tiles so small that the image has
+    many.
+    """
     monkeypatch.setattr(method, "TILE_PX", TILES_PX[request.param])
     return str(request.param)
 
@@ -63,15 +67,23 @@ def by_engine(dn: np.ndarray, options: Options) -> np.ndarray:
 def by_tradeoff(path: Path, precision: str, halo_px: int) -> Restored:
     """As a study scores an operating point whose halo is smaller than the network's radius."""
     variant = Variant(path.stem, FLOAT if precision == "float" else INT8, path)
-    return restore_in_tiles(Point(variant, tile_px=TILES_PX[precision], halo_px=halo_px), SENSOR, REFERENCE)
+    return restore_in_tiles(
+        Point(variant, tile_px=TILES_PX[precision], halo_px=halo_px), SENSOR, REFERENCE
+    )
 
 
 def exact_ways(path: Path, tile_px: int) -> dict[str, Restored]:
-    """Every way from digital numbers (H, W) float32 to whole restored ones whose seams are exact."""
+    """Every way from digital numbers (H, W) float32 to whole restored ones
+    whose seams are exact.
+    """
     network = load_onnx(path)
     return {
-        "evaluate and tradeoff": method_named(str(path), SENSOR, REFERENCE, around=Around(consistency=False)).restore,
-        "the library and the demo": lambda dn: np.rint(library.restore(dn, path, tile=tile_px, full_scale=4095)),
+        "evaluate and tradeoff": method_named(
+            str(path), SENSOR, REFERENCE, around=Around(consistency=False)
+        ).restore,
+        "the library and the demo": lambda dn: np.rint(
+            library.restore(dn, path, tile=tile_px, full_scale=4095)
+        ),
         "stress": lambda dn: np.rint(Network(network).restore(dn, tile_px=tile_px)),
         "the array": partial(by_engine, options=Options(path, tile_px)),
     }
@@ -89,13 +101,17 @@ def test_with_exact_seams_every_command_gives_the_pixels_of_restore(
         np.testing.assert_array_equal(way(pixels.astype(np.float32)), expected, err_msg=name)
 
 
-def test_with_a_halo_below_the_radius_they_have_the_same_seams(precision: str, path: Path, tmp_path: Path) -> None:
+def test_with_a_halo_below_the_radius_they_have_the_same_seams(
+    precision: str, path: Path, tmp_path: Path
+) -> None:
     pixels = image()
     tile_px = TILES_PX[precision]
     halo_px = SMALL_HALOS_PX[precision]
     options = Options(path, tile_px, str(halo_px), sensors={"": SENSOR})
     expected = restored(tmp_path, pixels, options)[0]
-    assert (expected != restored(tmp_path, pixels, Options(path, tile_px, sensors={"": SENSOR}))[0]).any()
+    assert (
+        expected != restored(tmp_path, pixels, Options(path, tile_px, sensors={"": SENSOR}))[0]
+    ).any()
     dn = pixels.astype(np.float32)
     with warnings.catch_warnings(action="ignore"):  # noise contradicts the sensor
         found = restore(pixels, path, tile=tile_px, halo=halo_px, sensor=SENSOR)
@@ -114,7 +130,9 @@ def test_floats_are_those_of_restore_unrounded(precision: str, path: Path, tmp_p
 
 
 @pytest.mark.parametrize("bits", [8, 14])
-def test_a_sensor_of_other_bits_has_its_own_full_scale(bits: int, model: Path, tmp_path: Path) -> None:
+def test_a_sensor_of_other_bits_has_its_own_full_scale(
+    bits: int, model: Path, tmp_path: Path
+) -> None:
     max_dn = (1 << bits) - 1
     dn = np.random.default_rng(3).integers(0, max_dn + 1, ODD).astype(np.uint16)
     network = load_onnx(model)

@@ -1,4 +1,6 @@
-"""The restored COG in programs that are not ours: gdalinfo, and QGIS's own reader, both of the system."""
+"""The restored COG in programs that are not ours: gdalinfo, and QGIS's own reader, both of the
+system.
+"""
 
 import json
 import shutil
@@ -36,14 +38,17 @@ layer = QgsRasterLayer(sys.argv[1], "restored", "gdal")
 data, box = layer.dataProvider(), layer.extent()
 bands = range(1, layer.bandCount() + 1)
 blocks = [data.block(band, box, layer.width(), layer.height()) for band in bands]
-values = [[[block.value(row, column) for column in range(0, 90, 7)] for row in range(0, 90, 7)] for block in blocks]
+grid = range(0, 90, 7)
+values = [[[block.value(row, column) for column in grid] for row in grid] for block in blocks]
 said = {
     "valid": layer.isValid(),
     "crs": layer.crs().authid(),
     "box": [box.xMinimum(), box.yMaximum(), box.xMaximum(), box.yMinimum()],
     "names": [layer.bandName(band) for band in bands],
     "missing": [data.sourceNoDataValue(band) for band in bands if data.sourceHasNoDataValue(band)],
-    "hole": [[blocks[0].isNoData(row, column) for column in (19, 20, 89, 90)] for row in (29, 30, 59, 60)],
+    "hole": [
+        [blocks[0].isNoData(row, column) for column in (19, 20, 89, 90)] for row in (29, 30, 59, 60)
+    ],
     "scales": [data.bandScale(band) for band in bands],
     "overviews": [[each.xDim, each.yDim] for each in data.buildPyramidList() if each.exists],
     "values": values,
@@ -64,14 +69,19 @@ print(json.dumps({"runs": runs}))
 FOOTPRINT = """
 layer = QgsVectorLayer(sys.argv[1], "footprint", "ogr")
 box = layer.extent()
-said = {"box": [box.xMinimum(), box.yMinimum(), box.xMaximum(), box.yMaximum()], "crs": layer.crs().authid()}
+said = {
+    "box": [box.xMinimum(), box.yMinimum(), box.xMaximum(), box.yMaximum()],
+    "crs": layer.crs().authid(),
+}
 print(json.dumps(said | {"features": layer.featureCount()}))
 """
 
 
 def answer(*command: str | Path) -> dict[str, Any]:
     """What a program prints as JSON."""
-    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=True, timeout=300)
+    done = subprocess.run(
+        list(map(str, command)), capture_output=True, text=True, check=True, timeout=300
+    )
     said: dict[str, Any] = json.loads(done.stdout)
     return said
 
@@ -87,13 +97,18 @@ def gdalinfo() -> str:
 @pytest.fixture
 def qgis() -> Path:
     """A Python that has QGIS."""
-    if not PYTHON.is_file() or subprocess.run([PYTHON, "-c", "import qgis.core"], capture_output=True).returncode:
+    if (
+        not PYTHON.is_file()
+        or subprocess.run([PYTHON, "-c", "import qgis.core"], capture_output=True).returncode
+    ):
         pytest.skip("no QGIS: apt-get install python3-qgis")
     return PYTHON
 
 
 @pytest.mark.parametrize("name", ["a.tif", "a.jp2", "a.vrt", "DIM.XML"])
-def test_gdalinfo_finds_it_where_the_input_was(name: str, gdalinfo: str, model: Path, tmp_path: Path) -> None:
+def test_gdalinfo_finds_it_where_the_input_was(
+    name: str, gdalinfo: str, model: Path, tmp_path: Path
+) -> None:
     image = images.FORMATS[name](tmp_path / name, images.digital_numbers())
     restore_file(image, tmp_path / "out.tif", Options(model, cog=True))
     before, after = (answer(gdalinfo, "-json", path) for path in (image, tmp_path / "out.tif"))
@@ -105,13 +120,21 @@ def test_gdalinfo_finds_it_where_the_input_was(name: str, gdalinfo: str, model: 
     assert after["metadata"]["IMAGE_STRUCTURE"]["LAYOUT"] == "COG"
     assert after["metadata"][""]["RESTORED_BY"].startswith("beers-deploy ")
     for key, text in before["metadata"].get("RPC", {}).items():
-        if key not in ("ERR_BIAS", "ERR_RAND"):  # GeoTIFF's tag has places for both, a DIMAP's model other ones
-            numbers = [[float(word) for word in said.split()] for said in (text, after["metadata"]["RPC"][key])]
+        if key not in (
+            "ERR_BIAS",
+            "ERR_RAND",
+        ):  # GeoTIFF's tag has places for both, a DIMAP's model other ones
+            numbers = [
+                [float(word) for word in said.split()]
+                for said in (text, after["metadata"]["RPC"][key])
+            ]
             assert numbers[1] == pytest.approx(numbers[0], rel=0, abs=1e-9)
     assert ("RPC" in before["metadata"]) == (name == "DIM.XML")
 
 
-def test_gdalinfo_finds_bands_nodata_and_overviews(gdalinfo: str, model: Path, tmp_path: Path) -> None:
+def test_gdalinfo_finds_bands_nodata_and_overviews(
+    gdalinfo: str, model: Path, tmp_path: Path
+) -> None:
     restore_with_a_hole(tmp_path, model)
     bands = answer(gdalinfo, "-json", tmp_path / "out.tif")["bands"]
     assert [band["description"] for band in bands] == ["B0", "B1"]
@@ -137,12 +160,16 @@ def test_qgis_shows_what_was_written(qgis: Path, model: Path, tmp_path: Path) ->
     place, (_, height, width) = images.profile()["transform"], restored.shape
     assert said["valid"]
     assert said["crs"] == "EPSG:32631"
-    assert said["box"] == pytest.approx([*(place * (0, 0)), *(place * (width, height))], rel=0, abs=1e-9)
+    assert said["box"] == pytest.approx(
+        [*(place * (0, 0)), *(place * (width, height))], rel=0, abs=1e-9
+    )
     assert said["names"] == ["Band 1: B0", "Band 2: B1"]
     assert said["missing"] == [0, 0]
     assert said["hole"] == [[row and column for column in (0, 1, 1, 0)] for row in (0, 1, 1, 0)]
     assert said["overviews"] == [[354, 375]]
-    physical = restored[:, :90:7, :90:7] * np.reshape(said["scales"], (-1, 1, 1))  # it applies the bands' gains
+    physical = restored[:, :90:7, :90:7] * np.reshape(
+        said["scales"], (-1, 1, 1)
+    )  # it applies the bands' gains
     known = restored[:, :90:7, :90:7] > 0
     np.testing.assert_allclose(np.asarray(said["values"])[known], physical[known], rtol=1e-6)
     assert said["scales"] == [0.1, 0.2]
@@ -153,17 +180,23 @@ def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
     image = images.write_tiff(tmp_path / "raw.tif", images.digital_numbers(bands=1))
     program = tmp_path / "beers-deploy"
     program.write_text(
-        f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} -c "from beers_deploy.cli import app; app()" "$@"\n'
+        f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} -c "from beers_deploy.cli import '
+        'app; app()" "$@"\n'
     )
     program.chmod(0o755)
     script = ROOT / "examples" / "qgis_restore.py"
     outs = [tmp_path / "restored.tif", tmp_path / "restored.xyz"]
-    (done, _), (refused, why) = answer(qgis, "-c", IN_QGIS.replace("{}", RUN), script, program, image, *outs)["runs"]
+    (done, _), (refused, why) = answer(
+        qgis, "-c", IN_QGIS.replace("{}", RUN), script, program, image, *outs
+    )["runs"]
     assert done
     assert not refused
     assert "expected a TIFF's name" in why
     restore_file(image, tmp_path / "expected.tif", Options(shipped_pair(sensor=BLIND)[1]))
-    with images.rasterio.open(outs[0]) as ours, images.rasterio.open(tmp_path / "expected.tif") as theirs:
+    with (
+        images.rasterio.open(outs[0]) as ours,
+        images.rasterio.open(tmp_path / "expected.tif") as theirs,
+    ):
         np.testing.assert_array_equal(ours.read(), theirs.read())
         assert ours.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
 
@@ -175,4 +208,6 @@ def test_qgis_draws_the_footprint_of_a_stac_item(qgis: Path, model: Path, tmp_pa
     write_item(tmp_path / "out.tif", tmp_path / "out.json")
     said = answer(qgis, "-c", IN_QGIS.replace("{}", FOOTPRINT), tmp_path / "out.json")
     assert (said["features"], said["crs"]) == (1, "EPSG:4326")
-    assert said["box"] == pytest.approx(json.loads((tmp_path / "out.json").read_text())["bbox"], rel=0, abs=1e-9)
+    assert said["box"] == pytest.approx(
+        json.loads((tmp_path / "out.json").read_text())["bbox"], rel=0, abs=1e-9
+    )

@@ -1,4 +1,6 @@
-"""What is said of a result: 3 % more light on an ordinary scene is told, what shipped networks do is not."""
+"""What is said of a result: 3 % more light on an ordinary scene is told, what shipped networks do
+is not.
+"""
 
 from pathlib import Path
 
@@ -29,11 +31,18 @@ def told(found: Tally) -> bool:
     return any("the mean went from" in doubt for doubt in found.doubts)
 
 
-@given(st.integers(0, 2**20), st.floats(0.08, 0.5), st.floats(0.05, 0.5), st.sampled_from([-0.03, 0.03]))
+@given(
+    st.integers(0, 2**20),
+    st.floats(0.08, 0.5),
+    st.floats(0.05, 0.5),
+    st.sampled_from([-0.03, 0.03]),
+)
 def test_three_percent_of_an_ordinary_scene_are_told_and_one_is_not(
     seed: int, mean: float, contrast: float, share: float
 ) -> None:
-    """The mean is from 8 to 50 % of full scale, the contrast up to half of that, as of most scenes in daylight."""
+    """The mean is from 8 to 50 % of full scale, the contrast up to half of that, as of most scenes
+    in daylight.
+    """
     image = mean * (1 + contrast * np.random.default_rng(seed).uniform(-1, 1, (200, 200)))
     assert told(tally(image, (1 + share) * image))
     assert not told(tally(image, (1 + share / 3) * image))
@@ -78,7 +87,9 @@ def test_a_network_that_brightens_or_darkens_by_three_percent_is_told(
     last = network.graph.output[0].name
     for node in network.graph.node:
         node.output[:] = ["plain" if name == last else name for name in node.output]
-    network.graph.initializer.append(numpy_helper.from_array(np.array(factor, np.float32), "factor"))
+    network.graph.initializer.append(
+        numpy_helper.from_array(np.array(factor, np.float32), "factor")
+    )
     network.graph.node.append(onnx.helper.make_node("Mul", ["plain", "factor"], [last], "brighten"))
     onnx.save(network, tmp_path / "network.onnx")
     image = tmp_path / "in.tif"

@@ -11,16 +11,22 @@ TILING = Tiling(RADIUS_PX)
 
 
 @given(st.integers(1, 90), st.integers(1, 90), st.integers(13, 40), st.integers(0, 6))
-def test_kept_parts_cover_every_pixel_once(height: int, width: int, tile_px: int, halo_px: int) -> None:
+def test_kept_parts_cover_every_pixel_once(
+    height: int, width: int, tile_px: int, halo_px: int
+) -> None:
     plan = make_plan((1, height, width), tile_px, halo_px, Tiling(halo_px))
     for size, spans in ((height, plan.rows), (width, plan.columns)):
-        assert [p for span in spans for p in range(span.keep_start, span.keep_stop)] == list(range(size))
+        assert [p for span in spans for p in range(span.keep_start, span.keep_stop)] == list(
+            range(size)
+        )
         assert {span.stop - span.start for span in spans} == {spans[0].stop}, "all of one size"
         assert spans[0].stop <= min(tile_px, size)
 
 
 @given(st.integers(1, 200), st.integers(13, 60), st.integers(0, 6))
-def test_every_kept_pixel_has_its_halo_or_touches_the_border(size: int, tile_px: int, halo_px: int) -> None:
+def test_every_kept_pixel_has_its_halo_or_touches_the_border(
+    size: int, tile_px: int, halo_px: int
+) -> None:
     for side_px in (tile_px, even_side_px(size, tile_px, halo_px)):
         for span in plan_side(size, side_px, halo_px):
             assert span.start == 0 or span.keep_start - span.start >= halo_px
@@ -28,7 +34,9 @@ def test_every_kept_pixel_has_its_halo_or_touches_the_border(size: int, tile_px:
 
 
 @given(st.integers(1, 2000), st.integers(13, 200), st.integers(0, 6))
-def test_an_even_side_needs_as_many_tiles_and_none_shorter_does(size: int, tile_px: int, halo_px: int) -> None:
+def test_an_even_side_needs_as_many_tiles_and_none_shorter_does(
+    size: int, tile_px: int, halo_px: int
+) -> None:
     side = even_side_px(size, tile_px, halo_px)
     count = len(plan_side(size, tile_px, halo_px))
     assert side <= tile_px
@@ -38,7 +46,9 @@ def test_an_even_side_needs_as_many_tiles_and_none_shorter_does(size: int, tile_
 
 
 def test_a_span_reads_as_many_pixels_as_a_network_needs() -> None:
-    assert [(span.start, span.stop, span.keep_stop) for span in plan_side(1, 20, 4, 2, least_px=5)] == [(0, 6, 1)]
+    assert [
+        (span.start, span.stop, span.keep_stop) for span in plan_side(1, 20, 4, 2, least_px=5)
+    ] == [(0, 6, 1)]
 
 
 def test_a_tile_without_room_between_its_halos_is_refused() -> None:

@@ -1,4 +1,6 @@
-"""Which value is full scale and who says so; what lies above it; and that the type of the pixels is kept."""
+"""Which value is full scale and who says so; what lies above it; and that the type of the pixels is
+kept.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -69,14 +71,20 @@ def test_floats_of_digital_numbers_have_the_sensor_s_full_scale_and_shares_none(
 
 
 @pytest.mark.parametrize("bits", [10, 14, 16])
-def test_a_file_of_such_bits_is_restored_to_its_own_full_scale(bits: int, model: Path, tmp_path: Path) -> None:
-    """Three ways to state it give the same pixels; that they reach half of it shows that none took 12 bits."""
+def test_a_file_of_such_bits_is_restored_to_its_own_full_scale(
+    bits: int, model: Path, tmp_path: Path
+) -> None:
+    """Three ways to state it give the same pixels; that they reach half of it shows that none took
+    12 bits.
+    """
     full = 2**bits - 1
     asked, row, _ = run(tmp_path, noise(bits), Options(model, 23, full_scale=full))
     assert row.text["full scale from"] == "asked for"
     assert asked.dtype == np.uint16
     assert full / 2 < asked.max() <= full
-    profiled, row, _ = run(tmp_path, noise(bits), Options(model, 23, sensors=told(bits), consistency=False))
+    profiled, row, _ = run(
+        tmp_path, noise(bits), Options(model, 23, sensors=told(bits), consistency=False)
+    )
     assert row.text["full scale"] == f"{full:g}"
     assert row.text["full scale from"] == f"{bits} bits, of the sensor"
     np.testing.assert_array_equal(profiled, asked)
@@ -113,7 +121,10 @@ def test_a_container_states_nothing_and_a_product_s_range_does(tmp_path: Path) -
         images.write(tmp_path / "a.ntf", pixels, "NITF", ICORDS="N"),
         images.write(tmp_path / "b.ntf", pixels, "NITF", ICORDS="N", ABPP="12"),
         images.write_dimap(
-            tmp_path / "DIM.XML", pixels, 16, "<Dynamic_Range><PRODUCT_RANGE>12</PRODUCT_RANGE></Dynamic_Range>"
+            tmp_path / "DIM.XML",
+            pixels,
+            16,
+            "<Dynamic_Range><PRODUCT_RANGE>12</PRODUCT_RANGE></Dynamic_Range>",
         ),
     ):
         with open_source(image) as source:
@@ -121,15 +132,22 @@ def test_a_container_states_nothing_and_a_product_s_range_does(tmp_path: Path) -
     assert found == [None, None, None, 12, 12]
 
 
-def test_values_above_a_stated_full_scale_are_clipped_counted_and_told(model: Path, tmp_path: Path) -> None:
+def test_values_above_a_stated_full_scale_are_clipped_counted_and_told(
+    model: Path, tmp_path: Path
+) -> None:
     """Counted once each, though tiles overlap; restored as if they were full scale."""
     pixels = noise(10)
     pixels[5:9, 3:40] = 5000
     pixels[30, 30] = 1024
     clipped, row, said = run(tmp_path, pixels, Options(model, 23, full_scale=1023))
     assert row.figures["clipped pixels"].value == 4 * 37 + 1
-    assert sum("149 pixels above full scale, 1023 (asked for), were clipped" in each for each in said) == 1
-    expected, row, said = run(tmp_path, np.minimum(pixels, 1023), Options(model, 23, full_scale=1023))
+    assert (
+        sum("149 pixels above full scale, 1023 (asked for), were clipped" in each for each in said)
+        == 1
+    )
+    expected, row, said = run(
+        tmp_path, np.minimum(pixels, 1023), Options(model, 23, full_scale=1023)
+    )
     np.testing.assert_array_equal(clipped, expected)
     assert row.figures["clipped pixels"].value == 0
     assert not any("clipped" in each for each in said)
@@ -149,12 +167,16 @@ def test_missing_pixels_are_not_above(model: Path, tmp_path: Path) -> None:
     assert found[pixels != 65535].max() <= 1023
 
 
-def test_the_count_outlives_a_stop(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_count_outlives_a_stop(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pixels = noise(10)
     pixels[2, :] = 3000
     options = Options(model, 23, full_scale=1023)
 
-    monkeypatch.setattr("beers_deploy.restoration.run.write_output", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr(
+        "beers_deploy.restoration.run.write_output", Mock(side_effect=KeyboardInterrupt)
+    )
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, pixels, options)
     monkeypatch.undo()
@@ -163,7 +185,9 @@ def test_the_count_outlives_a_stop(model: Path, tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.parametrize("value", [-1.0, np.inf])
-def test_negative_and_infinite_values_stay_an_error(value: float, model: Path, tmp_path: Path) -> None:
+def test_negative_and_infinite_values_stay_an_error(
+    value: float, model: Path, tmp_path: Path
+) -> None:
     pixels = noise(10).astype(np.float32)
     pixels[4, 4] = value
     with pytest.raises(ImageError, match="expected digital numbers of 0 to 1023"):
@@ -173,6 +197,8 @@ def test_negative_and_infinite_values_stay_an_error(value: float, model: Path, t
 def test_8_bits_come_back_as_8_bits(model: Path, tmp_path: Path) -> None:
     eight = (noise(10) >> 2).astype(np.uint8)
     kinds: list[np.ndarray] = [eight, eight.astype(np.uint16)]
-    narrow, wide = (restored(tmp_path, each, Options(model, 23, full_scale=255))[0] for each in kinds)
+    narrow, wide = (
+        restored(tmp_path, each, Options(model, 23, full_scale=255))[0] for each in kinds
+    )
     assert narrow.dtype == np.uint8
     np.testing.assert_array_equal(narrow, wide)

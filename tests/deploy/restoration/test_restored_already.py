@@ -1,4 +1,6 @@
-"""Without a sensor: an image that holds no raw noise is told apart, and a raw one of any sensor in range is not."""
+"""Without a sensor: an image that holds no raw noise is told apart, and a raw one of any sensor in
+range is not.
+"""
 
 import warnings
 from collections.abc import Callable
@@ -41,26 +43,44 @@ def scene() -> np.ndarray:
 def raw(seed: int = 0, light: float = 1.0, snr: tuple[float, float] = SNR_BRIGHT) -> np.ndarray:
     """A raw image (256, 256) of a sensor of the range, at a share of the light."""
     sensor = SensorFamily(SENSOR.nominal(), snr).draw(np.random.default_rng(seed))
-    return to_uint16(acquire_three(prepare_scene(light * scene(), 1), sensor, sensor, Draw(seed))[0])
+    return to_uint16(
+        acquire_three(prepare_scene(light * scene(), 1), sensor, sensor, Draw(seed))[0]
+    )
 
 
-def look(image: np.ndarray, full_scale: float = 4095, network: str = NETWORK, nodata: float | None = None) -> str:
+def look(
+    image: np.ndarray, full_scale: float = 4095, network: str = NETWORK, nodata: float | None = None
+) -> str:
     planes = image if image.ndim == 3 else image[None]
     bands, height, width = planes.shape
     source = ArraySource(planes, Raster(bands, height, width, planes.dtype, nodata))
-    return restored_already(source, [load_onnx(network_file(Path(network), load_sensor(BLIND)))], full_scale)
+    return restored_already(
+        source, [load_onnx(network_file(Path(network), load_sensor(BLIND)))], full_scale
+    )
 
 
 @settings(deadline=None, max_examples=20)
-@given(st.integers(0, 2**20), st.sampled_from([1.0, 0.25, 0.05]), st.sampled_from([SNR_BRIGHT, (SNR_BRIGHT[1],) * 2]))
-def test_a_raw_image_of_any_sensor_in_range_is_not_told(seed: int, light: float, snr: tuple[float, float]) -> None:
+@given(
+    st.integers(0, 2**20),
+    st.sampled_from([1.0, 0.25, 0.05]),
+    st.sampled_from([SNR_BRIGHT, (SNR_BRIGHT[1],) * 2]),
+)
+def test_a_raw_image_of_any_sensor_in_range_is_not_told(
+    seed: int, light: float, snr: tuple[float, float]
+) -> None:
     assert look(raw(seed, light, snr)) == ""
 
 
 PROCESSED: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "restored": lambda _: np.asarray(bd.restore(bd.simulate(sensor=SENSOR, size=320).degraded, NETWORK)),
-    "smoothed": lambda image: np.rint(gaussian_filter(image.astype(np.float64), 1.0)).astype(np.uint16),
-    "left-justified": lambda image: 16 * np.rint(gaussian_filter(image.astype(np.float64), 1.0)).astype(np.uint16),
+    "restored": lambda _: np.asarray(
+        bd.restore(bd.simulate(sensor=SENSOR, size=320).degraded, NETWORK)
+    ),
+    "smoothed": lambda image: np.rint(gaussian_filter(image.astype(np.float64), 1.0)).astype(
+        np.uint16
+    ),
+    "left-justified": lambda image: (
+        16 * np.rint(gaussian_filter(image.astype(np.float64), 1.0)).astype(np.uint16)
+    ),
 }
 
 
@@ -99,7 +119,9 @@ def test_the_command_says_it_and_goes_on(tmp_path: Path) -> None:
     image = tmp_path / "in.tif"
     out = tmp_path / "out.tif"
     tifffile.imwrite(image, PROCESSED["smoothed"](raw(1)))
-    assert "look at the image: it looks restored already" in done("restore", image, out, "--network", NETWORK)
+    assert "look at the image: it looks restored already" in done(
+        "restore", image, out, "--network", NETWORK
+    )
     assert out.exists()
     said = done("restore", image, out, "--network", NETWORK, "--sensor", SENSOR.name)
     assert "look at the image" not in said

@@ -1,4 +1,5 @@
-"""Whatever stops a run, the output is the old one or the new one, and a resumed run gives the same bytes.
+"""Whatever stops a run, the output is the old one or the new one, and a resumed run gives the same
+bytes.
 
 BEERS_KILLS=50 kills as many runs; the suite kills a few.
 """
@@ -67,7 +68,9 @@ def test_killed_at_random_moments_it_is_resumed_to_the_same_bytes(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no other process can send Ctrl-C on Windows")
-def test_ctrl_c_says_how_to_go_on(image: Path, model: Path, expected: bytes, tmp_path: Path) -> None:
+def test_ctrl_c_says_how_to_go_on(
+    image: Path, model: Path, expected: bytes, tmp_path: Path
+) -> None:
     running = begin(image, tmp_path / "out.tif", *asked(model))
     until(running, "memory")
     running.send_signal(signal.SIGINT)
@@ -96,7 +99,9 @@ def test_finished_rows_are_not_restored_again(
     assert out.read_bytes() == expected
 
 
-def test_another_image_of_the_same_name_is_not_mixed_in(image: Path, model: Path, tmp_path: Path) -> None:
+def test_another_image_of_the_same_name_is_not_mixed_in(
+    image: Path, model: Path, tmp_path: Path
+) -> None:
     with stopped_after(50):
         restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX))
     tifffile.imwrite(image, np.zeros((900, 260), np.uint16), tile=(16, 16))
@@ -108,7 +113,12 @@ def test_another_image_of_the_same_name_is_not_mixed_in(image: Path, model: Path
 
 @pytest.mark.parametrize("calls", [0, 4, 1000])
 def test_a_full_disk_is_one_sentence_and_loses_no_finished_row(
-    calls: int, image: Path, model: Path, expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    calls: int,
+    image: Path,
+    model: Path,
+    expected: bytes,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The disk fills up at the first rows, at later ones, or while the output is written."""
     out = tmp_path / "out.tif"

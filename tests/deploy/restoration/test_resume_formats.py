@@ -1,4 +1,6 @@
-"""A run killed on an image that GDAL reads, or while its COG is written, is resumed to the same bytes."""
+"""A run killed on an image that GDAL reads, or while its COG is written, is resumed to the same
+bytes.
+"""
 
 import time
 from pathlib import Path
@@ -27,7 +29,10 @@ def test_killed_among_its_rows_and_at_its_cog_it_is_resumed_to_the_same_bytes(
     before = {path.name for path in tmp_path.iterdir()}
     out.write_bytes(b"old")
     killed = []
-    for sign in ("journal.json", "out.tif"):  # some rows are finished; all are, and the TIFF is begun
+    for sign in (
+        "journal.json",
+        "out.tif",
+    ):  # some rows are finished; all are, and the TIFF is begun
         running = begin(image, out, "--network", model, "--tile", TILE_PX, "--cog", "--resume")
         while running.poll() is None and not (part_folder(out) / sign).exists():
             time.sleep(0.001)

@@ -1,4 +1,6 @@
-"""Files restored by the swath engine: the whole image's result bit for bit, and what is kept beside the pixels."""
+"""Files restored by the swath engine: the whole image's result bit for bit, and what is kept beside
+the pixels.
+"""
 
 from functools import partial
 from pathlib import Path
@@ -27,7 +29,9 @@ RADIUS_PX = 5
 SHAPES = [(61, 83), (17, 130), (1, 40), (40, 1), (29, 29), (3, 5)]
 
 
-def restore(folder: Path, pixels: np.ndarray, options: Options, **written: Any) -> tuple[np.ndarray, Row]:
+def restore(
+    folder: Path, pixels: np.ndarray, options: Options, **written: Any
+) -> tuple[np.ndarray, Row]:
     """Write, restore and read again."""
     found = restored_by_file(folder, pixels, options, **written)
     assert sorted(p.name for p in folder.iterdir()) == ["in.tif", "out.tif"]
@@ -40,7 +44,9 @@ def whole_image(model: Path, pixels: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_tiled_equals_whole_bit_for_bit(shape: tuple[int, int], model: Path, tmp_path: Path) -> None:
+def test_tiled_equals_whole_bit_for_bit(
+    shape: tuple[int, int], model: Path, tmp_path: Path
+) -> None:
     options = Options(model, tile_px=23)
     pixels = noise(*shape)
     restored, _ = restore(tmp_path, pixels, options, tile=(16, 16), compression="zlib")
@@ -51,7 +57,9 @@ def test_tiled_equals_whole_bit_for_bit(shape: tuple[int, int], model: Path, tmp
     np.testing.assert_array_equal(floats, whole_image(model, pixels))
 
 
-def test_one_pixel_less_than_the_radius_shows_seams_and_says_so(model: Path, tmp_path: Path) -> None:
+def test_one_pixel_less_than_the_radius_shows_seams_and_says_so(
+    model: Path, tmp_path: Path
+) -> None:
     pixels = noise(61, 83).astype(np.float32)
     restored, row = restore(tmp_path, pixels, Options(model, tile_px=23, halo=str(RADIUS_PX - 1)))
     assert (restored != whole_image(model, pixels)).any()
@@ -73,10 +81,14 @@ def test_the_seam_error_is_that_of_the_tile_in_the_middle(model: Path, tmp_path:
 
 
 @pytest.mark.parametrize("written", [{"planarconfig": "separate"}, {"planarconfig": "contig"}])
-def test_bands_are_restored_one_by_one(written: dict[str, str], model: Path, tmp_path: Path) -> None:
+def test_bands_are_restored_one_by_one(
+    written: dict[str, str], model: Path, tmp_path: Path
+) -> None:
     bands = noise(3, 41, 35)
     stored = bands if written["planarconfig"] == "separate" else np.moveaxis(bands, 0, 2)
-    restored, row = restore(tmp_path, stored, Options(model, tile_px=23), photometric="rgb", **written)
+    restored, row = restore(
+        tmp_path, stored, Options(model, tile_px=23), photometric="rgb", **written
+    )
     for band, result in zip(bands, restored, strict=True):
         np.testing.assert_array_equal(result, np.rint(whole_image(model, band)))
     assert row.figures["tiles"].value == 3 * 3 * 2
@@ -87,21 +99,29 @@ def test_full_scale_is_what_the_network_sees_as_one(model: Path, tmp_path: Path)
     twelve, _ = restore(tmp_path, pixels, Options(model, tile_px=23))
     fourteen, _ = restore(tmp_path, pixels * 4, Options(model, tile_px=23, full_scale=4095 * 4))
     assert np.abs(fourteen / 4 - twelve.astype(float)).max() <= 0.625
-    unit, _ = restore(tmp_path, (pixels / 4095).astype(np.float32), Options(model, tile_px=23, full_scale=1))
+    unit, _ = restore(
+        tmp_path, (pixels / 4095).astype(np.float32), Options(model, tile_px=23, full_scale=1)
+    )
     assert np.abs(unit * 4095 - twelve.astype(float)).max() <= 0.51
 
 
-def test_floats_of_about_0_to_1_are_refused_until_their_scale_is_named(model: Path, tmp_path: Path) -> None:
+def test_floats_of_about_0_to_1_are_refused_until_their_scale_is_named(
+    model: Path, tmp_path: Path
+) -> None:
     shares = (noise(61, 37) / 4095).astype(np.float32)
     shares[5:9] = np.nan
-    refused(tmp_path, shares, Options(model, tile_px=23), ImageError, "floats of at most 1", "`full")
+    refused(
+        tmp_path, shares, Options(model, tile_px=23), ImageError, "floats of at most 1", "`full"
+    )
     refused(tmp_path, shares * 1.9, Options(model, tile_px=23), ImageError, "full_scale")
     (tmp_path / "out.tif").unlink()
     restored, _ = restore(tmp_path, shares, Options(model, tile_px=23, full_scale=1))
     assert 0 < np.nanmean(restored) < np.nanmax(restored) <= 1
 
 
-def test_one_bright_row_at_the_end_makes_floats_digital_numbers(model: Path, tmp_path: Path) -> None:
+def test_one_bright_row_at_the_end_makes_floats_digital_numbers(
+    model: Path, tmp_path: Path
+) -> None:
     dark = np.full((70, 37), 0.5, np.float32)
     dark[-1, 3] = 900
     one, row = restore(tmp_path, dark, Options(model, tile_px=23))
@@ -130,7 +150,10 @@ def test_georeference_and_rpcs_are_kept(model: Path, tmp_path: Path) -> None:
         (50844, "d", 92, tuple(np.linspace(-1, 1, 92)), True),
     ]
     restore(tmp_path, noise(20, 20), Options(model), extratags=tags)
-    with tifffile.TiffFile(tmp_path / "in.tif") as before, tifffile.TiffFile(tmp_path / "out.tif") as after:
+    with (
+        tifffile.TiffFile(tmp_path / "in.tif") as before,
+        tifffile.TiffFile(tmp_path / "out.tif") as after,
+    ):
         for code, *_ in tags:
             assert after.pages.first.tags[code].value == before.pages.first.tags[code].value
             assert after.pages.first.tags[code].dtype == before.pages.first.tags[code].dtype
@@ -164,11 +187,15 @@ def test_a_filled_pixel_is_the_nearest_known_one() -> None:
     pixels = np.arange(12.0).reshape(2, 6)
     missing = np.zeros((2, 6), bool)
     missing[0, 1:] = missing[1, :2] = True
-    np.testing.assert_array_equal(fill_from_nearest(pixels, missing, 2), [[0, 0, 0, 9, 10, 11], [8, 8, 8, 9, 10, 11]])
+    np.testing.assert_array_equal(
+        fill_from_nearest(pixels, missing, 2), [[0, 0, 0, 9, 10, 11], [8, 8, 8, 9, 10, 11]]
+    )
     assert fill_from_nearest(pixels, np.ones((2, 6), bool), 2).max() == 0
 
 
-def refused(folder: Path, pixels: np.ndarray, options: Options, error: type[BeersError], *words: str) -> None:
+def refused(
+    folder: Path, pixels: np.ndarray, options: Options, error: type[BeersError], *words: str
+) -> None:
     """One sentence, the old output as it was, and nothing beside it."""
     tifffile.imwrite(folder / "in.tif", pixels, tile=(16, 16))
     (folder / "out.tif").write_bytes(b"the old one")
@@ -183,7 +210,10 @@ def refused(folder: Path, pixels: np.ndarray, options: Options, error: type[Beer
 @pytest.mark.parametrize(
     ("pixels", "words"),
     [
-        (np.pad(noise(89, 40), ((0, 1), (0, 0)), constant_values=60000), ("60000", "full_scale")),  # in the last row
+        (
+            np.pad(noise(89, 40), ((0, 1), (0, 0)), constant_values=60000),
+            ("60000", "full_scale"),
+        ),  # in the last row
         (-noise(90, 40).astype(np.float32), ("-4", "add the offset")),
         (np.full((20, 20), np.inf, np.float32), ("inf", "write NaN")),
         (np.full((60, 40), np.nan, np.float32), ("NaN",)),
@@ -197,9 +227,15 @@ def test_values_that_cannot_be_leave_the_old_output(
 
 @pytest.mark.parametrize(
     ("word", "wrong"),
-    [("tile", {"tile_px": 16, "halo": "8"}), ("halo", {"halo": "wide"}), ("full_scale", {"full_scale": 0.5})],
+    [
+        ("tile", {"tile_px": 16, "halo": "8"}),
+        ("halo", {"halo": "wide"}),
+        ("full_scale", {"full_scale": 0.5}),
+    ],
 )
-def test_options_that_cannot_be_are_refused(word: str, wrong: dict[str, Any], model: Path, tmp_path: Path) -> None:
+def test_options_that_cannot_be_are_refused(
+    word: str, wrong: dict[str, Any], model: Path, tmp_path: Path
+) -> None:
     refused(tmp_path, noise(40, 40), Options(model, **{"tile_px": 23, **wrong}), OptionError, word)
 
 
@@ -255,7 +291,9 @@ def test_integers_are_packed_as_differences_and_gdal_reads_them(
         assert file.pages.first.predictor == predictor
 
 
-def test_large_outputs_are_big_tiffs(model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_outputs_are_big_tiffs(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("beers_deploy.restoration.output.PLAIN_LIMIT_BYTES", 1000)
     restore(tmp_path, noise(40, 50), Options(model))
     with tifffile.TiffFile(tmp_path / "out.tif") as file:
@@ -281,14 +319,20 @@ def test_a_tile_without_known_pixels_costs_no_inference(
 
 def test_openvino_gives_the_same_int8_numbers(tmp_path: Path) -> None:
     pytest.importorskip("openvino")
-    pixels = np.concatenate([noise(100, 110), np.linspace(0, 4095, 11000).reshape(100, 110).astype(np.uint16)])
+    pixels = np.concatenate(
+        [noise(100, 110), np.linspace(0, 4095, 11000).reshape(100, 110).astype(np.uint16)]
+    )
     one, _ = restore(tmp_path, pixels, Options(shipped_pair()[1], tile_px=64))
-    other, row = restore(tmp_path, pixels, Options(shipped_pair()[1], tile_px=64, runtime=Runtime.openvino))
+    other, row = restore(
+        tmp_path, pixels, Options(shipped_pair()[1], tile_px=64, runtime=Runtime.openvino)
+    )
     np.testing.assert_array_equal(other, one)
     assert row.text["runtime"].startswith("openvino")
 
 
-def test_openvino_gives_them_on_processors_whose_kernels_saturate_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_openvino_gives_them_on_processors_whose_kernels_saturate_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """In the ways that are taken there; the image is of the extremes, at which sums are largest."""
     pytest.importorskip("openvino")
     image = np.random.default_rng(3).integers(0, 2, (1, 1, 41, 67)).astype(np.float32)
@@ -298,7 +342,9 @@ def test_openvino_gives_them_on_processors_whose_kernels_saturate_too(monkeypatc
     np.testing.assert_array_equal(restored, run(open_session(model), image))
 
 
-def test_openvino_gives_the_same_float_numbers_within_a_hundredth_of_a_dn(model: Path, tmp_path: Path) -> None:
+def test_openvino_gives_the_same_float_numbers_within_a_hundredth_of_a_dn(
+    model: Path, tmp_path: Path
+) -> None:
     pytest.importorskip("openvino")
     pixels = noise(61, 83).astype(np.float32)
     one, _ = restore(tmp_path, pixels, Options(model, tile_px=30))

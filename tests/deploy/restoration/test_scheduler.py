@@ -1,4 +1,6 @@
-"""Tiles run by the workers of a Dask scheduler: the bytes of a run without, whatever becomes of the workers."""
+"""Tiles run by the workers of a Dask scheduler: the bytes of a run without, whatever becomes of the
+workers.
+"""
 
 import os
 import signal
@@ -75,18 +77,26 @@ def test_two_workers_give_the_bytes_of_one_process(
 def test_and_with_a_network_for_each_band(
     model: Path, scheduler: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    tifffile.imwrite(tmp_path / "in.tif", noise(2, 91, 73), photometric="minisblack", planarconfig="separate")
+    tifffile.imwrite(
+        tmp_path / "in.tif", noise(2, 91, 73), photometric="minisblack", planarconfig="separate"
+    )
     other = load_onnx(model)
     other.graph.initializer[0].raw_data = bytes(len(other.graph.initializer[0].raw_data))
     save_onnx(other, other_path := tmp_path_factory.mktemp("networks") / "other.onnx")
     options = Options(model, tile_px=48, bands={"a": model, "b": other_path})
     one, two = both(tmp_path, options, scheduler)
     assert two == one
-    assert (tifffile.imread(tmp_path / "one.tif")[0] != tifffile.imread(tmp_path / "one.tif")[1]).any()
+    assert (
+        tifffile.imread(tmp_path / "one.tif")[0] != tifffile.imread(tmp_path / "one.tif")[1]
+    ).any()
 
 
-@pytest.mark.parametrize("make", [lambda: load_onnx(shipped_pair()[1]), float_unet, espcn, four_bands])
-def test_and_with_int8_and_users_own(make: Callable[[], onnx.ModelProto], scheduler: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "make", [lambda: load_onnx(shipped_pair()[1]), float_unet, espcn, four_bands]
+)
+def test_and_with_int8_and_users_own(
+    make: Callable[[], onnx.ModelProto], scheduler: str, tmp_path: Path
+) -> None:
     """With strides, a larger result, and several bands."""
     (tmp_path / "in").mkdir()
     save_onnx(make(), tmp_path / "network.onnx")
@@ -96,7 +106,9 @@ def test_and_with_int8_and_users_own(make: Callable[[], onnx.ModelProto], schedu
     assert two == one
 
 
-def test_a_run_begun_here_is_finished_by_workers(image: Path, model: Path, scheduler: str, tmp_path: Path) -> None:
+def test_a_run_begun_here_is_finished_by_workers(
+    image: Path, model: Path, scheduler: str, tmp_path: Path
+) -> None:
     options = Options(model, TILE_PX)
     out = tmp_path / "out.tif"
     restore_file(image, tmp_path / "expected.tif", options)
@@ -125,7 +137,10 @@ def test_a_worker_that_is_killed_changes_nothing(
 
 
 def call(
-    scheduler: str, function: Callable[..., object], *arguments: object, meanwhile: Callable[[], object] = tuple
+    scheduler: str,
+    function: Callable[..., object],
+    *arguments: object,
+    meanwhile: Callable[[], object] = tuple,
 ) -> None:
     """Wait for what a call on a cluster returns, once something else was done."""
     with open_cluster(scheduler) as there:
@@ -142,7 +157,10 @@ def test_a_call_that_kills_its_workers_is_one_sentence(scheduler: str) -> None:
 
 def test_a_scheduler_that_goes_away_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "ANSWER_S", 1)
-    with local_cluster(1) as local, pytest.raises(MachineError, match="no connection to their scheduler"):
+    with (
+        local_cluster(1) as local,
+        pytest.raises(MachineError, match="no connection to their scheduler"),
+    ):
         call(local.scheduler_address, time.sleep, 60, meanwhile=local.close)
 
 
@@ -156,7 +174,10 @@ def test_a_scheduler_whose_workers_left_is_one_sentence(monkeypatch: pytest.Monk
 def test_nobody_at_the_address_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "ANSWER_S", 0.5)
     for address in ("tcp://127.0.0.1:1", "foo://a:1"):
-        with pytest.raises(MachineError, match=f"{address}: expected an answer"), open_cluster(address):
+        with (
+            pytest.raises(MachineError, match=f"{address}: expected an answer"),
+            open_cluster(address),
+        ):
             pass
 
 
@@ -176,7 +197,9 @@ def test_a_worker_of_another_version_is_refused() -> None:
             assert on_error == "return"
             return {"tcp://worker": "0.0" if package == "numpy" else version(package)}
 
-    with pytest.raises(MachineError, match=r"worker tcp://worker: expected numpy \d.*got 0.0.*the same versions"):
+    with pytest.raises(
+        MachineError, match=r"worker tcp://worker: expected numpy \d.*got 0.0.*the same versions"
+    ):
         cluster._require_same_versions(Client())
 
 
@@ -203,13 +226,26 @@ app(sys.argv[1:])
 
 def test_restores_where_torch_is_not_installed(image: Path, scheduler: str, tmp_path: Path) -> None:
     out = tmp_path / "out.tif"
-    words = ("restore", str(image), str(out), "--network", "convbeers-xs-int8", "--scheduler", scheduler)
-    done = subprocess.run([sys.executable, "-c", WITHOUT_TORCH, *words], capture_output=True, text=True, check=False)
+    words = (
+        "restore",
+        str(image),
+        str(out),
+        "--network",
+        "convbeers-xs-int8",
+        "--scheduler",
+        scheduler,
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_TORCH, *words], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert tifffile.imread(out).shape == tifffile.imread(image).shape
 
 
 def test_a_missing_dask_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(MachineError, match=r"pip install 'beers-deploy\[dask\]'"), open_cluster("host:8786"):
+    with (
+        pytest.raises(MachineError, match=r"pip install 'beers-deploy\[dask\]'"),
+        open_cluster("host:8786"),
+    ):
         pass

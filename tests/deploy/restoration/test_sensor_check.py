@@ -1,4 +1,6 @@
-"""An image held against its sensor: what is told rightly passes, what is told wrongly is said, or refused."""
+"""An image held against its sensor: what is told rightly passes, what is told wrongly is said, or
+refused.
+"""
 
 import re
 import time
@@ -25,7 +27,10 @@ def raw() -> np.ndarray:
 
 
 def check(
-    image: np.ndarray, sensor: Sensor = SENSOR, full_scale: float = 4095, nodata: float | None = None
+    image: np.ndarray,
+    sensor: Sensor = SENSOR,
+    full_scale: float = 4095,
+    nodata: float | None = None,
 ) -> SensorCheck:
     planes = image if image.ndim == 3 else image[None]
     bands, height, width = planes.shape
@@ -40,7 +45,10 @@ def test_the_true_sensor_is_found_again(raw: np.ndarray) -> None:
     low, high = found.figures["SNR seen"].interval or (0, 0)
     assert 0 < high - low < 0.5 * high
     # Left-justified, and with missing pixels of any value: the same image of the same sensor.
-    assert check(raw * 16, full_scale=16 * 4095).figures["SNR seen"].value == found.figures["SNR seen"].value
+    assert (
+        check(raw * 16, full_scale=16 * 4095).figures["SNR seen"].value
+        == found.figures["SNR seen"].value
+    )
     holed = raw.copy()
     holed[100:140, 30:300] = 4000
     assert check(np.where(holed == 4000, 0, raw), nodata=0).doubts == ()
@@ -55,13 +63,18 @@ def test_the_true_sensor_is_found_again(raw: np.ndarray) -> None:
         ({"gain_dn_per_radiance": 25.0}, "looks like SNR"),
     ],
 )
-def test_another_sensor_is_told_apart(numbers: dict[str, float], words: str, raw: np.ndarray) -> None:
+def test_another_sensor_is_told_apart(
+    numbers: dict[str, float], words: str, raw: np.ndarray
+) -> None:
     (doubt, *_) = check(raw, SENSOR.replace(**numbers)).doubts
     assert re.search(words, doubt)
 
 
 def test_pixels_above_the_sensor_s_full_scale_contradict_it(raw: np.ndarray) -> None:
-    assert any("above its full scale, 1023" in doubt for doubt in check(raw, SENSOR.replace(bits=10), 1023).doubts)
+    assert any(
+        "above its full scale, 1023" in doubt
+        for doubt in check(raw, SENSOR.replace(bits=10), 1023).doubts
+    )
 
 
 def test_bands_are_held_one_by_one_against_their_own_sensors(raw: np.ndarray) -> None:
@@ -89,7 +102,9 @@ def test_what_cannot_be_seen_is_no_contradiction() -> None:
     ):
         found = check(image)
         assert found.text["sensor told"] in ("cannot be seen", *found.doubts)
-        assert all(figure.mode == "unavailable" and figure.reason for figure in found.figures.values())
+        assert all(
+            figure.mode == "unavailable" and figure.reason for figure in found.figures.values()
+        )
 
 
 def test_commands_say_it_and_strict_refuses(raw: np.ndarray, tmp_path: Path) -> None:
@@ -98,7 +113,9 @@ def test_commands_say_it_and_strict_refuses(raw: np.ndarray, tmp_path: Path) -> 
     tifffile.imwrite(image, raw)
     wrong = SENSOR.replace(snr_0=25, snr_1=55).save(tmp_path / "wrong.toml")
     network = ("--network", "convbeers-xs-int8")
-    assert "look at the sensor: noise at" in done("restore", image, out, *network, "--sensor", wrong)
+    assert "look at the sensor: noise at" in done(
+        "restore", image, out, *network, "--sensor", wrong
+    )
     assert "look at the sensor" not in done("info", image, *network, "--sensor", NAME, "--strict")
     out.unlink()
     for words in (("restore", image, out, *network), ("info", image, *network)):
@@ -123,7 +140,9 @@ def test_pairs_that_are_evaluated_are_held_against_it(tmp_path: Path) -> None:
     assert "look at the sensor: noise at" in done(*words, "--sensor", wrong)
     assert "expected an image of wrong" in refused(*words, "--sensor", wrong, "--strict")
     found = bd.evaluate(["degraded"], pairs, sensor=SENSOR, strict=True, progress=False)
-    assert next(row for row in found.rows if "sensor" in row.table).text == {"sensor told": "agrees"}
+    assert next(row for row in found.rows if "sensor" in row.table).text == {
+        "sensor told": "agrees"
+    }
 
 
 def test_its_time_is_no_part_of_the_restoration_s(
@@ -138,7 +157,9 @@ def test_its_time_is_no_part_of_the_restoration_s(
 
     monkeypatch.setattr("beers_deploy.restoration.run.told_sensor", slow)
     begun = time.perf_counter()
-    run = bd.restore(image, "convbeers-xs-int8", sensor=SENSOR, out=tmp_path / "out.tif", progress=False)
+    run = bd.restore(
+        image, "convbeers-xs-int8", sensor=SENSOR, out=tmp_path / "out.tif", progress=False
+    )
     whole_s = time.perf_counter() - begun
     (row,) = run.rows
     (check_s, time_s) = (row.figures[name].value or 0 for name in ("sensor check", "time"))

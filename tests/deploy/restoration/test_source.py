@@ -66,7 +66,9 @@ def test_bands_in_planes_or_interleaved(storage: str, tmp_path: Path) -> None:
     pixels = pixels_of("uint16", 3)
     given = {"photometric": "rgb", **STORAGES[storage]}
     tifffile.imwrite(tmp_path / "planes.tif", pixels, planarconfig="separate", **given)
-    tifffile.imwrite(tmp_path / "mixed.tif", np.moveaxis(pixels, 0, 2), planarconfig="contig", **given)
+    tifffile.imwrite(
+        tmp_path / "mixed.tif", np.moveaxis(pixels, 0, 2), planarconfig="contig", **given
+    )
     for name in ("planes", "mixed"):
         assert_rows_equal(tmp_path / f"{name}.tif", pixels)
 
@@ -98,7 +100,9 @@ def test_reading_downwards_decodes_each_segment_once(
         for height in heights:
             bottom = min(top + height, HEIGHT)
             rows = source.read(max(top - overlap, 0), bottom)
-            np.testing.assert_array_equal(rows[0], pixels_of("uint16")[max(top - overlap, 0) : bottom])
+            np.testing.assert_array_equal(
+                rows[0], pixels_of("uint16")[max(top - overlap, 0) : bottom]
+            )
             top = bottom
             if top == HEIGHT:
                 break
@@ -109,7 +113,9 @@ def test_tiles_never_written_hold_the_nodata_value(tmp_path: Path) -> None:
     tile = np.full((16, 16), 9, np.uint16)
     nodata = [(42113, "s", 0, "7", True)]
     shape: dict[str, Any] = {"shape": (16, 48), "dtype": "uint16", "tile": (16, 16)}
-    tifffile.imwrite(tmp_path / "a.tif", iter([tile, None, tile]), extratags=nodata, compression="zlib", **shape)
+    tifffile.imwrite(
+        tmp_path / "a.tif", iter([tile, None, tile]), extratags=nodata, compression="zlib", **shape
+    )
     with open_source(tmp_path / "a.tif") as source:
         rows = source.read(0, 16)
         assert source.raster.missing(rows).sum() == 256

@@ -37,7 +37,9 @@ def test_an_item_is_valid_and_lies_where_the_image_does(model: Path, tmp_path: P
 
 
 def test_an_image_that_lies_nowhere_has_no_geometry(model: Path, tmp_path: Path) -> None:
-    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers(), crs=None, transform=None)
+    image = images.write_tiff(
+        tmp_path / "in.tif", images.digital_numbers(), crs=None, transform=None
+    )
     found = restored(image, tmp_path / "item.json", model)
     pystac.Item.from_dict(found).validate()
     assert found["geometry"] is None
@@ -48,7 +50,15 @@ def test_it_goes_with_a_cog_and_needs_its_package(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    words = "restore", image, tmp_path / "out.tif", "--network", model, "--stac", tmp_path / "i.json"
+    words = (
+        "restore",
+        image,
+        tmp_path / "out.tif",
+        "--network",
+        model,
+        "--stac",
+        tmp_path / "i.json",
+    )
     monkeypatch.setitem(sys.modules, "pystac", None)
     for more, sentence in (([], "--stac: expected --cog"), (["--cog"], "beers-deploy[gdal]")):
         assert sentence in refused(*words, *more)

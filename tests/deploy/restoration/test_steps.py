@@ -1,4 +1,6 @@
-"""The two steps around a network, end to end: exact seams, the switches, and what each step changes."""
+"""The two steps around a network, end to end: exact seams, the switches, and what each step
+changes.
+"""
 
 import json
 import warnings
@@ -43,7 +45,9 @@ NODATA = 0
 
 @cache
 def image() -> np.ndarray:
-    """Dark, medium and bright ground (H, W) uint16, so that some pixels take each of the factors 1, 4 and 8."""
+    """Dark, medium and bright ground (H, W) uint16, so that some pixels take each of the factors 1,
+    4 and 8.
+    """
     generator = np.random.default_rng(7)
     pixels = generator.integers(1500, 3500, SHAPE)
     pixels[:, :BRIGHT_FROM] = generator.integers(350, 600, (SHAPE[0], BRIGHT_FROM))
@@ -66,12 +70,16 @@ def as_floats(pixels: np.ndarray) -> np.ndarray:
     return np.where(pixels == NODATA, np.float32(np.nan), pixels.astype(np.float32))
 
 
-def options(name: str, sensors: Mapping[str, Sensor] | None = None, exposure: bool = True, **more: Any) -> Options:
+def options(
+    name: str, sensors: Mapping[str, Sensor] | None = None, exposure: bool = True, **more: Any
+) -> Options:
     """Build what the command makes of --network, --sensor and --no-exposure."""
     known = sensors or {"": SENSOR}
     given = Path(name)
     files = {band: network_file(given, sensor) for band, sensor in known.items()}
-    brighter = {band: brighter_files(given, sensor) for band, sensor in known.items()} if exposure else {}
+    brighter = (
+        {band: brighter_files(given, sensor) for band, sensor in known.items()} if exposure else {}
+    )
     return Options(
         next(iter(files.values())),
         sensors=known,
@@ -84,7 +92,9 @@ def options(name: str, sensors: Mapping[str, Sensor] | None = None, exposure: bo
 def by_array(pixels: Any, name: str, **more: Any) -> Any:
     """Restore an array; that noise is no image of the sensor is told as a warning."""
     with warnings.catch_warnings(action="ignore"):
-        return bd.restore(pixels, name, progress=None, **{"sensor": SENSOR, "full_scale": 4095, **more})
+        return bd.restore(
+            pixels, name, progress=None, **{"sensor": SENSOR, "full_scale": 4095, **more}
+        )
 
 
 def by_file(folder: Path, pixels: np.ndarray, how: Options, **written: Any) -> np.ndarray:
@@ -93,7 +103,9 @@ def by_file(folder: Path, pixels: np.ndarray, how: Options, **written: Any) -> n
 
 
 @pytest.mark.parametrize(("name", "floats"), [(FLOAT, True), (INT8, False)])
-def test_tiles_and_files_give_the_whole_image_s_pixels(name: str, floats: bool, tmp_path: Path) -> None:
+def test_tiles_and_files_give_the_whole_image_s_pixels(
+    name: str, floats: bool, tmp_path: Path
+) -> None:
     """With both steps, missing and saturated pixels, bit for bit."""
     pixels = as_floats(lacking()) if floats else lacking()
     nodata = None if floats else NODATA
@@ -102,18 +114,25 @@ def test_tiles_and_files_give_the_whole_image_s_pixels(name: str, floats: bool, 
     for tile_px in TILES_PX:
         tiled = by_array(pixels, name, nodata=nodata, tile=tile_px)
         np.testing.assert_array_equal(tiled, whole, err_msg=f"tiles of {tile_px}")
-    np.testing.assert_array_equal(by_file(tmp_path, pixels, options(name, tile_px=TILES_PX[0])), whole)
+    np.testing.assert_array_equal(
+        by_file(tmp_path, pixels, options(name, tile_px=TILES_PX[0])), whole
+    )
     missing = lacking() == NODATA
     np.testing.assert_array_equal(np.isnan(whole) if floats else whole == NODATA, missing)
 
 
-def test_a_dask_array_gives_the_same_and_its_workers_read_no_files(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dask_array_gives_the_same_and_its_workers_read_no_files(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A worker on another machine has none of the networks' files, of any exposure."""
     da = pytest.importorskip("dask.array", reason="the extra 'dask' is not installed")
     whole = by_array(lacking(), INT8, nodata=NODATA)
     lazy = by_array(da.from_array(lacking(), chunks=50), INT8, nodata=NODATA, tile=TILES_PX[0])
     for module in ("tiles.lazy", "steps"):
-        monkeypatch.setattr(f"beers_deploy.restoration.{module}.load_onnx", lambda path: pytest.fail(f"reads {path}"))
+        monkeypatch.setattr(
+            f"beers_deploy.restoration.{module}.load_onnx",
+            lambda path: pytest.fail(f"reads {path}"),
+        )
     np.testing.assert_array_equal(lazy.compute(scheduler="synchronous"), whole)
 
 
@@ -129,7 +148,9 @@ def test_a_dask_array_has_the_full_scale_of_its_sensor(floats: bool) -> None:
 
 
 @pytest.mark.parametrize("sensors", [(SENSOR, NOISY), (load_sensor(BLIND), SENSOR)])
-def test_each_band_takes_the_steps_of_its_own_sensor(sensors: tuple[Sensor, Sensor], tmp_path: Path) -> None:
+def test_each_band_takes_the_steps_of_its_own_sensor(
+    sensors: tuple[Sensor, Sensor], tmp_path: Path
+) -> None:
     """Also where one band's sensor allows no factor above 1, or is not known."""
     bands = np.stack([image(), image()[::-1]])
     separate: dict[str, Any] = {"planarconfig": "separate", "photometric": "minisblack"}
@@ -140,7 +161,9 @@ def test_each_band_takes_the_steps_of_its_own_sensor(sensors: tuple[Sensor, Sens
 
 
 def stopped(folder: Path, how: Options, tiles: int) -> Options:
-    """Stop a run after so many tiles, the first rows of them finished; return the options to resume it."""
+    """Stop a run after so many tiles, the first rows of them finished; return the options to resume
+    it.
+    """
     error = MachineError("machine", expected="power", got="none", remedy="wait")
     with stopped_after(tiles, error):
         restore_file(folder / "in.tif", folder / "out.tif", how)
@@ -175,7 +198,9 @@ BRIGHTENED = "brightened pixels"
 
 @cache
 def share_of_dark() -> float:
-    """The share of pixels in percent that have no pixel above 614 DN within the receptive radius of 14 px."""
+    """The share of pixels in percent that have no pixel above 614 DN within the receptive radius of
+    14 px.
+    """
     return 100 * (BRIGHT_FROM - RADIUS_PX) / SHAPE[1]
 
 
@@ -183,7 +208,11 @@ def share_of_dark() -> float:
     ("words", "figures", "text"),
     [
         ((), {CONSISTENCY, RUNS, BRIGHTENED}, {"consistency": "on", "exposures": "x1, x4, x8"}),
-        (("--no-consistency",), {RUNS, BRIGHTENED}, {"consistency": "off", "exposures": "x1, x4, x8"}),
+        (
+            ("--no-consistency",),
+            {RUNS, BRIGHTENED},
+            {"consistency": "off", "exposures": "x1, x4, x8"},
+        ),
         (("--no-exposure",), {CONSISTENCY}, {"consistency": "on", "exposures": None}),
         (("--no-consistency", "--no-exposure"), set(), {"consistency": "off", "exposures": None}),
     ],
@@ -196,7 +225,10 @@ def test_the_command_says_which_steps_were_taken(
     results = tmp_path / "results.json"
     files = ("restore", tmp_path / "in.tif", out, "--json", results)
     done(*files, "--network", INT8, "--sensor", SENSOR.name, *words)
-    switches = {"consistency": "--no-consistency" not in words, "exposure": "--no-exposure" not in words}
+    switches = {
+        "consistency": "--no-consistency" not in words,
+        "exposure": "--no-exposure" not in words,
+    }
     np.testing.assert_array_equal(tifffile.imread(out), by_array(image(), INT8, **switches))
     (row,) = json.loads(results.read_text(encoding="utf-8"))["rows"]
     assert {CONSISTENCY, RUNS, BRIGHTENED} & set(row["figures"]) == figures
@@ -209,7 +241,12 @@ def test_the_command_says_which_steps_were_taken(
 def test_each_step_changes_what_it_is_for() -> None:
     """Exposure changes dark pixels alone, the consistency step all of them, by little."""
     pixels = as_floats(image())
-    switches = {"none": (False, False), "exposure": (False, True), "consistency": (True, False), "both": (True, True)}
+    switches = {
+        "none": (False, False),
+        "exposure": (False, True),
+        "consistency": (True, False),
+        "both": (True, True),
+    }
     found = {
         name: by_array(pixels, INT8, consistency=consistency, exposure=exposure)
         for name, (consistency, exposure) in switches.items()
@@ -223,20 +260,35 @@ def test_each_step_changes_what_it_is_for() -> None:
 
 
 @pytest.mark.parametrize("sensor", [(), ("--sensor", BLIND)])
-def test_without_a_sensor_the_consistency_step_is_off(sensor: tuple[str, ...], tmp_path: Path) -> None:
+def test_without_a_sensor_the_consistency_step_is_off(
+    sensor: tuple[str, ...], tmp_path: Path
+) -> None:
     """The two mean the same."""
     tifffile.imwrite(tmp_path / "in.tif", image())
     results = tmp_path / "results.json"
-    done("restore", tmp_path / "in.tif", tmp_path / "out.tif", "--network", INT8, *sensor, "--json", results)
+    done(
+        "restore",
+        tmp_path / "in.tif",
+        tmp_path / "out.tif",
+        "--network",
+        INT8,
+        *sensor,
+        "--json",
+        results,
+    )
     (row,) = json.loads(results.read_text(encoding="utf-8"))["rows"]
     assert row["text"]["consistency"] == "off: no sensor is named"
     assert CONSISTENCY not in row["figures"]
     expected = by_array(image(), INT8, sensor=BLIND)
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "out.tif"), expected)
-    np.testing.assert_array_equal(expected, by_array(image(), INT8, sensor=BLIND, consistency=False))
+    np.testing.assert_array_equal(
+        expected, by_array(image(), INT8, sensor=BLIND, consistency=False)
+    )
 
 
-def test_a_network_of_the_user_s_gets_the_consistency_step_and_no_exposure(model: Path, tmp_path: Path) -> None:
+def test_a_network_of_the_user_s_gets_the_consistency_step_and_no_exposure(
+    model: Path, tmp_path: Path
+) -> None:
     own = Options(model, 23, sensors={"": SENSOR}, full_scale=4095)
     found, row = restored(tmp_path, lacking().astype(np.float32), own)
     assert row.text["consistency"] == "on"
@@ -255,19 +307,27 @@ def test_a_network_of_other_pixels_or_bands_gets_none(
     save_onnx(make(), tmp_path / "network.onnx")
     pixels = np.stack([image()] * bands) if bands > 1 else image()
     written: dict[str, Any] = {"planarconfig": "separate"} if bands > 1 else {}
-    how = Options(tmp_path / "network.onnx", 56, sensors={"": SENSOR}, full_scale=4095, any_result=True)
+    how = Options(
+        tmp_path / "network.onnx", 56, sensors={"": SENSOR}, full_scale=4095, any_result=True
+    )
     found, row = restored(tmp_path, pixels, how, photometric="minisblack", **written)
     assert row.text["consistency"] == "off: the network makes other pixels or bands"
-    without, _ = restored(tmp_path, pixels, replace(how, consistency=False), photometric="minisblack", **written)
+    without, _ = restored(
+        tmp_path, pixels, replace(how, consistency=False), photometric="minisblack", **written
+    )
     np.testing.assert_array_equal(found, without)
 
 
 @pytest.mark.parametrize("name", [FLOAT, INT8])
 def test_the_mean_of_a_dark_image_is_kept(name: str) -> None:
-    """Measured at 30 DN: 3.3 and 3.8 % darker without the steps, less than 0.001 % off with both."""
+    """Measured at 30 DN: 3.3 and 3.8 % darker without the steps, less than
+    0.001 % off with both.
+    """
     nominal = SENSOR.nominal()
     level_dn = 30
-    sigma = nominal.noise_sigma(level_dn / nominal.gain_dn_per_radiance) * nominal.gain_dn_per_radiance
+    sigma = (
+        nominal.noise_sigma(level_dn / nominal.gain_dn_per_radiance) * nominal.gain_dn_per_radiance
+    )
     noise = np.random.default_rng(0).normal(0, sigma, (97, 110))
     dark = np.rint(level_dn + noise).astype(np.float32)
     kept = by_array(dark, name).mean() / dark.mean()
@@ -276,7 +336,9 @@ def test_the_mean_of_a_dark_image_is_kept(name: str) -> None:
 
 
 def test_few_rows_are_held_of_a_tall_image(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The consistency step needs its reach above and below a row of tiles, which ends within two others."""
+    """The consistency step needs its reach above and below a row of tiles, which ends within two
+    others.
+    """
     most = [0]
     add = HeldRows.add
 

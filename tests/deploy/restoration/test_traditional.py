@@ -1,4 +1,6 @@
-"""The traditional pipeline on files: the pixels of the chain on the whole array, whatever the sensor."""
+"""The traditional pipeline on files: the pixels of the chain on the whole array, whatever the
+sensor.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -44,13 +46,17 @@ def of_file(folder: Path, pixels: np.ndarray, asked: Options, **written: object)
 
 def other_sensor(folder: Path) -> Path:
     """Of another gain, and of 14 bits."""
-    return own_sensor(folder, ("bits = { value = 12", "bits = { value = 14"), ("value = 10.2375", "value = 40.0"))
+    return own_sensor(
+        folder, ("bits = { value = 12", "bits = { value = 14"), ("value = 10.2375", "value = 40.0")
+    )
 
 
 def test_a_file_gives_the_pixels_of_the_array(tmp_path: Path) -> None:
     whole = of_array(noise(), request())
     tags = [(33550, "d", 3, (0.5, 0.5, 0.0), True)]
-    restored = of_file(tmp_path, noise(), request(), rowsperstrip=16, compression="zlib", extratags=tags)
+    restored = of_file(
+        tmp_path, noise(), request(), rowsperstrip=16, compression="zlib", extratags=tags
+    )
     np.testing.assert_array_equal(restored, np.rint(whole).astype(np.uint16))
     with tifffile.TiffFile(tmp_path / "out.tif") as file:
         assert file.pages.first.tags[33550].value == (0.5, 0.5, 0.0)
@@ -74,7 +80,9 @@ def test_the_output_has_the_scale_of_the_input_whatever_the_gain(tmp_path: Path)
     flat = np.full(SHAPE, 8000, np.uint16)
     restored = of_file(tmp_path / "files", flat, mine)
     assert abs(float(restored.mean()) / 8000 - 1) < 0.01
-    share = of_file(tmp_path / "files", (noise() / 4095).astype(np.float32), request(full_scale=1.0))
+    share = of_file(
+        tmp_path / "files", (noise() / 4095).astype(np.float32), request(full_scale=1.0)
+    )
     np.testing.assert_allclose(share * 4095, of_array(noise(), request()), atol=0.5)
 
 
@@ -88,8 +96,12 @@ def test_the_output_has_the_scale_of_the_input_whatever_the_gain(tmp_path: Path)
         (np.full((*SHAPE, 3), 500, np.uint16), "one band"),
     ],
 )
-def test_what_it_cannot_restore_leaves_the_old_output(pixels: np.ndarray, words: str, tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "in.tif", pixels, photometric="rgb" if pixels.ndim == 3 else "minisblack")
+def test_what_it_cannot_restore_leaves_the_old_output(
+    pixels: np.ndarray, words: str, tmp_path: Path
+) -> None:
+    tifffile.imwrite(
+        tmp_path / "in.tif", pixels, photometric="rgb" if pixels.ndim == 3 else "minisblack"
+    )
     (tmp_path / "out.tif").write_bytes(b"the old one")
     with pytest.raises(ImageError, match=words):
         restore_file_traditionally(tmp_path / "in.tif", tmp_path / "out.tif", request(), no_log)

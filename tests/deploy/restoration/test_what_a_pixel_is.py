@@ -1,4 +1,6 @@
-"""Masks and alpha are missing pixels and stay what they are; what is no plain light is refused in a sentence."""
+"""Masks and alpha are missing pixels and stay what they are; what is no plain light is refused in a
+sentence.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -37,7 +39,9 @@ def restored(path: Path, model: Path, **options: Any) -> tuple[np.ndarray, np.nd
 
 def by_nodata(folder: Path, pixels: np.ndarray, model: Path) -> np.ndarray:
     """The same image restored, its hidden pixels told by a nodata value that no other has."""
-    seen = np.where(HIDDEN, NODATA, np.where(pixels == NODATA, NODATA + 1, pixels)).astype(pixels.dtype)
+    seen = np.where(HIDDEN, NODATA, np.where(pixels == NODATA, NODATA + 1, pixels)).astype(
+        pixels.dtype
+    )
     path = folder / "nodata.tif"
     tifffile.imwrite(path, seen, extratags=[(42113, "s", 0, str(NODATA), True)])
     return restored(path, model)[0]
@@ -61,7 +65,14 @@ def test_a_mask_is_missing_pixels_and_is_kept(
     with tifffile.TiffWriter(tmp_path / "in.tif") as file:
         file.write(pixels, metadata=None)
         if not beside:
-            file.write(mask, metadata=None, subfiletype=4, photometric="mask", tile=(16, 32), compression="zlib")
+            file.write(
+                mask,
+                metadata=None,
+                subfiletype=4,
+                photometric="mask",
+                tile=(16, 32),
+                compression="zlib",
+            )
     if beside:
         tifffile.imwrite(tmp_path / "in.tif.msk", mask)
     found, kept = restored(tmp_path / "in.tif", model, compression=compression)
@@ -81,7 +92,10 @@ def test_what_gdal_keeps_beside_an_image_counts(model: Path, tmp_path: Path) -> 
     np.testing.assert_array_equal(restored(image, model)[0], by_nodata(tmp_path, pixels, model))
     with tifffile.TiffFile(tmp_path / "out.tif") as file:
         assert file.pages.first.tags[42113].value == "7"
-    for text, words in ((band.format("<Offset>500</Offset>"), "0 is no light"), ("<", "as GDAL writes")):
+    for text, words in (
+        (band.format("<Offset>500</Offset>"), "0 is no light"),
+        ("<", "as GDAL writes"),
+    ):
         beside.write_text(text)
         with pytest.raises(ImageError, match=words):
             restored(image, model)
@@ -96,20 +110,30 @@ def test_what_gdal_keeps_beside_an_image_counts(model: Path, tmp_path: Path) -> 
 @pytest.mark.parametrize("kind", ["unassalpha", "assocalpha"])
 @pytest.mark.parametrize("planes", ["contig", "separate"])
 @pytest.mark.parametrize("bands", [1, 3])
-def test_alpha_goes_through_untouched(kind: str, planes: Any, bands: int, model: Path, tmp_path: Path) -> None:
+def test_alpha_goes_through_untouched(
+    kind: str, planes: Any, bands: int, model: Path, tmp_path: Path
+) -> None:
     pixels = pixels_of_test()
     alpha = np.where(HIDDEN, 0, noise(61, 83, seed=3)).astype(np.uint16)
     whole = np.stack([pixels] * bands + [alpha], axis=0 if planes == "separate" else 2)
     photometric: Any = "rgb" if bands == 3 else "minisblack"
     tifffile.imwrite(
-        tmp_path / "in.tif", whole, photometric=photometric, planarconfig=planes, extrasamples=[kind], metadata=None
+        tmp_path / "in.tif",
+        whole,
+        photometric=photometric,
+        planarconfig=planes,
+        extrasamples=[kind],
+        metadata=None,
     )
     restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=23))
     with tifffile.TiffFile(tmp_path / "out.tif") as file:
         page = file.pages.first
         found = page.asarray()
         said = (page.photometric, page.extrasamples)
-    assert said == ({"rgb": 2, "minisblack": 1}[photometric], ({"assocalpha": 1, "unassalpha": 2}[kind],))
+    assert said == (
+        {"rgb": 2, "minisblack": 1}[photometric],
+        ({"assocalpha": 1, "unassalpha": 2}[kind],),
+    )
     np.testing.assert_array_equal(found[-1], alpha)
     for band in found[:-1]:
         np.testing.assert_array_equal(band[HIDDEN], pixels[HIDDEN])
@@ -123,7 +147,9 @@ def test_alpha_of_a_png_is_no_light(mode: str, model: Path, tmp_path: Path) -> N
     Image.fromarray(np.concatenate([light, alpha], axis=2), mode).save(tmp_path / "in.png")
     with open_source(tmp_path / "in.png") as source:
         assert source.raster.shape == (len(mode) - 1, 31, 29)
-        np.testing.assert_array_equal(source.raster.missing(source.read(3, 9))[0], alpha[3:9, :, 0] == 0)
+        np.testing.assert_array_equal(
+            source.raster.missing(source.read(3, 9))[0], alpha[3:9, :, 0] == 0
+        )
     found, _ = restored(tmp_path / "in.png", model, full_scale=255)
     np.testing.assert_array_equal(found[-1], alpha[..., 0])
 
@@ -136,7 +162,9 @@ def two_pages(path: Path, pixels: np.ndarray) -> None:
 
 def alpha_in_each_page(path: Path, pixels: np.ndarray) -> None:
     two = np.stack([np.stack([pixels, pixels], axis=2)] * 2)
-    tifffile.imwrite(path, two, photometric="minisblack", planarconfig="contig", extrasamples=["unassalpha"])
+    tifffile.imwrite(
+        path, two, photometric="minisblack", planarconfig="contig", extrasamples=["unassalpha"]
+    )
 
 
 def two_sizes(path: Path, pixels: np.ndarray) -> None:
@@ -159,15 +187,23 @@ REFUSED: dict[str, tuple[Callable[[Path, np.ndarray], object], str]] = {
     "two pages": (two_pages, "2 pages"),
     "two sizes": (two_sizes, "2 pages"),
     "alpha in each page": (alpha_in_each_page, "alpha as the last band"),
-    "white is zero": (lambda path, pixels: tifffile.imwrite(path, pixels, photometric="miniswhite"), "MINISWHITE"),
+    "white is zero": (
+        lambda path, pixels: tifffile.imwrite(path, pixels, photometric="miniswhite"),
+        "MINISWHITE",
+    ),
     "palette": (palette, "PALETTE"),
     "offset": (with_offset, "offset of -1000"),
-    "radiances": (lambda path, pixels: tifffile.imwrite(path, (pixels / 10.2375).astype(np.float32)), "full_scale"),
+    "radiances": (
+        lambda path, pixels: tifffile.imwrite(path, (pixels / 10.2375).astype(np.float32)),
+        "full_scale",
+    ),
 }
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_is_no_plain_light_is_refused_with_a_remedy(case: str, model: Path, tmp_path: Path) -> None:
+def test_what_is_no_plain_light_is_refused_with_a_remedy(
+    case: str, model: Path, tmp_path: Path
+) -> None:
     write, word = REFUSED[case]
     write(tmp_path / "in.tif", noise(61, 83))
     with pytest.raises(ImageError, match=word):
@@ -191,7 +227,9 @@ def write_png(path: Path, width: int, height: int, bits: int, rows: bytes) -> No
     import zlib
 
     def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
 
     head = struct.pack(">IIBBBBB", width, height, bits, 2, 0, 0, 0)
     parts = (chunk(b"IHDR", head), chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b""))
@@ -232,7 +270,9 @@ def scaled(model: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[f
 @settings(max_examples=10, deadline=None)
 @given(st.sampled_from([(255.0, 0.0), (0.0, 0.3), (1.0, 0.6), (-1.0, 0.0), (40.0, -20.0)]))
 def test_a_result_that_no_restoration_has_is_refused(
-    scaled: Callable[[float, float], Path], tmp_path_factory: pytest.TempPathFactory, how: tuple[float, float]
+    scaled: Callable[[float, float], Path],
+    tmp_path_factory: pytest.TempPathFactory,
+    how: tuple[float, float],
 ) -> None:
     folder = tmp_path_factory.mktemp("refused")
     rows, columns = np.mgrid[:61, :83]
@@ -268,7 +308,9 @@ def test_a_small_departure_is_told(scaled: Callable[[float, float], Path], tmp_p
     tifffile.imwrite(tmp_path / "in.tif", np.full((61, 83), 1500, np.uint16) + (noise(61, 83) >> 6))
     moved = []
     for offset in (0.0, 0.05):
-        row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(scaled(1.0, offset)), said.append)
+        row = restore_file(
+            tmp_path / "in.tif", tmp_path / "out.tif", Options(scaled(1.0, offset)), said.append
+        )
         moved.append(row.figures["mean moved"].value or 0.0)
     assert moved[1] - moved[0] == pytest.approx(5, abs=0.1)
     assert any("the mean went from" in each for each in said)

@@ -16,11 +16,15 @@ from tests.deploy.documents import valid
 
 
 @pytest.mark.slow
-def test_the_demo_takes_a_raw_image_through_the_whole_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demo_takes_a_raw_image_through_the_whole_chain(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """On few patches: .ci/run's first stage has all."""
     monkeypatch.setattr(demo, "GATE_PATCHES", 2)
     raw = tmp_path / "raw.tif"
-    tifffile.imwrite(raw, np.random.default_rng(0).integers(300, 1500, (120, 150)).astype(np.uint16))
+    tifffile.imwrite(
+        raw, np.random.default_rng(0).integers(300, 1500, (120, 150)).astype(np.uint16)
+    )
     text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
     mine = tmp_path / "mine.toml"
     mine.write_text(text.replace("10.2375", "10.0"))
@@ -28,7 +32,14 @@ def test_the_demo_takes_a_raw_image_through_the_whole_chain(tmp_path: Path, monk
     figures = tmp_path / "figures.json"
     done("demo", "--image", raw, "--out", out, "--json", figures, "--sensor", mine)
     made = {path.name for path in out.iterdir()}
-    assert made == {"report.html", "float.onnx", "int8.onnx", "core.onnx", "restored.tif", "before-after.png"}
+    assert made == {
+        "report.html",
+        "float.onnx",
+        "int8.onnx",
+        "core.onnx",
+        "restored.tif",
+        "before-after.png",
+    }
     assert tifffile.imread(out / "restored.tif").shape == (120, 150)
     document = valid(figures)
     assert document["arguments"]["sensor"] == str(mine)
@@ -37,7 +48,11 @@ def test_the_demo_takes_a_raw_image_through_the_whole_chain(tmp_path: Path, monk
     assert {"measured", "predicted", "published"} <= modes
     page = (out / "report.html").read_text()
     assert "fits the DPU whole" in page
-    boards = {row["name"].split()[0]: row["figures"] for row in document["rows"] if row["table"] == "boards"}
+    boards = {
+        row["name"].split()[0]: row["figures"]
+        for row in document["rows"]
+        if row["table"] == "boards"
+    }
     assert list(boards) == board_names()
     assert boards["vek280"]["power"]["mode"] == "unavailable"
     assert "no power of vek280 under its DPU is published" in page
@@ -46,7 +61,9 @@ def test_the_demo_takes_a_raw_image_through_the_whole_chain(tmp_path: Path, monk
 
 @pytest.mark.slow
 def test_the_reference_has_the_gain_of_the_sensor_named(tmp_path: Path) -> None:
-    """Else every pixel of the scene would be off by the ratio of the gains, and the PSNR would say so."""
+    """Else every pixel of the scene would be off by the ratio of the gains, and the PSNR would say
+    so.
+    """
     text = (HERE / "sensors" / "pleiades-degraded.toml").read_text()
     (tmp_path / "mine.toml").write_text(text.replace("10.2375", "5.0"))
     pair = read_input(None, 0, load_sensors(str(tmp_path / "mine.toml")))[1]

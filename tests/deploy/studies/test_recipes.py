@@ -1,4 +1,6 @@
-"""`train --recipe`: stages, INT8 file and card, the same bytes where a run was stopped, and what it refuses."""
+"""`train --recipe`: stages, INT8 file and card, the same bytes where a run was stopped, and what it
+refuses.
+"""
 
 from pathlib import Path
 
@@ -76,7 +78,8 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
     trained = read_tensors(out / "1-float" / names[0])[1]["recipe"]
     assert isinstance(trained, dict)
     assert trained["held_out"] == ["town_1.png"]
-    # As if it had been stopped between the stages, and within the second one before its first checkpoint.
+    # As if it had been stopped between the stages, and within the second one before its first
+    # checkpoint.
     for name in names:
         (out / name).unlink()
     for path in (out / "2-rounded").iterdir():
@@ -89,19 +92,30 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--variant", "convbeers-s"], "--variant: expected no --recipe beside it, which states it"),
+        (
+            ["--variant", "convbeers-s"],
+            "--variant: expected no --recipe beside it, which states it",
+        ),
         (["--steps", "5"], "--steps: expected no --recipe beside it"),
         (["--conditioned"], "--conditioned: expected no --recipe"),
         (["--images", "nowhere"], "no such folder"),
         ([], "--images beside it"),
     ],
 )
-def test_what_a_recipe_states_or_needs_is_said(options: list[str], words: str, tmp_path: Path) -> None:
-    assert words in refused("train", "--recipe", "convbeers-xs", "--out", tmp_path / "run", *options)
+def test_what_a_recipe_states_or_needs_is_said(
+    options: list[str], words: str, tmp_path: Path
+) -> None:
+    assert words in refused(
+        "train", "--recipe", "convbeers-xs", "--out", tmp_path / "run", *options
+    )
     assert not (tmp_path / "run").exists()
 
 
-def test_a_held_out_site_that_no_folder_shows_is_refused(folders: list[Path], tmp_path: Path) -> None:
+def test_a_held_out_site_that_no_folder_shows_is_refused(
+    folders: list[Path], tmp_path: Path
+) -> None:
     (tmp_path / "own.toml").write_text(RECIPE)
-    said = refused("train", "--recipe", tmp_path / "own.toml", *given(folders[:1]), "--out", tmp_path / "run")
+    said = refused(
+        "train", "--recipe", tmp_path / "own.toml", *given(folders[:1]), "--out", tmp_path / "run"
+    )
     assert "held out: expected images of town, got none" in said

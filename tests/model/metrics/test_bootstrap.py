@@ -22,7 +22,9 @@ def test_it_covers_the_mean_as_often_as_it_says() -> None:
 
 
 def test_images_of_one_site_are_not_taken_for_many() -> None:
-    """Ten copies of five figures tell no more than the five; drawn one by one they would seem to."""
+    """Ten copies of five figures tell no more than the five; drawn one by one
+    they would seem to.
+    """
     values = [level for level in (38.0, 41.0, 44.0, 47.0, 50.0) for _ in range(10)]
     low, high = interval(values, [f"s{k // 10}" for k in range(50)])
     alone_low, alone_high = interval(values, [f"s{k}" for k in range(50)])

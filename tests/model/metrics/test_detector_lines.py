@@ -22,8 +22,12 @@ seeds = st.integers(0, 2**20)
 
 def judged(image: np.ndarray, rows_px: int = 64) -> Stripes:
     """Judge the columns of an image in blocks of rows."""
-    blocks = [image[top : top + rows_px].astype(np.float32) for top in range(0, len(image), rows_px)]
-    return judge_lines(join_blocks([measure_lines(block, np.isfinite(block)) for block in blocks]), LEAST)
+    blocks = [
+        image[top : top + rows_px].astype(np.float32) for top in range(0, len(image), rows_px)
+    ]
+    return judge_lines(
+        join_blocks([measure_lines(block, np.isfinite(block)) for block in blocks]), LEAST
+    )
 
 
 def noisy(image: np.ndarray, generator: np.random.Generator, noise: float = 4.0) -> np.ndarray:
@@ -62,7 +66,9 @@ def test_a_single_column_is_found_with_its_gain(seed: int, column: int, gain: fl
 @pytest.mark.parametrize("sigma_px", SIGMA_PX.values(), ids=list(SIGMA_PX))
 @pytest.mark.parametrize("width_px", [1, 2, 5, 40])
 @pytest.mark.parametrize("shift_px", [0, 1, 2])
-def test_a_blurred_road_along_the_columns_is_a_scene(sigma_px: float, width_px: int, shift_px: int) -> None:
+def test_a_blurred_road_along_the_columns_is_a_scene(
+    sigma_px: float, width_px: int, shift_px: int
+) -> None:
     fine = np.full((512, 300), 600.0)  # thirds of a pixel
     fine[:, 150 + shift_px : 150 + shift_px + 3 * width_px] = 900
     blurred = gaussian_filter(fine, (0, 3 * sigma_px), mode="nearest")
@@ -72,7 +78,9 @@ def test_a_blurred_road_along_the_columns_is_a_scene(sigma_px: float, width_px: 
 
 @settings(deadline=None, max_examples=10)
 @given(seeds, st.sampled_from([0.0, 7.0, 4095.0]), st.integers(1, 98))
-def test_a_dead_column_is_found_and_its_neighbours_are_not(seed: int, value: float, column: int) -> None:
+def test_a_dead_column_is_found_and_its_neighbours_are_not(
+    seed: int, value: float, column: int
+) -> None:
     image = noisy(np.full((512, 100), 600.0), np.random.default_rng(seed))
     image[:, column] = value
     found = judged(image)

@@ -5,7 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from beers_deploy.model.metrics.detector_phases import PATTERNS, Pattern, judge_phases, measure_phases
+from beers_deploy.model.metrics.detector_phases import (
+    PATTERNS,
+    Pattern,
+    judge_phases,
+    measure_phases,
+)
 
 LEAST = 0.003
 
@@ -16,19 +21,25 @@ def judged(image: np.ndarray, side_px: int = 64) -> dict[str, Pattern]:
         for top in range(0, image.shape[0], side_px)
         for left in range(0, image.shape[1], side_px)
     ]
-    return {found.name: found for found in judge_phases([measure_phases(p, np.isfinite(p)) for p in parts], LEAST)}
+    return {
+        found.name: found
+        for found in judge_phases([measure_phases(p, np.isfinite(p)) for p in parts], LEAST)
+    }
 
 
 def signs(name: str, shape: tuple[int, int]) -> np.ndarray:
     rows, columns = np.indices(shape)
     return 1 - 2.0 * (
-        {"alternate columns": columns, "alternate rows": rows, "checkerboard": rows + columns}[name] % 2
+        {"alternate columns": columns, "alternate rows": rows, "checkerboard": rows + columns}[name]
+        % 2
     )
 
 
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 2**20), st.sampled_from(PATTERNS), st.floats(0.005, 0.2), st.booleans())
-def test_a_pattern_is_found_with_its_size(seed: int, name: str, difference: float, turns: bool) -> None:
+def test_a_pattern_is_found_with_its_size(
+    seed: int, name: str, difference: float, turns: bool
+) -> None:
     shape = (192, 256)
     size = np.linspace(-1, 1, shape[0])[:, None] * np.sqrt(3) if turns else 1.0
     image = 500 * (1 + difference / 2 * size * signs(name, shape))

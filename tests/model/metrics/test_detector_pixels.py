@@ -1,4 +1,6 @@
-"""Dead and hot pixels are found where they are; stars, edges, texture and clipped ground are not."""
+"""Dead and hot pixels are found where they are; stars, edges, texture and
+clipped ground are not.
+"""
 
 import numpy as np
 import pytest
@@ -23,7 +25,11 @@ def found(image: np.ndarray) -> list[tuple[int, ...]]:
 
 
 @settings(deadline=None, max_examples=25)
-@given(seeds, st.integers(PATCH_PX, SIDE_PX - PATCH_PX - 1), st.integers(PATCH_PX, SIDE_PX - PATCH_PX - 1))
+@given(
+    seeds,
+    st.integers(PATCH_PX, SIDE_PX - PATCH_PX - 1),
+    st.integers(PATCH_PX, SIDE_PX - PATCH_PX - 1),
+)
 def test_dead_and_hot_pixels_are_found_and_nothing_else(seed: int, row: int, column: int) -> None:
     for value in (0, LEVEL + 100 * NOISE, 4095):
         image = ground(seed)
@@ -33,7 +39,9 @@ def test_dead_and_hot_pixels_are_found_and_nothing_else(seed: int, row: int, col
 
 @settings(deadline=None, max_examples=25)
 @given(seeds, st.floats(0.6, 2), st.floats(50, 5000), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
-def test_a_star_is_light(seed: int, sigma_px: float, peak: float, down_px: float, right_px: float) -> None:
+def test_a_star_is_light(
+    seed: int, sigma_px: float, peak: float, down_px: float, right_px: float
+) -> None:
     rows, columns = np.mgrid[:SIDE_PX, :SIDE_PX]
     distance = (rows - 45 - down_px) ** 2 + (columns - 45 - right_px) ** 2
     star = peak * np.exp(-distance / (2 * sigma_px**2))
@@ -44,7 +52,9 @@ def test_a_star_is_light(seed: int, sigma_px: float, peak: float, down_px: float
 @settings(deadline=None, max_examples=15)
 @given(seeds, st.floats(0.7, 3), st.floats(0, 60))
 def test_blurred_texture_is_a_scene(seed: int, sigma_px: float, contrast: float) -> None:
-    rough = gaussian_filter(np.random.default_rng(seed).standard_normal((SIDE_PX, SIDE_PX)), sigma_px)
+    rough = gaussian_filter(
+        np.random.default_rng(seed).standard_normal((SIDE_PX, SIDE_PX)), sigma_px
+    )
     assert found(ground(seed + 1) + contrast * rough / rough.std()) == []
 
 

@@ -44,7 +44,10 @@ def square(image: np.ndarray, angle_deg: float, rng: np.random.Generator) -> np.
 
 def edges(mtf_nyquist: float, angle_deg: float, count: int, seed: int = 0) -> list[EdgeBlur]:
     rng = np.random.default_rng(seed)
-    fits = [fit_blur(square(clean(mtf_nyquist, angle_deg), angle_deg, rng), noise, FOUND) for _ in range(count)]
+    fits = [
+        fit_blur(square(clean(mtf_nyquist, angle_deg), angle_deg, rng), noise, FOUND)
+        for _ in range(count)
+    ]
     return [fit for fit in fits if isinstance(fit, EdgeBlur)]
 
 
@@ -69,7 +72,9 @@ def test_the_interval_of_a_few_edges_holds_the_truth(mtf_nyquist: float) -> None
 def board(mtf_nyquist: Blur, lean_deg: float = 8.0, smear_px: float = 0.0) -> np.ndarray:
     upright = slanted_edge(SIDE_PX, RATIO, lean_deg, (-1.0, 1.0))
     image = blurred(
-        100 + 60 * upright * slanted_edge(SIDE_PX, RATIO, -lean_deg, (-1.0, 1.0)).T, mtf_nyquist, smear_px
+        100 + 60 * upright * slanted_edge(SIDE_PX, RATIO, -lean_deg, (-1.0, 1.0)).T,
+        mtf_nyquist,
+        smear_px,
     )
     return np.asarray(image + SIGMA * np.random.default_rng(1).standard_normal(image.shape))
 
@@ -85,7 +90,9 @@ def test_a_board_shows_both_axes(lean_deg: float) -> None:
 
 
 def test_a_curve_that_falls_more_steeply_is_no_higher_at_nyquist() -> None:
-    """Smear of a pixel keeps 0.64 at Nyquist and more before: the profile's own curve would pass too high there."""
+    """Smear of a pixel keeps 0.64 at Nyquist and more before: the profile's own curve would pass
+    too high there.
+    """
     image = board(0.1, smear_px=1.0)[10:-10, 10:-10]
     smeared = combine(find_blurs(image.T, noise, 4095), find_blurs(image, noise, 4095))
     true = 0.1 * float(np.sinc(0.5))
@@ -102,7 +109,9 @@ def test_clipped_edges_are_left_alone() -> None:
 
 
 def test_a_landscape_has_no_such_edge() -> None:
-    """Roads, roofs and crop rows, textured: steep places by the hundred, and none that is a plain step."""
+    """Roads, roofs and crop rows, textured: steep places by the hundred, and none that is a plain
+    step.
+    """
     scene = procedural_scene(1200, 1200, np.random.default_rng(3)).radiance.copy()
     scene[:400] = scene[400:800]  # the drawn calibration site
     image = blurred(scene, 0.07)

@@ -14,7 +14,13 @@ from beers_deploy.model.metrics.edge_curve import (
     search_curve,
     sharpest,
 )
-from beers_deploy.model.metrics.mtf_basis import CORNERS, at_distances, mtf_at, responses, weights_of
+from beers_deploy.model.metrics.mtf_basis import (
+    CORNERS,
+    at_distances,
+    mtf_at,
+    responses,
+    weights_of,
+)
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.metrics.uneven_edge import EdgeLine, EdgePixels, fit_edge
 
@@ -33,9 +39,14 @@ def noise(values: np.ndarray) -> np.ndarray:
 
 
 def drawn(
-    weights: np.ndarray, generator: np.random.Generator, texture: float = 0.0, size: tuple[int, int] = (23, 19)
+    weights: np.ndarray,
+    generator: np.random.Generator,
+    texture: float = 0.0,
+    size: tuple[int, int] = (23, 19),
 ) -> tuple[np.ndarray, EdgeLine]:
-    """A region (H, W) with an edge between sloping sides, its texture some pixels wide, and its line."""
+    """A region (H, W) with an edge between sloping sides, its texture some pixels wide, and its
+    line.
+    """
     height, width = size
     y, x = np.mgrid[:height, :width].astype(float)
     y -= (height - 1) / 2
@@ -96,7 +107,9 @@ def test_texture_widens_the_interval_which_holds_the_truth() -> None:
     held = []
     for seed in range(6):
         for texture in (0.0, 0.05):
-            curve = measure_curve(edges_of(weights, 3, 10 + seed, texture), np.random.default_rng(0))
+            curve = measure_curve(
+                edges_of(weights, 3, 10 + seed, texture), np.random.default_rng(0)
+            )
             assert isinstance(curve, MtfCurve)
             widths.append(curve.high[SHOWN] / curve.low[SHOWN])
             held.append((curve.low[SHOWN] <= truth) & (truth <= curve.high[SHOWN]))
@@ -125,7 +138,9 @@ def test_search_takes_the_sharpest_and_leaves_hedges() -> None:
 
 
 def test_few_edges_are_refused_with_their_number() -> None:
-    found = search_curve(edges_of(weights_of(CURVES["gaussian"]), 2, seed=7), np.random.default_rng(0))
+    found = search_curve(
+        edges_of(weights_of(CURVES["gaussian"]), 2, seed=7), np.random.default_rng(0)
+    )
     assert isinstance(found, Refusal)
     assert "2 straight edges" in found.reason
 
@@ -145,7 +160,9 @@ def test_noise_alone_holds_no_edge() -> None:
 
 
 @given(st.floats(1, 6), st.floats(1, 6), st.floats(0, 0.25), st.floats(0, 0.25))
-def test_axes_are_told_apart_by_how_the_edges_lean(x: float, y: float, lean_x: float, lean_y: float) -> None:
+def test_axes_are_told_apart_by_how_the_edges_lean(
+    x: float, y: float, lean_x: float, lean_y: float
+) -> None:
     """Edges that lean see both losses, added in squares; undone, each axis has its own."""
     detector = np.sinc(FREQUENCIES)
 

@@ -14,19 +14,27 @@ from beers_deploy.profiles.errors import ImageError
 def noisy_pair(seed: int, sigma_dn: float) -> tuple[np.ndarray, np.ndarray]:
     reference = skimage.data.camera()[100:213, 80:201].astype(np.float64) * 16
     noise = np.random.default_rng(seed).standard_normal(reference.shape) * sigma_dn
-    return np.clip(np.rint(reference + noise), 0, 4095).astype(np.float32), reference.astype(np.float32)
+    return np.clip(np.rint(reference + noise), 0, 4095).astype(np.float32), reference.astype(
+        np.float32
+    )
 
 
 @given(st.integers(0, 100), st.floats(1, 300))
 def test_both_agree_with_scikit_image(seed: int, sigma_dn: float) -> None:
     image, reference = noisy_pair(seed, sigma_dn)
     assert psnr_db(image, reference, 4095) == pytest.approx(
-        peak_signal_noise_ratio(reference.astype(float), image.astype(float), data_range=4095), abs=1e-9
+        peak_signal_noise_ratio(reference.astype(float), image.astype(float), data_range=4095),
+        abs=1e-9,
     )
     full = structural_similarity(
-        reference.astype(float), image.astype(float), data_range=4095, gaussian_weights=True, sigma=1.5,
-        use_sample_covariance=False, full=True,
-    )[1]  # fmt: skip
+        reference.astype(float),
+        image.astype(float),
+        data_range=4095,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
+    )[1]
     assert ssim(image, reference, 4095) == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-6)
 
 

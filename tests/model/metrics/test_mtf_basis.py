@@ -49,8 +49,12 @@ def test_the_edge_is_that_of_the_profiles_formula(gamma: float) -> None:
     distance = np.linspace(-9, 9, 73)
     weights = weights_of(np.exp(-gamma * CORNERS))
     edges, lines = responses()
-    assert at_distances(edges @ weights, distance) == pytest.approx(edge_response(distance, gamma), abs=0.006)
-    rise = at_distances(edges @ weights, distance + 0.05) - at_distances(edges @ weights, distance - 0.05)
+    assert at_distances(edges @ weights, distance) == pytest.approx(
+        edge_response(distance, gamma), abs=0.006
+    )
+    rise = at_distances(edges @ weights, distance + 0.05) - at_distances(
+        edges @ weights, distance - 0.05
+    )
     assert rise / 0.1 == pytest.approx(at_distances(lines @ weights, distance), abs=0.01)
 
 

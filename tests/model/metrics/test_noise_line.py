@@ -4,7 +4,13 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from beers_deploy.model.metrics.noise_line import Blocks, NoiseModel, cut_blocks, fit_noise_model, join
+from beers_deploy.model.metrics.noise_line import (
+    Blocks,
+    NoiseModel,
+    cut_blocks,
+    fit_noise_model,
+    join,
+)
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.simulator.acquire import acquire
 from beers_deploy.model.simulator.detector import Draw
@@ -29,7 +35,9 @@ def spectra() -> list[np.ndarray]:
 def seen(pair: tuple[float, float], seed: int, mtf_nyquist: float = 0.07) -> Blocks:
     alpha, beta = noise_from_snr(RADIANCES[0], pair[0], RADIANCES[1], pair[1])
     sensor = Instrument(mtf_nyquist, alpha, beta, GAIN, 12)
-    images = [acquire(s, 1280, sensor, RATIO, Draw(seed, k), "degraded") for k, s in enumerate(spectra())]
+    images = [
+        acquire(s, 1280, sensor, RATIO, Draw(seed, k), "degraded") for k, s in enumerate(spectra())
+    ]
     return join([cut_blocks(image, MAX_DN) for image in images])
 
 
@@ -63,7 +71,9 @@ def plain(shape: tuple[int, int] = (320, 320), low: float = 200, high: float = 2
 
 def noisy(sigma: float, image: np.ndarray | None = None, seed: int = 0) -> np.ndarray:
     image = plain() if image is None else image
-    return np.asarray(np.rint(image + sigma * np.random.default_rng(seed).standard_normal(image.shape)))
+    return np.asarray(
+        np.rint(image + sigma * np.random.default_rng(seed).standard_normal(image.shape))
+    )
 
 
 @pytest.mark.parametrize("sigma", [0.6, 5.0])
@@ -110,7 +120,9 @@ def test_what_cannot_be_known_is_refused() -> None:
 def test_smoothed_noise_is_refused() -> None:
     """What a denoiser or a resampling leaves is weaker at the finest detail."""
     noise = 10 * np.random.default_rng(6).standard_normal((320, 320))
-    smooth = (noise + np.roll(noise, 1, 0) + np.roll(noise, 1, 1) + np.roll(noise, (1, 1), (0, 1))) / 4
+    smooth = (
+        noise + np.roll(noise, 1, 0) + np.roll(noise, 1, 1) + np.roll(noise, (1, 1), (0, 1))
+    ) / 4
     assert "times as strong at middle frequencies" in refused(plain() + smooth)
 
 
@@ -118,7 +130,9 @@ def test_texture_as_sharp_as_a_pixel_is_refused() -> None:
     """A photograph that no instrument has blurred: its texture would pass for noise."""
     rng = np.random.default_rng(8)
     radius = np.hypot(np.fft.fftfreq(512)[:, None], np.fft.rfftfreq(512)[None, :])
-    waves = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((512, 512))) / np.maximum(radius, 1 / 100), s=(512, 512))
+    waves = np.fft.irfft2(
+        np.fft.rfft2(rng.standard_normal((512, 512))) / np.maximum(radius, 1 / 100), s=(512, 512)
+    )
     assert "texture" in refused(np.rint(plain((512, 512)) * np.exp(0.2 * waves / waves.std())))
 
 
@@ -136,7 +150,9 @@ def test_noise_of_one_level_is_that_of_photons_with_an_interval_that_holds_a_con
     assert bright.interval[0] <= 400 * 1.05
 
 
-@pytest.mark.parametrize(("kernel", "stronger"), [((0.2, 0.6, 0.2), "middle"), ((-0.25, 1.0, -0.25), "finest")])
+@pytest.mark.parametrize(
+    ("kernel", "stronger"), [((0.2, 0.6, 0.2), "middle"), ((-0.25, 1.0, -0.25), "finest")]
+)
 def test_noise_that_is_not_white_is_told_by_its_stronger_part(
     kernel: tuple[float, float, float], stronger: str
 ) -> None:
@@ -156,7 +172,10 @@ def test_noise_that_is_not_white_is_told_by_its_stronger_part(
 
 def test_a_mosaic_of_unequal_channels_is_refused() -> None:
     generator = np.random.default_rng(7)
-    channels = np.kron(np.ones((160, 160)), [[1.0, 0.6], [0.6, 0.4]]) * np.linspace(300, 3000, 320)[:, None]
+    channels = (
+        np.kron(np.ones((160, 160)), [[1.0, 0.6], [0.6, 0.4]])
+        * np.linspace(300, 3000, 320)[:, None]
+    )
     found = fit_noise_model(
         cut_blocks(generator.poisson(channels), MAX_DN), np.random.default_rng(0), incomplete=True
     )

@@ -38,7 +38,9 @@ def made_up(network: str) -> Weights:
     weights = {}
     for name, tensor in Backbone(network).state_dict().items():
         fan_in = tensor[0].numel() if name.endswith("weight") else 200
-        weights[name] = (rng.standard_normal(tuple(tensor.shape)) * np.sqrt(2 / fan_in)).astype(np.float32)
+        weights[name] = (rng.standard_normal(tuple(tensor.shape)) * np.sqrt(2 / fan_in)).astype(
+            np.float32
+        )
     return weights
 
 
@@ -75,13 +77,17 @@ def as_batch(plane: np.ndarray) -> Tensor:
 
 
 def convolve(x: Tensor, weights: Weights, name: str, stride: int = 1, padding: int = 0) -> Tensor:
-    kernel, bias = (torch.from_numpy(weights[f"{name}.{part}"]).double() for part in ("weight", "bias"))
+    kernel, bias = (
+        torch.from_numpy(weights[f"{name}.{part}"]).double() for part in ("weight", "bias")
+    )
     return conv2d(x, kernel, bias, stride, padding).relu()
 
 
 def fire(x: Tensor, weights: Weights, name: str) -> Tensor:
     squeezed = convolve(x, weights, f"{name}.squeeze")
-    return torch.cat([convolve(squeezed, weights, f"{name}.expand{n}x{n}", padding=n // 2) for n in (1, 3)], 1)
+    return torch.cat(
+        [convolve(squeezed, weights, f"{name}.expand{n}x{n}", padding=n // 2) for n in (1, 3)], 1
+    )
 
 
 def squeeze_maps(x: Tensor, weights: Weights) -> Maps:
@@ -100,7 +106,9 @@ def hanning_pooled(x: Tensor) -> Tensor:
     return ((cells * window).sum((-2, -1)) / window.sum() + 1e-12).sqrt()
 
 
-def vgg_maps(x: Tensor, weights: Weights, pool: Callable[[Tensor], Tensor] = lambda x: max_pool2d(x, 2)) -> Maps:
+def vgg_maps(
+    x: Tensor, weights: Weights, pool: Callable[[Tensor], Tensor] = lambda x: max_pool2d(x, 2)
+) -> Maps:
     maps: Maps = []
     for names in ("0 2", "5 7", "10 12 14", "17 19 21", "24 26 28"):
         x = pool(maps[-1]) if maps else x
@@ -116,12 +124,17 @@ def plain_lpips(network: str, image: np.ndarray, reference: np.ndarray) -> float
     weights = made_up(network)
     heads = load_file(PUBLISHED / f"lpips-{network}.safetensors")
     maps = {"squeeze": squeeze_maps, "vgg": vgg_maps}[network]
-    colours = [(2 * np.stack([a] * 3) - 1 - shift[:, None, None]) / scale[:, None, None] for a in (image, reference)]
+    colours = [
+        (2 * np.stack([a] * 3) - 1 - shift[:, None, None]) / scale[:, None, None]
+        for a in (image, reference)
+    ]
     total = 0.0
     pairs = zip(*(maps(torch.from_numpy(colour)[None], weights) for colour in colours), strict=True)
     for layer, both in enumerate(pairs):
         a, b = (m.numpy()[0] / (np.sqrt((m.numpy()[0] ** 2).sum(0)) + 1e-10) for m in both)
-        total += float(np.mean(np.tensordot(heads[f"lin{layer}"].astype(np.float64), (a - b) ** 2, axes=1)))
+        total += float(
+            np.mean(np.tensordot(heads[f"lin{layer}"].astype(np.float64), (a - b) ** 2, axes=1))
+        )
     return total
 
 
@@ -129,17 +142,23 @@ def plain_dists(image: np.ndarray, reference: np.ndarray) -> float:
     weights = made_up("vgg")
     published = load_file(PUBLISHED / "dists.safetensors")
     alpha, beta = (published[name].astype(np.float64) for name in ("alpha", "beta"))
-    mean, std = (torch.tensor(x, dtype=torch.float64)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
+    mean, std = (
+        torch.tensor(x, dtype=torch.float64)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD)
+    )
     colours = [torch.from_numpy(np.stack([a] * 3))[None] for a in (image, reference)]
     stages = [[c, *vgg_maps((c - mean) / std, weights, hanning_pooled)] for c in colours]
     channels = [
-        (a, b) for stage in zip(*stages, strict=True) for a, b in zip(*(x.numpy()[0] for x in stage), strict=True)
+        (a, b)
+        for stage in zip(*stages, strict=True)
+        for a, b in zip(*(x.numpy()[0] for x in stage), strict=True)
     ]
     similar = 0.0
     for channel, (a, b) in enumerate(channels):
         means = (2 * a.mean() * b.mean() + 1e-6) / (a.mean() ** 2 + b.mean() ** 2 + 1e-6)
         covariance = np.mean((a - a.mean()) * (b - b.mean()))
-        similar += alpha[channel] * means + beta[channel] * (2 * covariance + 1e-6) / (a.var() + b.var() + 1e-6)
+        similar += alpha[channel] * means + beta[channel] * (2 * covariance + 1e-6) / (
+            a.var() + b.var() + 1e-6
+        )
     return float(1 - similar / (alpha.sum() + beta.sum()))
 
 
@@ -153,7 +172,9 @@ def test_agrees_with_a_plain_computation(name: str, sides: tuple[int, int], fold
     planes = [a[0, 0].double().numpy() for a in (image, reference)]
     plain = plain_dists(*planes) if name == "dists" else plain_lpips(name, *planes)
     assert float(metric(image, reference)) == pytest.approx(plain, rel=1e-5)
-    assert float(metric.double()(image.double(), reference.double())) == pytest.approx(plain, rel=1e-7)
+    assert float(metric.double()(image.double(), reference.double())) == pytest.approx(
+        plain, rel=1e-7
+    )
 
 
 def test_identical_images_are_0_with_no_gradient(metric: Lpips | Dists) -> None:
@@ -232,7 +253,9 @@ def test_images_of_different_shapes_are_refused(metric: Lpips | Dists) -> None:
     image, reference = pair(40, 40)
     for wrong in (image[0], image[..., 1:], image.expand(-1, 3, -1, -1)):
         with pytest.raises(ImageError, match="of one shape"):
-            metric(wrong, wrong if wrong.shape == image[0].shape or wrong.shape[1] == 3 else reference)
+            metric(
+                wrong, wrong if wrong.shape == image[0].shape or wrong.shape[1] == 3 else reference
+            )
 
 
 @pytest.mark.parametrize(
@@ -259,7 +282,9 @@ class Bomb:
         return os.mkdir, (str(self.trace),)
 
 
-def test_npz_loads_like_safetensors_at_half_precision_and_with_other_entries(tmp_path: Path, folder: Path) -> None:
+def test_npz_loads_like_safetensors_at_half_precision_and_with_other_entries(
+    tmp_path: Path, folder: Path
+) -> None:
     halves = {name: array.astype(np.float16) for name, array in made_up("squeeze").items()}
     np.savez(tmp_path / "mine.npz", **halves, **{"classifier.1.weight": np.zeros(3)})  # type: ignore[arg-type]
     images = pair(40, 40)
@@ -272,7 +297,10 @@ def test_npz_loads_like_safetensors_at_half_precision_and_with_other_entries(tmp
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"features.3.squeeze.bias": None}, "expected a tensor named features.3.squeeze.bias, got none"),
+        (
+            {"features.3.squeeze.bias": None},
+            "expected a tensor named features.3.squeeze.bias, got none",
+        ),
         (
             {"features.0.weight": np.zeros((64, 3, 7, 7))},
             r"features.0.weight of shape \(64, 3, 3, 3\), got \(64, 3, 7",
@@ -315,7 +343,9 @@ def test_a_pickled_file_is_refused_with_the_way_out(tmp_path: Path, name: str) -
     assert "\n" not in str(error.value)
 
 
-def test_where_a_backbone_is_looked_for(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_a_backbone_is_looked_for(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv(WEIGHTS_VARIABLE, raising=False)
     assert find_backbone("squeeze") is None
     assert find_backbone("squeeze", tmp_path) is None
@@ -329,7 +359,9 @@ def test_where_a_backbone_is_looked_for(tmp_path: Path, folder: Path, monkeypatc
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "nowhere"))
     assert [find_backbone(network) for network in BACKBONES] == [None] * 2
     for network, stem in STEMS.items():
-        assert not_found(network).startswith(f"weights not found: no {stem}*.safetensors or {stem}*.npz")
+        assert not_found(network).startswith(
+            f"weights not found: no {stem}*.safetensors or {stem}*.npz"
+        )
 
 
 # The real SqueezeNet, where it lies beside the repository.
@@ -349,7 +381,11 @@ def test_known_values_on_a_photograph(squeeze: Lpips) -> None:
     noise = np.random.default_rng(0).standard_normal(reference.shape)
     for sigma, published in ((0.01, 0.094), (0.05, 0.369), (0.2, 0.649)):
         noisy = np.clip(reference + sigma * noise, 0, 1)
-        assert float(squeeze(as_batch(noisy), as_batch(reference))) == pytest.approx(published, rel=0.01)
+        assert float(squeeze(as_batch(noisy), as_batch(reference))) == pytest.approx(
+            published, rel=0.01
+        )
     for sigma_px, published in ((0.5, 0.020), (1, 0.132), (2, 0.293), (4, 0.425)):
         blurred = gaussian(reference, sigma_px, mode="reflect")
-        assert float(squeeze(as_batch(blurred), as_batch(reference))) == pytest.approx(published, abs=5.1e-4)
+        assert float(squeeze(as_batch(blurred), as_batch(reference))) == pytest.approx(
+            published, abs=5.1e-4
+        )

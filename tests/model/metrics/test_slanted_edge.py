@@ -23,7 +23,9 @@ MIDDLE = slice((SCENE_PX - SIDE_PX) // 2, (SCENE_PX + SIDE_PX) // 2)
 
 @lru_cache
 def clean(mtf_nyquist: float, angle_deg: float, antialias_px: float = 0.0) -> np.ndarray:
-    """The middle of a simulated edge, where the second edge at the wrapped border no longer counts."""
+    """The middle of a simulated edge, where the second edge at the wrapped
+    border no longer counts.
+    """
     side = SCENE_PX * RATIO
     transfer = transfer_function(side, side, RATIO, mtf_nyquist, antialias_px)
     image = sample(scene_spectrum(slanted_edge(SCENE_PX, RATIO, angle_deg)), transfer, side, RATIO)
@@ -47,8 +49,12 @@ def refused(image: np.ndarray, saturated: float = math.inf) -> str:
     return result.reason
 
 
-def gaussian_edge(angle_deg: float, sigma_px: float, shape: tuple[int, int] = (80, 80)) -> np.ndarray:
-    """An edge that owes nothing to the simulator: the error function along the normal, 0.13 px off the middle."""
+def gaussian_edge(
+    angle_deg: float, sigma_px: float, shape: tuple[int, int] = (80, 80)
+) -> np.ndarray:
+    """An edge that owes nothing to the simulator: the error function along the normal, 0.13 px off
+    the middle.
+    """
     angle = math.radians(angle_deg)
     y, x = (np.arange(size) - (size - 1) / 2 + 0.13 for size in shape)
     distance = x[None, :] * math.cos(angle) + y[:, None] * math.sin(angle)
@@ -58,10 +64,14 @@ def gaussian_edge(angle_deg: float, sigma_px: float, shape: tuple[int, int] = (8
 @pytest.mark.parametrize("antialias_px", [0.0, 0.25])
 @pytest.mark.parametrize("angle_deg", [2.0, 5.0, 8.0, 11.0, 15.0])
 @pytest.mark.parametrize("mtf_nyquist", [0.01, 0.03, 0.07, 0.25])
-def test_a_clean_edge_gives_the_simulated_mtf(mtf_nyquist: float, angle_deg: float, antialias_px: float) -> None:
+def test_a_clean_edge_gives_the_simulated_mtf(
+    mtf_nyquist: float, angle_deg: float, antialias_px: float
+) -> None:
     angle = math.radians(angle_deg)
     expected = float(mtf(0.5 * math.cos(angle), 0.5 * math.sin(angle), mtf_nyquist, antialias_px))
-    assert measured(clean(mtf_nyquist, angle_deg, antialias_px), angle_deg) == pytest.approx(expected, abs=0.002)
+    assert measured(clean(mtf_nyquist, angle_deg, antialias_px), angle_deg) == pytest.approx(
+        expected, abs=0.002
+    )
 
 
 @pytest.mark.parametrize("angle_deg", [2.0, 15.0])
@@ -75,7 +85,9 @@ def test_noise_does_not_bias(mtf_nyquist: float, bias: float, angle_deg: float) 
 @pytest.mark.parametrize("angle_deg", [3.0, 5.0, 11.31, 14.04])
 @pytest.mark.parametrize("sigma_px", [0.4, 0.53, 0.8])
 def test_a_gaussian_edge_gives_its_mtf_wherever_it_lies(sigma_px: float, angle_deg: float) -> None:
-    """Also where 1 / 4 of a pixel a row leaves bins one-sided, and where a restoration has moved its image."""
+    """Also where 1 / 4 of a pixel a row leaves bins one-sided, and where a restoration has moved
+    its image.
+    """
     expected = math.exp(-2 * (math.pi * sigma_px * 0.5) ** 2)
     image = gaussian_edge(angle_deg, sigma_px, (80, 84))
     for moved in (image[:, 2:-2], image[:, 1:-3], image[:, 3:-1]):

@@ -17,7 +17,9 @@ from beers_deploy.profiles.response import MtfTable, PointSpread, Response, pack
 from beers_deploy.profiles.scene_call import typical_effects
 from beers_deploy.profiles.sensor import Instrument
 
-TYPICAL: dict[str, Effect] = {name: middle_effect(name, table) for name, table in typical_effects().items()}
+TYPICAL: dict[str, Effect] = {
+    name: middle_effect(name, table) for name, table in typical_effects().items()
+}
 
 
 def plain_sensor(**effects: Effect) -> Instrument:
@@ -28,7 +30,9 @@ def plain_sensor(**effects: Effect) -> Instrument:
 def before_digitising(
     radiance: np.ndarray, sensor: Instrument, ratio: int, draw: Draw, skip: Collection[str] = ()
 ) -> np.ndarray:
-    """What `simulate_planned` computes, up to the converter, so that no rounding hides a difference."""
+    """What `simulate_planned` computes, up to the converter, so that no rounding hides a
+    difference.
+    """
     if "mtf" in skip:
         signal = pixel_means(radiance, ratio)
     else:
@@ -44,10 +48,14 @@ def before_digitising(
 def pixel_means(radiance: np.ndarray, ratio: int) -> np.ndarray:
     """The mean radiance of each whole target pixel."""
     height, width = (size // ratio for size in radiance.shape)
-    return np.asarray(crop_divisible(radiance, ratio).reshape(height, ratio, width, ratio).mean((1, 3)))
+    return np.asarray(
+        crop_divisible(radiance, ratio).reshape(height, ratio, width, ratio).mean((1, 3))
+    )
 
 
-def _apply(image: np.ndarray, acts_on: str, sensor: Instrument, draw: Draw, skip: Collection[str]) -> np.ndarray:
+def _apply(
+    image: np.ndarray, acts_on: str, sensor: Instrument, draw: Draw, skip: Collection[str]
+) -> np.ndarray:
     for name, effect in pixel_effects(sensor.effects, acts_on).items():
         if name not in skip:
             image = effect.apply(image, sensor, partial(draw.generator, f"{name}-degraded"))
@@ -78,7 +86,9 @@ def formula_table(across: float, along: float, steps: int = 5) -> MtfTable:
 
 
 def formula_point(blur: Blur, per_px: int, side_px: int, odd: bool) -> PointSpread:
-    """The formula's own point-spread function, by inverse transform; of an even side the middle is no sample's."""
+    """The formula's own point-spread function, by inverse transform; of an even side the middle is
+    no sample's.
+    """
     side = per_px * side_px + odd
     f = np.fft.fftfreq(side, 1 / per_px)
     samples = np.fft.fftshift(np.fft.ifft2(mtf(f[None], f[:, None], blur)).real)
@@ -86,11 +96,15 @@ def formula_point(blur: Blur, per_px: int, side_px: int, odd: bool) -> PointSpre
 
 
 def gaussian_pixel(sigma_x: float, sigma_y: float, per_px: int, side: int) -> PointSpread:
-    """A Gaussian of other widths across and along, seen by a square pixel: side x (side + 4) samples."""
+    """A Gaussian of other widths across and along, seen by a square pixel: side x (side + 4)
+    samples.
+    """
 
     def line(size: int, sigma: float) -> np.ndarray:
         x = (np.arange(size) - (size - 1) / 2) / per_px
-        return np.array([math.erf((v + 0.5) / 2**0.5 / sigma) - math.erf((v - 0.5) / 2**0.5 / sigma) for v in x])
+        return np.array(
+            [math.erf((v + 0.5) / 2**0.5 / sigma) - math.erf((v - 0.5) / 2**0.5 / sigma) for v in x]
+        )
 
     return point_spread(line(side, sigma_y)[:, None] * line(side + 4, sigma_x), per_px)
 

@@ -15,25 +15,35 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument
 from tests.model.simulator.stages import pixel_means
 
-DEGRADED, REFERENCE = (load_sensor(name).nominal() for name in ("pleiades-degraded", "pleiades-reference"))
+DEGRADED, REFERENCE = (
+    load_sensor(name).nominal() for name in ("pleiades-degraded", "pleiades-reference")
+)
 QUIET = Instrument(0.07, alpha=0.0, beta=0.0, gain_dn_per_radiance=10.0, bits=16)
 
 
 @pytest.mark.parametrize("cycles_per_px", [0.1, 0.25, 0.4])
 @pytest.mark.parametrize("mtf_nyquist", [0.03, 0.07, 0.25])
-def test_a_sine_keeps_the_contrast_that_the_mtf_says(cycles_per_px: float, mtf_nyquist: float) -> None:
+def test_a_sine_keeps_the_contrast_that_the_mtf_says(
+    cycles_per_px: float, mtf_nyquist: float
+) -> None:
     ratio = 4
     pixels = 40
     x = (np.arange(pixels * ratio) + 0.5) / ratio
     wave = 1000 + 500 * np.cos(2 * math.pi * cycles_per_px * x)
     radiance = np.tile(wave.astype(np.float32), (pixels * ratio, 1))
     sensor = Instrument(mtf_nyquist, 0.0, 0.0, 10.0, 16)
-    dn = acquire(scene_spectrum(radiance), radiance.shape[1], sensor, ratio, Draw(0), "degraded", margin_px=0)
+    dn = acquire(
+        scene_spectrum(radiance), radiance.shape[1], sensor, ratio, Draw(0), "degraded", margin_px=0
+    )
     line = dn.mean(0, np.float64) / 10
     bin_ = round(cycles_per_px * pixels)
     contrast = 2 * abs(np.fft.rfft(line)[bin_]) / pixels / 500
     gamma = -2 * math.log(mtf_nyquist * math.pi / 2)
-    expected = math.exp(-gamma * cycles_per_px) * math.sin(math.pi * cycles_per_px) / (math.pi * cycles_per_px)
+    expected = (
+        math.exp(-gamma * cycles_per_px)
+        * math.sin(math.pi * cycles_per_px)
+        / (math.pi * cycles_per_px)
+    )
     assert contrast == pytest.approx(expected, abs=1e-3)
 
 
@@ -65,22 +75,33 @@ def test_the_two_noises_of_a_pair_are_independent() -> None:
 
 def test_the_same_draw_gives_the_same_pixels_and_another_does_not() -> None:
     scene = np.full((500, 470), 80.0, np.float32)
-    first, again, other = (simulate_pair(scene, DEGRADED, REFERENCE, 5, Draw(s)).degraded for s in (1, 1, 2))
+    first, again, other = (
+        simulate_pair(scene, DEGRADED, REFERENCE, 5, Draw(s)).degraded for s in (1, 1, 2)
+    )
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
 
 
 def test_margin_and_ratio_give_the_size() -> None:
-    pair = simulate_pair(np.full((503, 471), 80.0, np.float32), DEGRADED, REFERENCE, 5, Draw(0), margin_px=16)
+    pair = simulate_pair(
+        np.full((503, 471), 80.0, np.float32), DEGRADED, REFERENCE, 5, Draw(0), margin_px=16
+    )
     assert pair.degraded.shape == pair.reference.shape == (100 - 32, 94 - 32)
 
 
 def test_the_margin_keeps_the_wrapped_border_out() -> None:
-    """A bright strip at the left edge wraps into the right one; within the margin it must have faded."""
+    """A bright strip at the left edge wraps into the right one; within the margin it must have
+    faded.
+    """
     dark, strip = (np.full((600, 600), 50.0, np.float32) for _ in range(2))
     strip[:, :5] = 400.0
-    inside = [simulate_pair(s, QUIET, QUIET, 5, Draw(0)).degraded[:, -1].mean() for s in (dark, strip)]
-    edge = [simulate_pair(s, QUIET, QUIET, 5, Draw(0), margin_px=0).degraded[:, -1].mean() for s in (dark, strip)]
+    inside = [
+        simulate_pair(s, QUIET, QUIET, 5, Draw(0)).degraded[:, -1].mean() for s in (dark, strip)
+    ]
+    edge = [
+        simulate_pair(s, QUIET, QUIET, 5, Draw(0), margin_px=0).degraded[:, -1].mean()
+        for s in (dark, strip)
+    ]
     assert abs(inside[1] - inside[0]) < 5
     assert abs(edge[1] - edge[0]) > 100
 
@@ -98,7 +119,9 @@ def test_a_padded_acquisition_covers_the_whole_scene(height: int, width: int) ->
 
 
 def test_padding_shifts_nothing() -> None:
-    """Where a margin of real scene surrounds it, an acquisition is the same to what the mirror brings in."""
+    """Where a margin of real scene surrounds it, an acquisition is the same to what the mirror
+    brings in.
+    """
     radiance = procedural_scene(600, 600, np.random.default_rng(3)).radiance
     whole = acquire_padded(radiance, QUIET, 3, Draw(0), "degraded")
     cropped = acquire(scene_spectrum(radiance), 600, QUIET, 3, Draw(0), "degraded")
@@ -114,8 +137,12 @@ def test_drawn_scenes_are_physical_and_repeatable() -> None:
     assert scene.radiance.dtype == np.float32
     assert 0 < scene.radiance.min() < 20
     assert 200 < scene.radiance.max() < 1000
-    assert np.array_equal(scene.radiance, procedural_scene(700, 913, np.random.default_rng(5)).radiance)
-    assert not np.array_equal(scene.radiance, procedural_scene(700, 913, np.random.default_rng(6)).radiance)
+    assert np.array_equal(
+        scene.radiance, procedural_scene(700, 913, np.random.default_rng(5)).radiance
+    )
+    assert not np.array_equal(
+        scene.radiance, procedural_scene(700, 913, np.random.default_rng(6)).radiance
+    )
 
 
 # On real images, where there are some beside the repository.
@@ -145,10 +172,14 @@ def test_a_real_pair_is_whole_numbers_of_the_same_ground(radiance: np.ndarray) -
 
 
 def test_the_blur_takes_detail_from_a_real_scene(radiance: np.ndarray) -> None:
-    """Contrast between neighbours falls; the negative control is the pair of one sensor with itself."""
+    """Contrast between neighbours falls; the negative control is the pair of one sensor with
+    itself.
+    """
     detail = []
     for sensor in (DEGRADED, REFERENCE):
         pair = simulate_pair(radiance, sensor, REFERENCE, 3, Draw(0), margin_px=16)
-        detail.append(float(np.diff(pair.degraded, axis=1).std() / np.diff(pair.reference, axis=1).std()))
+        detail.append(
+            float(np.diff(pair.degraded, axis=1).std() / np.diff(pair.reference, axis=1).std())
+        )
     assert detail[0] < 0.8
     assert detail[1] == pytest.approx(1, rel=0.02)

@@ -52,18 +52,24 @@ def scene(height: int = 340, width: int = 390, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("name", TABLES)
 def test_skipping_equals_applying_at_neutral_parameters_bit_for_bit(name: str) -> None:
-    """Whether the plan leaves the effect out or skips nothing: the operator itself must change no bit."""
+    """Whether the plan leaves the effect out or skips nothing: the operator itself must change no
+    bit.
+    """
     radiance = scene(171, 195)
     draw = Draw(3)
     neutral = stages.plain_sensor(**{name: NEUTRAL[name]})
     without_it = stages.plain_sensor()
-    one, other = (stages.before_digitising(radiance, sensor, 3, draw) for sensor in (neutral, without_it))
+    one, other = (
+        stages.before_digitising(radiance, sensor, 3, draw) for sensor in (neutral, without_it)
+    )
     assert np.array_equal(one, other)
     prepared = prepare_scene(radiance, 3)
     everything = Plan((), TOLERANCE_DN)
     expected = simulate_planned(prepared, without_it, draw, everything, margin_px=5)
     for plan in (make_plan(neutral, prepared.stats), everything):
-        assert np.array_equal(simulate_planned(prepared, neutral, draw, plan, margin_px=5), expected)
+        assert np.array_equal(
+            simulate_planned(prepared, neutral, draw, plan, margin_px=5), expected
+        )
 
 
 def test_the_pattern_of_a_column_is_the_same_in_every_row() -> None:
@@ -85,7 +91,10 @@ def test_stripes_alternate_and_keep_the_mean() -> None:
 
 
 def test_haze_is_affine() -> None:
-    assert stages.alone(Haze(0.6, 25.0), np.array([0.0, 100.0], np.float32)).tolist() == [25.0, 85.0]
+    assert stages.alone(Haze(0.6, 25.0), np.array([0.0, 100.0], np.float32)).tolist() == [
+        25.0,
+        85.0,
+    ]
 
 
 def test_below_the_well_nothing_changes_and_share_zero_is_a_clip() -> None:
@@ -116,7 +125,9 @@ def test_defects_come_at_their_rate_and_at_the_ends_of_the_range() -> None:
 
 
 def test_an_infeasible_budget_is_refused_with_its_numbers() -> None:
-    with pytest.raises(OptionError, match=r"up to 0\.1854 behind an anti-alias filter that keeps 0\.291"):
+    with pytest.raises(
+        OptionError, match=r"up to 0\.1854 behind an anti-alias filter that keeps 0\.291"
+    ):
         gamma_from_mtf(0.25, 0.5)
 
 
@@ -135,7 +146,9 @@ def test_the_noise_is_the_same_whether_a_pattern_is_applied_or_not(name: str) ->
     assert np.abs(added).min() > 0
 
 
-@given(st.floats(1, 150), st.floats(0, 0.5), st.floats(0, 9), st.integers(2, 37), st.integers(0, 99))
+@given(
+    st.floats(1, 150), st.floats(0, 0.5), st.floats(0, 9), st.integers(2, 37), st.integers(0, 99)
+)
 def test_a_full_well_gives_back_no_more_than_its_share_of_what_it_cuts_off(
     well: float, share: float, length_px: float, rows: int, seed: int
 ) -> None:
@@ -169,7 +182,9 @@ def test_the_variance_is_alpha_l_plus_beta_and_digitising_adds_a_twelfth(radianc
     noisy = add_noise(image, SENSOR, Draw(1).generator("noise"))
     expected = SENSOR.alpha * radiance + SENSOR.beta
     assert noisy.var(dtype=np.float64) == pytest.approx(expected, rel=0.01)
-    assert noisy.mean(dtype=np.float64) == pytest.approx(radiance, abs=4 * (expected / image.size) ** 0.5)
+    assert noisy.mean(dtype=np.float64) == pytest.approx(
+        radiance, abs=4 * (expected / image.size) ** 0.5
+    )
     dn = digitise(noisy * GAIN, SENSOR)
     assert dn.var(dtype=np.float64) == pytest.approx(expected * GAIN**2 + 1 / 12, rel=0.01)
 

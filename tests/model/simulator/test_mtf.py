@@ -41,19 +41,25 @@ def grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @given(st.floats(1e-3, 0.5), st.floats(1e-3, 0.5), st.sampled_from([0.0, 0.2]))
-def test_each_axis_keeps_the_contrast_stated_for_it(across: float, along: float, sigma_px: float) -> None:
+def test_each_axis_keeps_the_contrast_stated_for_it(
+    across: float, along: float, sigma_px: float
+) -> None:
     assert float(mtf(0.5, 0.0, (across, along), sigma_px)) == pytest.approx(across, rel=1e-9)
     assert float(mtf(0.0, 0.5, (across, along), sigma_px)) == pytest.approx(along, rel=1e-9)
 
 
 @given(st.floats(1e-4, 0.5), st.integers(2, 31), st.integers(2, 31))
-def test_two_equal_axes_are_one_to_the_last_bit(mtf_nyquist: float, height: int, width: int) -> None:
+def test_two_equal_axes_are_one_to_the_last_bit(
+    mtf_nyquist: float, height: int, width: int
+) -> None:
     fx, fy = grid(height, width)
     assert np.array_equal(mtf(fx, fy, (mtf_nyquist, mtf_nyquist)), mtf(fx, fy, mtf_nyquist))
 
 
 @given(st.floats(0.01, 0.5), st.integers(2, 31), st.integers(2, 31))
-def test_the_formula_of_two_axes_meets_that_of_one(mtf_nyquist: float, height: int, width: int) -> None:
+def test_the_formula_of_two_axes_meets_that_of_one(
+    mtf_nyquist: float, height: int, width: int
+) -> None:
     """Axes that differ in the last digits take the other branch: no step lies between the two."""
     fx, fy = grid(height, width)
     near = mtf(fx, fy, (mtf_nyquist, mtf_nyquist * (1 + 1e-12)))
@@ -64,7 +70,9 @@ def test_turning_the_axes_turns_the_response() -> None:
     fx, fy = grid(13, 21)
     turned = mtf(fy.T, fx.T, (0.05, 0.12))
     np.testing.assert_allclose(turned.T, mtf(fx, fy, (0.12, 0.05)), rtol=1e-12, atol=0)
-    assert not np.allclose(mtf(fx, fy, (0.12, 0.05)), mtf(fx, fy, (0.05, 0.12)), rtol=1e-3, atol=1e-3)
+    assert not np.allclose(
+        mtf(fx, fy, (0.12, 0.05)), mtf(fx, fy, (0.05, 0.12)), rtol=1e-3, atol=1e-3
+    )
 
 
 IMPOSSIBLE = [0.0, -0.1, 0.65, 1.0, math.nan, math.inf]

@@ -48,7 +48,9 @@ ALL_APPLIED = Plan((), TOLERANCE_DN)
 """A plan that skips nothing."""
 
 
-def draw_scene(kind: str, height: int, width: int, level: float, contrast: float, seed: int) -> np.ndarray:
+def draw_scene(
+    kind: str, height: int, width: int, level: float, contrast: float, seed: int
+) -> np.ndarray:
     noise: np.ndarray = np.random.default_rng(seed).random((height, width), np.float32)
     if kind == "ramp":
         noise = (np.arange(height)[:, None] + np.arange(width)) / (height + width)
@@ -114,12 +116,16 @@ def change(radiance: np.ndarray, sensor: Instrument, ratio: int, name: str, seed
     skip = {name, "smear", "antialias"} if name == "mtf" else {name}
     radiance = crop_divisible(radiance, ratio)
     whole = stages.before_digitising(radiance, sensor, ratio, Draw(seed))
-    return float(np.abs(whole - stages.before_digitising(radiance, sensor, ratio, Draw(seed), skip)).max())
+    return float(
+        np.abs(whole - stages.before_digitising(radiance, sensor, ratio, Draw(seed), skip)).max()
+    )
 
 
 @settings(max_examples=EXAMPLES)
 @given(scenes, sensors, st.sampled_from([1, 2, 3, 5]), st.integers(0, 99))
-def test_no_bound_is_ever_exceeded(radiance: np.ndarray, sensor: Instrument, ratio: int, seed: int) -> None:
+def test_no_bound_is_ever_exceeded(
+    radiance: np.ndarray, sensor: Instrument, ratio: int, seed: int
+) -> None:
     stats = scene_stats(crop_divisible(radiance, ratio), ratio)
     for name, bound in effect_bounds(sensor, stats).items():
         assert change(radiance, sensor, ratio, name, seed) <= bound * (1 + 1e-4) + ROUNDING_DN, name
@@ -127,14 +133,18 @@ def test_no_bound_is_ever_exceeded(radiance: np.ndarray, sensor: Instrument, rat
 
 @settings(max_examples=EXAMPLES)
 @given(scenes, sensors, st.sampled_from([1, 2, 3, 5]), st.integers(0, 99))
-def test_the_plan_keeps_within_its_tolerance(radiance: np.ndarray, sensor: Instrument, ratio: int, seed: int) -> None:
+def test_the_plan_keeps_within_its_tolerance(
+    radiance: np.ndarray, sensor: Instrument, ratio: int, seed: int
+) -> None:
     scene = prepare_scene(radiance, ratio)
     radiance = scene.radiance
     plan = make_plan(sensor, scene.stats)
     whole = stages.before_digitising(radiance, sensor, ratio, Draw(seed))
     planned = stages.before_digitising(radiance, sensor, ratio, Draw(seed), plan.skipped)
     assert np.abs(whole - planned).max() <= TOLERANCE_DN + ROUNDING_DN
-    products = [simulate_planned(scene, sensor, Draw(seed), p, margin_px=2) for p in (plan, ALL_APPLIED)]
+    products = [
+        simulate_planned(scene, sensor, Draw(seed), p, margin_px=2) for p in (plan, ALL_APPLIED)
+    ]
     assert np.abs(products[0] - products[1]).max() <= 1  # two roundings of almost the same number
 
 
@@ -145,7 +155,9 @@ def test_a_table_that_rings_is_bounded_by_its_own_ringing() -> None:
     plain = stages.plain_sensor()
     sensor = stages.with_response(plain, RESPONSES[0])
     stats = scene_stats(radiance, 3)
-    assert change(radiance, sensor, 3, "mtf", 0) <= effect_bounds(sensor, stats)["mtf"] + ROUNDING_DN
+    assert (
+        change(radiance, sensor, 3, "mtf", 0) <= effect_bounds(sensor, stats)["mtf"] + ROUNDING_DN
+    )
     assert ringing_of(sensor, stats) > 1.1 * ringing_of(replace(sensor, response=None), stats)
 
 
@@ -161,7 +173,9 @@ STRONG: dict[str, Effect] = {
 }
 
 
-@pytest.mark.parametrize("name", ["mtf", "noise", *(name for name in TABLES if name != "antialias")])
+@pytest.mark.parametrize(
+    "name", ["mtf", "noise", *(name for name in TABLES if name != "antialias")]
+)
 def test_a_quarter_of_any_bound_would_be_caught(name: str) -> None:
     """The bounds are not kept only because they are loose."""
     radiance = np.zeros((90, 75), np.float32)
@@ -209,7 +223,11 @@ def test_what_a_scene_shows_decides(
 
 
 def test_what_is_skipped_fits_the_tolerance_together() -> None:
-    faint: dict[str, Effect] = {"striping": Striping(0.3), "dsnu": Dsnu(0.03), "offset": Offset(0.14)}
+    faint: dict[str, Effect] = {
+        "striping": Striping(0.3),
+        "dsnu": Dsnu(0.03),
+        "offset": Offset(0.14),
+    }
     plan = make_plan(stages.plain_sensor(**faint), scene_stats(SCENE, 2))
     hidden = [d for d in plan.decisions if d.choice == "cannot show"]
     assert 1 <= len(hidden) < 3

@@ -1,4 +1,6 @@
-"""A tabulated MTF and a point-spread function blur as they say: contrast, place and radiance, on both axes."""
+"""A tabulated MTF and a point-spread function blur as they say: contrast, place and radiance, on
+both axes.
+"""
 
 import math
 from dataclasses import replace
@@ -39,14 +41,19 @@ def test_a_slanted_edge_shows_both_contrasts(name: str) -> None:
     (blur, wanted), side, ratio, middle = BLURS[name], 200, 4, slice(60, 140)
     scene = slanted_edge(side, ratio, 5.0)
     transfer = transfer_function(side * ratio, side * ratio, ratio, blur)
-    upright, lying = (sample(scene_spectrum(s), transfer, side * ratio, ratio) for s in (scene, scene.T))
-    assert [edge_mtf(image[middle, middle], 5.0) for image in (upright, lying.T)] == pytest.approx(wanted, abs=0.005)
+    upright, lying = (
+        sample(scene_spectrum(s), transfer, side * ratio, ratio) for s in (scene, scene.T)
+    )
+    assert [edge_mtf(image[middle, middle], 5.0) for image in (upright, lying.T)] == pytest.approx(
+        wanted, abs=0.005
+    )
 
 
 def lean(image: np.ndarray) -> float:
     """Mean product of the offsets down and right from the centroid, in pixels squared."""
     down, right = (
-        np.arange(n) - (n - 1) / 2 - middle for n, middle in zip(image.shape, centroid(image), strict=True)
+        np.arange(n) - (n - 1) / 2 - middle
+        for n, middle in zip(image.shape, centroid(image), strict=True)
     )
     return float(down @ image @ right / image.sum())
 
@@ -54,7 +61,9 @@ def lean(image: np.ndarray) -> float:
 def test_a_point_aslant_is_not_straightened() -> None:
     """Second moments of what is convolved add up, and a blob has none of both axes."""
     point = stages.lopsided_point()
-    image = sample(scene_spectrum(stages.blob(192, 12.0)), transfer_function(192, 192, 4, point), 192, 4)
+    image = sample(
+        scene_spectrum(stages.blob(192, 12.0)), transfer_function(192, 192, 4, point), 192, 4
+    )
     wanted = lean(unpacked(point)) / point.samples_per_px**2
     assert abs(wanted) > 0.01
     assert lean(image.astype(np.float64)) == pytest.approx(wanted, rel=0.01)
@@ -65,7 +74,9 @@ def test_a_point_aslant_is_not_straightened() -> None:
 def test_no_blur_shifts_a_blob_or_changes_its_light(name: str, ratio: int) -> None:
     side = 32 * ratio
     blob = stages.blob(side, 2.5 * ratio)
-    image = sample(scene_spectrum(blob), transfer_function(side, side, ratio, BLURS[name][0]), side, ratio)
+    image = sample(
+        scene_spectrum(blob), transfer_function(side, side, ratio, BLURS[name][0]), side, ratio
+    )
     assert image.sum(dtype=np.float64) * ratio**2 == pytest.approx(float(blob.sum()), rel=1e-5)
     assert max(map(abs, centroid(image.astype(np.float64)))) < 0.01
 
@@ -80,13 +91,17 @@ def test_a_table_of_the_formula_is_the_formula(contrasts: tuple[float, float], s
 
 
 def test_the_optics_of_one_table_are_round() -> None:
-    """The square detector apart, contrast depends on the radius alone: along a diagonal as along an axis."""
+    """The square detector apart, contrast depends on the radius alone: along a diagonal as along an
+    axis.
+    """
     table = replace(MEASURED, along=MEASURED.across)
     radius = np.linspace(0.01, 0.9, 40)[None]
     zero = np.zeros((1, 1))
     fx = 0.8 * radius
     fy = 0.6 * radius
-    aslant = np.stack([mtf(fx[:, k : k + 1], fy[:, k : k + 1], table).ravel() for k in range(40)], 1)
+    aslant = np.stack(
+        [mtf(fx[:, k : k + 1], fy[:, k : k + 1], table).ravel() for k in range(40)], 1
+    )
     optics = mtf(radius, zero, table) / np.sinc(radius)
     np.testing.assert_allclose(aslant / np.sinc(fx) / np.sinc(fy), optics, rtol=1e-9, atol=1e-12)
 
@@ -94,17 +109,23 @@ def test_the_optics_of_one_table_are_round() -> None:
 @pytest.mark.parametrize("side", [64, 75])
 @pytest.mark.parametrize("odd", [True, False])
 def test_a_point_of_the_formula_gives_the_formulas_images(odd: bool, side: int) -> None:
-    """Nearly exactly where the scene repeats as the point's window does, 64 pixels, and 3000 DN of contrast or less.
+    """Nearly exactly where the scene repeats as the point's window does, 64 pixels, and 3000 DN of
+    contrast or less.
 
-    Elsewhere the tail beyond the window is missing; an even side has one row too many at one end, which moves the
-    centroid by thousandths of a pixel.
+    Elsewhere the tail beyond the window is missing; an even side has one row too many at one end,
+    which moves the centroid by thousandths of a pixel.
     """
     ratio = 4
     point = stages.formula_point(UNEVEN, 4, 64, odd)
     radiance = 300 * np.random.default_rng(3).random((side * ratio, side * ratio), np.float32)
     radiance[: side * ratio // 2] *= 0.2
     wanted, found = (
-        sample(scene_spectrum(radiance), transfer_function(*radiance.shape, ratio, blur), side * ratio, ratio)
+        sample(
+            scene_spectrum(radiance),
+            transfer_function(*radiance.shape, ratio, blur),
+            side * ratio,
+            ratio,
+        )
         for blur in (UNEVEN, point)
     )
     limit_dn = 5.0
@@ -140,5 +161,7 @@ def test_any_bits_digitise_the_same_radiance(name: str, bits: int) -> None:
     spectrum = scene_spectrum(radiance)
     wanted = sample(spectrum, sensor_transfer(120, 100, 2, sensor), 100, 2)
     found = acquire(spectrum, 100, own, 2, Draw(0), "degraded", margin_px=0)
-    assert np.abs(found / own.gain_dn_per_radiance - wanted).max() <= 0.501 / own.gain_dn_per_radiance
+    assert (
+        np.abs(found / own.gain_dn_per_radiance - wanted).max() <= 0.501 / own.gain_dn_per_radiance
+    )
     assert 0.5 * 2**bits < float(found.max()) <= 2**bits - 1

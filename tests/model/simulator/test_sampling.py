@@ -1,4 +1,6 @@
-"""One fused pass computes what the effects would, one after the other, at full resolution; nothing is shifted."""
+"""One fused pass computes what the effects would, one after the other, at full resolution; nothing
+is shifted.
+"""
 
 import math
 
@@ -23,7 +25,9 @@ def scene(height: int, width: int, seed: int = 0) -> np.ndarray:
 def one_after_the_other(
     radiance: np.ndarray, ratio: int, mtf_nyquist: float, sigma: float, smear: float
 ) -> np.ndarray:
-    """Blur, then smear, then shift, each with a transform of its own in float64; then pick every r-th pixel."""
+    """Blur, then smear, then shift, each with a transform of its own in float64; then pick every
+    r-th pixel.
+    """
     height, width = radiance.shape
     fy = np.fft.fftfreq(height, 1 / ratio)[:, None]
     fx = np.fft.rfftfreq(width, 1 / ratio)[None]
@@ -40,9 +44,14 @@ def one_after_the_other(
 
 @settings(max_examples=40)
 @given(
-    st.integers(1, 8), st.floats(0.01, 0.3), st.floats(0, 0.3), st.floats(0, 3),
-    st.integers(2, 23), st.integers(1, 21), st.integers(0, 99),
-)  # fmt: skip
+    st.integers(1, 8),
+    st.floats(0.01, 0.3),
+    st.floats(0, 0.3),
+    st.floats(0, 3),
+    st.integers(2, 23),
+    st.integers(1, 21),
+    st.integers(0, 99),
+)
 def test_fused_equals_sequential(
     ratio: int, mtf_nyquist: float, sigma: float, smear: float, rows: int, columns: int, seed: int
 ) -> None:
@@ -55,12 +64,16 @@ def test_fused_equals_sequential(
 
 @pytest.mark.parametrize("ratio", [1, 2, 3, 5, 8])
 def test_haze_after_sampling_equals_haze_before_the_blur(ratio: int) -> None:
-    """An affine change of the light commutes with a blur that keeps the mean: so it may wait for the small grid."""
+    """An affine change of the light commutes with a blur that keeps the mean: so it may wait for
+    the small grid.
+    """
     haze = Haze(0.7, 15.0)
     radiance = 300 * np.random.default_rng(0).random((17 * ratio, 23 * ratio), np.float32)
     transfer = transfer_function(*radiance.shape, ratio, 0.07, 0.2, 1.5)
     fused = stages.alone(haze, sample(scene_spectrum(radiance), transfer, radiance.shape[1], ratio))
-    expected = one_after_the_other(stages.alone(haze, radiance.astype(np.float64)), ratio, 0.07, 0.2, 1.5)
+    expected = one_after_the_other(
+        stages.alone(haze, radiance.astype(np.float64)), ratio, 0.07, 0.2, 1.5
+    )
     assert np.abs(fused - expected).max() < 5e-4
 
 
@@ -84,15 +97,20 @@ def test_the_mean_radiance_is_kept(ratio: int, rows: int, columns: int, seed: in
     radiance = scene(rows * ratio, columns * ratio, seed)
     transfer = transfer_function(*radiance.shape, ratio, 0.07)
     result = sample(scene_spectrum(radiance), transfer, columns * ratio, ratio)
-    # Frequencies that alias onto the mean are whole cycles per pixel, where the detector's sinc is zero.
+    # Frequencies that alias onto the mean are whole cycles per pixel, where the detector's sinc is
+    # zero.
     assert result.mean(dtype=np.float64) == pytest.approx(radiance.mean(dtype=np.float64), rel=1e-6)
 
 
 @given(st.integers(1, 8), st.floats(0.0, 400.0))
 def test_a_constant_stays_what_it_is(ratio: int, level: float) -> None:
     radiance = np.full((5 * ratio, 7 * ratio), level, np.float32)
-    result = sample(scene_spectrum(radiance), transfer_function(*radiance.shape, ratio, 0.07), 7 * ratio, ratio)
-    np.testing.assert_allclose(result, np.full((5, 7), level, np.float32), rtol=2e-6, atol=1e-5, strict=True)
+    result = sample(
+        scene_spectrum(radiance), transfer_function(*radiance.shape, ratio, 0.07), 7 * ratio, ratio
+    )
+    np.testing.assert_allclose(
+        result, np.full((5, 7), level, np.float32), rtol=2e-6, atol=1e-5, strict=True
+    )
 
 
 def test_what_the_grid_does_not_divide_is_cropped() -> None:
@@ -114,7 +132,9 @@ def test_a_stack_of_scenes_is_sampled_one_by_one() -> None:
     stack = sample(scene_spectrum(scenes), transfer, 63, 3)
     assert stack.shape == (3, 13, 21)
     for one, image in zip(scenes, stack, strict=True):
-        np.testing.assert_allclose(sample(scene_spectrum(one), transfer, 63, 3), image, rtol=0, atol=1e-4)
+        np.testing.assert_allclose(
+            sample(scene_spectrum(one), transfer, 63, 3), image, rtol=0, atol=1e-4
+        )
 
 
 def wave(height: int, width: int, cycles: tuple[int, int]) -> np.ndarray:
@@ -126,14 +146,18 @@ def wave(height: int, width: int, cycles: tuple[int, int]) -> np.ndarray:
 
 @pytest.mark.parametrize(("height", "width"), [(48, 70), (75, 90), (31, 41), (60, 84)])
 @pytest.mark.parametrize("cycles", [(0, 0), (3, 5), (11, 2), (0, 13)])
-def test_a_wave_that_both_grids_hold_is_the_same_wave(height: int, width: int, cycles: tuple[int, int]) -> None:
+def test_a_wave_that_both_grids_hold_is_the_same_wave(
+    height: int, width: int, cycles: tuple[int, int]
+) -> None:
     result = resample(wave(60, 84, cycles), height, width)
     np.testing.assert_allclose(result, wave(height, width, cycles), rtol=0, atol=1e-3, strict=True)
 
 
 def test_what_the_new_grid_cannot_hold_is_cut_not_aliased() -> None:
     result = resample(wave(60, 84, (0, 30)), 40, 40)
-    np.testing.assert_allclose(result, np.full((40, 40), 100.0, np.float32), rtol=0, atol=1e-3, strict=True)
+    np.testing.assert_allclose(
+        result, np.full((40, 40), 100.0, np.float32), rtol=0, atol=1e-3, strict=True
+    )
 
 
 def test_the_mean_is_kept() -> None:

@@ -1,4 +1,6 @@
-"""MTF compensation: gain 1 at DC, the target MTF without regularisation, finite whatever the blur."""
+"""MTF compensation: gain 1 at DC, the target MTF without regularisation, finite
+whatever the blur.
+"""
 
 import numpy as np
 import pytest
@@ -21,13 +23,17 @@ EPSILON = 3e-3
 
 
 def texture(height: int, width: int) -> torch.Tensor:
-    return torch.from_numpy(np.random.default_rng(0).uniform(0, 4095, (height, width)).astype(np.float32))
+    return torch.from_numpy(
+        np.random.default_rng(0).uniform(0, 4095, (height, width)).astype(np.float32)
+    )
 
 
 @pytest.mark.parametrize("mtf_from", [1.001e-4, 1e-3, 0.03, 0.07, 0.25, 0.63])
 @pytest.mark.parametrize("mtf_to", [1.001e-4, 0.25, 0.63])
 @pytest.mark.parametrize("epsilon", [0.0, 3e-3])
-def test_gain_is_one_at_dc_and_finite_everywhere(mtf_from: float, mtf_to: float, epsilon: float) -> None:
+def test_gain_is_one_at_dc_and_finite_everywhere(
+    mtf_from: float, mtf_to: float, epsilon: float
+) -> None:
     gain = compensation_gain(26, 35, mtf_from, mtf_to, epsilon)
     assert float(gain[0, 0]) == 1
     assert np.isfinite(gain).all()
@@ -40,7 +46,9 @@ def test_without_regularisation_it_is_the_ratio_of_the_mtfs() -> None:
 
 
 def test_without_regularisation_a_point_spread_is_undone_whole() -> None:
-    """What it shifted and turned lies straight again: gain times blur is the target, phase and all."""
+    """What it shifted and turned lies straight again: gain times blur is the
+    target, phase and all.
+    """
     fx = np.fft.rfftfreq(34)[None]
     fy = np.fft.fftfreq(26)[:, None]
     blur = mtf(fx, fy, lopsided_point())
@@ -63,7 +71,9 @@ def test_a_constant_image_is_unchanged(value: float) -> None:
 
 @pytest.mark.parametrize("shape", [(128, 128), (61, 75), (400, 31), (1, 3)])
 def test_the_mean_is_preserved(shape: tuple[int, int]) -> None:
-    """A symmetric filter on a mirrored image: the mean of the crop is that of a period, whatever the size."""
+    """A symmetric filter on a mirrored image: the mean of the crop is that of a period, whatever
+    the size.
+    """
     image = texture(*shape)
     restored = compensate(image, 0.07, 0.25, EPSILON)
     assert float(restored.double().mean() / image.double().mean()) == pytest.approx(1, abs=1e-6)
@@ -87,7 +97,9 @@ def test_the_kernel_keeps_the_gain_off_dc(mtf_from: float) -> None:
     assert float(gain.imag.abs().max()) < 1e-9
     error = (gain.real / wanted - 1).abs()
     assert float(error[8:240, 8:240].max()) < 2e-3
-    assert float(error.max()) < 0.04  # at the kink that the gain has where it is continued beyond Nyquist
+    assert (
+        float(error.max()) < 0.04
+    )  # at the kink that the gain has where it is continued beyond Nyquist
 
 
 def test_strips_and_blocks_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,7 +145,10 @@ def test_any_shape_comes_back_finite(shape: tuple[int, int]) -> None:
 def test_it_carries_one_blur_into_the_other() -> None:
     yy, xx = np.mgrid[:261, :275]
     scene = np.asarray(2000 + 1000 * np.sin(0.9 * xx + 0.4 * yy) * np.cos(0.07 * xx), np.float32)
-    seen = (sample(scene_spectrum(scene), transfer_function(261, 275, 1, m), 275, 1) for m in (0.07, 0.25))
+    seen = (
+        sample(scene_spectrum(scene), transfer_function(261, 275, 1, m), 275, 1)
+        for m in (0.07, 0.25)
+    )
     blurred, target = map(torch.from_numpy, seen)
     inside = slice(80, -80), slice(80, -80)
     before = (blurred - target)[inside].square().mean()

@@ -56,8 +56,8 @@ def hard_images() -> dict[str, Tensor]:
 def test_it_reaches_the_published_quality(camera: Tensor, sigma: float, floor_db: float) -> None:
     """Measured 34.96 and 31.14 dB on this crop; 0.1 dB is left for other processors' rounding.
 
-    On the whole 512 x 512 photograph the same code gives 34.28 and 30.74 dB, the authors' own program 34.26 and
-    30.77 dB: a fault of the method would show here as half a decibel or more.
+    On the whole 512 x 512 photograph the same code gives 34.28 and 30.74 dB, the authors' own
+    program 34.26 and 30.77 dB: a fault of the method would show here as half a decibel or more.
     """
     clean = camera[96:288, 160:352]
     assert psnr_db(nl_bayes(with_noise(clean, sigma), Noise(sigma)), clean) > floor_db
@@ -74,7 +74,9 @@ def test_a_wrong_sigma_costs_decibels(camera: Tensor) -> None:
 def test_denser_references_cost_time_and_gain_quality(camera: Tensor) -> None:
     clean = camera[96:205, 160:273]
     noisy = with_noise(clean, SIGMA)
-    fast, standard, best = (psnr_db(nl_bayes(noisy, WHITE, quality), clean) for quality in QUALITIES.values())
+    fast, standard, best = (
+        psnr_db(nl_bayes(noisy, WHITE, quality), clean) for quality in QUALITIES.values()
+    )
     assert fast < standard < best
 
 
@@ -104,7 +106,9 @@ def test_every_row_of_the_settings_works(camera: Tensor, sigma: float) -> None:
 
 def test_an_offset_passes_through(camera: Tensor) -> None:
     noisy = with_noise(camera[96:133, 160:205], SIGMA)
-    torch.testing.assert_close(nl_bayes(noisy + 1000, WHITE), nl_bayes(noisy, WHITE) + 1000, rtol=0, atol=0.1)
+    torch.testing.assert_close(
+        nl_bayes(noisy + 1000, WHITE), nl_bayes(noisy, WHITE) + 1000, rtol=0, atol=0.1
+    )
 
 
 def test_tiles_leave_no_trace(camera: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,7 +127,9 @@ def test_strips_change_no_bit(height: int, cuts: list[int], camera: Tensor) -> N
     edges = sorted({0, height, *(cut for cut in cuts if cut < height)})
     strips = [noisy[top:bottom] for top, bottom in pairwise(edges)]
     together = torch.cat(list(nl_bayes_strips(strips, height, WHITE, QUALITIES["fast"])))
-    assert torch.equal(together.nan_to_num(-1), nl_bayes(noisy, WHITE, QUALITIES["fast"]).nan_to_num(-1))
+    assert torch.equal(
+        together.nan_to_num(-1), nl_bayes(noisy, WHITE, QUALITIES["fast"]).nan_to_num(-1)
+    )
 
 
 def test_results_come_before_the_image_has_ended(camera: Tensor) -> None:
@@ -167,7 +173,9 @@ def test_pixels_in_no_whole_patch_keep_their_values() -> None:
 
 
 def high_pass(noise: Tensor) -> Tensor:
-    return torch.nn.functional.conv2d(noise[None, None].double(), SHARPENER[None, None], padding=1)[0, 0]
+    return torch.nn.functional.conv2d(noise[None, None].double(), SHARPENER[None, None], padding=1)[
+        0, 0
+    ]
 
 
 def test_coloured_noise_is_described_by_its_filter() -> None:
@@ -175,7 +183,9 @@ def test_coloured_noise_is_described_by_its_filter() -> None:
     assert noise.sigma == pytest.approx(2 * 29**0.5)
     samples = 2 * torch.from_numpy(np.random.default_rng(3).standard_normal((701, 703)))
     seen = high_pass(samples)[8:-8, 8:-8].unfold(0, 3, 5).unfold(1, 3, 5).reshape(-1, 9)
-    torch.testing.assert_close(torch.cov(seen.T), noise.covariance(3), rtol=0, atol=0.06 * noise.sigma**2)
+    torch.testing.assert_close(
+        torch.cov(seen.T), noise.covariance(3), rtol=0, atol=0.06 * noise.sigma**2
+    )
 
 
 def test_knowing_the_colour_of_the_noise_pays(camera: Tensor) -> None:
@@ -199,18 +209,26 @@ def test_the_estimate_of_pass_2_is_the_posterior_mean() -> None:
     noisy = guide + SIGMA * torch.from_numpy(generator.standard_normal((1, 60, 25)))
     taken = torch.ones(1, 60, dtype=torch.float64)
     taken[:, 50:] = 0
-    estimates = estimate_groups(noisy, guide, taken, WHITE, second_pass(SIGMA, QUALITIES["standard"]))[0, :50]
+    estimates = estimate_groups(
+        noisy, guide, taken, WHITE, second_pass(SIGMA, QUALITIES["standard"])
+    )[0, :50]
     covariance = torch.cov(guide[0, :50].T, correction=0)
-    gain = covariance @ torch.linalg.inv(covariance + 1.1 * SIGMA**2 * torch.eye(25, dtype=torch.float64))
+    gain = covariance @ torch.linalg.inv(
+        covariance + 1.1 * SIGMA**2 * torch.eye(25, dtype=torch.float64)
+    )
     mean = noisy[0, :50].mean(0)
-    torch.testing.assert_close(estimates, mean + (noisy[0, :50] - mean) @ gain.T, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(
+        estimates, mean + (noisy[0, :50] - mean) @ gain.T, rtol=1e-8, atol=1e-8
+    )
 
 
 def test_a_flat_group_becomes_its_mean() -> None:
     group = torch.full((1, 45, 25), 300.0) + with_noise(torch.zeros(1, 45, 25), 0.9 * SIGMA)
     flat = estimate_groups(group, group, None, WHITE, first_pass(SIGMA))
     torch.testing.assert_close(flat, group.mean().expand_as(flat))
-    textured = estimate_groups(group, group, torch.ones(1, 45), Noise(SIGMA / 2), first_pass(SIGMA / 2))
+    textured = estimate_groups(
+        group, group, torch.ones(1, 45), Noise(SIGMA / 2), first_pass(SIGMA / 2)
+    )
     assert float(textured.std()) > 1
 
 
@@ -241,7 +259,9 @@ def test_threads_change_nothing(camera: Tensor) -> None:
 
 
 def image(height: int, width: int) -> torch.Tensor:
-    return torch.from_numpy(np.random.default_rng(4).normal(5000, 12, (height, width)).astype(np.float32))
+    return torch.from_numpy(
+        np.random.default_rng(4).normal(5000, 12, (height, width)).astype(np.float32)
+    )
 
 
 def test_distances_are_the_sums_of_squared_differences() -> None:

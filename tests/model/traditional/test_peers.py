@@ -9,7 +9,9 @@ from beers_deploy.model.traditional.pipeline import Chain
 from beers_deploy.profiles import load_sensor
 from tests.model.traditional.test_pipeline import Seen, psnr_db, restored_db, seen_by
 
-CHAIN = Chain(load_sensor("pleiades-degraded").nominal(), load_sensor("pleiades-reference").nominal())
+CHAIN = Chain(
+    load_sensor("pleiades-degraded").nominal(), load_sensor("pleiades-reference").nominal()
+)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,6 @@
-"""The whole chain on a simulated pair: what it gains, and what it loses when told the wrong sensor."""
+"""The whole chain on a simulated pair: what it gains, and what it loses when
+told the wrong sensor.
+"""
 
 from dataclasses import replace
 from typing import NamedTuple, get_args
@@ -15,7 +17,12 @@ from beers_deploy.model.simulator.sampling import sample, scene_spectrum
 from beers_deploy.model.traditional import pipeline
 from beers_deploy.model.traditional.noise import Noise, coloured_by, with_rounding_noise
 from beers_deploy.model.traditional.peers import PEERS
-from beers_deploy.model.traditional.pipeline import Chain, Order, restore_strips, restore_traditional
+from beers_deploy.model.traditional.pipeline import (
+    Chain,
+    Order,
+    restore_strips,
+    restore_traditional,
+)
 from beers_deploy.model.traditional.rows import mirrored
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError
@@ -38,8 +45,12 @@ class Seen(NamedTuple):
 
 
 def seen_by(camera: Tensor, sensor: Instrument, reference: Instrument = NOISE_FREE) -> Seen:
-    """A photograph of up to 200 W/m2/sr/um, 139 x 145 pixels within the margin, its reference without noise."""
-    pair = simulate_pair(camera[64:267, 128:337].numpy() * (200 / 255), sensor, reference, 1, Draw(seed=1))
+    """A photograph of up to 200 W/m2/sr/um, 139 x 145 pixels within the margin, its reference
+    without noise.
+    """
+    pair = simulate_pair(
+        camera[64:267, 128:337].numpy() * (200 / 255), sensor, reference, 1, Draw(seed=1)
+    )
     return Seen(torch.from_numpy(pair.degraded), torch.from_numpy(pair.reference))
 
 
@@ -68,16 +79,22 @@ def test_the_chain_gains_many_decibels_over_the_degraded_image(pair: Seen) -> No
 
 def test_each_half_of_the_chain_is_needed(pair: Seen) -> None:
     whole = restored_db(pair, Chain(DEGRADED, REFERENCE))
-    assert restored_db(pair, Chain(DEGRADED, replace(REFERENCE, mtf_nyquist=0.07))) < whole - 3  # denoised alone
+    assert (
+        restored_db(pair, Chain(DEGRADED, replace(REFERENCE, mtf_nyquist=0.07))) < whole - 3
+    )  # denoised alone
     assert psnr_db(compensate(pair.degraded, 0.07, 0.25, 3e-3), pair.reference) < whole - 3
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("mtf", "snr", "floor_db"), [(0.07, (50, 110), 46.5), (0.03, (15, 50), 41.0)])
+@pytest.mark.parametrize(
+    ("mtf", "snr", "floor_db"), [(0.07, (50, 110), 46.5), (0.03, (15, 50), 41.0)]
+)
 def test_both_orders_reach_the_measured_quality(
     mtf: float, snr: tuple[float, float], floor_db: float, camera: Tensor
 ) -> None:
-    """10 to 210 W/m2/sr/um, mirrored borders, 16 pixels inside, over 250: degraded 37.56 and 33.73 dB."""
+    """10 to 210 W/m2/sr/um, mirrored borders, 16 pixels inside, over 250: degraded 37.56 and 33.73
+    dB.
+    """
     alpha, beta = noise_from_snr(25, snr[0], 100, snr[1])
     told = replace(DEGRADED, mtf_nyquist=mtf, alpha=alpha, beta=beta)
     dn, truth = blurred_pair(10 + camera.double() * (200 / 255), told)
@@ -87,7 +104,9 @@ def test_both_orders_reach_the_measured_quality(
         error = (restored.double() / told.gain_dn_per_radiance - truth)[inside].square().mean()
         return float(10 * torch.log10(250**2 / error))
 
-    first, second = (level_db(restore_traditional(dn, Chain(told, REFERENCE, order=order))) for order in ORDERS)
+    first, second = (
+        level_db(restore_traditional(dn, Chain(told, REFERENCE, order=order))) for order in ORDERS
+    )
     assert level_db(dn) < first - 7
     assert first >= floor_db
     assert second >= first - 0.1
@@ -121,7 +140,9 @@ def test_strips_change_no_bit(order: Order, pair: Seen) -> None:
     assert torch.equal(whole.isnan(), dn.isnan())
 
 
-def test_without_the_colour_deconvolving_first_loses_decibels(pair: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_colour_deconvolving_first_loses_decibels(
+    pair: Seen, monkeypatch: pytest.MonkeyPatch
+) -> None:
     chain = Chain(DEGRADED, REFERENCE, order="deconvolve-first", epsilon=0.0)
     told = restored_db(pair, chain)
 
@@ -135,12 +156,16 @@ def test_without_the_colour_deconvolving_first_loses_decibels(pair: Seen, monkey
 def test_the_gain_of_each_sensor_is_its_own(pair: Seen) -> None:
     crop = pair.degraded[:37, :45]
     same = restore_traditional(crop, Chain(DEGRADED, REFERENCE, "fast"))
-    half = restore_traditional(crop, Chain(DEGRADED, replace(REFERENCE, gain_dn_per_radiance=10.2375 / 2), "fast"))
+    half = restore_traditional(
+        crop, Chain(DEGRADED, replace(REFERENCE, gain_dn_per_radiance=10.2375 / 2), "fast")
+    )
     torch.testing.assert_close(half * 2, same)
 
 
 @pytest.mark.parametrize("level", [0.0, 4095.0])
-@pytest.mark.parametrize("sensor", [DEGRADED, NOISE_FREE, load_sensor("pleiades-variable").nominal()])
+@pytest.mark.parametrize(
+    "sensor", [DEGRADED, NOISE_FREE, load_sensor("pleiades-variable").nominal()]
+)
 def test_a_black_and_a_saturated_image(level: float, sensor: Instrument) -> None:
     restored = restore_traditional(torch.full((13, 21), level), Chain(sensor, REFERENCE))
     torch.testing.assert_close(restored, torch.full((13, 21), level), rtol=0, atol=0.05)
@@ -166,7 +191,10 @@ def leaning_disc() -> PointSpread:
 def test_the_chain_restores_a_point_spread_as_the_formula_it_was_made_of(camera: Tensor) -> None:
     formula = replace(DEGRADED, mtf_nyquist=0.12, mtf_nyquist_along=0.05)
     point = with_response(DEGRADED, formula_point(formula.mtf_axes, 2, 129, odd=True))
-    found = [restored_db(seen_by(camera, sensor), Chain(sensor, REFERENCE)) for sensor in (formula, point)]
+    found = [
+        restored_db(seen_by(camera, sensor), Chain(sensor, REFERENCE))
+        for sensor in (formula, point)
+    ]
     assert found[1] == pytest.approx(found[0], abs=0.05)
 
 
@@ -179,13 +207,19 @@ WRONG += [(DEGRADED, replace(DEGRADED, mtf_nyquist=0.15), "denoise-first")]
 WRONG += [(DEGRADED, replace(DEGRADED, alpha=0.5), "denoise-first")]
 WRONG += [(AXES, TURNED, "denoise-first"), (AXES, ONE, "denoise-first")]
 WRONG += [(DISC, replace(DISC, response=None), order) for order in ORDERS]
-"""A sensor, and another that the chain is told: the formula with the contrasts of a leaning disc is another blur."""
+"""A sensor, and another that the chain is told: the formula with the contrasts of a leaning disc is
+another blur.
+"""
 
 
 @pytest.mark.parametrize(("sensor", "told", "order"), WRONG)
-def test_the_wrong_sensor_costs_decibels(sensor: Instrument, told: Instrument, order: Order, camera: Tensor) -> None:
+def test_the_wrong_sensor_costs_decibels(
+    sensor: Instrument, told: Instrument, order: Order, camera: Tensor
+) -> None:
     seen = seen_by(camera, sensor)
-    right, wrong = (restored_db(seen, Chain(each, REFERENCE, order=order)) for each in (sensor, told))
+    right, wrong = (
+        restored_db(seen, Chain(each, REFERENCE, order=order)) for each in (sensor, told)
+    )
     assert right > wrong + 1
 
 
@@ -204,7 +238,9 @@ def test_peers_undo_the_whole_response(name: str, camera: Tensor) -> None:
 def test_any_bits_are_restored(bits: int, camera: Tensor) -> None:
     """Rounding to 8 bits counts as noise, and costs a decibel; 14 bits are as good as 12."""
     gain = (2**bits - 1) / 400
-    degraded, reference = (replace(s, bits=bits, gain_dn_per_radiance=gain) for s in (DEGRADED, NOISE_FREE))
+    degraded, reference = (
+        replace(s, bits=bits, gain_dn_per_radiance=gain) for s in (DEGRADED, NOISE_FREE)
+    )
     seen = seen_by(camera, degraded, reference)
     restored = restore_traditional(seen.degraded, Chain(degraded, reference))
     before, after = (
@@ -215,7 +251,9 @@ def test_any_bits_are_restored(bits: int, camera: Tensor) -> None:
 
 
 def test_a_turned_sensor_gives_the_turned_filter() -> None:
-    upright, lying = (replace(DEGRADED, mtf_nyquist=a, mtf_nyquist_along=b) for a, b in ((0.1, 0.05), (0.05, 0.1)))
+    upright, lying = (
+        replace(DEGRADED, mtf_nyquist=a, mtf_nyquist_along=b) for a, b in ((0.1, 0.05), (0.05, 0.1))
+    )
     kernels = [Chain(sensor, REFERENCE, epsilon=3e-3).kernel() for sensor in (upright, lying)]
     torch.testing.assert_close(kernels[0].T, kernels[1], rtol=0, atol=1e-12)
     same = Chain(replace(DEGRADED, mtf_nyquist_along=0.07), REFERENCE, epsilon=3e-3)

@@ -1,4 +1,6 @@
-"""The regularisation that is derived from the image: what changes it, what does not, and what it is worth."""
+"""The regularisation that is derived from the image: what changes it, what does not, and what it is
+worth.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,14 +28,24 @@ from beers_deploy.model.traditional.regularisation import (
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.sensor import Instrument
 from tests.model.simulator.stages import formula_point, with_response
-from tests.model.traditional.test_pipeline import DEGRADED, NOISE_FREE, REFERENCE, restored_db, seen_by
+from tests.model.traditional.test_pipeline import (
+    DEGRADED,
+    NOISE_FREE,
+    REFERENCE,
+    restored_db,
+    seen_by,
+)
 
 SIZES = st.tuples(st.integers(1, 40), st.integers(1, 40))
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-def walk(shape: tuple[int, int], seed: int = 0, step_dn: float = 8.0, mean_dn: float = 900.0) -> Tensor:
-    """Return a random texture (H, W) of digital numbers whose power falls with frequency, with a little noise."""
+def walk(
+    shape: tuple[int, int], seed: int = 0, step_dn: float = 8.0, mean_dn: float = 900.0
+) -> Tensor:
+    """Return a random texture (H, W) of digital numbers whose power falls with frequency, with a
+    little noise.
+    """
     generator = np.random.default_rng(seed)
     texture = generator.standard_normal(shape).cumsum(0).cumsum(1) / sum(shape) ** 0.5
     dn = mean_dn + step_dn * texture + 5 * generator.standard_normal(shape)
@@ -45,7 +57,9 @@ def epsilon_of(strips: Sequence[Tensor], sensor: Instrument = DEGRADED) -> float
 
 
 @given(shape=SIZES, rows=st.integers(1, 41), seed=SEEDS, lost=st.floats(0, 1))
-def test_strips_of_any_height_give_the_same_bits(shape: tuple[int, int], rows: int, seed: int, lost: float) -> None:
+def test_strips_of_any_height_give_the_same_bits(
+    shape: tuple[int, int], rows: int, seed: int, lost: float
+) -> None:
     dn = walk(shape, seed)
     dn[torch.rand(shape, generator=torch.Generator().manual_seed(seed % 1000)) < lost] = torch.nan
     assert epsilon_of([dn]) == epsilon_of(torch.split(dn, rows))
@@ -55,10 +69,16 @@ def test_the_means_are_those_of_numpy() -> None:
     dn = walk((8 * BLOCK_PX, 7 * BLOCK_PX), step_dn=300.0)
     found = measure(torch.split(dn, 5), DEGRADED)
     radiance = dn.double().numpy() / DEGRADED.gain_dn_per_radiance
-    noise = DEGRADED.alpha * radiance.mean() + DEGRADED.beta + 1 / (12 * DEGRADED.gain_dn_per_radiance**2)
+    noise = (
+        DEGRADED.alpha * radiance.mean()
+        + DEGRADED.beta
+        + 1 / (12 * DEGRADED.gain_dn_per_radiance**2)
+    )
     squares = [float(np.square(np.diff(radiance, axis=axis)).mean()) for axis in (0, 1)]
     assert found.noise == pytest.approx(noise, rel=1e-9)
-    assert found.contrast == pytest.approx(sum(squares) / 2 - 2 * noise, rel=0.05)  # the first row has fewer pairs
+    assert found.contrast == pytest.approx(
+        sum(squares) / 2 - 2 * noise, rel=0.05
+    )  # the first row has fewer pairs
     assert 0 < found.residual < found.noise
 
 
@@ -78,7 +98,10 @@ def test_a_change_of_the_unit_of_radiance_leaves_epsilon(seed: int, factor: floa
     dn = walk((25, 37), seed)
     gain = DEGRADED.gain_dn_per_radiance / factor
     scaled = replace(
-        DEGRADED, gain_dn_per_radiance=gain, alpha=DEGRADED.alpha * factor, beta=DEGRADED.beta * factor**2
+        DEGRADED,
+        gain_dn_per_radiance=gain,
+        alpha=DEGRADED.alpha * factor,
+        beta=DEGRADED.beta * factor**2,
     )
     assert epsilon_of([dn], scaled) == pytest.approx(epsilon_of([dn]), rel=1e-9)
 
@@ -99,7 +122,12 @@ def test_a_bright_point_that_comes_to_saturate_changes_little() -> None:
     assert epsilon_of([dn]) == pytest.approx(bright, rel=1e-2)
 
 
-EMPTY = [torch.full((1, 1), torch.nan), torch.full((13, 21), 4095.0), torch.zeros(1, 1), torch.full((19, 1), 700.0)]
+EMPTY = [
+    torch.full((1, 1), torch.nan),
+    torch.full((13, 21), 4095.0),
+    torch.zeros(1, 1),
+    torch.full((19, 1), 700.0),
+]
 EMPTY += [torch.full((1, 19), 700.0), torch.full((13, 21), 0.0), torch.zeros(0, 5)]
 
 
@@ -140,14 +168,18 @@ def test_a_point_spread_counts_as_the_formula_it_was_made_of() -> None:
 
 def test_the_restored_mtf_comes_near_that_of_the_reference() -> None:
     """The reference has 25 %; the rule that knew the noise alone restored 16 % (measured)."""
-    found = [restored_mtf(angle_deg, number) for number, angle_deg in enumerate((3.0, 5.0, 8.0, 11.0))]
+    found = [
+        restored_mtf(angle_deg, number) for number, angle_deg in enumerate((3.0, 5.0, 8.0, 11.0))
+    ]
     assert 0.20 < float(np.mean(found)) < 0.26
 
 
 def restored_mtf(angle_deg: float, number: int) -> float:
     """Return the MTF at Nyquist of a slanted edge that the chain restored."""
     scene = slanted_edge(240, 5, angle_deg)
-    edge = acquire(scene_spectrum(scene), scene.shape[1], DEGRADED, 5, Draw(0, number), "degraded", margin_px=0)
+    edge = acquire(
+        scene_spectrum(scene), scene.shape[1], DEGRADED, 5, Draw(0, number), "degraded", margin_px=0
+    )
     restored = restore_traditional(torch.from_numpy(edge), Chain(DEGRADED, REFERENCE)).numpy()
     found = edge_mtf(restored[80:160, 80:160], angle_deg, DEGRADED.max_dn)
     assert isinstance(found, float)

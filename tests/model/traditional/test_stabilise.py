@@ -1,4 +1,6 @@
-"""Variance stabilisation: unit variance, an exact inverse, and the limits where formulas usually break."""
+"""Variance stabilisation: unit variance, an exact inverse, and the limits where formulas usually
+break.
+"""
 
 from dataclasses import replace
 
@@ -26,7 +28,9 @@ def noisy(radiance: float, sensor: Instrument, seed: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("radiance", [5.0, 25.0, 100.0, 390.0])
 def test_noise_has_variance_one_at_every_radiance(radiance: float) -> None:
-    assert float(stabilise(noisy(radiance, NOMINAL, 1), NOMINAL).var()) == pytest.approx(1, abs=0.03)
+    assert float(stabilise(noisy(radiance, NOMINAL, 1), NOMINAL).var()) == pytest.approx(
+        1, abs=0.03
+    )
 
 
 def test_without_it_the_variance_follows_the_light() -> None:

@@ -16,4 +16,6 @@ def nl_bayes(image: Tensor, noise: Noise, quality: Quality = QUALITIES["standard
 
 def compensate(image: Tensor, blur_from: Blur, blur_to: Blur, epsilon: float) -> Tensor:
     """Filter (H, W) by `compensation_kernel`; with equal MTFs only the regularisation acts."""
-    return torch.cat(list(filter_strips([image], len(image), compensation_kernel(blur_from, blur_to, epsilon))))
+    return torch.cat(
+        list(filter_strips([image], len(image), compensation_kernel(blur_from, blur_to, epsilon)))
+    )

@@ -28,7 +28,11 @@ def source(
     conditioned: bool = False,
 ) -> PatchSource:
     """Batches of three, of one variable sensor or of a family of sensors."""
-    recipe = PatchRecipe(load_sensor("pleiades-variable"), load_sensor("pleiades-reference"), patch_px=patch_px)
+    recipe = PatchRecipe(
+        load_sensor("pleiades-variable"), load_sensor("pleiades-reference"), patch_px=patch_px
+    )
     if conditioned:
         recipe = replace(recipe, family=SensorFamily(load_sensor("pleiades-degraded").nominal()))
-    return PatchSource([scene or small_scene()], recipe, batch=3, seed=seed, rank=rank, workers=workers)
+    return PatchSource(
+        [scene or small_scene()], recipe, batch=3, seed=seed, rank=rank, workers=workers
+    )

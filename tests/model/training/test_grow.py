@@ -13,7 +13,9 @@ def network(features: int) -> ConvBEERS:
     made = plain(Variant(blocks=2, features=features), seed=1)
     with torch.no_grad():
         for parameter in made.parameters():
-            parameter.add_(0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(2)))
+            parameter.add_(
+                0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(2))
+            )
     return made
 
 
@@ -60,7 +62,9 @@ def test_a_network_behind_a_bank_grows_for_every_sensor(variant: Variant) -> Non
         torch.nn.init.normal_(parameter, 0.0, 0.1, torch.Generator().manual_seed(seed))
     vectors = torch.tensor([[-1.0, -0.5, 0.2, 0.9], [0.7, 0.7, -1.0, -0.6]])
     known = told_of(vectors)
-    torch.testing.assert_close(grown(small, variant)(image(), known), small(image(), known), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(
+        grown(small, variant)(image(), known), small(image(), known), atol=1e-5, rtol=1e-5
+    )
 
 
 def test_a_coarser_network_grows_from_one_of_its_own_scale() -> None:

@@ -44,7 +44,9 @@ def test_gradients_are_finite_where_images_are_equal() -> None:
     assert bool((restored.grad == 0).all())
     again = images()[1].requires_grad_()
     spectrum = torch.fft.rfft2(again - images()[1], norm="ortho")
-    (spectrum.real.square() + spectrum.imag.square()).sqrt().mean().backward()  # the other way to write it
+    (
+        spectrum.real.square() + spectrum.imag.square()
+    ).sqrt().mean().backward()  # the other way to write it
     assert again.grad is not None
     assert bool(again.grad.isnan().any())
 
@@ -58,10 +60,16 @@ def test_the_terms_add_up() -> None:
 
 
 def test_a_psnr_term_is_lost_psnr_and_no_patch_counts_more() -> None:
-    """A tenth of the error on one patch of two is worth 10 dB in the mean, whichever of the two it is."""
+    """A tenth of the error on one patch of two is worth 10 dB in the mean, whichever of the two it
+    is.
+    """
     generator = torch.Generator().manual_seed(0)
     reference = torch.rand(2, 1, 13, 17, generator=generator)
-    errors = 0.05 * torch.randn(2, 1, 13, 17, generator=generator) * torch.tensor([1.0, 0.3]).view(2, 1, 1, 1)
+    errors = (
+        0.05
+        * torch.randn(2, 1, 13, 17, generator=generator)
+        * torch.tensor([1.0, 0.3]).view(2, 1, 1, 1)
+    )
     before = log_mse(reference + errors, reference)
     for patch in range(2):
         better = errors.clone()
@@ -79,7 +87,9 @@ def test_a_psnr_term_is_lost_psnr_and_no_patch_counts_more() -> None:
 
 def test_terms_without_weight_are_not_computed() -> None:
     restored, reference = images()
-    total, terms = RestorationLoss(LossWeights(l1=2.0, lpips=0.0, fft=0.0), with_distance())(restored, reference)
+    total, terms = RestorationLoss(LossWeights(l1=2.0, lpips=0.0, fft=0.0), with_distance())(
+        restored, reference
+    )
     assert set(terms) == {"l1"}
     torch.testing.assert_close(total, 2 * terms["l1"])
     assert set(RestorationLoss(PAPER)(restored, reference)[1]) == {"l1", "fft"}

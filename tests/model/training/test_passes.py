@@ -1,4 +1,6 @@
-"""A pass simulated in torch shows what the simulator shows, and gives the ground the look that was drawn."""
+"""A pass simulated in torch shows what the simulator shows, and gives the ground the look that was
+drawn.
+"""
 
 from dataclasses import replace
 
@@ -14,7 +16,14 @@ from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import crop_divisible, scene_spectrum
 from beers_deploy.model.training.looks import VARIED, Look
-from beers_deploy.model.training.passes import Pass, detected, folded_signals, looked, noiseless, prepare
+from beers_deploy.model.training.passes import (
+    Pass,
+    detected,
+    folded_signals,
+    looked,
+    noiseless,
+    prepare,
+)
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import AntiAlias, Offset, Smear
 from beers_deploy.profiles.sensor import Instrument
@@ -49,7 +58,17 @@ def test_a_pass_shows_what_the_simulator_shows(name: str, ratio: int) -> None:
     phase = (0.3, -0.8)
     radiance = crop_divisible(scene.radiance, ratio)
     skip = ("noise", "digitising")
-    wanted = acquire(scene_spectrum(radiance), radiance.shape[1], sensor, ratio, Draw(0), "degraded", phase, 8, skip)
+    wanted = acquire(
+        scene_spectrum(radiance),
+        radiance.shape[1],
+        sensor,
+        ratio,
+        Draw(0),
+        "degraded",
+        phase,
+        8,
+        skip,
+    )
     (signal,) = folded_signals(prepare(scene, ratio), (sensor,), Pass(ratio, phase, PLAIN, 8))
     found = noiseless(signal, sensor) * sensor.max_dn
     np.testing.assert_allclose(found.numpy(), wanted, atol=0.5)
@@ -93,8 +112,12 @@ def test_looks_reach_deep_shade_and_saturation_and_most_are_ordinary() -> None:
     assert lights.max() > 2
     ordinary = (lights >= 0.5) & (lights <= 1.25)
     assert ordinary.mean() > 0.6
-    assert np.mean([look.contrast < 1 for look in drawn]) == pytest.approx(VARIED.calm_share, abs=0.05)
-    assert np.mean([look.softness_px > 0 for look in drawn]) == pytest.approx(VARIED.soft_share, abs=0.05)
+    assert np.mean([look.contrast < 1 for look in drawn]) == pytest.approx(
+        VARIED.calm_share, abs=0.05
+    )
+    assert np.mean([look.softness_px > 0 for look in drawn]) == pytest.approx(
+        VARIED.soft_share, abs=0.05
+    )
 
 
 @pytest.mark.parametrize("level", [0.0, 5.0, 100.0, 390.0])
@@ -105,7 +128,9 @@ def test_noise_has_the_sensors_standard_deviation_at_every_level(level: float) -
     wanted = float(np.hypot(NOMINAL.noise_sigma(level) * NOMINAL.gain_dn_per_radiance, 12**-0.5))
     if not clipped:
         assert float(found.std()) == pytest.approx(wanted, rel=0.03)
-        assert float(found.mean()) == pytest.approx(level * NOMINAL.gain_dn_per_radiance, abs=5 * wanted / 300)
+        assert float(found.mean()) == pytest.approx(
+            level * NOMINAL.gain_dn_per_radiance, abs=5 * wanted / 300
+        )
     assert float(found.min()) >= 0
     assert torch.equal(found, found.round())
 
@@ -114,6 +139,10 @@ def test_effects_of_a_profile_are_the_simulators() -> None:
     """An offset, which torch does not know, is added."""
     sensor = replace(NOMINAL, effects={"offset": Offset(64.0)})
     signal = torch.full((40, 50), 80.0)
-    plain, shifted = (detected(signal, each, "degraded", np.random.default_rng(1)) for each in (NOMINAL, sensor))
+    plain, shifted = (
+        detected(signal, each, "degraded", np.random.default_rng(1)) for each in (NOMINAL, sensor)
+    )
     assert float((shifted - plain).mean() * NOMINAL.max_dn) == pytest.approx(64, abs=1)
-    assert float(noiseless(signal, sensor)[0, 0] - noiseless(signal, NOMINAL)[0, 0]) == pytest.approx(64 / 4095)
+    assert float(
+        noiseless(signal, sensor)[0, 0] - noiseless(signal, NOMINAL)[0, 0]
+    ) == pytest.approx(64 / 4095)

@@ -61,7 +61,9 @@ def threads_after(work: str) -> str:
     root = Path(__file__).parents[3]
     two = {**os.environ, "OMP_NUM_THREADS": "2"}  # the suite's own processes have one
     command = [sys.executable, "-c", code]
-    return subprocess.run(command, cwd=root, env=two, capture_output=True, text=True, check=True).stdout
+    return subprocess.run(
+        command, cwd=root, env=two, capture_output=True, text=True, check=True
+    ).stdout
 
 
 class OneSensor(SensorFamily):
@@ -84,15 +86,21 @@ def steps(image: torch.Tensor) -> tuple[float, float]:
 
 
 def test_a_turned_patch_comes_with_the_sensor_as_it_lies() -> None:
-    """A patch has lost more along the axis that its vector and its bank call the more blurred one."""
+    """A patch has lost more along the axis that its vector and its bank call
+    the more blurred one.
+    """
     scene = Scene("noise", 100 + 60 * np.random.default_rng(0).random((420, 480), np.float32))
     recipe = replace(
-        source().recipe, family=OneSensor(load_sensor("pleiades-degraded").nominal()), oversamplings=(2,)
+        source().recipe,
+        family=OneSensor(load_sensor("pleiades-degraded").nominal()),
+        oversamplings=(2,),
     )
     ways = set()
     for batch in islice(PatchSource([scene], recipe, 3, 0).batches(), 30):
         assert batch.told is not None
-        seen = zip(batch.degraded, batch.reference, batch.told.vectors, batch.told.filters, strict=True)
+        seen = zip(
+            batch.degraded, batch.reference, batch.told.vectors, batch.told.filters, strict=True
+        )
         for one, other, vector, filters in seen:
             across, along = (a / b for a, b in zip(steps(one), steps(other), strict=True))
             assert (across > along) == bool(vector[0] > vector[1])
@@ -111,7 +119,9 @@ def test_conditioned_patches_come_with_vectors_of_many_sensors_and_the_same_agai
 
 
 def test_dark_patches_are_those_of_a_brighter_sensor_as_a_restoration_shows_them() -> None:
-    """No patch could be brightened once more, and the noise that the network is told grows with the factor."""
+    """No patch could be brightened once more, and the noise that the network is told grows with the
+    factor.
+    """
     family = Alike(replace(NOMINAL, alpha=0.0, beta=(100 / 200) ** 2))
     recipe = replace(source().recipe, family=family, looks=replace(VARIED, lit_share=1.0))
     told = set()
@@ -142,7 +152,10 @@ def test_a_blind_network_sees_the_axes_of_one_sensor_as_they_are() -> None:
 
 def test_a_lopsided_blur_is_neither_mirrored_nor_turned() -> None:
     generator = np.random.default_rng(0)
-    ways = [draw_turn(generator, quarters, mirrors) for quarters, mirrors in ((True, True), (False, True))]
+    ways = [
+        draw_turn(generator, quarters, mirrors)
+        for quarters, mirrors in ((True, True), (False, True))
+    ]
     for _ in range(50):
         assert draw_turn(generator, True, mirrors=False) == (0, False)
         ways.append(draw_turn(generator, False))
@@ -197,8 +210,12 @@ def test_two_workers_share_the_batches_of_one() -> None:
 
 
 def stored(folder: Path, *degraded: np.ndarray) -> StoredPairs:
-    """Pairs of these images and such as are twice as bright; three of noise where none are given."""
-    noise = (np.random.default_rng(k).integers(0, 2048, (41, 53)).astype(np.uint16) for k in range(3))
+    """Pairs of these images and such as are twice as bright; three of noise
+    where none are given.
+    """
+    noise = (
+        np.random.default_rng(k).integers(0, 2048, (41, 53)).astype(np.uint16) for k in range(3)
+    )
     for k, image in enumerate(degraded or noise):
         write_tiff(folder / "degraded" / f"p{k}.tif", image)
         write_tiff(folder / "reference" / f"p{k}.tif", 2 * image)
@@ -235,7 +252,9 @@ def test_stored_pairs_of_two_different_axes_keep_them(quarters: bool, tmp_path: 
         (np.full((41, 53), -9, np.float32), "add the offset"),
     ],
 )
-def test_stored_pairs_of_another_scale_are_refused(pixels: np.ndarray, words: str, tmp_path: Path) -> None:
+def test_stored_pairs_of_another_scale_are_refused(
+    pixels: np.ndarray, words: str, tmp_path: Path
+) -> None:
     with pytest.raises(ImageError, match=words):
         next(stored(tmp_path, pixels).batches())
 

@@ -31,7 +31,12 @@ def test_every_recipe_is_of_a_shipped_network() -> None:
 def test_what_a_recipe_leaves_out_has_its_default(tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text(WHOLE)
     recipe = load_recipe(str(tmp_path / "own.toml"))
-    assert (recipe.seed, recipe.patch_px, recipe.stages[0].batch, recipe.looks.lit_share) == (0, 96, 8, 0.0)
+    assert (recipe.seed, recipe.patch_px, recipe.stages[0].batch, recipe.looks.lit_share) == (
+        0,
+        96,
+        8,
+        0.0,
+    )
 
 
 @pytest.mark.parametrize(
@@ -42,7 +47,10 @@ def test_what_a_recipe_leaves_out_has_its_default(tmp_path: Path) -> None:
         (WHOLE.replace("convbeers-xs", "huge"), "'huge'"),
         (WHOLE + "[looks]\nlit = 0.4\n", "write 'lit_share'"),
         (WHOLE + "[loss]\npsnr = -1.0\n", "loss: psnr: expected a number from 0 on, got -1.0"),
-        (WHOLE.replace("steps = 5", "steps = 5.5"), "stage 1: steps: expected a whole number from 0 on, got 5.5"),
+        (
+            WHOLE.replace("steps = 5", "steps = 5.5"),
+            "stage 1: steps: expected a whole number from 0 on, got 5.5",
+        ),
         (WHOLE.replace("steps = 5", "steps = true"), "expected a whole number from 0 on, got True"),
         (WHOLE + 'precision = "int8"\n', "expected one of float32, bfloat16, got 'int8'"),
         (WHOLE + 'rounding = "yes"\n', "expected true or false, got 'yes'"),

@@ -34,7 +34,12 @@ RECIPE = TrainingRecipe(steps=8, batch=3, warm_up_steps=2)
 
 
 def train(
-    folder: Path, steps: int = 8, *, conditioned: bool = False, resume: bool = False, kill_at: int = 0
+    folder: Path,
+    steps: int = 8,
+    *,
+    conditioned: bool = False,
+    resume: bool = False,
+    kill_at: int = 0,
 ) -> Trainer:
     """Run to the end, or until a kill that leaves the checkpoint of the step before."""
 
@@ -42,11 +47,15 @@ def train(
         if step == kill_at:
             raise KeyboardInterrupt
 
-    trainer = Trainer(VARIANT, TrainingRecipe(steps=steps, batch=3, warm_up_steps=2), conditioned=conditioned)
+    trainer = Trainer(
+        VARIANT, TrainingRecipe(steps=steps, batch=3, warm_up_steps=2), conditioned=conditioned
+    )
     checkpoint = folder / "checkpoint.safetensors"
     if resume:
         trainer.resume(checkpoint)
-    trainer.run(source(conditioned=conditioned).batches, checkpoint, Schedule(1, 0.0, report=report))
+    trainer.run(
+        source(conditioned=conditioned).batches, checkpoint, Schedule(1, 0.0, report=report)
+    )
     return trainer
 
 
@@ -64,11 +73,17 @@ def test_plain_and_conditioned_checkpoints_are_not_taken_for_one_another(tmp_pat
     for conditioned in (False, True):
         train(tmp_path, conditioned=conditioned)
         with pytest.raises(ModelError, match="checkpoint of this network"):
-            Trainer(VARIANT, RECIPE, conditioned=not conditioned).resume(tmp_path / "checkpoint.safetensors")
+            Trainer(VARIANT, RECIPE, conditioned=not conditioned).resume(
+                tmp_path / "checkpoint.safetensors"
+            )
 
 
-@pytest.mark.parametrize(("conditioned", "kill_at"), [(False, 2), (False, 5), (False, 8), (True, 5)])
-def test_killed_and_resumed_equals_unbroken_in_every_bit(conditioned: bool, kill_at: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("conditioned", "kill_at"), [(False, 2), (False, 5), (False, 8), (True, 5)]
+)
+def test_killed_and_resumed_equals_unbroken_in_every_bit(
+    conditioned: bool, kill_at: int, tmp_path: Path
+) -> None:
     unbroken = train(tmp_path / "a", conditioned=conditioned)
     with pytest.raises(KeyboardInterrupt):
         train(tmp_path / "b", conditioned=conditioned, kill_at=kill_at)
@@ -76,7 +91,9 @@ def test_killed_and_resumed_equals_unbroken_in_every_bit(conditioned: bool, kill
     for trainer, folder in ((unbroken, "a"), (resumed, "b")):
         finish(trainer.averaged(), tmp_path / folder / "weights.safetensors", {"steps": 8})
     for name in ("weights.safetensors", "checkpoint.safetensors"):
-        (tensors, header), (others, other_header) = (read_tensors(tmp_path / folder / name) for folder in "ab")
+        (tensors, header), (others, other_header) = (
+            read_tensors(tmp_path / folder / name) for folder in "ab"
+        )
         assert header == other_header
         assert tensors.keys() == others.keys()
         assert all(np.array_equal(tensor, others[name]) for name, tensor in tensors.items())
@@ -154,14 +171,18 @@ def test_a_constant_scene_trains_without_nan(level: float, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_finishes_the_step_and_leaves_a_checkpoint_of_it(number: int, tmp_path: Path) -> None:
+def test_ctrl_c_finishes_the_step_and_leaves_a_checkpoint_of_it(
+    number: int, tmp_path: Path
+) -> None:
     def report(step: int, *_: object) -> None:
         if step == 4:
             signal.raise_signal(number)
 
     trainer = Trainer(VARIANT, RECIPE)
     with pytest.raises(KeyboardInterrupt):
-        trainer.run(source().batches, tmp_path / "checkpoint.safetensors", Schedule(1, report=report))
+        trainer.run(
+            source().batches, tmp_path / "checkpoint.safetensors", Schedule(1, report=report)
+        )
     assert trainer.step == 4
     resumed = train(tmp_path, resume=True)
     unbroken = train(tmp_path / "b")
@@ -175,7 +196,9 @@ def test_a_second_ctrl_c_stops_at_once() -> None:
                 signal.raise_signal(signal.SIGINT)
             return interrupt.asked
 
-    before = signal.getsignal(signal.SIGINT)  # ignored where the tests were started in the background
+    before = signal.getsignal(
+        signal.SIGINT
+    )  # ignored where the tests were started in the background
     assert ask(1)
     with pytest.raises(KeyboardInterrupt):
         ask(2)
@@ -206,7 +229,10 @@ def test_guards_survive_a_resume(tmp_path: Path) -> None:
 def test_fine_tuning_starts_from_the_weights_given(tmp_path: Path) -> None:
     first = train(tmp_path, 4).averaged()
     again = Trainer(VARIANT, TrainingRecipe(steps=4), start=first)
-    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), again.network.parameters(), strict=True))
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(first.parameters(), again.network.parameters(), strict=True)
+    )
 
 
 def test_in_float32_the_network_is_the_plain_one_and_in_bfloat16_its_body_is_rounded() -> None:
@@ -219,7 +245,9 @@ def test_in_float32_the_network_is_the_plain_one_and_in_bfloat16_its_body_is_rou
 
 
 @pytest.mark.parametrize("first", get_args(Precision))
-def test_a_run_goes_on_in_the_other_format_and_the_loss_with_it(first: Precision, tmp_path: Path) -> None:
+def test_a_run_goes_on_in_the_other_format_and_the_loss_with_it(
+    first: Precision, tmp_path: Path
+) -> None:
     """Begun on one processor and resumed on another."""
     other: Precision = "float32" if first == "bfloat16" else "bfloat16"
     checkpoint = tmp_path / "checkpoint.safetensors"
@@ -232,7 +260,9 @@ def test_a_run_goes_on_in_the_other_format_and_the_loss_with_it(first: Precision
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        Trainer(VARIANT, recipe, precision=first).run(source().batches, checkpoint, Schedule(10, 0.0, report=note))
+        Trainer(VARIANT, recipe, precision=first).run(
+            source().batches, checkpoint, Schedule(10, 0.0, report=note)
+        )
     resumed = Trainer(VARIANT, recipe, precision=other)
     resumed.resume(checkpoint)
     resumed.run(source().batches, checkpoint, Schedule(10, 0.0, report=note))
@@ -253,7 +283,8 @@ torch.set_num_threads(1)
 with joined("cpu") as worker:
     recipe = TrainingRecipe(steps=3, batch=3, warm_up_steps=1)
     trainer = Trainer(Variant(blocks=1, features=4), recipe, worker=worker, precision="float32")
-    trainer.run(source(rank=worker.rank, workers=worker.count).batches, Path(sys.argv[1]), Schedule())
+    batches = source(rank=worker.rank, workers=worker.count).batches
+    trainer.run(batches, Path(sys.argv[1]), Schedule())
 """
 
 
@@ -268,13 +299,25 @@ class Together:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="torch for Windows lacks the libuv that torchrun asks for")
+@pytest.mark.skipif(
+    sys.platform == "win32", reason="torch for Windows lacks the libuv that torchrun asks for"
+)
 def test_two_workers_do_the_steps_of_one_with_a_batch_twice_as_large(tmp_path: Path) -> None:
     script = tmp_path / "worker.py"
     script.write_text(WORKER)
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[3])}
-    told: dict[str, Any] = {"env": environment, "capture_output": True, "text": True, "timeout": 240, "check": False}
+    environment = {
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+        "PYTHONPATH": str(Path(__file__).parents[3]),
+    }
+    told: dict[str, Any] = {
+        "env": environment,
+        "capture_output": True,
+        "text": True,
+        "timeout": 240,
+        "check": False,
+    }
     result = subprocess.run([*command, str(script), str(tmp_path / "two")], **told)
     assert result.returncode == 0, result.stderr[-2000:]
     recipe = TrainingRecipe(steps=3, batch=3, warm_up_steps=1)
@@ -293,7 +336,9 @@ def test_a_recorded_step_learns_as_the_processor_does(conditioned: bool, tmp_pat
     losses: dict[str, list[float]] = {}
     for device in ("cpu", "cuda"):
         seen = losses.setdefault(device, [])
-        trainer = Trainer(VARIANT, TrainingRecipe(steps=60, batch=3), device=device, conditioned=conditioned)
+        trainer = Trainer(
+            VARIANT, TrainingRecipe(steps=60, batch=3), device=device, conditioned=conditioned
+        )
         note = Schedule(20, report=lambda _, terms, __, seen=seen: seen.append(terms["l1"]))  # type: ignore[misc]
         # Patches of the processor for both: a GPU draws other noise.
         trainer.run(source(conditioned=conditioned).batches, tmp_path / device, note)

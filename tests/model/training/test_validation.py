@@ -9,7 +9,11 @@ from beers_deploy.model.training.run import Validation, split_by_site
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles import load_sensor
 
-NAMES = [f"village_{k:03d}.jpg" for k in range(30)] + [f"forest_{k:03d}.jpg" for k in range(10)] + ["dunes.jpg"]
+NAMES = (
+    [f"village_{k:03d}.jpg" for k in range(30)]
+    + [f"forest_{k:03d}.jpg" for k in range(10)]
+    + ["dunes.jpg"]
+)
 EYES = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
 
 
@@ -18,7 +22,9 @@ def test_whole_sites_are_held_out_the_smallest_first_in_any_order() -> None:
     assert sorted(kept + held) == list(range(41))
     assert {NAMES[k].split("_")[0] for k in held} == {"dunes.jpg", "forest"}
     order = list(reversed(NAMES))
-    assert {order[k] for k in split_by_site(order)[1]} == {NAMES[k] for k in split_by_site(NAMES)[1]}
+    assert {order[k] for k in split_by_site(order)[1]} == {
+        NAMES[k] for k in split_by_site(NAMES)[1]
+    }
 
 
 def test_few_sites_are_all_trained_on() -> None:
@@ -27,7 +33,9 @@ def test_few_sites_are_all_trained_on() -> None:
 
 
 @pytest.mark.parametrize("scale", [1, 2])
-def test_a_new_network_is_judged_like_its_input_also_on_odd_sides_at_half_resolution(scale: int) -> None:
+def test_a_new_network_is_judged_like_its_input_also_on_odd_sides_at_half_resolution(
+    scale: int,
+) -> None:
     scenes = [procedural_scene(side, side, np.random.default_rng(side)) for side in (303, 460, 90)]
     validation = Validation(scenes, *EYES)
     assert len(validation.pairs) == 2  # the third is too small

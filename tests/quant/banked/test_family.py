@@ -1,4 +1,6 @@
-"""INT8 once for a family of sensors: near the float network for each, and alike but for what a sensor changes."""
+"""INT8 once for a family of sensors: near the float network for each, and alike but for what a
+sensor changes.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +18,14 @@ from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.banked.calibrate import bank_results, map_steps, quantise_family
-from beers_deploy.quant.banked.family import FAMILY, Family, delta_of_file, family_of, required_family, with_delta
+from beers_deploy.quant.banked.family import (
+    FAMILY,
+    Family,
+    delta_of_file,
+    family_of,
+    required_family,
+    with_delta,
+)
 from beers_deploy.quant.banked.filters import channels
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.core import IntConv, IntCore, shift_faults
@@ -28,7 +37,12 @@ from beers_deploy.quant.tiling.walk import tiling_of
 from tests.model.networks import told_of
 from tests.quant.banked.test_filters import textured
 
-SENSORS = [(0.2, 0.1, -0.3, -0.2), (-0.9, -0.8, 0.4, 0.5), (0.6, 0.3, 0.8, 0.9), (-0.2, -0.4, -0.7, -0.9)]
+SENSORS = [
+    (0.2, 0.1, -0.3, -0.2),
+    (-0.9, -0.8, 0.4, 0.5),
+    (0.6, 0.3, 0.8, 0.9),
+    (-0.2, -0.4, -0.7, -0.9),
+]
 
 
 def network(scale: int) -> BankedConvBEERS:
@@ -42,14 +56,19 @@ def network(scale: int) -> BankedConvBEERS:
 
 
 def weights_of(made: BankedConvBEERS) -> Weights:
-    return Weights({name: value.numpy() for name, value in made.state_dict().items()}, made.variant, {})
+    return Weights(
+        {name: value.numpy() for name, value in made.state_dict().items()}, made.variant, {}
+    )
 
 
 @pytest.fixture(scope="module", params=[1, 2])
 def pair(request: pytest.FixtureRequest) -> tuple[BankedConvBEERS, Family]:
     made = network(request.param)
     scale = int(request.param)
-    images = [bank_results(textured(48, 48, k), bank_of_vector(each), each, scale) for k, each in enumerate(SENSORS)]
+    images = [
+        bank_results(textured(48, 48, k), bank_of_vector(each), each, scale)
+        for k, each in enumerate(SENSORS)
+    ]
     middle = bank_of_vector((0.0, 0.0, 0.0, 0.0))
     return made, quantise_family(weights_of(made), middle, Remade(images.__getitem__, len(images)))
 
@@ -63,7 +82,9 @@ def test_int8_is_near_the_float_network_for_every_sensor(
     pair: tuple[BankedConvBEERS, Family], vector: tuple[float, ...]
 ) -> None:
     made, family = pair
-    image = 0.3 + 0.3 * textured(46, 58, 9)  # within eight units of the quietest sensor, where int8 ends
+    image = 0.3 + 0.3 * textured(
+        46, 58, 9
+    )  # within eight units of the quietest sensor, where int8 ends
     with torch.inference_mode():
         wanted = made(torch.from_numpy(image), told_of(torch.tensor([vector]))).clamp(0, 1).numpy()
     found = run(open_session(host_model(core_of(family, vector), {})), image)
@@ -76,7 +97,9 @@ def test_int8_is_near_the_float_network_for_every_sensor(
 def test_points_and_saturated_edges_are_corrected_as_far_as_in_float(
     pair: tuple[BankedConvBEERS, Family], vector: tuple[float, ...]
 ) -> None:
-    """Also where the fine copies of the analytic restoration end, which they do behind blurred sensors."""
+    """Also where the fine copies of the analytic restoration end, which they do behind blurred
+    sensors.
+    """
     made, family = pair
     image = np.full((1, 1, 46, 58), 0.1, np.float32)
     image[..., 10:30, 20:40] = 1.0
@@ -99,7 +122,9 @@ def test_a_float_network_rounded_as_its_file_errs_as_that_does(
     made, family = pair
     image = 0.3 + 0.3 * textured(46, 58, 9)
     told = told_of(torch.tensor([vector]))
-    stream, *inner = (torch.from_numpy(each)[:, None, None] for each in map_steps(family, weights_of(made)))
+    stream, *inner = (
+        torch.from_numpy(each)[:, None, None] for each in map_steps(family, weights_of(made))
+    )
     with torch.inference_mode():
         plain = made(torch.from_numpy(image), told)
         steps = Rounding(stream, tuple(inner)).steps(told.gains)
@@ -110,14 +135,18 @@ def test_a_float_network_rounded_as_its_file_errs_as_that_does(
     assert 0.4 < ratio < 1.1  # weights, the bank and the last sum are rounded in the file alone
 
 
-def test_the_steps_of_maps_turn_float_weights_into_the_files(pair: tuple[BankedConvBEERS, Family]) -> None:
+def test_the_steps_of_maps_turn_float_weights_into_the_files(
+    pair: tuple[BankedConvBEERS, Family],
+) -> None:
     made, family = pair
     stream, *inner = map_steps(family, weights_of(made))
     convolutions = {op.name: op for op in family.core.convolutions}
     for k, read in enumerate(inner):  # what the steps were not found by
         op = convolutions[f"body.{k}.second"]
         given = made.state_dict()[f"body.{k}.second.weight"].numpy()
-        bits = op.weight_frac_bits + family.core.frac_bits[op.input] - family.core.frac_bits[op.output]
+        bits = (
+            op.weight_frac_bits + family.core.frac_bits[op.input] - family.core.frac_bits[op.output]
+        )
         wanted = (given * (read * 2.0**bits / stream[:, None])[:, :, None, None]).clip(-128, 127)
         assert np.sqrt(np.square(op.weight - wanted).mean()) < 1  # of 127; without levelling tens
 
@@ -135,7 +164,9 @@ def test_the_file_is_what_its_integers_ask_for_and_the_reference_gives_the_same(
     np.testing.assert_allclose(mine, run(open_session(file), image), atol=1e-7)
 
 
-def test_a_sensor_changes_the_first_layer_biases_and_the_unit_alone(pair: tuple[BankedConvBEERS, Family]) -> None:
+def test_a_sensor_changes_the_first_layer_biases_and_the_unit_alone(
+    pair: tuple[BankedConvBEERS, Family],
+) -> None:
     first, second = (core_of(pair[1], vector) for vector in SENSORS[:2])
     assert first.frac_bits == second.frac_bits
     assert first.ends.unit != second.ends.unit
@@ -143,7 +174,10 @@ def test_a_sensor_changes_the_first_layer_biases_and_the_unit_alone(pair: tuple[
         if isinstance(one, IntConv) and isinstance(other, IntConv):
             assert np.array_equal(one.weight, other.weight) == (one.name != "bank")
             told = replace(one, weight=other.weight, weight_frac_bits=other.weight_frac_bits)
-            assert replace(told, bias=other.bias, bias_frac_bits=other.bias_frac_bits) == other or one.name != "bank"
+            assert (
+                replace(told, bias=other.bias, bias_frac_bits=other.bias_frac_bits) == other
+                or one.name != "bank"
+            )
 
 
 @pytest.mark.parametrize("vector", SENSORS)
@@ -162,14 +196,20 @@ def test_a_body_finer_by_its_gain_makes_what_it_makes_at_a_gain_of_one(
 
 def test_the_file_of_any_sensor_can_be_told_another(pair: tuple[BankedConvBEERS, Family]) -> None:
     family = pair[1]
-    first, second = (host_model(core_of(family, each), {FAMILY: family.to_words()}) for each in SENSORS[:2])
+    first, second = (
+        host_model(core_of(family, each), {FAMILY: family.to_words()}) for each in SENSORS[:2]
+    )
     again = family_of(first)
     assert again is not None
     found = host_model(core_of(again, SENSORS[1]), {FAMILY: again.to_words()})
-    assert found.SerializeToString(deterministic=True) == second.SerializeToString(deterministic=True)
+    assert found.SerializeToString(deterministic=True) == second.SerializeToString(
+        deterministic=True
+    )
 
 
-def test_a_delta_makes_any_sensors_file_that_sensors_to_the_byte(pair: tuple[BankedConvBEERS, Family]) -> None:
+def test_a_delta_makes_any_sensors_file_that_sensors_to_the_byte(
+    pair: tuple[BankedConvBEERS, Family],
+) -> None:
     family = pair[1]
     first, second = (
         host_model(core_of(family, each), {FAMILY: family.to_words(), "sensor": str(k)})
@@ -179,15 +219,22 @@ def test_a_delta_makes_any_sensors_file_that_sensors_to_the_byte(pair: tuple[Ban
     assert len(delta) < 3000
     core, name = with_delta(required_family(first).core, delta)
     found = host_model(core, {FAMILY: family.to_words(), "sensor": name})
-    assert found.SerializeToString(deterministic=True) == second.SerializeToString(deterministic=True)
+    assert found.SerializeToString(deterministic=True) == second.SerializeToString(
+        deterministic=True
+    )
 
 
-@pytest.mark.parametrize("change", [lambda d: d[:-9], lambda d: d[:0], lambda d: b"x" + d, lambda d: d[:40] + d[41:]])
+@pytest.mark.parametrize(
+    "change", [lambda d: d[:-9], lambda d: d[:0], lambda d: b"x" + d, lambda d: d[:40] + d[41:]]
+)
 def test_a_damaged_delta_is_one_sentence(
     pair: tuple[BankedConvBEERS, Family], change: Callable[[bytes], bytes]
 ) -> None:
     file = host_model(core_of(pair[1], SENSORS[1]), {FAMILY: pair[1].to_words()})
-    with pytest.raises(ModelError, match=r"^delta: expected a delta of this network, got (damaged|another).*--delta"):
+    with pytest.raises(
+        ModelError,
+        match=r"^delta: expected a delta of this network, got (damaged|another).*--delta",
+    ):
         with_delta(required_family(file).core, change(delta_of_file(file)))
 
 
@@ -220,7 +267,9 @@ def test_tiles_give_the_whole_images_result(pair: tuple[BankedConvBEERS, Family]
         right = left + 32
         above = max(top - halo, 0)
         before = max(left - halo, 0)
-        tile = run(session, np.ascontiguousarray(image[..., above : bottom + halo, before : right + halo]))
+        tile = run(
+            session, np.ascontiguousarray(image[..., above : bottom + halo, before : right + halo])
+        )
         kept = tile[..., top - above : bottom - above, left - before : right - before]
         np.testing.assert_array_equal(kept, whole[..., top:bottom, left:right])
 
@@ -247,7 +296,9 @@ def test_the_dpu_runs_all_of_it(pair: tuple[BankedConvBEERS, Family]) -> None:
     assert size == (70 if core.ends.place_px == 1 else 36)
 
 
-def test_the_first_layer_writes_whole_groups_of_sixteen_channels(pair: tuple[BankedConvBEERS, Family]) -> None:
+def test_the_first_layer_writes_whole_groups_of_sixteen_channels(
+    pair: tuple[BankedConvBEERS, Family],
+) -> None:
     first = core_of(pair[1], SENSORS[0]).convolutions[0]
     assert len(first.weight) == 16 * pair[0].variant.pixels
     assert len(channels()) == 16

@@ -1,4 +1,6 @@
-"""A sensor's bank in whole numbers: flat ground leaves nothing, and together the copies say what the filters do."""
+"""A sensor's bank in whole numbers: flat ground leaves nothing, and together the copies say what
+the filters do.
+"""
 
 import numpy as np
 import pytest
@@ -27,20 +29,30 @@ VECTOR = st.tuples(*[st.floats(-1, 1)] * 4)
 
 
 def sums(image: np.ndarray, own: Bank) -> np.ndarray:
-    """What the first convolution makes of an image (1, 1, H, W), in steps, before anything is rounded or added."""
+    """What the first convolution makes of an image (1, 1, H, W), in steps, before anything is
+    rounded or added.
+    """
     whole = whole_bank(own, 1, own.gain)
     return convolve(split_planes(image), whole.weight, Window()) / 2.0**whole.frac_bits
 
 
 def textured(rows: int, columns: int, seed: int = 0) -> np.ndarray:
-    """Ground as a sensor sees it, from a twentieth to nearly all of full scale: (1, 1, rows, columns) float32."""
+    """Ground as a sensor sees it, from a twentieth to nearly all of full scale: (1, 1, rows,
+    columns) float32.
+    """
     generator = np.random.default_rng(seed)
     fy = np.fft.fftfreq(rows)[:, None]
     fx = np.fft.rfftfreq(columns)[None, :]
     frequency = np.hypot(fy, fx)
-    falling = np.fft.rfft2(generator.standard_normal((rows, columns))) * np.exp(-5 * frequency) / (frequency + 0.02)
+    falling = (
+        np.fft.rfft2(generator.standard_normal((rows, columns)))
+        * np.exp(-5 * frequency)
+        / (frequency + 0.02)
+    )
     ground = np.asarray(np.fft.irfft2(falling, (rows, columns)))
-    return np.asarray((0.05 + 0.9 * (ground - ground.min()) / np.ptp(ground))[None, None], np.float32)
+    return np.asarray(
+        (0.05 + 0.9 * (ground - ground.min()) / np.ptp(ground))[None, None], np.float32
+    )
 
 
 @settings(max_examples=25)
@@ -59,7 +71,9 @@ def test_the_planes_hold_every_number(dn: int) -> None:
 
 @settings(max_examples=15)
 @given(VECTOR, st.integers(0, MAX_DN))
-def test_flat_ground_leaves_nothing_but_its_own_brightness(vector: tuple[float, ...], dn: int) -> None:
+def test_flat_ground_leaves_nothing_but_its_own_brightness(
+    vector: tuple[float, ...], dn: int
+) -> None:
     flat = np.full((1, 1, SIDE_PX, SIDE_PX), dn / MAX_DN, np.float32)
     own = bank_of_vector(vector)
     found = sums(flat, own)[0, :, 0, 0]
@@ -74,7 +88,9 @@ def test_the_weights_are_int8_and_near_the_filters(vector: tuple[float, ...]) ->
     gain = own.gain
     whole = whole_bank(own, 1, gain)
     coarse_pair = whole.weight[:, :2].astype(int)
-    assert 62 <= np.abs(coarse_pair).max() < 127  # no finer scale would hold them, and none is cut off
+    assert (
+        62 <= np.abs(coarse_pair).max() < 127
+    )  # no finer scale would hold them, and none is cut off
     assert np.ptp(coarse_pair, axis=1).max() <= 1
     for channel, (kernel, _) in enumerate(channels()):
         steps_per_dn = gain * (UNIT_STEPS / MAX_DN if kernel else 1 / IMAGE_STEP_DN)
@@ -88,17 +104,23 @@ def test_the_weights_are_int8_and_near_the_filters(vector: tuple[float, ...]) ->
 @settings(max_examples=8)
 @given(VECTOR)
 def test_the_mean_of_the_copies_is_what_the_filter_gives(vector: tuple[float, ...]) -> None:
-    """To a fraction of a step on ground of all scales, so that rounding the weights costs less than the result's."""
+    """To a fraction of a step on ground of all scales, so that rounding the weights costs less than
+    the result's.
+    """
     own = bank_of_vector(vector)
     image = textured(90, 101)
-    centred = np.lib.stride_tricks.sliding_window_view(image[0, 0].astype(np.float64), (SIDE_PX, SIDE_PX))
+    centred = np.lib.stride_tricks.sliding_window_view(
+        image[0, 0].astype(np.float64), (SIDE_PX, SIDE_PX)
+    )
     found = sums(image, own)[0]
     read = [kernel for kernel, _ in channels()]
     for kernel in range(1, COARSE + 1):
         known = own.kernels[-1] / WIDE if kernel == COARSE else own.kernels[kernel]
         wanted = own.gain * UNIT_STEPS * np.einsum("ijkl,kl->ij", centred, known)
         mean = found[[place for place, each in enumerate(read) if each == kernel]].mean(0)
-        assert np.sqrt(np.square(mean - wanted).mean()) < 0.3 + 0.05 * np.sqrt(np.square(wanted).mean())
+        assert np.sqrt(np.square(mean - wanted).mean()) < 0.3 + 0.05 * np.sqrt(
+            np.square(wanted).mean()
+        )
 
 
 def test_copies_are_rounded_at_places_spread_over_a_step() -> None:
@@ -121,5 +143,10 @@ def test_at_half_resolution_the_same_filters_meet_the_same_pixels() -> None:
     found = convolve(blocks, coarse.weight, Window())  # of places 2 .. 13
     first = [kernel for kernel, _ in channels()].index(1)
     wanted = convolve(planes, fine.weight, Window())[0, first, 1:-1, 1:-1]
-    mine = found[0].reshape(-1, 2, 2, *found.shape[2:])[first].transpose(2, 0, 3, 1).reshape(wanted.shape)
+    mine = (
+        found[0]
+        .reshape(-1, 2, 2, *found.shape[2:])[first]
+        .transpose(2, 0, 3, 1)
+        .reshape(wanted.shape)
+    )
     np.testing.assert_array_equal(mine, wanted)

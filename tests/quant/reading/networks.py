@@ -27,14 +27,22 @@ WEIGHTS: dict[str, tuple[int, ...]] = {
 def values() -> dict[str, np.ndarray]:
     """Numbers of no special value: none is 0 or 1."""
     rng = np.random.default_rng(3)
-    found = {name: rng.uniform(0.3, 0.9, shape).astype(np.float32) for name, shape in WEIGHTS.items()}
-    found |= {name: rng.uniform(0.5, 2, (4,)).astype(np.float32) for name in ("gain", "offset", "mean", "variance")}
+    found = {
+        name: rng.uniform(0.3, 0.9, shape).astype(np.float32) for name, shape in WEIGHTS.items()
+    }
+    found |= {
+        name: rng.uniform(0.5, 2, (4,)).astype(np.float32)
+        for name in ("gain", "offset", "mean", "variance")
+    }
     found |= {
         "six": np.array(6, np.float32),
         "zero": np.array(0, np.float32),
         "pads": np.array([0, 0, 1, 1, 0, 0, 1, 1]),
     }
-    found |= {"around": np.array([0, 0, 1, 2, 0, 0, 2, 1]), "twice": np.array([1, 1, 2, 2], np.float32)}
+    found |= {
+        "around": np.array([0, 0, 1, 2, 0, 0, 2, 1]),
+        "twice": np.array([1, 1, 2, 2], np.float32),
+    }
     found |= {"small": np.array([2, 4, 2, 3]), "rows": np.array([0, -1])}
     found |= {"two": np.array([2]), "four": np.array([4])}
     found |= {"map again": np.array([-1, 4, 1, 1])}
@@ -43,11 +51,18 @@ def values() -> dict[str, np.ndarray]:
 
 
 def made(
-    nodes: Sequence[NodeProto], opset: int = OPSET, kind: int = TensorProto.FLOAT, outputs: Sequence[str] = ("y",)
+    nodes: Sequence[NodeProto],
+    opset: int = OPSET,
+    kind: int = TensorProto.FLOAT,
+    outputs: Sequence[str] = ("y",),
 ) -> onnx.ModelProto:
-    """A network from `x` (N, 4, H, W) to `y`, with the named numbers it reads as initializers of this kind."""
+    """A network from `x` (N, 4, H, W) to `y`, with the named numbers it reads as initializers of
+    this kind.
+    """
     read = {name for node in nodes for name in node.input}
-    held = [numpy_helper.from_array(value, name) for name, value in values().items() if name in read]
+    held = [
+        numpy_helper.from_array(value, name) for name, value in values().items() if name in read
+    ]
     if kind != TensorProto.FLOAT:
         held = [tensor_as(tensor, kind) for tensor in held]
     x = helper.make_tensor_value_info("x", kind, ["N", CHANNELS, "H", "W"])
@@ -65,7 +80,9 @@ def node(kind: str, *inputs: str, to: str = "y", **attributes: Any) -> NodeProto
     return helper.make_node(kind, inputs, [to], name=f"{kind} {to}", **attributes)
 
 
-def conv(source: str = "x", to: str = "c", weight: str = "w", pad_px: int = 1, group: int = 1) -> NodeProto:
+def conv(
+    source: str = "x", to: str = "c", weight: str = "w", pad_px: int = 1, group: int = 1
+) -> NodeProto:
     return node("Conv", source, weight, to=to, pads=[pad_px] * 4, group=group)
 
 
@@ -81,7 +98,10 @@ CASES: dict[str, tuple[list[NodeProto], dict[str, int]]] = {
         {"ConvTranspose": 1},
     ),
     "transposed and divided": (
-        [node("ConvTranspose", "x", "up", to="c", strides=[2, 2], group=2), node("Div", "c", "image")],
+        [
+            node("ConvTranspose", "x", "up", to="c", strides=[2, 2], group=2),
+            node("Div", "c", "image"),
+        ],
         {"ConvTranspose": 1},
     ),
     "normalised in front, unpadded": ([normal("x", "n"), conv("n", "y", pad_px=0)], {"Conv": 1}),
@@ -104,7 +124,10 @@ CASES: dict[str, tuple[list[NodeProto], dict[str, int]]] = {
         [node("Mul", "x", "six", to="m"), conv("m", "c"), conv("m", "d"), node("Add", "c", "d")],
         {"Conv": 2, "Add": 1},
     ),
-    "shifted in front, zeros added": ([node("Sub", "x", "image", to="m"), conv("m", "y")], {"Sub": 1, "Conv": 1}),
+    "shifted in front, zeros added": (
+        [node("Sub", "x", "image", to="m"), conv("m", "y")],
+        {"Sub": 1, "Conv": 1},
+    ),
     "scaled, and read elsewhere": (
         [node("Mul", "x", "image", to="m"), conv("m", "c"), node("Add", "c", "m")],
         {"Mul": 1, "Conv": 1, "Add": 1},
@@ -120,9 +143,15 @@ CASES: dict[str, tuple[list[NodeProto], dict[str, int]]] = {
     ),
     "a residual taken away": ([conv(), node("Sub", "x", "c")], {"Conv": 1, "Add": 1}),
     "a convolution less the image": ([conv(), node("Sub", "c", "x")], {"Conv": 1, "Sub": 1}),
-    "normalised, and read elsewhere": ([conv(), normal("c", "n"), node("Add", "c", "n")], {"Conv": 2, "Add": 1}),
+    "normalised, and read elsewhere": (
+        [conv(), normal("c", "n"), node("Add", "c", "n")],
+        {"Conv": 2, "Add": 1},
+    ),
     "zeros around": ([node("Pad", "x", "pads", to="p"), conv("p", "y", pad_px=0)], {"Conv": 1}),
-    "zeros around, lopsided": ([node("Pad", "x", "around", to="p"), conv("p", "y", pad_px=0)], {"Conv": 1}),
+    "zeros around, lopsided": (
+        [node("Pad", "x", "around", to="p"), conv("p", "y", pad_px=0)],
+        {"Conv": 1},
+    ),
     "a mirror around": (
         [node("Pad", "x", "pads", to="p", mode="reflect"), conv("p", "y", pad_px=0)],
         {"Pad": 1, "Conv": 1},
@@ -166,7 +195,12 @@ CASES: dict[str, tuple[list[NodeProto], dict[str, int]]] = {
     ),
     "sizes of constants": (
         [
-            node("ConstantOfShape", "two", to="none", value=numpy_helper.from_array(np.zeros(1, np.int64))),
+            node(
+                "ConstantOfShape",
+                "two",
+                to="none",
+                value=numpy_helper.from_array(np.zeros(1, np.int64)),
+            ),
             node("Slice", "around", "two", "four", to="end"),
             node("Concat", "none", "end", "none", "end", to="sizes", axis=0),
             node("Pad", "x", "sizes", to="p"),

@@ -1,4 +1,6 @@
-"""Weights in a file beside the model: taken in from the model's own folder, and from nowhere else."""
+"""Weights in a file beside the model: taken in from the model's own folder, and
+from nowhere else.
+"""
 
 import os
 from collections.abc import Callable
@@ -119,10 +121,15 @@ def test_no_pipe_is_waited_for(saved: Path) -> None:
         (lambda m: m.graph.initializer[1].dims.append(2**22), "values"),
         (lambda m: m.graph.initializer[1].dims.append(1000), "not the"),
         (lambda m: m.graph.initializer[1].dims.append(-1), "plain numbers"),
-        (lambda m: setattr(m.graph.initializer[1], "data_type", TensorProto.STRING), "plain numbers"),
+        (
+            lambda m: setattr(m.graph.initializer[1], "data_type", TensorProto.STRING),
+            "plain numbers",
+        ),
     ],
 )
-def test_what_the_model_states_of_its_weights_is_looked_at(damage: Damage, words: str, saved: Path) -> None:
+def test_what_the_model_states_of_its_weights_is_looked_at(
+    damage: Damage, words: str, saved: Path
+) -> None:
     assert words in refused(rewritten(saved, damage))
 
 

@@ -1,4 +1,6 @@
-"""What exporters leave is folded: the same results from a short list of operators, whatever the spelling."""
+"""What exporters leave is folded: the same results from a short list of operators, whatever the
+spelling.
+"""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -31,7 +33,9 @@ def kinds(model: onnx.ModelProto) -> dict[str, int]:
 
 
 def folded(model: onnx.ModelProto, atol: float = 2e-5) -> dict[str, int]:
-    """The kinds of nodes that are left, once it is seen that the results are the same and the network sound."""
+    """The kinds of nodes that are left, once it is seen that the results are the same and the
+    network sound.
+    """
     short = simplest(model, "a.onnx")
     onnx.checker.check_model(short)
     for before, after in zip(results(model), results(short), strict=True):
@@ -47,7 +51,9 @@ def test_what_exporters_leave_is_folded_and_computes_the_same(case: str) -> None
 
 
 def test_numbers_shared_by_two_convolutions_are_folded_into_one_of_them() -> None:
-    short = simplest(made([conv(), normal("c", "n"), node("Relu", "n", to="r"), conv("r", "y")]), "a.onnx")
+    short = simplest(
+        made([conv(), normal("c", "n"), node("Relu", "n", to="r"), conv("r", "y")]), "a.onnx"
+    )
     first, second = (n.input[1] for n in short.graph.node if n.op_type == "Conv")
     assert first != second == "w"
 
@@ -59,7 +65,9 @@ def test_operators_of_other_opsets_become_ours(opset: int) -> None:
     clip = node("Clip", "e", "zero", "six") if newer else node("Clip", "e", min=0.0, max=6.0)
     resize = node("Resize" if newer else "Upsample", *enlarged, to="e", mode="linear")
     if newer:
-        resize.attribute.append(helper.make_attribute("coordinate_transformation_mode", "asymmetric"))
+        resize.attribute.append(
+            helper.make_attribute("coordinate_transformation_mode", "asymmetric")
+        )
     model = made([conv(), resize, clip], opset)
     short = simplest(model, "a.onnx")
     assert [(o.domain, o.version) for o in short.opset_import] == [("", OPSET)]
@@ -83,7 +91,10 @@ def test_weights_of_16_bits_become_float32(kind: int) -> None:
 
 
 def test_names_and_what_is_said_of_a_network_stay() -> None:
-    model = made([conv(), node("Identity", "c", to="i"), node("Relu", "i"), conv("c", "z")], outputs=("y", "z"))
+    model = made(
+        [conv(), node("Identity", "c", to="i"), node("Relu", "i"), conv("c", "z")],
+        outputs=("y", "z"),
+    )
     # the first is named by its output, were it free
     model.graph.node[0].name = ""
     model.graph.node[2].name = "c"
@@ -108,7 +119,13 @@ def test_weights_that_are_inputs_too_are_weights() -> None:
 
 def test_the_same_file_gives_the_same_bytes_and_is_not_changed() -> None:
     model = made(
-        [node("Identity", "w", to="v"), conv(weight="v"), normal("c", "n"), conv("n", "d"), node("Sub", "x", "d")]
+        [
+            node("Identity", "w", to="v"),
+            conv(weight="v"),
+            normal("c", "n"),
+            conv("n", "d"),
+            node("Sub", "x", "d"),
+        ]
     )
     before = model.SerializeToString()
     short = simplest(model, "a.onnx")

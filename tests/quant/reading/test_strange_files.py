@@ -1,4 +1,6 @@
-"""What stops other readers: each file is read right, or refused by one sentence that names the node."""
+"""What stops other readers: each file is read right, or refused by one sentence that names the
+node.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -31,7 +33,9 @@ def saved(model: onnx.ModelProto, folder: Path) -> Path:
 def branch(name: str, value: float) -> onnx.GraphProto:
     chosen = helper.make_tensor(name, TensorProto.FLOAT, [1], [value])
     result = helper.make_tensor_value_info(name, TensorProto.FLOAT, [1])
-    return helper.make_graph([helper.make_node("Constant", [], [name], value=chosen)], name, [], [result])
+    return helper.make_graph(
+        [helper.make_node("Constant", [], [name], value=chosen)], name, [], [result]
+    )
 
 
 def chosen() -> onnx.ModelProto:
@@ -50,7 +54,9 @@ def foreign() -> onnx.ModelProto:
     return model
 
 
-@pytest.mark.parametrize(("make", "words"), [(chosen, "If f with a graph within"), (foreign, "Mystery y of")])
+@pytest.mark.parametrize(
+    ("make", "words"), [(chosen, "If f with a graph within"), (foreign, "Mystery y of")]
+)
 def test_what_no_runtime_of_ours_may_get_is_named_and_may_be_looked_at(
     make: Callable[[], onnx.ModelProto], words: str, tmp_path: Path
 ) -> None:
@@ -58,7 +64,8 @@ def test_what_no_runtime_of_ours_may_get_is_named_and_may_be_looked_at(
     with pytest.raises(ModelError, match=words):
         load_onnx(path)
     refused = [
-        found.op.op_type.rpartition("::")[2] for found in place(read_network(path, 32), load_dpu("vck190")).failed
+        found.op.op_type.rpartition("::")[2]
+        for found in place(read_network(path, 32), load_dpu("vck190")).failed
     ]
     assert words.split()[0] in refused
 
@@ -93,13 +100,17 @@ def test_five_sizes_are_named(tmp_path: Path) -> None:
     model = made([node("Relu", "x")])
     model.graph.input[0].type.tensor_type.shape.dim.add(dim_value=3)
     model.graph.output[0].type.tensor_type.shape.dim.add(dim_value=3)
-    with pytest.raises(ModelError, match=r"expected inputs \(N, C, H, W\), got x \[0, 4, 0, 0, 3\]"):
+    with pytest.raises(
+        ModelError, match=r"expected inputs \(N, C, H, W\), got x \[0, 4, 0, 0, 3\]"
+    ):
         read_network(saved(model, tmp_path), 32)
 
 
 @pytest.mark.parametrize("path", SMALL, ids=lambda path: path.stem)
 def test_known_architectures_are_read_and_judged(path: Path) -> None:
-    """Of opset 9, weights filled by nodes: the smaller of the nine that onnx brings, the others as these."""
+    """Of opset 9, weights filled by nodes: the smaller of the nine that onnx brings, the others as
+    these.
+    """
     result = CliRunner().invoke(app, ["check", str(path), "--tile", "224"])
     assert result.exit_code in (0, 1)
     assert "check passed" in result.output or "nodes the DPU refuses" in result.output

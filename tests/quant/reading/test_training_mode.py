@@ -1,4 +1,6 @@
-"""A network in training mode is refused wherever it is run; the same nodes in use are folded as before."""
+"""A network in training mode is refused wherever it is run; the same nodes in use are folded as
+before.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -77,7 +79,12 @@ def test_no_command_runs_it(name: str, tmp_path: Path) -> None:
     image = tmp_path / "image.tif"
     out = tmp_path / "out.tif"
     path.write_bytes(TRAINING[name].SerializeToString())
-    tifffile.imwrite(image, np.full((4, 40, 50), 900, np.uint16), photometric="minisblack", planarconfig="separate")
+    tifffile.imwrite(
+        image,
+        np.full((4, 40, 50), 900, np.uint16),
+        photometric="minisblack",
+        planarconfig="separate",
+    )
     int8 = tmp_path / "int8.onnx"
     for words in (
         ("quantize", path, "--out", int8),

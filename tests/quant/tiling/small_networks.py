@@ -1,4 +1,6 @@
-"""Small networks as users bring them: strides, pools, transposed convolutions, shuffles, enlargements, joins."""
+"""Small networks as users bring them: strides, pools, transposed convolutions, shuffles,
+enlargements, joins.
+"""
 
 import math
 from fractions import Fraction
@@ -24,7 +26,9 @@ from tests.quant.quick import patches_of, quickly
 def constant(name: str, *shape: int) -> onnx.TensorProto:
     """Random weights, such that values keep their size from layer to layer."""
     values = np.random.default_rng(list(name.encode())).normal(size=shape)
-    return numpy_helper.from_array((values / math.sqrt(math.prod(shape[1:]))).astype(np.float32), name)
+    return numpy_helper.from_array(
+        (values / math.sqrt(math.prod(shape[1:]))).astype(np.float32), name
+    )
 
 
 def whole(name: str, *values: int) -> onnx.TensorProto:
@@ -39,7 +43,9 @@ def taps(name: str, *shape: int) -> onnx.TensorProto:
 
 def real(*values: float) -> onnx.TensorProto:
     """Numbers, or one by itself."""
-    return numpy_helper.from_array(np.array(values if len(values) > 1 else values[0], np.float32), "real")
+    return numpy_helper.from_array(
+        np.array(values if len(values) > 1 else values[0], np.float32), "real"
+    )
 
 
 def graph(
@@ -52,7 +58,9 @@ def graph(
 
 
 class Row:
-    """A network written operator by operator, each of which reads what the last one made of the image."""
+    """A network written operator by operator, each of which reads what the last one made of the
+    image.
+    """
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
@@ -66,7 +74,9 @@ class Row:
         for other in others:
             feeds.append(other if isinstance(other, str) else f"{name}.{len(feeds)}")
             if not isinstance(other, str):
-                self.weights.append(numpy_helper.from_array(numpy_helper.to_array(other), feeds[-1]))
+                self.weights.append(
+                    numpy_helper.from_array(numpy_helper.to_array(other), feeds[-1])
+                )
         self.nodes.append(helper.make_node(kind, feeds, [name], **attributes))
         self.tensor = name
         return self
@@ -80,8 +90,12 @@ def float_unet() -> onnx.ModelProto:
     """Convolution, pool, convolution, transposed convolution, beside the first, convolution."""
     row = Row().add("Conv", constant("first", 2, 1, 3, 3), pads=[1] * 4)
     first = row.tensor
-    row.add("MaxPool", kernel_shape=[2, 2], strides=[2, 2]).add("Conv", constant("middle", 2, 2, 3, 3), pads=[1] * 4)
-    row.add("ConvTranspose", constant("up", 2, 2, 2, 2), strides=[2, 2]).add("Concat", first, axis=1)
+    row.add("MaxPool", kernel_shape=[2, 2], strides=[2, 2]).add(
+        "Conv", constant("middle", 2, 2, 3, 3), pads=[1] * 4
+    )
+    row.add("ConvTranspose", constant("up", 2, 2, 2, 2), strides=[2, 2]).add(
+        "Concat", first, axis=1
+    )
     return row.add("Conv", constant("last", 1, 4, 3, 3), pads=[1] * 4).model()
 
 
@@ -91,11 +105,17 @@ MICROSOFT = "com.microsoft"
 
 def int8_conv(source: str, weight: str, result: str, stride: int = 1) -> onnx.NodeProto:
     feeds = [source, *UNIT, weight, "fine", "none", *UNIT]
-    return helper.make_node("QLinearConv", feeds, [result], name=result, pads=[1] * 4, strides=[stride] * 2)
+    return helper.make_node(
+        "QLinearConv", feeds, [result], name=result, pads=[1] * 4, strides=[stride] * 2
+    )
 
 
-def int8_graph(nodes: list[onnx.NodeProto], unit: float, **weights: tuple[int, ...]) -> onnx.ModelProto:
-    """A network in whole numbers: `unit` is what 1 stands for, `weights` are the shapes of those."""
+def int8_graph(
+    nodes: list[onnx.NodeProto], unit: float, **weights: tuple[int, ...]
+) -> onnx.ModelProto:
+    """A network in whole numbers: `unit` is what 1 stands for, `weights` are
+    the shapes of those.
+    """
     numbers = {
         "unit": np.float32(unit),
         "coarse": np.float32(16),
@@ -106,8 +126,13 @@ def int8_graph(nodes: list[onnx.NodeProto], unit: float, **weights: tuple[int, .
         "table": np.random.default_rng(3).permutation(256).astype(np.uint8),
     }
     for name, shape in weights.items():
-        numbers[name] = np.random.default_rng(list(name.encode())).integers(-60, 61, shape).astype(np.int8)
-    return graph(nodes, *(numpy_helper.from_array(np.asarray(value), name) for name, value in numbers.items()))
+        numbers[name] = (
+            np.random.default_rng(list(name.encode())).integers(-60, 61, shape).astype(np.int8)
+        )
+    return graph(
+        nodes,
+        *(numpy_helper.from_array(np.asarray(value), name) for name, value in numbers.items()),
+    )
 
 
 def int8_unet() -> onnx.ModelProto:
@@ -115,22 +140,32 @@ def int8_unet() -> onnx.ModelProto:
     nodes = [
         helper.make_node("QuantizeLinear", ["image", "coarse", "zero"], ["q"]),
         int8_conv("q", "first", "a"),
-        helper.make_node("QLinearLeakyRelu", ["a", *UNIT, *UNIT], ["leaky"], domain=MICROSOFT, alpha=0.1),
+        helper.make_node(
+            "QLinearLeakyRelu", ["a", *UNIT, *UNIT], ["leaky"], domain=MICROSOFT, alpha=0.1
+        ),
         int8_conv("leaky", "down", "half", 2),
         helper.make_node("Cast", ["half"], ["places"], to=TensorProto.INT32),
         helper.make_node("Gather", ["table", "places"], ["bent"]),
         helper.make_node(
-            "QLinearAveragePool", ["bent", *UNIT, *UNIT], ["mean"], domain=MICROSOFT, kernel_shape=[2, 2],
+            "QLinearAveragePool",
+            ["bent", *UNIT, *UNIT],
+            ["mean"],
+            domain=MICROSOFT,
+            kernel_shape=[2, 2],
             strides=[2, 2],
         ),
-        helper.make_node("Resize", ["mean", "", "four"], ["wide"], coordinate_transformation_mode="asymmetric"),
-        helper.make_node("QLinearMul", ["wide", *UNIT, "leaky", *UNIT, *UNIT], ["gated"], domain=MICROSOFT),
+        helper.make_node(
+            "Resize", ["mean", "", "four"], ["wide"], coordinate_transformation_mode="asymmetric"
+        ),
+        helper.make_node(
+            "QLinearMul", ["wide", *UNIT, "leaky", *UNIT, *UNIT], ["gated"], domain=MICROSOFT
+        ),
         helper.make_node(
             "QLinearConcat", [*UNIT, "gated", *UNIT, "q", *UNIT], ["both"], domain=MICROSOFT, axis=1
         ),
         int8_conv("both", "last", "end"),
         helper.make_node("DequantizeLinear", ["end", *UNIT], ["restored"]),
-    ]  # fmt: skip
+    ]
     return int8_graph(nodes, 0.5, first=(2, 1, 3, 3), down=(2, 2, 3, 3), last=(1, 3, 3, 3))
 
 
@@ -152,7 +187,9 @@ class Builder(Row):
         return [*before, *(total - pad for pad in before)]
 
     def convolve(self, kernel: int, channels: int = 2, **window: Any) -> None:
-        self.add("Conv", taps(f"{len(self.nodes)}", channels, self.channels, kernel, kernel), **window)
+        self.add(
+            "Conv", taps(f"{len(self.nodes)}", channels, self.channels, kernel, kernel), **window
+        )
         self.channels = channels
 
     def conv(self, stride: int = 1) -> None:
@@ -170,18 +207,28 @@ class Builder(Row):
         extent = self.number(2, 4)
         kind = self.draw(st.sampled_from(["MaxPool", "AveragePool"]))
         counted = {"count_include_pad": 1} if kind == "AveragePool" else {}
-        self.add(kind, kernel_shape=[extent] * 2, strides=[2, 2], pads=self.pads(extent - 2), **counted)
+        self.add(
+            kind, kernel_shape=[extent] * 2, strides=[2, 2], pads=self.pads(extent - 2), **counted
+        )
         self.at /= 2
 
     def padded(self) -> None:
-        """By itself, then used up by a window; or moved, cut off on the one side that was not padded."""
-        mode, before, behind = self.draw(st.sampled_from(["constant", "edge", "reflect"])), *self.pads(2)[::2]
+        """By itself, then used up by a window; or moved, cut off on the one side that was not
+        padded.
+        """
+        mode, before, behind = (
+            self.draw(st.sampled_from(["constant", "edge", "reflect"])),
+            *self.pads(2)[::2],
+        )
         self.add("Pad", whole("pads", 0, 0, before, before, 0, 0, behind, behind), mode=mode)
         if before == behind or self.draw(st.booleans()):
             self.convolve(3)
         else:
             self.add(
-                "Slice", whole("from", behind, behind), whole("to", *[-before or 1 << 62] * 2), whole("axes", 2, 3)
+                "Slice",
+                whole("from", behind, behind),
+                whole("to", *[-before or 1 << 62] * 2),
+                whole("axes", 2, 3),
             )
 
     def transposed(self) -> None:
@@ -218,7 +265,9 @@ class Builder(Row):
         self.skips[self.at] = self.tensor, self.channels
 
     def small(self) -> None:
-        """Back to small whole numbers: their sums are exact in any order, which a runtime chooses by the size."""
+        """Back to small whole numbers: their sums are exact in any order, which a runtime chooses
+        by the size.
+        """
         self.add("Mul", real(0.125)).add("Floor").add("Clip", real(-255), real(255))
 
 
@@ -227,9 +276,16 @@ def networks(draw: Any) -> onnx.ModelProto:
     """Small networks of everything that can be tiled, of whole numbers."""
     builder = Builder(draw)
     parts = (
-        Builder.conv, Builder.strided, Builder.pool, Builder.padded, Builder.transposed, Builder.shuffle,
-        Builder.unshuffle, Builder.resize, Builder.join,
-    )  # fmt: skip
+        Builder.conv,
+        Builder.strided,
+        Builder.pool,
+        Builder.padded,
+        Builder.transposed,
+        Builder.shuffle,
+        Builder.unshuffle,
+        Builder.resize,
+        Builder.join,
+    )
     for part in draw(st.lists(st.sampled_from(parts), min_size=2, max_size=7)):
         grows = part in (Builder.transposed, Builder.shuffle, Builder.resize)
         if builder.channels <= 16 and not (grows and builder.at >= 2):
@@ -256,8 +312,12 @@ def four_bands(bands_out: int = 4) -> onnx.ModelProto:
 
 def ffdnet() -> onnx.ModelProto:
     """Half the size inside, by a pixel unshuffle in front and a shuffle behind."""
-    row = Row().add("SpaceToDepth", blocksize=2).add("Conv", constant("in", 8, 4, 3, 3), pads=[1] * 4)
-    row.add("Clip", real(0), real(6)).add("Conv", constant("out", 4, 8, 3, 3), pads=[2] * 4, dilations=[2, 2])
+    row = (
+        Row().add("SpaceToDepth", blocksize=2).add("Conv", constant("in", 8, 4, 3, 3), pads=[1] * 4)
+    )
+    row.add("Clip", real(0), real(6)).add(
+        "Conv", constant("out", 4, 8, 3, 3), pads=[2] * 4, dilations=[2, 2]
+    )
     return row.add("DepthToSpace", blocksize=2).model()
 
 
@@ -276,14 +336,22 @@ def plain_int8_unet() -> onnx.ModelProto:
         *conv("b", "third", "c", 2),
         helper.make_node("DepthToSpace", ["c"], ["larger"], blocksize=2),
         helper.make_node(
-            "Resize", ["larger", "", "four"], ["wide"], coordinate_transformation_mode="asymmetric",
+            "Resize",
+            ["larger", "", "four"],
+            ["wide"],
+            coordinate_transformation_mode="asymmetric",
             nearest_mode="floor",
         ),
         helper.make_node("Concat", ["wide", "a"], ["both"], axis=1),
         *conv("both", "last", "end"),
         helper.make_node("DequantizeLinear", ["end", *UNIT], ["restored"]),
-    ]  # fmt: skip
-    weights = {"first": (2, 1, 3, 3), "second": (4, 2, 3, 3), "third": (8, 4, 3, 3), "last": (1, 4, 3, 3)}
+    ]
+    weights = {
+        "first": (2, 1, 3, 3),
+        "second": (4, 2, 3, 3),
+        "third": (8, 4, 3, 3),
+        "last": (1, 4, 3, 3),
+    }
     return int8_graph(nodes, 2**-7, **weights)
 
 
@@ -301,7 +369,8 @@ def half_resolution() -> onnx.ModelProto:
 def quantised_half_resolution() -> Quantised:
     """The same in legal INT8, for the host and for the board."""
     return quickly(
-        half_resolution(), patches_of(list(np.random.default_rng(5).random((2, 1, 1, 48, 48), np.float32)))
+        half_resolution(),
+        patches_of(list(np.random.default_rng(5).random((2, 1, 1, 48, 48), np.float32))),
     )
 
 
@@ -313,17 +382,28 @@ def int8_half_resolution() -> onnx.ModelProto:
 def spans(size_px: int, kept_px: int, halo_px: int) -> list[tuple[int, int, int, int]]:
     """Start and stop of each window and of what is kept of it, `kept_px` at a time."""
     marks = range(0, size_px, kept_px)
-    return [(max(k - halo_px, 0), min(k + kept_px + halo_px, size_px), k, min(k + kept_px, size_px)) for k in marks]
+    return [
+        (max(k - halo_px, 0), min(k + kept_px + halo_px, size_px), k, min(k + kept_px, size_px))
+        for k in marks
+    ]
 
 
-def check_tiles(model: onnx.ModelProto, image: np.ndarray, all_cells: tuple[int, ...], short_px: int = 0) -> None:
-    """Tiles of so many lattice cells give the whole image (1, C, H, W) bit for bit; the halo may be too short."""
+def check_tiles(
+    model: onnx.ModelProto, image: np.ndarray, all_cells: tuple[int, ...], short_px: int = 0
+) -> None:
+    """Tiles of so many lattice cells give the whole image (1, C, H, W) bit for bit; the halo may be
+    too short.
+    """
     tiling = tiling_of(model)
     session = open_session(any_size(model), 1)
     more = [(0, -n % tiling.lattice_px) for n in image.shape[2:]]
     image = np.pad(image, ((0, 0), (0, 0), *more), mode="edge")
     expected = result_of(session, image)
-    assert expected.shape == (1, tiling.channels_out, *(int(n * tiling.scale) for n in image.shape[2:]))
+    assert expected.shape == (
+        1,
+        tiling.channels_out,
+        *(int(n * tiling.scale) for n in image.shape[2:]),
+    )
     for cells in all_cells:
         kept_px = cells * tiling.lattice_px
         rows = []
@@ -331,8 +411,12 @@ def check_tiles(model: onnx.ModelProto, image: np.ndarray, all_cells: tuple[int,
         for top, bottom, low, high in sides[0]:
             row = []
             for left, right, west, east in sides[1]:
-                found = result_of(session, np.ascontiguousarray(image[:, :, top:bottom, left:right]))
-                ends = [int(n * tiling.scale) for n in (low - top, high - top, west - left, east - left)]
+                found = result_of(
+                    session, np.ascontiguousarray(image[:, :, top:bottom, left:right])
+                )
+                ends = [
+                    int(n * tiling.scale) for n in (low - top, high - top, west - left, east - left)
+                ]
                 row.append(found[:, :, ends[0] : ends[1], ends[2] : ends[3]])
             rows.append(np.concatenate(row, axis=3))
         np.testing.assert_array_equal(np.concatenate(rows, axis=2), expected)

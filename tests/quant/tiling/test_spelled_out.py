@@ -1,4 +1,6 @@
-"""Pixel shuffles spelled out as torch does are seen as one operator; whatever else moves pixels is left as it is."""
+"""Pixel shuffles spelled out as torch does are seen as one operator; whatever else moves pixels is
+left as it is.
+"""
 
 import warnings
 from pathlib import Path
@@ -26,9 +28,15 @@ def exported(network: nn.Module, any_size: bool, folder: Path, opset: int = 17) 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            network, (torch.zeros(1, 1, 70, 70),), path, dynamo=False, opset_version=opset, input_names=["image"],
-            output_names=["restored"], dynamic_axes={"image": axes, "restored": axes} if any_size else None,
-        )  # fmt: skip
+            network,
+            (torch.zeros(1, 1, 70, 70),),
+            path,
+            dynamo=False,
+            opset_version=opset,
+            input_names=["image"],
+            output_names=["restored"],
+            dynamic_axes={"image": axes, "restored": axes} if any_size else None,
+        )
     return onnx.load_model(path)
 
 
@@ -36,16 +44,22 @@ def exported(network: nn.Module, any_size: bool, folder: Path, opset: int = 17) 
 @pytest.mark.parametrize("size", [2, 5])
 def test_what_torch_makes_of_an_unshuffle_is_one(size: int, any_size: bool, tmp_path: Path) -> None:
     count = size * size
-    network = nn.Sequential(nn.PixelUnshuffle(size), nn.Conv2d(count, count, 3, padding=1), nn.PixelShuffle(size))
+    network = nn.Sequential(
+        nn.PixelUnshuffle(size), nn.Conv2d(count, count, 3, padding=1), nn.PixelShuffle(size)
+    )
     model = exported(network, any_size, tmp_path)
     assert "Transpose" in {node.op_type for node in model.graph.node}
     assert tiling_of(model) == Tiling(size, size, fixed_px=None if any_size else 70)
     front = read_network(simplest(model, "exported")).front
-    assert [(shuffle.block, shuffle.up, shuffle.columns_first) for shuffle in front] == [(size, False, True)]
+    assert [(shuffle.block, shuffle.up, shuffle.columns_first) for shuffle in front] == [
+        (size, False, True)
+    ]
 
 
 def test_a_shuffle_of_an_old_opset_is_one(tmp_path: Path) -> None:
-    model = exported(nn.Sequential(nn.Conv2d(1, 4, 1), nn.PixelShuffle(2)), False, tmp_path, opset=9)
+    model = exported(
+        nn.Sequential(nn.Conv2d(1, 4, 1), nn.PixelShuffle(2)), False, tmp_path, opset=9
+    )
     assert "DepthToSpace" not in {node.op_type for node in model.graph.node}
     assert with_shuffles(model).nodes[-1].op_type == "DepthToSpace"
     assert tiling_of(model).scale == 2
@@ -58,7 +72,9 @@ def moves(*nodes: onnx.NodeProto) -> onnx.ModelProto:
 
 MORE = helper.make_node("Unsqueeze", ["image", "at"], ["more"])
 LEFT = {
-    "turned": moves(helper.make_node("Transpose", ["image"], ["restored"], name="turn", perm=[0, 1, 3, 2])),
+    "turned": moves(
+        helper.make_node("Transpose", ["image"], ["restored"], name="turn", perm=[0, 1, 3, 2])
+    ),
     "flat": moves(
         helper.make_node("Reshape", ["image", "flat"], ["line"], name="flatten"),
         helper.make_node("Reshape", ["line", "square"], ["restored"]),
@@ -80,7 +96,9 @@ def test_whatever_else_moves_pixels_is_left(name: str) -> None:
 
 
 def test_a_row_that_leads_back_is_a_shuffle_of_one() -> None:
-    assert tiling_of(moves(MORE, helper.make_node("Squeeze", ["more", "at"], ["restored"]))) == Tiling(0)
+    assert tiling_of(
+        moves(MORE, helper.make_node("Squeeze", ["more", "at"], ["restored"]))
+    ) == Tiling(0)
 
 
 def test_moves_between_integers_are_of_integers() -> None:
@@ -94,6 +112,8 @@ def test_moves_between_integers_are_of_integers() -> None:
         helper.make_node("DequantizeLinear", ["moved", *unit], ["restored"]),
     ]
     held = {"unit": np.float32(0.5), "zero": np.int8(0), "at": np.array([2])}
-    model = graph(nodes, *(numpy_helper.from_array(np.asarray(value), name) for name, value in held.items()))
+    model = graph(
+        nodes, *(numpy_helper.from_array(np.asarray(value), name) for name, value in held.items())
+    )
     kinds = [(op.kind, op.integer) for op in network_of(model, 8).operations]
     assert kinds == [("quantise", True), ("pixel shuffle", True), ("dequantise", False)]

@@ -1,4 +1,6 @@
-"""How an image may be tiled: the whole image's result wherever it is allowed, one sentence elsewhere."""
+"""How an image may be tiled: the whole image's result wherever it is allowed, one sentence
+elsewhere.
+"""
 
 from fractions import Fraction
 from typing import Any
@@ -53,7 +55,12 @@ def pad(before: int, behind: int) -> onnx.TensorProto:
 
 
 def cut(begin: tuple[int, int], end: int, step: int = 1) -> list[onnx.TensorProto]:
-    return [whole("from", *begin), whole("to", end, end), whole("axes", 2, 3), whole("steps", step, step)]
+    return [
+        whole("from", *begin),
+        whole("to", end, end),
+        whole("axes", 2, 3),
+        whole("steps", step, step),
+    ]
 
 
 FAR = 1 << 62
@@ -63,7 +70,10 @@ EXACT = {
     "dilated": (conv(pads=[4] * 4, dilations=[4, 4]), Tiling(4)),
     "one-sided": (conv(pads=[2, 0, 0, 2]), Tiling(2)),
     "same": (conv(4, 4, auto_pad="SAME_UPPER"), Tiling(2)),
-    "same, strided": (conv(4, 4, auto_pad="SAME_LOWER", strides=[3, 3]), Tiling(3, 3, Fraction(1, 3))),
+    "same, strided": (
+        conv(4, 4, auto_pad="SAME_LOWER", strides=[3, 3]),
+        Tiling(3, 3, Fraction(1, 3)),
+    ),
     "pool": (one("MaxPool", kernel_shape=[5, 5], pads=[2] * 4), Tiling(2)),
     "mean": (one("AveragePool", kernel_shape=[3, 3], pads=[1] * 4), Tiling(1)),
     "gain": (one("Mul", taps("gain", 1, 1, 1)), Tiling(0)),
@@ -72,27 +82,50 @@ EXACT = {
         Tiling(3),
     ),
     "looks ahead, mirrored and moved": (
-        looking([0, 0, 2, 2]).add("Pad", pad(1, 0), mode="reflect").add("Slice", *cut((0, 0), -1)).model(),
+        looking([0, 0, 2, 2])
+        .add("Pad", pad(1, 0), mode="reflect")
+        .add("Slice", *cut((0, 0), -1))
+        .model(),
         Tiling(3, least_px=2),  # a mirror needs pixels
     ),
     "looks back, copied and moved": (
-        looking([2, 2, 0, 0]).add("Pad", pad(0, 1), mode="edge").add("Slice", *cut((1, 1), FAR)).model(),
+        looking([2, 2, 0, 0])
+        .add("Pad", pad(0, 1), mode="edge")
+        .add("Slice", *cut((1, 1), FAR))
+        .model(),
         Tiling(2),
     ),
-    "strided pool": (one("MaxPool", kernel_shape=[2, 2], strides=[2, 2]), Tiling(0, 2, Fraction(1, 2))),
+    "strided pool": (
+        one("MaxPool", kernel_shape=[2, 2], strides=[2, 2]),
+        Tiling(0, 2, Fraction(1, 2)),
+    ),
     "strided": (conv(pads=[1] * 4, strides=[2, 2]), Tiling(2, 2, Fraction(1, 2))),
-    "odd pool": (one("MaxPool", kernel_shape=[3, 3], strides=[3, 3], ceil_mode=1), Tiling(0, 3, Fraction(1, 3))),
+    "odd pool": (
+        one("MaxPool", kernel_shape=[3, 3], strides=[3, 3], ceil_mode=1),
+        Tiling(0, 3, Fraction(1, 3)),
+    ),
     "transposed": (transposed(4, 2, pads=[1] * 4), Tiling(1, 1, Fraction(2))),
     "transposed with gaps": (transposed(2, 3, output_padding=[1, 1]), Tiling(0, 1, Fraction(3))),
-    "shuffle": (Row().add("DepthToSpace", blocksize=2).model((4, 1)), Tiling(0, 1, Fraction(2), 4, 1)),
-    "unshuffle": (Row().add("SpaceToDepth", blocksize=2).model((1, 4)), Tiling(0, 2, Fraction(1, 2), 1, 4)),
-    "nearest": (resized("nearest", "asymmetric", 3, nearest_mode="floor"), Tiling(0, 1, Fraction(3))),
+    "shuffle": (
+        Row().add("DepthToSpace", blocksize=2).model((4, 1)),
+        Tiling(0, 1, Fraction(2), 4, 1),
+    ),
+    "unshuffle": (
+        Row().add("SpaceToDepth", blocksize=2).model((1, 4)),
+        Tiling(0, 2, Fraction(1, 2), 1, 4),
+    ),
+    "nearest": (
+        resized("nearest", "asymmetric", 3, nearest_mode="floor"),
+        Tiling(0, 1, Fraction(3)),
+    ),
     "nearest, half": (resized("nearest", "half_pixel", 2), Tiling(0, 1, Fraction(2))),
     "linear": (resized("linear", "half_pixel", 2), Tiling(1, 1, Fraction(2))),
     "linear down": (resized("linear", "half_pixel", 0.5), Tiling(0, 2, Fraction(1, 2))),
     "transposed with a dilation, then windows": (
         Row()
-        .add("ConvTranspose", taps("far", 1, 1, 2, 2), strides=[2, 2], dilations=[3, 3], pads=[1] * 4)
+        .add(
+            "ConvTranspose", taps("far", 1, 1, 2, 2), strides=[2, 2], dilations=[3, 3], pads=[1] * 4
+        )
         .add("MaxPool", kernel_shape=[2, 2], pads=[0, 0, 1, 1])
         .model(),
         Tiling(1, 1, Fraction(2)),
@@ -135,21 +168,31 @@ ELSEWHERE = {
     .add("Concat", "image", axis=1)
     .model((1, 2)),
     "Resize restored, by 1 x 1 x 1.5 x 1.5": resized("nearest", "asymmetric", 1.5),
-    "Resize restored, by 3, of weights that depend on the place": resized("linear", "half_pixel", 3),
-    "Resize restored, of coordinates align_corners, which depend on the size": resized("linear", "align_corners", 2),
+    "Resize restored, by 3, of weights that depend on the place": resized(
+        "linear", "half_pixel", 3
+    ),
+    "Resize restored, of coordinates align_corners, which depend on the size": resized(
+        "linear", "align_corners", 2
+    ),
     "Resize restored, to a size that is fixed": one("Resize", "", "", whole("sizes", 1, 1, 40, 40)),
     "Slice restored, which cuts at a place that is fixed": one("Slice", *cut((0, 0), 40)),
-    "Add restored, with a constant that differs from pixel to pixel": one("Add", constant("map", 1, 1, 40, 40)),
+    "Add restored, with a constant that differs from pixel to pixel": one(
+        "Add", constant("map", 1, 1, 40, 40)
+    ),
     "Mul restored, with a constant that differs": one("Mul", constant("ramp", 40)),
     "MaxPool max, which tells places": graph(
         [
-            helper.make_node("MaxPool", ["image"], ["max", "places"], kernel_shape=[3, 3], pads=[1] * 4),
+            helper.make_node(
+                "MaxPool", ["image"], ["max", "places"], kernel_shape=[3, 3], pads=[1] * 4
+            ),
             helper.make_node("Cast", ["places"], ["restored"], to=TensorProto.FLOAT),
         ]
     ),
     "MaxPool restored, of no stride": one("MaxPool", kernel_shape=[2, 2], strides=[-2, -2]),
     "got -2 pixels a side": conv(),
-    "as many pixels of output along both sides, got 1/2 and 1": one("MaxPool", kernel_shape=[2, 1], strides=[2, 1]),
+    "as many pixels of output along both sides, got 1/2 and 1": one(
+        "MaxPool", kernel_shape=[2, 1], strides=[2, 1]
+    ),
     "got a period of 4096": Row()
     .add("MaxPool", kernel_shape=[2, 2], strides=[64, 64])
     .add("MaxPool", kernel_shape=[2, 2], strides=[64, 64])
@@ -166,20 +209,32 @@ def test_what_depends_on_the_place_or_the_whole_image_is_refused(sentence: str) 
 def test_constants_in_the_graph_are_followed() -> None:
     weight = helper.make_node("Constant", [], ["w"], value=constant("w", 1, 1, 7, 7))
     assert (
-        tiling_of(graph([weight, helper.make_node("Conv", ["image", "w"], ["restored"], pads=[3] * 4)])).halo_px == 3
+        tiling_of(
+            graph([weight, helper.make_node("Conv", ["image", "w"], ["restored"], pads=[3] * 4)])
+        ).halo_px
+        == 3
     )
 
 
 def check_any(
-    model: onnx.ModelProto, size: tuple[int, int], cells: tuple[int, ...] = (1, 3), short_px: int = 0
+    model: onnx.ModelProto,
+    size: tuple[int, int],
+    cells: tuple[int, ...] = (1, 3),
+    short_px: int = 0,
 ) -> None:
     """Of digital numbers at random; the halo may be too short."""
-    image = np.random.default_rng(1).integers(0, 4096, (1, tiling_of(model).channels_in, *size)).astype(np.float32)
+    image = (
+        np.random.default_rng(1)
+        .integers(0, 4096, (1, tiling_of(model).channels_in, *size))
+        .astype(np.float32)
+    )
     check_tiles(model, image, cells, short_px)
 
 
 @settings(max_examples=40)
 @given(networks(), st.integers(9, 40), st.integers(9, 40))
-def test_random_networks_are_tiled_as_a_whole(model: onnx.ModelProto, height: int, width: int) -> None:
+def test_random_networks_are_tiled_as_a_whole(
+    model: onnx.ModelProto, height: int, width: int
+) -> None:
     lattice_px = tiling_of(model).lattice_px
     check_any(model, (height + 2 * lattice_px, width + lattice_px))

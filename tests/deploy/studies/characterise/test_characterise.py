@@ -29,7 +29,9 @@ SENSOR = Instrument(0.09, *noise_from_snr(25, SNRS[0], 100, SNRS[1]), GAIN, 12, 
 
 
 def landscape(seed: int, board: bool) -> np.ndarray:
-    """A drawn scene without its own calibration site; a leaning checkerboard of 100 x 100 pixels in it or none."""
+    """A drawn scene without its own calibration site; a leaning checkerboard of 100 x 100 pixels in
+    it or none.
+    """
     radiance = procedural_scene(SIDE, SIDE, np.random.default_rng(seed)).radiance.copy()
     radiance[:420] = radiance[420:840]
     if board:
@@ -41,7 +43,9 @@ def landscape(seed: int, board: bool) -> np.ndarray:
 
 
 def acquisition(seed: int, board: bool) -> np.ndarray:
-    return to_uint16(acquire(scene_spectrum(landscape(seed, board)), SIDE, SENSOR, RATIO, Draw(seed), "degraded"))
+    return to_uint16(
+        acquire(scene_spectrum(landscape(seed, board)), SIDE, SENSOR, RATIO, Draw(seed), "degraded")
+    )
 
 
 @pytest.fixture(scope="module")
@@ -68,22 +72,31 @@ def test_the_profile_is_that_of_the_sensor(raw: tuple[Path, Path], tmp_path: Pat
     none = np.zeros((1, 1))
     for table, truth in (
         (sensor.response.at(FREQUENCIES[None], none)[0], transfer(FREQUENCIES, SENSOR.mtf_axes[0])),
-        (sensor.response.at(none, FREQUENCIES[:, None])[:, 0], transfer(FREQUENCIES, SENSOR.mtf_axes[1])),
+        (
+            sensor.response.at(none, FREQUENCIES[:, None])[:, 0],
+            transfer(FREQUENCIES, SENSOR.mtf_axes[1]),
+        ),
     ):
         assert table == pytest.approx(truth, rel=0.12)
     for radiance, snr in zip((25, 100), SNRS, strict=True):
         assert radiance / sensor.noise_sigma(radiance) == pytest.approx(snr, rel=0.1)
     assert (sensor.bits, sensor.gain_dn_per_radiance, profile.gsd_m.low) == (12, GAIN, 0.7)
     assert {profile.mtf_nyquist.status, profile.snr_pair[0].status} == {"measured"}
-    assert {profile.gain_dn_per_radiance.status, profile.bits.status, profile.gsd_m.status} == {"stated"}
+    assert {profile.gain_dn_per_radiance.status, profile.bits.status, profile.gsd_m.status} == {
+        "stated"
+    }
     done("characterise", *raw, *options, "--out", tmp_path / "again.toml")
     assert (tmp_path / "again.toml").read_bytes() == out.read_bytes()
     shown = valid(figures)["rows"][0]["figures"]
     truths = [100 * c for mtf in SENSOR.mtf_axes for c in transfer(FREQUENCIES, mtf)] + list(SNRS)
     assert {figure["mode"] for figure in shown.values()} == {"measured"}
     intervals = [figure["interval"] for figure in shown.values()][: len(truths)]
-    assert sum(low <= true <= high for (low, high), true in zip(intervals, truths, strict=True)) >= 6
-    assert f"95 % interval {intervals[6][0]:.3g} to {intervals[6][1]:.3g}" in out.read_text(encoding="utf-8")
+    assert (
+        sum(low <= true <= high for (low, high), true in zip(intervals, truths, strict=True)) >= 6
+    )
+    assert f"95 % interval {intervals[6][0]:.3g} to {intervals[6][1]:.3g}" in out.read_text(
+        encoding="utf-8"
+    )
 
 
 def transfer(frequencies: np.ndarray, mtf_nyquist: float) -> np.ndarray:
@@ -141,7 +154,9 @@ def test_the_mtf_may_be_stated(raw: tuple[Path, Path], tmp_path: Path) -> None:
     assert "assumption" not in said
 
 
-def test_steps_and_a_black_level_change_nothing_but_the_units(raw: tuple[Path, Path], tmp_path: Path) -> None:
+def test_steps_and_a_black_level_change_nothing_but_the_units(
+    raw: tuple[Path, Path], tmp_path: Path
+) -> None:
     """Ten bits stored in sixteen, above a pedestal: the noise above the dark is the same."""
     plain = characterise(raw, stated=Stated(bits=12, mtf=(0.1, 0.1)))
     folder = tmp_path / "frames"
@@ -165,7 +180,9 @@ def test_pairs_of_one_scene_give_the_noise_alone(tmp_path: Path) -> None:
     scene = np.linspace(300, 3000, 320)[:, None] + generator.normal(0, 40, (320, 320))
     for number in range(2):
         noisy = scene + generator.normal(size=scene.shape) * np.sqrt(0.5 * scene)
-        tifffile.imwrite(tmp_path / f"{number}.tif", np.clip(noisy.round(), 1, 4094).astype(np.uint16))
+        tifffile.imwrite(
+            tmp_path / f"{number}.tif", np.clip(noisy.round(), 1, 4094).astype(np.uint16)
+        )
     found = characterise([tmp_path], stated=Stated(bits=12, mtf=(0.1, 0.1)))
     assert found.noise.pairs == 1
     assert found.noise.model.at(1000).value == pytest.approx(500, rel=0.05)
@@ -189,16 +206,26 @@ def test_a_box_written_wrongly_is_refused(box: str, words: str) -> None:
 
 @pytest.mark.parametrize(
     ("box", "words"),
-    [("0,0,9999,20", "or more inside"), ("9,9,0,0", "or more inside"), ("2,2,30,40", "one straight edge")],
+    [
+        ("0,0,9999,20", "or more inside"),
+        ("9,9,0,0", "or more inside"),
+        ("2,2,30,40", "one straight edge"),
+    ],
 )
-def test_a_box_that_holds_no_edge_is_refused(raw: tuple[Path, Path], tmp_path: Path, box: str, words: str) -> None:
+def test_a_box_that_holds_no_edge_is_refused(
+    raw: tuple[Path, Path], tmp_path: Path, box: str, words: str
+) -> None:
     edge = "--edge", f"{raw[0]}:{box}"
-    assert words in refused("characterise", *raw, "--bits", 12, *edge, "--out", tmp_path / "mine.toml")
+    assert words in refused(
+        "characterise", *raw, "--bits", 12, *edge, "--out", tmp_path / "mine.toml"
+    )
     assert list(tmp_path.iterdir()) == []
 
 
 def tiff(folder: Path, pixels: np.ndarray) -> Path:
-    tifffile.imwrite(folder / "raw.tif", pixels, photometric="rgb" if pixels.ndim == 3 else "minisblack")
+    tifffile.imwrite(
+        folder / "raw.tif", pixels, photometric="rgb" if pixels.ndim == 3 else "minisblack"
+    )
     return folder / "raw.tif"
 
 
@@ -211,9 +238,17 @@ WRONG: dict[str, tuple[np.ndarray, tuple[str, ...], str]] = {
     "wide": (FLAT.astype(np.uint32) * 70, ("--bits", "16"), "from 0 to 65535"),
     "all missing": (np.full((200, 200), np.nan, np.float32), ("--bits", "12"), "unclipped"),
     "steps": (FLAT.astype(np.uint16) * 16 + 3, ("--bits", "16"), "divide it by 16"),
-    "black": (FLAT.astype(np.uint16), ("--bits", "12", "--black-level", "1500"), "below the images' median"),
+    "black": (
+        FLAT.astype(np.uint16),
+        ("--bits", "12", "--black-level", "1500"),
+        "below the images' median",
+    ),
     "mtf": (FLAT.astype(np.uint16), ("--bits", "12", "--mtf", "7"), "write 0.07 for 7 %"),
-    "three contrasts": (FLAT.astype(np.uint16), ("--bits", "12", "--mtf", "0.1,0.1,0.1"), "one or two ratios"),
+    "three contrasts": (
+        FLAT.astype(np.uint16),
+        ("--bits", "12", "--mtf", "0.1,0.1,0.1"),
+        "one or two ratios",
+    ),
     "open bits": (FLAT.astype(np.uint16), (), "--bits: expected --bits beside images"),
     "wrong bits": (FLAT.astype(np.uint16), ("--bits", "8"), "up to 255"),
     "gain": (FLAT.astype(np.uint16), ("--bits", "12", "--gain", "0"), "above 0"),
@@ -235,7 +270,9 @@ def test_wrong_input_is_one_sentence(case: str, tmp_path: Path) -> None:
 
 def test_one_image_twice_is_refused(raw: tuple[Path, Path], tmp_path: Path) -> None:
     """Its blocks would count twice, and the intervals would shrink for nothing."""
-    assert "twice" in refused("characterise", raw[0], raw[0], "--bits", 12, "--out", tmp_path / "mine.toml")
+    assert "twice" in refused(
+        "characterise", raw[0], raw[0], "--bits", 12, "--out", tmp_path / "mine.toml"
+    )
 
 
 def test_images_of_two_gains_are_refused(raw: tuple[Path, Path], tmp_path: Path) -> None:
@@ -268,13 +305,17 @@ def test_names_cannot_break_the_profile(raw: tuple[Path, Path], tmp_path: Path) 
     assert "quoted" in tomllib.loads(text)["description"]
 
 
-def test_the_noise_of_a_bound_is_a_profile_that_loads(raw: tuple[Path, Path], tmp_path: Path) -> None:
+def test_the_noise_of_a_bound_is_a_profile_that_loads(
+    raw: tuple[Path, Path], tmp_path: Path
+) -> None:
     """All noise in beta, or in alpha: decimals must not put the SNR beyond what physics allows."""
     found = characterise(raw, stated=Stated(bits=12))
     full_scale = 4095 / found.gain
     for dark in (math.sqrt(1 / 4), 1 / 4):
         bright = replace(found.snrs[1], radiance=full_scale / 4, value=100 / 3)
         low = replace(found.snrs[0], radiance=full_scale / 16, value=dark * 100 / 3)
-        (tmp_path / "mine.toml").write_text(profile_toml(replace(found, snrs=(low, bright))), encoding="utf-8")
+        (tmp_path / "mine.toml").write_text(
+            profile_toml(replace(found, snrs=(low, bright))), encoding="utf-8"
+        )
         sensor = load_sensor(str(tmp_path / "mine.toml")).nominal()
         assert min(sensor.alpha, sensor.beta) >= 0

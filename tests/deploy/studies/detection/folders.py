@@ -41,7 +41,8 @@ def text(path: Path, content: str) -> Path:
 def xml(objects: Sequence[Object], size_px: tuple[int, int] = SIZE_PX) -> str:
     """Pascal VOC: corners count pixels from 1."""
     entries = "".join(
-        f"<object><name>{name}</name><difficult>0</difficult><bndbox><xmin>{x1 + 1:g}</xmin><ymin>{y1 + 1:g}</ymin>"
+        f"<object><name>{name}</name><difficult>0</difficult>"
+        f"<bndbox><xmin>{x1 + 1:g}</xmin><ymin>{y1 + 1:g}</ymin>"
         f"<xmax>{x2:g}</xmax><ymax>{y2:g}</ymax></bndbox></object>"
         for name, x1, y1, x2, y2 in objects
     )
@@ -74,15 +75,30 @@ def dior(folder: Path, objects: dict[str, dict[str, list[Object]]]) -> Path:
 def coco(folder: Path) -> Path:
     """One file of JSON beside the images; its ids are in an order of their own."""
     names = sorted({box[0] for boxes in OBJECTS.values() for box in boxes})
-    content: dict[str, list[dict[str, object]]] = {"images": [], "annotations": [], "categories": []}
+    content: dict[str, list[dict[str, object]]] = {
+        "images": [],
+        "annotations": [],
+        "categories": [],
+    }
     content["categories"] = [{"id": 7 + i, "name": name} for i, name in enumerate(names)]
     for number, (stem, objects) in enumerate(sorted(OBJECTS.items(), reverse=True)):
         image(folder / f"{stem}.png")
-        entry = {"id": number, "file_name": f"{stem}.png", "height": SIZE_PX[0], "width": SIZE_PX[1]}
+        entry = {
+            "id": number,
+            "file_name": f"{stem}.png",
+            "height": SIZE_PX[0],
+            "width": SIZE_PX[1],
+        }
         content["images"].append(entry)
         for name, x1, y1, x2, y2 in objects:
-            row = {"id": len(content["annotations"]), "image_id": number, "bbox": [x1, y1, x2 - x1, y2 - y1]}
-            content["annotations"].append(row | {"category_id": 7 + names.index(name), "iscrowd": 0})
+            row = {
+                "id": len(content["annotations"]),
+                "image_id": number,
+                "bbox": [x1, y1, x2 - x1, y2 - y1],
+            }
+            content["annotations"].append(
+                row | {"category_id": 7 + names.index(name), "iscrowd": 0}
+            )
     text(folder / "labels.json", json.dumps(content))
     return folder
 
@@ -111,7 +127,8 @@ def labelled(folder: Path, count: int) -> Path:
         shown = Stretch(0, 4095 / full_scale.gain_dn_per_radiance).to_srgb(one.radiance(full_scale))
         Image.fromarray(np.rint(255 * shown).astype(np.uint8)).save(folder / f"s{number}x.png")
         boxes: list[Object] = [
-            (SPELT[c], *corners.tolist()) for c, corners in zip(one.truth.classes, one.truth.corners, strict=True)
+            (SPELT[c], *corners.tolist())
+            for c, corners in zip(one.truth.classes, one.truth.corners, strict=True)
         ]
         text(folder / f"s{number}x.xml", xml(boxes, (768, 768)))
     return folder

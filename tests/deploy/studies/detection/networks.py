@@ -56,16 +56,25 @@ def detector(
         {results} }}""")
     constants = {"answer": answer.astype(np.float32), "none": np.zeros(1, np.float32)}
     if cut is not None:
-        constants |= {"boxes": np.array([[[0, 0, 1, 1]]], np.float32), "scores": np.array([[[0.5]]], np.float32)}
+        constants |= {
+            "boxes": np.array([[[0, 0, 1, 1]]], np.float32),
+            "scores": np.array([[[0.5]]], np.float32),
+        }
         constants |= {"cut": np.array(cut, np.float32), "most": np.array([1])}
-    model.graph.initializer.extend(numpy_helper.from_array(value, name) for name, value in constants.items())
-    helper.set_model_props(model, {key: str(value) for key, value in given.items() if value is not None})
+    model.graph.initializer.extend(
+        numpy_helper.from_array(value, name) for name, value in constants.items()
+    )
+    helper.set_model_props(
+        model, {key: str(value) for key, value in given.items() if value is not None}
+    )
     onnx.save_model(model, path)
     return path
 
 
 def raw(*rows: tuple[float, ...], anchors: int = 20) -> np.ndarray:
-    """Centre, size and a score of each class, a row a box, as (1, 4 + classes, anchors); the rest is nothing."""
+    """Centre, size and a score of each class, a row a box, as (1, 4 + classes, anchors); the rest
+    is nothing.
+    """
     found = np.zeros((anchors, 4 + len(NAMES)), np.float32)
     found[: len(rows)] = np.reshape(rows, (-1, found.shape[1]))
     return found.T[None]

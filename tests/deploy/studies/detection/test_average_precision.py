@@ -1,4 +1,6 @@
-"""Scores of boxes are those of pycocotools, whatever the weights; intervals say no more than the sites allow."""
+"""Scores of boxes are those of pycocotools, whatever the weights; intervals say no more than the
+sites allow.
+"""
 
 import io
 from collections.abc import Sequence
@@ -45,31 +47,43 @@ def drawn(rng: np.random.Generator, count: int, ties: bool = False, ignored: flo
         again = rng.integers(0, max(len(truth), 1), int(rng.integers(0, 12)) if len(truth) else 0)
         near = truth.corners[again] + rng.normal(0, 1.5, (len(again), 4))
         near[:, 2:] = np.maximum(near[:, 2:], near[:, :2] + 1)
-        named = np.where(rng.random(len(again)) < 0.8, truth.classes[again], rng.integers(0, 3, len(again)))
+        named = np.where(
+            rng.random(len(again)) < 0.8, truth.classes[again], rng.integers(0, 3, len(again))
+        )
         false = boxes(rng, int(rng.integers(0, 6)))
         corners = np.vstack([near, false.corners])
         classes = np.concatenate([named, false.classes])
         passed = Boxes.of(truth.corners, truth.classes, ignored=rng.random(len(truth)) < ignored)
-        pairs.append((passed, Boxes.of(corners, classes, rng.random(len(corners)).round(1 if ties else 12))))
+        pairs.append(
+            (passed, Boxes.of(corners, classes, rng.random(len(corners)).round(1 if ties else 12)))
+        )
     return pairs
 
 
 def boxes(rng: np.random.Generator, count: int) -> Boxes:
     low = rng.uniform(0, 100, (count, 2))
-    return Boxes.of(np.hstack([low, low + rng.uniform(4, 60, (count, 2))]), rng.integers(0, 3, count))
+    return Boxes.of(
+        np.hstack([low, low + rng.uniform(4, 60, (count, 2))]), rng.integers(0, 3, count)
+    )
 
 
 def hits_of(pairs: Pairs, classes: int = len(NAMES)) -> Hits:
     return find_hits([truth for truth, _ in pairs], [found for _, found in pairs], classes)
 
 
-def scored(pairs: Pairs, names: Sequence[str] = ("ship",), confidence: float = np.nan) -> dict[str, float]:
-    figures = score(hits_of(pairs, len(names)), names, np.ones((1, len(pairs)), np.int64), confidence)
+def scored(
+    pairs: Pairs, names: Sequence[str] = ("ship",), confidence: float = np.nan
+) -> dict[str, float]:
+    figures = score(
+        hits_of(pairs, len(names)), names, np.ones((1, len(pairs)), np.int64), confidence
+    )
     return {name: float(values[0]) for name, values in figures.items()}
 
 
 def by_pycocotools(pairs: Pairs, size: str = "all") -> np.ndarray:
-    """Average precision by class and overlap, (3, 10), NaN where a class has no object: all of it by the library."""
+    """Average precision by class and overlap, (3, 10), NaN where a class has no object: all of it
+    by the library.
+    """
     with redirect_stdout(io.StringIO()):
         evaluation = COCOeval(_table([t for t, _ in pairs]), _table([f for _, f in pairs]), "bbox")
         evaluation.params.maxDets = [1000]
@@ -85,12 +99,19 @@ def by_pycocotools(pairs: Pairs, size: str = "all") -> np.ndarray:
 def _table(images: Sequence[Boxes]) -> COCO:
     rows: list[dict[str, object]] = []
     for number, each in enumerate(images):
-        for (left, top, right, bottom), kind, value, crowd in zip(*vars(each).values(), strict=True):
+        for (left, top, right, bottom), kind, value, crowd in zip(
+            *vars(each).values(), strict=True
+        ):
             box = [left, top, right - left, bottom - top]
             row = {"id": len(rows) + 1, "image_id": number, "category_id": int(kind), "bbox": box}
-            rows.append(row | {"area": box[2] * box[3], "score": float(value), "iscrowd": int(crowd)})
+            rows.append(
+                row | {"area": box[2] * box[3], "score": float(value), "iscrowd": int(crowd)}
+            )
     table = COCO()
-    numbers = {"images": [{"id": i} for i in range(len(images))], "categories": [{"id": c} for c in range(3)]}
+    numbers = {
+        "images": [{"id": i} for i in range(len(images))],
+        "categories": [{"id": c} for c in range(3)],
+    }
     table.dataset = {**numbers, "annotations": rows}
     table.createIndex()
     return table
@@ -98,11 +119,16 @@ def _table(images: Sequence[Boxes]) -> COCO:
 
 @settings(max_examples=60)
 @given(SEEDS, st.integers(1, 8), st.booleans(), st.sampled_from(list(SIZES_PX)))
-def test_average_precision_is_that_of_pycocotools(seed: int, count: int, ties: bool, size: str) -> None:
+def test_average_precision_is_that_of_pycocotools(
+    seed: int, count: int, ties: bool, size: str
+) -> None:
     pairs = drawn(np.random.default_rng(seed), count, ties)
     weights = np.ones((1, count), np.int64)
     number = list(SIZES_PX).index(size)
-    ours = [precisions(hits_of(pairs), kind, weights, number, 10)[0].mean(axis=-1) for kind in range(len(NAMES))]
+    ours = [
+        precisions(hits_of(pairs), kind, weights, number, 10)[0].mean(axis=-1)
+        for kind in range(len(NAMES))
+    ]
     np.testing.assert_allclose(ours, by_pycocotools(pairs, size), rtol=0, atol=1e-12)
 
 
@@ -117,14 +143,18 @@ def test_a_weight_is_as_good_as_so_many_copies(seed: int, weights: list[int]) ->
         return
     expected = by_pycocotools(copies)
     np.testing.assert_allclose(found["mAP50"], mean_known(expected[:, :1]), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(found["mAP50-95"], mean_known(expected.mean(axis=1))[None], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        found["mAP50-95"], mean_known(expected.mean(axis=1))[None], rtol=0, atol=1e-12
+    )
     for name, value in scored(copies, NAMES, 0.5).items():
         np.testing.assert_allclose(found[name][0], value, rtol=0, atol=1e-12, err_msg=name)
 
 
 @settings(max_examples=30)
 @given(SEEDS, st.sampled_from([0.0, 0.137, 0.5, 0.9, 1.0]))
-def test_precision_and_recall_are_those_of_what_is_left_at_a_confidence(seed: int, confidence: float) -> None:
+def test_precision_and_recall_are_those_of_what_is_left_at_a_confidence(
+    seed: int, confidence: float
+) -> None:
     pairs = drawn(np.random.default_rng(seed), 5)
     figures = scored(pairs, NAMES, confidence)
     left = hits_of([(truth, found[found.scores >= confidence]) for truth, found in pairs])
@@ -138,7 +168,9 @@ def test_precision_and_recall_are_those_of_what_is_left_at_a_confidence(seed: in
             precision.append(true / counted if counted else 1.0)
             recall.append(true / objects)
     expected = (np.mean(precision), np.mean(recall)) if recall else (np.nan, np.nan)
-    np.testing.assert_allclose((figures["precision"], figures["recall"]), expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        (figures["precision"], figures["recall"]), expected, rtol=0, atol=1e-12
+    )
 
 
 def test_each_object_is_found_once_by_the_surest_box_of_its_class() -> None:
@@ -157,12 +189,17 @@ def test_perfect_boxes_score_one_and_none_score_nothing() -> None:
     perfect = scored([(truth, truth) for truth, _ in pairs], NAMES, 0.5)
     assert {value for name, value in perfect.items() if name != "own confidence"} == {1.0}
     nothing = scored([(truth, Boxes.of([], [])) for truth, _ in pairs], NAMES, 0.5)
-    assert {name: value for name, value in nothing.items() if value} == {"precision": 1.0, "own precision": 1.0}
+    assert {name: value for name, value in nothing.items() if value} == {
+        "precision": 1.0,
+        "own precision": 1.0,
+    }
 
 
 def test_sizes_are_told_apart_by_the_root_of_the_area() -> None:
     sides = (15.99, 16.0, 31.99, 32.0)
-    found = Boxes.of([[0, 100.0 * i, side, 100.0 * i + side] for i, side in enumerate(sides)], [0] * 4)
+    found = Boxes.of(
+        [[0, 100.0 * i, side, 100.0 * i + side] for i, side in enumerate(sides)], [0] * 4
+    )
     assert hits_of([(found, found)], 1).objects.sum(axis=(1, 2)).tolist() == [4, 1, 2, 1]
 
 
@@ -177,7 +214,9 @@ def test_own_confidence_is_that_of_the_best_mean_f1() -> None:
 
 def test_every_row_is_read_at_the_first_one_s_confidence() -> None:
     pairs = drawn(np.random.default_rng(7), 10)
-    halved = [(truth, Boxes.of(found.corners, found.classes, found.scores / 2)) for truth, found in pairs]
+    halved = [
+        (truth, Boxes.of(found.corners, found.classes, found.scores / 2)) for truth, found in pairs
+    ]
     rows = {"reference": hits_of(pairs), "halved": hits_of(halved)}
     figures, confidence = score_rows(rows, NAMES, site_weights(list("abcdefghij"), 0, 5))
     assert confidence == scored(pairs, NAMES)["own confidence"]
@@ -195,7 +234,9 @@ def test_a_draw_takes_whole_sites_and_a_seed_gives_the_same_draws() -> None:
 
 
 def test_a_class_that_no_site_of_a_draw_holds_drops_out() -> None:
-    pairs = [(Boxes.of(ONE, [0]), Boxes.of(ONE, [0]))] * 3 + [(Boxes.of(ONE, [1]), Boxes.of([], []))] * 2
+    pairs = [(Boxes.of(ONE, [0]), Boxes.of(ONE, [0]))] * 3 + [
+        (Boxes.of(ONE, [1]), Boxes.of([], []))
+    ] * 2
     figures = score(hits_of(pairs, 2), ("ship", "tank"), site_weights(list("abcde"), 0, 400))
     assert set(figures["mAP50"]) == {0.0, 0.5, 1.0}
     assert 0 < np.isnan(figures["mAP50 of tank"]).sum() < 400

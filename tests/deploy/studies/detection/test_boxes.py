@@ -35,7 +35,9 @@ def test_an_overlap_is_that_of_the_pixels_they_cover(seed: int) -> None:
 def test_suppression_leaves_the_best_of_each_cluster(seed: int) -> None:
     rng = np.random.default_rng(seed)
     found = Boxes.of(
-        drawn(rng, 20).repeat(4, axis=0) + rng.uniform(0, 3, (80, 4)), rng.integers(0, 2, 80), rng.random(80)
+        drawn(rng, 20).repeat(4, axis=0) + rng.uniform(0, 3, (80, 4)),
+        rng.integers(0, 2, 80),
+        rng.random(80),
     )
     kept = suppress(found)
     assert (np.diff(kept.scores) <= 0).all()
@@ -43,12 +45,16 @@ def test_suppression_leaves_the_best_of_each_cluster(seed: int) -> None:
     assert (iou(kept.corners, kept.corners)[same & ~np.eye(len(kept), dtype=bool)] <= OVERLAP).all()
     dropped = found[~np.isin(found.scores, kept.scores)]
     assert len(dropped) + len(kept) == 80
-    better = (iou(dropped.corners, kept.corners) > OVERLAP) & (dropped.scores[:, None] < kept.scores[None, :])
+    better = (iou(dropped.corners, kept.corners) > OVERLAP) & (
+        dropped.scores[:, None] < kept.scores[None, :]
+    )
     assert (better & (dropped.classes[:, None] == kept.classes[None, :])).any(axis=1).all()
 
 
 def test_suppression_keeps_the_best_and_no_more_than_300() -> None:
-    apart = Boxes.of([[10.0 * i, 0, 10.0 * i + 5, 5] for i in range(320)], [0] * 320, np.linspace(0.1, 0.9, 320))
+    apart = Boxes.of(
+        [[10.0 * i, 0, 10.0 * i + 5, 5] for i in range(320)], [0] * 320, np.linspace(0.1, 0.9, 320)
+    )
     assert suppress(apart).scores.tolist() == apart.scores[::-1][:300].tolist()
     assert len(suppress(Boxes.of([], []))) == 0
 
@@ -69,7 +75,9 @@ def test_the_letterbox_takes_a_box_there_and_back(height: int, width: int, eight
 
 @settings(max_examples=25)
 @given(SIDES, SIDES, st.integers(3, 8))
-def test_pixels_go_where_the_letterbox_takes_their_box(height: int, width: int, eighths: int) -> None:
+def test_pixels_go_where_the_letterbox_takes_their_box(
+    height: int, width: int, eighths: int
+) -> None:
     """Of an image whose pixels say where they are."""
     height = 3 * height + 40
     width = 3 * width + 41
@@ -97,8 +105,12 @@ def test_an_image_of_which_nothing_would_be_left_is_refused() -> None:
 
 
 def test_what_is_mostly_outside_is_ignored_and_what_is_outside_is_none() -> None:
-    corners = np.array([[-8, 0, 2, 10], [-5, 0, 5, 10], [-20, 0, -10, 10], [95, 95, 120, 105], [10, 10, 20, 20]])
-    found = Boxes.of(corners, range(5), ignored=[False, False, False, False, True]).clipped(100, 100)
+    corners = np.array(
+        [[-8, 0, 2, 10], [-5, 0, 5, 10], [-20, 0, -10, 10], [95, 95, 120, 105], [10, 10, 20, 20]]
+    )
+    found = Boxes.of(corners, range(5), ignored=[False, False, False, False, True]).clipped(
+        100, 100
+    )
     assert found.classes.tolist() == [0, 1, 3, 4]
     assert found.ignored.tolist() == [True, False, True, True]
     assert found.corners[:2].tolist() == [[0, 0, 2, 10], [0, 0, 5, 10]]

@@ -1,4 +1,6 @@
-"""`beers-deploy detect` from options to a page: on drawn scenes, on a labelled folder, and on what is refused."""
+"""`beers-deploy detect` from options to a page: on drawn scenes, on a labelled folder, and on what
+is refused.
+"""
 
 from pathlib import Path
 
@@ -13,10 +15,14 @@ pytestmark = pytest.mark.slow
 
 
 def document(path: Path) -> dict[str, dict[str, dict[str, float]]]:
-    """Values by table, row and figure, of a document that the schema takes; 0 where there is none."""
+    """Values by table, row and figure, of a document that the schema takes; 0
+    where there is none.
+    """
     tables: dict[str, dict[str, dict[str, float]]] = {}
     for row in valid(path)["rows"]:
-        tables.setdefault(row["table"], {})[row["name"]] = {k: f["value"] or 0.0 for k, f in row["figures"].items()}
+        tables.setdefault(row["table"], {})[row["name"]] = {
+            k: f["value"] or 0.0 for k, f in row["figures"].items()
+        }
     return tables
 
 
@@ -25,10 +31,22 @@ MAP = ("--classes", "Motor-Car=vehicle,Storage tank=tank")
 
 
 def test_synthetic_scenes_and_the_same_as_pictures_score_alike(tmp_path: Path) -> None:
-    """Reading, class names, labels and sites lead to what the scenes lead to, but for 8 bits and the clip."""
+    """Reading, class names, labels and sites lead to what the scenes lead to, but for 8 bits and
+    the clip.
+    """
     done("detect", *SMALL, "--drawn", 2, "--out", tmp_path / "a", "--json", tmp_path / "a.json")
     folder = labelled(tmp_path / "pictures", 2)
-    done("detect", *SMALL, "--images", folder, *MAP, "--out", tmp_path / "b", "--json", tmp_path / "b.json")
+    done(
+        "detect",
+        *SMALL,
+        "--images",
+        folder,
+        *MAP,
+        "--out",
+        tmp_path / "b",
+        "--json",
+        tmp_path / "b.json",
+    )
     tables, others = (document(tmp_path / name) for name in ("a.json", "b.json"))
     one, other = (each["detection, dior-medium"] for each in (tables, others))
     assert one["reference"]["mAP50"] > 50
@@ -44,8 +62,18 @@ def test_synthetic_scenes_and_the_same_as_pictures_score_alike(tmp_path: Path) -
 
 def test_dior_s_tree_is_read_and_nothing_in_it_is_written_over(tmp_path: Path) -> None:
     boxes: list[Object] = [("vehicle", 4, 4, 20, 12), ("storagetank", 30, 10, 50, 30)]
-    folder = dior(tmp_path / "dior", {"test": {"00001": boxes, "00002": boxes[:1]}, "val": {"00003": boxes}})
-    command = [*SMALL, "--images", folder, "--classes", "storagetank=tank", "--out", tmp_path / "out"]
+    folder = dior(
+        tmp_path / "dior", {"test": {"00001": boxes, "00002": boxes[:1]}, "val": {"00003": boxes}}
+    )
+    command = [
+        *SMALL,
+        "--images",
+        folder,
+        "--classes",
+        "storagetank=tank",
+        "--out",
+        tmp_path / "out",
+    ]
     done("detect", *command, "--json", tmp_path / "found.json")
     inputs = [each["name"] for each in valid(tmp_path / "found.json")["inputs"]]
     assert inputs == ["detector.onnx", "00001.jpg", "00002.jpg"]

@@ -1,4 +1,6 @@
-"""Files of both layouts give the boxes that they answer, on the image; any other file is refused by one sentence."""
+"""Files of both layouts give the boxes that they answer, on the image; any other file is refused by
+one sentence.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -52,7 +54,9 @@ def test_the_size_is_the_file_s_or_the_one_asked_for(tmp_path: Path) -> None:
     sizes: list[object] = [None, [64, 96], [[], []], "wide"]
     for stated in sizes:
         unsaid = detector(tmp_path / "c.onnx", answer, size_px="side", imgsz=stated)
-        with pytest.raises(OptionError, match=r"the side of the detector's square input in px, got .*; say it"):
+        with pytest.raises(
+            OptionError, match=r"the side of the detector's square input in px, got .*; say it"
+        ):
             open_detector(unsaid, 1)
 
 
@@ -64,9 +68,17 @@ def test_the_size_is_the_file_s_or_the_one_asked_for(tmp_path: Path) -> None:
         (raw((1, 1, 1, 1, 0.5, 0)), {"names": "__import__('os')"}, "the names of its classes"),
         (raw((1, 1, 1, 1, 0.5, 0)), {"names": "(" * 9000}, "the names of its classes"),
         (raw((1, 1, 1, 1, 0.5, 0)), {"task": "segment"}, "task segment, "),
-        (raw((1, 1, 1, 1, 0.5, 0)), {"channels": 1}, r"for RGB, 1 x 6 x anchors .* got task detect, 1 channels"),
+        (
+            raw((1, 1, 1, 1, 0.5, 0)),
+            {"channels": 1},
+            r"for RGB, 1 x 6 x anchors .* got task detect, 1 channels",
+        ),
         (raw((1, 1, 1, 1, 0.5, 0)), {"outputs": 3}, r"output 1 x 6 x 20, 1 x 6 x 20, 1 x 6 x 20"),
-        (np.zeros((1, 20, 7)), {}, r"1 x 6 x anchors for 2 classes \(raw\) or 1 x N x 6 .* output 1 x 20 x 7"),
+        (
+            np.zeros((1, 20, 7)),
+            {},
+            r"1 x 6 x anchors for 2 classes \(raw\) or 1 x N x 6 .* output 1 x 20 x 7",
+        ),
         (np.zeros((1, 20, 6, 1)), {}, "output 1 x 20 x 6 x 1"),
         (np.zeros((4, 300, 6)), {}, "output 4 x 300 x 6"),
     ],
@@ -85,12 +97,17 @@ UNSOUND = [
     (final((1, 1, 2, 2, 0.5, 2)), "classes from 0 to 1 in its sixth column"),
     (final((1, 1, 2, 2, 0.5, 0.5)), "classes from 0 to 1 in its sixth column"),
     *((raw((value, 1, 1, 1, 0.5, 0)), "got NaN or infinity") for value in (np.nan, np.inf)),
-    *((np.zeros(sizes), "an answer of the sizes that its file") for sizes in ((1, 7, 20), (2, 6, 20), (6, 20), (0,))),
+    *(
+        (np.zeros(sizes), "an answer of the sizes that its file")
+        for sizes in ((1, 7, 20), (2, 6, 20), (6, 20), (0,))
+    ),
 ]
 
 
 @pytest.mark.parametrize(("answer", "sentence"), UNSOUND)
-def test_an_answer_that_is_no_detection_is_refused(answer: np.ndarray, sentence: str, tmp_path: Path) -> None:
+def test_an_answer_that_is_no_detection_is_refused(
+    answer: np.ndarray, sentence: str, tmp_path: Path
+) -> None:
     layout = final() if answer.shape[-1:] == (6,) else raw()
     opened = open_detector(detector(tmp_path / "a.onnx", layout), 1)
     with pytest.raises(ModelError, match=sentence):
@@ -120,9 +137,19 @@ def test_another_text_is_refused(text: str) -> None:
 @pytest.mark.parametrize(
     ("labelled", "detector", "given", "sentence"),
     [
-        (("Tree",), ("ship", "tank"), {}, r"a labelled class that the detector knows \(ship, tank\), got Tree; say"),
+        (
+            ("Tree",),
+            ("ship", "tank"),
+            {},
+            r"a labelled class that the detector knows \(ship, tank\), got Tree; say",
+        ),
         (("car",), ("ship",), {"van": "ship"}, r"one of the labelled classes \(car\), got 'van'"),
-        (("car",), ("ship",), {"car": "boat"}, r"one of the detector's classes \(ship\), got 'boat'"),
+        (
+            ("car",),
+            ("ship",),
+            {"car": "boat"},
+            r"one of the detector's classes \(ship\), got 'boat'",
+        ),
         (("ship",), ("Ship", "ship"), {}, "classes told apart by their letters"),
     ],
 )

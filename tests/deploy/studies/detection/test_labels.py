@@ -1,4 +1,6 @@
-"""Every layout gives the same boxes of the same labels; what none of them is, is refused by one sentence."""
+"""Every layout gives the same boxes of the same labels; what none of them is, is refused by one
+sentence.
+"""
 
 import json
 import sys
@@ -11,7 +13,17 @@ import pytest
 from beers_deploy.profiles.errors import ImageError, MachineError, OptionError
 from beers_deploy.studies.detection.detector import class_numbers
 from beers_deploy.studies.detection.labels import LabelledSet, read_labelled, yolo_names
-from tests.deploy.studies.detection.folders import OBJECTS, Object, coco, dior, image, text, voc, xml, yolo
+from tests.deploy.studies.detection.folders import (
+    OBJECTS,
+    Object,
+    coco,
+    dior,
+    image,
+    text,
+    voc,
+    xml,
+    yolo,
+)
 
 LAYOUTS: dict[str, Callable[[Path], Path]] = {"voc": voc, "coco": coco, "yolo": yolo}
 LAYOUTS["dior"] = lambda folder: dior(folder, {"test": OBJECTS})
@@ -22,7 +34,8 @@ SHIP = xml([("ship", 2, 3, 12, 9)])
 def boxes_of(found: LabelledSet) -> dict[str, list[tuple[object, ...]]]:
     return {
         path.stem: [
-            (found.names[c], *corners.round(9)) for c, corners in zip(truth.classes, truth.corners, strict=True)
+            (found.names[c], *corners.round(9))
+            for c, corners in zip(truth.classes, truth.corners, strict=True)
         ]
         for path, truth in found.images
     }
@@ -82,8 +95,12 @@ def test_a_split_that_is_not_there_is_named_with_those_that_are(tmp_path: Path) 
         read_labelled(voc(tmp_path / "plain"), split="test")
     text(folder / "ImageSets" / "Main" / "test.txt", "00001\n00777\n")
     refused(folder, "1 of 2 missing, the first '00777'")
-    with pytest.raises(OptionError, match=r"numbers as xmin, ymin, xmax, ymax of a .* got 'none none none none'"):
-        read_labelled(folder / "JPEGImages-test", folder / "Annotations" / "Oriented Bounding Boxes")
+    with pytest.raises(
+        OptionError, match=r"numbers as xmin, ymin, xmax, ymax of a .* got 'none none none none'"
+    ):
+        read_labelled(
+            folder / "JPEGImages-test", folder / "Annotations" / "Oriented Bounding Boxes"
+        )
 
 
 def test_the_four_photographs_are_read_with_their_boxes(shared_data: Path) -> None:
@@ -92,27 +109,39 @@ def test_the_four_photographs_are_read_with_their_boxes(shared_data: Path) -> No
         pytest.skip("no folder shared/data/detection beside the repository")
     found = read_labelled(folder)
     classes = np.concatenate([truth.classes for _, truth in found.images])
-    assert [int((classes == found.names.index(name)).sum()) for name in ("car", "minibus", "Tree")] == [108, 3, 61]
+    assert [
+        int((classes == found.names.index(name)).sum()) for name in ("car", "minibus", "Tree")
+    ] == [108, 3, 61]
     assert found.images[0][1].corners[0].tolist() == [160.0, 97.0, 182.0, 138.0]
     assert found.notes == []
 
 
-def test_without_labels_a_yolo_image_shows_nothing_and_a_voc_image_is_refused(tmp_path: Path) -> None:
+def test_without_labels_a_yolo_image_shows_nothing_and_a_voc_image_is_refused(
+    tmp_path: Path,
+) -> None:
     folder = yolo(tmp_path / "yolo")
     image(folder / "images" / "val" / "00003.png")
     found = read_labelled(folder)
     assert boxes_of(found)["00003"] == []
     assert found.notes == ["Images without a labelled object, all found there is false: 1 of 3."]
     image(voc(tmp_path / "voc") / "00003.png")
-    refused(tmp_path / "voc", r"a file of labels for every image, got 1 of 3 missing, the first 00003\.xml")
+    refused(
+        tmp_path / "voc",
+        r"a file of labels for every image, got 1 of 3 missing, the first 00003\.xml",
+    )
 
 
 def test_boxes_outside_or_without_area_are_left_out_and_told(tmp_path: Path) -> None:
     image(tmp_path / "a.png")
-    text(tmp_path / "a.xml", xml([("ship", 5, 5, 9, 9), ("ship", 70, 5, 90, 9), ("ship", 9, 9, 9, 20)]))
+    text(
+        tmp_path / "a.xml",
+        xml([("ship", 5, 5, 9, 9), ("ship", 70, 5, 90, 9), ("ship", 9, 9, 9, 20)]),
+    )
     found = read_labelled(tmp_path)
     assert boxes_of(found)["a"] == [("ship", 5, 5, 9, 9)]
-    assert found.notes == ["Boxes left out, without area inside their image: 2, the first in a.xml."]
+    assert found.notes == [
+        "Boxes left out, without area inside their image: 2, the first in a.xml."
+    ]
 
 
 def test_labels_of_an_image_of_another_size_are_refused(tmp_path: Path) -> None:
@@ -124,8 +153,14 @@ def test_labels_of_an_image_of_another_size_are_refused(tmp_path: Path) -> None:
     ("make", "sentence"),
     [
         (lambda folder: image(folder / "a.png"), "labels as VOC .* got none beside the images"),
-        (lambda folder: text(image(folder / "a.png").with_name("b.xml"), xml([])), "got none named as one of"),
-        (lambda folder: text(image(folder / "a.png").with_name("a.xml"), xml([])), "got none on 1 images"),
+        (
+            lambda folder: text(image(folder / "a.png").with_name("b.xml"), xml([])),
+            "got none named as one of",
+        ),
+        (
+            lambda folder: text(image(folder / "a.png").with_name("a.xml"), xml([])),
+            "got none on 1 images",
+        ),
         (lambda folder: folder, "a folder of images, got no image in it"),
         (
             lambda folder: text(text(coco(folder) / "b.json", "{}"), "{}"),
@@ -143,7 +178,10 @@ def test_a_folder_without_labelled_images_is_refused(
 
 def test_a_missing_folder_or_file_of_labels_is_refused(tmp_path: Path) -> None:
     folder = voc(tmp_path)
-    for given, sentence in ((tmp_path / "none", "got no such folder"), (folder / "00001.xml", "got another file")):
+    for given, sentence in (
+        (tmp_path / "none", "got no such folder"),
+        (folder / "00001.xml", "got another file"),
+    ):
         with pytest.raises(OptionError, match=sentence):
             read_labelled(folder, given)
 
@@ -161,7 +199,9 @@ def test_a_missing_folder_or_file_of_labels_is_refused(tmp_path: Path) -> None:
         ('<?xml version="1.0" encoding="klingon"?>' + SHIP, "expected plain XML"),
     ],
 )
-def test_a_faulty_voc_file_is_refused_by_a_sentence(content: str, sentence: str, tmp_path: Path) -> None:
+def test_a_faulty_voc_file_is_refused_by_a_sentence(
+    content: str, sentence: str, tmp_path: Path
+) -> None:
     text(image(tmp_path / "a.png").with_name("a.xml"), content)
     refused(tmp_path, sentence)
 
@@ -178,7 +218,11 @@ def test_a_huge_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
     [
         ("labels/val/00001.txt", "0 0.5 0.5 0.1", "YOLO's 'class cx cy w h'"),
         ("labels/val/00001.txt", "0 30 20 10 10", "coordinates as shares of the image, 0 to 1"),
-        ("labels/val/00001.txt", "2 0.5 0.5 0.1 0.1", "a class from 0 to 1, of which there is a name, got 2"),
+        (
+            "labels/val/00001.txt",
+            "2 0.5 0.5 0.1 0.1",
+            "a class from 0 to 1, of which there is a name, got 2",
+        ),
         ("labels/val/00001.txt", "0.5 0.5 0.5 0.1 0.1", "a class from 0 to 1"),
         ("labels/val/00001.txt", "ship 0.5 0.5 0.1 0.1", "numbers as class and coordinates"),
         ("data.yaml", "names: {0: ship, 2: tank}", "names: a list, or a table by number from 0"),
@@ -190,7 +234,9 @@ def test_a_huge_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
         ("data.yaml", "names: [" + "ab, " * 20000 + "]", "more than 65536 bytes"),
     ],
 )
-def test_a_faulty_text_is_refused_by_a_sentence(name: str, content: str, sentence: str, tmp_path: Path) -> None:
+def test_a_faulty_text_is_refused_by_a_sentence(
+    name: str, content: str, sentence: str, tmp_path: Path
+) -> None:
     text(yolo(tmp_path) / name, content)
     refused(tmp_path, sentence)
 
@@ -209,7 +255,9 @@ def test_names_stand_in_a_list_a_table_or_lines(tmp_path: Path) -> None:
     assert yolo_names([tmp_path / "none", tmp_path / "c"]) == ("ship", "tank")
 
 
-def test_without_pyyaml_it_is_said_how_to_do_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pyyaml_it_is_said_how_to_do_without(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "yaml", None)
     with pytest.raises(MachineError, match=r"beers-deploy\[detect\]', or write classes.txt"):
         read_labelled(yolo(tmp_path))
@@ -220,10 +268,19 @@ def test_without_pyyaml_it_is_said_how_to_do_without(tmp_path: Path, monkeypatch
     [
         ({"images": None}, "got TypeError: 'NoneType'"),
         ({"annotations": [5]}, "got TypeError: 'int'"),
-        ({"annotations": [{"image_id": 9, "category_id": 7, "bbox": [0, 0, 1, 1]}]}, "got KeyError: 9"),
-        ({"annotations": [{"image_id": [], "category_id": 7, "bbox": [0, 0, 1, 1]}]}, "got TypeError: "),
+        (
+            {"annotations": [{"image_id": 9, "category_id": 7, "bbox": [0, 0, 1, 1]}]},
+            "got KeyError: 9",
+        ),
+        (
+            {"annotations": [{"image_id": [], "category_id": 7, "bbox": [0, 0, 1, 1]}]},
+            "got TypeError: ",
+        ),
         ({"categories": [{"id": 7, "name": 5}]}, "got TypeError: "),
-        ({"images": [{"id": 0, "file_name": "../../etc/passwd"}]}, "its images in .* got none of 1"),
+        (
+            {"images": [{"id": 0, "file_name": "../../etc/passwd"}]},
+            "its images in .* got none of 1",
+        ),
         ({"images": [{"id": 0, "file_name": "/etc/passwd"}]}, "its images in .* got none of 1"),
     ],
 )
@@ -238,7 +295,9 @@ def test_a_faulty_coco_file_is_refused_by_a_sentence(
     refused(tmp_path, sentence)
 
 
-def test_what_coco_lists_and_the_folder_lacks_is_told_and_a_crowd_need_not_be_found(tmp_path: Path) -> None:
+def test_what_coco_lists_and_the_folder_lacks_is_told_and_a_crowd_need_not_be_found(
+    tmp_path: Path,
+) -> None:
     path = coco(tmp_path) / "labels.json"
     content = json.loads(path.read_text())
     content["annotations"][-1]["iscrowd"] = 1

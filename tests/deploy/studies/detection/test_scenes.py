@@ -1,4 +1,6 @@
-"""Synthetic scenes: the boxes are the objects' own pixels, the sizes are those of real ones, the seed decides all."""
+"""Synthetic scenes: the boxes are the objects' own pixels, the sizes are those of real ones, the
+seed decides all.
+"""
 
 import math
 from collections.abc import Callable
@@ -23,7 +25,12 @@ from beers_deploy.studies.detection.scenes import (
     vehicle,
 )
 
-SHAPES: list[Callable[[np.random.Generator], list[Part]]] = [vehicle, ship, aircraft, lambda g: tank(9.0, g)]
+SHAPES: list[Callable[[np.random.Generator], list[Part]]] = [
+    vehicle,
+    ship,
+    aircraft,
+    lambda g: tank(9.0, g),
+]
 Scene = tuple[np.ndarray, Boxes]
 LONGEST_M = {"vehicle": 14.2, "ship": 71, "aircraft": 46, "tank": 31}
 
@@ -69,12 +76,18 @@ def test_every_object_lies_within_and_has_the_size_of_its_kind(scenes: list[Scen
         sides_m = (truth.corners[:, 2:] - truth.corners[:, :2]) * SCENE_GSD_M
         assert (sides_m.max(1) >= 1.5).all()
         for kind, name in enumerate(CLASSES):
-            assert sides_m[truth.classes == kind].max(initial=0) <= LONGEST_M[name] + 2 * SCENE_GSD_M
-    assert np.all(sum(np.bincount(truth.classes, minlength=len(CLASSES)) for _, truth in scenes) >= 10)
+            assert (
+                sides_m[truth.classes == kind].max(initial=0) <= LONGEST_M[name] + 2 * SCENE_GSD_M
+            )
+    assert np.all(
+        sum(np.bincount(truth.classes, minlength=len(CLASSES)) for _, truth in scenes) >= 10
+    )
 
 
 def test_the_seed_decides_all() -> None:
-    one, same, other = (synthetic_scene(np.random.default_rng(seed), 300, 300) for seed in (4, 4, 5))
+    one, same, other = (
+        synthetic_scene(np.random.default_rng(seed), 300, 300) for seed in (4, 4, 5)
+    )
     np.testing.assert_array_equal(one[0], same[0])
     np.testing.assert_array_equal(one[1].corners, same[1].corners)
     assert one[0].tobytes() != other[0].tobytes()

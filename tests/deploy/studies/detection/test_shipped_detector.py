@@ -1,4 +1,6 @@
-"""The shipped detector: it is what its recipe says, finds what is drawn, and stays itself in INT8."""
+"""The shipped detector: it is what its recipe says, finds what is drawn, and
+stays itself in INT8.
+"""
 
 from functools import cache
 from pathlib import Path
@@ -32,9 +34,14 @@ def pictures() -> list[Picture]:
 def score(int8: bool) -> float:
     """mAP50 on the pictures."""
     detector = open_detector(DETECTOR_INT8 if int8 else DETECTOR, 1)
-    found = [detector.detect((picture.image.astype(np.float32) / 255).transpose(1, 2, 0)) for picture in pictures()]
+    found = [
+        detector.detect((picture.image.astype(np.float32) / 255).transpose(1, 2, 0))
+        for picture in pictures()
+    ]
     truths = [Boxes.of(picture.corners, picture.classes) for picture in pictures()]
-    return float(map50(find_hits(truths, found, len(CLASSES)), np.ones((1, len(truths)), np.int64))[0])
+    return float(
+        map50(find_hits(truths, found, len(CLASSES)), np.ones((1, len(truths)), np.int64))[0]
+    )
 
 
 @pytest.mark.parametrize("path", [DETECTOR, DETECTOR_INT8])

@@ -1,4 +1,6 @@
-"""A study with a detector that finds what is bright: where its boxes lie, what follows of it, and what is shown."""
+"""A study with a detector that finds what is bright: where its boxes lie, what follows of it, and
+what is shown.
+"""
 
 from dataclasses import replace
 
@@ -23,7 +25,14 @@ from beers_deploy.studies.detection.study import (
     SensorPair,
     acquired,
 )
-from beers_deploy.studies.detection.tables import GAIN, LOSS, NO_LOSS, REGAINED, detection_rows, headline
+from beers_deploy.studies.detection.tables import (
+    GAIN,
+    LOSS,
+    NO_LOSS,
+    REGAINED,
+    detection_rows,
+    headline,
+)
 from beers_deploy.studies.evaluation.methods import Method
 
 GROUND = 20.0
@@ -37,7 +46,9 @@ def sensors(name: str = "dior-medium", ratio: int = 3) -> SensorPair:
     return SensorPair(degraded, reference_for(degraded))
 
 
-def scene(corners: tuple[int, int, int, int], height: int = 150, width: int = 210, name: str = "a") -> LabelledScene:
+def scene(
+    corners: tuple[int, int, int, int], height: int = 150, width: int = 210, name: str = "a"
+) -> LabelledScene:
     radiance, (x1, y1, x2, y2) = np.full((height, width), GROUND, np.float32), corners
     radiance[y1:y2, x1:x2] = SHIP
     return LabelledScene(name, name, Boxes.of([corners], [0]), None, lambda _: radiance)
@@ -58,7 +69,9 @@ def bright(image: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("ratio", [2, 3, 4])
 @pytest.mark.parametrize("corners", [(24, 36, 84, 72), (60, 12, 96, 120), (131, 85, 190, 133)])
-def test_boxes_come_back_to_where_the_object_lies(ratio: int, corners: tuple[int, int, int, int]) -> None:
+def test_boxes_come_back_to_where_the_object_lies(
+    ratio: int, corners: tuple[int, int, int, int]
+) -> None:
     seen = AcquiredScene(scene(corners, 149, 211), sensors(ratio=ratio), Draw(0))
     found = seen.boxes(Detector(NAMES, 128, "", bright), None)
     assert iou(found.corners, np.array([corners], float))[0, 0] > 0.75
@@ -70,7 +83,10 @@ def test_all_rows_are_shown_under_the_stretch_of_the_reference() -> None:
     seen = AcquiredScene(scene((60, 60, 110, 100)), sensors("dior-high"), Draw(0))
     assert seen.degraded.shape == seen.reference.shape == (50, 70)
     shown = stretch_of(seen.reference)
-    for dn, method in ((seen.reference, None), (seen.degraded, Method("degraded", lambda dn: dn, "known"))):
+    for dn, method in (
+        (seen.reference, None),
+        (seen.degraded, Method("degraded", lambda dn: dn, "known")),
+    ):
         np.testing.assert_array_equal(seen.shown(method), shown.to_srgb(dn))
 
 
@@ -84,9 +100,15 @@ def handmade(sites: int = 12, **found: int) -> Comparison:
         for row, count in found.items()
     }
     hits = {row: find_hits(truths, each, len(NAMES)) for row, each in boxes.items()}
-    figures, confidence = score_rows(hits, NAMES, site_weights([each.site for each in scenes], 0, 200))
-    methods = {row: None if row == REFERENCE else Method(row, lambda dn: dn, "known") for row in found}
-    return Comparison(pair, methods, list(acquired(scenes, pair, 0)), boxes, hits, figures, confidence, NAMES)
+    figures, confidence = score_rows(
+        hits, NAMES, site_weights([each.site for each in scenes], 0, 200)
+    )
+    methods = {
+        row: None if row == REFERENCE else Method(row, lambda dn: dn, "known") for row in found
+    }
+    return Comparison(
+        pair, methods, list(acquired(scenes, pair, 0)), boxes, hits, figures, confidence, NAMES
+    )
 
 
 def rows_of(found: Comparison, table: str = "detection, dior-high") -> dict[str, Row]:
@@ -97,7 +119,9 @@ def test_a_loss_and_what_is_regained_of_it() -> None:
     found = handmade(reference=12, degraded=3, traditional=9)
     rows = rows_of(found)
     ap = {name: row.figures["mAP50"].value for name, row in rows.items()}
-    assert ap == pytest.approx({"reference": 100, "degraded": 100 * 26 / 101, "traditional": 100 * 76 / 101})
+    assert ap == pytest.approx(
+        {"reference": 100, "degraded": 100 * 26 / 101, "traditional": 100 * 76 / 101}
+    )
     last = rows["traditional"]
     assert last.figures[GAIN].value == pytest.approx(5000 / 101)
     assert last.figures[REGAINED].value == pytest.approx(100 * 50 / 75)
@@ -129,13 +153,22 @@ def test_every_figure_is_measured_or_says_why_not() -> None:
     for row in detection_rows(found):
         for name, figure in row.figures.items():
             assert (figure.mode == "measured" and figure.source) or figure.reason, name
-    assert set(rows_of(found, "mAP50 by class, dior-high")[REFERENCE].figures) == {"ship"}  # no tank is labelled
+    assert set(rows_of(found, "mAP50 by class, dior-high")[REFERENCE].figures) == {
+        "ship"
+    }  # no tank is labelled
     by_size = rows_of(found, "mAP50 by size, dior-high")["degraded"].figures
-    assert [figure.mode for figure in by_size.values()] == ["unavailable", "unavailable", "measured"]
+    assert [figure.mode for figure in by_size.values()] == [
+        "unavailable",
+        "unavailable",
+        "measured",
+    ]
 
 
 def test_pictures_show_the_scenes_that_lose_most() -> None:
     found = handmade(reference=12, degraded=3)
     pictures = [curves([found]), *crops([found])]
-    assert [picture.source.split(";")[0] for picture in pictures] == ["data:image/svg+xml", *["data:image/png"] * 4]
+    assert [picture.source.split(";")[0] for picture in pictures] == [
+        "data:image/svg+xml",
+        *["data:image/png"] * 4,
+    ]
     assert [picture.title[0] for picture in pictures[1:]] == ["3", "4", "5", "6"]

@@ -20,7 +20,13 @@ from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row, by_table, measured
 from beers_deploy.results import missing
 from beers_deploy.studies.evaluation import targets as targets_module
-from beers_deploy.studies.evaluation.methods import BLIND, KNOWN, Method, method_named, method_without_network
+from beers_deploy.studies.evaluation.methods import (
+    BLIND,
+    KNOWN,
+    Method,
+    method_named,
+    method_without_network,
+)
 from beers_deploy.studies.evaluation.pairs import (
     NamedPair,
     oversampling_note,
@@ -29,7 +35,13 @@ from beers_deploy.studies.evaluation.pairs import (
     scenes_at,
     simulate_pairs,
 )
-from beers_deploy.studies.evaluation.run import Evaluation, chosen_pairs, evaluate, evaluation_report, strip_of
+from beers_deploy.studies.evaluation.run import (
+    Evaluation,
+    chosen_pairs,
+    evaluate,
+    evaluation_report,
+    strip_of,
+)
 from beers_deploy.studies.evaluation.scores import (
     BIAS,
     INNER,
@@ -54,7 +66,9 @@ SENSORS = DEGRADED.nominal(), REFERENCE.nominal()
 PLAIN = Instruments({"LPIPS-squeeze": "no weights"})
 
 
-OTHER = replace(SENSORS[0], mtf_nyquist=0.03, gain_dn_per_radiance=0.7 * SENSORS[0].gain_dn_per_radiance)
+OTHER = replace(
+    SENSORS[0], mtf_nyquist=0.03, gain_dn_per_radiance=0.7 * SENSORS[0].gain_dn_per_radiance
+)
 
 
 def pair(name: str = "site_1.tif", seed: int = 0, noise_dn: float = 20) -> NamedPair:
@@ -137,11 +151,17 @@ def test_scenes_too_small_are_named_and_all_too_small_is_refused() -> None:
     [
         (2, (300, 700), ""),
         (4, (700, 700), ""),
-        (4, (300, 700), "4 (1 of 2 images) and 2 (1 of 2 images), where pleiades-degraded states 4"),
+        (
+            4,
+            (300, 700),
+            "4 (1 of 2 images) and 2 (1 of 2 images), where pleiades-degraded states 4",
+        ),
         (5, (700, 700), "4 (2 of 2 images), where pleiades-degraded states 5; at most 4 are taken"),
     ],
 )
-def test_another_oversampling_than_the_profiles_is_said(own: int, sides: tuple[int, int], words: str) -> None:
+def test_another_oversampling_than_the_profiles_is_said(
+    own: int, sides: tuple[int, int], words: str
+) -> None:
     profile = replace(DEGRADED, oversampling=Constant(own, "stated", "a test"))
     scenes = [procedural_scene(side, side, np.random.default_rng(0)) for side in sides]
     pairs, _ = simulate_pairs(scenes, profile, REFERENCE, 0, oversamplings_of(profile))
@@ -166,7 +186,9 @@ def test_an_unknown_method_is_refused(name: str) -> None:
         ("traditional", "known"),
     ],
 )
-def test_a_shipped_network_knows_the_images_sensor_unless_its_name_says_another(name: str, known: str) -> None:
+def test_a_shipped_network_knows_the_images_sensor_unless_its_name_says_another(
+    name: str, known: str
+) -> None:
     assert method_named(name, DEGRADED, REFERENCE).sensor_known == known
 
 
@@ -176,7 +198,9 @@ def test_a_shipped_network_restores_as_it_knows_the_sensor() -> None:
     blurred = replace(DEGRADED.nominal(), mtf_nyquist=0.03)
     method = method_named("convbeers-xs", DEGRADED, REFERENCE)
     assert method.specialise is not None
-    np.testing.assert_allclose(method.specialise(DEGRADED.nominal())(dn), method.restore(dn), rtol=0, atol=1)
+    np.testing.assert_allclose(
+        method.specialise(DEGRADED.nominal())(dn), method.restore(dn), rtol=0, atol=1
+    )
     assert np.abs(method.specialise(blurred)(dn) - method.restore(dn)).max() > 5
     assert method_named("convbeers-xs@blind", DEGRADED, REFERENCE).specialise is None
 
@@ -212,7 +236,9 @@ def test_clipped_pixels_do_not_count() -> None:
     restored[30, 30] += 500
     assert fidelity_db(restored, reference, degraded) < before
     white = np.full((12, 13), 4095, np.float32)
-    assert fidelity_db(white - 1, white, white) == pytest.approx(20 * np.log10(4095))  # all of it is clipped
+    assert fidelity_db(white - 1, white, white) == pytest.approx(
+        20 * np.log10(4095)
+    )  # all of it is clipped
 
 
 def test_the_degraded_input_gains_nothing_and_missing_figures_have_a_reason() -> None:
@@ -220,7 +246,11 @@ def test_the_degraded_input_gains_nothing_and_missing_figures_have_a_reason() ->
     assert mean.figures["PSNR gain"].value == 0
     assert len(images) == 5
     assert mean.figures["LPIPS-squeeze"].reason == "no weights"
-    reasons = [f"- {NOISE_FREE}: {READ}", f"- {INNER_NOISE_FREE}: {READ}", "- LPIPS-squeeze: no weights"]
+    reasons = [
+        f"- {NOISE_FREE}: {READ}",
+        f"- {INNER_NOISE_FREE}: {READ}",
+        "- LPIPS-squeeze: no weights",
+    ]
     assert missing([mean, *images]) == reasons
     interval = mean.figures["PSNR"].interval
     assert interval is not None
@@ -239,7 +269,9 @@ def test_identical_images_are_no_number() -> None:
 
 
 def test_the_reference_without_noise_is_the_same_acquisition_otherwise() -> None:
-    """What is left between the two is the reference sensor's noise and rounding; the pair's bytes are as ever."""
+    """What is left between the two is the reference sensor's noise and rounding; the pair's bytes
+    are as ever.
+    """
     scene = procedural_scene(700, 760, np.random.default_rng(3))
     (one,), _ = simulate_pairs([scene], DEGRADED, REFERENCE, 7)
     same = simulate_pair(scene.radiance, *SENSORS, 4, Draw(7))
@@ -258,7 +290,9 @@ def test_the_reference_without_noise_is_the_same_acquisition_otherwise() -> None
 def test_errors_in_the_border_are_none_of_inner_pixels() -> None:
     for height, width in ((37, 45), (300, 131)):
         border_px = inner_border_px(height, width)
-        reference = np.random.default_rng(height).uniform(100, 3000, (height, width)).astype(np.float32)
+        reference = (
+            np.random.default_rng(height).uniform(100, 3000, (height, width)).astype(np.float32)
+        )
         inside = np.zeros((height, width), bool)
         inside[border_px : height - border_px, border_px : width - border_px] = True
         assert inside.sum(0).max() >= height / 2
@@ -284,7 +318,8 @@ def test_the_border_covers_what_every_shipped_network_sees_and_is_less_of_small_
 @pytest.mark.parametrize("factor", [1.01, 0.97])
 def test_a_method_that_multiplies_has_that_bias(factor: float) -> None:
     perfect = [
-        replace(pair(f"{name}_1.tif", seed), degraded=pair(seed=seed).reference) for seed, name in enumerate("ab")
+        replace(pair(f"{name}_1.tif", seed), degraded=pair(seed=seed).reference)
+        for seed, name in enumerate("ab")
     ]
     scaled = Method("scaled", lambda dn: dn * np.float32(factor), BLIND)
     mean, *images = score(scaled, perfect, PLAIN, 0)
@@ -294,9 +329,14 @@ def test_a_method_that_multiplies_has_that_bias(factor: float) -> None:
 
 
 def test_the_largest_bias_is_that_of_the_worst_image_with_its_sign() -> None:
-    perfect = [replace(pair(f"{name}.tif", 1), degraded=pair(seed=1).reference) for name in ("a_1", "b_1", "b_2")]
+    perfect = [
+        replace(pair(f"{name}.tif", 1), degraded=pair(seed=1).reference)
+        for name in ("a_1", "b_1", "b_2")
+    ]
     factors = iter((1.01, 0.96, 1.02))
-    mean, *_ = score(Method("drifts", lambda dn: dn * np.float32(next(factors)), BLIND), perfect, PLAIN, 0)
+    mean, *_ = score(
+        Method("drifts", lambda dn: dn * np.float32(next(factors)), BLIND), perfect, PLAIN, 0
+    )
     assert mean.figures[BIAS].value == pytest.approx(-1 / 3, abs=1e-3)
     assert mean.figures[LARGEST_BIAS].value == pytest.approx(-4, abs=1e-3)
     assert mean.figures[LARGEST_BIAS].source == "one pair of site b"
@@ -311,7 +351,9 @@ def test_clipped_pixels_and_the_offset_are_no_bias_and_black_has_none() -> None:
     assert bias_percent(restored, level) > 1
     assert bias_percent(level + 4, level, offset_dn=100) == pytest.approx(1)
     black = np.zeros((40, 41), np.float32)
-    mean, _ = score(Method("lifts", lambda dn: dn + 1, BLIND), [NamedPair("a", black, black)], PLAIN, 0)
+    mean, _ = score(
+        Method("lifts", lambda dn: dn + 1, BLIND), [NamedPair("a", black, black)], PLAIN, 0
+    )
     assert mean.figures[BIAS].reason == "the reference is black"
 
 
@@ -354,13 +396,21 @@ def test_strips_hold_every_method_and_black_below_the_reference() -> None:
 
 def test_one_pair_a_site_is_shown() -> None:
     pairs = [pair(f"{site}_{k}.tif") for site in "abcdef" for k in range(2)]
-    assert [each.name for each in chosen_pairs(pairs)] == ["a_0.tif", "b_0.tif", "c_0.tif", "d_0.tif"]
+    assert [each.name for each in chosen_pairs(pairs)] == [
+        "a_0.tif",
+        "b_0.tif",
+        "c_0.tif",
+        "d_0.tif",
+    ]
 
 
 def test_tables_of_a_sweep_keep_their_words_on_the_page() -> None:
     mean, *_ = score(IDENTITY, [pair()], PLAIN, 0)
     dim = replace(mean, table="mean, radiance x 0.05")
-    rest = [Row(name, "nominal", {"degraded": measured(7, "%", "a test")}) for name in ("targets", "sweep, PSNR")]
+    rest = [
+        Row(name, "nominal", {"degraded": measured(7, "%", "a test")})
+        for name in ("targets", "sweep, PSNR")
+    ]
     about: dict[str, Any] = {"sensors": (DEGRADED, REFERENCE), "methods": [], "pairs": []}
     report = evaluation_report(Evaluation("evaluate", {}, (), (mean, dim, *rest), **about), [])
     titles = ["Means over all pairs", "Mean, radiance x 0.05", "Targets", "Sweep, PSNR"]
@@ -378,21 +428,30 @@ def test_the_command_on_a_folder_of_pairs(tmp_path: Path, monkeypatch: pytest.Mo
     names = [row["name"] for row in document["rows"] if row["table"] == "mean"]
     assert names == ["degraded", "traditional-fast", "paper: traditional", "paper: ConvBEERS"]
     printed = [row["figures"] for row in document["rows"] if row["name"].startswith("paper")]
-    assert {figure["mode"] for figures in printed for figure in figures.values()} == {"published", "unavailable"}
+    assert {figure["mode"] for figures in printed for figure in figures.values()} == {
+        "published",
+        "unavailable",
+    }
     assert (tmp_path / "out" / "report.html").read_text().count("data:image/png") == 2
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.png", "b.png", "report.html"]
 
 
 def test_brightness_scales_the_scenes_before_they_are_acquired() -> None:
-    """The signal is a quarter; the noise is less than that of the full light, and more than a quarter of it."""
+    """The signal is a quarter; the noise is less than that of the full light, and more than a
+    quarter of it.
+    """
     scenes = [procedural_scene(400, 430, np.random.default_rng(3))]
     (whole,), _ = simulate_pairs(scenes, DEGRADED, REFERENCE, 7)
     (dim,), _ = simulate_pairs(scenes_at(0.25, scenes), DEGRADED, REFERENCE, 7)
     assert whole.noise_free is not None
     assert dim.noise_free is not None
     unclipped = whole.reference < SENSORS[1].max_dn
-    np.testing.assert_allclose(4 * dim.noise_free[unclipped], whole.noise_free[unclipped], rtol=1e-3, atol=0.1)
-    noise, dim_noise = (float((each.reference - each.noise_free)[unclipped].std()) for each in (whole, dim))
+    np.testing.assert_allclose(
+        4 * dim.noise_free[unclipped], whole.noise_free[unclipped], rtol=1e-3, atol=0.1
+    )
+    noise, dim_noise = (
+        float((each.reference - each.noise_free)[unclipped].std()) for each in (whole, dim)
+    )
     assert noise / 4 < dim_noise < noise
 
 
@@ -414,7 +473,9 @@ def test_a_brightness_that_is_no_number_is_one_sentence(text: str, tmp_path: Pat
     assert said.startswith("beers-deploy: --brightness: expected numbers separated by commas")
 
 
-def test_the_command_at_two_brightnesses_on_photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_at_two_brightnesses_on_photographs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     few_targets(monkeypatch)
     scene = np.random.default_rng(0).integers(200, 3000, (270, 300)).astype(np.uint16)
     write_tiff(tmp_path / "scenes" / "zebra_DJI_0005.tif", scene)

@@ -1,4 +1,6 @@
-"""Conditions of a sweep: who is told which sensor, and what a chain loses when it is told the wrong one."""
+"""Conditions of a sweep: who is told which sensor, and what a chain loses when it is told the wrong
+one.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -54,9 +56,10 @@ def test_what_is_supposed_wrongly_is_another_sensor_than_the_one_of_a_condition(
     more, less = suppositions(NOMINAL, PROFILE)["nominal"].values()
     for radiance in (25, 100):
         sigma = NOMINAL.noise_sigma(radiance)
-        assert (sigma / more.noise_sigma(radiance), sigma / less.noise_sigma(radiance)) == pytest.approx(
-            (4 / 3, 2 / 3)
-        )
+        assert (
+            sigma / more.noise_sigma(radiance),
+            sigma / less.noise_sigma(radiance),
+        ) == pytest.approx((4 / 3, 2 / 3))
 
 
 Swept = tuple[dict[str, dict[str, Row]], list[Instrument]]
@@ -81,7 +84,9 @@ def quick() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory: pytest.TempPathFactory) -> Swept:
-    """One sweep under three conditions: its rows, and the sensors that the able network was given."""
+    """One sweep under three conditions: its rows, and the sensors that the able
+    network was given.
+    """
     given: list[Instrument] = []
 
     def specialise(sensor: Instrument) -> Restore:
@@ -122,7 +127,9 @@ def test_the_truth_pays_where_the_sensor_has_drifted(swept: Swept) -> None:
 
 
 def test_another_gain_is_told_to_the_chains_and_kept(swept: Swept) -> None:
-    """The reference has the gain of the input, so brightness is no error of a method that knows no gains."""
+    """The reference has the gain of the input, so brightness is no error of a method that knows no
+    gains.
+    """
     nominal = psnr(swept, "nominal")
     dim = psnr(swept, "dim")
     assert dim(NOMINAL_KNOWN) == dim(TRUTH_KNOWN)
@@ -131,7 +138,11 @@ def test_another_gain_is_told_to_the_chains_and_kept(swept: Swept) -> None:
 
 def test_a_wrong_sensor_costs_the_methods_that_can_know_one(swept: Swept) -> None:
     wrong, lost = (swept[0][name] for name in WRONGLY)
-    assert list(wrong) == list(lost) == ["nominal, supposed SNR x 1.33", "nominal, supposed SNR x 0.67", WRONG]
+    assert (
+        list(wrong)
+        == list(lost)
+        == ["nominal, supposed SNR x 1.33", "nominal, supposed SNR x 0.67", WRONG]
+    )
     assert list(wrong[WRONG].figures) == ["traditional", "able"]
     assert (lost[WRONG].figures["traditional"].value or 0) > 1
 
@@ -140,20 +151,26 @@ SITES = ["a", "b", "c", "d", "e", "f"]
 
 
 def known() -> Found:
-    """Sites differ by 20 dB, the network's lead over the chain by nothing under one condition, a little under two."""
+    """Sites differ by 20 dB, the network's lead over the chain by nothing under one condition, a
+    little under two.
+    """
     site = np.linspace(30, 50, len(SITES))
     lead = {"nominal": np.full(6, 0.75), "MTF 3%": np.linspace(0.1, 0.5, 6)}
     psnr: dict[Key, np.ndarray] = {}
     for truth, ahead in lead.items():
         levels = {"degraded": site - 8, "traditional": site, "net": site + ahead}
-        psnr |= {(truth, truth, name): np.stack([level, level + 1]) for name, level in levels.items()}
+        psnr |= {
+            (truth, truth, name): np.stack([level, level + 1]) for name, level in levels.items()
+        }
     psnr["MTF 3%", "nominal", "traditional"] = np.stack([site - 2, site - 2])
     psnr["MTF 3%", "MTF 7%", "net"] = np.stack([site - 1, site - 1])
     return Found(psnr, dict.fromkeys(psnr, unavailable("%", "no edges here")), SITES, 0)
 
 
 def test_the_interval_of_a_gain_is_that_of_differences_on_the_same_images() -> None:
-    nominal, blurred = (row.figures["net"] for row in by_table(known().rows)["sweep, gain over the pipeline"])
+    nominal, blurred = (
+        row.figures["net"] for row in by_table(known().rows)["sweep, gain over the pipeline"]
+    )
     assert nominal.value == pytest.approx(0.75)
     assert nominal.interval == pytest.approx((0.75, 0.75))
     assert blurred.interval is not None
@@ -170,7 +187,8 @@ def test_over_all_conditions_mean_and_least_gain_are_named() -> None:
 
 def test_the_reference_without_noise_has_a_table_of_its_own() -> None:
     noisy, clean = (
-        by_table(known().rows)[f"sweep, PSNR{end}"][0].figures for end in ("", ", reference without noise")
+        by_table(known().rows)[f"sweep, PSNR{end}"][0].figures
+        for end in ("", ", reference without noise")
     )
     assert (clean["net"].value or 0) - (noisy["net"].value or 0) == pytest.approx(1)
 
@@ -202,9 +220,24 @@ def test_the_command_sweeps_the_networks_alone_at_each_brightness(tmp_path: Path
     tifffile.imwrite(tmp_path / "scene.tif", scene)
     found = tmp_path / "found.json"
     methods = "degraded,convbeers-xs"
-    done("evaluate", "--images", tmp_path, "--methods", methods, "--sweep", "--brightness", 0.1, "--json", found)
+    done(
+        "evaluate",
+        "--images",
+        tmp_path,
+        "--methods",
+        methods,
+        "--sweep",
+        "--brightness",
+        0.1,
+        "--json",
+        found,
+    )
     whole, dim = (
-        {row["name"]: row["figures"] for row in valid(found)["rows"] if row["table"] == f"sweep, PSNR{end}"}
+        {
+            row["name"]: row["figures"]
+            for row in valid(found)["rows"]
+            if row["table"] == f"sweep, PSNR{end}"
+        }
         for end in ("", ", radiance x 0.1")
     )
     assert list(whole) == list(dim) == ["nominal", "MTF 3%", "dim"]

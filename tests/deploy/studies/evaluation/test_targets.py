@@ -1,4 +1,6 @@
-"""Targets whose truth is known: what they say of methods that do nothing, scale, blur, or sharpen."""
+"""Targets whose truth is known: what they say of methods that do nothing,
+scale, blur, or sharpen.
+"""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -49,9 +51,13 @@ def seen() -> Targets:
 
 @pytest.fixture(scope="module")
 def perfect(seen: Targets) -> Targets:
-    """The targets as the reference sensor sees them without noise; the background of points keeps its noise."""
+    """The targets as the reference sensor sees them without noise; the background of points keeps
+    its noise.
+    """
     points = [replace(each, seen=each.flat + each.wanted) for each in seen.points]
-    return replace(seen, points=points, patterns=[replace(each, seen=each.wanted) for each in seen.patterns])
+    return replace(
+        seen, points=points, patterns=[replace(each, seen=each.wanted) for each in seen.patterns]
+    )
 
 
 def values(row: Row, unit: str) -> list[float]:

@@ -28,7 +28,9 @@ def made(
     board: str = "vck190",
     power_w: float = 30.0,
 ) -> Measured:
-    """Make an INT8 network of that name: its scores differ from the mean as sites do, and by some scatter."""
+    """Make an INT8 network of that name: its scores differ from the mean as sites do, and by some
+    scatter.
+    """
     noise = np.random.default_rng(sum(map(ord, name))).normal(size=len(SITES))
     values = psnr_db + DIFFICULTY_DB - DIFFICULTY_DB.mean() + scatter_db * (noise - noise.mean())
     variant = Variant(method or name, INT8, Path(f"{method or name}.onnx"))
@@ -38,9 +40,13 @@ def made(
             "PSNR": measured(psnr_db, "dB", "made up", (psnr_db - 3, psnr_db + 3)),
             "SSIM": measured(psnr_db / 50, "ratio", "made up"),
             "host p50": measured(latency_s / 10, "s/Mpx", "made up"),
-            "board latency": predicted(latency_s, "s", (latency_s / 1.6, latency_s * 1.6), "made up"),
+            "board latency": predicted(
+                latency_s, "s", (latency_s / 1.6, latency_s * 1.6), "made up"
+            ),
             "board power": predicted(power_w, "W", (power_w / 2, power_w * 2), "made up"),
-            "board energy": predicted(latency_s * power_w, "J", (latency_s * 15, latency_s * 60), "made up"),
+            "board energy": predicted(
+                latency_s * power_w, "J", (latency_s * 15, latency_s * 60), "made up"
+            ),
         },
         {
             "board": board,

@@ -1,4 +1,6 @@
-"""Real studies of next to nothing: few patches, one chain, no other library, and a clock that stands still."""
+"""Real studies of next to nothing: few patches, one chain, no other library, and a clock that
+stands still.
+"""
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager

@@ -39,7 +39,9 @@ def at(number: int, cost: float, quality: float) -> Measured:
 
 
 @given(PLACES)
-def test_no_point_beats_a_member_and_a_member_is_as_good_as_each_point(places: list[tuple[int, int]]) -> None:
+def test_no_point_beats_a_member_and_a_member_is_as_good_as_each_point(
+    places: list[tuple[int, int]],
+) -> None:
     points = [at(number, *place) for number, place in enumerate(places)]
     front = pareto_front(points, COST)
     known = {point.name: place for point, place in zip(points, places, strict=True)}
@@ -53,7 +55,9 @@ def test_no_point_beats_a_member_and_a_member_is_as_good_as_each_point(places: l
 
 def test_what_lacks_a_figure_or_was_published_is_not_on_the_front() -> None:
     printed = Measured("paper", {COST: published(1, "s", ""), "PSNR": measured(99, "dB", "")}, {})
-    lacking = Measured("float", {COST: unavailable("s", "no board"), "PSNR": measured(99, "dB", "")}, {})
+    lacking = Measured(
+        "float", {COST: unavailable("s", "no board"), "PSNR": measured(99, "dB", "")}, {}
+    )
     found = pareto_front([printed, lacking, at(1, 2, 3)], COST)
     assert [point.name for point in found] == ["1"]
 
@@ -95,7 +99,8 @@ def test_a_ratio_of_latencies_on_a_board_has_the_width_of_pairs() -> None:
     dpu = replace(DPU, target=target)
     points = [made("small", 45.0, 2.0), made("large", 45.5, 6.0)]
     one, other = (
-        replace(each, point=replace(each.point, board=target, dpu=dpu) if each.point else None) for each in points
+        replace(each, point=replace(each.point, board=target, dpu=dpu) if each.point else None)
+        for each in points
     )
     found = cost_ratio(other, one, COST)
     assert found.value == pytest.approx(3)
@@ -127,7 +132,9 @@ def test_front_rows_compare_each_member_with_the_next_cheaper_one() -> None:
 
 def asked(budget: str | None = None, need: str | None = None) -> tuple[str | None, str]:
     """The name of the point to take, and the line that says so."""
-    limits = [parse_constraints(f"--{name}", text) for name, text in (("budget", budget), ("need", need))]
+    limits = [
+        parse_constraints(f"--{name}", text) for name, text in (("budget", budget), ("need", need))
+    ]
     point, line = recommend(family(), limits[0], limits[1], COMPARE)
     return point.name if point else None, line
 
@@ -166,8 +173,12 @@ def test_what_is_no_constraint_is_refused(text: str, words: str) -> None:
 
 
 @given(st.floats(-100, 100), st.floats(0.1, 100), st.booleans())
-def test_a_violation_is_0_where_the_value_keeps_the_limit(value: float, limit: float, at_most: bool) -> None:
-    found = Constraint("PSNR", at_most, limit, "dB").violation(having("PSNR", measured(value, "dB", "")))
+def test_a_violation_is_0_where_the_value_keeps_the_limit(
+    value: float, limit: float, at_most: bool
+) -> None:
+    found = Constraint("PSNR", at_most, limit, "dB").violation(
+        having("PSNR", measured(value, "dB", ""))
+    )
     assert (found == 0) == (value <= limit if at_most else value >= limit)
 
 
@@ -203,14 +214,21 @@ def test_what_is_not_significantly_better_is_not_paid_for() -> None:
 
 def test_the_line_has_value_interval_and_mode_and_says_what_only_the_value_keeps() -> None:
     line = asked("latency<=20s")[1]
-    assert line.startswith("recommended for board latency <= 20 s: medium: PSNR 45.5 [42.5, 48.5] dB (measured), ")
+    assert line.startswith(
+        "recommended for board latency <= 20 s: medium: PSNR 45.5 [42.5, 48.5] dB (measured), "
+    )
     assert "board latency 4 [2.5, 6.4] s (predicted)" in line
     assert "not over" not in line
-    assert "board latency <= 5 s holds by value, not over the whole interval" in asked("latency<=5s")[1]
+    assert (
+        "board latency <= 5 s holds by value, not over the whole interval"
+        in asked("latency<=5s")[1]
+    )
 
 
 def test_where_nothing_keeps_the_limits_the_nearest_is_named() -> None:
     name, line = asked("latency<=0.1s")
     assert name is None
-    assert line.startswith("nothing to recommend for board latency <= 0.1 s; nearest is tiny: board latency 0.6")
+    assert line.startswith(
+        "nothing to recommend for board latency <= 0.1 s; nearest is tiny: board latency 0.6"
+    )
     assert "no point has every figure" in asked("map50>=50")[1]

@@ -1,4 +1,6 @@
-"""Several boards in one study: their order changes nothing, and each board is recommended or says why not."""
+"""Several boards in one study: their order changes nothing, and each board is recommended or says
+why not.
+"""
 
 import json
 from collections.abc import Sequence
@@ -20,18 +22,31 @@ POWER_W = {"fast": 30.0, "frugal": 12.0, "slow": 20.0}
 
 
 def weighed(
-    points: Sequence[Measured], boards: Sequence[str], budget: str | None = None, need: str | None = None
+    points: Sequence[Measured],
+    boards: Sequence[str],
+    budget: str | None = None,
+    need: str | None = None,
 ) -> Tradeoff:
-    asked = Question(parse_constraints("--budget", budget), parse_constraints("--need", need), COMPARE)
+    asked = Question(
+        parse_constraints("--budget", budget), parse_constraints("--need", need), COMPARE
+    )
     return weigh(points, boards, asked, arguments={}, inputs=(), notes=())
 
 
 def on_boards(costs: dict[str, float], psnr_db: dict[str, float]) -> list[Measured]:
-    """One point for each network and board: its PSNR is the network's, its latency theirs together."""
+    """One point for each network and board: its PSNR is the network's, its
+    latency theirs together.
+    """
     found = []
     for board, factor in costs.items():
         for name, quality_db in psnr_db.items():
-            one = made(name, quality_db, factor * (1 + quality_db - 44), board=board, power_w=POWER_W[board])
+            one = made(
+                name,
+                quality_db,
+                factor * (1 + quality_db - 44),
+                board=board,
+                power_w=POWER_W[board],
+            )
             found.append(replace(one, name=f"{name} on {board}"))
     return found
 
@@ -41,29 +56,48 @@ NETWORKS = {"small": 44.0, "medium": 45.0, "large": 45.6}
 
 @given(
     points=st.lists(
-        st.tuples(st.sampled_from(BOARDS), st.sampled_from([44.0, 44.5, 45.0]), st.sampled_from([1.0, 2.0, 4.0])),
+        st.tuples(
+            st.sampled_from(BOARDS),
+            st.sampled_from([44.0, 44.5, 45.0]),
+            st.sampled_from([1.0, 2.0, 4.0]),
+        ),
         min_size=1,
         max_size=8,
         unique=True,
     ),
-    budget=st.sampled_from([None, "latency<=2", "power<=15", "latency<=3,power<=25", "energy<=40", "host<=0.15"]),
+    budget=st.sampled_from(
+        [None, "latency<=2", "power<=15", "latency<=3,power<=25", "energy<=40", "host<=0.15"]
+    ),
     need=st.sampled_from([None, "psnr>=44.4", "psnr>=46"]),
     data=st.data(),
 )
 def test_the_order_of_the_boards_changes_nothing(
-    points: list[tuple[str, float, float]], budget: str | None, need: str | None, data: st.DataObject
+    points: list[tuple[str, float, float]],
+    budget: str | None,
+    need: str | None,
+    data: st.DataObject,
 ) -> None:
-    """Equal figures on purpose: a tie between two boards must not be won by the one that was named first."""
+    """Equal figures on purpose: a tie between two boards must not be won by the one that was named
+    first.
+    """
     found = [
-        replace(made("net", psnr_db, cost_s, board=board, power_w=POWER_W[board]), name=f"{board} {psnr_db} {cost_s}")
+        replace(
+            made("net", psnr_db, cost_s, board=board, power_w=POWER_W[board]),
+            name=f"{board} {psnr_db} {cost_s}",
+        )
         for board, psnr_db, cost_s in points
     ]
     one = weighed(found, BOARDS, budget, need)
-    other = weighed(data.draw(st.permutations(found)), data.draw(st.permutations(BOARDS)), budget, need)
+    other = weighed(
+        data.draw(st.permutations(found)), data.draw(st.permutations(BOARDS)), budget, need
+    )
     assert other.line == one.line
     assert (other.best and other.best.name) == (one.best and one.best.name)
     assert [row.name for row in other.front_rows] == [row.name for row in one.front_rows]
-    rows = [{row.name: (row.text, dict(row.figures)) for row in each.board_rows} for each in (one, other)]
+    rows = [
+        {row.name: (row.text, dict(row.figures)) for row in each.board_rows}
+        for each in (one, other)
+    ]
     assert rows[0] == rows[1]
 
 
@@ -78,7 +112,10 @@ def test_a_board_that_the_budget_excludes_hides_no_other(boards: Sequence[str]) 
     words = dict(line.split(": ", 1) for line in str(found).splitlines()[1:])
     assert words.keys() == set(boards)
     assert words["fast"] == "no point within board power <= 20 W: the least is 30 W (small on fast)"
-    assert words["frugal"] == "no point within board latency <= 10 s: the least is 40 s (small on frugal)"
+    assert (
+        words["frugal"]
+        == "no point within board latency <= 10 s: the least is 40 s (small on frugal)"
+    )
     assert "this is the recommended point" in words["slow"]
 
 
@@ -89,11 +126,18 @@ def test_power_and_energy_are_columns_of_the_front() -> None:
 
 
 def test_a_board_within_the_limits_is_compared_with_the_recommended_point() -> None:
-    found = weighed(on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS), ["slow", "fast"], "latency<=30s")
+    found = weighed(
+        on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS), ["slow", "fast"], "latency<=30s"
+    )
     rows = {row.name: row for row in found.board_rows}
-    assert rows["slow"].text["verdict"] == "the PSNR of the recommended point, for 3 times its board latency"
+    assert (
+        rows["slow"].text["verdict"]
+        == "the PSNR of the recommended point, for 3 times its board latency"
+    )
     assert rows["slow"].figures["board power"].value == POWER_W["slow"]
-    tight = weighed(on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS), ["slow", "fast"], "latency<=4s")
+    tight = weighed(
+        on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS), ["slow", "fast"], "latency<=4s"
+    )
     rows = {row.name: row for row in tight.board_rows}
     assert rows["slow"].text["verdict"].startswith("PSNR -1.6 [-1.6")
     assert rows["slow"].text["point"] == "small on slow"
@@ -102,14 +146,28 @@ def test_a_board_within_the_limits_is_compared_with_the_recommended_point() -> N
 @pytest.mark.parametrize(
     ("budget", "need", "words"),
     [
-        ("latency<=0.5s", None, "no point within board latency <= 0.5 s: the least is 1 s (small on fast)"),
+        (
+            "latency<=0.5s",
+            None,
+            "no point within board latency <= 0.5 s: the least is 1 s (small on fast)",
+        ),
         (None, "psnr>=46", "no point within PSNR >= 46 dB: the most is 45.6 dB (large on fast)"),
         ("latency<=0.9999s", None, "the least is 1 s"),
-        ("latency<=1s", "psnr>=45", "no point keeps board latency <= 1 s and PSNR >= 45 dB at once; nearest is"),
-        ("latency<=0.5s,power<=3", None, "the least is 1 s (small on fast); no point within board power <= 3 W"),
+        (
+            "latency<=1s",
+            "psnr>=45",
+            "no point keeps board latency <= 1 s and PSNR >= 45 dB at once; nearest is",
+        ),
+        (
+            "latency<=0.5s,power<=3",
+            None,
+            "the least is 1 s (small on fast); no point within board power <= 3 W",
+        ),
     ],
 )
-def test_a_board_without_a_point_says_which_limit_it_misses(budget: str | None, need: str | None, words: str) -> None:
+def test_a_board_without_a_point_says_which_limit_it_misses(
+    budget: str | None, need: str | None, words: str
+) -> None:
     found = weighed(on_boards({"fast": 1.0}, NETWORKS), ["fast"], budget, need)
     assert found.best is None
     assert words in str(found).splitlines()[1]
@@ -119,7 +177,9 @@ def test_what_a_board_lacks_or_refuses_is_said_with_its_reason() -> None:
     points = on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS)
     lacking = unavailable("W", "nobody measured it")
     points = [
-        replace(each, figures={**each.figures, "board power": lacking}) if each.text["board"] == "slow" else each
+        replace(each, figures={**each.figures, "board power": lacking})
+        if each.text["board"] == "slow"
+        else each
         for each in points
     ]
     rows = {row.name: row for row in weighed(points, ["fast", "slow"], "power<=40").board_rows}
@@ -137,7 +197,9 @@ def test_what_a_board_lacks_or_refuses_is_said_with_its_reason() -> None:
 
 
 def test_the_document_has_a_row_for_each_board() -> None:
-    found = weighed(on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS), ["slow", "fast"], "latency<=2s")
+    found = weighed(
+        on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS), ["slow", "fast"], "latency<=2s"
+    )
     document = json.loads(json.dumps(found.to_dict()))
     rows = [row for row in document["rows"] if row["table"] == "boards"]
     assert [row["name"] for row in rows] == ["slow", "fast"]

@@ -23,7 +23,9 @@ BOARDS = ("vck190",)
 
 
 def study(
-    points: list[Measured] | None = None, budget: str | None = None, boards: tuple[str, ...] = BOARDS
+    points: list[Measured] | None = None,
+    budget: str | None = None,
+    boards: tuple[str, ...] = BOARDS,
 ) -> Tradeoff:
     found = list(family()) if points is None else points
     asked = Question(parse_constraints("budget", budget), [], COMPARE)
@@ -54,16 +56,32 @@ def test_every_series_has_a_look_of_its_own() -> None:
 
 
 def test_of_several_boards_a_network_keeps_its_colour_and_a_board_its_marker() -> None:
-    points = [made(f"{name} {board}", 45.0, cost, method=name, board=board) for name, board, cost in PLACES]
+    points = [
+        made(f"{name} {board}", 45.0, cost, method=name, board=board)
+        for name, board, cost in PLACES
+    ]
     points = [replace(each, text={**each.text, "method": each.name.split()[0]}) for each in points]
     found = list(series(study(points, boards=("vck190", "zcu104")).drawn))
-    assert len({(each.name, each.colour) for each in found}) == len({each.colour for each in found}) == 2
-    assert len({(each.board, each.marker) for each in found}) == len({each.marker for each in found}) == 2
+    assert (
+        len({(each.name, each.colour) for each in found})
+        == len({each.colour for each in found})
+        == 2
+    )
+    assert (
+        len({(each.board, each.marker) for each in found})
+        == len({each.marker for each in found})
+        == 2
+    )
     words = words_of(study(points, boards=("vck190", "zcu104")))
     assert {"vck190", "zcu104", "one", "other"} <= set(words)
 
 
-PLACES = [("one", "vck190", 1.0), ("one", "zcu104", 2.0), ("other", "vck190", 3.0), ("other", "zcu104", 4.0)]
+PLACES = [
+    ("one", "vck190", 1.0),
+    ("one", "zcu104", 2.0),
+    ("other", "vck190", 3.0),
+    ("other", "zcu104", 4.0),
+]
 
 
 @pytest.mark.parametrize("most_s", [9.9, 99.0, 2_813.0, 9_990.0, 4_200_000.0])
@@ -106,7 +124,8 @@ def test_the_pages_plot_is_the_file_beside_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize("width_px", [1280, 390])
 def test_nothing_is_wider_than_the_window(width_px: int, tmp_path: Path) -> None:
     look = """const image = document.images[0], root = document.documentElement;
-    return [root.scrollWidth - root.clientWidth, image.naturalWidth, image.getBoundingClientRect().width];"""
+    const width = image.getBoundingClientRect().width;
+    return [root.scrollWidth - root.clientWidth, image.naturalWidth, width];"""
     over, natural, shown = seen(page(), look, tmp_path, width_px=width_px)
     assert over <= 0
     assert natural == SIZE_PX[0]
@@ -116,9 +135,13 @@ def test_nothing_is_wider_than_the_window(width_px: int, tmp_path: Path) -> None
 @pytest.mark.slow
 def test_a_press_on_a_heading_sorts_by_it_and_another_reverses(tmp_path: Path) -> None:
     look = """const table = [...document.querySelectorAll("table.sortable")].at(-1);
-    const head = [...table.tHead.rows[0].cells].find((each) => each.textContent.startsWith("board latency"));
+    const heads = [...table.tHead.rows[0].cells];
+    const head = heads.find((each) => each.textContent.startsWith("board latency"));
     const names = () => [...table.tBodies[0].rows].map((row) => row.cells[0].textContent);
-    head.click(); const up = names(); head.click(); return [up, names(), head.getAttribute("aria-sort")];"""
+    head.click();
+    const up = names();
+    head.click();
+    return [up, names(), head.getAttribute("aria-sort")];"""
     up, down, state = seen(page(), look, tmp_path)
     assert up == ["tiny", "small", "medium", "slow", "large"]
     assert down == up[::-1]

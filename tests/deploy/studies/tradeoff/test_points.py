@@ -1,4 +1,6 @@
-"""Which operating points a study looks at; what is kept of measurements, and times on this machine."""
+"""Which operating points a study looks at; what is kept of measurements, and
+times on this machine.
+"""
 
 import json
 from dataclasses import replace
@@ -17,7 +19,13 @@ from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.target import TILE_PX, board_names
 from beers_deploy.quant.onnx_file import save_onnx
-from beers_deploy.studies.tradeoff.measure import ROUNDS, Measurements, host_figures, host_times, key_of
+from beers_deploy.studies.tradeoff.measure import (
+    ROUNDS,
+    Measurements,
+    host_figures,
+    host_times,
+    key_of,
+)
 from beers_deploy.studies.tradeoff.points import (
     FLOAT,
     HALOS_PX,
@@ -106,7 +114,9 @@ def test_a_network_of_one_tile_size_is_refused(tmp_path: Path) -> None:
         network_variants([str(tmp_path / "fixed.onnx")], SENSOR, refused, lambda _: None)
 
 
-def test_the_fastest_tile_is_a_multiple_of_the_step_and_no_other_is_faster(variant: Variant) -> None:
+def test_the_fastest_tile_is_a_multiple_of_the_step_and_no_other_is_faster(
+    variant: Variant,
+) -> None:
     found = fastest_tile_px(variant, DPU, WHOLE)
     radius = radius_px(variant)
     assert found % TILE_STEP_PX == 0
@@ -115,17 +125,24 @@ def test_the_fastest_tile_is_a_multiple_of_the_step_and_no_other_is_faster(varia
     def seconds(side: int) -> float:
         return dpu_latency(variant, DPU, replace(WHOLE, tile_px=side, halo_px=radius)).value or 0.0
 
-    assert seconds(found) == min(seconds(side) for side in range(2 * radius + TILE_STEP_PX, 641, 1) if side % 16 == 0)
+    assert seconds(found) == min(
+        seconds(side) for side in range(2 * radius + TILE_STEP_PX, 641, 1) if side % 16 == 0
+    )
 
 
-def test_int8_is_compared_on_every_board_and_configuration_in_several_tiles_and_halos(variant: Variant) -> None:
+def test_int8_is_compared_on_every_board_and_configuration_in_several_tiles_and_halos(
+    variant: Variant,
+) -> None:
     boards = [load_target("vck190"), load_target("zcu102")]
     points = network_points(variant, boards, WHOLE)
     assert len({point.name for point in points}) == len(points)
     for board in boards:
         here = [point for point in points if point.board == board]
         assert {point.dpu.name for point in here if point.dpu} == set(board.configurations)
-        assert {point.halo_px for point in here} == {None, *(halo for halo in HALOS_PX if halo < radius_px(variant))}
+        assert {point.halo_px for point in here} == {
+            None,
+            *(halo for halo in HALOS_PX if halo < radius_px(variant)),
+        }
         assert TILE_PX in {point.tile_px for point in here}
     other = network_points(variant, boards[::-1], WHOLE)
     assert {point.name for point in other} == {point.name for point in points}
@@ -139,7 +156,9 @@ def test_float_and_what_a_board_refuses_have_no_board_and_the_reason(variant: Va
     assert {figure.reason for figure in figures.values()} == {"the DPU takes INT8 alone"}
 
 
-def test_a_smaller_halo_takes_less_time_and_figures_follow_from_the_latency(variant: Variant) -> None:
+def test_a_smaller_halo_takes_less_time_and_figures_follow_from_the_latency(
+    variant: Variant,
+) -> None:
     def at(halo_px: int | None) -> dict[str, float]:
         figures = board_figures(Point(variant, DPU.target, DPU, 128, halo_px), WHOLE)
         assert {key: figure.unit for key, figure in figures.items()} == UNITS
@@ -148,11 +167,13 @@ def test_a_smaller_halo_takes_less_time_and_figures_follow_from_the_latency(vari
     exact, none = at(None), at(0)
     assert none["board latency"] < exact["board latency"]
     assert exact["board energy"] == pytest.approx(exact["board latency"] * exact["board power"])
-    assert exact["board throughput"] == pytest.approx(WHOLE.pixels / 640**2 / exact["board latency"])
+    assert exact["board throughput"] == pytest.approx(
+        WHOLE.pixels / 640**2 / exact["board latency"]
+    )
     assert exact["board efficiency"] == pytest.approx(WHOLE.pixels / exact["board energy"])
 
 
-def test_a_chain_on_a_boards_processor_takes_what_the_target_states_by_the_ratio_measured_here() -> None:
+def test_a_chain_on_a_boards_processor_takes_the_stated_time_by_the_measured_ratio() -> None:
     chain = Variant("traditional-best")
     stated = Constant((10.0, 40.0), "inferred", "a test")
     tables = {**DPU.target.tables, "cpu": {**DPU.target.tables["cpu"], "chain_s_per_mpx": stated}}
@@ -162,7 +183,9 @@ def test_a_chain_on_a_boards_processor_takes_what_the_target_states_by_the_ratio
     assert latency.value == pytest.approx(2 * 3 * 20)
     assert latency.interval == pytest.approx((60, 240))
     bare = replace(DPU.target, tables={"cpu": {}})
-    assert board_figures(Point(chain, bare), swath, slower=3.0)["board latency"].mode == "unavailable"
+    assert (
+        board_figures(Point(chain, bare), swath, slower=3.0)["board latency"].mode == "unavailable"
+    )
 
 
 def test_what_was_measured_is_kept_by_what_it_depends_on(tmp_path: Path) -> None:

@@ -24,7 +24,13 @@ from beers_deploy.studies.evaluation.methods import Method, method_named
 from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes
 from beers_deploy.studies.evaluation.scores import Instruments
 from beers_deploy.studies.tradeoff.advice import TOO_FEW
-from beers_deploy.studies.tradeoff.measure import SEAM_ERROR, Benchmark, Labelled, Measurements, make_int8
+from beers_deploy.studies.tradeoff.measure import (
+    SEAM_ERROR,
+    Benchmark,
+    Labelled,
+    Measurements,
+    make_int8,
+)
 from beers_deploy.studies.tradeoff.page import Tradeoff
 from beers_deploy.studies.tradeoff.points import Point, Variant
 from beers_deploy.studies.tradeoff.run import tradeoff
@@ -46,7 +52,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_network(folder / "narrow.safetensors", plain(Shape(1, 2), seed=3), {"degraded": SENSOR})
     for number in range(SITES + 1):
         scene = procedural_scene(300, 340, np.random.default_rng(number)).radiance
-        place = folder / ("images" if number < SITES else "calibration") / f"site{'abc'[number]}.png"
+        place = (
+            folder / ("images" if number < SITES else "calibration") / f"site{'abc'[number]}.png"
+        )
         place.parent.mkdir(exist_ok=True)
         Image.fromarray(np.clip(scene, 0, 255).astype(np.uint8)).save(place)
     return folder
@@ -65,7 +73,11 @@ def studied(folder: Path, out: Path, **options: Any) -> Tradeoff:
 
 
 @pytest.fixture(scope="module")
-def study(folder: Path, small: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Tradeoff, Path]:  # noqa: ARG001
+def study(
+    folder: Path,
+    small: None,  # noqa: ARG001
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[Tradeoff, Path]:
     """An unbroken run, and where its measurements lie."""
     out = tmp_path_factory.mktemp("study")
     return studied(folder, out), out
@@ -79,11 +91,15 @@ def test_every_figure_is_a_number_or_has_a_reason(study: tuple[Tradeoff, Path]) 
             assert figure.unit, key
             assert figure.source if figure.value is not None else figure.reason
     on_board = next(point for point in points if point.text["configuration"] == "C32B3")
-    assert {key for key, figure in on_board.figures.items() if figure.value is None} == {"LPIPS-squeeze"}
+    assert {key for key, figure in on_board.figures.items() if figure.value is None} == {
+        "LPIPS-squeeze"
+    }
     assert {point.text["sensor"] for point in points} == {"known"}
 
 
-def test_exact_halos_give_one_picture_and_smaller_ones_show_seams(study: tuple[Tradeoff, Path]) -> None:
+def test_exact_halos_give_one_picture_and_smaller_ones_show_seams(
+    study: tuple[Tradeoff, Path],
+) -> None:
     points = [point for point in study[0].points if "INT8" in point.name]
     exact = {point.value("PSNR") for point in points if point.text["halo"] == "exact"}
     (cut,) = [point for point in points if point.text["halo"] == "0"]
@@ -93,7 +109,9 @@ def test_exact_halos_give_one_picture_and_smaller_ones_show_seams(study: tuple[T
     assert all(SEAM_ERROR not in point.figures for point in points if point.text["halo"] == "exact")
 
 
-def test_the_scores_are_those_of_the_method_that_evaluate_takes(folder: Path, study: tuple[Tradeoff, Path]) -> None:
+def test_the_scores_are_those_of_the_method_that_evaluate_takes(
+    folder: Path, study: tuple[Tradeoff, Path]
+) -> None:
     degraded = load_sensor(SENSOR)
     reference = reference_for(degraded)
     restore = method_named(str(folder / "narrow.safetensors"), degraded, reference).restore
@@ -107,7 +125,10 @@ def test_the_scores_are_those_of_the_method_that_evaluate_takes(folder: Path, st
 def test_two_sites_give_no_interval_and_it_is_said(study: tuple[Tradeoff, Path]) -> None:
     found = study[0]
     assert all(point.figures["PSNR"].interval is None for point in found.points)
-    assert {row.text["gain over the next cheaper"] for row in found.front_rows} <= {"cheapest", TOO_FEW}
+    assert {row.text["gain over the next cheaper"] for row in found.front_rows} <= {
+        "cheapest",
+        TOO_FEW,
+    }
     notes = " ".join(found.notes)
     assert "No interval over sites is shown: of 2, fewer than 5" in notes
     assert "Scene pixels per pixel: 2 (2 of 2 images), where pleiades-degraded states 5" in notes
@@ -155,7 +176,9 @@ def test_a_measurement_depends_on_its_inputs(tmp_path: Path) -> None:
 
 def test_an_int8_file_is_made_once(folder: Path, tmp_path: Path) -> None:
     def made() -> Path:
-        return make_int8(folder / "narrow.safetensors", tmp_path, folder / "calibration", load_sensor(SENSOR), 0)
+        return make_int8(
+            folder / "narrow.safetensors", tmp_path, folder / "calibration", load_sensor(SENSOR), 0
+        )
 
     path = made()
     changed = path.stat().st_mtime_ns
@@ -163,11 +186,15 @@ def test_an_int8_file_is_made_once(folder: Path, tmp_path: Path) -> None:
     assert path.stat().st_mtime_ns == changed
 
 
-def test_two_boards_give_the_same_answer_in_either_order(folder: Path, study: tuple[Tradeoff, Path]) -> None:
+def test_two_boards_give_the_same_answer_in_either_order(
+    folder: Path, study: tuple[Tradeoff, Path]
+) -> None:
     """The VCK190 is faster, and takes more power than this budget allows."""
     boards = ("vck190", "zcu104")
     budget = "latency<=60s,power<=20W"
-    one, other = (studied(folder, study[1], board=each, budget=budget) for each in (boards, boards[::-1]))
+    one, other = (
+        studied(folder, study[1], board=each, budget=budget) for each in (boards, boards[::-1])
+    )
     assert one.best is not None
     assert one.best.text["board"] == "zcu104"
     assert one.line == other.line
@@ -182,7 +209,11 @@ def test_the_quality_is_measured_once_for_all_boards(
     monkeypatch.setattr(Benchmark, "score", lambda *_: pytest.fail("measured again"))
     found = studied(folder, study[1], board="all", budget="latency<=60s")
     assert {row.name for row in found.board_rows} == set(board_names())
-    values = {point.value("PSNR") for point in found.points if "INT8" in point.name and point.text["halo"] == "exact"}
+    values = {
+        point.value("PSNR")
+        for point in found.points
+        if "INT8" in point.name and point.text["halo"] == "exact"
+    }
     assert len(values) == 1
     assert all("board power" in row.figures for row in found.front_rows)
 
@@ -211,7 +242,9 @@ def test_labelled_pictures_add_map50_beside_exact_halos(
     monkeypatch.setattr(Labelled, "open", opened)
     monkeypatch.setattr(Labelled, "measure", lambda *_: {"value": 0.5, "interval": None})
     found = studied(folder, study[1], labelled=folder, need="map50>=40")
-    values = {point.text["halo"]: point.figures["mAP50"] for point in found.points if "INT8" in point.name}
+    values = {
+        point.text["halo"]: point.figures["mAP50"] for point in found.points if "INT8" in point.name
+    }
     assert values["exact"].value == 50
     assert values["0"].reason == "measured with exact halos alone"
     assert "mAP50 50 % (measured)" in found.line
@@ -222,8 +255,12 @@ def test_a_detector_is_shown_what_each_method_restored(folder: Path, tmp_path: P
     pytest.importorskip("pycocotools")
     for number in range(2):
         shutil.copy(folder / "images" / f"site{'ab'[number]}.png", tmp_path / f"scene{number}.png")
-    images = [{"id": k, "file_name": f"scene{k}.png", "width": 340, "height": 300} for k in range(2)]
-    boxes = [{"id": k + 1, "image_id": k, "category_id": 1, "bbox": [40, 40, 30, 20]} for k in range(2)]
+    images = [
+        {"id": k, "file_name": f"scene{k}.png", "width": 340, "height": 300} for k in range(2)
+    ]
+    boxes = [
+        {"id": k + 1, "image_id": k, "category_id": 1, "bbox": [40, 40, 30, 20]} for k in range(2)
+    ]
     labels = {"images": images, "annotations": boxes, "categories": [{"id": 1, "name": "vehicle"}]}
     (tmp_path / "labels.json").write_text(json.dumps(labels))
     degraded = load_sensor("dior-medium")
@@ -241,18 +278,31 @@ def test_the_command_recommends_in_one_line_and_writes_its_files(
     folder: Path, study: tuple[Tradeoff, Path], budget: str, code: int
 ) -> None:
     out = study[1]
-    given = "--network", folder / "narrow.safetensors", "--images", folder / "images", "--size", "1500x1200"
+    given = (
+        "--network",
+        folder / "narrow.safetensors",
+        "--images",
+        folder / "images",
+        "--size",
+        "1500x1200",
+    )
     calibrated = "--calibration", folder / "calibration"
     said = done("tradeoff", *given, *calibrated, "--out", out, "--budget", budget, code=code)
     lines = [line for line in said.splitlines() if "recommend" in line]
     assert len(lines) == 1
-    assert lines[0].startswith(f"{'nothing to recommend' if code else 'recommended'} for board latency <= ")
+    assert lines[0].startswith(
+        f"{'nothing to recommend' if code else 'recommended'} for board latency <= "
+    )
     names = {"tradeoff.html", "tradeoff.svg", "tradeoff.json", "measurements.json", "int8"}
     assert {path.name for path in out.iterdir()} == names
     assert valid(out / "tradeoff.json")["rows"][0]["text"]["line"] == lines[0]
     assert lines[0][1:40] in (out / "tradeoff.html").read_text().replace("&lt;", "<")
 
 
-@pytest.mark.parametrize("options", ["--detector d.onnx", "--classes car=vehicle", "--need map50>=40"])
-def test_what_only_labelled_pictures_have_is_refused_without_them(options: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "options", ["--detector d.onnx", "--classes car=vehicle", "--need map50>=40"]
+)
+def test_what_only_labelled_pictures_have_is_refused_without_them(
+    options: str, tmp_path: Path
+) -> None:
     assert "--labelled beside it" in refused("tradeoff", "--out", tmp_path, *options.split())
