@@ -1,5 +1,5 @@
-"""What the verbs give for three networks and two small images, in a form that is small to keep and
-to compare.
+"""What the verbs give for three networks and two small images, for sixteen layouts of rasters, for
+the twelve small networks and for wrong calls, in a form that is small to store and to compare.
 
     PYTHONPATH=. python tests/golden/outputs.py
 
@@ -8,8 +8,10 @@ said in its commit.
 """
 
 import json
+import os
 import sys
 import tempfile
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,42 +25,102 @@ from typer.testing import CliRunner
 from beers_deploy.cli import app
 from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
+from beers_deploy.model.io.files import sha256
+from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.onnx_file import save_onnx
+from benchmarks.small_networks import NETWORKS
 from examples.networks import build
 from examples.networks import to_onnx as example_to_onnx
+from tests.golden.layouts import CREATION, restored
+from tests.golden.small_networks import quantised
+from tests.golden.wrong_calls import CALLS, answer, inputs
 
-KEPT = Path(__file__).resolve().parent / "outputs"
+STORED = Path(__file__).resolve().parent / "outputs"
 SHIPPED = "convbeers-xs"
 PLAIN = "plain"
 OTHER = "dncnn"
 PATCHES = ("--patches", "4", "--patch", "48")
 
 
-def outputs(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Restored pixels and the integers of INT8 files by name; predicted and counted figures by verb
-    and network.
+@dataclass(frozen=True)
+class Outputs:
+    """What is frozen.
+
+    Attributes:
+        arrays: restored pixels, and the integers of INT8 files, by name.
+        figures: of the JSON of verbs, by verb and network.
+        digests: SHA-256 of the shipped INT8 files, as `export` writes them.
+        layouts: pixels and metadata that `restore` writes, by the layout of its input.
+        answers: exit code and message, by wrong call.
     """
-    images = _images(folder)
+
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+    figures: dict[str, Any] = field(default_factory=dict)
+    digests: dict[str, str] = field(default_factory=dict)
+    layouts: dict[str, Any] = field(default_factory=dict)
+    answers: dict[str, Any] = field(default_factory=dict)
+
+    def add_network(self, name: str, files: tuple[str, str], folder: Path) -> None:
+        """Restore, check and gate a network by its float and its INT8 file."""
+        for precision, file in zip(("float32", "int8"), files, strict=True):
+            for image, path in _images(folder).items():
+                self.arrays[f"{name}, {precision}, {image}"] = _restored(file, path, folder)
+            key = f"check, {name}, {precision}"
+            self.figures.update(_figures(key, folder, "check", file, "--tile", "64"))
+        self.add_integers(name, Path(files[1]))
+        pair = files if name != SHIPPED else (name,)
+        limits = ("--patches", "2", "--max-mae", "0.1")
+        self.figures.update(_figures(f"gate, {name}", folder, "gate", *pair, *limits))
+
+    def add_integers(self, name: str, int8: Path) -> None:
+        """Add the integers of an INT8 file."""
+        for key, value in _integers(int8).items():
+            self.arrays[f"{name}, {key}"] = value
+
+
+def outputs(folder: Path) -> Outputs:
+    """Run everything in an empty folder."""
+    made = Outputs()
     networks = _networks(folder)
-    arrays: dict[str, np.ndarray] = {}
-    figures: dict[str, Any] = {}
-    for name, (float_model, int8_model) in networks.items():
-        for precision, file in (("float32", float_model), ("int8", int8_model)):
-            for image, path in images.items():
-                arrays[f"{name}, {precision}, {image}"] = _restored(file, path, folder)
-            figures |= _figures(
-                f"check, {name}, {precision}", folder, "check", file, "--tile", "64"
-            )
-        arrays |= {f"{name}, {key}": value for key, value in _integers(Path(int8_model)).items()}
-        pair = (float_model, int8_model) if name != SHIPPED else (name,)
-        figures |= _figures(
-            f"gate, {name}", folder, "gate", *pair, "--patches", "2", "--max-mae", "0.1"
-        )
-    figures |= _figures(
-        f"bench, {SHIPPED}", folder, "bench", f"{SHIPPED}-int8", "--size", "3000x2000"
-    )
-    return arrays, figures
+    for name, files in networks.items():
+        made.add_network(name, files, folder)
+    for name in NETWORKS:
+        made.add_integers(name, quantised(name, folder))
+    for name in shipped_names():
+        file = folder / f"{name}-int8.onnx"
+        _run("export", "--network", f"{name}-int8", "--out", file)
+        made.digests[name] = sha256(file)
+    bench = (f"bench, {SHIPPED}", folder, "bench", f"{SHIPPED}-int8", "--size", "3000x2000")
+    made.figures.update(_figures(*bench))
+    made.figures.update(_evaluated(folder))
+    for name in CREATION:
+        made.layouts[name] = restored(name, networks[SHIPPED][1], folder)
+    made.answers.update(_answers(folder))
+    return made
+
+
+def _evaluated(folder: Path) -> dict[str, Any]:
+    """What `evaluate` finds on one pair of 96 x 96 pixels."""
+    scene = folder / "scene.tif"
+    rows, columns = np.mgrid[:384, :384] / 40
+    tifffile.imwrite(scene, (60 + 30 * np.sin(3 * rows) * np.cos(2 * columns)).astype(np.float32))
+    _run("simulate", scene, "--out", folder / "pairs")
+    methods = ("--methods", f"degraded,{SHIPPED}-int8")
+    return _figures("evaluate", folder, "evaluate", "--pairs", folder / "pairs", *methods)
+
+
+def _answers(folder: Path) -> dict[str, Any]:
+    """What wrong calls are answered, in a folder of their own."""
+    inner = folder / "wrong"
+    inner.mkdir()
+    inputs(inner)
+    before = Path.cwd()
+    os.chdir(inner)
+    try:
+        return {words: answer(words) for words in CALLS}
+    finally:
+        os.chdir(before)
 
 
 def _images(folder: Path) -> dict[str, Path]:
@@ -68,10 +130,10 @@ def _images(folder: Path) -> dict[str, Path]:
     noisy = scene + 12 * np.random.default_rng(0).standard_normal(scene.shape)
     holed = noisy.astype(np.float32)[:48, :70]
     holed[20:23, 30:41] = np.nan
-    found = {"uint16": np.rint(noisy.clip(0, 4095)).astype(np.uint16), "float32": holed}
-    for name, pixels in found.items():
+    images = {"uint16": np.rint(noisy.clip(0, 4095)).astype(np.uint16), "float32": holed}
+    for name, pixels in images.items():
         tifffile.imwrite(folder / f"{name}.tif", pixels)
-    return {name: folder / f"{name}.tif" for name in found}
+    return {name: folder / f"{name}.tif" for name in images}
 
 
 def _networks(folder: Path) -> dict[str, tuple[str, str]]:
@@ -85,13 +147,13 @@ def _networks(folder: Path) -> dict[str, tuple[str, str]]:
         example_to_onnx(OTHER, build(OTHER, torch.Generator().manual_seed(0))),
         folder / f"{OTHER}.onnx",
     )
-    found = {SHIPPED: (str(folder / "xs.onnx"), str(folder / "xs-int8.onnx"))}
+    files = {SHIPPED: (str(folder / "xs.onnx"), str(folder / "xs-int8.onnx"))}
     for name, path in ((SHIPPED, "xs.onnx"), (f"{SHIPPED}-int8", "xs-int8.onnx")):
         _run("export", "--network", name, "--out", folder / path)
     for name in (PLAIN, OTHER):
         _run("quantize", folder / f"{name}.onnx", "--out", folder / f"{name}-int8.onnx", *PATCHES)
-        found[name] = (str(folder / f"{name}.onnx"), str(folder / f"{name}-int8.onnx"))
-    return found
+        files[name] = (str(folder / f"{name}.onnx"), str(folder / f"{name}-int8.onnx"))
+    return files
 
 
 def _run(*arguments: object) -> None:
@@ -118,26 +180,37 @@ def _integers(path: Path) -> dict[str, np.ndarray]:
     }
 
 
-def _figures(key: str, folder: Path, *command: str) -> dict[str, Any]:
+def _figures(key: str, folder: Path, *command: object) -> dict[str, Any]:
     """Figures of a command's JSON that no clock made: of a bench those of the DPU, whole."""
     out = folder / "figures.json"
     _run(*command, "--json", out)
-    rows = json.loads(out.read_text(encoding="utf-8"))["rows"]
-    return {
-        f"{key}: {row['table']}, {row['name']}, {name}": figure["value"]
-        for row in rows
-        for name, figure in row["figures"].items()
-        if command[0] != "bench" or "on the DPU (" in row["name"] or "sum:" in row["name"]
-    }
+    figures = {}
+    for row in json.loads(out.read_text(encoding="utf-8"))["rows"]:
+        if (
+            command[0] == "bench"
+            and "on the DPU (" not in row["name"]
+            and "sum:" not in row["name"]
+        ):
+            continue
+        for name, figure in row["figures"].items():
+            figures[f"{key}: {row['table']}, {row['name']}, {name}"] = figure["value"]
+    return figures
 
 
 def main() -> None:
-    """Write what is kept anew."""
+    """Write the stored outputs anew."""
     with tempfile.TemporaryDirectory() as folder:
-        arrays, figures = outputs(Path(folder))
-    np.savez_compressed(KEPT.with_suffix(".npz"), **arrays)  # type: ignore[arg-type]
-    KEPT.with_suffix(".json").write_text(json.dumps(figures, indent=0) + "\n", encoding="utf-8")
-    sys.stdout.write(f"{len(arrays)} arrays, {len(figures)} figures\n")
+        made = outputs(Path(folder))
+    np.savez_compressed(STORED.with_suffix(".npz"), **made.arrays)  # type: ignore[arg-type]
+    document = {
+        "figures": made.figures,
+        "digests": made.digests,
+        "layouts": made.layouts,
+        "wrong calls": made.answers,
+    }
+    text = json.dumps(document, indent=0, ensure_ascii=False)
+    STORED.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
+    sys.stdout.write(f"{len(made.arrays)} arrays, {len(made.figures)} figures\n")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,193 @@
+"""Sixteen raster layouts, and what `restore` makes of each: pixels and metadata, as GDAL reads
+them, or the refusal. Compressed bytes are not kept: they change with the writer.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from affine import Affine
+from rasterio.control import GroundControlPoint
+from rasterio.rpc import RPC
+from typer.testing import CliRunner
+
+from beers_deploy.cli import app
+
+HEIGHT_PX = 48
+WIDTH_PX = 70
+NODATA = 65535
+ORIGIN = Affine(0.5, 0, 600000, 0, -0.5, 4800000)
+TILED: dict[str, object] = {"tiled": True, "blockxsize": 32, "blockysize": 16}
+CREATION: dict[str, dict[str, object]] = {
+    "striped": {"blockysize": 7},
+    "tiled": TILED,
+    "planar": {"interleave": "band"},
+    "lzw": {"compress": "lzw"},
+    "zstd": {"compress": "zstd"},
+    "deflate, predictor 2": {"compress": "deflate", "predictor": 2},
+    "deflate, predictor 3": {"compress": "deflate", "predictor": 3, "dtype": "float32"},
+    "jpeg": {"compress": "jpeg", "jpeg_quality": 95, "dtype": "uint8", **TILED},
+    "big-endian": {"ENDIANNESS": "BIG"},
+    "bigtiff": {"BIGTIFF": "YES", **TILED},
+    "12 bits packed": {"NBITS": 12},
+    "nodata": {"nodata": NODATA},
+    "internal mask": {},
+    "alpha": {"ALPHA": "YES"},
+    "rpcs and ground control points": {},
+    "jpeg 2000": {"driver": "JP2OpenJPEG", "QUALITY": 100, "REVERSIBLE": "YES"},
+    "vrt": {},
+    "float with nan": {"dtype": "float32"},
+}
+"""By layout, what GDAL is told when it writes the file."""
+
+
+def scene() -> np.ndarray:
+    """(48, 70) of 12 bits: texture, an edge, and noise."""
+    rows, columns = np.mgrid[:HEIGHT_PX, :WIDTH_PX] / 20
+    even = 900 + 700 * np.sin(5 * rows) * np.cos(3 * columns) + 1400 * (rows + columns > 3)
+    noise = 12 * np.random.default_rng(0).standard_normal(even.shape)
+    return np.asarray(np.rint((even + noise).clip(0, 4095)).astype(np.uint16))
+
+
+def bands_of(name: str) -> list[np.ndarray]:
+    """The planes of a layout: the scene, and what the layout is about."""
+    image = scene()
+    if name in ("nodata", "float with nan"):
+        image = image.astype(np.float32) if name == "float with nan" else image
+        image[20:23, 30:41] = np.nan if name == "float with nan" else NODATA
+    if name == "jpeg":
+        image = image // 16
+    if name == "planar":
+        return [image, image[::-1]]
+    if name == "alpha":
+        opaque = np.full_like(image, NODATA)
+        opaque[:5, :9] = 0
+        return [image, opaque]
+    return [image]
+
+
+def written(name: str, folder: Path) -> Path:
+    """Write a layout's file."""
+    bands = bands_of(name)
+    options = {"driver": "GTiff", "dtype": "uint16"} | CREATION[name]
+    path = folder / f"{name}.{'jp2' if name == 'jpeg 2000' else 'tif'}"
+    if "control" in name:
+        options |= {"crs": "EPSG:4326", "gcps": corner_points(), "rpcs": coefficients()}
+    else:
+        options |= {"crs": "EPSG:32631", "transform": ORIGIN}
+    with rasterio.open(
+        path, "w", height=HEIGHT_PX, width=WIDTH_PX, count=len(bands), **options
+    ) as file:
+        file.write(np.stack(bands))
+        describe(file, name)
+    return virtual(path) if name == "vrt" else path
+
+
+def describe(file: Any, name: str) -> None:
+    """Add the metadata that a layout is about to a file that is being written."""
+    if name == "internal mask":
+        known = np.full((HEIGHT_PX, WIDTH_PX), 255, np.uint8)
+        known[30:35, 50:58] = 0
+        file.write_mask(known)
+    if name == "planar":
+        file.descriptions = ("forward", "backward")
+
+
+def corner_points() -> list[GroundControlPoint]:
+    """The ground control points of the corners."""
+    corners = [(0, 0), (0, WIDTH_PX), (HEIGHT_PX, 0), (HEIGHT_PX, WIDTH_PX)]
+    return [
+        GroundControlPoint(row, column, 2.3 + column / 9e4, 48.8 - row / 9e4, 120.0)
+        for row, column in corners
+    ]
+
+
+def coefficients() -> RPC:
+    """Rational polynomials of a place: linear in longitude and latitude."""
+    return RPC(
+        err_bias=1.0,
+        err_rand=0.5,
+        height_off=120.0,
+        height_scale=500.0,
+        lat_off=48.8,
+        lat_scale=0.01,
+        long_off=2.3,
+        long_scale=0.01,
+        line_off=HEIGHT_PX / 2,
+        line_scale=HEIGHT_PX / 2,
+        samp_off=WIDTH_PX / 2,
+        samp_scale=WIDTH_PX / 2,
+        line_num_coeff=[0.0, 0.0, -1.0] + [0.0] * 17,
+        line_den_coeff=[1.0] + [0.0] * 19,
+        samp_num_coeff=[0.0, 1.0] + [0.0] * 18,
+        samp_den_coeff=[1.0] + [0.0] * 19,
+    )
+
+
+def virtual(source: Path) -> Path:
+    """Write a virtual raster of one file beside it."""
+    path = source.with_suffix(".vrt")
+    path.write_text(
+        f"""<VRTDataset rasterXSize="{WIDTH_PX}" rasterYSize="{HEIGHT_PX}">
+<SRS>EPSG:32631</SRS><GeoTransform>{", ".join(map(str, ORIGIN.to_gdal()))}</GeoTransform>
+<VRTRasterBand dataType="UInt16" band="1"><SimpleSource>
+<SourceFilename relativeToVRT="1">{source.name}</SourceFilename><SourceBand>1</SourceBand>
+<SrcRect xOff="0" yOff="0" xSize="{WIDTH_PX}" ySize="{HEIGHT_PX}"/>
+<DstRect xOff="0" yOff="0" xSize="{WIDTH_PX}" ySize="{HEIGHT_PX}"/>
+</SimpleSource></VRTRasterBand></VRTDataset>""",
+        encoding="utf-8",
+    )
+    return path
+
+
+def restored(name: str, network: str, folder: Path) -> Mapping[str, object]:
+    """Restore a layout by INT8; what GDAL reads of the result, or the exit code and what was said.
+
+    Args:
+        name: of the layout.
+        network: the file of an INT8 network.
+        folder: where files are written.
+    """
+    image = written(name, folder)
+    out = folder / f"{name}, restored.tif"
+    top = "255" if name == "jpeg" else "4095"
+    words = ["restore", str(image), str(out), "--network", network, "--full-scale", top]
+    result = CliRunner().invoke(app, [*words, "--tile", "64"], catch_exceptions=False)
+    if result.exit_code:
+        said = result.stderr.replace(str(folder), "FOLDER")
+        return {"exit code": result.exit_code, "message": " ".join(said.split())}
+    return read_back(out)
+
+
+def read_back(path: Path) -> dict[str, object]:
+    """What GDAL reads of a restored file, its pixels by their digest and mean."""
+    with rasterio.open(path) as file:
+        pixels = file.read()
+        mask = file.dataset_mask()
+        points, system = file.gcps
+        place = str(file.crs or system)
+        facts: dict[str, object] = {
+            "shape": list(pixels.shape),
+            "type": str(pixels.dtype),
+            "nodata": None if file.nodata is None else str(file.nodata),
+            "colours": [each.name for each in file.colorinterp],
+            "descriptions": list(file.descriptions),
+            "system": place,
+            "transform": list(file.transform)[:6],
+            "control points": [[each.row, each.col, each.x, each.y, each.z] for each in points],
+            "rpcs": digest(str(sorted(file.rpcs.to_dict().items()))) if file.rpcs else None,
+        }
+    facts["pixels"] = digest(pixels.tobytes())
+    facts["mean"] = round(float(np.nanmean(pixels.astype(np.float64))), 3)
+    facts["mask"] = digest(mask.tobytes())
+    facts["missing"] = int((mask == 0).sum())
+    return facts
+
+
+def digest(content: bytes | str) -> str:
+    """The first sixteen digits of the SHA-256."""
+    whole = content.encode() if isinstance(content, str) else content
+    return hashlib.sha256(whole).hexdigest()[:16]

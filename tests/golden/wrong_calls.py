@@ -1,0 +1,95 @@
+"""Forty calls that are wrong, and what is answered: exit code and message.
+
+Files are named by what is the matter with them; `inputs` writes them.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import tifffile
+from onnx import TensorProto, helper
+from typer.testing import CliRunner
+
+from beers_deploy.cli import app
+
+CALLS = (
+    "restore",
+    "restore none.tif out.tif",
+    "restore image.tif image.tif",
+    "restore empty.tif out.tif",
+    "restore nan.tif out.tif",
+    "restore image.tif out.jpg",
+    "restore image.tif out.tif --network none",
+    "restore image.tif out.tif --network empty.onnx",
+    "restore image.tif out.tif --sensor none",
+    "restore image.tif out.tif --tile 7",
+    "restore image.tif out.tif --full-scale -1",
+    "restore image.tif out.tif --method magic",
+    "info none.tif",
+    "info text.tif",
+    "export --network none --out out.onnx",
+    "export --network convbeers-xs --out out.txt",
+    "quantize none.onnx --out out.onnx",
+    "quantize text.onnx --out out.onnx",
+    "quantize pixelwise.onnx --out out.onnx --patches 0",
+    "quantize pixelwise.onnx --out out.onnx --images none",
+    "gate convbeers-xs --baseline none.json",
+    "gate convbeers-xs --max-mae -0.1",
+    "gate pixelwise.onnx",
+    "diff text.json text.json",
+    "check none.onnx",
+    "check pixelwise.onnx --target none",
+    "check pixelwise.onnx --target broken.toml",
+    "bench convbeers-xs-int8 --size 0x0",
+    "bench convbeers-xs-int8 --size large",
+    "bench convbeers-xs-int8 --target unknown.toml",
+    "evaluate --pairs none",
+    "tradeoff --images none --out out",
+    "stress none.onnx none.onnx",
+    "profiles none",
+    "characterise none.tif --out out.toml",
+    "simulate --out out --scenes 0",
+    "simulate --sensor broken.toml --out out",
+    "train --recipe none --images none --out out",
+    "none",
+    "restore image.tif out.tif --none",
+)
+"""Words of each command line; files lie in the folder where it is run."""
+
+
+def inputs(folder: Path) -> None:
+    """Write the files that the calls name."""
+    pixels = np.random.default_rng(0).integers(100, 4000, (40, 50)).astype(np.uint16)
+    tifffile.imwrite(folder / "image.tif", pixels)
+    tifffile.imwrite(folder / "nan.tif", np.full((40, 50), np.nan, np.float32))
+    for name in ("empty.tif", "empty.onnx"):
+        (folder / name).touch()
+    for name in ("text.tif", "text.onnx", "text.json"):
+        (folder / name).write_text("words\n", encoding="utf-8")
+    (folder / "broken.toml").write_text("[sensor\n", encoding="utf-8")
+    (folder / "unknown.toml").write_text('base = "vck190"\nspeed = 3\n', encoding="utf-8")
+    onnx.save(pixelwise(), str(folder / "pixelwise.onnx"))
+
+
+def pixelwise() -> onnx.ModelProto:
+    """A network of one convolution of 1 x 1."""
+    sides: list[str | int] = ["batch", 1, "height", "width"]
+    values = (
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, sides) for name in ("image", "out")
+    )
+    image, out = values
+    weight = helper.make_tensor("weight", TensorProto.FLOAT, [1, 1, 1, 1], [0.9])
+    node = helper.make_node("Conv", ["image", "weight"], ["out"], name="scale")
+    graph = helper.make_graph([node], "pixelwise", [image], [out], [weight])
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+
+
+def answer(words: str) -> dict[str, object]:
+    """Run a call in the current folder; its exit code, what it said, and what it left behind."""
+    before = {path.name for path in Path().iterdir()}
+    result = CliRunner(env={"COLUMNS": "200"}).invoke(app, words.split())
+    # Click draws a box around what is wrong with an option, under a line of usage.
+    message = " ".join(word for word in result.stderr.split() if not set(word) <= set("╭─│╮╰╯"))
+    left = sorted({path.name for path in Path().iterdir()} - before)
+    return {"exit code": result.exit_code, "message": message, "left behind": left}
