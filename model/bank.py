@@ -93,6 +93,8 @@ class Bank:
 
         The image's one weight, which no copy corrects, is a whole number so.
         """
+        # In eighths the image's one weight is an integer in INT8. No copy would correct its
+        # rounding.
         return float(np.clip(np.rint(8 * self.sigma / SIGMA) / 8, *GAINS))
 
     def reach(self, kernels: Kernels) -> tuple[float, float]:
@@ -137,9 +139,8 @@ def network_bank(sensor: Instrument, kernels: Kernels = "fitted") -> Bank:
     """The filters in front of a network: noise outside the range that was trained counts as the
     nearest end of it.
     """
-    return _bank(
-        sensor, float(np.clip(noise_over_full_scale(sensor), *RANGES["sigma_bright"])), kernels
-    )
+    sigma = float(np.clip(noise_over_full_scale(sensor), *RANGES["sigma_bright"]))
+    return _bank(sensor, sigma, kernels)
 
 
 @lru_cache(maxsize=4096)
@@ -161,21 +162,23 @@ def _reference() -> Instrument:
 def _bank(sensor: Instrument, sigma: float, kernels: Kernels) -> Bank:
     fy = np.fft.fftfreq(GRID)[:, None]
     fx = np.fft.fftfreq(GRID)[None, :]
-    blur, target = (sensor_mtf(fx, fy, each) for each in (sensor, _reference()))
+    blur, target = (sensor_mtf(fx, fy, side) for side in (sensor, _reference()))
     r_squared = (fx**2 + fy**2) / NYQUIST**2
     epsilons = [EPSILON_PER_SIGMA * sigma * STEP ** (k - 1) for k in range(FILTERS)]
     gains = [restoring_gain(blur, target, r_squared, epsilon) for epsilon in epsilons]
     if kernels == "cut":
+        # Networks trained before kernels were fitted read filters that are cut to 7 x 7.
         falling = np.stack([*gains, np.ones_like(blur)])
         filters = np.fft.ifft2(falling[:-1] - falling[1:]).real
-        return Bank(np.stack([cut_filter(each, SIDE_PX // 2, total=0) for each in filters]), sigma)
-    fitted = [
+        details = [cut_filter(kernel, SIDE_PX // 2, total=0) for kernel in filters]
+        return Bank(np.stack(details), sigma)
+    wiener_kernels = [
         fitted_kernel(gain, np.abs(blur) ** 2 + epsilon * r_squared, r_squared)
         for gain, epsilon in zip(gains, epsilons, strict=True)
     ]
     itself = np.zeros((SIDE_PX, SIDE_PX))
     itself[SIDE_PX // 2, SIDE_PX // 2] = 1
-    falling = np.stack([*fitted, itself])
+    falling = np.stack([*wiener_kernels, itself])
     return Bank(falling[:-1] - falling[1:], sigma)
 
 
@@ -196,17 +199,18 @@ def fitted_kernel(
         r_squared: r^2 there.
     """
     weights = np.zeros_like(power)
+    # At frequency 0 the weight is infinite. The equation for the sum stands for it below.
     weights[r_squared > 0] = power[r_squared > 0] / r_squared[r_squared > 0]
     correlation = np.fft.ifft2(weights).real
-    wanted = np.fft.ifft2(weights * gain).real
+    restoration = np.fft.ifft2(weights * gain).real
     offsets = np.arange(SIDE_PX) - SIDE_PX // 2
-    rows, columns = (each.ravel() for each in np.meshgrid(offsets, offsets, indexing="ij"))
+    rows, columns = (grid.ravel() for grid in np.meshgrid(offsets, offsets, indexing="ij"))
     # The sum of 1 is one more equation, with a multiplier as one more unknown.
     equations = np.ones((len(rows) + 1, len(rows) + 1))
     equations[:-1, :-1] = correlation[rows[:, None] - rows, columns[:, None] - columns]
     equations[-1, -1] = 0
-    found = np.linalg.solve(equations, np.append(wanted[rows, columns], 1.0))
-    return np.asarray(found[:-1].reshape(SIDE_PX, SIDE_PX))
+    solution = np.linalg.solve(equations, np.append(restoration[rows, columns], 1.0))
+    return np.asarray(solution[:-1].reshape(SIDE_PX, SIDE_PX))
 
 
 def in_places(kernels: NDArray[np.float64], scale: int) -> NDArray[np.float64]:
@@ -224,16 +228,14 @@ def in_places(kernels: NDArray[np.float64], scale: int) -> NDArray[np.float64]:
     side_px = kernels.shape[-1]
     reach = -(-(side_px // 2) // scale)
     middle = side_px // 2
-    found = np.zeros((len(kernels), scale, scale, scale, scale, 2 * reach + 1, 2 * reach + 1))
+    weights = np.zeros((len(kernels), scale, scale, scale, scale, 2 * reach + 1, 2 * reach + 1))
     for row, column, down, right in product(
         range(scale), range(scale), range(side_px), range(side_px)
     ):
-        (place_y, y), (place_x, x) = (
-            divmod(row + down - middle, scale),
-            divmod(column + right - middle, scale),
-        )
-        found[:, row, column, y, x, place_y + reach, place_x + reach] = kernels[:, down, right]
-    return found.reshape(len(kernels) * scale**2, scale**2, 2 * reach + 1, 2 * reach + 1)
+        place_y, y = divmod(row + down - middle, scale)
+        place_x, x = divmod(column + right - middle, scale)
+        weights[:, row, column, y, x, place_y + reach, place_x + reach] = kernels[:, down, right]
+    return weights.reshape(len(kernels) * scale**2, scale**2, 2 * reach + 1, 2 * reach + 1)
 
 
 def restoring_gain(

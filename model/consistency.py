@@ -90,10 +90,10 @@ around.
 PRODUCTS_PER_PX = (
     RANK
     * (BLOCK_PX + 2 * NEAR_PX)
-    * (1 / BLOCK_PX + 1 / BLOCK_PX**2)  # the near part, by rows and by columns
-    + (1 + 1 / BLOCK_PX) * 2  # block means of y and of x
-    + (2 * FAR_BLOCKS + 1) ** 2 / BLOCK_PX**2  # the far part
-    + 2 * (1 + 1 / BLOCK_PX)  # interpolation
+    * (1 / BLOCK_PX + 1 / BLOCK_PX**2)  # The near part, by rows and by columns.
+    + (1 + 1 / BLOCK_PX) * 2  # Block means of y and of x.
+    + (2 * FAR_BLOCKS + 1) ** 2 / BLOCK_PX**2  # The far part.
+    + 2 * (1 + 1 / BLOCK_PX)  # Interpolation.
 )
 """Products, each with its sum, that the step takes for a pixel."""
 
@@ -184,8 +184,10 @@ class Consistency:
         near = (left * values) @ right
         box = np.full(BLOCK_PX, 1 / BLOCK_PX)
         # Convolution turns a filter around; the sums below go forwards.
-        rows = np.array([np.convolve(each[::-1], box) for each in (left * values).T], np.float32)
-        columns = np.array([np.convolve(each[::-1], box) for each in right], np.float32)
+        rows = np.array(
+            [np.convolve(vector[::-1], box) for vector in (left * values).T], np.float32
+        )
+        columns = np.array([np.convolve(vector[::-1], box) for vector in right], np.float32)
         far = _far_weights(kernel, near)[::-1, ::-1]
         means, excess = _clipped_noise(sensor, scale)
         return cls(rows, columns, far.astype(np.float32), means, excess, float(scale))
@@ -209,17 +211,17 @@ class Consistency:
         """
         missing = np.isnan(restored)
         any_missing = bool(missing.any())
-        known = np.where(missing, np.float32(0), restored) if any_missing else restored
+        finite = np.where(missing, np.float32(0), restored) if any_missing else restored
         origin = down.start, across.start
-        blurred = self._near(_extended(known, (down, across), origin, NEAR_PX))
-        blurred += self._far(known, missing if any_missing else None, down, across)
-        own = _block_means(_extended(raw, (down, across), raw_at, 0))
-        residual = own - _interpolated_excess(own, self.means, self.excess) - blurred
-        lost = (raw >= self.full_scale).astype(np.float32)
-        weights = np.float32(1) - _reached(_extended(lost, (down, across), raw_at, NEAR_PX))
+        blurred = self._near(_extended(finite, (down, across), origin, NEAR_PX))
+        blurred += self._far(finite, missing if any_missing else None, down, across)
+        raw_means = _block_means(_extended(raw, (down, across), raw_at, 0))
+        residual = raw_means - _interpolated_excess(raw_means, self.means, self.excess) - blurred
+        saturated = (raw >= self.full_scale).astype(np.float32)
+        weights = np.float32(1) - _reached(_extended(saturated, (down, across), raw_at, NEAR_PX))
         if any_missing:
-            gone = _extended(missing.astype(np.float32), (down, across), origin, NEAR_PX)
-            weights *= np.float32(1) - _reached(gone)
+            missing_pixels = _extended(missing.astype(np.float32), (down, across), origin, NEAR_PX)
+            weights *= np.float32(1) - _reached(missing_pixels)
         if weights.all():
             return _interpolated(residual, down, across)
         share = _interpolated(weights, down, across)
@@ -227,17 +229,17 @@ class Consistency:
         change /= np.maximum(share, np.float32(LEAST_SHARE))
         return change
 
-    def _near(self, wide: Image) -> Image:
+    def _near(self, padded: Image) -> Image:
         """Block means of the near part of H x, from pixels with NEAR_PX more on every side."""
         total: Image | None = None
         for row, column in zip(self.rows, self.columns, strict=True):
-            term = _weighted(_weighted(wide, row, 0), column, 1)
+            term = _weighted(_weighted(padded, row, 0), column, 1)
             total = term if total is None else total + term
         assert total is not None  # noqa: S101 - RANK is at least 1
         return total
 
     def _far(
-        self, known: Image, missing: NDArray[np.bool_] | None, down: Placed, across: Placed
+        self, finite: Image, missing: NDArray[np.bool_] | None, down: Placed, across: Placed
     ) -> Image:
         """Block means of the far part of H x.
 
@@ -245,18 +247,18 @@ class Consistency:
         """
         around_px = BLOCK_PX * FAR_BLOCKS
         origin = down.start, across.start
-        means = _block_means(_extended(known, (down, across), origin, around_px))
+        means = _block_means(_extended(finite, (down, across), origin, around_px))
         if missing is None:
             return self._around(means)
-        lost = _block_means(
+        missing_share = _block_means(
             _extended(missing.astype(np.float32), (down, across), origin, around_px)
         )
-        whole = (lost == 0).astype(np.float32)
+        complete = (missing_share == 0).astype(np.float32)
         middle = means[FAR_BLOCKS:-FAR_BLOCKS, FAR_BLOCKS:-FAR_BLOCKS]
         # Where all blocks are whole the last factor is exactly 0, because both sums add the same
         # numbers.
-        return self._around(means * whole) + middle * (
-            self._around(np.ones_like(whole)) - self._around(whole)
+        return self._around(means * complete) + middle * (
+            self._around(np.ones_like(complete)) - self._around(complete)
         )
 
     def _around(self, means: Image) -> Image:
@@ -291,12 +293,12 @@ def _far_weights(kernel: NDArray[np.float64], near: NDArray[np.float64]) -> NDAr
     value, is the sum of f(8 d + e) (8 - |e_y|) (8 - |e_x|) / 64 over the offsets e. What lies
     beyond the farthest blocks is spread over all of them, so that a constant image stays as it is.
     """
-    rest = kernel.copy()
+    remainder = kernel.copy()
     offsets = np.arange(-NEAR_PX, NEAR_PX + 1)
-    rest[np.ix_(offsets, offsets)] -= near
+    remainder[np.ix_(offsets, offsets)] -= near
     ramp = np.maximum(BLOCK_PX - np.abs(np.fft.fftfreq(GRID, 1 / GRID)), 0)
     overlap = np.outer(ramp, ramp) / BLOCK_PX**2
-    summed = np.fft.ifft2(np.fft.fft2(rest) * np.fft.fft2(overlap)).real
+    summed = np.fft.ifft2(np.fft.fft2(remainder) * np.fft.fft2(overlap)).real
     weights = _centre(summed[::BLOCK_PX, ::BLOCK_PX], FAR_BLOCKS)
     return np.asarray(weights + (1 - near.sum() - weights.sum()) / weights.size)
 
@@ -311,8 +313,8 @@ def _clipped_noise(sensor: Instrument, full_scale: float) -> tuple[Image, Image]
     gain = sensor.gain_dn_per_radiance
     unit = full_scale / sensor.max_dn
     variance_dark_dn = sensor.beta * gain**2 + 1 / 12
-    # alpha L grows with the signal: the range ends where the signal is EXCESS_SIGMAS times its own
-    # noise.
+    # The noise grows with the signal: the range ends where the signal is EXCESS_SIGMAS times its
+    # own noise.
     slope_dn = sensor.alpha * gain
     end_dn = EXCESS_SIGMAS**2 * slope_dn + EXCESS_SIGMAS * np.sqrt(variance_dark_dn)
     signal_dn = np.linspace(0, end_dn, 256)
@@ -326,12 +328,12 @@ def _clipped_noise(sensor: Instrument, full_scale: float) -> tuple[Image, Image]
     return means, np.asarray(excess_dn * unit, np.float32)
 
 
-def _interpolated_excess(own: Image, means: Image, excess: Image) -> Image:
+def _interpolated_excess(block_means: Image, means: Image, excess: Image) -> Image:
     """The excess at block means `own`; a mean below the least that is possible counts as no light
     at all.
     """
-    found = np.interp(own, means, excess, right=0.0).astype(np.float32)
-    return np.minimum(found, np.maximum(own, np.float32(0)))
+    values = np.interp(block_means, means, excess, right=0.0).astype(np.float32)
+    return np.minimum(values, np.maximum(block_means, np.float32(0)))
 
 
 def _extended(

@@ -58,7 +58,8 @@ class ResidualBlock(nn.Module):
         """
         inner = torch.relu(self.first(x))
         if step is not None and inner_step is not None:
-            return in_steps(x + in_steps(self.second(in_steps(inner, inner_step)), step), step)
+            rounded = in_steps(self.second(in_steps(inner, inner_step)), step)
+            return in_steps(x + rounded, step)
         correction: Tensor = self.second(inner)
         return x + correction
 
@@ -88,18 +89,19 @@ class Layers(nn.Module):
 
     def _rounded(self, shallow: Tensor, step: Tensor, *inner: Tensor) -> Tensor:
         """What the tail reads, with every map between head and tail rounded."""
-        first = stream = in_steps(shallow, step)
+        skip = stream = in_steps(shallow, step)
         for block, inner_step in zip(self.body, inner, strict=True):
             stream = block(stream, step, inner_step)
-        return in_steps(first + in_steps(self.body_end(stream), step), step)
+        return in_steps(skip + in_steps(self.body_end(stream), step), step)
 
 
 def in_steps(maps: Tensor, step: Tensor) -> Tensor:
     """Maps (N, F, H, W) in float32, held to int8 and rounded to whole steps; gradients pass the
     rounding.
     """
-    held = maps.float().clamp(-128 * step, 127 * step)
-    return held + (torch.round(held / step) * step - held).detach()
+    clipped = maps.float().clamp(-128 * step, 127 * step)
+    # The value is rounded, but the gradient is that of `clipped`: detach hides the difference.
+    return clipped + (torch.round(clipped / step) * step - clipped).detach()
 
 
 @dataclass(frozen=True)
@@ -167,15 +169,15 @@ class Told:
 
     def to(self, device: torch.device) -> "Told":
         """The same on a device."""
-        return Told(*(each.to(device, non_blocking=True) for each in self.parts))
+        return Told(*(part.to(device, non_blocking=True) for part in self.parts))
 
     def repeated(self, count: int) -> "Told":
         """What is told of one image, for as many."""
-        return Told(*(each.expand(count, *each.shape[1:]) for each in self.parts))
+        return Told(*(part.expand(count, *part.shape[1:]) for part in self.parts))
 
     def some(self, which: slice | Tensor) -> "Told":
         """What is told of some of the images."""
-        return Told(*(each[which] for each in self.parts))
+        return Told(*(part[which] for part in self.parts))
 
 
 class BankedConvBEERS(Layers):
@@ -209,8 +211,8 @@ class BankedConvBEERS(Layers):
         """
         filtered = each_by_its_own(image, told.filters)
         planes, analytic = self._held(filtered, told.gains)
-        read = pixel_unshuffle(torch.cat([image - 0.5, planes], 1), self.variant.scale)
-        shallow = (self.head(read) + self.bias(told.vectors)[:, :, None, None]).contiguous(
+        inputs = pixel_unshuffle(torch.cat([image - 0.5, planes], 1), self.variant.scale)
+        shallow = (self.head(inputs) + self.bias(told.vectors)[:, :, None, None]).contiguous(
             memory_format=torch.channels_last
         )
         correction = self.corrected(shallow, bfloat16, steps)
@@ -223,6 +225,7 @@ class BankedConvBEERS(Layers):
         analytic = filtered[:, FILTERS:]
         if self.kernels == "cut":
             return planes.clamp(-LARGEST, LARGEST), analytic.clamp(-LARGEST, LARGEST)
+        # Both end where int8 does, so that a network trains with what INT8 will show it.
         reach = LARGEST / gains[:, None, None, None]
         return planes.clamp(-reach, reach), analytic.clamp(-WIDE * reach, WIDE * reach)
 
@@ -244,8 +247,8 @@ class OfOneSensor(nn.Module):
     def forward(self, image: Tensor) -> Tensor:
         """Restore (N, 1, H, W)."""
         bank = self.bank or bank_of_vector(tuple(self.vector.tolist()), self.network.kernels)
-        known = Told.of(self.vector[None], [bank])
-        restored: Tensor = self.network(image, known.repeated(len(image)))
+        condition = Told.of(self.vector[None], [bank])
+        restored: Tensor = self.network(image, condition.repeated(len(image)))
         return restored
 
 
@@ -266,23 +269,21 @@ def each_by_its_own(image: Tensor, kernels: Tensor) -> Tensor:
     """
     count = len(image)
     radius = SIDE_PX // 2
-    wide = pad(image, [radius] * 4, mode="reflect")
-    made = conv2d(wide.transpose(0, 1), kernels.flatten(0, 1)[:, None], groups=count)
-    return made.view(count, -1, *image.shape[-2:])
+    padded = pad(image, [radius] * 4, mode="reflect")
+    filtered = conv2d(padded.transpose(0, 1), kernels.flatten(0, 1)[:, None], groups=count)
+    return filtered.view(count, -1, *image.shape[-2:])
 
 
 def initialise(network: Network, generator: torch.Generator) -> None:
     """Start as (nearly) the identity: He-normal weights, residual branches and correction scaled
-    down.
-
-    Without batch normalisation the stream's variance would otherwise double at each block. The tail
-    is scaled down once more where it writes several pixels: what is an offset of one channel is a
-    pattern of several.
+    down, the tail once more where it writes several pixels.
     """
     for name, module in network.named_modules():
         if isinstance(module, nn.Conv2d):
             fan_in = module.in_channels * 9
+            # Without batch normalisation the stream's variance would double at each block.
             scale = 0.1 if name.endswith(("second", "body_end", "tail")) else 1.0
+            # What is an offset of one channel is a pattern of the pixels of one place.
             scale /= network.variant.scale if name == "tail" else 1
             with torch.no_grad():
                 module.weight.normal_(0.0, scale * (2 / fan_in) ** 0.5, generator=generator)
@@ -312,13 +313,14 @@ def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
         weight = weights[f"{name}.weight"]
         bias = weights[f"{name}.bias"]
         if source is not None:
-            weight.copy_(
-                _widened(_coarser(small[f"{source}.weight"], factor), weight.shape, generator)
-            )
+            coarse = _coarser(small[f"{source}.weight"], factor)
+            weight.copy_(_widened(coarse, weight.shape, generator))
             bias.copy_(_repeated(small[f"{source}.bias"], bias.shape, factor))
         elif name.endswith("second"):
+            # An added block hands on its input until it has learnt something.
             weight.zero_()
-    if isinstance(large, BankedConvBEERS):  # its head's bias is told the sensor
+    # The head's bias is linear in the sensor vector, so that its weights grow with the features.
+    if isinstance(large, BankedConvBEERS):
         large.bias.weight.data.copy_(
             _repeated(small["bias.weight"], large.bias.weight.shape, factor)
         )
@@ -343,14 +345,14 @@ def _sources(small: Variant, large: Variant) -> dict[str, str | None]:
             got=got,
             remedy="start from a smaller network",
         )
-    places = [old * large.blocks // small.blocks for old in range(small.blocks)]
-    kept = {f"body.{place}.": f"body.{old}." for old, place in enumerate(places)}
-    found: dict[str, str | None] = {}
+    places = [block * large.blocks // small.blocks for block in range(small.blocks)]
+    origins = {f"body.{place}.": f"body.{block}." for block, place in enumerate(places)}
+    sources: dict[str, str | None] = {}
     for name in large.convolutions:
-        stem, _, last = name.rpartition(".")
-        prefix = kept.get(f"{stem}.")
-        found[name] = name if not stem else prefix and prefix + last
-    return found
+        stem, _, layer = name.rpartition(".")
+        prefix = origins.get(f"{stem}.")
+        sources[name] = name if not stem else prefix and prefix + layer
+    return sources
 
 
 def _repeated(rows: Tensor, shape: Sequence[int], factor: int) -> Tensor:
@@ -363,10 +365,11 @@ def _coarser(weight: Tensor, factor: int) -> Tensor:
     """(O, I, 3, 3) to (O S^2, I S^2, 3, 3): the same convolution where S x S places are the
     channels of one.
     """
-    outputs, inputs, places = *weight.shape[:2], factor**2
+    outputs, inputs = weight.shape[:2]
+    places = factor**2
     coarse = torch.from_numpy(in_places(weight.flatten(0, 1).double().numpy(), factor)).to(weight)
-    apart = coarse.view(outputs, inputs, places, places, 3, 3).transpose(1, 2)
-    return apart.reshape(outputs * places, inputs * places, 3, 3)
+    by_feature = coarse.view(outputs, inputs, places, places, 3, 3).transpose(1, 2)
+    return by_feature.reshape(outputs * places, inputs * places, 3, 3)
 
 
 def _widened(weight: Tensor, channels: Sequence[int], generator: torch.Generator) -> Tensor:
@@ -377,8 +380,8 @@ def _widened(weight: Tensor, channels: Sequence[int], generator: torch.Generator
     copies_in = channels[1] // weight.shape[1]
     shares = torch.rand(channels[0], copies_in, weight.shape[1], 1, 1, generator=generator) + 0.5
     shares = shares / shares.sum(1, keepdim=True)
-    spread = weight.repeat(copies_out, 1, 1, 1).unsqueeze(1) * shares
-    return spread.reshape(channels[0], channels[1], *weight.shape[2:])
+    copies = weight.repeat(copies_out, 1, 1, 1).unsqueeze(1) * shares
+    return copies.reshape(channels[0], channels[1], *weight.shape[2:])
 
 
 def vector_tensor(sensor: Instrument) -> Tensor:
@@ -404,13 +407,13 @@ def network_of(weights: Weights) -> Network:
 
 def save_network(path: Path, network: Network, recipe: Mapping[str, object]) -> None:
     """Write a network's weights, its variant and the recipe that made them."""
-    made = Weights(arrays(network.state_dict()), network.variant, dict(recipe))
+    weights = Weights(arrays(network.state_dict()), network.variant, dict(recipe))
     if isinstance(network, BankedConvBEERS):
-        made = replace(made, conditioned=True, kernels=network.kernels)
-    write_weights(path, made)
+        weights = replace(weights, conditioned=True, kernels=network.kernels)
+    write_weights(path, weights)
 
 
 def load_network(path: Path) -> tuple[Network, dict[str, object]]:
     """Read a network in evaluation mode, plain or behind a bank, and its recipe."""
-    found = read_weights(path)
-    return network_of(found), found.recipe
+    weights = read_weights(path)
+    return network_of(weights), weights.recipe

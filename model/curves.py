@@ -46,8 +46,12 @@ def draw_table(across: float, along: float, generator: np.random.Generator) -> M
     smear_px = float(generator.choice([0.0, generator.uniform(0, LONGEST_SMEAR_PX)]))
     detector = np.sinc(FREQUENCIES)
     motion = np.sinc(smear_px * FREQUENCIES)
-    left = min(along / float(detector[-1] * motion[-1]), 1.0)
-    curves = optics(across / float(detector[-1])) * detector, optics(left) * detector * motion
+    # Optics take contrast away and add none, however much the motion has taken.
+    contrast_along = min(along / float(detector[-1] * motion[-1]), 1.0)
+    curves = (
+        optics(across / float(detector[-1])) * detector,
+        optics(contrast_along) * detector * motion,
+    )
     return MtfTable(*(tuple(values.tolist()) for values in (FREQUENCIES, *curves)))
 
 
@@ -71,10 +75,10 @@ def pupil_contrast(contrast: float, obscuration: float) -> Curve:
     """The contrast at FREQUENCIES behind a pupil whose cut-off frequency leaves `contrast` at
     Nyquist.
     """
-    frequency, left = _pupil(obscuration)
+    frequency, contrasts = _pupil(obscuration)
     # It falls, but for rounding: read backwards it can be searched.
-    at_nyquist = float(np.interp(contrast, left[::-1], frequency[::-1]))
-    return np.asarray(np.interp(FREQUENCIES / NYQUIST * at_nyquist, frequency, left))
+    at_nyquist = float(np.interp(contrast, contrasts[::-1], frequency[::-1]))
+    return np.asarray(np.interp(FREQUENCIES / NYQUIST * at_nyquist, frequency, contrasts))
 
 
 @lru_cache
@@ -82,9 +86,10 @@ def _pupil(obscuration: float) -> tuple[Curve, Curve]:
     """Frequencies over the cut-off frequency, and the contrast that a pupil with an obscuration
     leaves there.
     """
+    # The grid is twice as wide as the pupil: its autocorrelation does not wrap around.
     place = (np.arange(2 * PUPIL_GRID) - PUPIL_GRID + 0.5) / (PUPIL_GRID / 2)
     radius = np.hypot(place[:, None], place[None, :])
     pupil = ((radius <= 1) & (radius >= obscuration)).astype(np.float64)
     overlap = np.fft.ifft2(np.abs(np.fft.fft2(pupil)) ** 2).real[0, : PUPIL_GRID + 1]
-    left = np.minimum.accumulate(np.maximum(overlap / overlap[0], 0.0))
-    return np.linspace(0, 1, PUPIL_GRID + 1), np.asarray(left)
+    contrast = np.minimum.accumulate(np.maximum(overlap / overlap[0], 0.0))
+    return np.linspace(0, 1, PUPIL_GRID + 1), np.asarray(contrast)

@@ -16,7 +16,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
-from itertools import groupby
+from itertools import chain, groupby, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,17 +46,16 @@ SensorLike = Sensor | str | os.PathLike[str]
 class DatasetRecipe:
     """All that decides a dataset's pixels."""
 
-    scenes: tuple[Path | None, ...]  # None: a drawn scene
+    scenes: tuple[Path | None, ...]  # None stands for a drawn scene.
     degraded: Sensor
     reference: Sensor
     oversampling: int
-    patch_px: int | None  # None: each scene whole
+    patch_px: int | None  # None leaves each scene whole.
     radiance_scale: float = 1.0
     seed: int = 0
     tolerance_dn: float = TOLERANCE_DN
-    scene_scale: float = (
-        1.0  # scenes are resampled by it first, where the wanted ratio is no whole number
-    )
+    # Scenes are resampled by it first, where the wanted ratio is no whole number.
+    scene_scale: float = 1.0
 
     def __post_init__(self) -> None:
         require_same_units(self.degraded, self.reference)
@@ -88,12 +87,12 @@ def plan_windows(recipe: DatasetRecipe) -> list[Window]:
     """Every patch of a dataset, in order."""
     windows: list[Window] = []
     for index, path in enumerate(recipe.scenes):
-        found = list(_scene_windows(recipe, index, len(windows)))
-        if not found:
+        scene_windows = list(_scene_windows(recipe, index, len(windows)))
+        if not scene_windows:
             side = ((recipe.patch_px or 1) + 2 * MARGIN_PX) * recipe.oversampling
             expected = f"at least {side} scene pixels a side"
             raise ImageError(str(path), expected=expected, got="less", remedy="leave it out")
-        windows += found
+        windows += scene_windows
     return windows
 
 
@@ -108,10 +107,9 @@ def _scene_windows(recipe: DatasetRecipe, index: int, first: int) -> Iterator[Wi
         return
     side = (recipe.patch_px + 2 * MARGIN_PX) * ratio
     step = recipe.patch_px * ratio
-    corners = [
-        (y, x) for y in range(0, height - side + 1, step) for x in range(0, width - side + 1, step)
-    ]
-    for k, (top, left) in enumerate(corners):
+    tops = range(0, height - side + 1, step)
+    lefts = range(0, width - side + 1, step)
+    for k, (top, left) in enumerate(product(tops, lefts)):
         yield Window(first + k, index, f"{stem}-{k:05d}", top, left, side, side)
 
 
@@ -172,10 +170,9 @@ def _drawn(recipe: DatasetRecipe, window: Window) -> tuple[dict[str, Any], dict[
     sensors = {}
     for role, profile in (("degraded", recipe.degraded), ("reference", recipe.reference)):
         sensors[role], rejected = profile.draw_counted(draw.generator(f"sensor-{role}"))
-        drawn = asdict(
-            replace(sensors[role], response=None)
-        )  # the same for all: the recipe keeps it
-        line[role] = {"sensor": drawn, "rejected_snr_pairs": rejected}
+        # The response is the same for all pairs, and stands in the recipe.
+        numbers = asdict(replace(sensors[role], response=None))
+        line[role] = {"sensor": numbers, "rejected_snr_pairs": rejected}
     return line, sensors
 
 
@@ -187,8 +184,8 @@ def _is_drawn(recipe: DatasetRecipe, window: Window, text: str) -> bool:
     del line[DIGESTS]
     for role in ROLES:
         line[role] = {key: value for key, value in line[role].items() if key != PLAN}
-    wanted, _ = _drawn(recipe, window)
-    return json.dumps(line, sort_keys=True) == json.dumps(wanted, sort_keys=True)
+    drawn_line, _ = _drawn(recipe, window)
+    return json.dumps(line, sort_keys=True) == json.dumps(drawn_line, sort_keys=True)
 
 
 CHUNK = 32
@@ -227,20 +224,15 @@ def write_dataset(
     _remove_left_overs(out)
     windows = plan_windows(recipe)
     manifest = out / "manifest.jsonl"
-    scenes = [list(group) for _, group in groupby(windows, key=lambda w: w.scene)]
-    chunks = [
-        scene[first : first + CHUNK] for scene in scenes for first in range(0, len(scene), CHUNK)
-    ]
-    parts = {out / "parts" / f"{chunk[0].number:08d}.jsonl": chunk for chunk in chunks}
+    parts = {out / "parts" / f"{chunk[0].number:08d}.jsonl": chunk for chunk in _chunks(windows)}
     lines = _lines_left(recipe, out, windows, parts, log) if resume else {}
     waiting = {path: [w for w in chunk if w.number not in lines] for path, chunk in parts.items()}
     waiting = {path: chunk for path, chunk in waiting.items() if chunk}
     tick(len(lines))
     with ExitStack() as stack:
         if pool is None and workers > 1 and len(waiting) > 1:
-            spawn = multiprocessing.get_context(
-                "spawn"
-            )  # a forked copy of a library's threads can hang
+            # A forked copy of a library's threads can hang.
+            spawn = multiprocessing.get_context("spawn")
             pool = stack.enter_context(
                 ProcessPoolExecutor(min(workers, MOST_PROCESSES), mp_context=spawn)
             )
@@ -256,6 +248,14 @@ def write_dataset(
         write_text(manifest, content)
     shutil.rmtree(out / "parts", ignore_errors=True)
     return _read_summary(manifest)
+
+
+def _chunks(windows: list[Window]) -> Iterator[list[Window]]:
+    """Yield the windows of each call, in order: those of one scene, CHUNK at most."""
+    for _, group in groupby(windows, key=lambda window: window.scene):
+        scene = list(group)
+        for first in range(0, len(scene), CHUNK):
+            yield scene[first : first + CHUNK]
 
 
 def _remove_left_overs(out: Path) -> None:
@@ -279,18 +279,20 @@ def _lines_left(
     of the others.
     """
     manifest = out / "manifest.jsonl"
-    found = matching_lines(out, (manifest, *parts))
-    known = ((w, found[w.number, w.name]) for w in windows if (w.number, w.name) in found)
-    lines = {window.number: text for window, text in known if _is_drawn(recipe, window, text)}
-    stated = (
-        windows
-        if manifest.exists()
-        else [w for path, chunk in parts.items() if path.exists() for w in chunk]
-    )
-    damaged = sum(window.number not in lines for window in stated)
+    texts = matching_lines(out, (manifest, *parts))
+    lines = {}
+    for window in windows:
+        text = texts.get((window.number, window.name))
+        if text is not None and _is_drawn(recipe, window, text):
+            lines[window.number] = text
+    candidates = windows
+    if not manifest.exists():
+        begun = [chunk for path, chunk in parts.items() if path.exists()]
+        candidates = list(chain.from_iterable(begun))
+    damaged = sum(window.number not in lines for window in candidates)
     if damaged:
         log(
-            f"{damaged} of {len(stated)} pairs do not match the digests in the manifest: they "
+            f"{damaged} of {len(candidates)} pairs do not match the digests in the manifest: they "
             "are made again"
         )
     return lines
@@ -320,22 +322,22 @@ def _made(
 
 def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
     path = out / "recipe.json"
-    wanted = json.dumps(recipe.to_json(), indent=1, sort_keys=True) + "\n"
+    content = json.dumps(recipe.to_json(), indent=1, sort_keys=True) + "\n"
     if not path.exists():
-        write_text(path, wanted)
+        write_text(path, content)
         return
     expected = "a folder without a dataset"
-    found = path.read_bytes() if path.is_file() else b""
+    present = path.read_bytes() if path.is_file() else b""
     # An editor or Git may have changed how its lines end.
-    if found.replace(b"\r\n", b"\n") != wanted.encode():
+    if present.replace(b"\r\n", b"\n") != content.encode():
         raise OptionError(
             "out", expected=expected, got="another dataset", remedy="choose another folder"
         )
     if not resume:
         remedy = "add `resume` or choose another folder"
         raise OptionError("out", expected=expected, got="this dataset", remedy=remedy)
-    if found != wanted.encode():
-        write_text(path, wanted)
+    if present != content.encode():
+        write_text(path, content)
 
 
 def _read_summary(path: Path) -> dict[str, float]:
@@ -346,8 +348,7 @@ def _read_summary(path: Path) -> dict[str, float]:
         ]
         rejected = sum(
             int(line[role]["rejected_snr_pairs"])
-            for line in lines
-            for role in ("degraded", "reference")
+            for line, role in product(lines, ("degraded", "reference"))
         )
         return {"patches": len(lines), "rejected_share": rejected / (rejected + 2 * len(lines))}
     except (ArithmeticError, LookupError, OSError, TypeError, ValueError) as error:
@@ -364,7 +365,8 @@ class PairsRecipe:
 
     degraded: Sensor
     reference: Sensor
-    scenes: tuple[str | None, ...]  # file names in their order; None for a drawn scene
+    # File names in their order, None for a drawn scene.
+    scenes: tuple[str | None, ...]
 
     def site(self, stem: str) -> str:
         """The site of the pair NUMBER-SCENE or NUMBER-SCENE-PATCH: two frames of a site, or two
@@ -373,8 +375,8 @@ class PairsRecipe:
         A drawn scene is a site of its own.
         """
         number = stem.split("-", 1)[0]
-        known = number.isdecimal() and int(number) < len(self.scenes)
-        scene = self.scenes[int(number)] if known else stem
+        is_number = number.isdecimal() and int(number) < len(self.scenes)
+        scene = self.scenes[int(number)] if is_number else stem
         return f"{number}-drawn" if scene is None else site_of(scene)
 
 
@@ -408,18 +410,20 @@ def profiles_for(
     if recipe is None:
         degraded = Sensor.load(sensor or SENSOR)
         return degraded, reference_beside(degraded, reference, say)
-    named = (
-        sensor and Sensor.load(sensor),
-        reference and Sensor.load(reference).in_units_of(recipe.degraded),
-    )
-    _require_made_by("sensor", named[0] or None, recipe.degraded)
-    _require_made_by("reference", named[1] or None, recipe.reference)
+    sensor_profile = Sensor.load(sensor) if sensor else None
+    # A dataset's images are in the degraded sensor's units: so is its reference.
+    reference_profile = None
+    if reference:
+        reference_profile = Sensor.load(reference).in_units_of(recipe.degraded)
+    _require_made_by("sensor", sensor_profile, recipe.degraded)
+    _require_made_by("reference", reference_profile, recipe.reference)
     return recipe.degraded, recipe.reference
 
 
-def _require_made_by(option: str, named: Sensor | None, made: Sensor) -> None:
-    if named is not None and not same_instrument(named, made):
-        expected = f"the sensor that made the pairs, {made.name} with the numbers in recipe.json"
-        raise OptionError(
-            option, expected=expected, got=f"{named.name} with other numbers", remedy="leave it out"
+def _require_made_by(option: str, profile: Sensor | None, of_recipe: Sensor) -> None:
+    if profile is not None and not same_instrument(profile, of_recipe):
+        expected = (
+            f"the sensor that made the pairs, {of_recipe.name} with the numbers in recipe.json"
         )
+        got = f"{profile.name} with other numbers"
+        raise OptionError(option, expected=expected, got=got, remedy="leave it out")

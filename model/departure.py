@@ -35,18 +35,20 @@ def departure(sensor: Instrument, kernels: Kernels) -> str:
     zero = np.zeros((1, 1))
     for axis, contrast in zip(("across", "along"), sensor.mtf_axes, strict=True):
         frequency = FREQUENCIES[None]
-        seen = (
+        response = (
             sensor_mtf(frequency, zero, sensor)
             if axis == "across"
             else sensor_mtf(zero, frequency.T, sensor)
         )
-        curve = np.abs(np.ravel(seen))
+        curve = np.abs(np.ravel(response))
+        # The stated contrast does not include smear.
         smeared = axis == "along" and bool(sensor.smear_px)
         at_nyquist = float(curve[-1]) if smeared else contrast
-        known = np.stack(_known_curves(at_nyquist, kernels))
-        low = known.min(0) * (1 - MARGIN)
-        high = known.max(0) * (1 + MARGIN)
+        trained = np.stack(_known_curves(at_nyquist, kernels))
+        low = trained.min(0) * (1 - MARGIN)
+        high = trained.max(0) * (1 + MARGIN)
         outside = np.maximum(low / np.maximum(curve, 1e-9), curve / high)
+        # The last frequency is Nyquist, where all these curves have one contrast.
         worst = int(outside[:-1].argmax())
         if outside[worst] > 1:
             return (
@@ -71,15 +73,15 @@ def _known_curves(contrast: float, kernels: Kernels) -> list[Curve]:
     bend = DEEPEST_BEND * np.sin(math.pi * share)
     curves = list[Curve]()
     for smear_px in np.linspace(0, LONGEST_SMEAR_PX, 9):
-        kept = detector * np.sinc(smear_px * FREQUENCIES)
-        left = min(contrast / float(kept[-1]), 1.0)
-        formula = left**share
-        pupils = [pupil_contrast(left, obscuration) for obscuration in OBSCURATIONS]
+        detector_and_motion = detector * np.sinc(smear_px * FREQUENCIES)
+        optics_contrast = min(contrast / float(detector_and_motion[-1]), 1.0)
+        formula = optics_contrast**share
+        pupils = [pupil_contrast(optics_contrast, obscuration) for obscuration in OBSCURATIONS]
         optics = [
-            left ** (share**2),
+            optics_contrast ** (share**2),
             *pupils,
             formula * (1 - bend),
             np.minimum(formula * (1 + bend), 1.0),
         ]
-        curves += [np.asarray(each * kept) for each in optics]
+        curves += [np.asarray(curve * detector_and_motion) for curve in optics]
     return curves

@@ -90,12 +90,12 @@ def choose_factors(
             `image`.
     """
     size = 2 * radius_px + 1
-    brightest = maximum_filter1d(
-        maximum_filter1d(image, size, axis=0, mode="nearest"), size, axis=1, mode="nearest"
-    )
-    chosen = np.ones(image.shape, np.int64)
+    brightest_in_column = maximum_filter1d(image, size, axis=0, mode="nearest")
+    brightest = maximum_filter1d(brightest_in_column, size, axis=1, mode="nearest")
+    pixel_factors = np.ones(image.shape, np.int64)
     for factor in factors:
+        # The factors rise, so that a higher one that fits replaces a lower one.
         if factor > 1:
             fits = (brightest - offset) * factor + offset <= HEADROOM * full_scale
-            chosen[fits] = factor
-    return chosen
+            pixel_factors[fits] = factor
+    return pixel_factors

@@ -58,10 +58,10 @@ def sensor_values(sensor: Instrument) -> dict[str, float]:
     """The four values of `RANGES`, smear and rounding noise counted."""
     # A network knows no smear of its own: what that leaves of the contrast along the track is
     # counted there.
-    kept = abs(float(np.sinc(0.5 * sensor.smear_px)))
+    smear_contrast = abs(float(np.sinc(0.5 * sensor.smear_px)))
     sigmas = [noise_over_full_scale(sensor, part) for part in (16, 4)]
     across, along = sensor.mtf_axes
-    return dict(zip(RANGES, (across, along * kept, *sigmas), strict=True))
+    return dict(zip(RANGES, (across, along * smear_contrast, *sigmas), strict=True))
 
 
 def noise_over_full_scale(sensor: Instrument, part: int = 4) -> float:
@@ -120,15 +120,15 @@ class SensorFamily:
         sigma = full_scale / 4 / _log_uniform(generator, *self.snr_bright)
         # Variance alpha L + beta: all of it in alpha halves sigma at a quarter of the radiance, all
         # in beta keeps it.
-        dark = sigma * _log_uniform(generator, 0.5, 1.0)
-        alpha = max(sigma**2 - dark**2, 0.0) / (full_scale * 3 / 16)
-        beta = max(dark**2 - alpha * full_scale / 16, 0.0)
+        sigma_dark = sigma * _log_uniform(generator, 0.5, 1.0)
+        alpha = max(sigma**2 - sigma_dark**2, 0.0) / (full_scale * 3 / 16)
+        beta = max(sigma_dark**2 - alpha * full_scale / 16, 0.0)
         gain = self.like.gain_dn_per_radiance
         bits = self.like.bits
-        made = Instrument(mtf, alpha, beta, gain, bits, {}, along, full_scale / 4)
+        instrument = Instrument(mtf, alpha, beta, gain, bits, {}, along, full_scale / 4)
         if self.other_curves and generator.random() < self.other_curves:
-            return replace(made, response=draw_table(mtf, along, generator))
-        return made
+            return replace(instrument, response=draw_table(mtf, along, generator))
+        return instrument
 
 
 def _log_uniform(generator: np.random.Generator, low: float, high: float) -> float:

@@ -45,33 +45,35 @@ def matching_lines(out: Path, files: Iterable[Path]) -> dict[tuple[int, str], st
         out: the dataset's folder.
         files: manifests, or parts of one; one that is not there is passed over.
     """
-    found: dict[tuple[int, str], str] = {}
+    texts: dict[tuple[int, str], str] = {}
     for path in files:
         if not path.is_file():
             continue
+        # A byte that is no UTF-8 spoils its own line alone, whose digest then does not match.
         for text in path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True):
             line = _matching(out, text)
             if line is not None:
-                found[line["number"], str(line["name"])] = text
-    return found
+                texts[line["number"], str(line["name"])] = text
+    return texts
 
 
 def _matching(out: Path, text: str) -> dict[str, Any] | None:
     """Return a line without its digests; None if the line or an image does not match them."""
     try:
-        found: Any = parse_json(text)
-        line: dict[str, Any] = dict(found)
+        content: Any = parse_json(text)
+        line: dict[str, Any] = dict(content)
         digests = dict(line.pop(DIGESTS))
+        # A line without its line break was cut short, whatever its digest.
         if digests.pop("line") != _digest(line) or not text.endswith("\n"):
             return None
         if not (
             isinstance(line["number"], int) and all(isinstance(line[role], dict) for role in ROLES)
         ):
             return None
-        same = digests == {role: sha256(image_of(out, role, line["name"])) for role in ROLES}
+        matches = digests == {role: sha256(image_of(out, role, line["name"])) for role in ROLES}
     except (LookupError, OSError, TypeError, ValueError):
         return None
-    return line if same else None
+    return line if matches else None
 
 
 def _digest(line: Line) -> str:

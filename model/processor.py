@@ -123,12 +123,13 @@ def processor_name() -> str | None:
 
 
 def _linux_name() -> str:
+    # User-mode emulation shows the name of the processor beneath the emulated one.
     if COMM.read_text(encoding="utf-8", errors="replace").startswith("qemu-"):
         return ""
     cores = _fields(CPUINFO.read_text(encoding="utf-8", errors="replace"))
     if names := cores.get("model name"):
         return ", ".join(names)
-    if parts := cores.get("CPU part"):  # ARM's kernel knows numbers alone
+    if parts := cores.get("CPU part"):  # ARM's kernel knows numbers alone.
         return (
             f"ARM part {', '.join(parts)} of implementer "
             f"{', '.join(cores.get('CPU implementer', ['unknown']))}"
@@ -140,12 +141,12 @@ def _fields(cpuinfo: str) -> dict[str, list[str]]:
     """The different values of each field, in order: large and small cores have
     names of their own.
     """
-    found: dict[str, list[str]] = {}
+    fields: dict[str, list[str]] = {}
     for line in cpuinfo.splitlines():
         key, _, value = (part.strip() for part in line.partition(":"))
-        if value and value not in found.setdefault(key, []):
-            found[key].append(value)
-    return found
+        if value and value not in fields.setdefault(key, []):
+            fields[key].append(value)
+    return fields
 
 
 def _macos_name() -> str:

@@ -69,11 +69,11 @@ def once(log: Log) -> Log:
     """Tells each sentence the first time alone: several networks of one sensor have the same to
     say.
     """
-    told = set[str]()
+    sentences = set[str]()
 
     def tell(sentence: str) -> None:
-        if sentence not in told:
-            told.add(sentence)
+        if sentence not in sentences:
+            sentences.add(sentence)
             log(sentence)
 
     return tell
@@ -94,11 +94,11 @@ class Steps:
         """Report that so many further steps are done."""
         self.done += steps
         sink = _sink.get()
-        shown = f"{self.label} {note}".strip()
+        text = f"{self.label} {note}".strip()
         if callable(sink):
-            sink(Step(shown, self.done, self.total))
+            sink(Step(text, self.done, self.total))
         elif self._bar is not None and self._task is not None:
-            self._bar.update(self._task, completed=self.done, description=one_line(shown))
+            self._bar.update(self._task, completed=self.done, description=one_line(text))
         elif sink is not False and (
             time.monotonic() - self._printed > LINE_EVERY_S or self.done >= self.total
         ):
@@ -135,9 +135,9 @@ def progress(label: str) -> Iterator[Log]:
     elif not _shows_bars():
         yield lambda step: _line(f"{label}: {step}")
     else:
-        with _bar(rich_progress.TimeElapsedColumn()) as shown:
-            task = shown.add_task(label, total=None)
-            yield lambda step: shown.update(task, description=one_line(f"{label}: {step}"))
+        with _bar(rich_progress.TimeElapsedColumn()) as bar:
+            task = bar.add_task(label, total=None)
+            yield lambda step: bar.update(task, description=one_line(f"{label}: {step}"))
 
 
 def _line(text: str) -> None:
@@ -145,9 +145,8 @@ def _line(text: str) -> None:
 
 
 def _bar(*columns: rich_progress.ProgressColumn) -> rich_progress.Progress:
-    words = rich_progress.TextColumn(
-        "{task.description}", markup=False
-    )  # a name in brackets is a name
+    # Without markup a name in brackets is shown as it is.
+    words = rich_progress.TextColumn("{task.description}", markup=False)
     return rich_progress.Progress(words, *columns, console=Console(stderr=True), transient=True)
 
 
@@ -164,6 +163,7 @@ def held_back() -> Iterator[Interrupt]:
     Does nothing outside the main thread, where signals do not arrive.
     """
     interrupt = Interrupt()
+    # Python delivers signals to the main thread, and accepts handlers there alone.
     if threading.current_thread() is not threading.main_thread():
         yield interrupt
         return

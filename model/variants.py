@@ -8,6 +8,7 @@ places.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import Literal
 
 from beers_deploy.profiles.errors import OptionError
@@ -50,18 +51,22 @@ class Variant:
         """(outputs, inputs) of each 3 x 3 convolution by name, in the order in which an image meets
         them.
         """
-        inner = [f"body.{k}.{place}" for k in range(self.blocks) for place in ("first", "second")]
-        same = (self.features, self.features)
-        ends = {"head": (self.features, self.pixels)}, {"tail": (self.pixels, self.features)}
-        return {**ends[0], **dict.fromkeys([*inner, "body_end"], same), **ends[1]}
+        places = product(range(self.blocks), ("first", "second"))
+        body = [f"body.{block}.{place}" for block, place in places]
+        square = (self.features, self.features)
+        return {
+            "head": (self.features, self.pixels),
+            **dict.fromkeys([*body, "body_end"], square),
+            "tail": (self.pixels, self.features),
+        }
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """The shape of each weight and bias by name."""
-        found: dict[str, tuple[int, ...]] = {}
+        shapes: dict[str, tuple[int, ...]] = {}
         for name, (outputs, inputs) in self.convolutions.items():
-            found |= {f"{name}.weight": (outputs, inputs, 3, 3), f"{name}.bias": (outputs,)}
-        return found
+            shapes |= {f"{name}.weight": (outputs, inputs, 3, 3), f"{name}.bias": (outputs,)}
+        return shapes
 
     @property
     def banked_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -73,7 +78,7 @@ class Variant:
 
 
 VARIANTS = {
-    "convbeers": Variant(blocks=16, features=64),  # the paper's
+    "convbeers": Variant(blocks=16, features=64),  # This is the paper's network.
     "convbeers-s": Variant(blocks=8, features=32),
     "convbeers-xs": Variant(blocks=4, features=16),
     "convbeers-half": Variant(blocks=4, features=64, scale=2),

@@ -28,21 +28,19 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
         raise ValueError(reason)
     try:
         with path.open("rb") as stream:
-            archive = stream.read(len(ZIP)) == ZIP
-        if not archive:
+            is_archive = stream.read(len(ZIP)) == ZIP
+        if not is_archive:
             return {ALONE: np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))}
-        with (
-            path.open("rb") as stream,
-            np.load(stream, allow_pickle=False) as held,
-        ):  # NumPy leaves a broken one open
-            return {name: np.asarray(held[name]) for name in held.files}
+        # NumPy leaves a broken archive open, so that the stream is ours to close.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            return {name: np.asarray(archive[name]) for name in archive.files}
     except (AttributeError, ImportError, NameError):
-        raise  # NumPy was called in a way that it does not know, whatever the file holds
+        # NumPy was called in a way that it does not know, whatever the file holds.
+        raise
     except MemoryError:
         raise ValueError("an array that does not fit into memory") from None
-    except (
-        Exception
-    ) as error:  # each decompressor and the parser of NumPy's header raise classes of their own
+    # Each decompressor and the parser of NumPy's header raise classes of their own.
+    except Exception as error:
         raise ValueError(
             f"another file ({type(error).__name__}: {' '.join(str(error).split())[:80]})"
         ) from error

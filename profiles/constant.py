@@ -107,6 +107,7 @@ def check_keys(
 ) -> None:
     """Refuse unknown keys first (a typo is the likelier fault), then missing ones."""
     allowed = required | optional
+    # A misspelt key is unknown, and leaves its right name missing: the first is the likelier fault.
     for key in raw:
         if key not in allowed:
             raise ProfileError(
@@ -126,10 +127,10 @@ def check_keys(
 
 def _rename(key: str, allowed: set[str]) -> str:
     """Point at the key that was meant: most often the same one with its unit."""
-    meant = sorted(name for name in allowed if name.startswith(key) or key.startswith(name))
+    similar = sorted(name for name in allowed if name.startswith(key) or key.startswith(name))
     return (
-        f"write {meant[0]!r} (the unit belongs to the name)"
-        if meant
+        f"write {similar[0]!r} (the unit belongs to the name)"
+        if similar
         else "remove it or correct its spelling"
     )
 
@@ -150,6 +151,7 @@ def _number(where: str, raw: object) -> Number:
 def is_number(raw: object) -> bool:
     """Whether a value of a file is a finite number that float64 holds."""
     return (
+        # Python counts True as an int. TOML allows integers of any size, which float64 cannot hold.
         isinstance(raw, int | float)
         and not isinstance(raw, bool)
         and abs(raw) <= sys.float_info.max

@@ -99,7 +99,7 @@ class Haze(PixelEffect):
 
     def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
         changes = (abs((self.transmittance - 1) * v + self.path_radiance) for v in (low, high))
-        return sensor.gain_dn_per_radiance * max(changes)  # affine in L: the ends decide
+        return sensor.gain_dn_per_radiance * max(changes)  # Affine in L: the ends decide.
 
 
 @dataclass(frozen=True)
@@ -121,6 +121,7 @@ class FullWell(PixelEffect):
 
     @property
     def growth(self) -> float:
+        # The kernel sums to 1 at most, so that blooming adds at most this share of a change.
         return 1 + self.blooming_share
 
     def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
@@ -130,9 +131,8 @@ class FullWell(PixelEffect):
         return np.asarray(np.minimum(image, self.radiance))
 
     def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
-        return sensor.gain_dn_per_radiance * max(
-            high - self.radiance, 0.0
-        )  # what is cut off or spilt
+        # What is cut off, and what is spilt, is no more than the excess.
+        return sensor.gain_dn_per_radiance * max(high - self.radiance, 0.0)
 
 
 @dataclass(frozen=True)
@@ -145,6 +145,7 @@ class Prnu(PixelEffect):
 
     @property
     def growth(self) -> float:
+        # Each draw is clipped at PATTERN_LIMIT, so that no detector's factor is larger.
         return 1 + PATTERN_LIMIT * self.rms
 
     def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
@@ -243,10 +244,10 @@ TABLES: dict[str, type[Effect]] = {
 
 def pixel_effects(effects: Mapping[str, Effect], acts_on: str) -> dict[str, PixelEffect]:
     """The effects on radiance, or those on DN, in the order in which they apply."""
-    found = ((name, effects.get(name)) for name in TABLES)
+    effects_in_order = ((name, effects.get(name)) for name in TABLES)
     return {
         name: effect
-        for name, effect in found
+        for name, effect in effects_in_order
         if isinstance(effect, PixelEffect) and effect.acts_on == acts_on
     }
 
@@ -265,11 +266,14 @@ def _spread(excess: np.ndarray, length_px: float) -> np.ndarray:
     if radius < 1:
         return np.zeros_like(excess)
     distance = np.abs(np.arange(-radius, radius + 1, dtype=np.float64))
-    with np.errstate(over="ignore"):  # of a length near 0 no neighbour is reached
+    # A length near 0 reaches no neighbour.
+    with np.errstate(over="ignore"):
         kernel = np.exp(-distance / length_px) * (distance > 0)
-    if kernel.sum() == 0:  # so short that not even a neighbour is reached
+    # So short that not even a neighbour is reached.
+    if kernel.sum() == 0:
         return np.zeros_like(excess)
-    from scipy.ndimage import convolve1d  # a sixth of a second to load, for what few sensors have
+    # It takes a sixth of a second to load, for what few sensors have.
+    from scipy.ndimage import convolve1d
 
     return np.asarray(convolve1d(excess, kernel / kernel.sum(), axis=-2, mode="constant"))
 
@@ -303,6 +307,8 @@ def read_effect(where: str, name: str, raw: object) -> Table:
 def draw_effect(name: str, table: Table, generator: np.random.Generator) -> Effect:
     """Settle every number of an effect; nothing is drawn where no range is stated."""
     values = {
+        # A number without a range takes nothing from the generator: the numbers after it stay the
+        # same.
         key: c.low if c.low == c.high else float(generator.uniform(c.low, c.high))
         for key, c in table.items()
     }

@@ -164,7 +164,8 @@ def optional(package: str, where: str) -> Any:
     """
     try:
         return import_module(package)
-    except ImportError as error:  # not there, or there and unable to load what it needs
+    # It is not there, or is there and cannot load what it needs.
+    except ImportError as error:
         raise _without(package.split(".")[0], where, error) from error
 
 
@@ -178,6 +179,8 @@ def _imported(error: ImportError) -> str | None:
     """Return the optional package whose import failed, by the module's name or by the code that
     imported it.
     """
+    # Python runs the top level of a module under this name. A fault within a function is no failed
+    # import.
     at_import = (
         frame for frame, _ in walk_tb(error.__traceback__) if frame.f_code.co_name == "<module>"
     )

@@ -54,9 +54,8 @@ class Figure:
             return "unavailable"
         digits = DIGITS[self.mode]
         text = number(self.value, digits)
-        if (
-            self.interval is None or self.interval[0] == self.interval[1]
-        ):  # plain arithmetic needs no interval
+        # Plain arithmetic needs no interval.
+        if self.interval is None or self.interval[0] == self.interval[1]:
             return text
         return f"{text} [{number(self.interval[0], digits)}, {number(self.interval[1], digits)}]"
 
@@ -71,10 +70,10 @@ def measured(
     """
     if not math.isfinite(value):
         return unavailable(unit, f"{NOT_FINITE} ({float(value)}): {source}")
-    known = (
+    finite_interval = (
         interval if interval is not None and all(math.isfinite(end) for end in interval) else None
     )
-    return Figure(float(value), unit, "measured", source, known)
+    return Figure(float(value), unit, "measured", source, finite_interval)
 
 
 def predicted(value: float, unit: str, interval: tuple[float, float], source: str) -> Figure:
@@ -185,6 +184,7 @@ class Check:
             "unit": self.unit,
             "bound": self.bound,
             "passed": self.passed,
+            # JSON has no number for infinity and NaN: the text of the value stands here instead.
             "detail": self.detail if math.isfinite(self.value) else self.found,
         }
 

@@ -64,7 +64,7 @@ class MtfTable:
 
     def _gamma(self, radius: Frequencies, contrast: tuple[float, ...]) -> Frequencies:
         frequency = np.array(self.frequency)
-        # max: rounded tables exceed the detector's own contrast by a little at low frequencies
+        # Rounded tables exceed the detector's own contrast by a little at low frequencies.
         loss = np.maximum(-np.log(np.array(contrast) / np.sinc(frequency)), 0.0)
         # Towards 0, where there is nothing to divide by, and beyond the end gamma stays what it
         # was.
@@ -128,21 +128,20 @@ Response = MtfTable | PointSpread
 
 def packed(values: NDArray[np.floating]) -> str:
     """Samples of any shape as text: float32, compressed, in base 64."""
-    return base64.b64encode(
-        zlib.compress(np.ascontiguousarray(values, "<f4").tobytes(), 9)
-    ).decode()
+    content = np.ascontiguousarray(values, "<f4").tobytes()
+    return base64.b64encode(zlib.compress(content, 9)).decode()
 
 
 def unpacked(point: PointSpread) -> NDArray[np.float64]:
     """The samples, (height, width)."""
     count_bytes = 4 * point.height * point.width
     try:
-        found = zlib.decompressobj().decompress(
-            base64.b64decode(point.samples, validate=True), count_bytes
-        )
+        compressed = base64.b64decode(point.samples, validate=True)
+        # The limit stops a text that would unpack to more than the samples.
+        content = zlib.decompressobj().decompress(compressed, count_bytes)
     except zlib.error as error:
         raise ValueError(str(error)) from None
-    return np.frombuffer(found, "<f4").astype(np.float64).reshape(point.height, point.width)
+    return np.frombuffer(content, "<f4").astype(np.float64).reshape(point.height, point.width)
 
 
 def centroid(values: NDArray[np.float64]) -> tuple[float, float]:
@@ -210,9 +209,9 @@ def read_response(label: str, raw: Mapping[str, Any], folder: Path) -> tuple[Res
     """
     key = "psf" if "psf" in raw else "across"
     _, status, source = read_stated(f"{label} {key}", raw[key])
-    stated = {name: read_stated(f"{label} {name}", value)[0] for name, value in raw.items()}
+    values = {name: read_stated(f"{label} {name}", value)[0] for name, value in raw.items()}
     response: Response = (
-        _point_spread(label, stated, folder) if key == "psf" else _table(label, stated)
+        _point_spread(label, values, folder) if key == "psf" else _table(label, values)
     )
     _require_contrast(f"{label} {key}", response)
     return response, status, source
@@ -281,8 +280,8 @@ def _require_contrast(where: str, response: Response) -> None:
             )
 
 
-def _table(label: str, stated: Mapping[str, Any]) -> MtfTable:
-    frequency = _numbers(f"{label} frequency", stated["frequency"])
+def _table(label: str, values: Mapping[str, Any]) -> MtfTable:
+    frequency = _numbers(f"{label} frequency", values["frequency"])
     rising = all(after - before >= LEAST_STEP for before, after in pairwise(frequency))
     if not rising or frequency[0] != 0 or not NYQUIST <= frequency[-1] < 1:
         raise ProfileError(
@@ -294,12 +293,12 @@ def _table(label: str, stated: Mapping[str, Any]) -> MtfTable:
             remedy=f"give them in that order, in cycles per target pixel, {LEAST_STEP:g} apart "
             "at least",
         )
-    across = _contrasts(f"{label} across", stated["across"], frequency)
-    given = stated.get("along")
+    across = _contrasts(f"{label} across", values["across"], frequency)
+    along = values.get("along")
     return MtfTable(
         frequency,
         across,
-        across if given is None else _contrasts(f"{label} along", given, frequency),
+        across if along is None else _contrasts(f"{label} along", along, frequency),
     )
 
 
@@ -336,9 +335,9 @@ def _numbers(where: str, raw: object) -> tuple[float, ...]:
     return tuple(map(float, numbers))
 
 
-def _point_spread(label: str, stated: Mapping[str, Any], folder: Path) -> PointSpread:
-    per_px = _samples_per_px(f"{label} psf_samples_per_px", stated["psf_samples_per_px"])
-    name = stated["psf"]
+def _point_spread(label: str, values: Mapping[str, Any], folder: Path) -> PointSpread:
+    per_px = _samples_per_px(f"{label} psf_samples_per_px", values["psf_samples_per_px"])
+    name = values["psf"]
     if not isinstance(name, str) or not _lies_within(folder, name):
         expected = "the name of a file beside this one or in a folder beneath"
         raise ProfileError(
@@ -351,7 +350,8 @@ def _point_spread(label: str, stated: Mapping[str, Any], folder: Path) -> PointS
 def _lies_within(folder: Path, name: str) -> bool:
     try:
         return (folder / name).resolve().is_relative_to(folder.resolve())
-    except (OSError, ValueError):  # a circle of links, a NUL
+    # A circle of links raises the first, a NUL the second.
+    except (OSError, ValueError):
         return False
 
 
@@ -370,6 +370,7 @@ def _from_samples(where: str, samples: NDArray[np.float64], per_px: float) -> Po
     the weight.
     """
     finite = bool(np.isfinite(samples).all())
+    # The largest is brought to 1 first, because the sum of finite samples may overflow.
     samples = samples / max(float(np.abs(samples).max()), 1e-300) if finite else samples
     total = float(samples.sum())
     if not finite or total <= 0:
@@ -385,14 +386,14 @@ def _from_samples(where: str, samples: NDArray[np.float64], per_px: float) -> Po
         raise ProfileError(
             where, expected=expected, got=f"one {shift_px:.3g} pixels off", remedy=remedy
         )
-    kept = _trimmed(samples / total)
-    if max(kept.shape) > KEPT_SIDE:
+    core = _trimmed(samples / total)
+    if max(core.shape) > KEPT_SIDE:
         expected = f"all but a millionth of the weight within {KEPT_SIDE} x {KEPT_SIDE} samples"
         remedy = "crop it, or sample it more coarsely"
         raise ProfileError(
-            where, expected=expected, got=f"{kept.shape[1]} x {kept.shape[0]}", remedy=remedy
+            where, expected=expected, got=f"{core.shape[1]} x {core.shape[0]}", remedy=remedy
         )
-    return PointSpread(len(kept), kept.shape[1], per_px, packed(kept))
+    return PointSpread(len(core), core.shape[1], per_px, packed(core))
 
 
 def _trimmed(samples: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -403,9 +404,9 @@ def _trimmed(samples: NDArray[np.float64]) -> NDArray[np.float64]:
     parts = []
     for axis in (1, 0):
         grown = np.cumsum(weight.sum(axis)) / weight.sum()
-        parts.append(
-            slice(*np.searchsorted(grown, (CUT_SHARE / 4, 1 - CUT_SHARE / 4)) + np.array([0, 1]))
-        )
+        # Two axes with two ends each: every end may lose a quarter of the share.
+        ends = np.searchsorted(grown, (CUT_SHARE / 4, 1 - CUT_SHARE / 4)) + np.array([0, 1])
+        parts.append(slice(*ends))
     return samples[tuple(parts)]
 
 
@@ -418,17 +419,17 @@ def _read_samples(where: str, path: Path) -> NDArray[np.float64]:
         remedy = "check the path, which counts from the profile's folder"
         raise ProfileError(where, expected="a .npy file", got=reason, remedy=remedy)
     try:
-        found = np.load(
-            path, mmap_mode="r", allow_pickle=False
-        )  # nothing is read before its shape is known
+        # Mapped: nothing is read before its shape is known.
+        samples = np.load(path, mmap_mode="r", allow_pickle=False)
         if (
-            found.ndim != 2
-            or found.dtype.kind not in "iuf"
-            or not 1 <= min(found.shape) <= max(found.shape) <= FILE_SIDE
+            samples.ndim != 2
+            or samples.dtype.kind not in "iuf"
+            or not 1 <= min(samples.shape) <= max(samples.shape) <= FILE_SIDE
         ):
-            raise ValueError(f"{found.dtype} of shape {found.shape}")
-        return np.asarray(found, np.float64)
-    except Exception as error:  # whatever the bytes of a damaged file lead to
+            raise ValueError(f"{samples.dtype} of shape {samples.shape}")
+        return np.asarray(samples, np.float64)
+    # The bytes of a damaged file may lead to anything.
+    except Exception as error:
         expected = f"one array of real numbers, (rows, columns), of at most {FILE_SIDE} a side"
         got = str(error) or type(error).__name__
         remedy = "crop it, leave one plane, and save it by numpy.save"

@@ -83,17 +83,19 @@ def calling_for(
     """
     for name in (*add, *forbid):
         if name not in TABLES:
-            known = ", ".join(TABLES)
+            names = ", ".join(TABLES)
             raise OptionError(
-                "effect", expected=f"one of {known}", got=repr(name), remedy="correct the name"
+                "effect", expected=f"one of {names}", got=repr(name), remedy="correct the name"
             )
     typical = typical_effects()
     effects = {**profile.effects, **(scene.effects if scene else {})}
     effects |= {name: typical[name] for name in add if name not in effects}
-    gone = {*forbid, *(scene.without if scene else ())}
+    forbidden = {*forbid, *(scene.without if scene else ())}
     return replace(
         profile,
-        effects={name: effects[name] for name in TABLES if name in effects and name not in gone},
+        effects={
+            name: effects[name] for name in TABLES if name in effects and name not in forbidden
+        },
     )
 
 
@@ -106,9 +108,10 @@ def origins(
     """Of each effect of `calling_for`'s profile where it comes from; of one that it lost, who
     leaves it out.
     """
-    found = dict.fromkeys(add, "--with")  # what is stated wins over it
-    found |= dict.fromkeys(("mtf", "noise", *profile.effects), f"sensor {profile.name}")
+    # What is stated wins over what is added.
+    sources = dict.fromkeys(add, "--with")
+    sources |= dict.fromkeys(("mtf", "noise", *profile.effects), f"sensor {profile.name}")
     if scene:
-        found |= dict.fromkeys(scene.effects, f"scene {scene.name}")
-        found |= dict.fromkeys(scene.without, f"left out by scene {scene.name}")
-    return found | dict.fromkeys(forbid, "left out by --without")
+        sources |= dict.fromkeys(scene.effects, f"scene {scene.name}")
+        sources |= dict.fromkeys(scene.without, f"left out by scene {scene.name}")
+    return sources | dict.fromkeys(forbid, "left out by --without")

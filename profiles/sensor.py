@@ -93,6 +93,7 @@ class Instrument:
         turned by a quarter).
         """
         if isinstance(self.response, PointSpread):
+            # A point-spread function may have no symmetry at all.
             return False, False
         across, along = (
             (self.response.across, self.response.along) if self.response else self.mtf_axes
@@ -140,6 +141,7 @@ class Instrument:
 
     def noise_sigma(self, radiance: float) -> float:
         """Standard deviation of the noise at `radiance`, both in W/m2/sr/um."""
+        # A sharp blur rings below zero, where the variance would be negative and have no root.
         return math.sqrt(max(self.alpha * radiance + self.beta, 0.0))
 
 
@@ -182,7 +184,8 @@ class Sensor:
             ProfileError: unknown name, wrong or missing key, or numbers that no instrument can
                 have.
         """
-        from beers_deploy.profiles.sensor_file import load_sensor  # it reads what this file defines
+        # Imported here, because it reads what this file defines.
+        from beers_deploy.profiles.sensor_file import load_sensor
 
         return sensor if isinstance(sensor, Sensor) else load_sensor(os.fspath(sensor))
 
@@ -280,7 +283,8 @@ class Sensor:
         effects = {
             name: draw_effect(name, table, generator) for name, table in self.effects.items()
         }
-        along = self.mtf_nyquist_along  # drawn last: a profile without it draws what it always drew
+        # Drawn last: a profile without it draws what it always drew.
+        along = self.mtf_nyquist_along
         mtf_along = None if along is None else _uniform(generator, along)
         return self._sensor(mtf_nyquist, alpha, beta, effects, mtf_along), rejected
 
@@ -334,8 +338,10 @@ class Sensor:
     ) -> Instrument:
         gain = self.gain_dn_per_radiance.low
         bits = int(self.bits.low)
-        bright = self.radiance_1.low
-        return Instrument(mtf, alpha, beta, gain, bits, effects, mtf_along, bright, self.response)
+        radiance_1 = self.radiance_1.low
+        return Instrument(
+            mtf, alpha, beta, gain, bits, effects, mtf_along, radiance_1, self.response
+        )
 
     def impossible_snr(self) -> ProfileError:
         """The error of SNRs that no alpha and beta can have, with the range that the first one must
@@ -405,6 +411,8 @@ def noise_from_snr(
     """
     variance_0 = (radiance_0 / snr_0) ** 2
     variance_1 = (radiance_1 / snr_1) ** 2
+    # Where the exact difference is 0, rounding may leave either sign, and the pair would count as
+    # impossible.
     rounding = ROUNDING * max(variance_0, variance_1)
     slope = _rounded_off(variance_1 - variance_0, rounding)
     alpha = slope / (radiance_1 - radiance_0)
@@ -417,6 +425,8 @@ def _rounded_off(difference: float, rounding: float) -> float:
 
 def snr_0_bounds(radiance_0: float, radiance_1: float, snr_1: float) -> tuple[float, float]:
     """The SNRs at `radiance_0` that leave alpha >= 0 (lower bound) and beta >= 0 (upper bound)."""
+    # Alpha >= 0 asks for sigma_0 <= sigma_1, and beta >= 0 for sigma_0^2 / L_0 >= sigma_1^2 / L_1;
+    # sigma is L / SNR.
     ratio = radiance_0 / radiance_1
     return snr_1 * ratio, snr_1 * math.sqrt(ratio)
 
@@ -446,9 +456,10 @@ RESPONSE = ("frequency", "across", "along", "psf", "psf_samples_per_px")
 
 def table_keys(table: str) -> tuple[str, ...]:
     """Every key that a table may have, each once, in the order of its ways."""
-    return tuple(
-        dict.fromkeys(key for required, optional in TABLES[table] for key in required + optional)
-    )
+    keys: dict[str, None] = {}
+    for required, optional in TABLES[table]:
+        keys |= dict.fromkeys(required + optional)
+    return tuple(keys)
 
 
 def constant_keys(table: str) -> tuple[str, ...]:
@@ -456,7 +467,9 @@ def constant_keys(table: str) -> tuple[str, ...]:
     return tuple(key for key in table_keys(table) if key not in RESPONSE)
 
 
-TABLE_OF = {key: table for table in TABLES for key in constant_keys(table)}
+TABLE_OF: dict[str, str] = {}
+for _table in TABLES:
+    TABLE_OF |= dict.fromkeys(constant_keys(_table), _table)
 """The table of each constant."""
 
 
@@ -472,13 +485,10 @@ def numbers_of(profile: Sensor) -> dict[str, object]:
     like.
     """
     constants: dict[str, Constant | None] = {key: getattr(profile, key) for key in TABLE_OF}
-    constants |= {
-        f"{n}.{key}": value for n, table in profile.effects.items() for key, value in table.items()
-    }
+    for effect, table in profile.effects.items():
+        constants |= {f"{effect}.{key}": constant for key, constant in table.items()}
     numbers: dict[str, object] = {
         key: constant and (constant.low, constant.high) for key, constant in constants.items()
     }
-    return {
-        **numbers,
-        "response": repr(profile.response),
-    }  # all of it: as text it would be cut short
+    # The representation holds all samples, where the text of a response holds a digest.
+    return {**numbers, "response": repr(profile.response)}

@@ -61,8 +61,8 @@ def load_sensor(name: str) -> Sensor:
     `blind` is one too.
     """
     shipped = BLIND_PROFILE if name == BLIND else name
-    found = read_sensor(*read_toml("sensors", shipped), profile_path("sensors", shipped).parent)
-    return replace(found, name=BLIND) if name == BLIND else found
+    sensor = read_sensor(*read_toml("sensors", shipped), profile_path("sensors", shipped).parent)
+    return replace(sensor, name=BLIND) if name == BLIND else sensor
 
 
 def with_numbers(sensor: Sensor, numbers: Mapping[str, Number]) -> Sensor:
@@ -75,36 +75,38 @@ def with_numbers(sensor: Sensor, numbers: Mapping[str, Number]) -> Sensor:
             remedy = "correct the name"
             raise ProfileError(where, expected=expected, got=repr(key), remedy=remedy)
         tables[TABLE_OF[key]][key] = list(value) if isinstance(value, tuple) else value
-    for one, other in (
+    # Noise is stated in one of two ways: numbers of the one replace those of the other.
+    for stated, superseded in (
         ({"alpha", "beta"}, {"snr_0", "snr_1"}),
         ({"snr_0", "snr_1"}, {"alpha", "beta"}),
     ):
-        if one & set(numbers):
+        if stated & set(numbers):
             tables["noise"] = {
-                key: value for key, value in tables["noise"].items() if key not in other
+                key: value for key, value in tables["noise"].items() if key not in superseded
             }
-    found = replace(
+    changed = replace(
         read_sensor(where, {"description": sensor.description, **tables}), name=sensor.name
     )
+    # A response settles the contrasts at Nyquist, so that it goes if they are replaced.
     keeps_blur = sensor.response is not None and not {"mtf_nyquist", "mtf_nyquist_along"} & set(
         numbers
     )
-    return replace(found, response=sensor.response) if keeps_blur else found
+    return replace(changed, response=sensor.response) if keeps_blur else changed
 
 
 def tables_of(sensor: Sensor) -> dict[str, dict[str, object]]:
     """The tables of a sensor's file as plain values; of a response its
     contrasts at Nyquist alone.
     """
-    found: dict[str, dict[str, object]] = {}
+    tables: dict[str, dict[str, object]] = {}
     for key, table in TABLE_OF.items():
         constant: Constant | None = getattr(sensor, key)
-        found.setdefault(table, {})
+        tables.setdefault(table, {})
         if constant is not None:
-            found[table][key] = _plain(constant)
+            tables[table][key] = _plain(constant)
     for name, effect in sensor.effects.items():
-        found[name] = {key: _plain(constant) for key, constant in effect.items()}
-    return found
+        tables[name] = {key: _plain(constant) for key, constant in effect.items()}
+    return tables
 
 
 def _plain(constant: Constant) -> dict[str, object]:
@@ -144,7 +146,7 @@ def sensor_toml(description: str, tables: Mapping[str, Mapping[str, object]]) ->
 def _toml(value: object) -> str:
     """A value in TOML's notation: of JSON's it differs in tables alone."""
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {_toml(each)}" for key, each in value.items()) + " }"
+        return "{ " + ", ".join(f"{key} = {_toml(entry)}" for key, entry in value.items()) + " }"
     return json.dumps(value, ensure_ascii=False)
 
 
@@ -164,13 +166,13 @@ def sensor_from_json(label: str, raw: Mapping[str, Any]) -> Sensor:
         raise ProfileError(
             label, expected="a table of effects", got=repr(effects), remedy="make it anew"
         )
-    found = read_sensor(label, {"description": raw["description"], **tables, **effects})
+    sensor = read_sensor(label, {"description": raw["description"], **tables, **effects})
     if raw.get("response") is not None:
         response = response_from_json(f"{label} response", raw["response"])
-        mtf = found.mtf_nyquist
-        found = replace(found, response=response, **axes_of(response, mtf.status, mtf.source))
-        _check_budget(label, found)
-    return replace(found, name=str(raw["name"]))
+        mtf = sensor.mtf_nyquist
+        sensor = replace(sensor, response=response, **axes_of(response, mtf.status, mtf.source))
+        _check_budget(label, sensor)
+    return replace(sensor, name=str(raw["name"]))
 
 
 def read_sensor(label: str, raw: Mapping[str, Any], folder: Path = Path()) -> Sensor:
@@ -182,13 +184,12 @@ def read_sensor(label: str, raw: Mapping[str, Any], folder: Path = Path()) -> Se
         folder: where it lies, from which the path of a point-spread function counts.
     """
     check_keys(label, raw, required={"description", *TABLES}, optional=set(EFFECT_TABLES))
-    stated = {table: _read_table(label, table, raw[table]) for table in TABLES}
-    constants = {
-        key: read_constant(f"{label} [{table}] {key}", value)
-        for table, content in stated.items()
-        for key, value in content.items()
-        if key not in RESPONSE
-    }
+    contents = {table: _read_table(label, table, raw[table]) for table in TABLES}
+    constants: dict[str, Constant] = {}
+    for table, content in contents.items():
+        for key, value in content.items():
+            if key not in RESPONSE:
+                constants[key] = read_constant(f"{label} [{table}] {key}", value)
     effects = {
         name: read_effect(f"{label} [{name}]", name, raw[name])
         for name in EFFECT_TABLES
@@ -201,7 +202,7 @@ def read_sensor(label: str, raw: Mapping[str, Any], folder: Path = Path()) -> Se
     _check_noise(label, constants)
     blur: dict[str, Any] = {}
     if "mtf_nyquist" not in constants:
-        response, status, source = read_response(f"{label} [mtf]", stated["mtf"], folder)
+        response, status, source = read_response(f"{label} [mtf]", contents["mtf"], folder)
         blur = {"response": response, **axes_of(response, status, source)}
     name = label.removesuffix(".toml")
     description = str(raw["description"])
@@ -354,12 +355,11 @@ def _check_budget(label: str, profile: Sensor) -> None:
 
 
 def _check_snr(profile: Sensor) -> None:
-    """Some pair in the ranges must be physical: the bounds grow with snr_1, so
-    its two ends decide.
-    """
+    """Raise ProfileError unless some pair in the ranges is physical."""
     if profile.snr_0 is None or profile.snr_1 is None:
         return
     radiances = profile.radiance_0.low, profile.radiance_1.low
+    # Both bounds grow with snr_1, so that its two ends decide.
     lowest = snr_0_bounds(*radiances, profile.snr_1.low)[0]
     highest = snr_0_bounds(*radiances, profile.snr_1.high)[1]
     if profile.snr_0.high < lowest or profile.snr_0.low > highest:
@@ -374,9 +374,9 @@ def reference_beside(
 
     One that was named, and states other ones, is converted in sight: `say` is told.
     """
-    stated = Sensor.load(named or REFERENCE)
-    reference = stated.in_units_of(degraded)
-    if named is not None and reference is not stated:
+    profile = Sensor.load(named or REFERENCE)
+    reference = profile.in_units_of(degraded)
+    if named is not None and reference is not profile:
         units = f"{describe_units(degraded)}, as {degraded.name} has them"
-        say(f"note: the reference {stated.name} ({describe_units(stated)}) is taken at {units}")
+        say(f"note: the reference {profile.name} ({describe_units(profile)}) is taken at {units}")
     return reference

@@ -99,15 +99,15 @@ class TargetProfile:
 
     def configuration(self, name: str | None = None) -> tuple[str, dict[str, Constant]]:
         """Name and constants of configuration `name`, or of the default one."""
-        chosen = name or self.default_configuration
-        if chosen is None or chosen not in self.configurations:
+        build = name or self.default_configuration
+        if build is None or build not in self.configurations:
             raise ProfileError(
                 f"target profile {self.name}",
                 expected=f"a configuration out of {', '.join(self.configurations) or 'none'}",
                 got=repr(name),
                 remedy="choose one of them as `dpu`",
             )
-        return chosen, self.configurations[chosen]
+        return build, self.configurations[build]
 
 
 def target_names() -> list[str]:
@@ -156,6 +156,7 @@ def load_target(name: str) -> TargetProfile:
     default = raw.get("default_configuration")
     activations = _whole_table(label, raw, "activations", PLACES)
     npu = _whole_table(label, raw, "npu", NPU)
+    # The rules of an NPU stand in [npu], in place of a DPU's manuals.
     documents = _whole_table(
         label, raw, "documents", frozenset({"quantiser"}) if npu else DOCUMENTS
     )
@@ -173,6 +174,7 @@ def load_target(name: str) -> TargetProfile:
         {key: read_words(f"{label} [npu] {key}", value) for key, value in npu.items()},
     )
     if configurations:
+        # This raises if the default is none of them.
         profile.configuration()
     return profile
 
@@ -183,20 +185,21 @@ def _with_base(label: str, raw: dict[str, object]) -> tuple[str, dict[str, objec
     if base is None:
         return label, raw
     if base not in target_names():
-        known = ", ".join(board_names())
+        boards = ", ".join(board_names())
         raise ProfileError(
             f"{label} base",
-            expected=f"one of {known}",
+            expected=f"one of {boards}",
             got=repr(base),
             remedy="name a shipped board",
         )
-    below = _with_base(*read_toml("targets", str(base)))[1]
+    inherited = _with_base(*read_toml("targets", str(base)))[1]
+    # Measured powers belong to one board, and no other board inherits them.
     power = {
         key: value
-        for key, value in _mapping(label, below.get("power", {})).items()
+        for key, value in _mapping(label, inherited.get("power", {})).items()
         if not key.endswith(WATTS)
     }
-    return label, _over(raw, {**below, "power": power}, depth=1)
+    return label, _over(raw, {**inherited, "power": power}, depth=1)
 
 
 def _over(
@@ -205,14 +208,16 @@ def _over(
     """One table over another: `depth` levels of tables are joined, below them what stands above
     replaces.
     """
-    joined = dict(below)
+    table = dict(below)
     for key, value in above.items():
         under = below.get(key)
         if depth and isinstance(value, Mapping) and isinstance(under, Mapping):
-            joined[key] = _over(value, under, depth if key == "configurations" else depth - 1)
+            # Under "configurations" each table holds the tables of the builds: one level more to
+            # join.
+            table[key] = _over(value, under, depth if key == "configurations" else depth - 1)
         else:
-            joined[key] = value
-    return joined
+            table[key] = value
+    return table
 
 
 def _whole_table(

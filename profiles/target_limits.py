@@ -174,6 +174,7 @@ def check_limits(where: str, table: str, constants: Mapping[str, Constant]) -> N
     """
     limits = CONFIGURATION if table == CONFIGURATIONS else TABLES.get(table, {})
     for key, constant in constants.items():
+        # A key without limits takes part in no rule and no prediction.
         allowed = limits.get(key, ANY_KEY.get(table))
         values = (constant.low, constant.high)
         if allowed is not None and not all(map(allowed.holds, values)):

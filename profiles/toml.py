@@ -22,16 +22,16 @@ QUOTED = 80
 
 def read_toml_text(path: Path) -> dict[str, object]:
     """A TOML file as plain values; it may say inf, nan, or a whole number of any size."""
-    text = read_whole(path, TOML_BYTES).decode(
-        "utf-8-sig"
-    )  # some editors on Windows begin with a mark
+    # Some editors on Windows begin a file with a byte order mark.
+    text = read_whole(path, TOML_BYTES).decode("utf-8-sig")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ValueError(_line_at_fault(text, str(error))) from None
     except RecursionError:
         raise ValueError(TOO_DEEP) from None
-    except ValueError:  # Python converts no more than 4300 digits, and names a setting of its own
+    # Python converts no more than 4300 digits, and its message names a setting of its own.
+    except ValueError:
         raise ValueError("a number of too many digits") from None
 
 
@@ -41,7 +41,8 @@ def _line_at_fault(text: str, reason: str) -> str:
     """
     what, _, where = reason.rpartition(" (at ")
     lines = text.rstrip().split("\n")
-    number = int(found[1]) if (found := re.match(r"line (\d+)", where)) else len(lines)
+    place = re.match(r"line (\d+)", where)
+    number = int(place[1]) if place else len(lines)
     line = lines[number - 1].strip() if number <= len(lines) else ""
     return f"line {number}, {line[:QUOTED]!r}: {what}"
 
@@ -56,28 +57,29 @@ def parse_json(text: str) -> object:
     if not text.strip():
         raise ValueError("an empty file")
     try:
-        found: object = json.loads(
+        document: object = json.loads(
             text,
             parse_constant=_number,
             parse_float=_number,
             parse_int=_whole,
             object_pairs_hook=_unique,
         )
-        json.dumps(found, ensure_ascii=False).encode()  # half a surrogate pair cannot be printed
+        # Half a surrogate pair cannot be printed.
+        json.dumps(document, ensure_ascii=False).encode()
     except RecursionError:
         raise ValueError(TOO_DEEP) from None
-    return found
+    return document
 
 
 def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
     """Return an object; raise ValueError for a key that stands in it twice, of which readers take
     either.
     """
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    members = dict(pairs)
+    if len(members) < len(pairs):
         twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
         raise ValueError(f"the key {twice[:QUOTED]!r} twice")
-    return found
+    return members
 
 
 def _number(text: str) -> float:
@@ -88,16 +90,17 @@ def _number(text: str) -> float:
 
 
 def _whole(text: str) -> int:
-    _number(text)  # refuses what float64 cannot hold
+    # It refuses what float64 cannot hold.
+    _number(text)
     return int(text)
 
 
 def read_whole(path: Path, limit_bytes: int) -> bytes:
     """Read all bytes of a regular file that has at most `limit_bytes`."""
-    found = path.stat()
+    status = path.stat()
     if reason := unreadable(path):
         raise ValueError(reason)
-    if found.st_size > limit_bytes:
+    if status.st_size > limit_bytes:
         raise ValueError(f"more than {limit_bytes} bytes")
     return path.read_bytes()
 
@@ -112,7 +115,8 @@ def unreadable(path: Path) -> str | None:
         mode = path.stat().st_mode
     except FileNotFoundError:
         return "no such file"
-    except OSError as error:  # such as a name that is too long
+    # One reason is a name that is too long.
+    except OSError as error:
         return error.strerror or str(error)
     if not stat.S_ISREG(mode):
         return "a folder" if stat.S_ISDIR(mode) else "no regular file"
@@ -138,11 +142,11 @@ def profile_path(kind: str, name: str) -> Path:
 def read_toml(kind: str, name: str) -> tuple[str, dict[str, object]]:
     """Return (label for messages, parsed table) of profile `name`."""
     path = profile_path(kind, name)
-    known = shipped_names(kind)
-    if not name.endswith(".toml") and name not in known:
+    names = shipped_names(kind)
+    if not name.endswith(".toml") and name not in names:
         raise ProfileError(
             f"profile {name!r}",
-            expected=f"one of {', '.join(known)}, or the path of a .toml file",
+            expected=f"one of {', '.join(names)}, or the path of a .toml file",
             got=repr(name),
             remedy="run 'beers-deploy profiles' to see them all",
         )

@@ -3,6 +3,7 @@ weights.
 """
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.integer.arithmetic import activated, activation_table, mean_factor
 
+# `split` caps the coarse plane at 127, so the remainder of the brightest values reaches 31.
 PLANE_LOW = np.array([0, -STEP // 2, -STEP // 2 // QUARTER])
 PLANE_HIGH = np.array([COARSE_MAX, STEP - 1, STEP // QUARTER])
 
@@ -72,29 +74,31 @@ Accumulated = tuple[np.ndarray, np.ndarray, int]
 """The accumulators' interval, zero padding included, and the shift to int8."""
 
 
-def _accumulated(core: IntCore, op: IntConv | Op, read: list[Range]) -> Accumulated:
+def _accumulated(core: IntCore, op: IntConv | Op, inputs: list[Range]) -> Accumulated:
     if isinstance(op, IntConv):
-        return _conv(core, op, read[0])
+        return _conv(core, op, inputs[0])
     if isinstance(op, Add):
-        return _whole_add(core, op, read)
+        return _whole_add(core, op, inputs)
     if isinstance(op, Mul):
-        corners = np.array([a.astype(np.int64) * b for a in read[0] for b in read[1]])
+        # A product is linear in each factor, so its extremes lie at the ends of both intervals.
+        corners = np.array([a.astype(np.int64) * b for a, b in product(inputs[0], inputs[1])])
         shift = sum(core.frac_bits[name] for name in op.inputs) - core.frac_bits[op.output]
         return corners.min(0), corners.max(0), shift
     if isinstance(op, AveragePool):
         assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
         factor, shift = mean_factor(op.kernel)
         low, high = (
-            op.kernel[0] * op.kernel[1] * factor * end.astype(np.int64) for end in _padded(read[0])
+            op.kernel[0] * op.kernel[1] * factor * end.astype(np.int64)
+            for end in _padded(inputs[0])
         )
         return low, high, shift
-    low, high = _moved(core, op, read)
+    low, high = _moved(core, op, inputs)
     return low, high, 0
 
 
-def _moved(core: IntCore, op: Op, read: list[Range]) -> Range:
+def _moved(core: IntCore, op: Op, inputs: list[Range]) -> Range:
     """Behind what hands values on, or looks them up."""
-    low, high = (np.concatenate([ends[k] for ends in read]) for k in (0, 1))
+    low, high = (np.concatenate([ends[k] for ends in inputs]) for k in (0, 1))
     if isinstance(op, Concat):
         return low, high
     if isinstance(op, Pointwise):
@@ -112,13 +116,15 @@ def _padded(ends: Range) -> Range:
     return np.minimum(ends[0], 0), np.maximum(ends[1], 0)
 
 
-def _conv(core: IntCore, op: IntConv, read: Range) -> Accumulated:
-    low, high = _padded(read)
+def _conv(core: IntCore, op: IntConv, source: Range) -> Accumulated:
+    low, high = _padded(source)
     weight = op.weight.astype(np.int64)
     up = np.maximum(weight, 0).sum((2, 3))
     down = np.minimum(weight, 0).sum((2, 3))
-    product = op.weight_frac_bits + core.frac_bits[op.input]
-    bias = op.bias.astype(np.int64) << (product - op.bias_frac_bits)
+    product_bits = op.weight_frac_bits + core.frac_bits[op.input]
+    bias = op.bias.astype(np.int64) << (product_bits - op.bias_frac_bits)
+    # A sum is largest where each positive weight reads its channel's high end and each negative
+    # one the low end.
     if op.groups == 1:
         least = up @ low + down @ high + bias
         most = up @ high + down @ low + bias
@@ -127,19 +133,22 @@ def _conv(core: IntCore, op: IntConv, read: Range) -> Accumulated:
         down = down[:, 0]
         least = up * low + down * high + bias
         most = up * high + down * low + bias
-    (least, finer), (most, _) = (activated(end, op.activation, product) for end in (least, most))
-    return least, most, product - core.frac_bits[op.output] + finer
+    (least, finer), (most, _) = (
+        activated(end, op.activation, product_bits) for end in (least, most)
+    )
+    return least, most, product_bits - core.frac_bits[op.output] + finer
 
 
-def _whole_add(core: IntCore, op: Add, read: list[Range]) -> Accumulated:
+def _whole_add(core: IntCore, op: Add, inputs: list[Range]) -> Accumulated:
     finest = max(core.frac_bits[name] for name in op.inputs)
     shifts = [finest - core.frac_bits[name] for name in op.inputs]
     ends = (
-        sum(r[k].astype(np.int64) << s for r, s in zip(read, shifts, strict=True)) for k in (0, 1)
+        sum(r[k].astype(np.int64) << s for r, s in zip(inputs, shifts, strict=True)) for k in (0, 1)
     )
     (low, finer), (high, _) = (activated(np.asarray(end), op.activation, finest) for end in ends)
     return low, high, finest - core.frac_bits[op.output] + finer
 
 
 def _shifted(sums: np.ndarray, shift: int) -> np.ndarray:
+    # The half before the shift makes ties round up, as the DPU rounds its results.
     return sums << -shift if shift <= 0 else (sums + (1 << (shift - 1))) >> shift

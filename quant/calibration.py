@@ -7,6 +7,7 @@ with them. So memory grows neither with their number nor with their size.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import TypeVar
 
@@ -107,27 +108,31 @@ def draw_views(
         [size // ratio - 2 * MARGIN_PX for size in scene.radiance.shape] for scene, ratio in places
     ]
     room = np.prod(sides, axis=1)  # target pixels within the margin
-    drawn = generator.choice(len(places), VIEW_CANDIDATES * count, p=room / room.sum())
-    grounds = [_ground(places[k], recipe, generator) for k in drawn]
-    seen_by = recipe.family or recipe.degraded
-    sensors = [seen_by.draw(generator) for _ in range(VIEW_CANDIDATES * count)]
+    # One generator draws all of this, so the order of the draws decides what a seed gives.
+    indices = generator.choice(len(places), VIEW_CANDIDATES * count, p=room / room.sum())
+    grounds = [_ground(places[k], recipe, generator) for k in indices]
+    source = recipe.family or recipe.degraded
+    sensors = [source.draw(generator) for _ in range(VIEW_CANDIDATES * count)]
     dark = recipe.degraded.radiance_0.low
+    # Brightness, MTF and noise are each spread by themselves, in orders that do not depend on each
+    # other.
     spread = zip(
         stratified(grounds, lambda ground: ground.brightness, count, generator),
         stratified(sensors, lambda sensor: sensor.mtf_nyquist, count, generator),
         stratified(sensors, lambda sensor: sensor.noise_sigma(dark), count, generator),
         strict=True,
     )
-    return [
-        View(ground, _blurred_as(noisy, blurred), recipe.reference.draw(generator))
-        for ground, blurred, noisy in spread
-    ]
-
-
-def _blurred_as(sensor: Instrument, other: Instrument) -> Instrument:
-    across = other.mtf_nyquist
-    along = other.mtf_nyquist_along
-    return replace(sensor, mtf_nyquist=across, mtf_nyquist_along=along, response=other.response)
+    views = []
+    for ground, blurred, noisy in spread:
+        # A view has the noise of one sensor and the blur of another, each from its own group.
+        degraded = replace(
+            noisy,
+            mtf_nyquist=blurred.mtf_nyquist,
+            mtf_nyquist_along=blurred.mtf_nyquist_along,
+            response=blurred.response,
+        )
+        views.append(View(ground, degraded, recipe.reference.draw(generator)))
+    return views
 
 
 def stratified(
@@ -139,18 +144,18 @@ def stratified(
     """One of each of `count` equal groups of the candidates ordered by `key`, in random order."""
     ranked = sorted(candidates, key=key)
     size = len(candidates) // count
-    chosen = [ranked[group * size + int(generator.integers(size))] for group in range(count)]
-    return [chosen[k] for k in generator.permutation(count)]
+    members = [ranked[group * size + int(generator.integers(size))] for group in range(count)]
+    # In rank order the darkest ground would always meet the weakest MTF.
+    return [members[k] for k in generator.permutation(count)]
 
 
 def _places(scenes: Sequence[Scene], recipe: PatchRecipe) -> list[tuple[Scene, int]]:
     """Scenes, each with every oversampling at which it holds a patch."""
     side_px = recipe.patch_px + 2 * MARGIN_PX
     fitting = [
-        (s, ratio)
-        for s in scenes
-        for ratio in recipe.oversamplings
-        if min(s.radiance.shape) >= side_px * ratio
+        (scene, ratio)
+        for scene, ratio in product(scenes, recipe.oversamplings)
+        if min(scene.radiance.shape) >= side_px * ratio
     ]
     if not fitting:
         expected = (
@@ -167,13 +172,13 @@ def _ground(
     place: tuple[Scene, int], recipe: PatchRecipe, generator: np.random.Generator
 ) -> Ground:
     scene, oversampling = place
+    # A Fourier transform wraps around; the margin keeps the far border out of the patch.
     side_px = recipe.patch_px + 2 * MARGIN_PX
     top, left = (
         int(generator.integers(size - side_px * oversampling + 1)) for size in scene.radiance.shape
     )
-    return Ground(
-        scene, top, left, side_px, oversampling, float(generator.uniform(*recipe.looks.exposures))
-    )
+    exposure = float(generator.uniform(*recipe.looks.exposures))
+    return Ground(scene, top, left, side_px, oversampling, exposure)
 
 
 ROLES = "degraded", "reference"
@@ -211,17 +216,21 @@ def draw_patches(
         ProfileError: the two profiles differ in gain, bits or offset.
     """
     recipe = PatchRecipe(degraded, reference, patch_px=patch_px, family=family)
+    # Each purpose has a generator of its own, so that lightings change no other draw.
     views = draw_views(scenes, recipe, count, Draw(seed).generator("views"))
     if lightings:
         views = relit(views, lightings, Draw(seed).generator("lighting"))
 
     def pair(number: int) -> Pair:
         view = views[number]
-        seen, meant = _simulate(view.ground, (view.degraded, view.reference), Draw(seed, number))
-        return seen, meant
+        # Keyed by the patch's number, because patches are simulated anew in any order.
+        image, target = _simulate(view.ground, (view.degraded, view.reference), Draw(seed, number))
+        return image, target
 
     def alone(number: int) -> np.ndarray:
-        return _simulate(views[number].ground, (views[number].degraded,), Draw(seed, number))[0]
+        view = views[number]
+        (image,) = _simulate(view.ground, (view.degraded,), Draw(seed, number))
+        return image
 
     return Patches(views, Remade(pair, count), Remade(alone, count))
 
@@ -235,9 +244,8 @@ def relit(
     for view, lighting in zip(views, assigned, strict=True):
         full_scale = full_scale_radiance(view.degraded)
         factor = lighting.factor(view.ground.sampled_radiance, full_scale, generator)
-        result.append(
-            replace(view, ground=replace(view.ground, exposure=factor * view.ground.exposure))
-        )
+        ground = replace(view.ground, exposure=factor * view.ground.exposure)
+        result.append(replace(view, ground=ground))
     return result
 
 
@@ -252,7 +260,8 @@ def _simulate(ground: Ground, sensors: Sequence[Instrument], draw: Draw) -> list
         acquire(spectrum, width, sensor, ground.oversampling, draw, role) / sensor.max_dn
         for role, sensor in zip(ROLES, sensors, strict=False)
     ]
-    transfer_function.cache_clear()  # no two patches share one, and each is megabytes
+    # No two patches share a transfer function, and each is megabytes.
+    transfer_function.cache_clear()
     mirrors, quarters = sensors[0].symmetry
     turned = turn(np.stack(images)[:, None], draw.generator("turn"), quarters, mirrors)
     return [np.ascontiguousarray(image[None]) for image in turned]
@@ -318,6 +327,7 @@ def unseen_patches(degraded: Sensor, images: Path | None, patches: int, seed: in
         seed: of the calibration.
     """
     reference = reference_for(degraded)
+    # Another seed draws other scenes, and other patches of the same images.
     other = seed + HELD_OUT_SEED
     scenes = load_scenes(images, reference.nominal(), other, patches)
     return draw_patches(scenes, degraded, reference, patches, other, lightings=JUDGING)

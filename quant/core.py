@@ -38,8 +38,9 @@ def quantise(values: np.ndarray, frac_bits: int) -> np.ndarray:
     bias.
     """
     scaled = np.asarray(values, dtype=np.float64) * 2.0**frac_bits
-    rounded = np.sign(scaled) * np.floor(np.abs(scaled) + 0.5)
-    return np.asarray(np.clip(rounded, INT8_MIN, INT8_MAX).astype(np.int8))
+    # AMD's quantiser rounds these away from zero, unlike activations, which round half up.
+    units = np.sign(scaled) * np.floor(np.abs(scaled) + 0.5)
+    return np.asarray(np.clip(units, INT8_MIN, INT8_MAX).astype(np.int8))
 
 
 def unclipped_frac_bits(max_abs: float) -> int:
@@ -55,6 +56,7 @@ def squared_errors(values: np.ndarray, first: int) -> np.ndarray:
     for k in range(CANDIDATES):
         scale = np.float32(2.0 ** (first + k))
         scaled = values * scale
+        # How ties round does not matter here: either way they err by half a unit.
         difference = np.clip(np.rint(scaled), INT8_MIN, INT8_MAX) - scaled
         errors[k] = float(np.vdot(difference, difference)) / float(scale) ** 2
     return errors
@@ -99,6 +101,7 @@ def target_shifts(target: TargetProfile) -> Shifts:
         constant = target.constant("numbers", key)
         return int(constant.low), int(constant.high)
 
+    # Boards allow a bias finer than the accumulator, whose lowest bits are lost: none is written.
     bias = 0, int(target.value("numbers", "shift_bias_max"))
     return Shifts(window("shift_cut"), bias, window("shift_read"), window("shift_write"))
 
@@ -164,9 +167,9 @@ def dequantised(op: Conv, whole: IntConv) -> Conv:
 def rounded_to(values: np.ndarray, frac_bits: int) -> np.ndarray:
     """To whole multiples of 2^-n, half up, and clipped, as the DPU does."""
     scale = np.float32(2.0**frac_bits)
-    return np.asarray(
-        np.clip(np.floor(values * scale + np.float32(0.5)), INT8_MIN, INT8_MAX) / scale
-    )
+    # np.rint would round half to even, as onnxruntime does.
+    units = np.floor(values * scale + np.float32(0.5))
+    return np.asarray(np.clip(units, INT8_MIN, INT8_MAX) / scale)
 
 
 def build_core(
@@ -181,9 +184,11 @@ def build_core(
         ends: what the host does around; by default an image of one channel and a correction of it.
     """
     lowered = {op.output: op.offset for op in graph if isinstance(op, Conv) and op.offset}
+    # An offset is 128 units of its tensor, so it states the scale.
     legal = dict(frac_bits) | {
         name: round(math.log2(-INT8_MIN / offset)) for name, offset in lowered.items()
     }
+    # Each round starts from the scales that the one before has moved.
     for _ in range(ROUNDS):
         core = _in_one_round(graph, legal, shifts, ends or Ends())
         faults = shift_faults(core, shifts)
@@ -200,11 +205,11 @@ def _with_biases_left(core: IntCore, graph: Graph) -> IntCore:
     adds it.
     """
     last = graph[-1]
-    whole = core.ops[-1]
-    if not (core.ends.offsets and isinstance(last, Conv) and isinstance(whole, IntConv)):
+    rounded = core.ops[-1]
+    if not (core.ends.offsets and isinstance(last, Conv) and isinstance(rounded, IntConv)):
         return core
-    wanted = nearest_bias(last, whole.weight, whole.weight_frac_bits, graph)
-    return replace(core, ends=core.ends.moved(wanted - whole.float_bias))
+    bias = nearest_bias(last, rounded.weight, rounded.weight_frac_bits, graph)
+    return replace(core, ends=core.ends.moved(bias - rounded.float_bias))
 
 
 def nearest_bias(op: Conv, weight: np.ndarray, weight_frac_bits: int, graph: Graph) -> np.ndarray:
@@ -214,14 +219,13 @@ def nearest_bias(op: Conv, weight: np.ndarray, weight_frac_bits: int, graph: Gra
     Where what it reads is stored less an offset, those weights give back another amount than the
     float ones.
     """
-    offset = next(
-        (each.offset for each in graph if isinstance(each, Conv) and each.output == op.input), 0.0
-    )
+    writers = (conv for conv in graph if isinstance(conv, Conv) and conv.output == op.input)
+    offset = next((conv.offset for conv in writers), 0.0)
     if not offset:
         return op.stored_bias
-    return np.asarray(
-        op.stored_bias + offset * (weight * 2.0**-weight_frac_bits - op.weight).sum((1, 2, 3))
-    )
+    # The float bias has the offset times the float weights in it.
+    errors = weight * 2.0**-weight_frac_bits - op.weight
+    return np.asarray(op.stored_bias + offset * errors.sum((1, 2, 3)))
 
 
 def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends: Ends) -> IntCore:
@@ -234,6 +238,7 @@ def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends:
         if isinstance(op, Add):
             _move_add(op, frac_bits, shifts)
         elif isinstance(op, Mul):
+            # A product has the fractional bits of both factors; only the result's scale can move.
             finest = sum(frac_bits[name] for name in op.inputs)
             frac_bits[op.output] = finest - clamp(finest - frac_bits[op.output], shifts.cut)
         elif ties_scales(op):
@@ -243,21 +248,20 @@ def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends:
 
 
 def _quantise_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts, graph: Graph) -> IntConv:
-    finest = (
-        shifts.cut[1] + frac_bits[op.output] - frac_bits[op.input]
-    )  # finer weights would make the result clip
+    # With finer weights the shift would be beyond its window, and the result's scale would have to
+    # become finer too, so that it clips.
+    finest = shifts.cut[1] + frac_bits[op.output] - frac_bits[op.input]
     weight_frac_bits = min(best_frac_bits(op.weight), finest)
-    if (
-        op.ceiling is not None or op.offset
-    ):  # the result keeps its scale, for it clips where int8 ends
+    # Here the end of int8 is the activation's own clip, so the result must keep its scale: the
+    # weights are made fine enough for a shift of 0.
+    if op.ceiling is not None or op.offset:
         weight_frac_bits = max(weight_frac_bits, frac_bits[op.output] - frac_bits[op.input])
     product = weight_frac_bits + frac_bits[op.input]
     cut = clamp(product - frac_bits[op.output], shifts.cut)
     frac_bits[op.output] = product - cut
     weight = quantise(op.weight, weight_frac_bits)
-    bias, bias_frac_bits = quantise_bias(
-        nearest_bias(op, weight, weight_frac_bits, graph), product, shifts
-    )
+    exact_bias = nearest_bias(op, weight, weight_frac_bits, graph)
+    bias, bias_frac_bits = quantise_bias(exact_bias, product, shifts)
     kind = (_activation(op, frac_bits[op.output]), op.window, op.groups, op.transposed)
     return IntConv(
         op.name, op.input, op.output, weight, weight_frac_bits, bias, bias_frac_bits, *kind
@@ -268,6 +272,7 @@ def _activation(op: Conv, frac_bits: int) -> Activation:
     """Of whole numbers: ReLU6 is ReLU where int8 ends no later than the six, as it does once
     `equalise` scaled.
     """
+    # Stored less 128 units, zero is -128, below which int8 saturates by itself.
     if op.offset:
         return Activation.saturated_relu
     ends_first = op.ceiling is not None or INT8_MAX * 2.0**-frac_bits <= SIX
@@ -280,12 +285,14 @@ def quantise_bias(
     """An int8 bias (O,) and its scale, within reach of the accumulator's
     `product` fractional bits.
     """
-    wanted = best_frac_bits(bias) if bias.any() else product
-    frac_bits = product - clamp(product - wanted, shifts.bias)
+    # Any scale holds zeros; the accumulator's own needs no shift.
+    best = best_frac_bits(bias) if bias.any() else product
+    frac_bits = product - clamp(product - best, shifts.bias)
     return quantise(bias, frac_bits), frac_bits
 
 
 def _move_add(op: Add, frac_bits: dict[str, int], shifts: Shifts) -> None:
+    # The coarsest input stays, for a finer scale would make it clip; finer inputs come nearer.
     coarse = min(frac_bits[i] for i in op.inputs)
     for name in op.inputs:
         frac_bits[name] = coarse + clamp(frac_bits[name] - coarse, shifts.read)
@@ -297,6 +304,7 @@ def _tie(op: Op, frac_bits: dict[str, int]) -> None:
     planes is fixed.
     """
     names = (*op.inputs, op.output)
+    # The host writes the planes with a scale of their own; a finer scale than the coarsest clips.
     shared = frac_bits[PLANES] if PLANES in names else min(frac_bits[name] for name in names)
     frac_bits.update(dict.fromkeys(names, shared))
 
@@ -318,13 +326,14 @@ def op_shifts(
     inputs = [frac_bits[i] for i in op.inputs]
     output = frac_bits[op.output]
     if isinstance(op, Add):
-        read = max(inputs) - min(inputs)
+        spread = max(inputs) - min(inputs)
         write = min(inputs) - output
-        return [("shift_read", read, shifts.read), ("shift_write", write, shifts.write)]
+        return [("shift_read", spread, shifts.read), ("shift_write", write, shifts.write)]
     if isinstance(op, Mul):
         return [("shift_cut", sum(inputs) - output, shifts.cut)]
     if ties_scales(op):
-        return [("shift_read", max(*inputs, output) - min(*inputs, output), (0, 0))]
+        spread = max(*inputs, output) - min(*inputs, output)
+        return [("shift_read", spread, (0, 0))]
     if not isinstance(op, IntConv):
         return []
     product = op.weight_frac_bits + inputs[0]

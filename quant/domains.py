@@ -60,6 +60,7 @@ def operator_name(node: NodeProto, functions: Functions = ()) -> str:
     """
     if (node.domain, node.op_type) in functions:
         return f"{node.domain}{SEPARATOR}{node.op_type}"
+    # With `channels_last` onnxruntime's operators read (N, H, W, C), which ONNX's never do.
     transposed = any(
         attribute.name == "channels_last" and attribute.i for attribute in node.attribute
     )

@@ -90,6 +90,7 @@ class Ends:
     @property
     def border_px(self) -> int:
         """Pixels by which the image's borders are mirrored in front of the planes."""
+        # Rounded up, so that pixel unshuffling divides the image into the same places as before.
         return -(-BORDER_PX // self.place_px) * self.place_px if self.banked else 0
 
     @property
@@ -109,8 +110,10 @@ class Ends:
 
     def split(self, image: np.ndarray) -> np.ndarray:
         """An image (N, C, H, W) in [0, 1] to the core's planes, int8."""
+        # These are multiples of 1/128 already: rounding takes off float error alone.
         if self.direct:
             return np.clip(np.rint(image * 2.0**BITS), -128, 127).astype(np.int8)
+        # Zeros around the image would look like a black edge to the bank's filters.
         if self.border_px:
             image = np.pad(image, ((0, 0), (0, 0), *[(self.border_px,) * 2] * 2), "reflect")
         for shuffle in self.front:
@@ -126,11 +129,13 @@ class Ends:
         if self.gains == 1:
             return correction
         fine, coarse, *analytic = np.split(correction, self.copies, axis=1)
+        # At int8's end the fine copy may have saturated, so the coarse one is taken there.
         limit = np.float32((FINE_MAX + 0.5) * scale)
         value = np.where(np.abs(fine) <= limit, fine, coarse * np.float32(GAIN))
         if not analytic:
             return value
         added = np.sum(analytic[: self.fine_copies], 0) * np.float32(self.analytic_gain(scale))
+        # The fine copies lie within one step of each other, so one of them tells where they end.
         if self.wide:
             coarse = analytic[-1] * np.float32(self.coarse_gain(scale))
             added = np.where(np.abs(analytic[0]) <= limit, added, coarse)
@@ -160,6 +165,7 @@ class Ends:
 
     def _of_windows(self, correction: np.ndarray, scale: float) -> np.ndarray:
         coarse, *windows = np.split(correction, self.copies, axis=1)
+        # The coarse copy stays where no window holds the value.
         value = coarse * np.float32(GAIN)
         for window, offset in zip(windows, np.array(self.offsets, np.float32), strict=True):
             inside = np.abs(window) <= np.float32((FINE_MAX + 0.5) * scale)
@@ -170,11 +176,11 @@ class Ends:
         """With what rounding left of the biases of all channels, (copies outputs,), put into the
         windows' offsets.
         """
+        # The coarse copy comes first, and the host adds no offset to it.
         windows = np.asarray(left[self.outputs :]).reshape(-1, self.outputs)
-        offsets = np.array(self.offsets) + windows
-        return replace(
-            self, offsets=tuple(tuple(float(each) for each in window) for window in offsets)
-        )
+        sums = np.array(self.offsets) + windows
+        offsets = tuple(tuple(float(offset) for offset in window) for window in sums)
+        return replace(self, offsets=offsets)
 
     @property
     def copies(self) -> int:
@@ -190,6 +196,7 @@ class Ends:
         for shuffle in self.back:
             result = shuffle(result)
         if self.softmax:
+            # Without the largest the powers would overflow; it cancels in the quotient.
             powers = np.exp(result - result.max(axis=1, keepdims=True))
             result = powers / powers.sum(axis=1, keepdims=True)
         if self.flat:
@@ -210,6 +217,7 @@ class Ends:
         """The correction from which `finished` makes that result (N, C, H, W), in [0, 1] where the
         image is added.
         """
+        # The inverse of `finished`, from its last step to its first.
         for shuffle in reversed(self.last):
             result = shuffle.inverse(result)
         result = result - image if self.adds_image else result
@@ -230,7 +238,7 @@ ONE_CHANNEL = Ends()
 
 def ends_of(network: Network, gains: int = 1) -> Ends:
     """The ends of a network whose correction comes in so many gains."""
-    kept = (
+    steps = (
         network.front,
         network.back,
         network.adds_image,
@@ -239,7 +247,7 @@ def ends_of(network: Network, gains: int = 1) -> Ends:
         network.softmax,
     )
     outputs = channels_of(network.graph, {IMAGE: network.core_channels})[CORRECTION]
-    return Ends(network.core_channels, COUNT, *kept, gains, outputs)
+    return Ends(network.core_channels, COUNT, *steps, gains, outputs)
 
 
 class HostWriter(GraphWriter):
@@ -274,6 +282,7 @@ def write_front(w: HostWriter, ends: Ends) -> None:
         write_shuffle(w, shuffle, image, f"host_front.shuffled_{k}", channels)
         image = f"host_front.shuffled_{k}"
         channels = channels * shuffle.block**2
+    # A digital number is a coarse step and a remainder, so that int8 planes hold its 12 bits.
     step, part = (STEP_DN, PART) if ends.banked else (STEP, QUARTER)
     w.node("Mul", "host_front.scale", [image, w.scalar("max_dn", MAX_DN)])
     w.node("Round", "host_front.round", ["host_front.scale"])
@@ -286,6 +295,7 @@ def write_front(w: HostWriter, ends: Ends) -> None:
         dn = w.node("Sub", "host_front.centred", [dn, w.scalar("middle", MIDDLE_DN)])
     w.node("Mul", "host_front.steps", [dn, w.scalar("one_step", 1 / step)])
     w.node("Round", "host_front.whole_steps", ["host_front.steps"])
+    # At full scale the coarse plane is at int8's end, and the remainder holds more.
     w.node(
         "Min", "host_front.coarse", ["host_front.whole_steps", w.scalar("coarse_max", COARSE_MAX)]
     )
@@ -295,6 +305,7 @@ def write_front(w: HostWriter, ends: Ends) -> None:
         "Mul", "host_front.quarters", ["host_front.remainder", w.scalar("one_quarter", 1 / part)]
     )
     w.node("Round", "host_front.quarter", ["host_front.quarters"])
+    # A bank shares the weights of its coarse plane between two, and so has twice int8's range.
     coarse = ["host_front.coarse"] * (2 if ends.banked else 1)
     planes = [*coarse, "host_front.remainder", "host_front.quarter"]
     w.node("Concat", "host_front.planes", planes, axis=1)
@@ -335,9 +346,9 @@ def write_back(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> Non
     elif ends.tail:
         ends.tail.write(w, result)
     else:
-        w.node(
-            "Flatten" if ends.flat else "Identity", "restored", [result], name="host_back.result"
-        )
+        # The file's output is named `restored`, whatever the node in front of it.
+        kind = "Flatten" if ends.flat else "Identity"
+        w.node(kind, "restored", [result], name="host_back.result")
 
 
 def _write_one(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> str:
@@ -356,48 +367,41 @@ def _write_one(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> str
 def _write_windows(w: HostWriter, ends: Ends, scale: float) -> None:
     """Write the nodes that find each value in the window that holds it."""
     names = [f"host_back.window_{k}" for k in range(ends.copies)]
-    each = w.constant("channels_each", np.full(ends.copies, ends.outputs))
+    sizes = w.constant("channels_each", np.full(ends.copies, ends.outputs))
     w.nodes.append(
-        helper.make_node("Split", ["host_back.all", each], names, axis=1, name="host_back.split")
+        helper.make_node("Split", ["host_back.all", sizes], names, axis=1, name="host_back.split")
     )
     value = w.node("Mul", "host_back.wide", [names[0], w.scalar("gain", GAIN)])
     limit = w.scalar("fine_max", (FINE_MAX + 0.5) * scale)
     for k, (name, offset) in enumerate(zip(names[1:], ends.offsets, strict=True)):
-        taken_off = w.constant(f"offset_{k}", np.array(offset, np.float32)[None, :, None, None])
+        added = w.constant(f"offset_{k}", np.array(offset, np.float32)[None, :, None, None])
         w.node("Abs", f"{name}.size", [name])
         w.node("LessOrEqual", f"{name}.inside", [f"{name}.size", limit])
-        w.node("Add", f"{name}.value", [name, taken_off])
+        w.node("Add", f"{name}.value", [name, added])
         result = "host_back.correction" if k + 1 == len(ends.offsets) else f"{name}.chosen"
         value = w.node("Where", result, [f"{name}.inside", f"{name}.value", value])
 
 
 def _write_merge(w: HostWriter, ends: Ends, scale: float) -> None:
     """Write the nodes that make one correction of two gains: `Ends.merge` as operators."""
-    each = w.constant(
-        "one_each" if ends.outputs == 1 else "channels_each", np.full(ends.copies, ends.outputs)
-    )
+    name = "one_each" if ends.outputs == 1 else "channels_each"
+    sizes = w.constant(name, np.full(ends.copies, ends.outputs))
     analytic = [f"host_back.analytic_{k}" for k in range(ends.copies - 2)]
     names = ["host_back.fine", "host_back.coarse", *analytic]
-    w.nodes.append(helper.make_node("Split", ["host_back.both", each], names, axis=1))
+    w.nodes.append(helper.make_node("Split", ["host_back.both", sizes], names, axis=1))
     w.nodes[-1].name = "host_back.split"
     w.node("Mul", "host_back.wide", ["host_back.coarse", w.scalar("gain", GAIN)])
     w.node("Abs", "host_back.size", ["host_back.fine"])
-    w.node(
-        "LessOrEqual",
-        "host_back.fits",
-        ["host_back.size", w.scalar("fine_max", (FINE_MAX + 0.5) * scale)],
-    )
-    chosen = "host_back.chosen" if analytic else "host_back.correction"
-    w.node("Where", chosen, ["host_back.fits", "host_back.fine", "host_back.wide"])
+    limit = w.scalar("fine_max", (FINE_MAX + 0.5) * scale)
+    w.node("LessOrEqual", "host_back.fits", ["host_back.size", limit])
+    merged = "host_back.chosen" if analytic else "host_back.correction"
+    w.node("Where", merged, ["host_back.fits", "host_back.fine", "host_back.wide"])
     if analytic:
         w.node("Sum", "host_back.analytic", analytic[: ends.fine_copies])
-        w.node(
-            "Mul",
-            "host_back.added",
-            ["host_back.analytic", w.scalar("analytic_gain", ends.analytic_gain(scale))],
-        )
+        gain = w.scalar("analytic_gain", ends.analytic_gain(scale))
+        w.node("Mul", "host_back.added", ["host_back.analytic", gain])
         added = _write_wide(w, ends, analytic, scale) if ends.wide else "host_back.added"
-        w.node("Add", "host_back.correction", [chosen, added])
+        w.node("Add", "host_back.correction", [merged, added])
 
 
 def _write_wide(w: HostWriter, ends: Ends, analytic: list[str], scale: float) -> str:

@@ -69,10 +69,9 @@ def float_note(model: onnx.ModelProto) -> list[str]:
         )
         if kinds:
             names = ", ".join(kinds)
-            return [
-                (
-                    f"the INT8 file computes {names} in float, which the board's processor has to "
-                    "compute alike"
-                )
-            ]
+            note = (
+                f"the INT8 file computes {names} in float, which the board's processor has to "
+                "compute alike"
+            )
+            return [note]
     return []

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,9 +50,9 @@ def _alone(value: float) -> Parts:
 
 
 def _similarity(result: np.ndarray, reference: np.ndarray) -> Parts:
-    return _alone(
-        float(np.mean([ssim(*pair, 1.0) for pair in zip(result[0], reference[0], strict=True)]))
-    )
+    # SSIM is that of one band, so it is the mean over the bands.
+    values = [ssim(*pair, 1.0) for pair in zip(result[0], reference[0], strict=True)]
+    return _alone(float(np.mean(values)))
 
 
 def _hits(result: np.ndarray, reference: np.ndarray) -> Parts:
@@ -61,11 +62,10 @@ def _hits(result: np.ndarray, reference: np.ndarray) -> Parts:
 
 def _overlap(result: np.ndarray, reference: np.ndarray) -> Parts:
     """Of every class, the pixels that both say and those that one of them says."""
-    said, meant = (
-        np.arange(result.shape[1])[:, None] == each.ravel()
-        for each in (result.argmax(1), reference)
-    )
-    return (said & meant).sum(1), (said | meant).sum(1)
+    classes = np.arange(result.shape[1])[:, None]
+    predicted = classes == result.argmax(1).ravel()
+    actual = classes == reference.ravel()
+    return (predicted & actual).sum(1), (predicted | actual).sum(1)
 
 
 METRICS: Mapping[str, Metric] = {
@@ -88,10 +88,11 @@ METRICS: Mapping[str, Metric] = {
 def parts_of(name: str, result: np.ndarray, reference: np.ndarray) -> Parts:
     """What one result (1, C, ...) adds to a metric, by its name."""
     metric = METRICS[name]
-    wanted = (len(result), *result.shape[2:]) if metric.of_classes else result.shape
-    if reference.size != math.prod(wanted) or (metric.of_classes and result.shape[1] < 2):
+    shape = (len(result), *result.shape[2:]) if metric.of_classes else result.shape
+    # Of one channel the largest is always the same, so it tells no classes.
+    if reference.size != math.prod(shape) or (metric.of_classes and result.shape[1] < 2):
         kind = "numbers of classes" if metric.of_classes else "references"
-        expected = f"{kind} of {times(wanted)}"
+        expected = f"{kind} of {times(shape)}"
         got = f"{times(reference.shape)} for results of {times(result.shape)}"
         raise OptionError(
             "metric", expected=expected, got=got, remedy="give these, or another metric"
@@ -103,7 +104,8 @@ def value_of(parts: Sequence[Parts]) -> float:
     """The metric over all samples of one network; NaN of none."""
     if not parts:
         return math.nan
-    above, below = (np.sum(each, 0) for each in zip(*parts, strict=True))
+    above, below = (np.sum(column, 0) for column in zip(*parts, strict=True))
+    # A class that neither result nor reference has in any sample has no ratio.
     return float((above[below > 0] / below[below > 0]).mean())
 
 
@@ -210,12 +212,12 @@ def compare(
     """
     differences = []
     errors = []
-    agreeing = []
+    agreements = []
     changes = []
     contrasts = []
     counts = RangeCounts()
-    measured_by = list[list[Parts]]()
-    lacking = dict[str, tuple[int, ...]]()
+    metric_parts = list[list[Parts]]()
+    unfit_shapes = dict[str, tuple[int, ...]]()
     for number, (degraded, reference) in enumerate(pairs):
         counts.add(degraded)
         results = [result_of(s, degraded) for s in (float_session, int8_session)]
@@ -229,11 +231,10 @@ def compare(
                 remedy=remedy,
             )
         classes = [result.argmax(1) for result in results]
-        agreeing.append(
-            (classes[0] == classes[1]).mean()
-            if results[0].shape[1] > degraded.shape[1]
-            else math.nan
-        )
+        # More channels than the image has are taken for classes.
+        tells_classes = results[0].shape[1] > degraded.shape[1]
+        agreements.append((classes[0] == classes[1]).mean() if tells_classes else math.nan)
+        # The float result alone decides, so that both are clipped or neither is.
         inside = ((results[0] >= 0) & (results[0] <= 1)).mean()
         is_image = (
             results[0].ndim == 4
@@ -247,18 +248,18 @@ def compare(
         contrasts.append(float(np.abs(in_float - in_float.mean()).mean()))
         name = names[number] if names else f"sample {number}"
         if reference.shape != in_float.shape:
-            lacking[name] = reference.shape
+            unfit_shapes[name] = reference.shape
         elif metric is None or not METRICS[metric].of_classes:
             _require_full_scale(name, reference)
         errors.append([_psnr_db(image, reference) for image in (degraded, in_float, in_int8)])
         if metric is not None:
-            measured_by.append(
+            metric_parts.append(
                 [parts_of(metric, result, reference) for result in (in_float, in_int8)]
             )
-    some_have_one = not np.isnan([in_float for _, in_float, _ in errors]).all()
-    if lacking and some_have_one:
+    some_fit = not np.isnan([in_float for _, in_float, _ in errors]).all()
+    if unfit_shapes and some_fit:
         # A mean over some of them would be NaN, and its check left out.
-        name, shape = next(iter(lacking.items()))
+        name, shape = next(iter(unfit_shapes.items()))
         raise unfit_reference(name, shape, "the PSNRs, as other samples have one")
     difference = np.concatenate(differences).astype(np.float64)
     degraded_db, float_db, int8_db = np.mean(errors, axis=0)
@@ -272,11 +273,11 @@ def compare(
         psnr_float_db=float(float_db),
         psnr_int8_db=float(int8_db),
         patches=len(errors),
-        same_class=float(np.mean(agreeing)),
+        same_class=float(np.mean(agreements)),
         simulated=simulated,
         metric=metric or "",
-        metric_float=value_of([parts for parts, _ in measured_by]),
-        metric_int8=value_of([parts for _, parts in measured_by]),
+        metric_float=value_of([parts for parts, _ in metric_parts]),
+        metric_int8=value_of([parts for _, parts in metric_parts]),
         worst_drop_db=float(np.max([in_float - in_int8 for _, in_float, in_int8 in errors])),
         input_change=float(np.mean(changes)),
         contrast=float(np.mean(contrasts)),
@@ -331,7 +332,8 @@ def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None)
         _at_most("std / MAE", result.std_over_mae, limits.std_over_mae, "ratio"),
         _at_most("PSNR drop", result.drop_db, limits.psnr_drop_db, "dB"),
     ]
-    if result.gain_db > 0:  # without references it is NaN
+    # Without references the gain is NaN, and where float gains nothing a share of it says nothing.
+    if result.gain_db > 0:
         gained = f"the float network gains {result.gain_db:.2f} dB"
         checks.append(
             _at_most("PSNR drop over gain", result.drop_share, limits.drop_share, "ratio", gained)
@@ -349,16 +351,15 @@ def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None)
         allowed = growth * baseline_mae
         detail = f"the baseline has {baseline_mae:.4g}"
         checks.append(_at_most("MAE against the baseline", result.mae, allowed, scale, detail))
-    return [check for found in checks for check in found]
+    return list(chain.from_iterable(checks))
 
 
 def judge_saturation(shares: Mapping[str, float], limits: Limits) -> list[Check]:
     """The layer that saturates most, against the limit if there is one; where nothing is 8-bit none
     is kept.
     """
-    layer, share = max(
-        shares.items(), key=lambda item: item[1], default=("any layer: none is 8-bit", math.nan)
-    )
+    none = ("any layer: none is 8-bit", math.nan)
+    layer, share = max(shares.items(), key=lambda item: item[1], default=none)
     return _at_most("saturated results", share, limits.saturated, "of a layer's", f"in {layer}")
 
 
@@ -370,7 +371,7 @@ def _at_most(
 
 def gate_row(result: GateResult) -> Row:
     """What INT8 changes, on patches that calibration did not see."""
-    found = {
+    entries = {
         "MAE": (result.mae, "of full scale"),
         "std": (result.std, "of full scale"),
         "std / MAE": (result.std_over_mae, "ratio"),
@@ -381,7 +382,7 @@ def gate_row(result: GateResult) -> Row:
         "PSNR float": (result.psnr_float_db, "dB"),
         "PSNR INT8": (result.psnr_int8_db, "dB"),
     }
-    figures = {name: _figure(value, unit, result) for name, (value, unit) in found.items()}
+    figures = {name: _figure(value, unit, result) for name, (value, unit) in entries.items()}
     if not math.isnan(result.same_class):
         figures["same class"] = _figure(100 * result.same_class, "%", result)
     if result.metric:
@@ -391,10 +392,8 @@ def gate_row(result: GateResult) -> Row:
             "lost": result.metric_loss,
         }
         unit = METRICS[result.metric].unit
-        figures |= {
-            f"{result.metric} {name}": _figure(value, unit, result)
-            for name, value in values.items()
-        }
+        for name, value in values.items():
+            figures[f"{result.metric} {name}"] = _figure(value, unit, result)
     return Row("gate", "INT8 against float", figures)
 
 

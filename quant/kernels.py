@@ -24,6 +24,7 @@ from collections import defaultdict
 from copy import deepcopy
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import chain
 
 import numpy as np
 import onnx
@@ -83,9 +84,10 @@ def made_exact(model: onnx.ModelProto) -> tuple[onnx.ModelProto, dict[str, Way]]
     its name.
     """
     work = _Rewriting(model)
-    for node in [each for each in work.model.graph.node if each.op_type == "Max"]:
-        work.move_relu_down(node)
-    nodes = [each for node in work.model.graph.node for each in work.around(node)]
+    relus = [node for node in work.model.graph.node if node.op_type == "Max"]
+    for relu in relus:
+        work.move_relu_down(relu)
+    nodes = list(chain.from_iterable(map(work.around, work.model.graph.node)))
     del work.model.graph.node[:]
     work.model.graph.node.extend(nodes)
     return work.model, work.ways
@@ -113,7 +115,8 @@ def cannot_saturate(kind: str, weight: np.ndarray, largest: int) -> bool:
 
 def _rows(kind: str, weight: np.ndarray) -> np.ndarray:
     """The weights of each result in the order of the sum, (O, terms) int64."""
-    if kind == "QLinearConv":  # over the channels of a tap, then tap by tap
+    # A convolution's kernels add over the channels of a tap, then tap by tap.
+    if kind == "QLinearConv":
         ordered = np.moveaxis(weight.reshape(*weight.shape[:2], -1), 1, 2)
     else:
         ordered = weight if kind == "ConvInteger" else np.moveaxis(weight, -1, 0)
@@ -127,12 +130,13 @@ class _Rewriting:
         self.model = deepcopy(model)
         self.arrays = constants(model)
         self.ways = dict[str, Way]()
-        self.writers = {name: node for node in self.model.graph.node for name in node.output}
+        self.writers: dict[str, onnx.NodeProto] = {}
         self.readers: dict[str, list[onnx.NodeProto]] = defaultdict(list)
         for node in self.model.graph.node:
+            self.writers.update((name, node) for name in node.output)
             for name in node.input:
                 self.readers[name].append(node)
-        self.kept = {value.name for value in self.model.graph.output}
+        self.outputs = {value.name for value in self.model.graph.output}
         self.largest: dict[str, int] = {}
         self.moved: set[str] = set()
 
@@ -148,20 +152,22 @@ class _Rewriting:
         writer = self.writers.get(source)
         if middle is None or middle.dtype != np.uint8 or middle.size != 1 or writer is None:
             return
-        own = len(self.readers[source]) == 1 and not self.kept & {source, result}
-        written = writer.op_type in REQUANTISING and self._holds(
-            writer, REQUANTISING[writer.op_type], middle
-        )
-        if (
-            not own
-            or not written
-            or not all(self._reads(node, result, middle) for node in self.readers[result])
-        ):
+        if len(self.readers[source]) != 1 or self.outputs & {source, result}:
             return
-        zero, self.largest[result] = self._constant(np.uint8(0)), UINT8_MAX - int(middle.ravel()[0])
-        writer.input[REQUANTISING[writer.op_type]] = zero
-        relu.op_type, relu.input[1] = "Min", self._constant(np.uint8(self.largest[result]))
-        for reader in self.readers[result]:
+        place = REQUANTISING.get(writer.op_type)
+        if place is None or not self._holds(writer, place, middle):
+            return
+        readers = self.readers[result]
+        if not all(self._reads(node, result, middle) for node in readers):
+            return
+        # With a zero point of 0 the writer clips at 0 itself, which is the ReLU. What remains is
+        # the upper end: 255 around the old zero point is 255 - middle around 0.
+        zero = self._constant(np.uint8(0))
+        self.largest[result] = UINT8_MAX - int(middle.ravel()[0])
+        writer.input[place] = zero
+        relu.op_type = "Min"
+        relu.input[1] = self._constant(np.uint8(self.largest[result]))
+        for reader in readers:
             reader.input[OPERATORS[reader.op_type].zero] = zero
 
     def _reads(self, node: onnx.NodeProto, name: str, zero: np.ndarray) -> bool:
@@ -176,11 +182,11 @@ class _Rewriting:
         )
 
     def _holds(self, node: onnx.NodeProto, place: int, value: np.ndarray) -> bool:
-        held = self.arrays.get(node.input[place]) if place < len(node.input) else None
+        constant = self.arrays.get(node.input[place]) if place < len(node.input) else None
         return (
-            held is not None
-            and held.dtype == value.dtype
-            and held.ravel().tolist() == value.ravel().tolist()
+            constant is not None
+            and constant.dtype == value.dtype
+            and constant.ravel().tolist() == value.ravel().tolist()
         )
 
     def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
@@ -221,25 +227,28 @@ class _Rewriting:
         )
         if source is None or weight is None or weight.dtype != np.int8:
             return [node]
-        turned = any(each.name == "transB" and each.i for each in node.attribute)
-        if cannot_saturate(
-            FLOAT_OPERATORS[node.op_type], weight.T if turned else weight, UINT8_MAX
-        ):
+        if any(attribute.name == "transB" and attribute.i for attribute in node.attribute):
+            weight = weight.T
+        if cannot_saturate(FLOAT_OPERATORS[node.op_type], weight, UINT8_MAX):
             self.ways[node.name or node.output[0]] = Way.signed
             return [node]
         self.ways[node.name or node.output[0]] = Way.unsigned
+        # A copy, because another node may read the same weights as int8.
         lifted = deepcopy(source)
         self._lift(lifted, 0, 2)
-        node.input[1] = lifted.name = lifted.output[0] = f"{node.output[0]}.weight_from_uint8"
+        name = f"{node.output[0]}.weight_from_uint8"
+        lifted.name = name
+        lifted.output[0] = name
+        node.input[1] = name
         return [lifted, node]
 
     def _lift(self, node: onnx.NodeProto, *places: int) -> None:
         """Store int8 constants as uint8, 128 higher."""
         for place in places:
             node.input.extend([""] * (place + 1 - len(node.input)))
-            value = self.arrays.get(
-                node.input[place], np.zeros((), np.int8)
-            )  # a zero point that is left out
+            # A zero point that is left out is 0.
+            value = self.arrays.get(node.input[place], np.zeros((), np.int8))
+            # The sum is formed in int16, because int8 wraps around above 127.
             node.input[place] = self._constant((value.astype(np.int16) + MIDDLE).astype(np.uint8))
 
     def _converted(self, node: onnx.NodeProto, places: Places) -> list[onnx.NodeProto]:
@@ -251,7 +260,8 @@ class _Rewriting:
         if places.result_zero is None:
             return [*before, node]
         self._lift(node, places.result_zero)
-        result, node.output[0] = node.output[0], f"{node.output[0]}.unsigned"
+        result = node.output[0]
+        node.output[0] = f"{result}.unsigned"
         self.moved.add(node.output[0])
         behind, _ = self._moved(node.output[0], -MIDDLE, TensorProto.INT8, result)
         return [*before, node, *behind]
@@ -266,11 +276,12 @@ class _Rewriting:
         if result in self.moved:
             return [], result
         wide = f"{result}.wide"
-        moved = f"{result}.moved"
+        # ONNX's Add of 8-bit integers would wrap around, so the sum is formed in int32.
+        total = f"{result}.moved"
         nodes = [
             helper.make_node("Cast", [source], [wide], name=wide, to=TensorProto.INT32),
-            helper.make_node("Add", [wide, self._constant(np.int32(by))], [moved], name=moved),
-            helper.make_node("Cast", [moved], [result], name=f"{result}.cast", to=kind),
+            helper.make_node("Add", [wide, self._constant(np.int32(by))], [total], name=total),
+            helper.make_node("Cast", [total], [result], name=f"{result}.cast", to=kind),
         ]
         self.moved.add(result)
         return nodes, result
@@ -286,6 +297,7 @@ class _Rewriting:
         return name
 
 
+# On onnxruntime's integer kernels two output channels took four times as long as sixteen.
 FEWEST_OUTPUTS = 16
 INPUTS_OF = 4
 FIRST_OPSET = 11
@@ -298,12 +310,12 @@ def filled(model: onnx.ModelProto) -> onnx.ModelProto:
     """
     if opset_of(model) < FIRST_OPSET:
         return model
-    wider = deepcopy(model)
-    work = _ChannelPadding(wider.graph, constants(model))
-    nodes = [each for node in wider.graph.node for each in work.around(node)]
-    del wider.graph.node[:]
-    wider.graph.node.extend(nodes)
-    return wider
+    result = deepcopy(model)
+    work = _ChannelPadding(result.graph, constants(model))
+    nodes = list(chain.from_iterable(map(work.around, result.graph.node)))
+    del result.graph.node[:]
+    result.graph.node.extend(nodes)
+    return result
 
 
 class _ChannelPadding:
@@ -331,7 +343,9 @@ class _ChannelPadding:
     def _takes_zeros(self, node: onnx.NodeProto) -> bool:
         """Whether a stored 0 is a weight of 0, and each output reads every input."""
         middle = self.arrays.get(node.input[5])
-        grouped = any(each.name == "group" and each.i != 1 for each in node.attribute)
+        grouped = any(
+            attribute.name == "group" and attribute.i != 1 for attribute in node.attribute
+        )
         return middle is not None and not middle.any() and not grouped
 
     def _widen(self, node: onnx.NodeProto, outputs: int, inputs: int) -> None:
@@ -339,17 +353,19 @@ class _ChannelPadding:
         to nobody.
         """
         name = node.output[0]
-        narrow = self.arrays[node.input[3]]
-        wide = np.pad(narrow, [(0, outputs), (0, inputs), (0, 0), (0, 0)])
-        for place in (4, 5, 8):  # scale and zero point of the weights, bias
+        weight = self.arrays[node.input[3]]
+        padded_weight = np.pad(weight, [(0, outputs), (0, inputs), (0, 0), (0, 0)])
+        # These inputs are scale and zero point of the weights, and the bias.
+        for place in (4, 5, 8):
             value = self.arrays.get(node.input[place]) if place < len(node.input) else None
-            if value is not None and value.shape == (len(narrow),) and outputs:
+            if value is not None and value.shape == (len(weight),) and outputs:
                 widened = np.pad(value, (0, outputs), mode="edge")
                 node.input[place] = self._constant(f"{name}.filled.{place}", widened)
-        node.input[3] = self._constant(f"{name}.filled.weight", wide)
+        node.input[3] = self._constant(f"{name}.filled.weight", padded_weight)
 
     def _padded(self, node: onnx.NodeProto, count: int) -> list[onnx.NodeProto]:
-        source, node.input[0] = node.input[0], f"{node.input[0]}.padded"
+        source = node.input[0]
+        node.input[0] = f"{source}.padded"
         if source in self.wide_inputs:
             return []
         self.wide_inputs.add(source)
@@ -361,14 +377,11 @@ class _ChannelPadding:
     def _cut(self, node: onnx.NodeProto, count: int) -> list[onnx.NodeProto]:
         name = node.output[0]
         node.output[0] = f"{name}.filled"
-        ends = [
-            self._constant(f"{name}.filled.{k}", np.array([value]))
-            for k, value in (("from", 0), ("to", count))
-        ]
+        start = self._constant(f"{name}.filled.from", np.array([0]))
+        end = self._constant(f"{name}.filled.to", np.array([count]))
         axis = self._constant("filled.channels", np.array([1]))
-        return [
-            helper.make_node("Slice", [f"{name}.filled", *ends, axis], [name], name=f"{name}.cut")
-        ]
+        feeds = [f"{name}.filled", start, end, axis]
+        return [helper.make_node("Slice", feeds, [name], name=f"{name}.cut")]
 
     def _constant(self, name: str, value: np.ndarray) -> str:
         if name not in self.arrays:

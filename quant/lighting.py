@@ -56,6 +56,7 @@ def _dark(
     radiance: NDArray[np.floating], full_scale: float, generator: np.random.Generator
 ) -> float:
     del radiance, full_scale
+    # Uniform in the logarithm, so that each factor of two of the darkness is equally likely.
     return float(np.exp(generator.uniform(np.log(DARKEST), np.log(DARK))))
 
 
@@ -73,9 +74,9 @@ def _saturated(
     return _factor_to(float(np.quantile(radiance, 1 - generator.uniform(*SATURATED))), full_scale)
 
 
-def _factor_to(radiance: float, wanted: float) -> float:
-    """Return wanted / radiance; 1 for ground without any light, which no factor brightens."""
-    return wanted / radiance if radiance > 0 else 1.0
+def _factor_to(radiance: float, target: float) -> float:
+    """Return target / radiance; 1 for ground without any light, which no factor brightens."""
+    return target / radiance if radiance > 0 else 1.0
 
 
 CALIBRATION = (
@@ -103,6 +104,8 @@ def assign_lightings(
 ) -> list[Lighting]:
     """Return a lighting for each of `count` patches, in random order, in their shares."""
     ends = np.cumsum([lighting.share for lighting in lightings])
+    # Each patch stands for the middle of an equal part of [0, 1], which rounds the shares to whole
+    # patches.
     middles = (np.arange(count) + 0.5) / count
     numbers = np.searchsorted(ends, middles)
     return [lightings[number] for number in generator.permutation(numbers)]

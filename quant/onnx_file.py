@@ -8,6 +8,7 @@ image may be cut into tiles for it is `quant.tiling`'s matter.
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +60,7 @@ def read_onnx(content: bytes, where: str) -> onnx.ModelProto:
 
 def _simplest(model: onnx.ModelProto, where: str, to_run: bool) -> onnx.ModelProto:
     try:
+        # First, because folding removes the Dropout and BatchNormalization that show the mode.
         require_inference(model, where)
         if is_quantised(model):
             return model
@@ -85,9 +87,8 @@ def parse_onnx(
         model.ParseFromString(content)
         if path is not None:
             take_in(model, path)
-        check_content(
-            model, where
-        )  # before the checker, which looks for files that weights are said to be in
+        # Before onnx's checker, which looks for the files that weights are said to be in.
+        check_content(model, where)
         onnx.checker.check_model(model)
     except BeersError:
         raise
@@ -95,9 +96,9 @@ def parse_onnx(
         got = " ".join(str(error).split())[:120] or "other bytes"
         raise ModelError(where, expected="an ONNX file", got=got, remedy=REMEDY) from error
     opset = opset_of(model)
-    known = onnx.defs.onnx_opset_version()
-    if opset > known:
-        expected = f"an ONNX opset of at most {known}"
+    newest = onnx.defs.onnx_opset_version()
+    if opset > newest:
+        expected = f"an ONNX opset of at most {newest}"
         remedy = "export it for an older one"
         raise ModelError(where, expected=expected, got=f"{opset}", remedy=remedy)
     if to_run:
@@ -200,33 +201,31 @@ def image_info(name: str, channels: int, tile_px: int | None) -> onnx.ValueInfoP
 def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.ModelProto:
     """The model with these tensors, of these ONNX types, as outputs behind its own."""
     extended = deepcopy(model)
-    own = {value.name for value in extended.graph.output}
+    names = {value.name for value in extended.graph.output}
     extended.graph.output.extend(
         onnx.helper.make_tensor_value_info(name, kind, None)
         for name, kind in kinds.items()
-        if name not in own
+        if name not in names
     )
     return extended
 
 
 def constants(model: onnx.ModelProto) -> dict[str, np.ndarray]:
     """The constants of a model by name: initializers, and what nodes of the kind Constant hold."""
-    found = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+    arrays = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
     functions = functions_of(model)
     for node in model.graph.node:
         values = [a.t for a in node.attribute if a.name == "value"]
         if operator_name(node, functions) == "Constant" and values:
-            found[node.output[0]] = numpy_helper.to_array(values[0])
-    return found
+            arrays[node.output[0]] = numpy_helper.to_array(values[0])
+    return arrays
 
 
 def fixed_tile_px(model: onnx.ModelProto) -> int | None:
     """The tile side that a model is fixed to, or None when it takes any size."""
-    sizes = (
-        [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim]
-        if model.graph.input
-        else []
-    )
+    sizes = []
+    if model.graph.input:
+        sizes = [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim]
     if len(model.graph.input) != 1 or len(sizes) != 4 or sizes[2] != sizes[3]:
         raise ModelError(
             "ONNX model",
@@ -243,22 +242,24 @@ def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
     """
     if fixed_tile_px(model) is None:
         return model
-    free = deepcopy(model)
-    for value in (*free.graph.input, *free.graph.output):
-        if (
-            len(value.type.tensor_type.shape.dim) != 4
-        ):  # such as a classifier's, which has one size of image
+    copy = deepcopy(model)
+    for value in (*copy.graph.input, *copy.graph.output):
+        dims = value.type.tensor_type.shape.dim
+        # A classifier's result has two sizes, and its image one size only.
+        if len(dims) != 4:
             return model
-        for side, name in zip(value.type.tensor_type.shape.dim[2:], ("H", "W"), strict=True):
+        for side, name in zip(dims[2:], ("H", "W"), strict=True):
             side.dim_param = name
-    del free.graph.value_info[:]
-    return free
+    # Sizes of inner tensors that the file states are those of the fixed tile.
+    del copy.graph.value_info[:]
+    return copy
 
 
 def is_quantised(model: onnx.ModelProto) -> bool:
     """Whether any node computes on, makes or reads quantised numbers."""
     kinds = {node.op_type.lower() for node in model.graph.node}
-    return any(mark in kind for kind in kinds for mark in ("qlinear", "quantizelinear", "integer"))
+    marks = ("qlinear", "quantizelinear", "integer")
+    return any(mark in kind for kind, mark in product(kinds, marks))
 
 
 NAMELESS = "ONNX model", "float model", "tiled model", "INT8 core"
@@ -281,8 +282,7 @@ def faults_named(label: str) -> Iterator[None]:
 def require_quantised(model: onnx.ModelProto, name: str, wanted: bool) -> None:
     """Refuse the float network in the place of the INT8 one, and the other way round."""
     if is_quantised(model) != wanted:
-        expected, got = (
-            ("an INT8 network", "a float one") if wanted else ("a float network", "an INT8 one")
-        )
+        expected = "an INT8 network" if wanted else "a float network"
+        got = "a float one" if wanted else "an INT8 one"
         remedy = "give the float model first, the INT8 model second"
         raise ModelError(name, expected=expected, got=got, remedy=remedy)

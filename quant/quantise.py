@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -147,6 +148,7 @@ class Plan:
         """
         alone = self.ends.gains == 1 and not self.ends.adds_image
         finer = self.passes.dual_range and takes_gains(self.graph)
+        # One convolution of the DPU has to write the coarse copy and a window at the least.
         if not (alone and finer and self.ends.outputs <= MAX_CHANNELS // 2):
             return self
         low = np.array(np.inf)
@@ -155,25 +157,25 @@ class Plan:
             low = np.minimum(low, result[0].min((1, 2)))
             high = np.maximum(high, result[0].max((1, 2)))
         offsets = window_offsets(low, high, 2.0 ** -(frac_bits + FINER))
-        found = tuple(tuple(float(each) for each in window) for window in offsets)
-        return replace(self, ends=replace(self.ends, offsets=found))
+        windows = tuple(tuple(float(offset) for offset in window) for window in offsets)
+        return replace(self, ends=replace(self.ends, offsets=windows))
 
     def without_large_sums(self, frac_bits: Mapping[str, int]) -> "Plan":
         """Without the streams in which sums exceed a ReLU6's six, where int8 could not end for
         both.
         """
-        kept = [stream for stream in self.streams if not exceeds_six(self.graph, stream, frac_bits)]
-        if len(kept) == len(self.streams):
+        within = [
+            stream for stream in self.streams if not exceeds_six(self.graph, stream, frac_bits)
+        ]
+        if len(within) == len(self.streams):
             return self
-        return replace(self, streams=kept, chain=_chain(self.graph, self.ends, kept))
+        return replace(self, streams=within, chain=_chain(self.graph, self.ends, within))
 
     def paired(self, graph: Graph) -> Graph:
         """The graph with the half-LSB pair where that is wanted and possible; else itself."""
-        return (
-            half_lsb_pair(graph, STREAM_STEP)
-            if self.passes.half_lsb_pair and self.streams
-            else graph
-        )
+        if self.passes.half_lsb_pair and self.streams:
+            return half_lsb_pair(graph, STREAM_STEP)
+        return graph
 
     def ended(self, graph: Graph) -> Graph:
         """The graph with windows or two gains where the result has them."""
@@ -185,14 +187,16 @@ class Plan:
         """The integer core of a graph, paired and ended, whose tensors have these least-squares
         scales.
         """
-        shared = [name for stream in streams(final) for name in stream] if self.streams else []
-        chosen = {**frac_bits, **dict.fromkeys([*shared, *self.chain.tensors], STREAM_FRAC_BITS)}
+        # The pair has added tensors, so the streams are looked up anew.
+        shared = list(chain.from_iterable(streams(final))) if self.streams else []
+        scales = {**frac_bits, **dict.fromkeys([*shared, *self.chain.tensors], STREAM_FRAC_BITS)}
+        # A coarse copy holds what a finer scale clips.
         if self.ends.offsets:
-            chosen[CORRECTION] += FINER
+            scales[CORRECTION] += FINER
         elif self.ends.gains == 2:
-            chosen[CORRECTION] += 1
-        assert set(tensors(final)) <= set(chosen)  # noqa: S101
-        return build_core(final, chosen, self.shifts, self.ends)
+            scales[CORRECTION] += 1
+        assert set(tensors(final)) <= set(scales)  # noqa: S101
+        return build_core(final, scales, self.shifts, self.ends)
 
 
 def _chain(graph: Graph, ends: Ends, streams: list[Stream]) -> Chain:
@@ -201,6 +205,7 @@ def _chain(graph: Graph, ends: Ends, streams: list[Stream]) -> Chain:
     """
     widths = channels_of(graph, {PLANES: ends.planes * ends.channels})
     depthwise = any(isinstance(op, Conv) and op.groups > 1 for op in graph)
+    # Beside a stream, levelling made no dense network for one sensor better: see `passes.level`.
     alone = lone_tensors(graph) if depthwise or not streams else []
     return Chain(tuple(alone), tuple(widths[name] for name in alone))
 
@@ -237,26 +242,26 @@ def quantise_model(
     graph = read_planes(network.graph)
     finer = passes.dual_range and network.adds_image and takes_gains(graph)
     ends = ends_of(network, 2 if finer else 1)
-    found = streams(graph)
-    plan = Plan(graph, ends, found, _chain(graph, ends, found), shifts, passes)
+    equalised = streams(graph)
+    plan = Plan(graph, ends, equalised, _chain(graph, ends, equalised), shifts, passes)
     core, final, last_sum = rounded(plan, patches.degraded, log)
+    # Only now: values of boxes that no object has would outweigh all others in the search.
     core = replace(core, ends=replace(core.ends, tail=network.tail))
     if tuning:
-        from beers_deploy.quant.passes.tune import tune  # torch, which no other step takes
+        # Imported here because it needs torch, which no other step does.
+        from beers_deploy.quant.passes.tune import tune
 
         # Patches that hold few roofs would train the last sum's room away.
         core, steps = tune(core, graph, tuning, still=last_sum, log=log)
-    covered = range_of(patches.degraded).to_words()
     about = {
         **metadata(model),
         "precision": "int8 legal",
         "calibration_sha256": patches.digest,
-        CALIBRATION_RANGE: covered,
+        CALIBRATION_RANGE: range_of(patches.degraded).to_words(),
         **about,
     }
-    about["passes"] = (
-        f"{PASSES}, {LOWERED}" if any(getattr(op, "offset", 0.0) for op in final) else PASSES
-    )
+    lowered = any(getattr(op, "offset", 0.0) for op in final)
+    about["passes"] = f"{PASSES}, {LOWERED}" if lowered else PASSES
     if tuning:
         about["finetune"] = f"{steps} steps on {len(tuning.pairs)} patches"
     return Quantised(host_model(core, about, fixed_tile_px(model)), core, relu_count(graph), final)
@@ -277,6 +282,7 @@ def choose_frac_bits(
     """
     names = tensors(graph)
     shared = tied(graph)
+    # The planes' scale is fixed; -1 stands for the group of what is tied to them.
     groups = np.array(
         [names.index(shared[name]) if shared[name] in names else -1 for name in names]
     )
@@ -319,6 +325,7 @@ def rounded(
     paired = plan.paired(graph)
     last_sum = frozenset[str]()
     if paired is not graph:
+        # No block reads the last sum, so a finer step there does not make up for clipped roofs.
         paired = with_room(paired, STREAM_STEP, images, plan.ends)
         last_sum = frozenset(paired[-2].inputs)
     final = plan.ended(paired)
@@ -342,21 +349,23 @@ def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray],
         return plan.graph
     targets = search_targets(plan.graph, plan.ends, images)
 
-    def built(tried: Graph) -> tuple[Graph, IntCore]:
-        final = plan.ended(plan.paired(tried))
+    def built(candidate: Graph) -> tuple[Graph, IntCore]:
+        final = plan.ended(plan.paired(candidate))
         return final, plan.core(final, frac_bits)
 
-    def trial(tried: Graph) -> Costs:
-        return crop_costs(host_model(built(tried)[1], {}), targets)
+    def trial(candidate: Graph) -> Costs:
+        return crop_costs(host_model(built(candidate)[1], {}), targets)
 
-    def fitted(tried: Graph) -> Costs:
-        return crop_costs(host_model(_fitted(plan, *built(tried), images), {}), targets)
+    def fitted(candidate: Graph) -> Costs:
+        core = _fitted(plan, *built(candidate), images)
+        return crop_costs(host_model(core, {}), targets)
 
     def searched(graph: Graph, copies: Copies) -> Graph:
         graph = plan.chain.scaled(graph, plan.chain.unscaled(frac_bits))
         graph = _equalised(graph, plan, trial, images, log) if plan.streams else graph
         graph = _levelled(graph, plan, trial, images, log, copies) if plan.chain.tensors else graph
         shared = frac_bits | dict.fromkeys(plan.chain.tensors, STREAM_FRAC_BITS)
+        # There are few of these trials, so each is judged with its weights fitted as in the end.
         return lower(graph, shared, fitted) if plan.passes.full_range_relu else graph
 
     graph = searched(plan.graph, {})
@@ -364,7 +373,8 @@ def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray],
         other, copies = with_copies(plan.graph, plan.chain.tensors, images, plan.ends)
         if copies:
             graph = min(
-                (graph, searched(other, copies)), key=lambda tried: float(fitted(tried)(None).sum())
+                (graph, searched(other, copies)),
+                key=lambda candidate: float(fitted(candidate)(None).sum()),
             )
     return graph
 
@@ -376,12 +386,13 @@ def _levelled(
     calibration sees.
     """
     log(f"equalising the channels of {len(plan.chain.tensors)} tensors")
-    ranges = ranges_apart(
-        chain_ranges(graph, plan.chain, images, plan.ends), plan.chain.parts, copies
-    )
-    graph = plan.chain.scaled(graph, level(graph, plan.chain, ranges, np.ones(len(ranges)), trial))
+    ranges = chain_ranges(graph, plan.chain, images, plan.ends)
+    ranges = ranges_apart(ranges, plan.chain.parts, copies)
+    factors = level(graph, plan.chain, ranges, np.ones(len(ranges)), trial)
+    graph = plan.chain.scaled(graph, factors)
     if not plan.ends.offsets:
         return graph
+    # Here the image itself is in the tensors, with nothing on the host to make up for a clip.
     largest = largest_values(graph, plan.chain, images, plan.ends)
     return plan.chain.scaled(graph, FULL / np.maximum(largest, FULL))
 
@@ -391,10 +402,11 @@ def _equalised(
 ) -> Graph:
     """Stream after stream, the others levelled by a first guess until their turn comes."""
     ranges = [channel_ranges(plan.graph, stream, images, plan.ends) for stream in plan.streams]
-    for stream, of_it in list(zip(plan.streams, ranges, strict=True))[1:]:
-        graph = equalise(graph, stream, first_guess(of_it, LEVELLING[0], 1.0))
+    for stream, stream_ranges in list(zip(plan.streams, ranges, strict=True))[1:]:
+        graph = equalise(graph, stream, first_guess(stream_ranges, LEVELLING[0], 1.0))
     for number, stream in enumerate(plan.streams):
         log(f"equalising the channels of residual stream {number + 1} of {len(plan.streams)}")
+        # The search starts from the stream as it is in the float network.
         if number:
             graph = equalise(graph, stream, 1 / first_guess(ranges[number], LEVELLING[0], 1.0))
         factors = first_guess(ranges[number], 0.0, 1.0)
@@ -424,20 +436,20 @@ def search_targets(graph: Graph, ends: Ends, images: Remade[np.ndarray]) -> Targ
         result = restored(crop)
         return float(np.abs(result - crop if result.shape == crop.shape else result).max())
 
-    sizes = {
-        (k, n): size(crop)
-        for k, image in enumerate(images)
-        for n, crop in enumerate(crops(image, halo_px))
-    }
+    sizes = {}
+    for k, image in enumerate(images):
+        for n, crop in enumerate(crops(image, halo_px)):
+            sizes[k, n] = size(crop)
     order = sorted(sizes, key=lambda place: sizes[place], reverse=True)
     height, width = map(int, crops(images[0], halo_px)[0].shape[2:])
     count = min(max(SEARCH_CROPS * TILE_PX**2 // (height * width), SEARCH_CROPS), MOST_CROPS)
+    # int8 clips the largest corrections, so a quarter of the crops are those that hold them.
     hard = count // 4
     others = order[hard :: max((len(order) - hard) // (count - hard), 1)]
-    chosen = [
-        crops(images[k], halo_px)[n].copy() for k, n in (*order[:hard], *others[: count - hard])
-    ]
-    return [(crop, restored(crop)) for crop in chosen]
+    places = (*order[:hard], *others[: count - hard])
+    # A copy, because a view would keep the whole image in memory.
+    selection = [crops(images[k], halo_px)[n].copy() for k, n in places]
+    return [(crop, restored(crop)) for crop in selection]
 
 
 def crop_costs(model: onnx.ModelProto, targets: Targets) -> Costs:
@@ -451,15 +463,16 @@ def crop_costs(model: onnx.ModelProto, targets: Targets) -> Costs:
     session = open_session(model, threads=1)
 
     def cost(number: int) -> float:
-        image, wanted = targets[number]
-        return rms(result_of(session, image) - wanted) / changes[number]
+        image, target = targets[number]
+        return rms(result_of(session, image) - target) / changes[number]
 
     def rms(values: np.ndarray) -> float:
         return float(np.sqrt(np.square(values, dtype=np.float64).mean()))
 
-    same_size = all(image.shape == wanted.shape for image, wanted in targets)
+    # Without an image of the result's size there is no change to compare with.
+    same_size = all(image.shape == target.shape for image, target in targets)
     changes = [
-        rms(wanted - image) + LEAST_CHANGE if same_size else 1.0 for image, wanted in targets
+        rms(target - image) + LEAST_CHANGE if same_size else 1.0 for image, target in targets
     ]
 
     def of(crops: np.ndarray | None) -> np.ndarray:

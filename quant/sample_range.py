@@ -70,15 +70,18 @@ class RangeCounts:
 
     def add(self, sample: np.ndarray) -> None:
         """Add a sample of any shape, values in [0, 1]."""
+        # The value 1 would open a bin of its own, so it is clipped to the last.
         bins = np.clip(sample * np.float32(BINS), 0, BINS - 1).astype(np.int64)
         self._counts += np.bincount(bins.ravel(), minlength=BINS)
 
     @property
     def range(self) -> SampleRange:
         """The range of what was added."""
+        # Without samples the sum is 0.
         shares = np.cumsum(self._counts) / max(int(self._counts.sum()), 1)
+        # The numbers of the bins are digital numbers, and the last of them is full scale.
         p1, p50, p99, p99_9 = (
-            float(np.searchsorted(shares, each / 100)) / (BINS - 1) for each in PERCENTS
+            float(np.searchsorted(shares, percent / 100)) / (BINS - 1) for percent in PERCENTS
         )
         saturated = float(self._counts[-1] / max(int(self._counts.sum()), 1))
         return SampleRange(p1, p50, p99, p99_9, saturated)
@@ -100,15 +103,17 @@ def recorded_range(about: Mapping[str, str]) -> SampleRange | None:
     it.
     """
     try:
+        # Wrong names are a TypeError of the constructor.
         values: Any = parse_json(about.get(KEY, ""))
-        found = SampleRange(**{name: float(value) for name, value in values.items()})
+        record = SampleRange(**{name: float(value) for name, value in values.items()})
     except (ValueError, TypeError, AttributeError):
         return None
-    in_order = [found.p1, found.p50, found.p99, found.p99_9]
+    percentiles = [record.p1, record.p50, record.p99, record.p99_9]
     plausible = all(
-        math.isfinite(value) and 0 <= value <= 1 for value in (*in_order, found.saturated)
+        math.isfinite(value) and 0 <= value <= 1 for value in (*percentiles, record.saturated)
     )
-    return found if plausible and in_order == sorted(in_order) else None
+    # Percentiles rise by definition; others were not computed from any image.
+    return record if plausible and percentiles == sorted(percentiles) else None
 
 
 def range_row(found: SampleRange, name: str, source: str) -> Row:

@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -104,20 +105,22 @@ def read_samples(
             patches.
         multiple_px: what sides must be multiples of; the rest is cut off.
     """
-    named = (
+    # Messages name a sample by its file or, in memory, by its place.
+    sources = (
         _samples(given)
         if isinstance(given, Path)
         else ((f"{IN_MEMORY}[{k}]", *p) for k, p in enumerate(given))
     )
-    found = list[Named]()
-    for name, image, reference in named:
-        seen = _sound(name, image, channels)
-        meant = _sound_reference(name, reference)
-        found += [(name, pair) for pair in _cut(seen, meant, name, fixed_px, multiple_px)]
-    if not found:
+    samples = list[Named]()
+    for name, image, reference in sources:
+        pixels = _sound(name, image, channels)
+        target = _sound_reference(name, reference)
+        pairs = _cut(pixels, target, name, fixed_px, multiple_px)
+        samples += [(name, pair) for pair in pairs]
+    if not samples:
         where = str(given) if isinstance(given, Path) else IN_MEMORY
         raise ImageError(where, expected="at least one sample", got="none", remedy=REMEDY)
-    return _patches(found)
+    return _patches(samples)
 
 
 IN_MEMORY = "samples"
@@ -132,54 +135,55 @@ def samples_in(given: object) -> list[Pair]:
             tuple of two; a simulated pair, which knows its full scale; or an iterable of any of
             these, such as a DataLoader.
     """
+    # A simulated pair holds digital numbers, and alone knows its full scale.
     if hasattr(given, "degraded") and hasattr(given, "reference"):
         pair: Any = given
         largest = np.float32(pair.sensor.max_dn)
-        images = [
-            np.asarray(image, np.float32)[None] / largest
-            for image in (pair.degraded, pair.reference)
-        ]
-        return [(images[0], images[1])]
+        degraded = np.asarray(pair.degraded, np.float32)[None] / largest
+        reference = np.asarray(pair.reference, np.float32)[None] / largest
+        return [(degraded, reference)]
     if hasattr(given, "ndim"):
         return [(image, NO_REFERENCE) for image in _batch(given)]
     if (
         isinstance(given, tuple)
         and len(given) == 2
-        and all(hasattr(each, "ndim") for each in given)
+        and all(hasattr(array, "ndim") for array in given)
     ):
-        # a reference may be a class, or a class for each pixel
-        seen = _batch(given[0])
-        meant = _plain(given[1])
-        meant = meant[None] if np.ndim(given[0]) == 3 else meant
-        if meant.ndim == 0 or len(seen) != len(meant):
-            got = f"images of {times(seen.shape)} and references of {_shape(meant)}"
+        # A reference may be a class, or a class for each pixel, so it has any number of axes.
+        images = _batch(given[0])
+        references = _plain(given[1])
+        references = references[None] if np.ndim(given[0]) == 3 else references
+        if references.ndim == 0 or len(images) != len(references):
+            got = f"images of {times(images.shape)} and references of {_shape(references)}"
             raise ImageError(
                 IN_MEMORY, expected="a reference for each image", got=got, remedy=REMEDY
             )
-        return list(zip(seen, meant, strict=True))
+        return list(zip(images, references, strict=True))
     if not isinstance(given, Iterable) or isinstance(given, str | bytes | Mapping):
         got = type(given).__name__
         raise ImageError(
             IN_MEMORY, expected="arrays (N, C, H, W), or a path", got=got, remedy=REMEDY
         )
+    # A DataLoader gives a batch as a list: of images and references, or of images alone.
     items = (tuple(item) if isinstance(item, list) and len(item) == 2 else item for item in given)
     items = (
         item[0] if isinstance(item, list | tuple) and len(item) == 1 else item for item in items
     )
-    return [sample for item in items for sample in samples_in(item)]
+    return list(chain.from_iterable(map(samples_in, items)))
 
 
 def _batch(array: Any) -> np.ndarray:
     """One image or a batch of NumPy or torch as (N, C, H, W)."""
-    found = _plain(array)
-    if found.ndim not in (3, 4):
+    batch = _plain(array)
+    if batch.ndim not in (3, 4):
         raise ImageError(
-            IN_MEMORY, expected="a batch of (N, C, H, W)", got=times(found.shape), remedy=REMEDY
+            IN_MEMORY, expected="a batch of (N, C, H, W)", got=times(batch.shape), remedy=REMEDY
         )
-    return found if found.ndim == 4 else found[None]
+    return batch if batch.ndim == 4 else batch[None]
 
 
 def _plain(array: Any) -> np.ndarray:
+    # NumPy refuses a tensor of torch that still has a gradient.
     return np.asarray(array.detach() if hasattr(array, "detach") else array)
 
 
@@ -189,9 +193,9 @@ NO_REFERENCE = np.empty(0, np.float32)
 def _patches(samples: Sequence[Named]) -> Patches:
     names = tuple(name for name, _ in samples)
     pairs = [pair for _, pair in samples]
-    return Patches(
-        [], Remade(lambda k: pairs[k], len(pairs)), Remade(lambda k: pairs[k][0], len(pairs)), names
-    )
+    count = len(pairs)
+    images = Remade(lambda k: pairs[k][0], count)
+    return Patches([], Remade(lambda k: pairs[k], count), images, names)
 
 
 def _named(samples: Patches) -> list[Named]:
@@ -205,9 +209,8 @@ DIGEST_DIGITS = 16
 
 def digest_of(sample: np.ndarray) -> str:
     """A sample (1, C, h, w), told from any other."""
-    return hashlib.sha256(np.ascontiguousarray(sample, np.float32).tobytes()).hexdigest()[
-        :DIGEST_DIGITS
-    ]
+    content = np.ascontiguousarray(sample, np.float32).tobytes()
+    return hashlib.sha256(content).hexdigest()[:DIGEST_DIGITS]
 
 
 def split_samples(samples: Patches) -> tuple[Patches, Patches]:
@@ -216,11 +219,11 @@ def split_samples(samples: Patches) -> tuple[Patches, Patches]:
     """
     pairs = _named(samples)
     held_out = pairs[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY]
+    # Fewer than four samples are too few to leave one out of calibration.
     if not held_out:
         return samples, samples
-    return _patches([pair for k, pair in enumerate(pairs) if (k + 1) % HELD_OUT_EVERY]), _patches(
-        held_out
-    )
+    calibration = [pair for k, pair in enumerate(pairs) if (k + 1) % HELD_OUT_EVERY]
+    return _patches(calibration), _patches(held_out)
 
 
 def sample_files(path: Path) -> list[Path]:
@@ -282,7 +285,7 @@ def _stored(path: Path) -> tuple[np.ndarray, np.ndarray]:
     except ValueError as error:
         expected = "a .npy or .npz file of numbers, or a folder of images"
         raise ImageError(str(path), expected=expected, got=str(error), remedy=REMEDY) from error
-    # One array alone may have any name.
+    # One array alone may have any name: `np.savez(file, images)` calls it `arr_0`.
     image = next(iter(arrays)) if len(arrays) == 1 else "image"
     if image not in arrays:
         got = ", ".join(arrays) or "no array"
@@ -303,6 +306,7 @@ def _bands_first(path: Path, pixels: np.ndarray) -> np.ndarray:
         raise ImageError(
             str(path), expected="pixels that are numbers", got=f"{bands.dtype}", remedy=REMEDY
         )
+    # Files state no full scale: pixels of 8 bits use all of them, others are taken for 12 bits.
     return bands / np.float32(FULL_SCALE_8 if bands.dtype.itemsize == 1 else MAX_DN)
 
 
@@ -336,6 +340,7 @@ def _sound(name: str, image: np.ndarray, channels: int) -> np.ndarray:
         raise ImageError(name, expected="an image with pixels", got=_shape(image), remedy=REMEDY)
     values = np.asarray(image, np.float32)
     low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+    # NaN fails every comparison, so it is refused as well.
     if not (low >= 0 and high <= LARGEST):
         remedy = (
             "divide them by full scale"
@@ -345,6 +350,7 @@ def _sound(name: str, image: np.ndarray, channels: int) -> np.ndarray:
         raise ImageError(
             name, expected="values in [0, 1]", got=f"{low:.4g} to {high:.4g}", remedy=remedy
         )
+    # What rounding has left above 1, within the tolerance of LARGEST.
     return np.minimum(values, 1)
 
 
@@ -362,10 +368,12 @@ def _cut(
         expected = f"images of multiples of {multiple_px} pixels beside a reference"
         got = times((height, width))
         raise ImageError(name, expected=expected, got=got, remedy="cut both")
+    # A reference may be of another size, such as an enlarged image or a class: it cannot be cut.
     if reference.size:
         yield image[None], reference[None]
         return
     side = fixed_px or PATCH_PX // multiple_px * multiple_px
+    # An image smaller than a patch is one patch, cut to the sides that the network takes.
     sizes = [side if n >= side else n // multiple_px * multiple_px for n in (height, width)]
     if 0 in sizes or (fixed_px is not None and sizes != [side, side]):
         expected = f"images of at least {fixed_px or multiple_px} pixels a side"
@@ -374,10 +382,8 @@ def _cut(
         )
     for top in range(0, height - sizes[0] + 1, sizes[0]):
         for left in range(0, width - sizes[1] + 1, sizes[1]):
-            yield (
-                np.ascontiguousarray(image[None, :, top : top + sizes[0], left : left + sizes[1]]),
-                NO_REFERENCE,
-            )
+            patch = image[None, :, top : top + sizes[0], left : left + sizes[1]]
+            yield np.ascontiguousarray(patch), NO_REFERENCE
 
 
 @dataclass(frozen=True)
@@ -394,9 +400,12 @@ class OwnSamples:
         """Every sample with contrast: any network keeps what is constant, and a mean over such
         hides errors.
         """
-        found = read_samples(self.given, self.channels, self.fixed_px, self.multiple_px)
-        kept = [(name, pair) for name, pair in _named(found) if np.ptp(pair[0]) >= LEAST_CONTRAST]
-        if not kept:
+        # Any network keeps what is constant, so a mean over such samples would hide errors.
+        samples = read_samples(self.given, self.channels, self.fixed_px, self.multiple_px)
+        textured = [
+            (name, pair) for name, pair in _named(samples) if np.ptp(pair[0]) >= LEAST_CONTRAST
+        ]
+        if not textured:
             name = str(self.given) if isinstance(self.given, Path) else IN_MEMORY
             raise ImageError(
                 name,
@@ -404,7 +413,7 @@ class OwnSamples:
                 got="constant ones",
                 remedy="give real images",
             )
-        return _patches(kept)
+        return _patches(textured)
 
     @property
     def drawn(self) -> Patches:
@@ -437,8 +446,9 @@ def samples_of(model: onnx.ModelProto, given: object) -> OwnSamples | None:
     fixed_px = fixed_tile_px(model)
     multiple_px = _multiple_px(model)
     if given is not None:
-        found = Path(given) if isinstance(given, str | os.PathLike) else samples_in(given)
-        return OwnSamples(found, channels, fixed_px, multiple_px or 1)
+        source = Path(given) if isinstance(given, str | os.PathLike) else samples_in(given)
+        return OwnSamples(source, channels, fixed_px, multiple_px or 1)
+    # Simulated patches have one channel and PATCH_PX a side.
     if channels != 1 or multiple_px is None or PATCH_PX % multiple_px:
         what = f"images of {fixed_px} x {fixed_px} pixels alone"
         if multiple_px is not None:

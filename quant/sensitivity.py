@@ -60,7 +60,9 @@ class Loss:
     """Adds up how far results lie from what was wanted, array by array."""
 
     def __init__(self) -> None:
-        self._signal = self._noise = self._size = 0.0
+        self._signal = 0.0
+        self._noise = 0.0
+        self._size = 0.0
         self._count = 0
 
     def add(self, result: np.ndarray, wanted: np.ndarray, offset: np.ndarray | float = 0.0) -> None:
@@ -122,15 +124,15 @@ def layer_errors(
     # The same convolutions, by their side, with the values that their int8 weights and biases stand
     # for.
     twins = tuple(
-        replace(dequantised(op, whole), name=op.name + IN_INT8, output=op.output + IN_INT8)
-        for op, whole in zip(graph, core.ops, strict=True)
-        if isinstance(op, Conv) and isinstance(whole, IntConv)
+        replace(dequantised(op, int_op), name=op.name + IN_INT8, output=op.output + IN_INT8)
+        for op, int_op in zip(graph, core.ops, strict=True)
+        if isinstance(op, Conv) and isinstance(int_op, IntConv)
     )
     names = tensors((*graph, *twins))
     width = core.ends.planes * core.ends.channels
     halo_px = None if halo_of(graph) is None else 0
-    exact = open_session(graph_to_onnx((*graph, *twins), names, width))
-    int8 = open_session(host_model(core, {}))
+    float_session = open_session(graph_to_onnx((*graph, *twins), names, width))
+    int8_session = open_session(host_model(core, {}))
     rests = {
         name: open_session(_rest(graph, name, width))
         for name in tensors(graph)
@@ -140,37 +142,35 @@ def layer_errors(
     together = Loss()
     scale = core.scale(CORRECTION)
     for crop in crops:
-        (values,) = tensor_values(exact, names, crop, halo_px, core.ends)
-        wanted = dict(zip(names, values, strict=True))
-        restored = core.ends.restored(crop, wanted[CORRECTION], scale)
+        (values,) = tensor_values(float_session, names, crop, halo_px, core.ends)
+        float_values = dict(zip(names, values, strict=True))
+        restored = core.ends.restored(crop, float_values[CORRECTION], scale)
         offset = crop if core.ends.adds_image else 0.0
         for op, layer in zip(graph, layers, strict=True):
-            result = _in_int8(op, core, wanted)
-            meant = wanted[op.output]
-            if (
-                op.output == CORRECTION
-            ):  # of two gains one is coarse and the other clipped: together they count
-                result = core.ends.merge(result, scale)
-                meant = core.ends.whole(meant)
-            layer.alone.add(result, meant)
-            result = result - (result - meant).mean(
-                (2, 3), keepdims=True
-            )  # for which the next bias makes up
+            result = _in_int8(op, core, float_values)
+            expected = float_values[op.output]
+            # Of two gains one is coarse and the other clipped, so they count together.
             if op.output == CORRECTION:
-                found = core.ends.finished(crop, result)
+                result = core.ends.merge(result, scale)
+                expected = core.ends.whole(expected)
+            layer.alone.add(result, expected)
+            # The next layer's bias makes up for a mean error.
+            result = result - (result - expected).mean((2, 3), keepdims=True)
+            if op.output == CORRECTION:
+                image = core.ends.finished(crop, result)
             else:
                 feed = {PLANES: planes_of(crop, core.ends), op.output: result}
-                found = core.ends.restored(crop, rests[op.output].run(None, feed)[0], scale)
-            layer.network.add(found, restored, offset)
-        together.add(result_of(int8, crop), restored, offset)
+                image = core.ends.restored(crop, rests[op.output].run(None, feed)[0], scale)
+            layer.network.add(image, restored, offset)
+        together.add(result_of(int8_session, crop), restored, offset)
     return layers, together
 
 
-def _rest(graph: Graph, given: str, width: int) -> onnx.ModelProto:
+def _rest(graph: Graph, tensor: str, width: int) -> onnx.ModelProto:
     """The float network from one of its tensors, given beside the planes, to the correction."""
-    model = graph_to_onnx(tuple(op for op in graph if op.output != given), [CORRECTION], width)
+    model = graph_to_onnx(tuple(op for op in graph if op.output != tensor), [CORRECTION], width)
     model.graph.input.append(
-        helper.make_tensor_value_info(given, TensorProto.FLOAT, ["N", "C", None, None])
+        helper.make_tensor_value_info(tensor, TensorProto.FLOAT, ["N", "C", None, None])
     )
     return model
 
@@ -179,14 +179,15 @@ def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarr
     """A layer's result when it alone is in int8."""
     if isinstance(op, Conv):
         return rounded_to(exact[op.output + IN_INT8], core.frac_bits[op.output])
+    # What only hands values on rounds nothing, because its inputs and result have one scale.
     if ties_scales(op) and not isinstance(op, AveragePool | Resize):
         return exact[op.output]
     if not isinstance(op, Add):
         return rounded_to(exact[op.output], core.frac_bits[op.output])
     left, right = (rounded_to(exact[name], core.frac_bits[name]) for name in op.inputs)
-    return np.asarray(
-        exact[op.output] + (rounded_to(left + right, core.frac_bits[op.output]) - (left + right))
-    )
+    # Only the error of the sum itself: that of its inputs belongs to the layers that wrote them.
+    error = rounded_to(left + right, core.frac_bits[op.output]) - (left + right)
+    return np.asarray(exact[op.output] + error)
 
 
 @dataclass(frozen=True)
@@ -216,6 +217,7 @@ class Spread:
 
     def worst(self, count: int) -> list[int]:
         """The patches of the largest MAE, the worst first."""
+        # Stable, so that patches of equal error keep their order.
         return [int(k) for k in np.argsort(-self.mae, kind="stable")[:count]]
 
 
@@ -233,9 +235,9 @@ def spread_of(
             np.clip(run(session, image), 0, 1) for session in (float_session, int8_session)
         )
         difference = (in_int8 - in_float).ravel()
-        counts += np.bincount(
-            np.rint(difference * MAX_DN).astype(np.int64) + MAX_DN, minlength=len(counts)
-        )
+        # Shifted by the largest digital number, because `bincount` counts from 0 on.
+        dn = np.rint(difference * MAX_DN).astype(np.int64) + MAX_DN
+        counts += np.bincount(dn, minlength=len(counts))
         mae.append(float(np.abs(difference).mean()))
         largest.append(float(np.abs(difference).max()))
     return Spread(counts, np.array(mae), np.array(largest))
@@ -243,18 +245,18 @@ def spread_of(
 
 def layer_error_rows(result: Quantised, patches: Patches) -> list[Row]:
     """Every layer in int8 by itself, and all of them."""
-    seen = few_crops(patches.degraded, result.host)
-    layers, together = layer_errors(result.graph, result.core, seen)
-    source = f"{len(seen)} patches, all other layers in float"
-    whole = sum(layer.network.squared for layer in layers)
+    crops = few_crops(patches.degraded, result.host)
+    layers, together = layer_errors(result.graph, result.core, crops)
+    source = f"{len(crops)} patches, all other layers in float"
+    total = sum(layer.network.squared for layer in layers)
     rows = []
     for layer in layers:
         figures = {"SQNR alone": _sqnr(layer.alone, source), **_network(layer.network, source)}
         figures["share of squared error"] = measured(
-            100 * layer.network.squared / whole if whole else 0, "%", source
+            100 * layer.network.squared / total if total else 0, "%", source
         )
         rows.append(Row("layers", layer.name, figures))
-    return [*rows, Row("layers", "all layers", _network(together, f"{len(seen)} patches"))]
+    return [*rows, Row("layers", "all layers", _network(together, f"{len(crops)} patches"))]
 
 
 def _network(loss: Loss, source: str) -> dict[str, Figure]:
@@ -322,25 +324,22 @@ def losses(result: Quantised, gate: GateResult, patches: Patches) -> str:
             f"{gate.drop_db:.2f} dB of {gate.psnr_float_db:.2f}, and "
             f"{gate.worst_drop_db:.2f} dB where most"
         )
-        said = f"INT8 loses {worst}"
+        message = f"INT8 loses {worst}"
         much = gate.drop_db > MUCH_DB
     elif not math.isnan(gate.same_class):
-        said = f"INT8 tells {100 * gate.same_class:.2f} % of the classes as float"
+        message = f"INT8 tells {100 * gate.same_class:.2f} % of the classes as float"
         much = gate.same_class < SAME_CLASS
     else:
-        said = f"INT8 differs from float by {gate.mae:.2g} of full scale on average"
+        message = f"INT8 differs from float by {gate.mae:.2g} of full scale on average"
         much = False
     if not much:
-        return f"{said} ({gate.source})"
-    named = ", ".join(
-        f"{name} ({share:.0f} %)" for name, share in _costliest(layer_error_rows(result, patches))
-    )
-    add = (
-        ""
-        if result.core.ends.adds_image
-        else ", or a network that ends with a global add, of which INT8 errs less"
-    )
-    return f"{said} ({gate.source}): most of it in {named}; try --finetune auto{add}"
+        return f"{message} ({gate.source})"
+    costliest = _costliest(layer_error_rows(result, patches))
+    names = ", ".join(f"{name} ({share:.0f} %)" for name, share in costliest)
+    add = ""
+    if not result.core.ends.adds_image:
+        add = ", or a network that ends with a global add, of which INT8 errs less"
+    return f"{message} ({gate.source}): most of it in {names}; try --finetune auto{add}"
 
 
 MOST = 3
@@ -357,20 +356,20 @@ def _costliest(layers: list[Row]) -> list[tuple[str, float]]:
 
 def headline(gate: GateResult, layers: list[Row]) -> str:
     """How much INT8 loses, of what kind the errors are, and which layers make most of them."""
-    named = ", ".join(f"{name} {share:.0f} %" for name, share in _costliest(layers))
+    names = ", ".join(f"{name} {share:.0f} %" for name, share in _costliest(layers))
     drop = "" if math.isnan(gate.drop_db) else f" and costs {gate.drop_db:.2f} dB"
     return (
         f"INT8 differs from float by {gate.mae:.2g} of full scale on average{drop} "
         f"(measured). {kind_of_error(gate.std_over_mae)} Most of the squared error comes from: "
-        f"{named}."
+        f"{names}."
     )
 
 
 def kind_of_error(std_over_mae: float) -> str:
     """What std / MAE says, in one sentence."""
-    found = f"std / MAE is {std_over_mae:.2f}, where a Gaussian has 1.25"
+    sentence = f"std / MAE is {std_over_mae:.2f}, where a Gaussian has 1.25"
     if std_over_mae <= ROUNDING:
-        return f"{found}: the errors are mostly those of rounding."
+        return f"{sentence}: the errors are mostly those of rounding."
     if std_over_mae <= CLIPPING:
-        return f"{found}: rounding, but of unequal size from place to place."
-    return f"{found}: a few pixels err far more than the rest, which is clipping."
+        return f"{sentence}: rounding, but of unequal size from place to place."
+    return f"{sentence}: a few pixels err far more than the rest, which is clipping."

@@ -53,26 +53,28 @@ def open_session(
     """
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
-    options.enable_mem_pattern = (
-        False  # a plan of the memory takes up to 40 % more of it, and saves no time
-    )
-    options.log_severity_level = 4  # what fails is raised, and said once
+    # A plan of the memory takes up to 40 % more of it, and saves no time.
+    options.enable_mem_pattern = False
+    # An error is raised, so onnxruntime need not print it as well.
+    options.log_severity_level = 4
     # Threads that wait for this session's next run take a core from whoever runs meanwhile, for
     # tens of milliseconds.
     options.add_session_config_entry("session.force_spinning_stop", "1")
     if not optimise:
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
-    known = model if isinstance(model, onnx.ModelProto) else load_onnx(model)
+    network = model if isinstance(model, onnx.ModelProto) else load_onnx(model)
     name = "ONNX model" if isinstance(model, onnx.ModelProto) else str(model)
-    if exact is None:  # runs a network of its own, whose faults are not this file's
-        exact = is_quantised(known) and not int8_adds_exactly()
+    # Outside `contradictions`: the processor is asked with a network of its own, whose faults are
+    # not this file's.
+    if exact is None:
+        exact = is_quantised(network) and not int8_adds_exactly()
     with contradictions(name):
-        known = filled(known) if optimise else known
-        if exact and is_quantised(known):
-            known, _ = made_exact(known)
+        network = filled(network) if optimise else network
+        if exact and is_quantised(network):
+            network, _ = made_exact(network)
     try:
         return ort.InferenceSession(
-            known.SerializeToString(), options, providers=["CPUExecutionProvider"]
+            network.SerializeToString(), options, providers=["CPUExecutionProvider"]
         )
     except CODE_FAULTS:
         raise
@@ -111,9 +113,8 @@ def tensors_of(
 ) -> list[np.ndarray]:
     """The named outputs, or all, for an image (N, 1, H, W) float32 in [0, 1]."""
     try:
-        return [
-            np.asarray(value) for value in session.run(names, {session.get_inputs()[0].name: image})
-        ]
+        values = session.run(names, {session.get_inputs()[0].name: image})
+        return [np.asarray(value) for value in values]
     except CODE_FAULTS:
         raise
     except Exception as error:  # as above
@@ -124,6 +125,7 @@ def require_finite(values: Iterable[np.ndarray], where: str) -> None:
     """Refuse what a network computed of an image in [0, 1], where its weights are finite and that
     is not.
     """
+    # NaN and infinity reach the minimum or the maximum, which need no array of their own.
     if not all(np.isfinite((value.min(), value.max())).all() for value in values):
         remedy = (
             "its sums overflow: train it again with a lower learning rate, or scale its weights"
@@ -171,6 +173,7 @@ def tensor_values(
         around_px = halo_px or 0
         above = min(top, around_px)
         before = min(left, around_px)
+        # A slice ends at the image's own border, where the network pads with zeros as it would.
         with_halo = image[..., top - above : bottom + around_px, left - before : right + around_px]
         values = session.run(names, {PLANES: planes_of(with_halo, ends)})
         if halo_px is not None:
@@ -234,5 +237,5 @@ def few_crops(images: Iterable[np.ndarray], model: onnx.ModelProto) -> list[np.n
     """One crop of each of the first few images: what is looked at layer by layer; all of it where a
     size is fixed.
     """
-    whole = fixed_tile_px(any_size(model)) is not None
-    return [crops(image, None if whole else 0)[0] for image in islice(images, LAYER_PATCHES)]
+    halo_px = None if fixed_tile_px(any_size(model)) is not None else 0
+    return [crops(image, halo_px)[0] for image in islice(images, LAYER_PATCHES)]

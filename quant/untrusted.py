@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from types import ModuleType
 
 import numpy as np
@@ -32,8 +33,8 @@ VALUE_BYTES: dict[int, int] = {
 def check_content(model: onnx.ModelProto, where: str) -> None:
     """Refuse a model that does not hold what it states."""
     graph = model.graph
-    held = {tensor.name for tensor in graph.initializer}
-    if all(value.name in held for value in graph.input) or not graph.output:
+    initializers = {tensor.name for tensor in graph.initializer}
+    if all(value.name in initializers for value in graph.input) or not graph.output:
         raise refused(
             where, "a network with an input and an output", "none", "export the network again"
         )
@@ -71,10 +72,9 @@ def contradictions(where: str) -> Iterator[None]:
 def check_size(name: str, sizes: Iterable[float], where: str) -> None:
     """Refuse a tensor that a file sizes beyond reason; 0 and -1 stand for sizes left open."""
     sizes = list(sizes)
-    rank = len(sizes) <= RANK
-    if not (
-        rank and min(sizes, default=0) >= -1 and math.prod(max(size, 1) for size in sizes) <= VALUES
-    ):
+    allowed = len(sizes) <= RANK and min(sizes, default=0) >= -1
+    # Written so that NaN is refused as well: it compares as False.
+    if not allowed or not math.prod(max(size, 1) for size in sizes) <= VALUES:
         got = f"{name!r} of {times(sizes)}"
         raise refused(where, f"tensors of at most {VALUES} values", got, "export the network again")
 
@@ -94,9 +94,12 @@ def held_tensors(graph: onnx.GraphProto) -> Iterator[TensorProto]:
     yield from graph.initializer
     for sparse in graph.sparse_initializer:
         yield from (sparse.values, sparse.indices)
-    for attribute in (a for node in graph.node for a in node.attribute):
-        yield from (*([attribute.t] if attribute.HasField("t") else []), *attribute.tensors)
-        for inner in (*([attribute.g] if attribute.HasField("g") else []), *attribute.graphs):
+    for attribute in chain.from_iterable(node.attribute for node in graph.node):
+        if attribute.HasField("t"):
+            yield attribute.t
+        yield from attribute.tensors
+        graphs = [attribute.g] if attribute.HasField("g") else []
+        for inner in (*graphs, *attribute.graphs):
             yield from held_tensors(inner)
 
 
@@ -106,13 +109,13 @@ def _check_tensor(tensor: TensorProto, where: str) -> None:
         got = f"{tensor.name!r} of {times(tensor.dims)}"
         raise refused(where, f"at most {RANK} sizes from 0 on", got, "export it again")
     # A tensor that states more than it holds makes a runtime allocate first and read afterwards.
-    stated = math.prod(tensor.dims)
+    stated_count = math.prod(tensor.dims)
     raw = tensor.HasField("raw_data")
     kind = tensor.data_type
     field = tensor.raw_data if raw else getattr(tensor, helper.tensor_dtype_to_field(kind))
-    present = len(field) / (VALUE_BYTES[kind] if raw else 1)
-    if stated != present:
-        got = f"{tensor.name!r} of {times(tensor.dims)} values that holds {present:g}"
+    stored_count = len(field) / (VALUE_BYTES[kind] if raw else 1)
+    if stated_count != stored_count:
+        got = f"{tensor.name!r} of {times(tensor.dims)} values that holds {stored_count:g}"
         raise refused(where, "weights as many as it states", got, "copy or export it again")
     _check_finite(tensor, where)
 
@@ -138,10 +141,10 @@ def _check_place_and_type(tensor: TensorProto, where: str) -> None:
         got = f"{tensor.name!r} kept in another file, {place!r}"
         raise refused(where, "one self-contained ONNX file", got, "save it as one file")
     if tensor.data_type not in VALUE_BYTES:
-        known = TensorProto.DataType.values()
+        type_numbers = TensorProto.DataType.values()
         kind = (
             TensorProto.DataType.Name(tensor.data_type)
-            if tensor.data_type in known
+            if tensor.data_type in type_numbers
             else f"{tensor.data_type}"
         )
         raise refused(
@@ -293,7 +296,8 @@ def _computed(
     short = all(value is not None and value.size <= LIST_VALUES for value in values)
     if node.op_type not in COMPUTED or not short:
         return None
-    from onnx.reference import ReferenceEvaluator  # half a second, of files alone that compute
+    # Importing it takes half a second, which only files that compute sizes should cost.
+    from onnx.reference import ReferenceEvaluator
 
     try:
         with np.errstate(all="ignore"):

@@ -9,7 +9,7 @@ import hashlib
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from itertools import combinations
+from itertools import chain, combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -35,7 +35,8 @@ def whole_file(path: Path) -> Iterator[Path]:
         temporary.touch()
         mode = temporary.stat().st_mode
         yield temporary
-        temporary.chmod(mode)  # safetensors makes files that only their owner can read
+        # safetensors makes files that only their owner can read.
+        temporary.chmod(mode)
         temporary.replace(path)
     except OSError as error:
         raise _unwritable(path, error.strerror or str(error)) from error
@@ -57,9 +58,10 @@ def require_writable(
         folders: are to be filled with images whose names are not known yet: no image that is read
             may lie there.
     """
-    outputs, filled = ([path for path in given if path is not None] for given in (paths, folders))
-    _require_apart(outputs, filled, inputs)
-    for folder in filled:
+    outputs = [path for path in paths if path is not None]
+    image_folders = [path for path in folders if path is not None]
+    _require_apart(outputs, image_folders, inputs)
+    for folder in image_folders:
         if os.path.lexists(folder) and not folder.is_dir():
             raise _unwritable(folder, "something else", expected="a folder")
     for path in outputs:
@@ -67,21 +69,24 @@ def require_writable(
         _probe(path)
 
 
-def _require_apart(outputs: list[Path], filled: list[Path], inputs: Iterable[Path | None]) -> None:
+def _require_apart(
+    outputs: list[Path], image_folders: list[Path], inputs: Iterable[Path | None]
+) -> None:
     """Refuse an output that is an input or another output, and a folder to be filled where images
     are read.
     """
-    read = [file for path in inputs if path is not None for file in _files_of(path)]
-    known = {_identity(file) for file in read} - {None}
-    homes = {_identity(file.parent) for file in read if file.suffix.lower() in IMAGE_SUFFIXES} - {
-        None
-    }
-    for places, taken, by in (
-        (outputs, known, "an input of this run"),
-        (filled, homes, "the folder of an input"),
+    sources = [path for path in inputs if path is not None]
+    files = list(chain.from_iterable(map(_files_of, sources)))
+    images = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
+    # What does not exist has no identity, and is in nobody's way.
+    identities = {_identity(file) for file in files} - {None}
+    homes = {_identity(image.parent) for image in images} - {None}
+    for places, occupied, by in (
+        (outputs, identities, "an input of this run"),
+        (image_folders, homes, "the folder of an input"),
     ):
         for path in places:
-            if _identity(path) in taken:
+            if _identity(path) in occupied:
                 raise _taken(path, by)
     for one, other in combinations(outputs, 2):
         # Some disks know no capitals.
@@ -125,10 +130,10 @@ def _part_of(path: Path) -> Path:
 def _identity(path: Path) -> tuple[int, int] | None:
     """What all names of a file have in common; None where there is none."""
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError:
         return None
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino
 
 
 def _files_of(path: Path) -> list[Path]:

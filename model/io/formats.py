@@ -33,7 +33,7 @@ SAFETENSORS = OtherFormat(
 )
 
 MAGIC: tuple[tuple[int, bytes, OtherFormat], ...] = (
-    (0, b"\x80\x02", TORCH),  # before torch 1.6: a pickle of protocol 2
+    (0, b"\x80\x02", TORCH),  # Before torch 1.6: a pickle of protocol 2.
     (0, b"\x89HDF\r\n", OtherFormat("an HDF5 file, such as Keras writes", FROM_TENSORFLOW)),
     (4, b"TFL3", OtherFormat("a file of TensorFlow Lite", f"{FROM_TENSORFLOW}, by its --tflite")),
     (
@@ -63,8 +63,10 @@ def other_format(head: bytes) -> OtherFormat | None:
     Args:
         head: its first bytes.
     """
+    # torch.save writes a ZIP archive that holds data.pkl.
     if head.startswith(b"PK\x03\x04"):
         return TORCH if b"data.pkl" in head or b"/version" in head else ARCHIVE
+    # A safetensors file begins with the length of its JSON header, in 8 bytes.
     if head[8:9] == b"{" and int.from_bytes(head[:8], "little") < 1 << 32:
         return SAFETENSORS
     return next((kind for place, magic, kind in MAGIC if head[place:].startswith(magic)), None)

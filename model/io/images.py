@@ -101,7 +101,7 @@ def damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
         raise
     except Exception as error:
         if isinstance(error, CODE_FAULTS) and not _library_works(path):
-            raise  # the installed version is at fault, not the file
+            raise  # The installed version is at fault, not the file.
         name = f"{path}, {where}" if where else str(path)
         if isinstance(error, ModuleNotFoundError) or "imagecodecs" in str(error):
             remedy = "pip install 'beers-deploy[codecs]'"
@@ -147,12 +147,12 @@ def image_size_px(path: Path) -> tuple[int, int]:
 
 def list_images(folder: Path) -> list[Path]:
     """The image files of a folder, sorted by name."""
-    found = (
+    images = (
         sorted(p for p in folder.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES)
         if folder.is_dir()
         else []
     )
-    if not found:
+    if not images:
         got = "no image in it" if folder.is_dir() else "no such folder"
         raise ImageError(
             str(folder),
@@ -160,7 +160,7 @@ def list_images(folder: Path) -> list[Path]:
             got=got,
             remedy="give TIFF, PNG or JPEG files",
         )
-    return found
+    return images
 
 
 def site_of(name: str) -> str:
@@ -190,18 +190,19 @@ def _read_tiff(path: Path) -> np.ndarray:
             check_page(path, page)
         pixels = np.asarray(file.series[0].asarray())
     if pixels.ndim == 3 and (len(pages) > 1 or pages[0].planarconfig == PLANAR):
+        # Pages and planar bands are read as (bands, H, W).
         pixels = np.moveaxis(pixels, 0, 2)
     return pixels[..., 0] if pixels.ndim == 3 and pixels.shape[2] == 1 else pixels
 
 
 def _read_other(path: Path) -> np.ndarray:
-    # our own check knows the free memory
+    # Pillow's own limit is lifted, because `_check_memory` knows the free memory.
     limit = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = None
     try:
         with (
             damage_in_a_sentence(path),
-            warnings.catch_warnings(action="ignore"),  # odd EXIF is no concern of ours
+            warnings.catch_warnings(action="ignore"),  # Odd EXIF is no concern of ours.
             # In memory, so that a chunk's stated length takes no more of it than there is file.
             # Other formats would run further programs, as for EPS.
             Image.open(
@@ -240,6 +241,7 @@ def _png_bits(path: Path) -> int | None:
     """Bits of a sample, as the head of a PNG has them; None of other files."""
     with path.open("rb") as stream:
         head = stream.read(25)
+    # The header chunk comes first: the bit depth is byte 24 of the file.
     return head[24] if head.startswith(b"\x89PNG") else None
 
 
@@ -278,8 +280,8 @@ class Extent(NamedTuple):
 def extent_of(pixels: np.ndarray, known: np.ndarray | bool = True) -> Extent:
     """The extent of pixels of any shape, of those that are `known`."""
     low, high = (float(extreme(pixels, where=known, initial=0)) for extreme in (np.min, np.max))
-    whole = pixels.dtype.kind != "f" or bool((np.rint(pixels) == pixels).all(where=known))
-    return Extent(max(-low, high), whole)
+    integers = pixels.dtype.kind != "f" or bool((np.rint(pixels) == pixels).all(where=known))
+    return Extent(max(-low, high), integers)
 
 
 def settled_scale(
@@ -315,7 +317,7 @@ def settled_scale(
         brightest = max(brightest, extent.largest)
         if brightest > UNIT_MAX and (extent.whole or brightest > RADIANCE_SHARE * usual):
             return usual
-    if brightest == 0:  # black, or missing everywhere
+    if brightest == 0:  # All of it is black or missing.
         return usual
     if brightest > UNIT_MAX:
         got = "no whole numbers, as radiances are"
@@ -330,8 +332,8 @@ def settled_scale(
 
 def check_scale(full_scale: float, kind: str) -> None:
     """A full scale that pixels of this kind (numpy's letter) can have."""
-    whole = full_scale <= 65535 and full_scale % 1 == 0
-    if 0 < full_scale < np.inf and (kind == "f" or whole):
+    fits_integers = full_scale <= 65535 and full_scale % 1 == 0
+    if 0 < full_scale < np.inf and (kind == "f" or fits_integers):
         return
     expected = (
         "a number above 0" if kind == "f" else "a whole number of 1 to 65535 for integer pixels"
@@ -385,22 +387,19 @@ def read_acquisition(
         )
     low = float(pixels.min())
     high = float(pixels.max())
-    settled = settled_scale(
-        str(path), pixels.dtype, [extent_of(pixels)], full_scale, max_dn, remedy
-    )
-    if low < 0 or high > settled:
+    scale = settled_scale(str(path), pixels.dtype, [extent_of(pixels)], full_scale, max_dn, remedy)
+    if low < 0 or high > scale:
         expected = (
             f"{max_dn.bit_length()}-bit digital numbers, 0 to {max_dn}"
-            if settled == max_dn
-            else f"values of 0 to {settled:g}"
+            if scale == max_dn
+            else f"values of 0 to {scale:g}"
         )
         got = f"values from {low:g} to {high:g}"
         raise ImageError(
             str(path), expected=expected, got=got, remedy=remedy_outside(low, high, RESCALE)
         )
     dn = np.asarray(pixels, dtype=np.float32)
-    return (
-        dn
-        if settled == max_dn
-        else np.minimum(dn * np.float32(max_dn / settled), np.float32(max_dn))
-    )
+    if scale == max_dn:
+        return dn
+    # Rounding may carry full scale above the largest digital number.
+    return np.asarray(np.minimum(dn * np.float32(max_dn / scale), np.float32(max_dn)))

@@ -37,20 +37,21 @@ def only_run(out: Path) -> Iterator[None]:
     It locks nothing on a disk that has no locks, as some of networks.
     """
     folder = part_folder(out)
-    new = [parent for parent in folder.parents if not parent.exists()]
+    created = [parent for parent in folder.parents if not parent.exists()]
     lock = _take(out, folder)
     try:
         yield
     finally:
-        with suppress(OSError):  # Windows removes no open file: there it goes with the release
-            (
-                folder / NAME
-            ).unlink()  # while it is ours: whoever has opened it finds out and begins again
+        # Removed while it is ours: whoever has opened it finds out and begins again. Windows
+        # removes no open file: there it goes with the release.
+        with suppress(OSError):
+            (folder / NAME).unlink()
         with suppress(OSError):
             lock.release()
-        with suppress(OSError):  # rows for --resume lie there
-            for each in (folder, *new):
-                each.rmdir()
+        # A folder that holds rows for --resume is not empty, and stays.
+        with suppress(OSError):
+            for place in (folder, *created):
+                place.rmdir()
 
 
 def _take(out: Path, folder: Path) -> BaseFileLock:
@@ -75,7 +76,7 @@ def _take(out: Path, folder: Path) -> BaseFileLock:
             ) from error
         except OSError as error:
             if isinstance(error, FileNotFoundError) and time.monotonic() < until_s:
-                continue  # the folder went with a run that ended just now
+                continue  # The folder went with a run that ended just now.
             if error.errno not in NO_LOCKS:
                 got = error.strerror or str(error)
                 remedy = "choose another path"

@@ -4,6 +4,7 @@ import base64
 import io
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -29,12 +30,12 @@ class Stretch:
         bands.
         """
         light = self._share(dn)
-        code = np.where(
-            light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055
-        )  # IEC 61966-2-1
+        # The two parts of the curve are those of IEC 61966-2-1.
+        code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
         return np.repeat(code.astype(np.float32)[..., None], 3, axis=2)
 
     def _share(self, dn: np.ndarray) -> np.ndarray:
+        # An image of one value has no range to divide by.
         return np.asarray(np.clip((dn - self.black) / max(self.white - self.black, 1e-6), 0, 1))
 
 
@@ -62,7 +63,7 @@ def _busiest(dn: np.ndarray, side_px: int) -> tuple[int, int]:
     rows, columns = (
         range(0, max(size - side_px, 0) + 1, max(side_px // 2, 1)) for size in dn.shape
     )
-    corners = [(top, left) for top in rows for left in columns]
+    corners = product(rows, columns)
     return max(
         corners, key=lambda c: float(gradient[c[0] : c[0] + side_px, c[1] : c[1] + side_px].mean())
     )

@@ -53,10 +53,12 @@ class Weights:
 
 def write_tensors(path: Path, tensors: Arrays, header: Mapping[str, object]) -> None:
     """Write named arrays of any shape and a JSON header as safetensors, whole or not at all."""
-    whole = {name: np.asarray(array, order="C") for name, array in tensors.items()}
+    contiguous = {name: np.asarray(array, order="C") for name, array in tensors.items()}
     with whole_file(path) as temporary:
         save_file(
-            whole, temporary, metadata={key: json.dumps(value) for key, value in header.items()}
+            contiguous,
+            temporary,
+            metadata={key: json.dumps(value) for key, value in header.items()},
         )
         _sort_metadata(temporary)
 
@@ -66,11 +68,13 @@ def _sort_metadata(path: Path) -> None:
     one each time.
     """
     content = path.read_bytes()
+    # The file begins with the length of its JSON header, in 8 bytes.
     end = 8 + int.from_bytes(content[:8], "little")
-    known = json.loads(content[8:end])
-    known["__metadata__"] = dict(sorted(known.get("__metadata__", {}).items()))
-    text = json.dumps(known, separators=(",", ":"), ensure_ascii=False).encode()
-    text += b" " * (-len(text) % 8)  # the tensors begin at a multiple of 8
+    header = json.loads(content[8:end])
+    header["__metadata__"] = dict(sorted(header.get("__metadata__", {}).items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    # The tensors begin at a multiple of 8.
+    text += b" " * (-len(text) % 8)
     path.write_bytes(len(text).to_bytes(8, "little") + text + content[end:])
 
 
@@ -99,10 +103,10 @@ def _other_format(path: Path) -> OtherFormat | None:
     """
     try:
         with path.open("rb") as file:
-            found = other_format(file.read(HEAD_BYTES))
+            kind = other_format(file.read(HEAD_BYTES))
     except OSError:
         return None
-    return None if found is SAFETENSORS else found
+    return None if kind is SAFETENSORS else kind
 
 
 def write_weights(path: Path, weights: Weights) -> None:
@@ -136,24 +140,24 @@ def read_weights(path: Path) -> Weights:
 
 def read_plain(path: Path) -> Weights:
     """The weights of a plain network."""
-    found = read_weights(path)
-    if found.conditioned:
+    weights = read_weights(path)
+    if weights.conditioned:
         remedy = "name the sensor: beers-deploy export --network FILE --sensor NAME"
         got = "one that is conditioned on its sensor"
         raise ModelError(
             str(path), expected="the weights of a plain network", got=got, remedy=remedy
         )
-    return found
+    return weights
 
 
 def read_conditioned(path: Path) -> Weights:
     """The weights of a network that is told its sensor."""
-    found = read_weights(path)
-    if not found.conditioned:
+    weights = read_weights(path)
+    if not weights.conditioned:
         raise _not_weights(
             path, "weights that 'train --conditioned' wrote", "a network that is told no sensor"
         )
-    return found
+    return weights
 
 
 def is_conditioned(path: Path) -> bool:
@@ -185,10 +189,10 @@ def _told(header: Mapping[str, object]) -> bool:
 
 def _variant(header: Mapping[str, Any]) -> Variant:
     shape = header["variant"]
-    found = Variant(int(shape["blocks"]), int(shape["features"]), int(shape.get("scale", 1)))
-    if found.scale < 1:
-        raise ValueError(f"a scale of {found.scale}")
-    return found
+    variant = Variant(int(shape["blocks"]), int(shape["features"]), int(shape.get("scale", 1)))
+    if variant.scale < 1:
+        raise ValueError(f"a scale of {variant.scale}")
+    return variant
 
 
 def _check_like(tensors: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:

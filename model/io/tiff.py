@@ -43,9 +43,8 @@ LABORATORIES = {
 # it does not know.
 PLAIN: dict[str, Any] = {f"is_{kind}": False for kind in LABORATORIES & tifffile.TIFF.FILE_FLAGS}
 
-logging.getLogger("tifffile").addHandler(
-    logging.NullHandler()
-)  # who asks for its remarks still has them
+# Whoever asks for tifffile's remarks still has them.
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 
 def open_tiff(path: Path) -> tifffile.TiffFile:
@@ -114,11 +113,12 @@ def image_pages(
 
 def _require_no_offset(path: Path, page: tifffile.TiffPage) -> None:
     """That 0 stands for no light in every band, by GDAL's metadata."""
-    said = str(page.tags[GDAL_METADATA].value) if GDAL_METADATA in page.tags else ""
-    found = [
-        re.findall(rf'<Item [^>]*role="{role}"[^>]*>([^<]*)<', said) for role in ("offset", "scale")
+    metadata = str(page.tags[GDAL_METADATA].value) if GDAL_METADATA in page.tags else ""
+    values = [
+        re.findall(rf'<Item [^>]*role="{role}"[^>]*>([^<]*)<', metadata)
+        for role in ("offset", "scale")
     ]
-    for offset, scale in zip_longest(*found, fillvalue="1"):
+    for offset, scale in zip_longest(*values, fillvalue="1"):
         require_small_offset(str(path), number_of(offset, 0), number_of(scale, 1))
 
 
@@ -173,6 +173,7 @@ def check_page(path: Path, page: tifffile.TiffPage) -> None:
 
 def segment_bytes(page: tifffile.TiffPage) -> int:
     """Bytes of one decoded strip or tile, as the file sizes it."""
+    # Bands that lie one behind the other have strips or tiles of their own.
     samples = page.samplesperpixel if page.planarconfig == 1 else 1
     place = page.tilelength, page.tilewidth
     pixels = math.prod(
@@ -182,7 +183,8 @@ def segment_bytes(page: tifffile.TiffPage) -> int:
 
 
 def _check_whole(path: Path, page: tifffile.TiffPage) -> None:
-    """Reading beyond the end would take the memory first, and find out then."""
+    """Raise ImageError if the file ends before its pixels do."""
+    # Reading beyond the end would take the memory first, and find out then.
     ends = (a + n for a, n in zip(page.dataoffsets, page.databytecounts, strict=True))
     end = max(ends, default=0)
     size = path.stat().st_size

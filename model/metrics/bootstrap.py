@@ -40,9 +40,9 @@ def site_interval(
     names = np.asarray(sites)
     groups = [numbers[names == name] for name in np.unique(names)]
     sums, counts = (np.array([f(group) for group in groups]) for f in (np.sum, np.size))
-    drawn = generator.integers(len(groups), size=(DRAWS, len(groups)))
+    draws = generator.integers(len(groups), size=(DRAWS, len(groups)))
     # Sums over counts and not a mean of means: a site of many images counts for them.
-    means = sums[drawn].sum(1) / counts[drawn].sum(1)
+    means = sums[draws].sum(1) / counts[draws].sum(1)
     return percentiles(means), WORDS
 
 

@@ -93,7 +93,7 @@ class Blocks:
     def of(self, lines: slice) -> "Blocks":
         """Return some of the lines."""
         arrays = self.second, self.error, self.level, self.constant
-        return Blocks(*(each[:, lines] for each in arrays))
+        return Blocks(*(array[:, lines] for array in arrays))
 
 
 @dataclass(frozen=True)
@@ -151,9 +151,9 @@ def measure_lines(pixels: np.ndarray, valid: np.ndarray) -> Blocks:
     if columns < 2 * REACH + 1:
         return Blocks(nothing, nothing, nothing, constant[None])
     second = pixels[:, 1:-1] - (pixels[:, :-2] + pixels[:, 2:]) / 2
-    known = valid[:, 1:-1] & valid[:, :-2] & valid[:, 2:]
+    mask = valid[:, 1:-1] & valid[:, :-2] & valid[:, 2:]
     located, error = (
-        np.pad(each, 1, constant_values=np.nan)[None] for each in _location(second, known)
+        np.pad(array, 1, constant_values=np.nan)[None] for array in _location(second, mask)
     )
     count = valid.sum(0)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -162,24 +162,24 @@ def measure_lines(pixels: np.ndarray, valid: np.ndarray) -> Blocks:
         return Blocks(located, error, np.where(around > 0, around, np.nan)[None], constant[None])
 
 
-def _location(values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _location(values: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the robust location of the columns of (h, w) values by Huber's estimator, and its
     standard error.
 
     A median would be one of the few values that integers leave; a mean follows the edges of the
     scene.
     """
-    count = known.sum(0, dtype=np.float32)
-    values = values if known.all() else np.where(known, values, 0)
+    count = mask.sum(0, dtype=np.float32)
+    values = values if mask.all() else np.where(mask, values, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         reach = 2 * np.abs(values).sum(0) / count
         centre = np.zeros(values.shape[1], np.float32)
         for _ in range(ROUNDS):
-            rest = values - centre
+            residuals = values - centre
             inside = np.maximum(
-                (known & (np.abs(rest) <= reach)).sum(0, dtype=np.float32), count / 3
+                (mask & (np.abs(residuals) <= reach)).sum(0, dtype=np.float32), count / 3
             )
-            clipped = np.clip(rest, -reach, reach) * known
+            clipped = np.clip(residuals, -reach, reach) * mask
             centre = centre + clipped.sum(0) / inside
             reach = 2 * np.abs(clipped).sum(0) / count
         error = np.sqrt(np.square(clipped).sum(0)) / inside
@@ -193,27 +193,28 @@ def constant_columns(pixels: np.ndarray) -> np.ndarray:
 
     NaN is a missing pixel, which says nothing.
     """
-    same = np.fmax.reduce(pixels, axis=0) == np.fmin.reduce(pixels, axis=0)
-    known = np.isfinite(pixels).sum(0)
-    still = same & (known >= FEW)
-    moving = ~same & (known > 0)
-    left = np.roll(moving, 1)
-    right = np.roll(moving, -1)
+    constant = np.fmax.reduce(pixels, axis=0) == np.fmin.reduce(pixels, axis=0)
+    counts = np.isfinite(pixels).sum(0)
+    candidates = constant & (counts >= FEW)
+    varying = ~constant & (counts > 0)
+    left = np.roll(varying, 1)
+    right = np.roll(varying, -1)
+    # np.roll wraps around: a border has no neighbour.
     left[0] = right[-1] = False
-    pair = still & np.roll(still, -1) & left & np.roll(right, -1)
+    pair = candidates & np.roll(candidates, -1) & left & np.roll(right, -1)
     pair[-1] = False
-    return np.asarray((still & left & right) | pair | np.roll(pair, 1))
+    return np.asarray((candidates & left & right) | pair | np.roll(pair, 1))
 
 
 def join_blocks(blocks: Sequence[Blocks]) -> Blocks:
     """Return blocks of the same lines as one."""
-    parts = [[each.second, each.error, each.level, each.constant] for each in blocks]
+    parts = [[block.second, block.error, block.level, block.constant] for block in blocks]
     return Blocks(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 def line_up(blocks: Sequence[Blocks]) -> Blocks:
     """Return blocks of other lines, all of the same count, as one: line behind line."""
-    parts = [[each.second, each.error, each.level, each.constant] for each in blocks]
+    parts = [[block.second, block.error, block.level, block.constant] for block in blocks]
     return Blocks(*(np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True)))
 
 
@@ -224,32 +225,30 @@ def judge_lines(blocks: Blocks, least: float) -> Stripes:
         blocks: of all lines.
         least: the gain that matters, over the level.
     """
-    measured = np.isfinite(blocks.second) & np.isfinite(blocks.level)
-    dead = np.flatnonzero(_always(blocks.constant, measured | blocks.constant))
-    seen_at_all = measured.any(1)
-    if not seen_at_all.any():
+    measurable = np.isfinite(blocks.second) & np.isfinite(blocks.level)
+    # A dead line is constant in all blocks where anything is known of it.
+    unknown = ~(measurable | blocks.constant)
+    dead = np.flatnonzero((blocks.constant | unknown).all(0) & blocks.constant.any(0))
+    usable = measurable.any(1)
+    if not usable.any():
         return Stripes(dead=tuple(dead.tolist()))
-    level = blocks.level[seen_at_all]
-    gains = blocks.second[seen_at_all] / level
-    errors = blocks.error[seen_at_all] / level
+    level = blocks.level[usable]
+    gains = blocks.second[usable] / level
+    errors = blocks.error[usable] / level
+    # Blocks without scatter have the error 0, by which weights would be divided.
     errors = np.maximum(errors, 1e-6)
     gains = _without_parity(gains)
     mean, error = _combined(gains, errors)
-    spread, spread_error, seen = _spread(gains, errors)
+    spread, spread_error, significant = _spread(gains, errors)
     off = _single(mean, error, gains, errors, least)
     return Stripes(
         spread=spread,
         spread_error=spread_error,
-        seen=seen and spread is not None and spread - spread_error > least,
+        seen=significant and spread is not None and spread - spread_error > least,
         off=tuple(line for line in off if line.index not in set(dead.tolist())),
         dead=tuple(dead.tolist()),
         grows_with_level=_grows(gains, errors, level),
     )
-
-
-def _always(flags: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return which lines are flagged in all blocks where anything is known of them."""
-    return np.asarray((flags | ~known).all(0) & flags.any(0))
 
 
 def _without_parity(gains: np.ndarray) -> np.ndarray:
@@ -257,9 +256,8 @@ def _without_parity(gains: np.ndarray) -> np.ndarray:
     sign = 1 - 2.0 * (np.arange(gains.shape[1]) % 2)
     size = min(PARITY_LINES, gains.shape[1])
     bound = 3 * np.nanmedian(np.abs(gains), axis=1, keepdims=True)
-    shared = uniform_filter1d(
-        np.clip(np.nan_to_num(gains) * sign, -bound, bound), size, axis=1, mode="nearest"
-    )
+    alternating = np.clip(np.nan_to_num(gains) * sign, -bound, bound)
+    shared = uniform_filter1d(alternating, size, axis=1, mode="nearest")
     return np.asarray(gains - shared * sign)
 
 
@@ -273,6 +271,8 @@ def _combined(gains: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.nda
         mean = np.nansum(weights * gains, axis=0) / total
         free = np.maximum((weights > 0).sum(0) - 1, 1)
         scatter = np.nansum(weights * np.square(gains - mean), axis=0) / free
+        # Blocks that contradict each other widen the error. Those that agree by chance do not
+        # narrow it.
         return mean, np.sqrt(np.maximum(scatter, 1) / total)
 
 
@@ -293,24 +293,25 @@ def _spread(gains: np.ndarray, errors: np.ndarray) -> tuple[float | None, float,
         return None, 0.0, False
     covariance, error = _covariance(first[both], other[both])
     spread = float(np.sqrt(max(covariance, 0) / SECOND))
-    if error == 0:  # constant lines
+    # Constant lines have no error.
+    if error == 0:
         return spread, 0.0, False
     pairs = both[:-1] & both[1:]
     crossed = ((first[:-1], other[1:]), (other[:-1], first[1:]))
     next_one = np.mean([_covariance(left[pairs], right[pairs])[0] for left, right in crossed])
     spread_error = float(error / (2 * SECOND * max(spread, np.sqrt(error / SECOND))))
-    seen = covariance > SPREAD_SIGNIFICANT * error and next_one < WHITE * covariance
-    return spread, spread_error, bool(seen)
+    significant = covariance > SPREAD_SIGNIFICANT * error and next_one < WHITE * covariance
+    return spread, spread_error, bool(significant)
 
 
 def _covariance(first: np.ndarray, other: np.ndarray) -> tuple[float, float]:
     """Return a robust covariance (Gnanadesikan and Kettenring 1972) and its standard error."""
-    together, apart = (
-        np.square(MAD * np.median(np.abs(each))) for each in (first + other, first - other)
+    of_sum, of_difference = (
+        np.square(MAD * np.median(np.abs(values))) for values in (first + other, first - other)
     )
     # Second differences of neighbouring lines are no independent numbers: half as many count.
-    error = MAD_ERROR * np.hypot(together, apart) / 4 / np.sqrt(max(len(first) / 2, 1))
-    return float(together - apart) / 4, float(error)
+    error = MAD_ERROR * np.hypot(of_sum, of_difference) / 4 / np.sqrt(max(len(first) / 2, 1))
+    return float(of_sum - of_difference) / 4, float(error)
 
 
 def _single(
@@ -318,26 +319,25 @@ def _single(
 ) -> list[Line]:
     """Return the lines that are off alone, the largest deviation first."""
     with np.errstate(invalid="ignore"):
-        known = np.isfinite(gains).sum(0)
+        counts = np.isfinite(gains).sum(0)
         like = np.abs(gains - mean) < np.maximum(3 * errors, np.abs(mean) / 2)
-        agree = (like & (np.sign(gains) == np.sign(mean))).sum(0) >= AGREE * np.maximum(known, 2)
+        agree = (like & (np.sign(gains) == np.sign(mean))).sum(0) >= AGREE * np.maximum(counts, 2)
         off = (
             (np.abs(mean) > np.maximum(least, SIGNIFICANT * error))
             & agree
             & _alone(mean, error, -1.0)
         )
+    # A line that is off in some blocks only is described by its largest deviation.
     farthest = np.argmax(np.abs(np.nan_to_num(gains)), axis=0)
     largest = np.where(off, mean, np.take_along_axis(gains, farthest[None], axis=0)[0])
-    taken = set[int]()
+    numbers = set[int]()
     lines = []
     for index in sorted(
         np.flatnonzero(off | _partly(gains, errors)), key=lambda index: -abs(largest[index])
     ):
-        if not taken & {
-            index - 1,
-            index + 1,
-        }:  # neighbours are off by half of it, to the other side
-            taken.add(int(index))
+        # The neighbours of a line that is off are off by half of it, to the other side.
+        if not numbers & {index - 1, index + 1}:
+            numbers.add(int(index))
             lines.append(Line(int(index), float(largest[index]), float(error[index])))
     return lines
 
@@ -349,13 +349,16 @@ def _partly(gains: np.ndarray, errors: np.ndarray) -> np.ndarray:
     """
     with np.errstate(invalid="ignore"):
         clear = np.abs(gains) > np.maximum(CLEAR * errors, PART)
-    sure = clear & np.array(
-        [_alone(each, its, SURE) for each, its in zip(gains, errors, strict=True)]
+    isolated = clear & np.array(
+        [
+            _alone(block_gains, block_errors, SURE)
+            for block_gains, block_errors in zip(gains, errors, strict=True)
+        ]
     )
-    return np.asarray((sure.sum(0) >= 2) & (4 * sure.sum(0) >= 3 * clear.sum(0)))
+    return np.asarray((isolated.sum(0) >= 2) & (4 * isolated.sum(0) >= 3 * clear.sum(0)))
 
 
-def _alone(second: np.ndarray, error: np.ndarray, sure: float) -> np.ndarray:
+def _alone(second: np.ndarray, error: np.ndarray, margin: float) -> np.ndarray:
     """Return which lines are alone with their deviation, by so many standard errors more than
     `ISOLATED`.
 
@@ -376,12 +379,12 @@ def _alone(second: np.ndarray, error: np.ndarray, sure: float) -> np.ndarray:
     far = beside[1] + beside[4]
     with np.errstate(invalid="ignore", divide="ignore"):
         isolation = (far - near) / second
-        unsure = 2 * error / np.abs(second)
+        isolation_error = 2 * error / np.abs(second)
         slack = np.maximum(ASKEW * np.abs(second), 3 * error)
         like = np.all(np.abs(beside - expected[:, None] * second) < slack, axis=0)
         largest = np.all(np.abs(second) > np.abs(beside), axis=0)
-        needed = np.maximum(ISOLATED + sure * unsure, LEAST_ISOLATED)
-        return np.asarray(like & largest & (isolation > needed))
+        least = np.maximum(ISOLATED + margin * isolation_error, LEAST_ISOLATED)
+        return np.asarray(like & largest & (isolation > least))
 
 
 def _grows(gains: np.ndarray, errors: np.ndarray, level: np.ndarray) -> bool | None:
@@ -391,22 +394,23 @@ def _grows(gains: np.ndarray, errors: np.ndarray, level: np.ndarray) -> bool | N
     The pattern of the other blocks is fitted to each block. Over the level, gains fit all blocks
     alike, and offsets fall as 1 / level: the slope of the logarithms is 0 or -1.
     """
-    fits, unsure = (
-        np.array(each)
-        for each in zip(*map(partial(_fit, gains, errors), range(len(gains))), strict=True)
+    fits, fit_errors = (
+        np.array(numbers)
+        for numbers in zip(*map(partial(_fit, gains, errors), range(len(gains))), strict=True)
     )
     levels = np.nanmean(level, axis=1)
-    use = (fits > 0) & np.isfinite(unsure)
+    use = (fits > 0) & np.isfinite(fit_errors)
     if use.sum() < 3 or np.ptp(np.log(levels[use])) < np.log(LEVELS):
         return None
     x = np.log(levels[use])
     y = np.log(fits[use])
-    weights = np.square(fits[use] / unsure[use])
-    x, y = (each - np.average(each, weights=weights) for each in (x, y))
+    weights = np.square(fits[use] / fit_errors[use])
+    x, y = (axis - np.average(axis, weights=weights) for axis in (x, y))
     power = float((weights * x * x).sum())
     slope = float((weights * x * y).sum()) / power
-    rest = float((weights * np.square(y - slope * x)).sum()) / (len(x) - 2)
-    error = float(np.sqrt(max(rest, 1) / power))
+    residual = float((weights * np.square(y - slope * x)).sum()) / (len(x) - 2)
+    error = float(np.sqrt(max(residual, 1) / power))
+    # The slope is 0 for gains and -1 for offsets: the middle between them decides.
     return None if abs(slope + 1 / 2) < 3 * error else slope > -1 / 2
 
 
@@ -420,6 +424,5 @@ def _fit(gains: np.ndarray, errors: np.ndarray, number: int) -> tuple[float, flo
     if power == 0:
         return 0.0, np.inf
     noise = float(np.sqrt(np.square(pattern * np.nan_to_num(errors[number])).sum()))
-    return float(
-        (pattern * np.nan_to_num(gains[number])).sum()
-    ) / power, noise / power if noise else np.inf
+    factor = float((pattern * np.nan_to_num(gains[number])).sum()) / power
+    return factor, noise / power if noise else np.inf

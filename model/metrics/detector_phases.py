@@ -62,21 +62,21 @@ def measure_phases(pixels: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, n
     if min(pixels.shape) < 8 * EDGE_PX:
         return nothing
     smooth = convolve1d(convolve1d(pixels, SMOOTH, axis=0), SMOOTH, axis=1)
-    inner = (slice(EDGE_PX, -EDGE_PX),) * 2
-    rest = (pixels - smooth)[inner]
+    inside_border = (slice(EDGE_PX, -EDGE_PX),) * 2
+    residuals = (pixels - smooth)[inside_border]
     # The filter spreads what is no measurement over its reach.
-    known = np.ones(rest.shape, bool)
+    mask = np.ones(residuals.shape, bool)
     if not valid.all():
-        known = ~maximum_filter(~valid, 2 * EDGE_PX + 1)[inner]
-    if known.mean() < 1 / 4:
+        mask = ~maximum_filter(~valid, 2 * EDGE_PX + 1)[inside_border]
+    if mask.mean() < 1 / 4:
         return nothing
-    level = float(np.mean(smooth[inner][known], dtype=np.float64))
+    level = float(np.mean(smooth[inside_border][mask], dtype=np.float64))
     if level <= 0:
         return nothing
-    reach = CLIP * float(np.mean(np.abs(rest[known])))
-    clipped = np.where(known, np.clip(rest, -reach, reach), 0)
-    inside = max(int((known & (np.abs(rest) <= reach)).sum()), 1)
-    down, across = (1 - 2.0 * (np.arange(side) % 2) for side in rest.shape)
+    reach = CLIP * float(np.mean(np.abs(residuals[mask])))
+    clipped = np.where(mask, np.clip(residuals, -reach, reach), 0)
+    inside = max(int((mask & (np.abs(residuals) <= reach)).sum()), 1)
+    down, across = (1 - 2.0 * (np.arange(side) % 2) for side in residuals.shape)
     signs = ((np.ones_like(down), across), (down, np.ones_like(across)), (down, across))
     sums = np.array([float(rows @ clipped @ columns) for rows, columns in signs])
     error = TEXTURE * float(np.sqrt(np.square(clipped).sum(dtype=np.float64))) / inside
@@ -95,17 +95,19 @@ def judge_phases(
     """
     if not measured:
         return ()
-    differences, errors = (np.array(each) for each in zip(*measured, strict=True))
-    found = []
+    differences, errors = (np.array(values) for values in zip(*measured, strict=True))
+    patterns = []
     for number, name in enumerate(PATTERNS):
-        known = np.isfinite(differences[:, number])
-        if not known.any():
+        mask = np.isfinite(differences[:, number])
+        if not mask.any():
             continue
-        difference = differences[known, number]
-        error = errors[known, number]
+        difference = differences[mask, number]
+        error = errors[mask, number]
+        # The squares hold the noise as well. Its variance is taken off, without the factor for
+        # texture.
         power = float(np.mean(np.square(difference) - np.square(error / TEXTURE)))
         strong = np.abs(difference) > SIGNIFICANT * error
         rms = float(np.sqrt(max(power, 0)))
         largest = float(np.max(np.abs(difference[strong]), initial=0))
-        found.append(Pattern(name, rms, largest, bool(rms > least and strong.mean() >= MANY)))
-    return tuple(found)
+        patterns.append(Pattern(name, rms, largest, bool(rms > least and strong.mean() >= MANY)))
+    return tuple(patterns)

@@ -56,9 +56,9 @@ def wrong_pixels(pixels: np.ndarray, step: float = 0.0) -> np.ndarray:
     places = _candidates(pixels)
     windows = np.lib.stride_tricks.sliding_window_view(pixels, (size, size))
     patches = windows[places[:, 0] - PATCH_PX, places[:, 1] - PATCH_PX].astype(np.float64)
-    known = np.isfinite(patches).sum((1, 2)) > KNOWN
-    places = places[known]
-    patches = patches[known]
+    sufficient = np.isfinite(patches).sum((1, 2)) > KNOWN
+    places = places[sufficient]
+    patches = patches[sufficient]
     return np.asarray(places[_wrong(patches, step)]) if len(places) else places
 
 
@@ -67,16 +67,16 @@ def _candidates(pixels: np.ndarray) -> np.ndarray:
     neighbours.
     """
     height, width = pixels.shape
-    inner = pixels[PATCH_PX : height - PATCH_PX, PATCH_PX : width - PATCH_PX]
+    centres = pixels[PATCH_PX : height - PATCH_PX, PATCH_PX : width - PATCH_PX]
     above = below = None
     for down, across in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
         rows = slice(PATCH_PX + down, height - PATCH_PX + down)
-        each = pixels[rows, PATCH_PX + across : width - PATCH_PX + across]
-        above = each if above is None else np.maximum(above, each)
-        below = each if below is None else np.minimum(below, each)
-    step = np.abs(np.diff(inner, axis=1))
+        neighbours = pixels[rows, PATCH_PX + across : width - PATCH_PX + across]
+        above = neighbours if above is None else np.maximum(above, neighbours)
+        below = neighbours if below is None else np.minimum(below, neighbours)
+    step = np.abs(np.diff(centres, axis=1))
     least = CANDIDATE * float(np.nanmean(step)) if np.isfinite(step).any() else 0.0
-    out = np.maximum(inner - above, below - inner)
+    out = np.maximum(centres - above, below - centres)
     return np.asarray(np.argwhere((out > 0) & (out >= least)) + PATCH_PX)
 
 
@@ -98,9 +98,11 @@ def _wrong(patches: np.ndarray, step: float) -> np.ndarray:
     ground = np.nanmedian(patches[:, 2:7, 2:7].reshape(len(patches), 25), axis=1)
     # Rounding hides the noise of a quiet image, and an end of the range cuts it off: neither may
     # pass for no noise.
-    cut = (patches == ground[:, None, None]).mean((1, 2)) > CUT
+    is_cut_off = (patches == ground[:, None, None]).mean((1, 2)) > CUT
     floor = np.where(
-        cut, CUT_NOISE * np.abs(ground) + CUT_STEPS * step, np.maximum(step, QUIET * np.abs(ground))
+        is_cut_off,
+        CUT_NOISE * np.abs(ground) + CUT_STEPS * step,
+        np.maximum(step, QUIET * np.abs(ground)),
     )
     scatter = np.maximum(scatter, floor)
     middle = patches[:, 3:6, 3:6].reshape(len(patches), 9)
@@ -110,11 +112,11 @@ def _wrong(patches: np.ndarray, step: float) -> np.ndarray:
     outward = np.where(middle[:, 4] > np.nanmax(around, axis=1), centre, -centre)
     with np.errstate(invalid="ignore", divide="ignore"):
         isolation = 2 * (far - near) / centre
-        unsure = 1.5 * scatter / np.abs(centre)
-        alone = (outward > LEAST * scatter) & (isolation - SURE * unsure > ISOLATED)
+        isolation_error = 1.5 * scatter / np.abs(centre)
+        isolated = (outward > LEAST * scatter) & (isolation - SURE * isolation_error > ISOLATED)
     dead = (
         (middle[:, 4] < DEAD * ground)
         & (around.min(1) > BRIGHT * ground)
         & (ground > DARK * scatter)
     )
-    return np.asarray(np.isfinite(isolation) & (alone | dead))
+    return np.asarray(np.isfinite(isolation) & (isolated | dead))

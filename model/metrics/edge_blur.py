@@ -109,34 +109,34 @@ def plain_squares(
 def _squares(image: np.ndarray, noise: Noise, effort: Effort) -> np.ndarray:
     """Squares (N, S, S) around the steepest places, no centre in another's middle."""
     rows, columns = _steepest(_steepness(image, noise, effort.step_px), effort)
-    taken = np.zeros(image.shape, bool)
-    chosen = list[int]()
+    occupied = np.zeros(image.shape, bool)
+    numbers = list[int]()
     for k, (row, column) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
-        if not taken[row, column]:
-            taken[row - HALF_PX : row + HALF_PX + 1, column - 3 : column + 4] = True
-            chosen.append(k)
-            if len(chosen) == effort.candidates:
+        if not occupied[row, column]:
+            occupied[row - HALF_PX : row + HALF_PX + 1, column - 3 : column + 4] = True
+            numbers.append(k)
+            if len(numbers) == effort.candidates:
                 break
     reach = np.arange(-HALF_PX, HALF_PX + 1)
-    rows, columns = (places[chosen][:, None, None] for places in (rows, columns))
+    rows, columns = (places[numbers][:, None, None] for places in (rows, columns))
     return np.asarray(image[rows + reach[:, None], columns + reach])
 
 
-def _steepest(steep: np.ndarray, effort: Effort) -> tuple[np.ndarray, np.ndarray]:
+def _steepest(steepness: np.ndarray, effort: Effort) -> tuple[np.ndarray, np.ndarray]:
     """Return rows and columns of the steepest place of each cell that is steep, the steepest of all
     first.
     """
-    height, width = steep.shape
+    height, width = steepness.shape
     down = effort.cell_px[0] // effort.step_px
     across = effort.cell_px[1]
-    padded = np.pad(steep, ((0, -height % down), (0, -width % across)))
+    padded = np.pad(steepness, ((0, -height % down), (0, -width % across)))
     blocks = padded.reshape(padded.shape[0] // down, down, -1, across).swapaxes(1, 2)
     cells = blocks.reshape(*blocks.shape[:2], -1)
-    inner = cells.argmax(2)
-    best = np.take_along_axis(cells, inner[:, :, None], 2)[:, :, 0]
+    place_in_cell = cells.argmax(2)
+    best = np.take_along_axis(cells, place_in_cell[:, :, None], 2)[:, :, 0]
     order = np.argsort(best, axis=None, kind="stable")[::-1][: int((best > MIN_STEEPNESS).sum())]
     cell_row, cell_column = np.divmod(order, best.shape[1])
-    inner_row, inner_column = np.divmod(inner.ravel()[order], across)
+    inner_row, inner_column = np.divmod(place_in_cell.ravel()[order], across)
     rows = cell_row * down + inner_row
     columns = cell_column * across + inner_column
     return MARGIN_PX + rows * effort.step_px, MARGIN_PX + columns
@@ -156,14 +156,14 @@ def _steepness(image: np.ndarray, noise: Noise, step_px: int) -> np.ndarray:
     def column(rows: np.ndarray, k: int) -> np.ndarray:
         return rows[:, MARGIN_PX + k : width - MARGIN_PX + k]
 
-    near = range(-2, 3)
-    lengthwise = np.asarray(sum(row(k) for k in near))
+    offsets = range(-2, 3)
+    lengthwise = np.asarray(sum(row(k) for k in offsets))
     step_down = row(2) - row(-2)
     across = np.abs(column(lengthwise, 2) - column(lengthwise, -2)) / 5
-    down = np.abs(sum(column(step_down, k) for k in near)) / 5
-    return np.asarray(
-        np.where(down > across, 0, across / np.sqrt(2 / 5 * noise(column(row(0), 0))))
-    )
+    down = np.abs(sum(column(step_down, k) for k in offsets)) / 5
+    # A mean of 5 rows less another one has 2 / 5 of a pixel's variance.
+    deviation = np.sqrt(2 / 5 * noise(column(row(0), 0)))
+    return np.asarray(np.where(down > across, 0, across / deviation))
 
 
 def _flat(squares: np.ndarray, noise: Noise, roughness: float) -> np.ndarray:
@@ -225,16 +225,19 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
 
     The shape of the curve is left open: each one counts by what it leaves unexplained of the edges.
     """
-    from scipy.special import stdtrit  # here: who tells no sensor need not wait for SciPy
+    # Imported here: who measures no sensor need not wait for SciPy.
+    from scipy.special import stdtrit
 
-    other = float(np.median([edge.gamma for edge in others])) if others else None
-    known = own[:SHAPED_EDGES]
-    logs, errors, left = (
-        np.array(part) for part in zip(*(_of_shape(own, other, s) for s in SHAPES), strict=True)
+    other_gamma = float(np.median([edge.gamma for edge in others])) if others else None
+    shaped = own[:SHAPED_EDGES]
+    logs, errors, chi2 = (
+        np.array(part)
+        for part in zip(*(_of_shape(own, other_gamma, s) for s in SHAPES), strict=True)
     )
-    scatter = np.maximum(left.min(0) / [edge.count for edge in known], 1.0)
+    # The best shape leaves the noise at least: less is chance.
+    scatter = np.maximum(chi2.min(0) / [edge.count for edge in shaped], 1.0)
     # The median and not the sum: an edge that another crosses nearby has a shape of its own.
-    weights = -len(known) / 2 * np.median((left - left[0]) / scatter, axis=1)
+    weights = -len(shaped) / 2 * np.median((chi2 - chi2[0]) / scatter, axis=1)
     # Before any edge is seen, half of the belief is in the profile's curve: of few edges nothing
     # else can be said.
     belief = np.gradient(SHAPES)
@@ -253,7 +256,7 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
 
 
 def _of_shape(
-    own: Sequence[EdgeBlur], other: float | None, shape: float
+    edges: Sequence[EdgeBlur], other_gamma: float | None, shape: float
 ) -> tuple[float, float, np.ndarray]:
     """Logarithm of the MTF at Nyquist over a perfect lens', its standard error, and what each edge
     leaves over.
@@ -261,17 +264,17 @@ def _of_shape(
     gamma^2 of a leaning edge is (gamma_x cos)^2 + (gamma_y sin)^2: the other axis has a part in it.
     An edge that the shape cannot be fitted to leaves more than any other.
     """
-    fits = _reshaped(own[:SHAPED_EDGES], shape) if shape else list(own)
-    known = [fit for fit in fits if isinstance(fit, EdgeBlur)] or list(own)
+    fits = _reshaped(edges[:SHAPED_EDGES], shape) if shape else list(edges)
+    blurs = [fit for fit in fits if isinstance(fit, EdgeBlur)] or list(edges)
     gammas, errors = (
-        np.array([getattr(edge, name) for edge in known]) for name in ("gamma", "error")
+        np.array([getattr(edge, name) for edge in blurs]) for name in ("gamma", "error")
     )
-    if other is not None and not shape:
-        lean = np.array([edge.slope for edge in known]) ** 2
-        gammas = np.sqrt(np.maximum(gammas**2 * (1 + lean) - lean * other**2, 1e-4))
+    if other_gamma is not None and not shape:
+        lean = np.array([edge.slope for edge in blurs]) ** 2
+        gammas = np.sqrt(np.maximum(gammas**2 * (1 + lean) - lean * other_gamma**2, 1e-4))
     gamma, error = _centre(gammas, errors)
-    left = [fit.chi2 if isinstance(fit, EdgeBlur) else WORST for fit in fits[:SHAPED_EDGES]]
-    return -gamma / 2 - shape / 4, error / 2, np.array(left)
+    chi2 = [fit.chi2 if isinstance(fit, EdgeBlur) else WORST for fit in fits[:SHAPED_EDGES]]
+    return -gamma / 2 - shape / 4, error / 2, np.array(chi2)
 
 
 def _reshaped(edges: Sequence[EdgeBlur], shape: float) -> list[Fit]:
@@ -291,9 +294,9 @@ def _centre(values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
         return float(values[0]), math.hypot(float(errors[0]), LONE_ERROR)
     off = np.abs(values - np.median(values))
     scatter = ROBUST * float(np.median(off))
-    kept = off <= 3 * np.maximum(scatter, errors)
-    v = values[kept]
-    e = errors[kept]
+    inliers = off <= 3 * np.maximum(scatter, errors)
+    v = values[inliers]
+    e = errors[inliers]
     between = max(float(v.var(ddof=1)) - float((e**2).mean()), 0.0) if v.size > 1 else LONE_ERROR**2
     weights = 1 / (e**2 + between)
     return float((weights * v).sum() / weights.sum()), float(weights.sum() ** -0.5)

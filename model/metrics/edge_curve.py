@@ -151,11 +151,11 @@ def find_edges(image: np.ndarray, noise: Noise, clipped_at: float, label: str) -
         return []
     scaled = squares / np.sqrt(noise(squares).mean((1, 2)))[:, None, None]
     fits = zip(squares, fit_shape(scaled, SEARCHED), strict=True)
-    found = [(fit, square) for square, fit in fits if isinstance(fit, EdgeBlur)]
-    found.sort(key=lambda pair: pair[0].chi2 / pair[0].count / float(np.ptp(pair[1])) ** 2)
+    blurs = [(fit, square) for square, fit in fits if isinstance(fit, EdgeBlur)]
+    blurs.sort(key=lambda pair: pair[0].chi2 / pair[0].count / float(np.ptp(pair[1])) ** 2)
     return [
         (EdgePixels(square, noise(square), label), EdgeLine(fit.place, fit.slope))
-        for fit, square in found[:MOST_EDGES]
+        for fit, square in blurs[:MOST_EDGES]
     ]
 
 
@@ -251,14 +251,15 @@ def search_curve(edges: Sequence[Edge], generator: np.random.Generator) -> MtfCu
         edges: pixels, and where the edge runs roughly.
         generator: for the draws of the interval.
     """
-    some = edges[:: max(len(edges) // MOST_FITTED, 1)]
-    fitted = sorted(_first_fits(some), key=lambda edge: edge.unevenness)
+    sample = edges[:: max(len(edges) // MOST_FITTED, 1)]
+    fitted = sorted(_first_fits(sample), key=lambda edge: edge.unevenness)
     result: MtfCurve | Refusal = Refusal("no straight edge")
     for unevenness, least, floor in TIERS:
         tier = [edge for edge in fitted if edge.unevenness <= unevenness][:MOST_EDGES]
-        found = _curve_of_sharpest(tier, least, floor, generator)
-        if isinstance(result, Refusal) or isinstance(found, MtfCurve):
-            result = found
+        curve = _curve_of_sharpest(tier, least, floor, generator)
+        # A refusal of a later tier replaces no curve of an earlier one.
+        if isinstance(result, Refusal) or isinstance(curve, MtfCurve):
+            result = curve
         if isinstance(result, MtfCurve) and not result.missing_edges:
             break
     return result
@@ -268,44 +269,41 @@ def _curve_of_sharpest(
     fitted: list[FittedEdge], least: int, floor: float, generator: np.random.Generator
 ) -> MtfCurve | Refusal:
     """Return the curve of the edges that are as sharp as the sharpest, but for chance."""
-    kept = fitted
+    sharp = fitted
     weights = START
     step = 0.0
     for _ in range(ROUNDS):
-        if len(kept) < least:
+        if len(sharp) < least:
             break
-        weights = _solved(kept, weights)
+        weights = _solved(sharp, weights)
         fitted = _fitted_again(fitted, weights)
         values, errors = _softness(fitted, weights)
-        sure = errors <= MAX_ERROR_PX
+        precise = errors <= MAX_ERROR_PX
+        # Texture scatters the softness by more than the noise that its own error counts.
         errors = np.hypot(errors, [UNEVEN_PX * edge.unevenness for edge in fitted])
-        step = sharpest(values[sure], errors[sure]) if sure.any() else 0.0
-        alike = sure & (np.abs(values - step) <= KEPT_DEVIATIONS * np.hypot(errors, SCATTER_PX))
-        kept = [edge for edge, each in zip(fitted, alike, strict=True) if each]
-    if len(kept) < least:
-        count = f"{len(kept)} straight edge{'' if len(kept) == 1 else 's'}"
+        step = sharpest(values[precise], errors[precise]) if precise.any() else 0.0
+        alike = precise & (np.abs(values - step) <= KEPT_DEVIATIONS * np.hypot(errors, SCATTER_PX))
+        sharp = [edge for edge, is_sharp in zip(fitted, alike, strict=True) if is_sharp]
+    if len(sharp) < least:
+        count = f"{len(sharp)} straight edge{'' if len(sharp) == 1 else 's'}"
         return Refusal(f"{count} of one sharpness, {least} are needed")
-    steps = _drawn_steps(values[sure], errors[sure], generator)
-    draws = [softened(*pair) for pair in zip(_drawn(kept, weights, generator), steps, strict=True)]
-    curve = _with_interval(softened(weights, step), draws, kept, (), floor)
+    values = values[precise]
+    errors = errors[precise]
+    picks = (generator.integers(values.size, size=values.size) for _ in range(DRAWS))
+    steps = [sharpest(values[pick], errors[pick]) for pick in picks]
+    draws = [softened(*pair) for pair in zip(_drawn(sharp, weights, generator), steps, strict=True)]
+    curve = _with_interval(softened(weights, step), draws, sharp, (), floor)
+    # The sharpest edges of a scene may themselves be softer than a step, or look sharper.
     unknown = np.exp(NATURAL_PX * FREQUENCIES)
     return replace(
         curve, low=curve.low / unknown, high=np.minimum(curve.high * unknown, np.sinc(FREQUENCIES))
     )
 
 
-def _drawn_steps(
-    values: np.ndarray, errors: np.ndarray, generator: np.random.Generator
-) -> list[float]:
-    """Return the softness of the steps in each draw of edges."""
-    draws = (generator.integers(values.size, size=values.size) for _ in range(DRAWS))
-    return [sharpest(values[chosen], errors[chosen]) for chosen in draws]
-
-
 def _first_fits(edges: Sequence[Edge]) -> list[FittedEdge]:
     """Return those of the edges that keep to their pixels, fitted to the curve to begin with."""
-    first = (fit_edge(pixels, line, START, FIRST_PASSES) for pixels, line in edges)
-    return [edge for edge in first if edge is not None]
+    fits = (fit_edge(pixels, line, START, FIRST_PASSES) for pixels, line in edges)
+    return [edge for edge in fits if edge is not None]
 
 
 def _fitted_again(edges: Sequence[FittedEdge], weights: np.ndarray) -> list[FittedEdge]:
@@ -348,6 +346,7 @@ def sharpest(values: np.ndarray, errors: np.ndarray) -> float:
         soft = SOFT_PX * math.exp(log_soft)
         sigma = np.hypot(errors, scatter)
         off = values - step
+        # The logarithm of an exponential distribution convolved with a normal one.
         density = (
             sigma**2 / (2 * soft**2)
             - off / soft
@@ -368,15 +367,15 @@ def _drawn(
 ) -> list[np.ndarray]:
     """Return the curve of each draw of edges, strips and expected bends."""
     count = len(edges)
-    whole = [normal_equations(edge, weights) for edge in edges]
+    equations = [normal_equations(edge, weights) for edge in edges]
     draws = []
     for _ in range(DRAWS):
         if count <= FEW_EDGES:
-            drawn = [_drawn_along(edge, weights, generator) for edge in edges]
+            sample = [_drawn_along(edge, weights, generator) for edge in edges]
         else:
-            drawn = [whole[number] for number in generator.integers(count, size=count)]
-        gram = np.sum([each[0] for each in drawn], axis=0)
-        moment = np.sum([each[1] for each in drawn], axis=0)
+            sample = [equations[number] for number in generator.integers(count, size=count)]
+        gram = np.sum([pair[0] for pair in sample], axis=0)
+        moment = np.sum([pair[1] for pair in sample], axis=0)
         # Where pixels say little, the expected smoothness decides. It is drawn too, and is the
         # loosest one, so that the interval holds what a smooth curve hides.
         draws.append(solve(gram, moment, weights, BENDS[-1], generator.standard_normal(PARTS - 3)))
@@ -391,6 +390,7 @@ def _drawn_along(
     """
     if edge.unevenness <= EVEN:
         gram, moment = normal_equations(edge, weights)
+        # Noise of 1 in the pixels gives the moments the covariance `gram`.
         sizes, axes = np.linalg.eigh(gram)
         noise = axes @ (np.sqrt(np.maximum(sizes, 0.0)) * generator.standard_normal(PARTS))
         return gram, moment + noise
@@ -406,8 +406,8 @@ def _contradicting(
     centre = float(np.median(values))
     off = np.abs(values - centre)
     typical = np.hypot(errors, MAD * float(np.median(off)) if len(edges) > 3 else 0.0)
-    odd = (off > CONTRADICTION_DEVIATIONS * typical) & (off > CONTRADICTION_PX)
-    return tuple(edge.pixels.label for edge, each in zip(edges, odd, strict=True) if each)
+    contradicts = (off > CONTRADICTION_DEVIATIONS * typical) & (off > CONTRADICTION_PX)
+    return tuple(edge.pixels.label for edge, flag in zip(edges, contradicts, strict=True) if flag)
 
 
 def _with_interval(
@@ -422,18 +422,19 @@ def _with_interval(
 
     detector = np.sinc(FREQUENCIES)
     contrast = np.clip(mtf_at(FREQUENCIES, weights), LEAST_CONTRAST, detector)
-    drawn = np.maximum([mtf_at(FREQUENCIES, draw) for draw in draws], LEAST_CONTRAST)
+    curves = np.maximum([mtf_at(FREQUENCIES, draw) for draw in draws], LEAST_CONTRAST)
     looks = len(edges)
     if looks <= FEW_EDGES:
         looks = sum(
             len(edge.weights) if edge.unevenness <= EVEN else strips_of(edge) for edge in edges
         )
+    # Few looks ask for Student's quantile, and a bootstrap's variance is too small by (n - 1) / n.
     wider = (
         float(stdtrit(looks - 1, HIGH_PERCENT / 100))
         / NORMAL_QUANTILE
         * math.sqrt(looks / (looks - 1))
     )
-    lowest, highest = np.percentile(drawn, [LOW_PERCENT, HIGH_PERCENT], axis=0)
+    lowest, highest = np.percentile(curves, [LOW_PERCENT, HIGH_PERCENT], axis=0)
     unknown = NORMAL_QUANTILE * floor * contrast
     low = np.maximum(
         contrast - np.hypot(wider * np.maximum(contrast - lowest, 0.0), unknown), LEAST_CONTRAST
@@ -456,6 +457,7 @@ def _missing(contrast: np.ndarray, low: np.ndarray, high: np.ndarray, edges: int
     if low[place] < LEAST_AT_NYQUIST:
         return MOST_MISSING
     factor = max(high[place] / contrast[place], contrast[place] / low[place])
+    # The interval narrows with the root of the number of edges.
     excess = (math.log(factor) / math.log(WIDEST)) ** 2
     return min(max(math.ceil(edges * (excess - 1)), 0), MOST_MISSING)
 
@@ -468,8 +470,9 @@ def apart(own: MtfCurve, other: MtfCurve) -> MtfCurve:
     """
     detector = np.sinc(FREQUENCIES)
     own_loss, other_loss = (np.log(detector / curve.contrast) ** 2 for curve in (own, other))
-    mixed = np.array([[1 - own.lean, own.lean], [other.lean, 1 - other.lean]])
-    loss = np.sqrt(np.maximum(np.linalg.solve(mixed, np.stack([own_loss, other_loss]))[0], 0.0))
+    # Squared losses add up, weighted by the squared cosine and sine of the edge's angle.
+    mixture = np.array([[1 - own.lean, own.lean], [other.lean, 1 - other.lean]])
+    loss = np.sqrt(np.maximum(np.linalg.solve(mixture, np.stack([own_loss, other_loss]))[0], 0.0))
     contrast = np.minimum.accumulate(np.maximum(detector * np.exp(-loss), LEAST_CONTRAST))
     ratio = contrast / own.contrast
     return replace(

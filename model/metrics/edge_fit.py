@@ -108,6 +108,7 @@ def _responses(shape: float) -> np.ndarray:
     waves = np.exp(-np.outer(GAMMAS, f) - shape * f**2) * np.sinc(f) / (math.pi * f * PERIOD_PX)
     places = np.arange(REACH_PX * PER_PX + 1)
     sums = np.fft.ifft(waves, PERIOD_PX * PER_PX, norm="forward")[:, places]
+    # The response is odd around the edge: the left half is the right one, turned around.
     half = (sums * np.exp(1j * math.pi * places / (PERIOD_PX * PER_PX))).imag
     return np.asarray(0.5 + np.concatenate([-half[:, :0:-1], half], axis=1))
 
@@ -123,12 +124,13 @@ def _at_gammas(gammas: np.ndarray, shape: float) -> np.ndarray:
 def _at_distances(lines: np.ndarray, distance: np.ndarray) -> np.ndarray:
     """Return tabulated edges (N, T) at the distances (N, P) from each."""
     count, length = lines.shape
+    # The last sample has no neighbour on its right.
     place = np.clip((distance + REACH_PX) * PER_PX, 0, length - 1.001)
     column = place.astype(int)
     share = place - column
     column += np.arange(count)[:, None] * length
-    flat = lines.ravel()
-    return np.asarray(flat[column] * (1 - share) + flat[column + 1] * share)
+    samples = lines.ravel()
+    return np.asarray(samples[column] * (1 - share) + samples[column + 1] * share)
 
 
 def edge_response(distance: np.ndarray, gamma: float, shape: float = 0.0) -> np.ndarray:
@@ -158,18 +160,20 @@ def fit_blurs(regions: np.ndarray, noise: Noise, limits: Limits) -> list[Fit]:
         The blur by the profile's curve, or, of an edge that no shape of the curve fits, why there
             is none.
     """
+    # Over their noise: residuals are then in its standard deviations.
     pixels = regions / np.sqrt(noise(regions).mean((1, 2)))[:, None, None]
-    found = fit_shape(pixels, limits)
-    refused = [k for k, fit in enumerate(found) if isinstance(fit, Refusal)]
+    results = fit_shape(pixels, limits)
+    refused = [k for k, fit in enumerate(results) if isinstance(fit, Refusal)]
     steeper = set[int]()
     for shape in STEEPER:
-        left = [k for k in refused if k not in steeper]
-        fits = fit_shape(pixels[left], limits, shape)
-        steeper |= {k for k, fit in zip(left, fits, strict=True) if isinstance(fit, EdgeBlur)}
-    known = sorted(steeper)
-    for k, fit in zip(known, fit_shape(pixels[known], ANY), strict=True):
-        found[k] = fit
-    return found
+        remaining = [k for k in refused if k not in steeper]
+        fits = fit_shape(pixels[remaining], limits, shape)
+        steeper |= {k for k, fit in zip(remaining, fits, strict=True) if isinstance(fit, EdgeBlur)}
+    # What a steeper curve fits is an edge. The profile's own curve is fitted to it all the same.
+    steep = sorted(steeper)
+    for k, fit in zip(steep, fit_shape(pixels[steep], ANY), strict=True):
+        results[k] = fit
+    return results
 
 
 class _Lines(NamedTuple):
@@ -181,9 +185,9 @@ class _Lines(NamedTuple):
     slope: np.ndarray
     gamma: np.ndarray
 
-    def only(self, chosen: np.ndarray) -> "_Lines":
-        """Return the lines that `chosen`, bool or indices, picks."""
-        return _Lines(*(column[chosen] for column in self))
+    def only(self, index: np.ndarray) -> "_Lines":
+        """Return the lines that `index`, bool or numbers, picks."""
+        return _Lines(*(column[index] for column in self))
 
 
 class _Solved(NamedTuple):
@@ -215,31 +219,32 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
     across = np.tile(x, height)
     down = np.repeat(y, width)
     start = lines.place
-    seen = pixels.reshape(count, -1)
-    left = np.arange(count)
+    values = pixels.reshape(count, -1)
+    active = np.arange(count)
     for _ in range(PASSES):
-        near = np.abs(across - lines.place[:, None] - lines.slope[:, None] * down) <= HALF_PX
-        sizes = near.sum(1)
+        mask = np.abs(across - lines.place[:, None] - lines.slope[:, None] * down) <= HALF_PX
+        sizes = mask.sum(1)
         for k in np.flatnonzero(sizes < 10 * HALF_PX):
-            fits[left[k]] = Refusal(f"{sizes[k]} pixels near the edge, {10 * HALF_PX} are needed")
+            fits[active[k]] = Refusal(f"{sizes[k]} pixels near the edge, {10 * HALF_PX} are needed")
         enough = sizes >= 10 * HALF_PX
         lines = lines.only(enough)
-        left = left[enough]
-        near = near[enough]
-        solved = _solve(lines, across, down, seen[left], near, shape)
-        moved, lines = _move(lines, solved.change)
-        lost = (np.abs(lines.place - start[left]) > MAX_PLACE_PX) | (
+        active = active[enough]
+        mask = mask[enough]
+        solved = _solve(lines, across, down, values[active], mask, shape)
+        gamma_change, lines = _move(lines, solved.change)
+        astray = (np.abs(lines.place - start[active]) > MAX_PLACE_PX) | (
             np.abs(lines.slope) > MAX_SLOPE
         )
-        done = ~lost & (moved < CONVERGED)
-        for k in np.flatnonzero(done):
-            at = left[k]
+        converged = ~astray & (gamma_change < CONVERGED)
+        # Each edge has its own count of passes: what has converged leaves the batch.
+        for k in np.flatnonzero(converged):
+            at = active[k]
             fits[at] = _judged(
-                lines, solved, int(k), int(near[k].sum()) - 5, pixels[at], limits, bool(shape)
+                lines, solved, int(k), int(mask[k].sum()) - 5, pixels[at], limits, bool(shape)
             )
-        lines = lines.only(~lost & ~done)
-        left = left[~lost & ~done]
-        if not left.size:
+        lines = lines.only(~astray & ~converged)
+        active = active[~astray & ~converged]
+        if not active.size:
             break
     return fits
 
@@ -256,7 +261,7 @@ def centroids(regions: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> _Li
 
 
 def _solve(
-    lines: _Lines, x: np.ndarray, y: np.ndarray, seen: np.ndarray, near: np.ndarray, shape: float
+    lines: _Lines, x: np.ndarray, y: np.ndarray, values: np.ndarray, mask: np.ndarray, shape: float
 ) -> _Solved:
     """Solve for the levels of both sides, then for small changes of all five numbers, of each edge.
 
@@ -264,19 +269,20 @@ def _solve(
         lines: N edges.
         x: (P,) columns of a region's pixels.
         y: (P,) their rows.
-        seen: (N, P) pixels.
-        near: (N, P) which of them count.
+        values: (N, P) pixels.
+        mask: (N, P) which of them count.
         shape: of the curve.
     """
     lean = np.sqrt(1 + lines.slope**2)[:, None]
     distance = (x - lines.place[:, None] - lines.slope[:, None] * y) / lean
     tables = _at_gammas(lines.gamma, shape)
-    plateaus = np.stack([near.astype(np.float64), _at_distances(tables, distance) * near], axis=1)
+    plateaus = np.stack([mask.astype(np.float64), _at_distances(tables, distance) * mask], axis=1)
+    # Where a square holds no step the matrix is singular.
     normal = np.linalg.pinv(plateaus @ plateaus.swapaxes(1, 2), hermitian=True)
-    seen = seen * near
-    levels = (normal @ (plateaus @ seen[:, :, None]))[:, :, 0]
+    values = values * mask
+    levels = (normal @ (plateaus @ values[:, :, None]))[:, :, 0]
     fitted = (levels[:, None] @ plateaus)[:, 0]
-    step = levels[:, 1, None] * near
+    step = levels[:, 1, None] * mask
     rise = _at_distances(tables, distance + 0.1) - _at_distances(tables, distance - 0.1)
     rise *= step / 0.2 / lean
     low = np.maximum(lines.gamma - 0.15, 0.0)
@@ -287,10 +293,10 @@ def _solve(
         axis=1,
     )
     covariance = np.linalg.pinv(terms @ terms.swapaxes(1, 2), hermitian=True)
-    rest = seen - fitted
-    change = (covariance @ (terms @ rest[:, :, None]))[:, 2:, 0]
-    span = np.where(near, fitted, -np.inf).max(1) - np.where(near, fitted, np.inf).min(1)
-    return _Solved(change, covariance[:, 4, 4], span, (rest**2).sum(1))
+    residuals = values - fitted
+    change = (covariance @ (terms @ residuals[:, :, None]))[:, 2:, 0]
+    span = np.where(mask, fitted, -np.inf).max(1) - np.where(mask, fitted, np.inf).min(1)
+    return _Solved(change, covariance[:, 4, 4], span, (residuals**2).sum(1))
 
 
 def _move(lines: _Lines, change: np.ndarray) -> tuple[np.ndarray, _Lines]:
@@ -315,6 +321,7 @@ def _judged(
     step = float(solved.step[k])
     scatter = chi2 / count
     misfit = math.sqrt(max(scatter - 1, 0.0)) / max(step, 1e-9)
+    # By chance less than the noise may be left, which makes no error smaller.
     error = math.sqrt(float(solved.variance[k]) * max(scatter, 1.0))
     if limits is not ANY and not LEAST_GAMMA * (not steeper) <= gamma < LARGEST_GAMMA:
         return Refusal("sharper than a detector's pixel or softer than any profile: no plain edge")

@@ -27,6 +27,7 @@ def psnr_db(image: np.ndarray, reference: np.ndarray, data_range: float) -> floa
     error = float(np.mean(difference**2))
     if not math.isfinite(error):
         return math.nan
+    # scikit-image divides by zero where the images are identical.
     return math.inf if error == 0 else 10 * math.log10(data_range**2 / error)
 
 
@@ -44,19 +45,18 @@ def ssim(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
         reference: (H, W).
         data_range: the span of legal values.
     """
-    from skimage.metrics import (
-        structural_similarity,
-    )  # here, for PSNR alone needs none of its half second
+    # Imported here, because PSNR alone needs none of its half second.
+    from skimage.metrics import structural_similarity
 
     if min(image.shape) < MIN_SIDE_PX:
         expected = f"at least {MIN_SIDE_PX} pixels a side"
         got = " x ".join(map(str, image.shape[::-1]))
         raise ImageError("SSIM", expected=expected, got=got, remedy="give larger images")
-    # float64, or scikit-image would compute float32 images in float32 and be off by some 1e-8.
-    pixels = (np.asarray(each, np.float64) for each in (image, reference))
+    # In float64: scikit-image would compute float32 images in float32, off by some 1e-8.
+    pair = (np.asarray(each, np.float64) for each in (image, reference))
     window = {"gaussian_weights": True, "sigma": SSIM_SIGMA_PX, "use_sample_covariance": False}
     with np.errstate(invalid="ignore"):
-        return float(structural_similarity(*pixels, data_range=data_range, **window))
+        return float(structural_similarity(*pair, data_range=data_range, **window))
 
 
 def fidelity_db(

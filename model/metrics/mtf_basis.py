@@ -90,6 +90,7 @@ def at_distances(table: np.ndarray, distance_px: np.ndarray) -> np.ndarray:
     """A tabulated edge or line, (T,) or (T, PARTS), at distances (N,) from it:
     (N,) or (N, PARTS).
     """
+    # The last sample has no neighbour on its right.
     place = np.clip((distance_px + REACH_PX) * SAMPLES_PER_PX, 0, len(table) - 1.001)
     row = place.astype(int)
     share = place - row
@@ -128,7 +129,8 @@ def solve(
         bends: (PARTS - 3,) what the second differences are expected to be, over their deviations; 0
             without.
     """
-    from scipy.optimize import nnls  # here: who tells no sensor need not wait for SciPy
+    # Imported here: who measures no sensor need not wait for SciPy.
+    from scipy.optimize import nnls
 
     expected = expected_bends(near, bend)
     gram = gram + expected.T @ expected
@@ -153,9 +155,9 @@ def likeliest_bend(gram: np.ndarray, moment: np.ndarray, near: np.ndarray) -> fl
     def evidence(bend: float) -> float:
         expected = expected_bends(near, bend)
         weights = solve(gram, moment, near, bend)
-        whole = gram + expected.T @ expected
-        left = float(weights @ whole @ weights - 2 * moment @ weights)
-        _, log_volume = np.linalg.slogdet(whole + np.trace(whole) * 1e-12 * np.eye(PARTS))
-        return -0.5 * left - 0.5 * float(log_volume) - len(expected) * math.log(bend)
+        precision = gram + expected.T @ expected
+        misfit = float(weights @ precision @ weights - 2 * moment @ weights)
+        _, log_volume = np.linalg.slogdet(precision + np.trace(precision) * 1e-12 * np.eye(PARTS))
+        return -0.5 * misfit - 0.5 * float(log_volume) - len(expected) * math.log(bend)
 
     return max(BENDS, key=evidence)

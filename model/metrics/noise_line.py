@@ -100,9 +100,9 @@ class Blocks(NamedTuple):
 
 def join(images: Sequence[Blocks]) -> Blocks:
     """The blocks of several images as one; their parts stay apart."""
-    first = np.cumsum([0] + [int(b.part.max(initial=-1)) + 1 for b in images])
-    apart = [b._replace(part=b.part + start) for b, start in zip(images, first, strict=False)]
-    return Blocks(*(np.concatenate(column) for column in zip(*apart, strict=True)))
+    starts = np.cumsum([0] + [int(b.part.max(initial=-1)) + 1 for b in images])
+    renumbered = [b._replace(part=b.part + start) for b, start in zip(images, starts, strict=False)]
+    return Blocks(*(np.concatenate(column) for column in zip(*renumbered, strict=True)))
 
 
 def cut_blocks(image: np.ndarray, clipped_at: float) -> Blocks:
@@ -155,13 +155,16 @@ def _measured(mean: np.ndarray, pixels: np.ndarray, part: np.ndarray) -> Blocks:
 
 def _energies(pixels: np.ndarray) -> np.ndarray:
     """Squared cosine coefficients (N, S, S) of blocks less their planes."""
-    from scipy.fft import dctn  # here, as below: who tells no sensor need not wait for SciPy
+    # Imported here, and SciPy below: who measures no sensor need not wait for it.
+    from scipy.fft import dctn
 
     ramp = np.arange(SIDE_PX) - (SIDE_PX - 1) / 2
-    flat = pixels - pixels.mean((1, 2), keepdims=True)
-    down, across = ((flat.sum(axis) * ramp).sum(1) / (SIDE_PX * (ramp**2).sum()) for axis in (2, 1))
-    flat -= down[:, None, None] * ramp[:, None] + across[:, None, None] * ramp
-    coefficients = dctn(flat, axes=(1, 2), norm="ortho", overwrite_x=True)
+    residuals = pixels - pixels.mean((1, 2), keepdims=True)
+    down, across = (
+        (residuals.sum(axis) * ramp).sum(1) / (SIDE_PX * (ramp**2).sum()) for axis in (2, 1)
+    )
+    residuals -= down[:, None, None] * ramp[:, None] + across[:, None, None] * ramp
+    coefficients = dctn(residuals, axes=(1, 2), norm="ortho", overwrite_x=True)
     return np.asarray(np.square(coefficients, out=coefficients))
 
 
@@ -249,30 +252,33 @@ def fit_noise_model(
     if blocks.mean.size < LEAST:
         return Refusal(f"{blocks.mean.size} blocks of 16 x 16 unclipped pixels, {LEAST} are needed")
     quietest = float(np.percentile(blocks.fine, QUIET_PERCENT))
+    # What was restored or resampled has less noise than a detector, at the finest detail.
     if quietest < ROUNDING + LEAST_NOISE:
         got = (
             f"a variance of {quietest:.2g} DN^2 at the finest detail, where rounding alone "
             f"makes {ROUNDING:.2g}"
         )
         return Refusal(got)
-    used, fit = _choose(blocks)
-    parts = np.unique(used.part)
-    if used.mean.size < LEAST or parts.size < LEAST_PARTS:
-        return Refusal(f"{used.mean.size} blocks without much texture, {LEAST} are needed")
-    dark, bright = (float(v) for v in np.percentile(used.mean, [EDGE_PERCENT, 100 - EDGE_PERCENT]))
+    quiet, fit = _choose(blocks)
+    parts = np.unique(quiet.part)
+    if quiet.mean.size < LEAST or parts.size < LEAST_PARTS:
+        return Refusal(f"{quiet.mean.size} blocks without much texture, {LEAST} are needed")
+    dark, bright = (float(v) for v in np.percentile(quiet.mean, [EDGE_PERCENT, 100 - EDGE_PERCENT]))
     one_level = bright - dark < MIN_RANGE * bright
     if one_level and not incomplete:
         return Refusal(f"even areas from {dark:.4g} to {bright:.4g} DN only, too narrow for a line")
-    draws = np.array([_fitted(used, _weights(used.part, parts, generator)) for _ in range(DRAWS)])
+    draws = np.array([_fitted(quiet, _weights(quiet.part, parts, generator)) for _ in range(DRAWS)])
     if one_level:
-        fit, draws = _of_one_level(used, fit, draws, generator)
-    leak = float(fit[2] * np.maximum(used.structure - used.noise(fit), 0).mean() / used.fine.mean())
-    alpha, beta = _unrounded(fit)
-    shown = np.array([_unrounded(draw) for draw in draws])
-    model = NoiseModel(
-        alpha, beta, shown, used.mean.size, (dark, bright), leak, one_level=one_level
+        fit, draws = _of_one_level(quiet, fit, draws, generator)
+    leak = float(
+        fit[2] * np.maximum(quiet.structure - quiet.noise(fit), 0).mean() / quiet.fine.mean()
     )
-    return _judged(_with_colour(used, model), incomplete)
+    alpha, beta = _unrounded(fit)
+    lines = np.array([_unrounded(draw) for draw in draws])
+    model = NoiseModel(
+        alpha, beta, lines, quiet.mean.size, (dark, bright), leak, one_level=one_level
+    )
+    return _judged(_with_colour(quiet, model), incomplete)
 
 
 def _judged(model: NoiseModel, incomplete: bool) -> NoiseModel | Refusal:
@@ -286,7 +292,7 @@ def _judged(model: NoiseModel, incomplete: bool) -> NoiseModel | Refusal:
 
 
 def _of_one_level(
-    used: Blocks, fit: np.ndarray, draws: np.ndarray, generator: np.random.Generator
+    blocks: Blocks, fit: np.ndarray, draws: np.ndarray, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return fit and draws of noise whose growth with light is not seen: any part of it may be that
     of photons.
@@ -294,17 +300,17 @@ def _of_one_level(
     The fit takes all: told too much noise in bright light, a restoration smooths, told too little
     it makes grain. The draws take from none to all.
     """
-    level = float(np.median(used.mean))
+    level = float(np.median(blocks.mean))
 
     def split(numbers: np.ndarray, share: float) -> list[float]:
         noise = float(numbers[0]) * level + float(numbers[1])
         return [share * noise / max(level, ROUNDING), (1 - share) * noise, float(numbers[2])]
 
-    drawn = [
+    splits = [
         split(draw, share)
         for draw, share in zip(draws, generator.uniform(size=len(draws)), strict=True)
     ]
-    return np.array(split(fit, 1.0)), np.array(drawn)
+    return np.array(split(fit, 1.0)), np.array(splits)
 
 
 def _choose(blocks: Blocks) -> tuple[Blocks, np.ndarray]:
@@ -312,10 +318,10 @@ def _choose(blocks: Blocks) -> tuple[Blocks, np.ndarray]:
     images.
     """
     for limit in STRUCTURES:
-        used, fit = _quiet(blocks, limit)
-        if used.mean.size >= ENOUGH:
+        quiet, fit = _quiet(blocks, limit)
+        if quiet.mean.size >= ENOUGH:
             break
-    return used, fit
+    return quiet, fit
 
 
 def _quiet(blocks: Blocks, limit: float) -> tuple[Blocks, np.ndarray]:
@@ -330,29 +336,31 @@ def _quiet(blocks: Blocks, limit: float) -> tuple[Blocks, np.ndarray]:
         # Rows of crops, nets and ripples are as fine as noise: such blocks stand apart from the
         # rest.
         alike = np.abs(blocks.fine - expected) <= MAX_SCATTER * math.sqrt(2 / FINE_WAVES) * expected
-        used = blocks.only(quiet & alike if (quiet & alike).sum() >= LEAST else quiet)
-        fit = _fitted(used, np.ones(used.mean.size))
+        sample = blocks.only(quiet & alike if (quiet & alike).sum() >= LEAST else quiet)
+        fit = _fitted(sample, np.ones(sample.mean.size))
         noise = blocks.noise(fit)
         expected = noise + fit[2] * np.maximum(blocks.structure - noise, 0)
     return blocks.only((blocks.structure <= limit * noise) & alike), fit
 
 
-def _fitted(blocks: Blocks, weights: np.ndarray, seen: np.ndarray | None = None) -> np.ndarray:
+def _fitted(blocks: Blocks, weights: np.ndarray, band: np.ndarray | None = None) -> np.ndarray:
     """(alpha, beta, leak), none negative, of a band (N,), the finest if none; a mean square
     scatters by its size.
     """
     from scipy.optimize import nnls
 
-    seen = blocks.fine if seen is None else seen
-    size = np.full(seen.size, max(float(weights @ seen / weights.sum()), ROUNDING))
+    band = blocks.fine if band is None else band
+    size = np.full(band.size, max(float(weights @ band / weights.sum()), ROUNDING))
     fit = np.zeros(3)
     for _ in range(4):
         noise = blocks.noise(fit) if fit.any() else size
+        # White noise is alike in all bands: what the structure has beyond it is texture.
         terms = np.stack(
-            [blocks.mean, np.ones(seen.size), np.maximum(blocks.structure - noise, 0)], axis=1
+            [blocks.mean, np.ones(band.size), np.maximum(blocks.structure - noise, 0)], axis=1
         )
+        # A mean square scatters by its size.
         root = np.sqrt(weights) / size
-        fit, _ = nnls(terms * root[:, None], seen * root)
+        fit, _ = nnls(terms * root[:, None], band * root)
         size = np.maximum(terms @ fit, 0.3 * ROUNDING)
     return fit
 
@@ -370,19 +378,19 @@ def _unrounded(fit: np.ndarray) -> tuple[float, float]:
     return float(fit[0]), max(float(fit[1]) - ROUNDING, 0.0)
 
 
-def _with_colour(used: Blocks, model: NoiseModel) -> NoiseModel:
+def _with_colour(blocks: Blocks, model: NoiseModel) -> NoiseModel:
     """Return the line with the spectrum of the noise; where that is not flat, the line of its
     stronger part.
 
     What is told to a restoration should rather be too much noise than too little: noise that it
     takes for detail comes out amplified.
     """
-    place = np.array([float(np.median(used.mean)), 1.0])
-    ones = np.ones(used.mean.size)
+    place = np.array([float(np.median(blocks.mean)), 1.0])
+    ones = np.ones(blocks.mean.size)
     fine = float((model.alpha, model.beta) @ place)
-    bands = np.column_stack([used.middle, used.spectrum])
+    bands = np.column_stack([blocks.middle, blocks.spectrum])
     middle, *spectrum = (
-        (_fitted(used, ones, band)[:2] @ place - ROUNDING) / fine for band in bands.T
+        (_fitted(blocks, ones, band)[:2] @ place - ROUNDING) / fine for band in bands.T
     )
     scatter = float((model.draws @ place).std()) / fine
     white = abs(middle - 1) <= MAX_COLOUR + COLOUR_SCATTER * scatter
@@ -394,5 +402,5 @@ def _with_colour(used: Blocks, model: NoiseModel) -> NoiseModel:
         draws=model.draws * stronger,
         colour=float(middle),
         white=bool(white),
-        spectrum=tuple(float(each) for each in spectrum),
+        spectrum=tuple(float(value) for value in spectrum),
     )

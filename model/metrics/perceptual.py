@@ -30,9 +30,12 @@ from beers_deploy.profiles.toml import unreadable
 class BackboneSpec:
     """What is known of a backbone before any weights are there."""
 
-    file_stem: str  # what torchvision calls it, and the start of its file's name
-    taps: tuple[int, ...]  # which feature layers are compared
-    min_side_px: int  # a smaller image leaves nothing for the last pooling
+    # What torchvision calls it, and the start of its file's name.
+    file_stem: str
+    # The feature layers that are compared.
+    taps: tuple[int, ...]
+    # A smaller image leaves nothing for the last pooling.
+    min_side_px: int
 
 
 BACKBONES: Mapping[str, BackboneSpec] = {
@@ -96,12 +99,12 @@ class Backbone(nn.Module):
         colour = image.to(next(self.parameters()).dtype).expand(-1, 3, -1, -1)
         mean, std = (colour.new_tensor(x)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
         x = (colour - mean) / std
-        found = [colour]
+        maps = [colour]
         for index, layer in enumerate(self.features):
             x = layer(x)
             if index in self.spec.taps:
-                found.append(x)
-        return found
+                maps.append(x)
+        return maps
 
 
 def _squeezenet() -> list[nn.Module]:
@@ -149,10 +152,10 @@ def find_backbone(network: str, place: Path | None = None) -> Path | None:
     stem = BACKBONES[network].file_stem
     if place is not None and not place.is_dir():
         return place
-    named = place or os.environ.get(WEIGHTS_VARIABLE)
-    if not named:
+    location = place or os.environ.get(WEIGHTS_VARIABLE)
+    if not location:
         return None
-    files = [Path(named)] if Path(named).is_file() else sorted(Path(named).glob("*"))
+    files = [Path(location)] if Path(location).is_file() else sorted(Path(location).glob("*"))
     return next(
         (file for file in files if file.name.startswith(stem) and file.suffix in SUFFIXES), None
     )
@@ -169,13 +172,13 @@ def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbon
     aside.
     """
     backbone = Backbone(network, l2_pool=l2_pool)
-    wanted = backbone.state_dict()
-    tensors = read_tensors(path, wanted)
+    parameters = backbone.state_dict()
+    tensors = read_tensors(path, parameters)
     for name, tensor in tensors.items():
-        if tensor.shape != wanted[name].shape:
+        if tensor.shape != parameters[name].shape:
             raise _error(
                 path,
-                f"{name} of shape {tuple(wanted[name].shape)}",
+                f"{name} of shape {tuple(parameters[name].shape)}",
                 f"{tuple(tensor.shape)}",
                 NAMED,
             )
@@ -195,34 +198,35 @@ def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
     if got is not None:
         raise _error(path, "a weights file", got, "check the path")
     try:
-        found = _read(path, names)
-        for tensor in found.values():
+        tensors = _read(path, names)
+        for tensor in tensors.values():
             if not tensor.is_floating_point():
                 raise TypeError(f"an array of {tensor.dtype}")
-    except Exception as error:  # whatever the bytes of a damaged archive lead to
+    # The bytes of a damaged archive may lead to anything.
+    except Exception as error:
         got = " ".join(str(error).split())[:120]
         raise _error(
             path, "arrays of floating-point numbers, none pickled", got, CONVERT
         ) from error
     for name in names:
-        if name not in found:
+        if name not in tensors:
             raise _error(path, f"a tensor named {name}", "none of that name", NAMED)
-    return {name: tensor.float() for name, tensor in found.items()}
+    return {name: tensor.float() for name, tensor in tensors.items()}
 
 
 def _read(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
     """Those of the named tensors that a file holds."""
     if path.suffix == ".npz":
-        with path.open("rb") as raw:  # np.load leaves a file open that turns out to be broken
+        # np.load leaves a file open that turns out to be broken.
+        with path.open("rb") as raw:
             file = np.load(raw, allow_pickle=False)
             if not isinstance(file, NpzFile):
                 raise TypeError("a single array")
             return {name: torch.from_numpy(file[name]) for name in names if name in file}
     with safe_open(path, framework="pt") as file:
-        held = set(file.keys())
-        return {
-            name: file.get_tensor(name).clone() for name in names if name in held
-        }  # the library's lie in the file
+        keys = set(file.keys())
+        # Copies, because the library's own lie in the file.
+        return {name: file.get_tensor(name).clone() for name in names if name in keys}
 
 
 def _error(path: Path, expected: str, got: str, remedy: str) -> ModelError:
@@ -309,8 +313,8 @@ class Dists(nn.Module):
         _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):
             stages = zip(self.backbone(image), self.backbone(reference), strict=True)
-            apart = [_texture_and_structure(a, b) for a, b in stages]
-            texture, structure = (torch.cat(parts, dim=1) for parts in zip(*apart, strict=True))
+            terms = [_texture_and_structure(a, b) for a, b in stages]
+            texture, structure = (torch.cat(parts, dim=1) for parts in zip(*terms, strict=True))
             return texture @ self.alpha + structure @ self.beta
 
 

@@ -17,6 +17,7 @@ window resolves some 0.1 cycles per pixel: a narrower peak of the curve comes ou
 
 import math
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,15 +58,15 @@ def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -
         return distance
     plateaus = _fit_plateaus(pixels, distance)
     if not plateaus.step > MIN_CONTRAST_SIGMA * plateaus.sigma:
-        seen = f"a step of {plateaus.step:.4g} in noise of {plateaus.sigma:.4g}"
-        return Refusal(f"{seen}, {MIN_CONTRAST_SIGMA} times are needed")
+        contrast = f"a step of {plateaus.step:.4g} in noise of {plateaus.sigma:.4g}"
+        return Refusal(f"{contrast}, {MIN_CONTRAST_SIGMA} times are needed")
     return _mtf(pixels, distance, plateaus)
 
 
 def _unusable(image: np.ndarray, saturated: float) -> Refusal | None:
-    lost = ~np.isfinite(image)
-    if lost.any():
-        return Refusal(f"{int(lost.sum())} pixels are not finite")
+    not_finite = ~np.isfinite(image)
+    if not_finite.any():
+        return Refusal(f"{int(not_finite.sum())} pixels are not finite")
     clipped = float(((image <= 0) | (image >= saturated)).mean())
     if clipped > MAX_CLIPPED:
         return Refusal(f"{clipped:.1%} of the pixels are clipped, {MAX_CLIPPED:.0%} at most")
@@ -149,9 +150,9 @@ class Plateaus:
 
 def _fit_plateaus(image: np.ndarray, distance: np.ndarray) -> Plateaus:
     """Least squares over all pixels beyond the window, both sides at once."""
-    far = np.abs(distance) > WINDOW_PX
-    d = distance[far]
-    v = image[far]
+    beyond_window = np.abs(distance) > WINDOW_PX
+    d = distance[beyond_window]
+    v = image[beyond_window]
     terms = np.stack([d < 0, d > 0, -1 / d], axis=1).astype(np.float64)
     low, high, tail = (float(c) for c in np.linalg.lstsq(terms, v, rcond=None)[0])
     sigma = float(np.sqrt(np.mean((v - terms @ (low, high, tail)) ** 2)))
@@ -165,27 +166,27 @@ def _mtf(image: np.ndarray, distance: np.ndarray, plateaus: Plateaus) -> float:
     Without the tails what is left is compact, so the window around it costs next to nothing. The
     model only has to have the right tails: what else it gets wrong stands in the bins.
     """
-    near = np.abs(np.rint(distance * BINS_PER_PX)) <= HALF
-    place = distance[near] * BINS_PER_PX
-    values = image[near]
+    mask = np.abs(np.rint(distance * BINS_PER_PX)) <= HALF
+    place = distance[mask] * BINS_PER_PX
+    values = image[mask]
     bins = np.rint(place).astype(int)
     centres = np.arange(-HALF, HALF + 1)
 
     def mean(x: np.ndarray) -> np.ndarray:
         counts, sums = (np.bincount(bins + HALF, weights, centres.size) for weights in (None, x))
-        filled = counts > 0
-        return np.asarray(np.interp(centres, centres[filled], sums[filled] / counts[filled]))
+        occupied = counts > 0
+        return np.asarray(np.interp(centres, centres[occupied], sums[occupied] / counts[occupied]))
 
     edge = mean(values)
     softness_px = min(
         SOFTNESS_PX,
         key=lambda s: float(((edge - plateaus.model(centres / BINS_PER_PX, s)) ** 2).sum()),
     )
-    left = mean(values - plateaus.model(place / BINS_PER_PX, softness_px))
+    residual = mean(values - plateaus.model(place / BINS_PER_PX, softness_px))
     shift = mean(place - bins)
     variance_px2 = float((mean((place - bins) ** 2) - shift**2).mean()) / BINS_PER_PX**2
-    rest = _transform(variance_px2) @ _at_centres(left, shift) / plateaus.step
-    return float(plateaus.transfer(NYQUIST, softness_px) + rest)
+    correction = _transform(variance_px2) @ _at_centres(residual, shift) / plateaus.step
+    return float(plateaus.transfer(NYQUIST, softness_px) + correction)
 
 
 def _at_centres(averages: np.ndarray, shift: np.ndarray) -> np.ndarray:
@@ -251,10 +252,11 @@ def _covered(distance: np.ndarray, width: float, height: float) -> np.ndarray:
     double integral.
     """
     small, large = sorted((width, height))
+    # An edge along the grid is a box that nothing smears: the formula would divide by 0.
     if small < 1e-9:
         return np.asarray(np.clip(distance / large + 0.5, 0, 1))
     ramps = [
-        (sa * sb, distance + (sa * large + sb * small) / 2) for sa in (1, -1) for sb in (1, -1)
+        (sa * sb, distance + (sa * large + sb * small) / 2) for sa, sb in product((1, -1), repeat=2)
     ]
     return np.asarray(sum(sign * np.maximum(x, 0) ** 2 for sign, x in ramps) / (2 * small * large))
 

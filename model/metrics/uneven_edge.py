@@ -156,7 +156,9 @@ def fit_edge(
         by_levels = np.hstack([plane * (1 - share), plane * share])
         rest = near.values - by_levels @ levels
         scale = max(MAD * float(np.median(np.abs(rest))), 1e-9)
+        # Cars, branches and drains lie beside edges: what departs far counts less.
         huber = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(rest), 1e-9))
+        # What the noise does not explain is texture, which lowers the weight of the edge.
         texture = max(float(np.average(rest**2, weights=huber)) - float(near.variance.mean()), 0.0)
         pixel_weights = np.sqrt(huber / (near.variance + texture))
         rise = plane @ (levels[3:] - levels[:3])
@@ -186,7 +188,8 @@ def fit_edge(
         )
         change = np.linalg.lstsq(normal, weighted_rest, rcond=None)[0]
         levels = levels + change[:LEVELS]
-        line = EdgeLine(*(np.array(line) + np.clip(change[LEVELS:], -MAX_STEP, MAX_STEP)).tolist())
+        numbers = np.array(line) + np.clip(change[LEVELS:], -MAX_STEP, MAX_STEP)
+        line = EdgeLine(*numbers.tolist())
     return fitted
 
 
@@ -224,6 +227,7 @@ def _expectations(levels: np.ndarray, line: EdgeLine, step: float) -> tuple[np.n
     rows = np.zeros((NUMBERS, NUMBERS))
     right = np.zeros(NUMBERS)
     gradient = GRADIENT * abs(step)
+    # The change away from the edge on either side, which far tails of the blur resemble.
     for number in (2, 5):
         rows[number, number] = 1 / gradient
         right[number] = -levels[number] / gradient
@@ -247,17 +251,18 @@ def normal_equations(
     """
     normal = edge.normal
     curve = edge.curve
-    rest = edge.rest
+    residuals = edge.rest
     if counts is not None:
-        times = np.sqrt(counts[np.minimum(edge.strip, len(counts) - 1)])
-        times = np.append(times, np.ones(NUMBERS))
-        normal = normal * times[:, None]
-        curve = curve * times[:, None]
-        rest = rest * times
+        root_counts = np.sqrt(counts[np.minimum(edge.strip, len(counts) - 1)])
+        root_counts = np.append(root_counts, np.ones(NUMBERS))
+        normal = normal * root_counts[:, None]
+        curve = curve * root_counts[:, None]
+        residuals = residuals * root_counts
+    # Without what planes and line could explain: the rest speaks of the curve alone.
     basis, _ = np.linalg.qr(normal)
     curve = curve - basis @ (basis.T @ curve)
-    rest = rest - basis @ (basis.T @ rest)
-    return curve.T @ curve, curve.T @ (rest + curve @ weights)
+    residuals = residuals - basis @ (basis.T @ residuals)
+    return curve.T @ curve, curve.T @ (residuals + curve @ weights)
 
 
 def strips_of(edge: FittedEdge) -> int:
@@ -275,9 +280,10 @@ def softness(edge: FittedEdge, weights: np.ndarray) -> tuple[float, float]:
     by_softness = edge.curve @ (softened(weights, SOFTER_PX) - weights) / SOFTER_PX
     basis, _ = np.linalg.qr(edge.normal)
     by_softness = by_softness - basis @ (basis.T @ by_softness)
-    rest = edge.rest - basis @ (basis.T @ edge.rest)
+    residuals = edge.rest - basis @ (basis.T @ edge.rest)
     size = float(by_softness @ by_softness)
-    value = float(by_softness @ rest) / size
-    left = (by_softness * (rest - value * by_softness))[: edge.strip.size]
-    by_strip = np.bincount(edge.strip - edge.strip.min(), weights=left)
+    value = float(by_softness @ residuals) / size
+    contributions = (by_softness * (residuals - value * by_softness))[: edge.strip.size]
+    # Texture is alike over some pixels along the edge: strips are independent, pixels are not.
+    by_strip = np.bincount(edge.strip - edge.strip.min(), weights=contributions)
     return value, max(size**-0.5, math.sqrt(float((by_strip**2).sum())) / size)

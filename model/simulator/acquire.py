@@ -74,14 +74,22 @@ def simulate_planned(
     r - 2 margin).
     """
     if "mtf" not in plan.skipped:
-        kept = without(sensor, plan.skipped)
+        instrument = without(sensor, plan.skipped)
         width = scene.radiance.shape[-1]
         ratio = scene.oversampling
         return acquire(
-            scene.spectrum, width, kept, ratio, draw, role, margin_px=margin_px, skip=plan.skipped
+            scene.spectrum,
+            width,
+            instrument,
+            ratio,
+            draw,
+            role,
+            margin_px=margin_px,
+            skip=plan.skipped,
         )
     # Without any blur a target pixel is the mean of its scene pixels, which needs no transform.
-    ratio, (height, width) = scene.oversampling, scene.radiance.shape
+    ratio = scene.oversampling
+    height, width = scene.radiance.shape
     pixels = scene.radiance.reshape(height // ratio, ratio, width // ratio, ratio).mean((1, 3))
     return detect(crop_margin(pixels, margin_px), sensor, draw, role, plan.skipped)
 
@@ -137,6 +145,7 @@ def acquire(
         skip: what to leave out of `detect`.
     """
     transfer = sensor_transfer(spectrum.shape[-2], width, oversampling, sensor)
+    # The transform wraps around: without a margin the far border leaks into the near one.
     signal = crop_margin(sample(spectrum, transfer, width, oversampling, offset_px), margin_px)
     return detect(signal, sensor, draw, role, skip)
 
@@ -172,8 +181,9 @@ def acquire_padded(
     lies at x / r.
     """
     margin_px = MARGIN_PX * oversampling
+    # The last target pixel may lack scene pixels: size % -oversampling is minus their number.
     after = [margin_px - size % -oversampling for size in radiance.shape]
-    scene = np.pad(radiance, [(margin_px, each) for each in after], mode="reflect")
+    scene = np.pad(radiance, [(margin_px, end_px) for end_px in after], mode="reflect")
     return acquire(scene_spectrum(scene), scene.shape[1], sensor, oversampling, draw, role)
 
 

@@ -62,16 +62,11 @@ def bars(level: float, generator: np.random.Generator) -> Pattern:
     """Bars of any direction, between a sine and a square wave."""
     y, x = _coordinates()
     angle = float(generator.uniform(0, math.pi))
-    if (
-        generator.random() < 0.5
-    ):  # rows and columns are the commonest direction, and the hardest: they alias
+    # Rows and columns are the commonest direction, and the hardest: they alias.
+    if generator.random() < 0.5:
         angle = float(generator.choice([0.0, math.pi / 2]))
-    phase = (
-        2
-        * math.pi
-        / log_uniform(generator, PERIODS_PX)
-        * (x * math.cos(angle) + y * math.sin(angle))
-    )
+    wave_number = 2 * math.pi / log_uniform(generator, PERIODS_PX)
+    phase = wave_number * (x * math.cos(angle) + y * math.sin(angle))
     return _wave(level, phase + generator.uniform(0, 2 * math.pi), generator)
 
 
@@ -92,23 +87,23 @@ def soft_texture(level: float, generator: np.random.Generator) -> Pattern:
 def discs(level: float, generator: np.random.Generator) -> Pattern:
     """Discs a little brighter or darker than the ground."""
     y, x = _coordinates()
-    found = np.full((SQUARE_PX, SQUARE_PX), level)
+    pattern = np.full((SQUARE_PX, SQUARE_PX), level)
     for _ in range(12):
         middle_y, middle_x = generator.uniform(-SQUARE_PX / 2, SQUARE_PX / 2, 2)
         inside = np.hypot(y - middle_y, x - middle_x) < generator.uniform(2, 30)
-        found[inside] = level * (
+        pattern[inside] = level * (
             1 + float(generator.choice([-1, 1])) * log_uniform(generator, CONTRASTS)
         )
-    return found
+    return pattern
 
 
 def points(level: float, generator: np.random.Generator) -> Pattern:
     """Points of light on flat ground."""
-    found = np.full((SQUARE_PX, SQUARE_PX), level)
+    pattern = np.full((SQUARE_PX, SQUARE_PX), level)
     for _ in range(30):
         row, column = generator.integers(SQUARE_PX, size=2)
-        found[row, column] += log_uniform(generator, POINTS)
-    return found
+        pattern[row, column] += log_uniform(generator, POINTS)
+    return pattern
 
 
 def _coordinates() -> tuple[Pattern, Pattern]:

@@ -42,6 +42,7 @@ def add_noise(
 ) -> np.ndarray:
     """L + sigma(L) * n, n standard normal and independent per pixel; any shape."""
     normal = generator.standard_normal(radiance.shape, dtype=np.float32)
+    # The plan of effects needs a bound of the noise, and a normal number has none.
     np.clip(normal, -NOISE_LIMIT, NOISE_LIMIT, out=normal)
     return radiance + noise_sigma(radiance, sensor) * normal
 
@@ -71,6 +72,7 @@ def to_uint16(dn: np.ndarray) -> np.ndarray:
     """Whole digital numbers of at most 16 bits, of any shape, as the array that
     a TIFF file takes.
     """
+    # A cast without a clip would wrap values below 0 around to 65535.
     return np.asarray(np.rint(dn).clip(0, 65535), np.uint16)
 
 
@@ -85,6 +87,7 @@ class Draw:
         """The generator of one effect of this patch; counter-based (Philox), the same on every
         machine.
         """
+        # Python's own hash of a text differs from process to process, CRC-32 does not.
         entropy = (self.seed, self.patch, zlib.crc32(effect.encode()))
         return np.random.Generator(np.random.Philox(np.random.SeedSequence(entropy)))
 
@@ -107,11 +110,13 @@ def detect(
 
     def apply(image: np.ndarray, acts_on: str) -> np.ndarray:
         for name, effect in pixel_effects(effects, acts_on).items():
+            # Each effect has its own generator: leaving one out changes no draw of the others.
             image = effect.apply(image, sensor, partial(draw.generator, f"{name}-{role}"))
         return image
 
     signal = apply(signal, "radiance")
     if "noise" not in skip:
+        # The role belongs to the key, so that the two noises of a pair are independent.
         signal = add_noise(signal, sensor, draw.generator(f"noise-{role}"))
     dn = apply(signal * sensor.gain_dn_per_radiance, "DN")
     return dn.clip(0, sensor.max_dn) if "digitising" in skip else digitise(dn, sensor)

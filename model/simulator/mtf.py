@@ -35,7 +35,7 @@ def gamma_from_mtf(mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> float
             got=repr(mtf_nyquist),
             remedy="0.07 means 7 %",
         )
-    # max: at the limit itself the rounding of the ratio may fall on either side of 1
+    # At the limit itself the rounding of the ratio may fall on either side of 1.
     return max(-2 * math.log(mtf_nyquist / limit), 0.0)
 
 
@@ -79,11 +79,12 @@ def mtf(
     across, along = blur if isinstance(blur, tuple) else (blur, blur)
     gamma_x, gamma_y = (gamma_from_mtf(value, antialias_sigma_px) for value in (across, along))
     radius = np.hypot(fx, fy)
-    # gamma * radius where it can be: hypot(gamma fx, gamma fy) rounds otherwise, and one gamma is
-    # the usual case
+    # One gamma is the usual case, in which gamma * radius is exactly the paper's formula:
+    # hypot(gamma fx, gamma fy) rounds otherwise.
     optics = np.exp(
         -gamma_x * radius if gamma_x == gamma_y else -np.hypot(gamma_x * fx, gamma_y * fy)
     )
+    # Beyond frequency 1 the sinc is negative: the contrast is reversed there, and its sign stays.
     response = np.asarray(optics * np.sinc(fx) * np.sinc(fy))
     return (
         response * gaussian_response(radius, antialias_sigma_px) if antialias_sigma_px else response
@@ -108,8 +109,8 @@ def sensor_mtf(fx: ArrayLike, fy: ArrayLike, sensor: Instrument) -> NDArray[np.i
     """What a sensor's blur and smear leave of each frequency, fx (1, W) and fy (H, 1) as in `mtf`:
     (H, W).
     """
-    found = mtf(fx, fy, sensor.blur, sensor.antialias_px)
-    return found * smear_response(fy, sensor.smear_px) if sensor.smear_px else found
+    response = mtf(fx, fy, sensor.blur, sensor.antialias_px)
+    return response * smear_response(fy, sensor.smear_px) if sensor.smear_px else response
 
 
 def sensor_transfer(
@@ -139,15 +140,15 @@ def transfer_function(
     Complex64 for a point-spread function, which may be lopsided or lie aslant.
     """
     aslant = isinstance(blur, PointSpread)
+    # Only a transfer that is even in fy can be computed from half of the rows.
     vertical = np.fft.fftfreq if aslant else np.fft.rfftfreq
     fy = vertical(height, 1 / oversampling)
     fx = np.fft.rfftfreq(width, 1 / oversampling)
-    found = mtf(fx[None, :], fy[:, None], blur, antialias_sigma_px)
+    transfer = mtf(fx[None, :], fy[:, None], blur, antialias_sigma_px)
     if smear_px:
-        found = found * smear_response(fy[:, None], smear_px)
+        transfer = transfer * smear_response(fy[:, None], smear_px)
     if aslant:
-        return found.astype(np.complex64)
-    upper = found.astype(np.float32)
-    return np.concatenate(
-        [upper, upper[1 : (height + 1) // 2][::-1]]
-    )  # even in fy: the rows below are the same
+        return transfer.astype(np.complex64)
+    upper = transfer.astype(np.float32)
+    # The transfer is even in fy: the rows below mirror those above.
+    return np.concatenate([upper, upper[1 : (height + 1) // 2][::-1]])

@@ -30,9 +30,8 @@ class SceneStats:
 
     low: float
     high: float
-    step_along: (
-        float  # largest difference between neighbours in a column, the periodic border included
-    )
+    # The largest difference between neighbours in a column, the periodic border included.
+    step_along: float
     height: int
     width: int
     oversampling: int
@@ -140,7 +139,8 @@ class Decision:
     effect: str
     choice: Choice
     why: str
-    bound_dn: float | None  # None: applied without asking, or not there to be bounded
+    # None where it is applied without asking, or not there to be bounded.
+    bound_dn: float | None
     cost: str
 
 
@@ -165,15 +165,15 @@ def make_plan(sensor: Instrument, stats: SceneStats, tolerance_dn: float = TOLER
     """Decide for every effect of a sensor on a scene of these statistics."""
     bounds = effect_bounds(sensor, stats)
     spent = 0.0
-    hidden = set()
+    negligible = set()
     # Smallest first: as many effects as the tolerance can pay for are left out.
     for name, change in sorted(bounds.items(), key=lambda item: item[1]):
         if change > 0 and spent + change <= tolerance_dn:
             spent += change
-            hidden.add(name)
+            negligible.add(name)
     decisions = []
     for name, cost in COSTS.items():
-        choice, why, bound = _decide(name, sensor, bounds, hidden, tolerance_dn)
+        choice, why, bound = _decide(name, sensor, bounds, negligible, tolerance_dn)
         decisions.append(
             Decision(name, choice, why, bound, cost if choice == "applied" else "none")
         )
@@ -213,7 +213,7 @@ def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
     for name, effect in pixel_effects(sensor.effects, "radiance").items():
         direct = effect.bound_dn(sensor, low, high)
         bounds[name] = behind(name, direct, sensor)
-        # whether it is applied or not
+        # Later effects may meet this range, whether the effect is applied or not.
         low = low - direct / gain
         high = high + direct / gain
     noise = gain * NOISE_LIMIT * sensor.noise_sigma(max(high, 0.0))
@@ -229,14 +229,18 @@ def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
 
 
 def _decide(
-    name: str, sensor: Instrument, bounds: dict[str, float], hidden: set[str], tolerance_dn: float
+    name: str,
+    sensor: Instrument,
+    bounds: dict[str, float],
+    negligible: set[str],
+    tolerance_dn: float,
 ) -> tuple[Choice, str, float | None]:
     """What becomes of an effect, why, and its bound."""
     if name in ("sampling", "digitising"):
         return "applied", "every sensor has it", None
     if name in TABLES and name not in sensor.effects:
         return "not called for", "nothing asks for it", None
-    if name in ("antialias", "smear") and ("mtf" in hidden or bounds["mtf"] == 0):
+    if name in ("antialias", "smear") and ("mtf" in negligible or bounds["mtf"] == 0):
         return "cannot show", "the scene is too flat for any blur to show", bounds["mtf"]
     if name == "antialias":
         return "applied", "part of the MTF, and of its budget", None
@@ -244,7 +248,7 @@ def _decide(
     if bound == 0:
         why = UNSEEN.get(name)
         return "cannot show" if why else "neutral", why or "its parameters change nothing", 0.0
-    if name in hidden:
+    if name in negligible:
         return (
             "cannot show",
             f"no pixel changes by more than the {tolerance_dn:g} DN allowed",

@@ -46,6 +46,7 @@ def procedural_scene(height_px: int, width_px: int, generator: np.random.Generat
     _town(draw, canvas.size, generator)
     radiance = np.asarray(canvas) * texture(height_px, width_px, generator)
     canvas = Image.fromarray(radiance.astype(np.float32))
+    # The calibration site is drawn after the texture and has none.
     _pattern(ImageDraw.Draw(canvas), canvas.size)
     return Scene("procedural", np.array(canvas, dtype=np.float32))
 
@@ -163,25 +164,29 @@ def _house(
     generator: np.random.Generator,
 ) -> None:
     """A gable roof, one slope in the sun, its shadow, a chimney and a tree in the yard."""
-    long = generator.uniform(90, 130)
-    wide = generator.uniform(64, 92)
-    bright = float(generator.uniform(60, 160))
-    roof = [(u, v), (u + long, v), (u + long, v + wide), (u, v + wide)]
+    length = generator.uniform(90, 130)
+    width = generator.uniform(64, 92)
+    sunlit = float(generator.uniform(60, 160))
+    roof = [(u, v), (u + length, v), (u + length, v + width), (u, v + width)]
+    # The shadow is drawn first, so that the house covers its beginning.
     draw.polygon([shift(place(*p), 22) for p in roof], fill=SHADOW)
-    ridge = v + wide / 2
+    ridge = v + width / 2
     draw.polygon(
-        [place(*p) for p in [(u, v), (u + long, v), (u + long, ridge), (u, ridge)]], fill=bright
+        [place(*p) for p in [(u, v), (u + length, v), (u + length, ridge), (u, ridge)]], fill=sunlit
     )
     draw.polygon(
-        [place(*p) for p in [(u, ridge), (u + long, ridge), (u + long, v + wide), (u, v + wide)]],
-        fill=bright * 0.55,
+        [
+            place(*p)
+            for p in [(u, ridge), (u + length, ridge), (u + length, v + width), (u, v + width)]
+        ],
+        fill=sunlit * 0.55,
     )
-    for k in np.arange(8, long, 11):
-        draw.line([place(u + k, v), place(u + k, v + wide)], fill=bright * 0.8, width=2)
-    x, y = place(u + 0.3 * long, v + 0.3 * wide)
+    for k in np.arange(8, length, 11):
+        draw.line([place(u + k, v), place(u + k, v + width)], fill=sunlit * 0.8, width=2)
+    x, y = place(u + 0.3 * length, v + 0.3 * width)
     draw.rectangle((x, y, x + 9, y + 9), fill=CONCRETE)
     if generator.random() < 0.6:
-        tree(draw, *place(u + long + 24, v + wide), generator.uniform(12, 22), generator)
+        tree(draw, *place(u + length + 24, v + width), generator.uniform(12, 22), generator)
 
 
 def _pattern(draw: ImageDraw.ImageDraw, size: tuple[int, int]) -> None:
@@ -220,6 +225,7 @@ def texture(height_px: int, width_px: int, generator: np.random.Generator) -> np
     fy = np.fft.fftfreq(height_px)[:, None]
     fx = np.fft.rfftfreq(width_px)[None, :]
     radius = np.hypot(fx, fy)
+    # 1 / f has no value at frequency 0: below 1 / 400 the spectrum stays as it is there.
     spectrum = fft.rfft2(white) / np.maximum(radius, 1 / 400).astype(np.float32)
     pattern = fft.irfft2(spectrum, s=(height_px, width_px))
     return np.asarray(np.exp(0.12 * pattern / pattern.std()))

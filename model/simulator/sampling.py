@@ -47,6 +47,7 @@ def sample(
     """
     height = spectrum.shape[-2]
     centre = (oversampling - 1) / 2
+    # For even r the centre lies between two scene pixels: slicing alone would shift the image.
     ramp_y = _ramp(np.fft.fftfreq(height), centre + offset_px[0])
     ramp_x = _ramp(np.fft.rfftfreq(width), centre + offset_px[1])
     # Keeping every r-th row is adding up the r aliases of each frequency: what follows is r times
@@ -54,9 +55,8 @@ def sample(
     rows = height // oversampling
     blurred = spectrum * transfer
     blurred *= ramp_y[:, None]
-    folded = blurred.reshape(*blurred.shape[:-2], oversampling, rows, -1).sum(-3) * (
-        ramp_x / oversampling
-    )
+    aliases = blurred.reshape(*blurred.shape[:-2], oversampling, rows, -1)
+    folded = aliases.sum(-3) * (ramp_x / oversampling)
     lines = fft.irfft(
         fft.ifft(folded, axis=-2, overwrite_x=True), n=width, axis=-1, overwrite_x=True
     )
@@ -95,11 +95,12 @@ def resample(radiance: np.ndarray, height: int, width: int) -> np.ndarray:
     top = (rows + 1) // 2
     bottom = rows // 2
     half = columns // 2 + 1
-    cut = np.zeros((height, width // 2 + 1), spectrum.dtype)
-    cut[:top, :half] = spectrum[:top, :half]
-    cut[height - bottom :, :half] = spectrum[old_height - bottom :, :half]
+    resampled = np.zeros((height, width // 2 + 1), spectrum.dtype)
+    resampled[:top, :half] = spectrum[:top, :half]
+    resampled[height - bottom :, :half] = spectrum[old_height - bottom :, :half]
+    # The inverse transform divides by the points of the new grid, not of the old one.
     scale = height * width / (old_height * old_width)
-    return np.asarray(fft.irfft2(cut, s=(height, width)) * scale)
+    return np.asarray(fft.irfft2(resampled, s=(height, width)) * scale)
 
 
 def _ramp(frequency: np.ndarray, shift_px: float) -> np.ndarray:

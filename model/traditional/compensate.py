@@ -43,9 +43,9 @@ def filter_strips(strips: Iterable[Tensor], height: int, kernel: Tensor) -> Iter
     radius = kernel.shape[0] // 2
     for top in range(0, height, BLOCK_PX):
         bottom = min(top + BLOCK_PX, height)
-        wide = rows.window(mirrored(top - radius, bottom + radius, height))
-        lefts = range(0, wide.shape[1], BLOCK_PX)
-        yield torch.cat(list(map_tiles(partial(_block, wide, kernel), lefts)), 1)
+        window = rows.window(mirrored(top - radius, bottom + radius, height))
+        lefts = range(0, window.shape[1], BLOCK_PX)
+        yield torch.cat(list(map_tiles(partial(_block, window, kernel), lefts)), 1)
 
 
 def _block(rows: Tensor, kernel: Tensor, left: int) -> Tensor:
@@ -59,18 +59,17 @@ def _block(rows: Tensor, kernel: Tensor, left: int) -> Tensor:
     width = rows.shape[1]
     right = min(left + BLOCK_PX, width)
     block = rows[:, mirrored(left - radius, right + radius, width)]
-    known = torch.isfinite(block)
+    valid = torch.isfinite(block)
     # Filtered without its mean, which has gain 1: in float32 the FFT of large constant values costs
     # digits.
-    mean = block[known].mean() if bool(known.any()) else block.new_zeros(())
+    mean = block[valid].mean() if bool(valid.any()) else block.new_zeros(())
     size = tuple(next_fast_len(side, real=True) for side in block.shape)
-    spectrum = torch.fft.rfft2(fill_with_local_means(block, known) - mean, s=size)
-    filtered: Tensor = torch.fft.irfft2(
-        spectrum * torch.fft.rfft2(kernel, s=size).to(spectrum), s=size
-    )
+    spectrum = torch.fft.rfft2(fill_with_local_means(block, valid) - mean, s=size)
+    gain = torch.fft.rfft2(kernel, s=size).to(spectrum)
+    filtered: Tensor = torch.fft.irfft2(spectrum * gain, s=size)
     inside = slice(2 * radius, block.shape[0]), slice(2 * radius, block.shape[1])
     core = slice(radius, -radius), slice(radius, -radius)
-    return (filtered[inside] + mean).where(known[core], torch.nan)
+    return (filtered[inside] + mean).where(valid[core], torch.nan)
 
 
 def compensation_kernel(blur_from: Blur, blur_to: Blur, epsilon: float) -> Tensor:

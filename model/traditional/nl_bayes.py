@@ -141,16 +141,16 @@ def estimate_groups(
     return estimates
 
 
-def _moments(patches: Tensor, taken: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def _moments(patches: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Mean patch (B, 1, k * k), the patches without it, and their covariance, of the taken patches.
 
     Divided by their number and not by one less, as published.
     """
-    if taken is None:
+    if mask is None:
         mean = patches.mean(1, keepdim=True)
         centred = patches - mean
         return mean, centred, centred.mT @ centred / patches.shape[1]
-    share = taken / taken.sum(1, keepdim=True)
+    share = mask / mask.sum(1, keepdim=True)
     mean = share[:, None] @ patches
     centred = patches - mean
     return mean, centred, centred.mT @ (centred * share[..., None])
@@ -178,11 +178,11 @@ def _shrinkage(covariance: Tensor, noise: Noise, settings: PassSettings) -> Tens
     else:
         diagonal.add_(JITTER * noise.sigma**2)
     factor, failed = torch.linalg.cholesky_ex(covariance)
-    lost = failed != 0
+    no_factor = failed != 0
     # Any factor does there, since its result is thrown away: the batch has to stay one call.
-    factor[lost] = torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device)
+    factor[no_factor] = torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device)
     shrinkage = torch.cholesky_inverse(factor) @ sigma_matrix
-    shrinkage[lost] = 0
+    shrinkage[no_factor] = 0
     return shrinkage
 
 
@@ -231,9 +231,8 @@ def window_distances(
     centre = guide[half : half + height, None, half : half + width]
     distances = guide.new_empty(len(rows), len(columns), window_px, window_px)
     for dy in range(window_px):
-        shifted = guide[dy : dy + height].unfold(1, width, 1)[
-            :, :window_px
-        ]  # (height, window, width)
+        # (height, window, width): each shift along the row beside the others.
+        shifted = guide[dy : dy + height].unfold(1, width, 1)[:, :window_px]
         squares = (shifted - centre).square_().reshape(height, -1)
         # Two small matrix products add up the k * k squares at the references alone, not at every
         # pixel.
@@ -295,10 +294,10 @@ def denoise_pass(
         if carried is not None:
             for sum_, before in zip(sums, carried, strict=True):
                 sum_[: len(before)] += before
-        done = (height if following is None else int(following[0]) - margin) - top
-        total, count = (sum_[max(-top, 0) : done] for sum_ in sums)
-        yield (total / count).where(count > 0, noisy_rows[max(-top, 0) : done])
-        carried = sums[0][done:], sums[1][done:]
+        stop = (height if following is None else int(following[0]) - margin) - top
+        total, count = (sum_[max(-top, 0) : stop] for sum_ in sums)
+        yield (total / count).where(count > 0, noisy_rows[max(-top, 0) : stop])
+        carried = sums[0][stop:], sums[1][stop:]
 
 
 def reference_runs(size_px: int, stride_px: int) -> tuple[Tensor, ...]:
@@ -320,18 +319,17 @@ def _row_of_tiles(
     """The sums of one row of tiles over (h, W); `centres` count from the first reference's own."""
     margin = settings.margin_px
     width = noisy.shape[1]
-    wide = mirrored(-margin, width + stride_px - 1 + margin, width)
-    noisy_wide = noisy[:, wide]
-    guide_wide = guide[:, wide]
+    columns_around = mirrored(-margin, width + stride_px - 1 + margin, width)
+    noisy_wide = noisy[:, columns_around]
+    guide_wide = guide[:, columns_around]
     runs = reference_runs(width, stride_px)
 
     def estimate(run: Tensor) -> Sums:
         area = slice(int(run[0]), int(run[-1]) + stride_px + 2 * margin)
         rows = centres
         columns = run - run[0]
-        if not bool(
-            torch.isfinite(noisy_wide[:, area]).all()
-        ):  # what is left between missing pixels is narrow
+        # What is left between missing pixels is narrow: every pixel is a reference there.
+        if not bool(torch.isfinite(noisy_wide[:, area]).all()):
             rows, columns = (torch.arange(int(place[-1]) + stride_px) for place in (rows, columns))
         return _tile(noisy_wide[:, area], guide_wide[:, area], (rows, columns), noise, settings)
 
@@ -348,21 +346,21 @@ def _tile(
     noisy: Tensor, guide: Tensor, places: Places, noise: Noise, settings: PassSettings
 ) -> Sums:
     """The sums over a tile (h, w)."""
-    known = torch.isfinite(noisy)
-    if not bool(known.any()):
+    valid = torch.isfinite(noisy)
+    if not bool(valid.any()):
         return torch.zeros_like(noisy), torch.zeros_like(noisy)
     side = settings.side_px
     patches = patch_matrix(noisy.nan_to_num(0), side)
     guides = patch_matrix(guide.nan_to_num(0), side)
     total = torch.zeros_like(patches)
     count = patches.new_zeros(len(patches), 1)
-    for numbers, taken in similar_groups(guide, known, places, settings):
+    for numbers, mask in similar_groups(guide, valid, places, settings):
         members = _rows_of(patches, numbers)
         model = _rows_of(guides, numbers) if settings.clean_guide else members
-        estimates = estimate_groups(members, model, taken, noise, settings)
-        weights = torch.ones_like(numbers, dtype=noisy.dtype) if taken is None else taken
-        if taken is not None:
-            estimates *= taken[..., None]
+        estimates = estimate_groups(members, model, mask, noise, settings)
+        weights = torch.ones_like(numbers, dtype=noisy.dtype) if mask is None else mask
+        if mask is not None:
+            estimates *= mask[..., None]
         # A patch lies in many groups, so its estimates add up here before any pixel is touched.
         total.index_add_(0, numbers.reshape(-1), estimates.reshape(-1, side**2))
         count.index_add_(0, numbers.reshape(-1), weights.reshape(-1, 1))
@@ -397,21 +395,21 @@ def similar_groups(
     # most.
     alike = ALIKE_RMS**2 * settings.side_px**2 if settings.clean_guide else 0.0
     enough = nearest[:, :usual].amax(1, keepdim=True).clamp(min=alike)
-    taken = (nearest <= enough) & nearest.isfinite()
-    sizes = taken.sum(1)
-    for chosen, size in (((sizes > 0) & (sizes <= usual), usual), (sizes > usual, most)):
-        if bool(chosen.any()):
-            counts = taken[chosen, :size]
-            numbers = first[chosen] + steps[candidate[chosen, :size]]
+    mask = (nearest <= enough) & nearest.isfinite()
+    sizes = mask.sum(1)
+    for selection, size in (((sizes > 0) & (sizes <= usual), usual), (sizes > usual, most)):
+        if bool(selection.any()):
+            counts = mask[selection, :size]
+            numbers = first[selection] + steps[candidate[selection, :size]]
             yield numbers, None if bool(counts.all()) else counts.to(guide.dtype)
 
 
-def _rule_out(distances: Tensor, numbers: Tensor, whole: Tensor) -> None:
+def _rule_out(distances: Tensor, numbers: Tensor, complete: Tensor) -> None:
     """Put the patches (B, M) that hold a missing pixel, and groups around such
     a one, out of reach.
     """
-    distances[~whole[numbers]] = torch.inf
-    distances[~whole[numbers[:, numbers.shape[1] // 2]]] = torch.inf
+    distances[~complete[numbers]] = torch.inf
+    distances[~complete[numbers[:, numbers.shape[1] // 2]]] = torch.inf
 
 
 def nearest_first(distances: Tensor, usual: int, most: int) -> tuple[Tensor, Tensor]:
@@ -421,12 +419,9 @@ def nearest_first(distances: Tensor, usual: int, most: int) -> tuple[Tensor, Ten
     numpy's partition is over three times faster than torch's topk (measured).
     """
     ends = [k for k in (usual - 1, most - 1) if k < distances.shape[1] - 1]
-    columns = (
-        torch.from_numpy(np.argpartition(distances.numpy(), ends, axis=1)[:, :most])
-        if ends
-        else None
-    )
-    if columns is None:
+    if ends:
+        columns = torch.from_numpy(np.argpartition(distances.numpy(), ends, axis=1)[:, :most])
+    else:
         columns = torch.arange(most).expand(len(distances), most)
     return columns, distances.gather(1, columns)
 

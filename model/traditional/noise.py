@@ -45,7 +45,8 @@ def coloured_by(kernel: Tensor, sigma: float) -> Noise:
     The autocorrelation of the kernel: r(d) = sum over p of k(p) k(p + d), sigma times the root of
     r(0).
     """
-    size = kernel.shape[-1] + 2 * LAG_PX  # no lag wraps around
+    # So large that no lag wraps around.
+    size = kernel.shape[-1] + 2 * LAG_PX
     power = torch.fft.rfft2(kernel.double(), s=(size, size)).abs().square()
     full = torch.fft.irfft2(power, s=(size, size)).roll((LAG_PX, LAG_PX), (0, 1))
     autocorrelation = full[: 2 * LAG_PX + 1, : 2 * LAG_PX + 1]
@@ -67,8 +68,9 @@ def stabilise(radiance: Tensor, sensor: Instrument) -> Tensor:
     L = 0 the noise is that of the dark, and f goes on as L / sqrt(beta) (as 0 where beta = 0). L
     has any shape and is in W/m2/sr/um; alpha and beta are at least 0 and not both 0.
     """
-    dark = math.sqrt(sensor.beta)
-    denominator = (sensor.alpha * radiance.clamp(min=0) + sensor.beta).sqrt() + dark
+    sigma_dark = math.sqrt(sensor.beta)
+    # Without the difference of two roots, which vanishes in float32 for small alpha.
+    denominator = (sensor.alpha * radiance.clamp(min=0) + sensor.beta).sqrt() + sigma_dark
     # With beta = 0 the denominator is 0 at L = 0, where f is 0 too.
     return (2 * radiance / denominator).where(denominator != 0, 0.0)
 

@@ -51,14 +51,14 @@ def unsupervised_wiener(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
 def richardson_lucy(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
     """scikit-image's Richardson-Lucy deconvolution, 20 steps."""
     side = 2 * PAD_PX + 1
-    spread = np.roll(fft.irfft2(blur, s=image.shape), (PAD_PX, PAD_PX), (0, 1))[:side, :side]
+    psf = np.roll(fft.irfft2(blur, s=image.shape), (PAD_PX, PAD_PX), (0, 1))[:side, :side]
     # Richardson-Lucy is defined for kernels that are nowhere negative, and this one may ring below
     # 0.
-    spread = np.maximum(spread, 0)
+    psf = np.maximum(psf, 0)
     # It divides by its own blurred estimate, which goes to 0 where the image is 0.
     light = np.maximum(image, 1e-6)
     return np.asarray(
-        restoration.richardson_lucy(light, spread / spread.sum(), RICHARDSON_LUCY_STEPS, clip=False)
+        restoration.richardson_lucy(light, psf / psf.sum(), RICHARDSON_LUCY_STEPS, clip=False)
     )
 
 
@@ -72,9 +72,8 @@ def nl_means(dn: Tensor, chain: Chain) -> Tensor:
         stable.numpy(), NLM_PATCH_PX, NLM_DISTANCE_PX, h=NLM_STRENGTH, sigma=1.0, fast_mode=True
     )
     radiance = destabilise(torch.from_numpy(clean).float(), sensor) + bias_radiance(sensor)
-    sharp = torch.cat(
-        list(filter_strips([radiance], len(radiance), chain.fitted_to([dn]).kernel()))
-    )
+    kernel = chain.fitted_to([dn]).kernel()
+    sharp = torch.cat(list(filter_strips([radiance], len(radiance), kernel)))
     return to_dn(sharp, chain.reference)
 
 
@@ -90,13 +89,12 @@ def _deconvolved(
     rows, columns = (mirrored(-PAD_PX, size + PAD_PX, size) for size in dn.shape)
     height = len(rows)
     width = len(columns)
-    wide = ((dn.double() - chain.degraded.offset_dn) / chain.degraded.max_dn)[rows][
-        :, columns
-    ].numpy()
+    share = (dn.double() - chain.degraded.offset_dn) / chain.degraded.max_dn
+    padded = share[rows][:, columns].numpy()
     blur, target = (
         transfer_function(height, width, 1, s.blur) for s in (chain.degraded, chain.reference)
     )
-    sharp = fft.rfft2(deconvolve(wide, blur)) * target
+    sharp = fft.rfft2(deconvolve(padded, blur)) * target
     inside = fft.irfft2(sharp, s=(height, width))[PAD_PX:-PAD_PX, PAD_PX:-PAD_PX]
     return to_dn(torch.from_numpy((inside * full_scale).astype(np.float32)), chain.reference)
 

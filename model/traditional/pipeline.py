@@ -67,8 +67,8 @@ class Chain:
         """
         if self.epsilon is not None:
             return self
-        measured = measure(finite_or_missing(strips), self.degraded)
-        return replace(self, epsilon=derived_epsilon(measured, self.degraded))
+        noise_and_scene = measure(finite_or_missing(strips), self.degraded)
+        return replace(self, epsilon=derived_epsilon(noise_and_scene, self.degraded))
 
     def kernel(self) -> Tensor:
         """Return the filter of the MTF compensation, (2 R + 1, 2 R + 1) float64, for the pipeline's
@@ -97,6 +97,7 @@ def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Itera
     some 700 rows of the image, and the tallest strip.
     """
     radiance = (to_radiance(strip, chain.degraded) for strip in finite_or_missing(strips))
+    # The converter's rounding adds a twelfth of a squared DN, which NL-Bayes must know of.
     sensor = with_rounding_noise(chain.degraded)
     kernel = chain.kernel()
     quality = quality_named(chain.quality)
@@ -105,6 +106,7 @@ def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Itera
         restored = filter_strips(clean, height, kernel)
     else:
         coloured = coloured_by(kernel, 1.0)
+        # The filter multiplies the variance of white noise by the sum of its squares.
         amplified = replace(
             sensor, alpha=sensor.alpha * coloured.sigma**2, beta=sensor.beta * coloured.sigma**2
         )
@@ -125,6 +127,7 @@ def denoise_radiance(
     scale = noise.sigma
     stable = (stabilise(strip, sensor) * scale for strip in radiance)
     for clean in nl_bayes_strips(stable, height, noise, quality):
+        # The root is concave: a mean on the stabilised scale lies alpha / 4 too low.
         yield destabilise(clean / scale, sensor) + bias_radiance(sensor)
 
 

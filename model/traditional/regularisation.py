@@ -109,6 +109,7 @@ class NoiseAndScene:
     def largest_epsilon(self) -> float:
         """Return the bound of epsilon that the noise sets."""
         sigma = self.noise**0.5
+        # Compared as products, because the radiance of the dark is 0.
         if LARGEST_EPSILON * self.radiance <= LARGEST_PER_NOISE * sigma:
             return LARGEST_EPSILON
         return float(LARGEST_PER_NOISE * sigma / self.radiance)
@@ -138,7 +139,7 @@ def measure(strips: Iterable[Tensor], sensor: Instrument) -> NoiseAndScene:
         above = radiance[-1:]
     if not pixels:
         return NoiseAndScene(radiance=0.0, noise=digitised.beta, residual=0.0, contrast=0.0)
-    return NoiseAndScene(*(float(each) for each in sums / pixels))
+    return NoiseAndScene(*(float(mean) for mean in sums / pixels))
 
 
 def derived_epsilon(measured: NoiseAndScene, sensor: Instrument, fit: Fit = FIT) -> float:
@@ -150,15 +151,15 @@ def bands(strips: Iterable[Tensor]) -> Iterator[Tensor]:
     """Yield the rows of strips (any, W) in bands of BLOCK_PX rows, the last one
     with what is left.
     """
-    held: Tensor | None = None
+    remainder: Tensor | None = None
     for strip in strips:
-        rows = strip if held is None else torch.cat([held, strip])
-        whole = len(rows) // BLOCK_PX * BLOCK_PX
-        for top in range(0, whole, BLOCK_PX):
+        rows = strip if remainder is None else torch.cat([remainder, strip])
+        complete = len(rows) // BLOCK_PX * BLOCK_PX
+        for top in range(0, complete, BLOCK_PX):
             yield rows[top : top + BLOCK_PX]
-        held = rows[whole:]
-    if held is not None and len(held):
-        yield held
+        remainder = rows[complete:]
+    if remainder is not None and len(remainder):
+        yield remainder
 
 
 def _sums(
@@ -181,14 +182,19 @@ def _sums(
         squares += total / np.maximum(pairs, 1)
         axes += pairs > 0
     _, below_full_scale = _blocks(np.where(unsaturated, radiance, np.nan))
+    # Saturated pixels say nothing of the scene. One among others counts, or epsilon would jump.
     usable = (axes > 0) & (below_full_scale > 0)
     pixels = pixels[usable]
     mean_radiance = np.maximum(light[usable] / pixels, 0)
     variance = sensor.alpha * mean_radiance + sensor.beta
+    # White noise adds 2 v to the squared difference of two neighbours.
     contrast = squares[usable] / axes[usable] - 2 * variance
     scene_over_noise = np.maximum(contrast / (2 * variance), 0)
+    # A Wiener filter leaves the share u / (u + 1) of the noise, and NL-Bayes a similar one.
     residual = variance * scene_over_noise / (scene_over_noise + 1)
-    sums = [float((pixels * each).sum()) for each in (mean_radiance, variance, residual, contrast)]
+    sums = [
+        float((pixels * values).sum()) for values in (mean_radiance, variance, residual, contrast)
+    ]
     return np.array(sums), int(pixels.sum())
 
 
@@ -196,12 +202,13 @@ def _blocks(values: Array) -> tuple[Array, Array]:
     """Return the sum and the number of the known values (rows, W) in each block of BLOCK_PX
     columns.
     """
-    known = np.isfinite(values)
-    columns = np.where(known, values, 0.0).sum(0), known.sum(0, dtype=np.float64)
+    valid = np.isfinite(values)
+    columns = np.where(valid, values, 0.0).sum(0), valid.sum(0, dtype=np.float64)
     missing_columns = -values.shape[1] % BLOCK_PX
     # Rows are added first: sums over the few columns of a block are slow.
     total, number = (
-        np.pad(each, (0, missing_columns)).reshape(-1, BLOCK_PX).sum(1) for each in columns
+        np.pad(per_column, (0, missing_columns)).reshape(-1, BLOCK_PX).sum(1)
+        for per_column in columns
     )
     return total, number
 
@@ -214,6 +221,7 @@ def difference_energy(sensor: Instrument) -> float:
     fy = np.fft.fftfreq(GRID)[:, None]
     fx = np.fft.fftfreq(GRID)[None, :]
     r_squared = (fx**2 + fy**2) / NYQUIST**2
+    # The mean of an image is no contrast: the quotient is 0 there.
     r_squared[0, 0] = np.inf
     differences = 2 * np.sin(np.pi * fx) ** 2 + 2 * np.sin(np.pi * fy) ** 2
     return float((np.abs(sensor_mtf(fx, fy, sensor)) ** 2 * differences / r_squared).mean())

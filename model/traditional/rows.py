@@ -29,8 +29,8 @@ class Rows:
         # Strips above the window are never asked for again: forgetting them bounds the memory.
         while self._top + len(self._held[0]) <= top:
             self._top += len(self._held.pop(0))
-        held = self._held[0] if len(self._held) == 1 else torch.cat(self._held)
-        return held[rows - self._top]
+        rows_held = self._held[0] if len(self._held) == 1 else torch.cat(self._held)
+        return rows_held[rows - self._top]
 
 
 def mirrored(start: int, stop: int, size: int) -> Tensor:
@@ -81,9 +81,9 @@ def fill_with_local_means(image: Tensor, known: Tensor) -> Tensor:
     if bool(known.all()) or max(image.shape) == 1:
         return filled
     # Odd sides get a row or column that counts as unknown, so that every 2 x 2 is whole.
-    odd = (0, image.shape[1] % 2, 0, image.shape[0] % 2)
-    count = _sum_2x2(pad(known.to(image.dtype), odd))
-    mean = _sum_2x2(pad(filled, odd)) / count.clamp(min=1)
+    to_even = (0, image.shape[1] % 2, 0, image.shape[0] % 2)
+    count = _sum_2x2(pad(known.to(image.dtype), to_even))
+    mean = _sum_2x2(pad(filled, to_even)) / count.clamp(min=1)
     coarse = fill_with_local_means(mean, count > 0).repeat_interleave(2, 0).repeat_interleave(2, 1)
     return filled.where(known, coarse[: image.shape[0], : image.shape[1]])
 

@@ -146,9 +146,10 @@ def checkpoint_sha256(tensors: Mapping[str, Tensor], header: Mapping[str, object
 
     Safetensors has none, and a flipped bit is a plausible weight or another step.
     """
-    stated = {key: value for key, value in header.items() if key != "sha256"}
-    digest = hashlib.sha256(json.dumps(stated, sort_keys=True).encode())
+    content = {key: value for key, value in header.items() if key != "sha256"}
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
     for name, array in sorted(arrays(dict(tensors)).items()):
+        # The same bytes of another shape or type are another tensor.
         digest.update(f"{name} {array.shape} {array.dtype} ".encode())
         digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
@@ -166,8 +167,8 @@ def read_checkpoint(
         recipe: that it was begun with.
         data: digest of all that it was begun to learn from.
     """
-    found, header = read_tensors(path)
-    tensors = {name: torch.from_numpy(array) for name, array in found.items()}
+    parts, header = read_tensors(path)
+    tensors = {name: torch.from_numpy(array) for name, array in parts.items()}
     if header.get("recipe") != asdict(recipe):
         remedy = "repeat its options, or choose another folder"
         raise ModelError(
@@ -181,9 +182,9 @@ def read_checkpoint(
         if header["sha256"] != checkpoint_sha256(tensors, header):
             raise ValueError("a content that does not match its digest")
         _check_parts(tensors, network, recipe.steps)
-        kept: Any = header["guards"]
-        best = None if kept["best"] is None else float(kept["best"])
-        guards = Guards(int(kept["bad_steps"]), best, float(kept["sum"]), int(kept["count"]))
+        counts: Any = header["guards"]
+        best = None if counts["best"] is None else float(counts["best"])
+        guards = Guards(int(counts["bad_steps"]), best, float(counts["sum"]), int(counts["count"]))
         step = int(str(header["step"]))
         if not 0 <= step <= recipe.steps:
             raise ValueError(f"step {step} of {recipe.steps}")
@@ -206,29 +207,27 @@ def finish(network: Network, path: Path, recipe: dict[str, object]) -> None:
 
 
 def _check_parts(tensors: dict[str, Tensor], network: Network, steps: int) -> None:
-    """Nothing is filled in before all of it fits."""
-    wanted = {
-        f"{part}.{k}": value
-        for k, value in network.state_dict().items()
-        for part in ("network", "average")
-    }
-    if len(tensors) > len(wanted):  # before the first step Adam keeps nothing
+    """Raise ValueError unless all tensors fit the network and Adam: nothing is filled in before."""
+    templates: dict[str, Tensor] = {}
+    for key, value in network.state_dict().items():
+        templates |= {f"network.{key}": value, f"average.{key}": value}
+    # Before the first step Adam keeps nothing.
+    if len(tensors) > len(templates):
         for name, parameter in network.named_parameters():
-            wanted |= {f"moment.{name}.{moment}": parameter for moment in MOMENTS}
-            wanted[f"moment.{name}.step"] = parameter.new_zeros(())
-    for name, like in wanted.items():
+            templates |= {f"moment.{name}.{moment}": parameter for moment in MOMENTS}
+            templates[f"moment.{name}.step"] = parameter.new_zeros(())
+    for name, template in templates.items():
         value = tensors[name]
         moment = name.rsplit(".", 1)[1]
-        if value.shape != like.shape or value.dtype != like.dtype:
-            raise ValueError(
-                f"a tensor {tuple(value.shape)} of {value.dtype} in place of {tuple(like.shape)}"
-            )
-        least, most = {"step": (0, steps), "exp_avg_sq": (0, math.inf)}.get(
-            moment, (-math.inf, math.inf)
-        )
+        if value.shape != template.shape or value.dtype != template.dtype:
+            shapes = f"{tuple(value.shape)} of {value.dtype} in place of {tuple(template.shape)}"
+            raise ValueError(f"a tensor {shapes}")
+        # Adam's second moment is a mean of squares.
+        limits = {"step": (0, steps), "exp_avg_sq": (0, math.inf)}
+        least, most = limits.get(moment, (-math.inf, math.inf))
         if not bool(((value >= least) & (value <= most)).all()):
             raise ValueError(f"{name} that Adam cannot have")
-    if len(tensors) != len(wanted) or not all_finite(arrays(tensors)):
+    if len(tensors) != len(templates) or not all_finite(arrays(tensors)):
         raise ValueError(
-            f"{len(tensors)} tensors in place of {len(wanted)}, or values that are not finite"
+            f"{len(tensors)} tensors in place of {len(templates)}, or values that are not finite"
         )

@@ -80,8 +80,10 @@ def coarse(error: Tensor) -> Tensor:
     blocks, the same.
     """
     means = avg_pool2d(error, BLOCK_PX)
-    found: Tensor = interpolate(means, size=error.shape[-2:], mode="bilinear", align_corners=False)
-    return found
+    interpolated: Tensor = interpolate(
+        means, size=error.shape[-2:], mode="bilinear", align_corners=False
+    )
+    return interpolated
 
 
 def log_mse(restored: Tensor, reference: Tensor) -> Tensor:
@@ -103,5 +105,6 @@ def fft_l1(restored: Tensor, reference: Tensor) -> Tensor:
     and twice that at
     256. The size is taken by abs(), whose gradient at 0 is 0; that of sqrt(re^2 + im^2) is NaN.
     """
+    # Orthonormal, so that the term does not grow with the patch. abs() has a gradient at 0.
     size: Tensor = torch.fft.rfft2(restored - reference, norm="ortho").abs().mean()
     return size

@@ -83,18 +83,17 @@ def folded_signals(scene: Visited, sensors: tuple[Instrument, ...], made: Pass) 
     centre = (made.oversampling - 1) / 2
     ground *= _ramp(down / made.oversampling, centre + made.phase_px[0])[:, None]
     ramp = _ramp(across / made.oversampling, centre + made.phase_px[1]) / made.oversampling
-    found = []
+    signals = []
     for sensor in sensors:
         blurs = sensor.blur, sensor.antialias_px, sensor.smear_px
         transfer = transfer_of(height, width, made.oversampling, *blurs, str(device))
         # Keeping every r-th row is adding up the r aliases of each frequency: what follows is r
         # times smaller.
-        rows = (ground * transfer).view(made.oversampling, height // made.oversampling, -1).sum(
-            0
-        ) * ramp
+        aliases = (ground * transfer).view(made.oversampling, height // made.oversampling, -1)
+        rows = aliases.sum(0) * ramp
         lines = torch.fft.irfft(torch.fft.ifft(rows, dim=0), n=width)
-        found.append(within_margin(lines[:, :: made.oversampling], made.margin_px))
-    return found
+        signals.append(within_margin(lines[:, :: made.oversampling], made.margin_px))
+    return signals
 
 
 def within_margin(image: Tensor, margin_px: int) -> Tensor:
@@ -115,13 +114,14 @@ def looked(spectrum: Tensor, look: Look, fy: Tensor, fx: Tensor) -> Tensor:
     Returns:
         (H, W // 2 + 1) complex.
     """
-    found = spectrum * (look.light * look.contrast)
+    ground = spectrum * (look.light * look.contrast)
     if look.softness_px:
         down, across = (torch.exp(-2 * (math.pi * look.softness_px * f) ** 2) for f in (fy, fx))
-        found *= down[:, None]
-        found *= across
-    found[0, 0] = spectrum[0, 0] * look.light
-    return found
+        ground *= down[:, None]
+        ground *= across
+    # Frequency 0 is the mean of the ground, which the light alone changes.
+    ground[0, 0] = spectrum[0, 0] * look.light
+    return ground
 
 
 def _ramp(frequency: Tensor, shift_px: float) -> Tensor:
@@ -154,8 +154,8 @@ def transfer_of(
     A point-spread function is left to that function.
     """
     if isinstance(blur, PointSpread):
-        found = transfer_function(height, width, oversampling, blur, antialias_px, smear_px)
-        return torch.from_numpy(found).to(device)
+        transfer = transfer_function(height, width, oversampling, blur, antialias_px, smear_px)
+        return torch.from_numpy(transfer).to(device)
     down, across = frequencies(height, width, oversampling, device)
     fy = down[: height // 2 + 1, None].abs()
     fx = across[None]
@@ -170,9 +170,8 @@ def transfer_of(
     # The anti-alias filter's own loss: exp(-2 pi^2 sigma^2 f^2).
     loss = loss + 2 * (math.pi * antialias_px * radius) ** 2
     upper = torch.exp(-loss) * torch.sinc(fx) * (torch.sinc(fy) * torch.sinc(smear_px * fy))
-    return torch.cat(
-        [upper, upper[1 : (height + 1) // 2].flip(0)]
-    )  # even in fy: the rows below are the same
+    # The transfer is even in fy: the rows below mirror those above.
+    return torch.cat([upper, upper[1 : (height + 1) // 2].flip(0)])
 
 
 def _table_gammas(table: MtfTable, radius: Tensor) -> list[Tensor]:
@@ -182,14 +181,14 @@ def _table_gammas(table: MtfTable, radius: Tensor) -> list[Tensor]:
     place = (radius.clamp(evenly[0], evenly[-1]) - evenly[0]) * (
         (GAMMAS - 1) / (evenly[-1] - evenly[0])
     )
+    # The last radius has no neighbour on its right.
     left = place.int().clamp(max=GAMMAS - 2)
     share = place - left
     gammas = []
     for contrast in (table.across, table.along):
         losses = np.maximum(-np.log(np.array(contrast) / np.sinc(frequency)), 0.0)
-        gamma = torch.tensor(np.interp(evenly, frequency, losses) / evenly, dtype=torch.float32).to(
-            radius.device
-        )
+        values = np.interp(evenly, frequency, losses) / evenly
+        gamma = torch.tensor(values, dtype=torch.float32).to(radius.device)
         gammas.append(torch.lerp(gamma[left], gamma[left + 1], share))
     return gammas
 

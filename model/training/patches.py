@@ -62,6 +62,7 @@ def draw_turn(
     `quarters` is False: four symmetries are left. Where its blur is lopsided it stays as it is, and
     `mirrors` is False.
     """
+    # Both are drawn whatever is allowed: the generator goes on in the same way.
     quarter = int(generator.integers(4))
     mirrored = bool(generator.integers(2))
     if not mirrors:
@@ -84,10 +85,10 @@ def pair_files(folder: Path) -> list[Files]:
     degraded, reference = (
         {p.stem: p for p in list_images(folder / role)} for role in ("degraded", "reference")
     )
-    alone = sorted(degraded.keys() ^ reference.keys())
-    if alone:
+    unpaired = sorted(degraded.keys() ^ reference.keys())
+    if unpaired:
         expected = "each name in degraded/ and in reference/"
-        got = f"{alone[0]!r} in one of them only"
+        got = f"{unpaired[0]!r} in one of them only"
         remedy = "complete the pairs; 'beers-deploy simulate' writes such folders"
         raise ImageError(str(folder), expected=expected, got=got, remedy=remedy)
     return [(path, reference[name]) for name, path in degraded.items()]

@@ -23,6 +23,7 @@ T = TypeVar("T")
 
 
 def _whole(value: Any) -> bool:
+    # Python counts True as an int.
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
@@ -44,7 +45,7 @@ KINDS: Mapping[object, tuple[Callable[[Any], bool], str]] = {
         "two numbers from 0 on",
     ),
     tuple[str, ...]: (
-        lambda value: _list_of(value, lambda each: isinstance(each, str)),
+        lambda value: _list_of(value, lambda item: isinstance(item, str)),
         "a list of texts",
     ),
     Precision: (
@@ -161,7 +162,7 @@ def load_recipe(name: str) -> NetworkRecipe:
             remedy="add the stages of the training",
         )
     stages = tuple(
-        _made(Stage, f"{where}: stage {number}", each) for number, each in enumerate(tables, 1)
+        _made(Stage, f"{where}: stage {number}", table) for number, table in enumerate(tables, 1)
     )
     parts: dict[str, Any] = {"stages": stages}
     for key, kind in (("looks", Looks), ("loss", LossWeights)):
@@ -181,15 +182,18 @@ def _made(kind: type[T], where: str, raw: object) -> T:
     """A dataclass of a table's values, each of the kind of the field's default."""
     if not isinstance(raw, Mapping):
         raise ProfileError(where, expected="a table", got=repr(raw), remedy="write it as a table")
-    known = {each.name: each for each in fields(kind)}  # type: ignore[arg-type]
+    fields_by_name = {field_.name: field_ for field_ in fields(kind)}  # type: ignore[arg-type]
     required = {
         n
-        for n, each in known.items()
-        if each.default is MISSING and each.default_factory is MISSING
+        for n, field_ in fields_by_name.items()
+        if field_.default is MISSING and field_.default_factory is MISSING
     }
-    check_keys(where, raw, required, set(known) - required)
+    check_keys(where, raw, required, set(fields_by_name) - required)
     return kind(
-        **{key: _value(f"{where}: {key}", known[key].type, value) for key, value in raw.items()}
+        **{
+            key: _value(f"{where}: {key}", fields_by_name[key].type, value)
+            for key, value in raw.items()
+        }
     )
 
 

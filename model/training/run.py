@@ -10,6 +10,7 @@ import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -122,18 +123,19 @@ def split_by_site(names: Sequence[str], wanted: Sequence[str] = ()) -> tuple[lis
     sites: dict[str, list[int]] = {}
     for number, name in enumerate(names):
         sites.setdefault(site_of(name), []).append(number)
-    held: list[int] = []
+    held_out: list[int] = []
     for site in wanted:
         if site not in sites:
             remedy = "give the folders of all its images"
             raise OptionError("held out", expected=f"images of {site}", got="none", remedy=remedy)
-        held += sites[site]
+        held_out += sites[site]
     if len(sites) >= 3 and not wanted:
+        # The name decides between sites of one size, so that the split is always the same.
         for site in sorted(sites, key=lambda s: (len(sites[s]), s)):
-            if len(held) >= SHARE * len(names):
+            if len(held_out) >= SHARE * len(names):
                 break
-            held += sites[site]
-    return [n for n in range(len(names)) if n not in held], sorted(held)
+            held_out += sites[site]
+    return [n for n in range(len(names)) if n not in held_out], sorted(held_out)
 
 
 class Validation:
@@ -152,6 +154,7 @@ class Validation:
             ratio = fitting_oversampling(scene.radiance, OVERSAMPLINGS, LEAST_SIDE_PX)
             if ratio is None:
                 continue
+            # Seed 0 whatever that of the run: validation is the same in every run.
             draw = Draw(0, number)
             sensors = [profile.draw(draw.generator("sensor")) for profile in (degraded, reference)]
             pair = simulate_pair(scene.radiance, sensors[0], sensors[1], ratio, draw)
@@ -173,14 +176,13 @@ class Validation:
         """
         restored = []
         for (degraded, _), sensor in zip(self.pairs, self.sensors, strict=True):
-            plain = told(network, vector_tensor(sensor), network_bank(sensor))
+            for_sensor = told(network, vector_tensor(sensor), network_bank(sensor))
             height, width = degraded.shape[-2:]
-            lack = (-size % plain.variant.scale for size in (width, height))
-            extended = pad(
-                degraded, [each for side in lack for each in (0, side)], mode="replicate"
-            )
+            right = -width % for_sensor.variant.scale
+            below = -height % for_sensor.variant.scale
+            extended = pad(degraded, [0, right, 0, below], mode="replicate")
             with torch.inference_mode():
-                restored.append(plain(extended)[0, 0, :height, :width].clamp(0, 1).numpy())
+                restored.append(for_sensor(extended)[0, 0, :height, :width].clamp(0, 1).numpy())
         return restored
 
     def judge(self, network: Network) -> dict[str, float]:
@@ -207,9 +209,9 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
     """Run or resume a training to its end; says first whether LPIPS is part of the loss."""
     variant = variant_named(run.variant)
     require_whole_places(run, variant)
-    loss, said = loss_of(run)
-    if said and worker.first:
-        say(said)
+    loss, message = loss_of(run)
+    if message and worker.first:
+        say(message)
     generator = torch.Generator().manual_seed(run.recipe.seed)
     start = grow(_given(run, run.start), variant, generator) if run.start else None
     conditioned = run.patches.family is not None
@@ -248,15 +250,15 @@ def _given(run: Run, path: Path) -> Network:
     every step would.
     """
     network, _ = load_network(path)
-    wanted = ConvBEERS if run.patches.family is None else BankedConvBEERS
-    if not isinstance(network, wanted):
+    kind = ConvBEERS if run.patches.family is None else BankedConvBEERS
+    if not isinstance(network, kind):
         kinds = {
             ConvBEERS: "a plain network's",
             BankedConvBEERS: "those that 'train --conditioned' wrote",
         }
-        remedy = "give others, or give `conditioned`" if wanted is ConvBEERS else "give others"
+        remedy = "give others, or give `conditioned`" if kind is ConvBEERS else "give others"
         raise ModelError(
-            str(path), expected=f"weights: {kinds[wanted]}", got=kinds[type(network)], remedy=remedy
+            str(path), expected=f"weights: {kinds[kind]}", got=kinds[type(network)], remedy=remedy
         )
     if run.rounding is not None and network.variant != variant_named(run.variant):
         remedy = "train a network of that size first, and make its INT8 file"
@@ -266,6 +268,7 @@ def _given(run: Run, path: Path) -> Network:
             got=f"{network.variant.blocks} blocks of {network.variant.features} features",
             remedy=remedy,
         )
+    # Finite weights may still give NaN, and then would in every step.
     require_finite_output(network, str(path), "give another network")
     return network
 
@@ -274,13 +277,13 @@ def loss_of(run: Run) -> tuple[RestorationLoss, str]:
     """The loss of the recipe, and a sentence on whether LPIPS is part of it."""
     if not run.recipe.loss.lpips:
         return RestorationLoss(run.recipe.loss), ""
-    found = find_backbone("squeeze", run.lpips)
-    if found is None:
+    backbone = find_backbone("squeeze", run.lpips)
+    if backbone is None:
         return RestorationLoss(
             run.recipe.loss
         ), f"trains WITHOUT the LPIPS term: {not_found('squeeze')}"
-    perceptual = Lpips.load("squeeze", found)
-    return RestorationLoss(run.recipe.loss, perceptual), f"LPIPS term over {found.name}"
+    perceptual = Lpips.load("squeeze", backbone)
+    return RestorationLoss(run.recipe.loss, perceptual), f"LPIPS term over {backbone.name}"
 
 
 def data_sha256(run: Run, loss: RestorationLoss) -> str:
@@ -292,10 +295,11 @@ def data_sha256(run: Run, loss: RestorationLoss) -> str:
         loss: with or without LPIPS, whose weights may be missing at the second time.
     """
     patches = run.patches
-    files = [file for folder in run.images for file in list_images(folder)]
+    files = list(chain.from_iterable(map(list_images, run.images)))
     for pair in pair_files(run.pairs) if run.pairs else []:
         files += pair
-    stated = [
+    weights = [path for path in (run.start, run.lpips) if path and path.is_file()]
+    content = [
         *(numbers_of(sensor) for sensor in (patches.degraded, patches.reference)),
         patches.family,
         (
@@ -307,15 +311,9 @@ def data_sha256(run: Run, loss: RestorationLoss) -> str:
         ),
         (run.drawn, run.charts, run.held_out),
         loss.perceptual is not None,
-        *(
-            (file.name, sha256(file))
-            for file in (
-                *files,
-                *(each for each in (run.start, run.lpips) if each and each.is_file()),
-            )
-        ),
+        *((file.name, sha256(file)) for file in (*files, *weights)),
     ]
-    return hashlib.sha256(repr(stated).encode()).hexdigest()
+    return hashlib.sha256(repr(content).encode()).hexdigest()
 
 
 def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
@@ -325,19 +323,31 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
     if run.pairs is not None:
         files = pair_files(run.pairs)
         degraded = run.patches.degraded
-        given = (run.patches.patch_px, degraded.nominal().max_dn, recipe.batch, recipe.seed)
-        mirrors, alike = degraded.nominal().symmetry
+        nominal = degraded.nominal()
+        mirrors, alike = nominal.symmetry
+        # Axes that are drawn from two ranges differ, even where the middles of the ranges agree.
         turns = alike and degraded.mtf_nyquist_along is None
         source = StoredPairs(
-            files, *given, trainer.worker.rank, trainer.worker.count, turns, mirrors
+            files,
+            run.patches.patch_px,
+            nominal.max_dn,
+            recipe.batch,
+            recipe.seed,
+            trainer.worker.rank,
+            trainer.worker.count,
+            turns,
+            mirrors,
         )
         return source.batches, Validation([], *sensors), [degraded.name for degraded, _ in files]
     scenes = read_scenes(run)
-    kept, held = split_by_site([scene.name for scene in scenes], run.held_out)
+    training, held_out = split_by_site([scene.name for scene in scenes], run.held_out)
     views = SENSOR_VIEWS if run.patches.family else 1
-    validation = Validation([scenes[k] for k in held for _ in range(views)], *sensors)
-    drawn = draw_scenes(run.drawn, recipe.seed) + draw_charts(run.charts, recipe.seed)
-    train_on = [scenes[k] for k in kept] + drawn
+    held_out_scenes = list[Scene]()
+    for number in held_out:
+        held_out_scenes += [scenes[number]] * views
+    validation = Validation(held_out_scenes, *sensors)
+    synthetic = draw_scenes(run.drawn, recipe.seed) + draw_charts(run.charts, recipe.seed)
+    train_on = [scenes[number] for number in training] + synthetic
     if not train_on:
         remedy = "give `images`, `pairs` or `drawn`"
         raise OptionError(
@@ -351,7 +361,7 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
 
 def read_scenes(run: Run) -> list[Scene]:
     """The images of the run's folders."""
-    files = [file for folder in run.images for file in list_images(folder)]
+    files = list(chain.from_iterable(map(list_images, run.images)))
     scenes = list[Scene]()
     if not files:
         return []
@@ -370,11 +380,11 @@ def _train(run: Run, trainer: Trainer, batches: Batches, validation: Validation)
 
         def report(step: int, terms: Mapping[str, float], speed: Speed) -> None:
             log.write(step, {**terms, "patches_per_s": speed.patches_per_s, "waited": speed.waited})
-            shown = ", ".join(f"{name} {value:.5f}" for name, value in terms.items())
+            means = ", ".join(f"{name} {value:.5f}" for name, value in terms.items())
             rate = (
                 f"{speed.patches_per_s:.0f} patches/s in {run.precision}, waits {speed.waited:.0%}"
             )
-            bar.advance(step - bar.done, f"{shown}, {rate}")
+            bar.advance(step - bar.done, f"{means}, {rate}")
 
         def validate(step: int, network: Network) -> None:
             require_finite_output(network, f"training step {step}")
@@ -399,11 +409,12 @@ class Log:
         self.path = path
         if path.exists():
             lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-            kept = [
+            # A run that was killed may have written lines after its last checkpoint.
+            entries = [
                 line for line in lines if not (number := STEP.match(line)) or int(number[0]) <= step
             ]
             path.write_text(
-                "".join(f"{line}\n" for line in kept if step), encoding="utf-8", newline=""
+                "".join(f"{line}\n" for line in entries if step), encoding="utf-8", newline=""
             )
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
@@ -427,6 +438,7 @@ def write_picture(validation: Validation, network: Network, path: Path) -> None:
         top, left = busiest_windows(images[2], side)[0]
         crops = (image[top : top + side, left : left + side] for image in images)
         rows.append(strip_row(crops, stretch_of(images[2])))
+    # Scenes may have other sizes, and the cells of a grid have one.
     smallest = min(row[0].shape for row in rows)
     cells = [[cell[: smallest[0], : smallest[1]] for cell in row] for row in rows]
     with whole_file(path) as temporary:

@@ -104,27 +104,29 @@ class PatchSource:
                 number += 1
                 waiting.append(ahead.submit(self._shard, number + threads - 1))
                 for k in range(within, self.SHARD_BATCHES):
-                    yield _part(shard, slice(k * self.batch, (k + 1) * self.batch))
+                    part = slice(k * self.batch, (k + 1) * self.batch)
+                    told = None if shard.told is None else shard.told.some(part)
+                    yield Batch(shard.degraded[part], shard.reference[part], told)
                 within = 0
 
     def _shard(self, number: int) -> Batch:
         # Keyed by its number and not drawn in sequence: a resumed run makes the same shard.
         generator = Draw(self.seed, number * self.workers + self.rank).generator("shard")
-        wanted = self.batch * self.SHARD_BATCHES
+        shard_size = self.batch * self.SHARD_BATCHES
         visits = list[Visit]()
         count = 0
-        for _ in range(50 * wanted):
-            made = visit(
+        for _ in range(50 * shard_size):
+            scene_visit = visit(
                 self._scenes[generator.integers(len(self._scenes))], self.recipe, generator
             )
-            if made is None:
+            if scene_visit is None:
                 continue
-            visits.append(made)
-            count += len(made.patches)
-            if count >= wanted:
+            visits.append(scene_visit)
+            count += len(scene_visit.patches)
+            if count >= shard_size:
                 # Mixed, because neighbours of one scene would make a batch whose gradient knows one
                 # scene.
-                order = generator.permutation(count)[:wanted]
+                order = generator.permutation(count)[:shard_size]
                 return _mixed(visits, order)
         expected = f"scenes that hold a patch of {self.recipe.patch_px} target pixels"
         remedy = "give larger images or a smaller patch"
@@ -135,17 +137,12 @@ class PatchSource:
 
 def _mixed(visits: Sequence[Visit], order: np.ndarray) -> Batch:
     places = torch.from_numpy(order)
-    patches = torch.cat([each.patches for each in visits])[places.to(visits[0].patches.device)]
+    patches = torch.cat([item.patches for item in visits])[places.to(visits[0].patches.device)]
     pair = patches[:, :1].contiguous(), patches[:, 1:].contiguous()
-    told = [each.told.parts for each in visits if each.told is not None]
+    told = [item.told.parts for item in visits if item.told is not None]
     if not told:
         return Batch(*pair)
     return Batch(*pair, Told(*(torch.cat(part)[places] for part in zip(*told, strict=True))))
-
-
-def _part(shard: Batch, part: slice) -> Batch:
-    told = None if shard.told is None else shard.told.some(part)
-    return Batch(shard.degraded[part], shard.reference[part], told)
 
 
 def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -> Visit | None:
@@ -177,10 +174,10 @@ def _acquire_pair(
     )
     degraded = detected(signals[0], sensors[0], "degraded", generator)
     if recipe.noisy_reference:
-        return torch.stack(
-            [degraded, detected(signals[1], sensors[1], "reference", generator)]
-        ), sensors[0]
-    return torch.stack([degraded, noiseless(signals[1], sensors[1])]), sensors[0]
+        reference = detected(signals[1], sensors[1], "reference", generator)
+    else:
+        reference = noiseless(signals[1], sensors[1])
+    return torch.stack([degraded, reference]), sensors[0]
 
 
 def _told(patches: Tensor, sensor: Instrument, quarter: int, mirrored: bool) -> Visit:
@@ -191,9 +188,11 @@ def _told(patches: Tensor, sensor: Instrument, quarter: int, mirrored: bool) -> 
     brightest = patches[:, 0].amax((1, 2)).cpu().numpy()
     for factor in factors_for(sensor):
         factors[brightest * factor <= HEADROOM] = factor
-    used, places = np.unique(factors, return_inverse=True)
-    each = [_told_of(sensor, int(factor), quarter, mirrored) for factor in used]
-    told = Told.of(torch.stack([vector for vector, _ in each]), [bank for _, bank in each])
+    distinct, places = np.unique(factors, return_inverse=True)
+    conditions = [_told_of(sensor, int(factor), quarter, mirrored) for factor in distinct]
+    told = Told.of(
+        torch.stack([vector for vector, _ in conditions]), [bank for _, bank in conditions]
+    )
     scale = torch.from_numpy(factors).to(patches)[:, None, None, None]
     return Visit(patches * scale, told.some(torch.from_numpy(places)))
 
@@ -206,6 +205,7 @@ def _told_of(sensor: Instrument, factor: int, quarter: int, mirrored: bool) -> t
     vector = vector_tensor(brighter)
     bank = network_bank(brighter)
     if quarter % 2:
+        # A quarter turn swaps the axes, whose MTFs are the first two values.
         vector = vector[[1, 0, 2, 3]]
     details = turned(torch.from_numpy(bank.details), quarter, mirrored)
     return vector, Bank(details.numpy(), bank.sigma)

@@ -116,8 +116,8 @@ class Step:
         if self._graph is None:
             self._record(inputs)
         assert self._graph is not None and self._inputs is not None and self._outputs is not None  # noqa: S101, PT018
-        for kept, given in zip(self._inputs.tensors(), inputs.tensors(), strict=True):
-            kept.copy_(given)
+        for memory, value in zip(self._inputs.tensors(), inputs.tensors(), strict=True):
+            memory.copy_(value)
         self._graph.replay()
         return self._outputs.clone()
 
@@ -127,35 +127,37 @@ class Step:
         if batch.told is not None:
             told = batch.told.to(self.device)
             if self.rounding is not None:
-                steps = [each.to(self.device) for each in self.rounding.steps(batch.told.gains)]
+                steps = [step.to(self.device) for step in self.rounding.steps(batch.told.gains)]
         degraded = batch.degraded.to(self.device, memory_format=torch.channels_last)
-        placed = Batch(degraded, batch.reference.to(self.device), told)
+        batch_on_device = Batch(degraded, batch.reference.to(self.device), told)
         return Inputs(
-            placed, steps, *(torch.tensor(value, device=self.device) for value in (rate, share))
+            batch_on_device,
+            steps,
+            *(torch.tensor(value, device=self.device) for value in (rate, share)),
         )
 
     def _taken(self, inputs: Inputs) -> Tensor:
         total, terms = self._backward(inputs)
         norm = clip_grad_norm_(self.network.parameters(), self.gradient_norm)
-        bad = (~(torch.isfinite(total) & torch.isfinite(norm))).float()
+        skipped = (~(torch.isfinite(total) & torch.isfinite(norm))).float()
         if self.agree is not None:
             # All workers skip a step that is bad for one of them, or their weights would part.
-            bad = self.agree(bad)
+            skipped = self.agree(skipped)
         for group in self.optimiser.param_groups:
             group["lr"].copy_(inputs.rate)
-        self.optimiser.found_inf = bad  # type: ignore[attr-defined]
+        self.optimiser.found_inf = skipped  # type: ignore[attr-defined]
         self.optimiser.step()
-        share = inputs.share * (1 - bad)
+        share = inputs.share * (1 - skipped)
         for name, value in self.network.state_dict().items():
             self.average[name].lerp_(value, share)
         self.names = tuple(terms)
-        return torch.stack([bad, total.detach(), *terms.values()])
+        return torch.stack([skipped, total.detach(), *terms.values()])
 
     def _backward(self, inputs: Inputs) -> tuple[Tensor, Mapping[str, Tensor]]:
         batch = inputs.batch
-        known = () if batch.told is None else (batch.told, self.bfloat16, inputs.steps)
-        plain = {"bfloat16": self.bfloat16} if batch.told is None else {}
-        restored = self.forward(batch.degraded, *known, **plain)
+        conditions = () if batch.told is None else (batch.told, self.bfloat16, inputs.steps)
+        keywords = {"bfloat16": self.bfloat16} if batch.told is None else {}
+        restored = self.forward(batch.degraded, *conditions, **keywords)
         total, terms = self.loss(restored, batch.reference)
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]

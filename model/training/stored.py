@@ -39,6 +39,7 @@ class StoredPairs:
         """Batch number `first` and all that follow."""
         number = first
         while True:
+            # Keyed by the batch's number and not drawn in sequence: a resumed run draws the same.
             generator = Draw(self.seed, number * self.workers + self.rank).generator("stored")
             patches = torch.stack([self._patch(generator) for _ in range(self.batch)]) / self.max_dn
             yield Batch(patches[:, :1].contiguous(), patches[:, 1:].contiguous())
@@ -57,6 +58,5 @@ class StoredPairs:
         top, left = (int(generator.integers(size - self.patch_px + 1)) for size in (height, width))
         window = slice(top, top + self.patch_px), slice(left, left + self.patch_px)
         both = np.stack([np.float32(image[window]) for image in images])
-        return torch.from_numpy(
-            np.ascontiguousarray(turn(both, generator, self.quarters, self.mirrors))
-        )
+        patches = turn(both, generator, self.quarters, self.mirrors)
+        return torch.from_numpy(np.ascontiguousarray(patches))

@@ -113,7 +113,7 @@ class Schedule:
 
     report_steps: int = 100
     save_s: float = 120.0
-    validate_steps: int = 0  # 0: never
+    validate_steps: int = 0  # 0 stands for never.
     report: Callable[[int, Mapping[str, float], "Speed"], None] = field(default=lambda *_: None)
     validate: Callable[[int, Network], None] = field(default=lambda *_: None)
 
@@ -191,7 +191,8 @@ class Trainer:
     ) -> None:
         self.recipe = recipe
         self.worker = worker or Worker()
-        self.loss, self.device = loss or RestorationLoss(recipe.loss), self.worker.device(device)
+        self.loss = loss or RestorationLoss(recipe.loss)
+        self.device = self.worker.device(device)
         require_loss(self.loss)
         self.step = 0
         self.guards = Guards()
@@ -221,7 +222,7 @@ class Trainer:
         """
         schedule = schedule if self.worker.first else Schedule()
         spent = Spent()
-        saved = time.monotonic()
+        saved_at = time.monotonic()
         rows = list[list[float]]()
         with held_back() as interrupt:
             following = batches(self.step)
@@ -231,7 +232,7 @@ class Trainer:
                 with spent.waiting():
                     batch = next(following)
                 self.train_step(batch)
-                save = time.monotonic() - saved > schedule.save_s
+                save = time.monotonic() - saved_at > schedule.save_s
                 if (
                     save
                     or self._due(schedule.report_steps)
@@ -240,16 +241,15 @@ class Trainer:
                 ):
                     rows += self.seen()
                 if self._due(schedule.report_steps):
-                    schedule.report(
-                        self.step, self._means(rows), spent.figures(self._patches(len(rows)))
-                    )
+                    patches = len(rows) * self.recipe.batch * self.worker.count
+                    schedule.report(self.step, self._means(rows), spent.figures(patches))
                     rows = []
                     spent = Spent()
                 if self._due(schedule.validate_steps):
                     schedule.validate(self.step, self.averaged())
                 if save:
                     self.save(checkpoint)
-                    saved = time.monotonic()
+                    saved_at = time.monotonic()
         self.seen()
         self.save(checkpoint)
         if self.step < self.recipe.steps:
@@ -266,15 +266,12 @@ class Trainer:
         """
         return len(self._unseen) >= (UNSEEN_STEPS if self.device.type == "cuda" else 1)
 
-    def _patches(self, steps: int) -> int:
-        return steps * self.recipe.batch * self.worker.count
-
     def _means(self, rows: Sequence[Sequence[float]]) -> dict[str, float]:
         """Of the steps since the last report: the means of their terms, but of those skipped."""
-        kept = [terms for bad, _, *terms in rows if not bad]
-        if not kept:
+        counted = [terms for skipped, _, *terms in rows if not skipped]
+        if not counted:
             return {}
-        return dict(zip(self._take.names, np.mean(kept, 0).tolist(), strict=True))
+        return dict(zip(self._take.names, np.mean(counted, 0).tolist(), strict=True))
 
     def train_step(self, batch: Batch) -> None:
         """One step on a batch; what it gave is kept for `seen`."""
@@ -293,8 +290,8 @@ class Trainer:
         rows: list[list[float]] = torch.stack(self._unseen).tolist() if self._unseen else []
         first = self.step - len(rows) + 1
         self._unseen = []
-        for number, (bad, total, *_) in enumerate(rows, first):
-            if bad:
+        for number, (skipped, total, *_) in enumerate(rows, first):
+            if skipped:
                 self.guards.skipped(number)
             else:
                 self.guards.passed(number, total)
@@ -334,7 +331,8 @@ class Trainer:
         self.network.load_state_dict({name: tensors[f"network.{name}"] for name in self.average})
         for name, value in self.average.items():
             value.copy_(tensors[f"average.{name}"])
-        if len(tensors) == 2 * len(self.average):  # from before the first step
+        # A checkpoint from before the first step has no moments.
+        if len(tensors) == 2 * len(self.average):
             return
         for name, parameter in self.network.named_parameters():
             # Adam keeps its step count and its moments with (and laid out as) the parameter.
@@ -342,8 +340,8 @@ class Trainer:
                 key: torch.empty_like(parameter).copy_(tensors[f"moment.{name}.{key}"])
                 for key in MOMENTS
             }
-            taken = tensors[f"moment.{name}.step"].to(self.device)
-            self.optimiser.state[parameter] = {"step": taken, **moments}
+            step_count = tensors[f"moment.{name}.step"].to(self.device)
+            self.optimiser.state[parameter] = {"step": step_count, **moments}
 
 
 def require_loss(loss: RestorationLoss) -> None:

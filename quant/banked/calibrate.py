@@ -7,6 +7,7 @@ planes of a sensor's values stand for what its head's bias will be told.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain, repeat
 
 import numpy as np
 
@@ -46,7 +47,7 @@ from beers_deploy.quant.graph import (
 from beers_deploy.quant.graph.network import renamed
 from beers_deploy.quant.integer.arithmetic import convolve
 from beers_deploy.quant.passes.level import Chain
-from beers_deploy.quant.passes.selection import Passes
+from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.passes.stream import lone_tensors, streams
 from beers_deploy.quant.quantise import Plan, rounded
 from beers_deploy.quant.samples import PATCH_PX, Remade
@@ -55,6 +56,8 @@ LIKE = "pleiades-degraded"
 """The profile that gives gain and bits; what is computed is over full scale."""
 
 ANALYTIC = "analytic"
+PASSES = replace(ALL, half_lsb_pair=False)
+"""A pair in the last sum costs 10 to 18 % of the time, and bought 0.007 dB at most."""
 BODY = "body.correction"
 """The results that lie side by side: the analytic restoration, and the body's correction of it."""
 
@@ -64,15 +67,16 @@ def _assembled(body: IntCore, bank: Bank, scale: int, shifts: Shifts, kernels: K
     analytic restoration.
     """
     result = body.frac_bits[CORRECTION]
-    named = (renamed(op, {PLANES: BANK, CORRECTION: BODY}) for op in body.ops)
+    behind_bank = (renamed(op, {PLANES: BANK, CORRECTION: BODY}) for op in body.ops)
     joined = Concat("joined", (BODY, ANALYTIC), CORRECTION)
+    # A concat has one scale for its inputs and its output.
     frac_bits = dict(body.frac_bits) | {BANK: BITS, BODY: result, ANALYTIC: result}
     unit = float(np.float32(bank.unit))
     ends = replace(
         front_ends(scale), gains=2, outputs=scale**2, unit=unit, wide=kernels == "fitted"
     )
     analytic = _analytic(scale, result, shifts, kernels)
-    ops = (bank_layer(bank, scale, shifts, kernels), *named, analytic, joined)
+    ops = (bank_layer(bank, scale, shifts, kernels), *behind_bank, analytic, joined)
     return IntCore(ops, frac_bits, ends)
 
 
@@ -95,14 +99,17 @@ def _analytic(scale: int, result: int, shifts: Shifts, kernels: Kernels) -> IntC
     for k, share in enumerate(_spread(2**shift, copies)):
         weight[:fine, rows, inputs - COPIES[2] + k, rows] = share
     weight[fine:, rows, inputs - 1, rows] = 2**shift if coarse else 0
+    # Rounded at other places of a step each time, the copies hold together what one cannot.
     offsets = np.repeat(np.array(spread_over_a_step(fine) + [0.0] * coarse), pixels)
     bias = quantise_bias(offsets * 2.0**-result, shift + result, shifts)
-    whole = weight.reshape(ANALYTIC_COPIES * pixels, -1, 1, 1)
-    return IntConv("analytic", BANK, ANALYTIC, whole, shift + result - BITS, *bias)
+    flat = weight.reshape(ANALYTIC_COPIES * pixels, -1, 1, 1)
+    # These bits make the shift to int8 `shift`, whatever scale the result is said to have.
+    return IntConv("analytic", BANK, ANALYTIC, flat, shift + result - BITS, *bias)
 
 
 def _spread(total: int, parts: int) -> list[int]:
     """So many whole numbers, as alike as can be, of that sum."""
+    # Differences of rounded-down multiples telescope to `total`.
     return [total * (k + 1) // parts - total * k // parts for k in range(parts)]
 
 
@@ -136,21 +143,23 @@ def _head(weights: Weights) -> Conv:
     its middle tap.
     """
     variant = weights.variant
-    given = weights.tensors["head.weight"].reshape(
+    trained = weights.tensors["head.weight"].reshape(
         variant.features, 1 + FILTERS, variant.pixels, 3, 3
     )
     counts = COPIES
+    # A filter's result of 1 is 128 steps here, where the trained weights count `UNIT_STEPS` as 1.
     units = 2.0**BITS / UNIT_STEPS
     copies = [(0, counts[0], 1.0), *((1 + k, counts[1], units) for k in range(FILTERS))]
-    read = [
-        given[:, kernel] * (unit / count) for kernel, count, unit in copies for _ in range(count)
-    ]
-    unread = np.zeros(
-        (variant.features, counts[2] * variant.pixels, 3, 3)
-    )  # the coarse one among them
-    told = np.zeros((variant.features, SENSOR_VALUES, 3, 3))
-    told[:, :, 1, 1] = 2 * weights.tensors["bias.weight"]  # of planes that hold half of each value
-    weight = np.concatenate([*read, unread, told], 1).astype(np.float32)
+    # Copies are averaged, so each gets an equal share of the weights of what it stands for.
+    of_copies = chain.from_iterable(
+        repeat(trained[:, kernel] * (unit / count), count) for kernel, count, unit in copies
+    )
+    # The body does not read the analytic restoration, the coarse copy among it.
+    of_analytic = np.zeros((variant.features, counts[2] * variant.pixels, 3, 3))
+    of_values = np.zeros((variant.features, SENSOR_VALUES, 3, 3))
+    # The planes of a sensor's values hold half of each.
+    of_values[:, :, 1, 1] = 2 * weights.tensors["bias.weight"]
+    weight = np.concatenate([*of_copies, of_analytic, of_values], 1).astype(np.float32)
     return Conv("head", PLANES, "head", weight, weights.tensors["head.bias"], window=same(weight))
 
 
@@ -173,13 +182,15 @@ def bank_results(
 
     The bank's results over 128 at a gain of 1, and planes of the halves of a sensor's values.
     """
-    whole = whole_bank(bank, scale, 1, kernels)
-    sums = convolve(front_ends(scale).split(image), whole.weight, Window())
-    results = np.floor(sums / 2.0**whole.frac_bits + whole.offsets[:, None, None] + 0.5).clip(
-        -128, 127
-    )
-    told = np.ones((1, SENSOR_VALUES, *results.shape[2:])) * np.asarray(vector)[:, None, None] / 2
-    return np.concatenate([results / 2.0**BITS, told], 1).astype(np.float32)
+    integers = whole_bank(bank, scale, 1, kernels)
+    sums = convolve(front_ends(scale).split(image), integers.weight, Window())
+    # Rounded half up and saturated as in the core, so that calibration meets these errors.
+    raw = sums / 2.0**integers.frac_bits + integers.offsets[:, None, None]
+    results = np.floor(raw + 0.5).clip(-128, 127)
+    # Half of a value in [-1, 1] fits int8 at the bank's scale, which ends just below 1.
+    vector_planes = np.ones((1, SENSOR_VALUES, *results.shape[2:]))
+    vector_planes = vector_planes * np.asarray(vector)[:, None, None] / 2
+    return np.concatenate([results / 2.0**BITS, vector_planes], 1).astype(np.float32)
 
 
 def quantise_family(
@@ -187,6 +198,7 @@ def quantise_family(
     bank: Bank,
     images: Remade[np.ndarray],
     shifts: Shifts = SHIFTS,
+    passes: Passes = PASSES,
     log: Log = no_log,
 ) -> Family:
     """A network behind a bank in whole numbers, for the middle of the family.
@@ -196,11 +208,18 @@ def quantise_family(
         bank: of the middle of the family.
         images: of `bank_results`, of sensors from all over the family.
         shifts: the windows of the target.
+        passes: that reduce the error.
         log: is told each step.
     """
-    body, *_ = rounded(_plan(weights, shifts), images, log)
+    body, *_ = rounded(_plan(weights, shifts, passes), images, log)
     biases = {op.name: _biases(op) for op in body.convolutions}
-    ops = tuple(map(_without_values, body.ops))
+    # A sensor's values are constant, so their planes become part of the biases.
+    ops = tuple(
+        replace(op, weight=op.weight[:, :-SENSOR_VALUES])
+        if isinstance(op, IntConv) and op.input == PLANES
+        else op
+        for op in body.ops
+    )
     core = _assembled(replace(body, ops=ops), bank, weights.variant.scale, shifts, weights.kernels)
     family = Family(core, biases, shifts, weights.kernels)
     return replace(family, core=family.for_sensor(bank, (0.0,) * SENSOR_VALUES))
@@ -215,21 +234,22 @@ def map_steps(family: Family, weights: Weights) -> list[np.ndarray]:
     Returns:
         (F,) of the maps between head and tail, then of the one within each block.
     """
-    whole = {op.name: op.weight * 2.0**-op.weight_frac_bits for op in family.core.convolutions}
-    given = {op.name: op.weight for op in body_graph(weights) if isinstance(op, Conv)}
+    quantised = {op.name: op.weight * 2.0**-op.weight_frac_bits for op in family.core.convolutions}
+    floats = {op.name: op.weight for op in body_graph(weights) if isinstance(op, Conv)}
 
-    def steps(name: str, read: np.ndarray | float, output: str) -> np.ndarray:
-        weight = given[name][:, : whole[name].shape[1]] * read
+    def steps(name: str, inputs: np.ndarray | float, output: str) -> np.ndarray:
+        weight = floats[name][:, : quantised[name].shape[1]] * inputs
         square = np.square(weight).sum((1, 2, 3))
-        factors = np.where(
-            square > 0, (weight * whole[name]).sum((1, 2, 3)) / np.maximum(square, 1e-30), 1.0
-        )
+        # Least squares over a channel's weights, each of which is rounded.
+        products = (weight * quantised[name]).sum((1, 2, 3))
+        factors = np.where(square > 0, products / np.maximum(square, 1e-30), 1.0)
         return np.asarray(2.0 ** -family.core.frac_bits[output] / factors)
 
     stream = steps("head", 1.0, "head")
-    read = 2.0 ** family.core.frac_bits["head"] * stream[:, None, None]
+    # The factors of the stream are in the weights that read it, so they are taken out first.
+    inputs = 2.0 ** family.core.frac_bits["head"] * stream[:, None, None]
     inner = (
-        steps(f"body.{k}.first", read, f"body.{k}.relu") for k in range(weights.variant.blocks)
+        steps(f"body.{k}.first", inputs, f"body.{k}.relu") for k in range(weights.variant.blocks)
     )
     return [stream, *inner]
 
@@ -244,13 +264,7 @@ def _biases(op: IntConv) -> np.ndarray:
     return np.concatenate([op.float_bias[:, None], values], 1)
 
 
-def _without_values(op: IntConv | Op) -> IntConv | Op:
-    if isinstance(op, IntConv) and op.input == PLANES:
-        return replace(op, weight=op.weight[:, :-SENSOR_VALUES])
-    return op
-
-
-def _plan(weights: Weights, shifts: Shifts) -> Plan:
+def _plan(weights: Weights, shifts: Shifts, passes: Passes) -> Plan:
     """What is to be quantised: the body, from a bank's results."""
     graph = body_graph(weights)
     scale = weights.variant.scale
@@ -258,9 +272,7 @@ def _plan(weights: Weights, shifts: Shifts) -> Plan:
     ends = Ends(width, 1, adds_image=False, gains=2, outputs=scale**2, direct=True)
     inner = tuple(lone_tensors(graph))
     chain = Chain(inner, (weights.variant.features,) * len(inner), by_channel=False)
-    # A pair in the last sum costs 10 to 18 % of the time, and bought 0.007 dB at most: what limits
-    # lies elsewhere.
-    return Plan(graph, ends, streams(graph), chain, shifts, Passes(half_lsb_pair=False))
+    return Plan(graph, ends, streams(graph), chain, shifts, passes)
 
 
 PATCHES = 80
@@ -290,6 +302,7 @@ def family_images(
     )
 
     def results(number: int) -> np.ndarray:
+        # Every patch is seen by another sensor of the family, through the bank of that one.
         sensor = patches.views[number].degraded
         bank = network_bank(sensor, kernels)
         vector = sensor_vector(sensor).values

@@ -14,6 +14,7 @@ import json
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 import onnx
@@ -60,22 +61,25 @@ class Family:
     def for_sensor(self, bank: Bank, vector: Sequence[float]) -> IntCore:
         """The core for one sensor, of its bank and its sensor vector (4,)."""
         gain = bank.gain
-        ops = tuple(self._told(op, bank, gain * np.array([1.0, *vector])) for op in self.core.ops)
-        return replace(
-            self.core,
-            ops=ops,
-            ends=replace(self.core.ends, unit=float(np.float32(bank.unit / gain))),
-        )
+        # ReLU and sums pass a positive factor on, so of the body only biases grow.
+        values = gain * np.array([1.0, *vector])
+        ops = tuple(self._conditioned(op, bank, values) for op in self.core.ops)
+        # The host takes the gain off again; in float32, as its file stores the unit.
+        unit = float(np.float32(bank.unit / gain))
+        return replace(self.core, ops=ops, ends=replace(self.core.ends, unit=unit))
 
-    def _told(self, op: IntConv | Op, bank: Bank, values: NDArray[np.float64]) -> IntConv | Op:
+    def _conditioned(
+        self, op: IntConv | Op, bank: Bank, values: NDArray[np.float64]
+    ) -> IntConv | Op:
         if isinstance(op, IntConv) and op.input == PLANES:
             return bank_layer(bank, self.core.ends.place_px, self.shifts, self.kernels)
         if not (isinstance(op, IntConv) and op.name in self.biases):
             return op
-        added = self.biases[op.name]
+        terms = self.biases[op.name]
         product = op.weight_frac_bits + self.core.frac_bits[op.input]
-        whole, bits = quantise_bias(added @ values[: added.shape[1]], product, self.shifts)
-        return replace(op, bias=whole, bias_frac_bits=bits)
+        # Only the convolution behind the bank has a term for each of the sensor's values.
+        bias, bits = quantise_bias(terms @ values[: terms.shape[1]], product, self.shifts)
+        return replace(op, bias=bias, bias_frac_bits=bits)
 
     def to_words(self) -> str:
         """The biases as JSON, for a file's metadata."""
@@ -91,14 +95,15 @@ def family_of(model: onnx.ModelProto) -> Family | None:
         return None
     with contradictions("INT8 model"):
         core = read_core(model)
-        said = json.loads(words)
-        biases = {str(name): np.array(values, np.float64) for name, values in said.items()}
+        record = json.loads(words)
+        biases = {str(name): np.array(values, np.float64) for name, values in record.items()}
         body = {op.name: op for op in core.convolutions if op.name in biases}
-        wanted = {
+        # The file is not trusted: its biases must fit its own convolutions.
+        shapes = {
             name: (len(op.bias), 1 + SENSOR_VALUES * (op.input == BANK))
             for name, op in body.items()
         }
-        if {name: values.shape for name, values in biases.items()} != wanted:
+        if {name: values.shape for name, values in biases.items()} != shapes:
             raise ValueError("biases that are not its convolutions'")
         # Only behind fitted kernels does the analytic restoration have a coarse copy.
         return Family(core, biases, kernels="fitted" if core.ends.wide else "cut")
@@ -117,9 +122,10 @@ def required_family(model: onnx.ModelProto) -> Family:
 
 def bank_layer(bank: Bank, scale: int, shifts: Shifts, kernels: Kernels) -> IntConv:
     """The first convolution of a network of that scale, for one sensor."""
-    whole = whole_bank(bank, scale, bank.gain, kernels)
-    bias = quantise_bias(whole.offsets * 2.0**-BITS, whole.frac_bits + BITS, shifts)
-    return IntConv("bank", PLANES, BANK, whole.weight, whole.frac_bits, *bias)
+    integers = whole_bank(bank, scale, bank.gain, kernels)
+    # The offsets put each copy of a result at another place of a rounding step.
+    bias = quantise_bias(integers.offsets * 2.0**-BITS, integers.frac_bits + BITS, shifts)
+    return IntConv("bank", PLANES, BANK, integers.weight, integers.frac_bits, *bias)
 
 
 def delta_of_file(model: onnx.ModelProto) -> bytes:
@@ -130,15 +136,18 @@ def delta_of_file(model: onnx.ModelProto) -> bytes:
     compressed.
     """
     family = required_family(model)
-    told = [op for op in family.core.convolutions if op.input == PLANES or op.name in family.biases]
-    bits = {op.name: [op.weight_frac_bits, op.bias_frac_bits] for op in told}
-    said = {
+    ops = [op for op in family.core.convolutions if op.input == PLANES or op.name in family.biases]
+    bits = {op.name: [op.weight_frac_bits, op.bias_frac_bits] for op in ops}
+    header = {
         "sensor": metadata(model).get("sensor", ""),
         "unit": family.core.ends.unit,
         "bits": bits,
     }
-    numbers = b"".join(values.astype(np.int8).tobytes() for op in told for values in _numbers(op))
-    return zlib.compress(json.dumps(said, separators=(",", ":")).encode() + b"\n" + numbers, 9)
+    arrays = chain.from_iterable(map(_numbers, ops))
+    numbers = b"".join(values.astype(np.int8).tobytes() for values in arrays)
+    # JSON without indent holds no line break, so the first one in a delta ends its header.
+    line = json.dumps(header, separators=(",", ":")).encode()
+    return zlib.compress(line + b"\n" + numbers, 9)
 
 
 def _numbers(op: IntConv) -> list[np.ndarray]:
@@ -160,21 +169,25 @@ def with_delta(core: IntCore, delta: bytes, where: str = "delta") -> tuple[IntCo
         ModelError: damaged bytes, or a delta of another network.
     """
     try:
-        line, _, numbers = zlib.decompressobj().decompress(delta, LARGEST_DELTA).partition(b"\n")
-        said = json.loads(line)
-        left = np.frombuffer(numbers, np.int8)
+        # The limit keeps a small delta from being unpacked to any size.
+        content = zlib.decompressobj().decompress(delta, LARGEST_DELTA)
+        line, _, numbers = content.partition(b"\n")
+        header = json.loads(line)
+        remainder = np.frombuffer(numbers, np.int8)
         ops = list[IntConv | Op]()
-        known = {op.name: op for op in core.convolutions}
-        told = {known[name].name: tuple(map(int, bits)) for name, bits in said["bits"].items()}
+        convolutions = {op.name: op for op in core.convolutions}
+        bits_of = {
+            convolutions[name].name: tuple(map(int, bits)) for name, bits in header["bits"].items()
+        }
         for op in core.ops:
-            if isinstance(op, IntConv) and op.name in told:
-                op, left = _patched(op, told[op.name], left)
+            if isinstance(op, IntConv) and op.name in bits_of:
+                op, remainder = _patched(op, bits_of[op.name], remainder)
             ops.append(op)
-        if len(left):
-            raise ValueError(f"{len(left)} bytes too many")
-        return replace(
-            core, ops=tuple(ops), ends=replace(core.ends, unit=float(said["unit"]))
-        ), str(said["sensor"])
+        # A network of the same names and smaller layers takes fewer bytes.
+        if len(remainder):
+            raise ValueError(f"{len(remainder)} bytes too many")
+        ends = replace(core.ends, unit=float(header["unit"]))
+        return replace(core, ops=tuple(ops), ends=ends), str(header["sensor"])
     except (
         zlib.error,
         AttributeError,
@@ -195,16 +208,17 @@ LARGEST_DELTA = 1 << 20
 """Bytes that one is unpacked to."""
 
 
-def _patched(op: IntConv, bits: tuple[int, ...], left: np.ndarray) -> tuple[IntConv, np.ndarray]:
+def _patched(op: IntConv, bits: tuple[int, ...], numbers: np.ndarray) -> tuple[IntConv, np.ndarray]:
     """A convolution with the first of these numbers in the place of its own, and the numbers after
     them.
     """
-    found = list[np.ndarray]()
+    arrays = list[np.ndarray]()
     for values in _numbers(op):
-        found.append(left[: values.size].reshape(values.shape))
-        left = left[values.size :]
+        arrays.append(numbers[: values.size].reshape(values.shape))
+        numbers = numbers[values.size :]
     weight_bits, bias_bits = bits
-    weight = found[0] if len(found) > 1 else op.weight
+    # Weights come first, and only the bank's depend on the sensor.
+    weight = arrays[0] if len(arrays) > 1 else op.weight
     return replace(
-        op, weight=weight, bias=found[-1], weight_frac_bits=weight_bits, bias_frac_bits=bias_bits
-    ), left
+        op, weight=weight, bias=arrays[-1], weight_frac_bits=weight_bits, bias_frac_bits=bias_bits
+    ), numbers

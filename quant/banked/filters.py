@@ -93,11 +93,11 @@ class WholeBank:
 def split_planes(image: np.ndarray) -> np.ndarray:
     """(N, C, H, W) float32 in [0, 1] to the planes (N, 4 C, H, W) int8."""
     dn = np.clip(np.rint(image * np.float32(MAX_DN)), 0, MAX_DN) - MIDDLE_DN
+    # Full scale is 2047 above the middle, 128 steps: int8 ends one before, and more remains.
     coarse = np.minimum(np.rint(dn / STEP_DN), 127)
     remainder = dn - STEP_DN * coarse
-    return np.concatenate([coarse, coarse, remainder, np.rint(remainder / PART)], axis=1).astype(
-        np.int8
-    )
+    planes = np.concatenate([coarse, coarse, remainder, np.rint(remainder / PART)], axis=1)
+    return planes.astype(np.int8)
 
 
 def channels(kernels: Kernels = "fitted") -> list[tuple[int, float]]:
@@ -106,11 +106,10 @@ def channels(kernels: Kernels = "fitted") -> list[tuple[int, float]]:
     """
     coarse = int(kernels == "fitted")
     copies = [COPIES[0], *[COPIES[1]] * FILTERS, COPIES[2] - coarse, coarse]
-    return [
-        (kernel, offset)
-        for kernel, count in enumerate(copies)
-        for offset in spread_over_a_step(count)
-    ]
+    outputs = list[tuple[int, float]]()
+    for kernel, count in enumerate(copies):
+        outputs += [(kernel, offset) for offset in spread_over_a_step(count)]
+    return outputs
 
 
 def spread_over_a_step(count: int) -> list[float]:
@@ -120,47 +119,54 @@ def spread_over_a_step(count: int) -> list[float]:
 
 def whole_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted") -> WholeBank:
     """The whole numbers of a bank, for a network of that scale, in steps finer by `gain`."""
-    wanted = np.concatenate([bank.kernels, bank.kernels[-1:] / WIDE])
-    wanted *= gain * UNIT_STEPS / MAX_DN  # steps for one digital number
-    wanted[0] *= MAX_DN / UNIT_STEPS / IMAGE_STEP_DN
-    frac_bits = int(np.floor(np.log2(LARGEST / np.abs(STEP_DN * wanted).max())))
-    read, offsets = zip(*channels(kernels), strict=True)
-    exact = _copies(wanted * 2.0**frac_bits, read)
+    steps = np.concatenate([bank.kernels, bank.kernels[-1:] / WIDE])
+    # The kernels are for values over full scale; the planes hold digital numbers.
+    steps *= gain * UNIT_STEPS / MAX_DN
+    # The image comes in steps of its own.
+    steps[0] *= MAX_DN / UNIT_STEPS / IMAGE_STEP_DN
+    # A tensor has one scale, which the largest of all coarse weights sets.
+    frac_bits = int(np.floor(np.log2(LARGEST / np.abs(STEP_DN * steps).max())))
+    sources, offsets = zip(*channels(kernels), strict=True)
+    integers = _copies(steps * 2.0**frac_bits, sources)
     planes = [
-        in_places(exact[:, plane].astype(np.float64), scale) for plane in range(PLANES_PER_CHANNEL)
+        in_places(integers[:, plane].astype(np.float64), scale)
+        for plane in range(PLANES_PER_CHANNEL)
     ]
     return WholeBank(
         np.concatenate(planes, 1).astype(np.int8), frac_bits, np.repeat(offsets, scale**2)
     )
 
 
-def _copies(wanted: NDArray[np.float64], kernels: Sequence[int]) -> NDArray[np.int64]:
+def _copies(exact: NDArray[np.float64], kernels: Sequence[int]) -> NDArray[np.int64]:
     """Weights (O, 4, 7, 7): each further copy of a kernel makes up for what rounding has left of
     those before it.
     """
-    left = np.zeros_like(wanted)
-    found = list[NDArray[np.int64]]()
+    residual = np.zeros_like(exact)
+    copies = list[NDArray[np.int64]]()
     for kernel in kernels:
-        whole = _in_four(wanted[kernel] + left[kernel]) if kernel else _of_image(wanted[0])
-        found.append(whole)
-        left[kernel] += wanted[kernel] - _response(whole)
-    return np.stack(found)
+        weight = _in_four(exact[kernel] + residual[kernel]) if kernel else _of_image(exact[0])
+        copies.append(weight)
+        residual[kernel] += exact[kernel] - _response(weight)
+    return np.stack(copies)
 
 
-def _response(whole: NDArray[np.int64]) -> NDArray[np.float64]:
+def _response(weight: NDArray[np.int64]) -> NDArray[np.float64]:
     """What weights (4, 7, 7) of the planes multiply a digital number with: (7, 7)."""
-    return np.asarray((whole[0] + whole[1]) / STEP_DN)
+    # The two coarse planes carry nearly all of a number; the others only the remainder.
+    return np.asarray((weight[0] + weight[1]) / STEP_DN)
 
 
 def _of_image(kernel: NDArray[np.float64]) -> NDArray[np.int64]:
     """The image in its own steps, from the coarse planes alone: (4, 7, 7)."""
     none = np.zeros(kernel.shape, np.int64)
-    return np.stack([*_shared(np.rint(STEP_DN * kernel).astype(np.int64)), none, none])
+    coarse = np.rint(STEP_DN * kernel).astype(np.int64)
+    return np.stack([*_shared(coarse), none, none])
 
 
-def _shared(whole: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _shared(weight: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Two halves of each."""
-    return whole // 2, whole - whole // 2
+    # The coarse plane comes twice, so a weight of twice int8's size fits.
+    return weight // 2, weight - weight // 2
 
 
 def _in_four(kernel: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -168,12 +174,16 @@ def _in_four(kernel: NDArray[np.float64]) -> NDArray[np.int64]:
     numbers.
     """
     coarse = shaped(STEP_DN * kernel.ravel())
-    fine = shaped(PART * kernel.ravel())  # in parts of the remainder's weights
-    odd = np.flatnonzero(fine % PART)  # an even number of them, for their sum is 0
+    # The last plane holds half of the remainder, so this grid is twice as fine.
+    fine = shaped(PART * kernel.ravel())
+    # Their sum is 0, so the number of odd weights is even.
+    odd = np.flatnonzero(fine % PART)
     parts = np.zeros_like(fine)
-    parts[odd[::2]], parts[odd[1::2]] = 1, -1
-    found = np.stack([*_shared(coarse), (fine - parts) // PART, parts])
-    return found.reshape(PLANES_PER_CHANNEL, *kernel.shape)
+    # One up, one down: the weights of each plane sum to 0, and flat ground leaves nothing.
+    parts[odd[::2]] = 1
+    parts[odd[1::2]] = -1
+    weight = np.stack([*_shared(coarse), (fine - parts) // PART, parts])
+    return weight.reshape(PLANES_PER_CHANNEL, *kernel.shape)
 
 
 def shaped(wanted: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -183,22 +193,24 @@ def shaped(wanted: NDArray[np.float64]) -> NDArray[np.int64]:
     that lowers e^T C e, C the covariance of natural images. All sums are exact, so that every
     processor finds the same numbers.
     """
-    wanted = _on_grid(wanted)
-    whole = np.rint(wanted)
-    while (excess := int(whole.sum())) != 0:
-        error = (whole - wanted) * np.sign(excess)
-        whole[np.argsort(-error, kind="stable")[: abs(excess)]] -= np.sign(excess)
-    slope = COVARIANCE @ (whole - wanted)
+    exact = _on_grid(wanted)
+    weight = np.rint(exact)
+    # The weights that were rounded furthest in the direction of the excess give up one each.
+    while (excess := int(weight.sum())) != 0:
+        error = (weight - exact) * np.sign(excess)
+        weight[np.argsort(-error, kind="stable")[: abs(excess)]] -= np.sign(excess)
+    slope = COVARIANCE @ (weight - exact)
     curve = np.diag(COVARIANCE)
     pair = curve[:, None] + curve[None, :] - 2 * COVARIANCE
     while True:
-        change = 2 * (slope[:, None] - slope[None, :]) + pair  # raise the row's, lower the column's
+        # By how much e^T C e changes when the row's weight is raised and the column's lowered.
+        change = 2 * (slope[:, None] - slope[None, :]) + pair
         np.fill_diagonal(change, 0)
         up, down = np.unravel_index(np.argmin(change), change.shape)
         if change[up, down] >= 0:
-            return np.asarray(whole.astype(np.int64))
-        whole[up] += 1
-        whole[down] -= 1
+            return np.asarray(weight.astype(np.int64))
+        weight[up] += 1
+        weight[down] -= 1
         slope += COVARIANCE[up] - COVARIANCE[down]
 
 

@@ -63,15 +63,16 @@ def _core_file(
     result = image_info(
         CORRECTION, ends.copies * ends.outputs, tile_px and tile_px // ends.correction_px
     )
-    if not ends.adds_image:  # of another size than the image, perhaps
-        for side, name in zip(
-            result.type.tensor_type.shape.dim[2:], ("rows", "columns"), strict=True
-        ):
+    # A result that the image is not added to may have another size than the image.
+    if not ends.adds_image:
+        sides = result.type.tensor_type.shape.dim[2:]
+        for side, name in zip(sides, ("rows", "columns"), strict=True):
             side.dim_param = name
     places = {PLACE_PX: str(ends.place_px)} if ends.place_px > 1 else {}
     places |= {BORDER_PX: str(ends.border_px)} if ends.border_px else {}
-    said = {key: words for key, words in about.items() if key != KEY}  # it is the core itself
-    return make_model(writer.graph("convbeers-core", [size], [result]), said | places)
+    # This file is the core itself, so it needs no description of one.
+    entries = {key: words for key, words in about.items() if key != KEY}
+    return make_model(writer.graph("convbeers-core", [size], [result]), entries | places)
 
 
 def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
@@ -114,16 +115,13 @@ class BoardWriter(GraphWriter):
                 "weight": (weight, op.weight_frac_bits),
                 "bias": (op.bias, op.bias_frac_bits),
             }
-            feeds = [
-                *feeds,
-                *(self._dequantised(f"{op.name}.{role}", *each) for role, each in numbers.items()),
-            ]
+            feeds = list(feeds)
+            for role, (value, frac_bits) in numbers.items():
+                name = f"{op.name}.{role}"
+                integers = [self.constant(name, value), *self.scale(name, frac_bits)]
+                feeds.append(self.node("DequantizeLinear", f"{name}.float", integers))
             op = Conv(op.name, op.input, op.output, op.weight, op.bias, *kind)
         write_float(self, op, feeds, output)
-
-    def _dequantised(self, name: str, value: np.ndarray, frac_bits: int) -> str:
-        feeds = [self.constant(name, value), *self.scale(name, frac_bits)]
-        return self.node("DequantizeLinear", f"{name}.float", feeds)
 
 
 CONFIG = "vitisai_config.json"
@@ -145,7 +143,10 @@ def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> on
         OptionError: no tile.
     """
     side_px = required_tile(tile_px)
-    parts = [(part, core.frac_bits[op.output]) for op in core.ops for part in _apart(op)]
+    parts: list[tuple[IntConv | Op, int]] = []
+    for op in core.ops:
+        # An operation and its clamp share the scale of the result, so that no bit changes.
+        parts += [(part, core.frac_bits[op.output]) for part in _apart(op)]
     writer = _PairWriter(
         {PLANES: core.frac_bits[PLANES], **{op.output: bits for op, bits in parts}}
     )
@@ -153,6 +154,7 @@ def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> on
         writer.operation(op, [writer.read(name) for name in op.inputs], writer.source(op.output))
     writer.read(CORRECTION, CORRECTION)
     model = _core_file(writer, core.ends, about, side_px)
+    # The compiler of an NPU takes stated sizes alone, of inner tensors too.
     return shape_inference.infer_shapes(model, strict_mode=True)
 
 
@@ -186,6 +188,7 @@ class _PairWriter(BoardWriter):
 
     def scale(self, tensor: str, frac_bits: int) -> list[str]:
         """Scale and zero point of a tensor, which no other shares."""
+        # AMD's quantiser adjusts a scale in place, which would move all tensors that share it.
         scale = self.constant(f"{tensor}.scale", np.array(2.0**-frac_bits, np.float32))
         return [scale, self.constant(f"{tensor}.zero_point", np.array(0, np.int8))]
 
@@ -210,6 +213,6 @@ def save_config(core: Path, device: str) -> Path:
     vaiml = {"device": device, "optimize_level": 2}
     first, second = ({"name": name, "plugin": f"vaip-pass_{name}"} for name in names)
     passes = [first, {**second, "vaiml_config": vaiml}]
-    said = {"passes": passes, "target": "VAIML", "targets": [{"name": "VAIML", "pass": [*names]}]}
-    write_text(core.with_name(CONFIG), json.dumps(said, indent=1) + "\n")
+    config = {"passes": passes, "target": "VAIML", "targets": [{"name": "VAIML", "pass": [*names]}]}
+    write_text(core.with_name(CONFIG), json.dumps(config, indent=1) + "\n")
     return core.with_name(CONFIG)

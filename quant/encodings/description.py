@@ -57,10 +57,10 @@ def describe(core: IntCore) -> str:
 
 
 def _plain(op: IntConv | Op) -> dict[str, Any]:
-    found = asdict(op)  # type: ignore[arg-type]
+    fields = asdict(op)  # type: ignore[arg-type]
     if isinstance(op, IntConv):
-        found |= {"weight": list(op.weight.shape), "bias": len(op.bias)}
-    return found
+        fields |= {"weight": list(op.weight.shape), "bias": len(op.bias)}
+    return fields
 
 
 def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
@@ -87,15 +87,16 @@ def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
 
 
 def _described(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
-    said = json.loads(text)
-    _require_small({**said, "ends": {**said["ends"], "offsets": []}})  # values, of any size
-    frac_bits = {str(name): int(bits) for name, bits in said["frac_bits"].items()}
-    ops = tuple(_op(dict(op), frac_bits, constants) for op in said["ops"])
-    ends = said["ends"]
+    description = json.loads(text)
+    # Offsets are values, which may be of any size; every other number is bounded.
+    _require_small({**description, "ends": {**description["ends"], "offsets": []}})
+    frac_bits = {str(name): int(bits) for name, bits in description["frac_bits"].items()}
+    ops = tuple(_op(dict(op), frac_bits, constants) for op in description["ops"])
+    ends = description["ends"]
     shuffles = {
-        key: tuple(Shuffle(**each) for each in ends[key]) for key in ("front", "back", "last")
+        key: tuple(Shuffle(**shuffle) for shuffle in ends[key]) for key in ("front", "back", "last")
     }
-    offsets = tuple(tuple(float(each) for each in window) for window in ends["offsets"])
+    offsets = tuple(tuple(float(offset) for offset in window) for window in ends["offsets"])
     counts = {key: int(ends[key]) for key in ("channels", "planes", "gains", "outputs")}
     tail = Tail(**ends["tail"]) if ends["tail"] else None
     return IntCore(
@@ -103,38 +104,40 @@ def _described(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
     )
 
 
-def _require_small(said: object) -> None:
+def _require_small(value: object) -> None:
     """Numbers that size something are looked at before anything is made of them."""
     parts: Iterable[object] = ()
-    if isinstance(said, dict):
-        parts = said.values()
-    elif isinstance(said, list):
-        parts = said
+    if isinstance(value, dict):
+        parts = value.values()
+    elif isinstance(value, list):
+        parts = value
     for part in parts:
         _require_small(part)
-    if isinstance(said, int | float) and not abs(said) <= LARGEST:
-        raise ValueError(f"a size of {said}")
+    if isinstance(value, int | float) and not abs(value) <= LARGEST:
+        raise ValueError(f"a size of {value}")
 
 
 def _op(
-    said: dict[str, Any], frac_bits: Mapping[str, int], constants: Mapping[str, np.ndarray]
+    fields: dict[str, Any], frac_bits: Mapping[str, int], constants: Mapping[str, np.ndarray]
 ) -> IntConv | Op:
-    kind = KINDS[said.pop("kind")]
-    if "window" in said:
-        said["window"] = Window(**{key: tuple(value) for key, value in said["window"].items()})
-    if "activation" in said:
-        said["activation"] = Activation(said["activation"])
+    kind = KINDS[fields.pop("kind")]
+    if "window" in fields:
+        fields["window"] = Window(**{key: tuple(value) for key, value in fields["window"].items()})
+    if "activation" in fields:
+        fields["activation"] = Activation(fields["activation"])
     for key in ("inputs", "kernel"):
-        if key in said:
-            said[key] = tuple(said[key])
+        if key in fields:
+            fields[key] = tuple(fields[key])
     if kind is IntConv:
-        shift = said["weight_frac_bits"] + frac_bits[said["input"]] - said["bias_frac_bits"]
-        whole = constants[f"{said['name']}.bias"].ravel()[: said["bias"]].astype(np.int64)
-        weight = constants[f"{said['name']}.weight"]
-        if said["transposed"]:
-            weight = of_phases(weight, tuple(said["weight"]), said["window"].strides[0])
-        said |= {"weight": weight.reshape(said["weight"]), "bias": (whole >> shift).astype(np.int8)}
-    op: IntConv | Op = kind(**said)
+        shift = fields["weight_frac_bits"] + frac_bits[fields["input"]] - fields["bias_frac_bits"]
+        bias = constants[f"{fields['name']}.bias"].ravel()[: fields["bias"]].astype(np.int64)
+        weight = constants[f"{fields['name']}.weight"]
+        if fields["transposed"]:
+            weight = of_phases(weight, tuple(fields["weight"]), fields["window"].strides[0])
+        # The file holds the bias at the accumulator's scale, the core at its own, in int8.
+        fields["weight"] = weight.reshape(fields["weight"])
+        fields["bias"] = (bias >> shift).astype(np.int8)
+    op: IntConv | Op = kind(**fields)
     return op
 
 
@@ -149,10 +152,10 @@ def phases(weight: np.ndarray, stride: int) -> tuple[np.ndarray, int]:
     reach = max(-(-k // stride) for k in kernel)
     padded = np.zeros((outputs, inputs, reach * stride, reach * stride), weight.dtype)
     padded[:, :, : kernel[0], : kernel[1]] = weight
+    # Reversed, because w[f + stride j] meets x[q - j], and a convolution's taps go the other way.
     taps = padded.reshape(outputs, inputs, reach, stride, reach, stride)[:, :, ::-1, :, ::-1]
-    return np.ascontiguousarray(taps.transpose(3, 5, 0, 1, 2, 4)).reshape(
-        -1, inputs, reach, reach
-    ), reach - 1
+    by_phase = np.ascontiguousarray(taps.transpose(3, 5, 0, 1, 2, 4))
+    return by_phase.reshape(-1, inputs, reach, reach), reach - 1
 
 
 def of_phases(weight: np.ndarray, shape: tuple[int, ...], stride: int) -> np.ndarray:

@@ -142,9 +142,8 @@ def _clamp(w: HostWriter, core: IntCore, op: IntConv | Add) -> None:
     relu = op.output if op.activation is Activation.relu else f"{op.output}.above_0"
     w.node("Max", relu, [_unclamped(op), w.zero_point()], name=f"{op.name}.relu")
     if op.activation is Activation.relu6:
-        six = w.constant(
-            f"{op.name}.six", np.array(ZERO + six_in_units(core.frac_bits[op.output]), np.uint8)
-        )
+        units = ZERO + six_in_units(core.frac_bits[op.output])
+        six = w.constant(f"{op.name}.six", np.array(units, np.uint8))
         w.node("Min", op.output, [relu, six], name=f"{op.name}.relu6")
 
 
@@ -161,6 +160,7 @@ def _leaky(w: HostWriter, core: IntCore, op: IntConv) -> None:
     w.node("ConvInteger", f"{name}.products", feeds, name=op.name, **_attributes(op))
     bias = w.constant(f"{op.name}.bias", _bias(core, op)[:, None, None])
     w.node("Add", f"{name}.sums", [f"{name}.products", bias])
+    # Float64 holds products of int32 sums and 26 exactly, so that Round is the only rounding.
     w.node("Cast", f"{name}.wide", [f"{name}.sums"], to=TensorProto.DOUBLE)
     unit = 2.0 ** (core.frac_bits[op.output] - product)
     for kind, factor in {"whole": unit, "leaking": LEAKY_SLOPE * unit}.items():
@@ -172,11 +172,8 @@ def _leaky(w: HostWriter, core: IntCore, op: IntConv) -> None:
     w.node("Round", f"{name}.round", [f"{name}.linear"])
     limits = [w.constant(f"int8_{end}", np.array(end, np.float64)) for end in (INT8_MIN, INT8_MAX)]
     w.node("Clip", f"{name}.clip", [f"{name}.round", *limits])
-    w.node(
-        "Add",
-        f"{name}.offset",
-        [f"{name}.clip", w.constant("offset_64", np.array(ZERO, np.float64))],
-    )
+    zero = w.constant("offset_64", np.array(ZERO, np.float64))
+    w.node("Add", f"{name}.offset", [f"{name}.clip", zero])
     w.node("Cast", name, [f"{name}.offset"], to=TensorProto.UINT8)
 
 
@@ -185,14 +182,16 @@ def _transposed(w: HostWriter, core: IntCore, op: IntConv) -> None:
     cut.
     """
     stride = op.window.strides[0]
-    top = op.window.pads[0]
-    left = op.window.pads[1]
+    first_row = op.window.pads[0]
+    first_column = op.window.pads[1]
     weight, reach = phases(op.weight, stride)
     phased = replace(
         op, output=f"{op.output}.phases", weight=weight, window=Window(pads=(reach,) * 4)
     )
-    both = replace(core, frac_bits={**core.frac_bits, phased.output: core.frac_bits[op.output]})
-    _qlinear(w, both, phased, np.tile(_bias(core, op), stride**2))
+    phased_core = replace(
+        core, frac_bits={**core.frac_bits, phased.output: core.frac_bits[op.output]}
+    )
+    _qlinear(w, phased_core, phased, np.tile(_bias(core, op), stride**2))
     shuffle = Shuffle(
         f"{op.name}.shuffle", phased.output, f"{op.output}.whole", stride, True, False
     )
@@ -201,8 +200,9 @@ def _transposed(w: HostWriter, core: IntCore, op: IntConv) -> None:
     # are cut as well.
     rows, columns = (stride * (reach + 1) - k for k in op.weight.shape[2:])
     ends = [-(op.window.pads[2] + rows), -(op.window.pads[3] + columns)]
+    # A stop of 0 would mean the first pixel, not the last.
     stops = [end if end else np.iinfo(np.int64).max for end in ends]
-    feeds = {"from": [top, left], "to": stops, "axes": [2, 3]}
+    feeds = {"from": [first_row, first_column], "to": stops, "axes": [2, 3]}
     places = [
         w.constant(f"{op.name}.{name}", np.array(value, np.int64)) for name, value in feeds.items()
     ]
@@ -210,9 +210,9 @@ def _transposed(w: HostWriter, core: IntCore, op: IntConv) -> None:
 
 
 def _add(w: HostWriter, core: IntCore, op: Add | Mul) -> None:
-    feeds = [
-        feed for name in op.inputs for feed in (name, w.unit(core.frac_bits[name]), w.zero_point())
-    ]
+    feeds: list[str] = []
+    for name in op.inputs:
+        feeds += [name, w.unit(core.frac_bits[name]), w.zero_point()]
     feeds += [w.unit(core.frac_bits[op.output]), w.zero_point()]
     result = _unclamped(op) if isinstance(op, Add) else op.output
     w.node(f"QLinear{type(op).__name__}", result, feeds, name=op.name, domain=MICROSOFT)
@@ -223,9 +223,8 @@ def _add(w: HostWriter, core: IntCore, op: Add | Mul) -> None:
 def _average_pool(w: HostWriter, core: IntCore, op: AveragePool) -> None:
     assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
     factor, shift = mean_factor(op.kernel)
-    _weighted(
-        w, core, op, (op.input, op.output), np.full((1, 1, *op.kernel), factor), shift, op.window
-    )
+    weight = np.full((1, 1, *op.kernel), factor)
+    _weighted(w, core, op, (op.input, op.output), weight, shift, op.window)
 
 
 def _weighted(
@@ -256,25 +255,19 @@ def _resize(w: HostWriter, core: IntCore, op: Resize) -> None:
     weight, shift = bilinear_weights(op.factor)
     wide = f"{op.output}.edged"
     phased = f"{op.output}.phases"
-    w.node(
-        "Pad",
-        wide,
-        [op.input, w.constant("edge_pads", np.array([0, 0, 1, 1, 0, 0, 1, 1]))],
-        mode="edge",
-    )
+    # Half-pixel centres read one pixel beyond the border, where ONNX's Resize repeats the edge.
+    pads = w.constant("edge_pads", np.array([0, 0, 1, 1, 0, 0, 1, 1]))
+    w.node("Pad", wide, [op.input, pads], mode="edge")
     _weighted(w, core, op, (wide, phased), weight[:, None], shift, Window())
     write_shuffle(w, Shuffle(f"{op.name}.shuffle", phased, op.output, op.factor), phased, op.output)
 
 
 def _pointwise(w: HostWriter, core: IntCore, op: Pointwise) -> None:
-    table = (activation_table(op, core.frac_bits) + ZERO).astype(np.uint8)
-    w.node("Cast", f"{op.output}.place", [op.input], to=TensorProto.INT32)
-    w.node(
-        "Gather",
-        op.output,
-        [w.constant(f"{op.name}.table", table), f"{op.output}.place"],
-        name=op.name,
-    )
+    values = (activation_table(op, core.frac_bits) + ZERO).astype(np.uint8)
+    # Gather takes no 8-bit indices.
+    place = w.node("Cast", f"{op.output}.place", [op.input], to=TensorProto.INT32)
+    table = w.constant(f"{op.name}.table", values)
+    w.node("Gather", op.output, [table, place], name=op.name)
 
 
 _WRITERS: dict[type, Callable[..., Any]] = {
@@ -296,9 +289,9 @@ def read_core(model: onnx.ModelProto) -> IntCore:
     Raises:
         ModelError: a file that describes none.
     """
-    said = metadata(model).get(KEY)
-    if said is not None:
-        return described_core(said, constants(model))
+    text = metadata(model).get(KEY)
+    if text is not None:
+        return described_core(text, constants(model))
     expected = "a file that describes its integers"
     remedy = "make it with 'beers-deploy quantize'"
     raise ModelError(
@@ -320,14 +313,14 @@ def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
     except ModelError as error:
         return [f"no integers to compare with: {error.got}"]
     with contradictions("INT8 model"):
-        meant = host_model(core, {}, fixed_tile_px(model)).graph
+        expected = host_model(core, {}, fixed_tile_px(model)).graph
         faults = list[str]()
-    for kind, found, wanted in (
-        ("constant", model.graph.initializer, meant.initializer),
-        ("node", model.graph.node, meant.node),
+    for kind, parts, expected_parts in (
+        ("constant", model.graph.initializer, expected.initializer),
+        ("node", model.graph.node, expected.node),
     ):
-        faults += [f"{kind} {a.name}" for a, b in zip(found, wanted, strict=False) if a != b]
-        faults += (
-            [f"{len(found)} {kind}s instead of {len(wanted)}"] if len(found) != len(wanted) else []
-        )
+        pairs = zip(parts, expected_parts, strict=False)
+        faults += [f"{kind} {part.name}" for part, other in pairs if part != other]
+        if len(parts) != len(expected_parts):
+            faults.append(f"{len(parts)} {kind}s instead of {len(expected_parts)}")
     return faults

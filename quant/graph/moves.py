@@ -46,20 +46,19 @@ def with_shuffles(model: onnx.ModelProto) -> OnnxGraph:
     graph = OnnxGraph(model)
     if not any(node.op_type in MOVES for node in graph.nodes):
         return graph
-    inferred = onnx.shape_inference.infer_shapes(model).graph
-    known = {
-        value.name: value.type.tensor_type.shape.dim
-        for value in (*inferred.input, *inferred.value_info)
+    info = onnx.shape_inference.infer_shapes(model).graph
+    dims = {
+        value.name: value.type.tensor_type.shape.dim for value in (*info.input, *info.value_info)
     }
-    spelled: dict[Node, Node | None] = {}  # of the nodes of a chain the last one stands for all
+    # The last node of a chain stands for all of them, so that no reader of the result moves.
+    replacements: dict[Node, Node | None] = {}
     for chain in _chains(graph):
-        shuffle = _shuffle(
-            chain, [dim.dim_value for dim in known.get(chain[0].inputs[0], ())], graph
-        )
+        sizes = [dim.dim_value for dim in dims.get(chain[0].inputs[0], ())]
+        shuffle = _shuffle(chain, sizes, graph)
         if shuffle is not None:
-            spelled |= {**dict.fromkeys(chain), chain[-1]: shuffle}
-    written = (spelled.get(node, node) for node in graph.nodes)
-    return OnnxGraph(model, [node for node in written if node is not None])
+            replacements |= {**dict.fromkeys(chain), chain[-1]: shuffle}
+    nodes = (replacements.get(node, node) for node in graph.nodes)
+    return OnnxGraph(model, [node for node in nodes if node is not None])
 
 
 def _chains(graph: OnnxGraph) -> list[list[Node]]:
@@ -81,6 +80,7 @@ def _shuffle(chain: list[Node], sizes: list[int], graph: OnnxGraph) -> Node | No
         shape = sizes[0] or 1, sizes[1], sizes[2] or side_px, sizes[3] or 2 * side_px
         if math.prod(shape) > VALUES:
             continue
+        # Each pixel has a number of its own, so that the result says where each one went.
         image = np.arange(math.prod(shape)).reshape(shape)
         result = _moved(chain, image, graph)
         growth = _growth(result, shape)
@@ -88,28 +88,34 @@ def _shuffle(chain: list[Node], sizes: list[int], graph: OnnxGraph) -> Node | No
             continue
         up = growth > 1
         block = max(growth.numerator, growth.denominator)
-        trials = (
-            (mode, Shuffle("", "", "", block, up, first)(image)) for mode, first in ORDERS.items()
-        )
-        mode = next(
-            (mode for mode, moved in trials if block > 1 and np.array_equal(moved, result)), ""
-        )
+        mode = _order(image, result, block, up) if block > 1 else ""
         kind = "DepthToSpace" if up else "SpaceToDepth"
-        ends = ([chain[0].inputs[0]], [chain[-1].outputs[0]])
-        node = Node.of(helper.make_node(kind, *ends, chain[-1].name, blocksize=block))
+        source = chain[0].inputs[0]
+        output = chain[-1].outputs[0]
+        proto = helper.make_node(kind, [source], [output], chain[-1].name, blocksize=block)
+        node = Node.of(proto)
         return replace(node, name=chain[0].name, attributes={"blocksize": block, "mode": mode})
     return None
+
+
+def _order(image: np.ndarray, result: np.ndarray, block: int, up: bool) -> str:
+    """Return the mode of a pixel shuffle that makes the result of the image; empty if none does."""
+    for mode, columns_first in ORDERS.items():
+        shuffle = Shuffle("", "", "", block, up, columns_first)
+        if np.array_equal(shuffle(image), result):
+            return mode
+    return ""
 
 
 def _moved(chain: list[Node], image: np.ndarray, graph: OnnxGraph) -> np.ndarray:
     """Where a chain takes the pixels of an image; nowhere where it does not fit."""
     for node in chain:
         key, move = MOVES[node.op_type]
-        stated = graph.numbers(node, 1, key)
-        if stated is None:
+        numbers = graph.numbers(node, 1, key)
+        if numbers is None:
             return np.array([])
         try:
-            image = move(image, stated)
+            image = move(image, numbers)
         except (IndexError, ValueError):
             return np.array([])
     return image
@@ -126,8 +132,10 @@ def _growth(result: np.ndarray, shape: tuple[int, int, int, int]) -> Fraction | 
     growth = Fraction(result.shape[2], shape[2])
     rows, columns = (source // growth.denominator for source in np.unravel_index(result, shape)[2:])
     down, across = (np.arange(side) // growth.numerator for side in result.shape[2:])
-    whole = 1 in (growth.numerator, growth.denominator)
-    return growth if whole and (rows == down[:, None]).all() and (columns == across).all() else None
+    # Numerator or denominator is 1 where blocks become pixels or pixels become blocks.
+    in_blocks = 1 in (growth.numerator, growth.denominator)
+    in_place = (rows == down[:, None]).all() and (columns == across).all()
+    return growth if in_blocks and in_place else None
 
 
 PLACES: dict[str, Callable[[int, float], float]] = {
@@ -163,17 +171,17 @@ class Resizing:
     @classmethod
     def of(cls, node: Node, graph: OnnxGraph) -> "Resizing":
         """What a node states."""
-        old = node.op_type == "Upsample" or len(node.inputs) == 2  # before opset 11
-        given = node.attributes.get
+        # Before opset 11 the factors are the second input, and places start at the corner.
+        old = node.op_type == "Upsample" or len(node.inputs) == 2
+        attribute = node.attributes.get
         scales = graph.numbers(node, 1 if old else 2, "scales") or []
-        factors = dict(
-            zip((axis % 4 for axis in given("axes", range(4))), scales, strict=bool(scales))
-        )
+        axes = [axis % 4 for axis in attribute("axes", range(4))]
+        factors = dict(zip(axes, scales, strict=bool(scales)))
         return cls(
             tuple(factors.get(axis, 1.0) for axis in range(4)) if factors else (),
-            given("mode", "nearest"),
-            given("coordinate_transformation_mode", "asymmetric" if old else "half_pixel"),
-            given("nearest_mode", "floor" if old else "round_prefer_floor"),
+            attribute("mode", "nearest"),
+            attribute("coordinate_transformation_mode", "asymmetric" if old else "half_pixel"),
+            attribute("nearest_mode", "floor" if old else "round_prefer_floor"),
         )
 
     def makes_blocks(self, factor: int) -> bool:

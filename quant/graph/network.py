@@ -84,7 +84,8 @@ def cut(graph: Graph, channels: int, flat: bool, softmax: bool) -> Network:
     adds_image = False
     if isinstance(end, Add) and IMAGE in end.inputs and end.activation is Activation.none:
         adds_image = True
-        graph, back = _without_shuffles(_ended(graph[:-1], end.inputs[1 - end.inputs.index(IMAGE)]))
+        correction = end.inputs[1 - end.inputs.index(IMAGE)]
+        graph, back = _without_shuffles(_ended(graph[:-1], correction))
     else:
         back = last
         last = ()
@@ -92,8 +93,8 @@ def cut(graph: Graph, channels: int, flat: bool, softmax: bool) -> Network:
     while isinstance(first := _only_reader(graph), Shuffle) and not first.up:
         front.append(first)
         graph = tuple(renamed(op, {first.output: IMAGE}) for op in graph if op is not first)
-    found = Network(graph, channels, tuple(front), back, adds_image, last, flat, softmax)
-    return replace(found, graph=_image_for_convolutions(graph, found.core_channels))
+    network = Network(graph, channels, tuple(front), back, adds_image, last, flat, softmax)
+    return replace(network, graph=_image_for_convolutions(graph, network.core_channels))
 
 
 def _image_for_convolutions(graph: Graph, channels: int) -> Graph:
@@ -115,11 +116,11 @@ def _image_for_convolutions(graph: Graph, channels: int) -> Graph:
 
 def _without_shuffles(graph: Graph) -> tuple[Graph, tuple[Shuffle, ...]]:
     """The graph up to the pixel shuffles that it ends with, and these in their order."""
-    found: list[Shuffle] = []
+    shuffles: list[Shuffle] = []
     while graph and isinstance(end := graph[-1], Shuffle) and end.up:
-        found.insert(0, end)
+        shuffles.insert(0, end)
         graph = _ended(graph[:-1], end.input)
-    return graph, tuple(found)
+    return graph, tuple(shuffles)
 
 
 def _ended(graph: Graph, name: str) -> Graph:
@@ -147,9 +148,13 @@ def named_apart(ops: Sequence[Op], ends: Mapping[str, str]) -> Graph:
     """The operations with these names for the ends, and with others where ours would mean something
     else.
     """
+    # A network may call its own tensors "planes" or "restored", which our files use for others.
     names = {op.output: f"net.{op.output}" for op in ops if _is_ours(op.output)} | dict(ends)
-    moved = (renamed(op, names) for op in ops)
-    return tuple(replace(op, name=f"net.{op.name}") if _is_ours(op.name) else op for op in moved)  # type: ignore[type-var]
+    renamed_ops = (renamed(op, names) for op in ops)
+    return tuple(
+        replace(op, name=f"net.{op.name}") if _is_ours(op.name) else op  # type: ignore[type-var]
+        for op in renamed_ops
+    )
 
 
 def _is_ours(name: str) -> bool:
@@ -170,6 +175,8 @@ def check_network(network: Network) -> None:
         raise refused_graph(expected, str(network.tail.graph.node[0].name))
     widths = channels_of(graph, {IMAGE: network.core_channels})
     for op in graph:
+        # ONNX's SpaceToDepth has the other order of channels, so several need a Gather, which the
+        # DPU does not compute.
         if isinstance(op, Shuffle) and not op.up and op.columns_first and widths[op.input] > 1:
             remedy = (
                 "put it at the network's start, where the host does it, or take a strided "
@@ -187,36 +194,34 @@ def check_network(network: Network) -> None:
 def sized(graph: Graph, size: Pair) -> Graph:
     """The graph for images of one size (rows, columns), the windows of global pooling known."""
     sizes = {IMAGE: size}
-    found = list[Op]()
+    ops = list[Op]()
     for op in graph:
-        read = sizes[op.inputs[0]]
-        if any(sizes[name] != read for name in op.inputs):
-            found_sizes = " and ".join(
-                f"{rows} x {columns}" for rows, columns in (sizes[name] for name in op.inputs)
-            )
-            raise refused_graph(f"tensors of one size for {op.name}", found_sizes)
+        input_sizes = [sizes[name] for name in op.inputs]
+        input_size = input_sizes[0]
+        if any(other != input_size for other in input_sizes):
+            got = " and ".join(f"{rows} x {columns}" for rows, columns in input_sizes)
+            raise refused_graph(f"tensors of one size for {op.name}", got)
+        # Global pooling is a window of the whole map, whose size is known from here on.
         if isinstance(op, AveragePool) and op.kernel is None:
-            op = replace(op, kernel=read)
-        sizes[op.output] = _size(op, read)
-        found.append(op)
-    return tuple(found)
+            op = replace(op, kernel=input_size)
+        sizes[op.output] = _size(op, input_size)
+        ops.append(op)
+    return tuple(ops)
 
 
-def _size(op: Op, read: Pair) -> Pair:
+def _size(op: Op, size: Pair) -> Pair:
     if isinstance(op, Conv | MaxPool | AveragePool):
-        rows, columns = op.weight.shape[2:] if isinstance(op, Conv) else op.kernel or read
+        rows, columns = op.weight.shape[2:] if isinstance(op, Conv) else op.kernel or size
         window = Window((rows, columns), op.window.strides, op.window.pads, op.window.dilations)
         move = window.put_down if isinstance(op, Conv) and op.transposed else window.slid
-        return move(0, read[0]), move(1, read[1])
+        return move(0, size[0]), move(1, size[1])
     if isinstance(op, Resize):
-        return read[0] * op.factor, read[1] * op.factor
+        return size[0] * op.factor, size[1] * op.factor
     if isinstance(op, Shuffle):
-        return (
-            (read[0] * op.block, read[1] * op.block)
-            if op.up
-            else (read[0] // op.block, read[1] // op.block)
-        )
-    return read
+        if op.up:
+            return size[0] * op.block, size[1] * op.block
+        return size[0] // op.block, size[1] // op.block
+    return size
 
 
 def channels_of(graph: Graph, given: Mapping[str, int]) -> dict[str, int]:
@@ -229,27 +234,29 @@ def channels_of(graph: Graph, given: Mapping[str, int]) -> dict[str, int]:
 def add_channels(widths: dict[str, int], ops: Iterable[Op]) -> None:
     """Add the channels of what operations write to those of the tensors that they read."""
     for op in ops:
-        missing = [name for name in op.inputs if name not in widths]
-        if missing:
-            raise refused_graph(f"{op.name} behind what it reads", missing[0])
+        unwritten = [name for name in op.inputs if name not in widths]
+        if unwritten:
+            raise refused_graph(f"{op.name} behind what it reads", unwritten[0])
         widths[op.output] = _width(op, [widths[name] for name in op.inputs])
 
 
-def _width(op: Op, read: list[int]) -> int:
+def _width(op: Op, widths: list[int]) -> int:
     if isinstance(op, HasWeight):  # in float or in whole numbers
-        if read[0] != op.weight.shape[1] * op.groups:
+        if widths[0] != op.weight.shape[1] * op.groups:
             raise refused_graph(
-                f"{op.weight.shape[1] * op.groups} channels for {op.name}", f"{read[0]}"
+                f"{op.weight.shape[1] * op.groups} channels for {op.name}", f"{widths[0]}"
             )
         return len(op.weight)
     if isinstance(op, Concat):
-        return sum(read)
-    if isinstance(op, Add | Mul) and len(set(read)) > 1:
+        return sum(widths)
+    if isinstance(op, Add | Mul) and len(set(widths)) > 1:
         raise refused_graph(
-            f"two tensors of one width for {op.name}", f"{read[0]} and {read[1]} channels"
+            f"two tensors of one width for {op.name}", f"{widths[0]} and {widths[1]} channels"
         )
     if isinstance(op, Shuffle):
-        if op.up and read[0] % op.block**2:
-            raise refused_graph(f"a multiple of {op.block**2} channels for {op.name}", f"{read[0]}")
-        return read[0] // op.block**2 if op.up else read[0] * op.block**2
-    return read[0]
+        if op.up and widths[0] % op.block**2:
+            raise refused_graph(
+                f"a multiple of {op.block**2} channels for {op.name}", f"{widths[0]}"
+            )
+        return widths[0] // op.block**2 if op.up else widths[0] * op.block**2
+    return widths[0]

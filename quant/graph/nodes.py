@@ -58,9 +58,9 @@ OPERATORS: dict[Kind, tuple[str, ...]] = {
     "activation": ("Relu", "LeakyRelu", "QLinearLeakyRelu", "PRelu", "HardSigmoid", "HardSwish"),
     "pool": ("MaxPool", *POOLS, *(f"QLinear{pool}" for pool in POOLS), "GlobalMaxPool"),
 }
-KINDS: dict[str, Kind] = {
-    op_type: kind for kind, op_types in OPERATORS.items() for op_type in op_types
-}
+KINDS: dict[str, Kind] = {}
+for _kind, _op_types in OPERATORS.items():
+    KINDS.update(dict.fromkeys(_op_types, _kind))
 WEIGHTS = {"Conv": 1, "ConvInteger": 1, "ConvTranspose": 1, "QLinearConv": 3}
 """Operator, and which input holds its weights."""
 
@@ -88,11 +88,11 @@ class Window:
         stride = self.stride[axis]
         before = self.pads[axis]
         room = size + before + self.pads[axis + 2] - self.extent(axis)
-        return (
-            min(-(-room // stride), (size + before - 1) // stride) + 1
-            if ceil
-            else room // stride + 1
-        )
+        if not ceil:
+            return room // stride + 1
+        # ONNX lets the last window reach beyond the padding, but it must begin on the map or on the
+        # padding before it.
+        return min(-(-room // stride), (size + before - 1) // stride) + 1
 
     def put_down(self, axis: int, size: int) -> int:
         """How many pixels it makes of so many where it is put down at each, as a transposed
@@ -110,6 +110,7 @@ class Window:
         )
         less = [t // 2 for t in total]
         more = [t - t // 2 for t in total]
+        # Of an odd number SAME_LOWER puts the extra pixel before the map, SAME_UPPER behind it.
         begin, end = (more, less) if auto_pad == "SAME_LOWER" else (less, more)
         return replace(self, pads=(begin[0], begin[1], end[0], end[1]))
 
@@ -148,19 +149,21 @@ class Node:
             size: of the map that it reads, or any that is smaller or larger by whole strides: for
                 `auto_pad`.
         """
-        given = self.attributes.get
+        attribute = self.attributes.get
         sides = (
-            kernel or given("kernel_shape", ()),
-            given("strides", (1, 1)),
-            given("dilations", (1, 1)),
+            kernel or attribute("kernel_shape", ()),
+            attribute("strides", (1, 1)),
+            attribute("dilations", (1, 1)),
         )
-        pads = given("pads", (0, 0, 0, 0))
-        beyond = given("output_padding", (0, 0))
-        if [len(each) for each in (*sides, pads, beyond)] != [2, 2, 2, 4, 2]:
+        pads = attribute("pads", (0, 0, 0, 0))
+        beyond = attribute("output_padding", (0, 0))
+        # In one dimension or three the lists are shorter or longer.
+        lengths = [len(numbers) for numbers in (*sides, pads, beyond)]
+        if lengths != [2, 2, 2, 4, 2]:
             return None
         (rows, columns), stride, dilation = sides
         window = Window((rows, columns), tuple(stride), tuple(pads), tuple(dilation), tuple(beyond))
-        auto_pad = given("auto_pad", "NOTSET")
+        auto_pad = attribute("auto_pad", "NOTSET")
         return (
             window.padded(auto_pad, size)
             if auto_pad in ("VALID", "SAME_UPPER", "SAME_LOWER")
@@ -183,10 +186,9 @@ class OnnxGraph:
         """Of a model as it is, or with other nodes in the place of its own."""
         self.constants = constants(model)
         functions = functions_of(model)
-        own = (Node.of(node, functions) for node in model.graph.node)
-        self.nodes = tuple(
-            node for node in (own if nodes is None else nodes) if node.op_type != "Constant"
-        )
+        if nodes is None:
+            nodes = [Node.of(node, functions) for node in model.graph.node]
+        self.nodes = tuple(node for node in nodes if node.op_type != "Constant")
         inputs = {
             v.name: v.type.tensor_type for v in model.graph.input if v.name not in self.constants
         }
@@ -199,11 +201,11 @@ class OnnxGraph:
     @cached_property
     def readers(self) -> Mapping[str, list[Node]]:
         """The nodes that read each tensor, one as often as it does."""
-        found = defaultdict(list)
+        readers = defaultdict(list)
         for node in self.nodes:
             for name in node.inputs:
-                found[name].append(node)
-        return found
+                readers[name].append(node)
+        return readers
 
     def reads(self, name: str) -> int:
         """How often a tensor is read, by nodes and as a result."""
@@ -260,10 +262,10 @@ def out_shape(
         channels: of a convolution's result.
         constants: the file's, for operators that read sizes from them.
     """
-    known = [shape for shape in shapes if shape is not None]
-    if not known or len(known) != len(shapes):
+    inputs = [shape for shape in shapes if shape is not None]
+    if not inputs or len(inputs) != len(shapes):
         return None
-    first = known[0]
+    first = inputs[0]
     if kind in WINDOWED:
         ceil = bool(node.attributes.get("ceil_mode", 0))
         rows, columns = (
@@ -273,20 +275,20 @@ def out_shape(
             for axis in (0, 1)
         )
         return (channels, rows, columns) if min(rows, columns) > 0 else None
-    if kind == "concat" and len(known) > 1:
-        return (sum(shape[0] for shape in known), first[1], first[2])
+    if kind == "concat" and len(inputs) > 1:
+        return (sum(shape[0] for shape in inputs), first[1], first[2])
     if kind in ("add", "mul") or node.op_type == "Where":
-        return (max(s[0] for s in known), max(s[1] for s in known), max(s[2] for s in known))
+        return (max(s[0] for s in inputs), max(s[1] for s in inputs), max(s[2] for s in inputs))
     return (
         first
         if kind in ("activation", "quantise", "dequantise")
-        else _inferred(node, known, constants)
+        else _inferred(node, inputs, constants)
     )
 
 
-def _inferred(node: Node, known: list[Shape], constants: Mapping[str, np.ndarray]) -> Shape | None:
+def _inferred(node: Node, inputs: list[Shape], constants: Mapping[str, np.ndarray]) -> Shape | None:
     """What onnx knows of one standard operator."""
-    shapes = iter(known)
+    shapes = iter(inputs)
     types = {}
     data = {}
     for name in filter(None, node.inputs):
@@ -295,7 +297,8 @@ def _inferred(node: Node, known: list[Shape], constants: Mapping[str, np.ndarray
             types[name] = helper.make_tensor_type_proto(
                 helper.np_dtype_to_tensor_dtype(value.dtype), value.shape
             )
-            if value.size <= LIST_VALUES:  # weights are longer, and say nothing of sizes
+            # Weights are longer, and say nothing of sizes.
+            if value.size <= LIST_VALUES:
                 data[name] = numpy_helper.from_array(value)
         elif (shape := next(shapes, None)) is not None:
             types[name] = helper.make_tensor_type_proto(TensorProto.FLOAT, [1, *shape])
@@ -304,11 +307,12 @@ def _inferred(node: Node, known: list[Shape], constants: Mapping[str, np.ndarray
     try:
         schema = onnx.defs.get_schema(node.op_type, OPSET)
         opsets = [helper.make_opsetid("", OPSET)]
-        found = shape_inference.infer_node_outputs(
+        outputs = shape_inference.infer_node_outputs(
             schema, node.proto, types, data, opset_imports=opsets
         )
-        sizes = [d.dim_value for d in found[node.outputs[0]].tensor_type.shape.dim]
-    except CODE_FAULTS:  # a version of onnx that lacks this call would make every size unknown
+        sizes = [d.dim_value for d in outputs[node.outputs[0]].tensor_type.shape.dim]
+    except CODE_FAULTS:
+        # A version of onnx that lacks this call would make every size unknown.
         raise
     except Exception:  # noqa: BLE001 - an unknown operator and whatever its own inference raises mean: unknown
         return None

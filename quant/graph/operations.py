@@ -153,10 +153,10 @@ class Conv(OneInput):
     window: Window = field(default_factory=Window)
     groups: int = 1
     transposed: bool = False
-    ceiling: np.ndarray | None = (
-        None  # (O,) where ReLU6 clips each channel once they are scaled; None at 6
-    )
-    offset: float = 0.0  # taken off the result behind its ReLU: 128 units of int8, or nothing
+    # (O,) where ReLU6 clips each channel once they are scaled; None at 6.
+    ceiling: np.ndarray | None = None
+    # Taken off the result behind its ReLU: 128 units of int8, or nothing.
+    offset: float = 0.0
 
     @property
     def ceilings(self) -> np.ndarray:
@@ -236,6 +236,7 @@ class Shuffle(OneInput):
         """The values (N, C, H, W), of any type, moved."""
         count, channels, height, width = values.shape
         r = self.block
+        # ONNX's DCR has the block's place before the channel, CRD (torch's order) behind it.
         if self.up:
             inner = channels // r**2
             parts = (inner, r, r) if self.columns_first else (r, r, inner)
@@ -290,8 +291,12 @@ def tied(graph: Graph) -> dict[str, str]:
     """For every tensor, the first of those that must share its scale: by concat, pooling, resizing,
     shuffling.
     """
-    alone = [(name,) for op in graph for name in (*op.inputs, op.output)]
-    return united([*alone, *((*op.inputs, op.output) for op in graph if ties_scales(op))])
+    links: list[tuple[str, ...]] = []
+    # A link of one name lists each tensor, also those that share their scale with none.
+    for op in graph:
+        links += [(name,) for name in (*op.inputs, op.output)]
+    links += [(*op.inputs, op.output) for op in graph if ties_scales(op)]
+    return united(links)
 
 
 def tensors(graph: Graph) -> list[str]:
@@ -320,6 +325,7 @@ PLANES_FRAC_BITS = 7
 def split(image: np.ndarray, count: int = COUNT) -> np.ndarray:
     """(N, C, H, W) float32 in [0, 1] to the planes (N, count C, H, W) int8."""
     dn = np.clip(np.rint(image * np.float32(MAX_DN)), 0, MAX_DN)
+    # The largest digital number, 4095, rounds to 128 steps, one more than int8 holds.
     coarse = np.minimum(np.rint(dn / STEP), COARSE_MAX)
     remainder = dn - STEP * coarse
     planes = [coarse, remainder, np.rint(remainder / QUARTER)]
@@ -337,11 +343,12 @@ def read_planes(graph: Graph) -> Graph:
 
 def _reads_planes(op: Conv) -> Conv:
     unit = np.float32(2.0**PLANES_FRAC_BITS / MAX_DN)
-    weight = (
-        op.weight
-        if op.groups == 1
-        else op.weight * np.eye(op.groups, dtype=np.float32)[:, :, None, None]
-    )
+    weight = op.weight
+    # Each result of a depthwise convolution reads several planes of its channel, which a depthwise
+    # one cannot, so it becomes an ordinary one with zeros for the other channels.
+    if op.groups != 1:
+        weight = weight * np.eye(op.groups, dtype=np.float32)[:, :, None, None]
+    # The third plane only makes the steps of the weights finer: in float it adds nothing.
     planes = [weight * (STEP * unit), weight * unit, np.zeros_like(weight)]
     return replace(
         op, input=PLANES, weight=np.concatenate(planes, axis=1).astype(np.float32), groups=1

@@ -47,6 +47,7 @@ class Scale:
         """The p of a scale 2^-p, None for any other scale."""
         if len(self.scales) != 1:
             return None
+        # `frexp` splits off a fraction in [0.5, 1), which of a power of two is exactly 0.5.
         fraction, exponent = math.frexp(self.scales[0])
         return 1 - exponent if fraction == 0.5 else None
 
@@ -60,21 +61,16 @@ def stated(node: Node, graph: OnnxGraph) -> Iterator[tuple[str, Scale]]:
         name = node.outputs[0] if place == RESULT else node.inputs[place]
         scales = graph.constants.get(node.inputs[scale], np.zeros(0))
         zeros = graph.value(node, zero_point)
-        if (
-            zeros is None
-        ):  # around 0, of the constant's own type, the one that is asked for, or ONNX's default
-            asked = helper.tensor_dtype_to_np_dtype(
-                node.attributes.get("output_dtype") or TensorProto.UINT8
-            )
-            zeros = np.zeros(1, graph.constants[name].dtype if name in graph.constants else asked)
-        yield (
-            name,
-            Scale(
-                tuple(scales.astype(float).ravel()),
-                tuple(map(int, zeros.ravel())),
-                str(zeros.dtype),
-            ),
-        )
+        # A zero point that is left out is 0, of the constant's own type, of the one that
+        # `output_dtype` asks for, or of ONNX's default, which is uint8.
+        if zeros is None:
+            output_dtype = node.attributes.get("output_dtype") or TensorProto.UINT8
+            dtype = helper.tensor_dtype_to_np_dtype(output_dtype)
+            if name in graph.constants:
+                dtype = graph.constants[name].dtype
+            zeros = np.zeros(1, dtype)
+        values = tuple(scales.astype(float).ravel())
+        yield name, Scale(values, tuple(map(int, zeros.ravel())), str(zeros.dtype))
 
 
 BYTES = (TensorProto.INT8, TensorProto.UINT8)
@@ -99,11 +95,12 @@ class Integers:
         self._results = frozenset(graph.outputs)
         self._int8 = {name for name, kind in graph.types.items() if kind in BYTES}
         self._wide: set[str] = set()
-        self._seen: dict[str, str] = {}  # and the int8 tensor that each is
-        self._same: dict[str, str] = {}  # notation, and what it stands for
-        self._formats: dict[
-            str, tuple[Scale, ...]
-        ] = {}  # the writer's first, then whatever contradicts it
+        # Int8 tensors seen as float, and the int8 tensor that each of them is.
+        self._seen: dict[str, str] = {}
+        # Notation, and the tensor that it stands for.
+        self._same: dict[str, str] = {}
+        # The writer's format first, then whatever contradicts it.
+        self._formats: dict[str, tuple[Scale, ...]] = {}
         self._becomes = self._rounded()
         for node in graph.nodes:
             self._read_formats(node)
@@ -147,22 +144,23 @@ class Integers:
 
     def operand(self, node: Node) -> np.ndarray | None:
         """The first constant among what an operator computes with, as stored."""
-        found = (self.constant(name) for name in self._operands(node))
-        return next((value for value in found if value is not None), None)
+        constants = (self.constant(name) for name in self._operands(node))
+        return next((value for value in constants if value is not None), None)
 
     def formats(self, node: Node) -> dict[str, tuple[Scale, ...]]:
         """Of a node's tensors by role: "input 0", ..., "weight", "bias", "constant 1", "output".
 
         Several where the file contradicts itself, the writer's first; none where it says nothing.
         """
-        own = dict(stated(node, self._graph))
+        stated_scales = dict(stated(node, self._graph))
         numbers = self._numbers(node)
-        found = {
+        formats = {
             role: self._formats.get(self.resolve(name), ())
             for role, name in self._tensors(node).items()
         }
-        return found | {
-            role: (own[n],) if n in own else self._formats.get(n, ()) for role, n in numbers.items()
+        return formats | {
+            role: (stated_scales[n],) if n in stated_scales else self._formats.get(n, ())
+            for role, n in numbers.items()
         }
 
     def numbers(self, node: Node) -> dict[str, np.ndarray | None]:
@@ -189,12 +187,11 @@ class Integers:
         if not self.is_integer(node):
             return names
         if node.op_type in ("Conv", "ConvTranspose", "QLinearConv"):
-            behind = (
-                node.inputs[1:]
-                if node.op_type != "QLinearConv"
-                else (node.inputs[3], *node.inputs[8:])
-            )
-            names = dict(zip(("weight", "bias"), behind, strict=False))
+            numbers = node.inputs[1:]
+            # A QLinearConv has scales and zero points between its input, weights and bias.
+            if node.op_type == "QLinearConv":
+                numbers = (node.inputs[3], *node.inputs[8:])
+            names = dict(zip(("weight", "bias"), numbers, strict=False))
         elif node.op_type in ELEMENTWISE:
             operands = enumerate(self._operands(node))
             names = {
@@ -208,9 +205,8 @@ class Integers:
         result = node.outputs[0]
         if node.op_type == "DequantizeLinear":
             aliases = self._seen if self.constant(source) is None else self._same
-            aliases[result] = self.resolve(
-                source
-            )  # at once: a chain of aliases would be walked again by each reader
+            # At once, because each reader would walk a chain of aliases again.
+            aliases[result] = self.resolve(source)
         elif node.op_type == "QuantizeLinear" and source in self._wide:
             self._int8.add(result)
             self._same[result] = self.resolve(source)
@@ -234,26 +230,23 @@ class Integers:
 
     def _reads(self, node: Node, *tensors: Container[str]) -> bool:
         """Whether all that it reads is among these, constants left out, and there is any."""
-        names = [
-            name
-            for name in map(self.resolve, filter(None, node.inputs))
-            if name not in self._constants
-        ]
-        return bool(names) and all(any(name in each for each in tensors) for name in names)
+        resolved = map(self.resolve, filter(None, node.inputs))
+        names = [name for name in resolved if name not in self._constants]
+        return bool(names) and all(any(name in group for group in tensors) for name in names)
 
     def _rounded(self) -> dict[str, str]:
         """The int8 tensor that each one becomes that is rounded next, or behind activations."""
-        found: dict[str, str] = {}
+        int8_names: dict[str, str] = {}
         for node in reversed(self._graph.nodes):
             readers = self._graph.readers.get(node.outputs[0], [])
             kinds = {reader.op_type for reader in readers}
             if node.outputs[0] in self._results or not kinds:
                 continue
             if kinds == {"QuantizeLinear"}:
-                found[node.outputs[0]] = readers[0].outputs[0]
-            elif len(readers) == 1 and kinds <= ACTIVATIONS and readers[0].outputs[0] in found:
-                found[node.outputs[0]] = found[readers[0].outputs[0]]
-        return found
+                int8_names[node.outputs[0]] = readers[0].outputs[0]
+            elif len(readers) == 1 and kinds <= ACTIVATIONS and readers[0].outputs[0] in int8_names:
+                int8_names[node.outputs[0]] = int8_names[readers[0].outputs[0]]
+        return int8_names
 
     def _read_formats(self, node: Node) -> None:
         """A constant's format is its reader's own: two nodes may read the same
@@ -266,6 +259,6 @@ class Integers:
                 self._give(node.outputs[0], scale)
 
     def _give(self, tensor: str, scale: Scale) -> None:
-        known = self._formats.get(tensor, ())
-        if scale not in known:
-            self._formats[tensor] = (*known, scale)
+        scales = self._formats.get(tensor, ())
+        if scale not in scales:
+            self._formats[tensor] = (*scales, scale)

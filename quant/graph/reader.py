@@ -112,12 +112,14 @@ class _Reader:
 
     def __init__(self, model: onnx.ModelProto) -> None:
         self.source = with_shuffles(model)
-        (self.image, *_), self.result = self.source.inputs, model.graph.output[0].name
+        self.result = model.graph.output[0].name
+        self.image, *_ = self.source.inputs
         self.ops: list[Op] = []
         self._places: dict[str, int] = {}  # where the operation that writes a tensor stands
         self._widths: dict[str, int] = {}  # channels of what the first operations write
         self._measured = 0  # so many operations
-        self.flat = self.softmax = False
+        self.flat = False
+        self.softmax = False
 
     def channels(self) -> int:
         """Of the image."""
@@ -187,8 +189,8 @@ class _Reader:
         self._measured = len(self.ops)
         return self._widths[tensor]
 
-    def _require(self, sound: bool, node: Node, expected: str, got: str = "another") -> None:
-        if not sound:
+    def _require(self, condition: bool, node: Node, expected: str, got: str = "another") -> None:
+        if not condition:
             raise refused_graph(expected, f"{got} at {node}")
 
     def _weights(self, node: Node) -> tuple[np.ndarray, np.ndarray]:
@@ -211,6 +213,7 @@ class _Reader:
     def _conv(self, node: Node) -> Op:
         weight, bias = self._weights(node)
         groups = int(node.attributes.get("group", 1))
+        # A DPU has one group or one a channel: its tools leave others to the processor.
         depthwise = groups == len(weight) and weight.shape[1] == 1
         self._require(
             groups == 1 or depthwise,
@@ -225,14 +228,17 @@ class _Reader:
 
     def _convtranspose(self, node: Node) -> Op:
         weight, bias = self._weights(node)
-        given = node.attributes
-        strides = node.attributes.get("strides", [1, 1])
-        plain = int(given.get("group", 1)) == 1 and not any(given.get("output_padding", [0]))
+        attributes = node.attributes
+        strides = attributes.get("strides", [1, 1])
+        # AMD's tools leave a transposed convolution with output padding to the processor.
+        plain = int(attributes.get("group", 1)) == 1 and not any(
+            attributes.get("output_padding", [0])
+        )
         self._require(plain, node, "transposed convolutions of one group, without output padding")
         even = (
-            set(given.get("dilations", [1])) == {1}
+            set(attributes.get("dilations", [1])) == {1}
             and len(set(strides)) == 1
-            and "output_shape" not in given
+            and "output_shape" not in attributes
         )
         self._require(
             even,
@@ -240,7 +246,9 @@ class _Reader:
             "transposed convolutions of one stride, undilated, sized by it",
             f"{list(strides)}",
         )
-        self._require(given.get("auto_pad", "NOTSET") == "NOTSET", node, "stated pads", "auto_pad")
+        self._require(
+            attributes.get("auto_pad", "NOTSET") == "NOTSET", node, "stated pads", "auto_pad"
+        )
         _, window = self._window(node, weight.shape[2:])
         return Conv(
             node.name, node.inputs[0], node.outputs[0], weight, bias, window=window, transposed=True
@@ -251,35 +259,35 @@ class _Reader:
         auto = str(node.attributes.get("auto_pad", ""))
         if window is None:
             raise refused_graph("windows over rows and columns", f"another at {node}")
-        known = window.stride == (1, 1) or not auto.startswith("SAME")
-        self._require(known, node, "stated pads", f"auto_pad {auto} with strides")
+        has_pads = window.stride == (1, 1) or not auto.startswith("SAME")
+        self._require(has_pads, node, "stated pads", f"auto_pad {auto} with strides")
         return window.kernel, Window(window.stride, window.pads, window.dilation)
 
     def _flatten(self, node: Node) -> None:
         """At the end, where what is flat is (N, K): inside it stays (N, K, 1, 1)."""
-        ends = (
+        at_end = (
             node.outputs[0] == self.result
             and bool(self.ops)
             and node.attributes.get("axis", 1) == 1
         )
         self._require(
-            ends and self.ops[-1].output == node.inputs[0], node, "Flatten at the end alone"
+            at_end and self.ops[-1].output == node.inputs[0], node, "Flatten at the end alone"
         )
         self._replace(len(self.ops) - 1, renamed(self.ops[-1], {node.inputs[0]: node.outputs[0]}))
         self.flat = True
 
     def _softmax(self, node: Node) -> None:
         """Along the channels, at the end, where the host does it."""
-        rest = [each.op_type for each in self.source.readers.get(node.outputs[0], ())]
-        ends = (node.outputs[0] == self.result or rest == ["Flatten"]) and node.attributes.get(
-            "axis", -1
-        ) in (1, -3)
+        readers = self.source.readers.get(node.outputs[0], ())
+        rest = [reader.op_type for reader in readers]
+        at_end = node.outputs[0] == self.result or rest == ["Flatten"]
+        of_channels = node.attributes.get("axis", -1) in (1, -3)
         last = (
             bool(self.ops)
             and self.ops[-1].output == node.inputs[0]
             and self.source.reads(node.inputs[0]) == 1
         )
-        self._require(ends and last, node, "Softmax of channels at the end alone")
+        self._require(at_end and of_channels and last, node, "Softmax of channels at the end alone")
         self._replace(len(self.ops) - 1, renamed(self.ops[-1], {node.inputs[0]: node.outputs[0]}))
         self.softmax = True
 
@@ -305,10 +313,10 @@ class _Reader:
         """A sum, difference or product with one number a channel: a depthwise convolution of one
         pixel.
         """
-        found = {k: value for k in (0, 1) if (value := self.source.value(node, k)) is not None}
-        if not found:
+        constants = {k: value for k in (0, 1) if (value := self.source.value(node, k)) is not None}
+        if not constants:
             return None
-        (place, value), *others = found.items()
+        (place, value), *others = constants.items()
         flat = None if others else per_channel(value)
         if flat is None:
             got = f"one of {times(value.shape)} at {node}"
@@ -317,12 +325,11 @@ class _Reader:
         source = node.inputs[1 - place]
         channels = self._channels_of(source)
         self._require(value.size in (1, channels), node, f"{channels} numbers", f"{value.size}")
-        each = np.broadcast_to(flat.astype(np.float32), (channels,))
+        values = np.broadcast_to(flat.astype(np.float32), (channels,))
         one = np.ones(channels, np.float32)
         none = np.zeros(channels, np.float32)
-        factor, offset = {"Add": (one, each), "Sub": (one, -each), "Mul": (each, none)}[
-            node.op_type
-        ]
+        operators = {"Add": (one, values), "Sub": (one, -values), "Mul": (values, none)}
+        factor, offset = operators[node.op_type]
         return Conv(
             node.name, source, node.outputs[0], factor[:, None, None, None], offset, groups=channels
         )
@@ -347,24 +354,25 @@ class _Reader:
         return AveragePool(node.name, node.inputs[0], node.outputs[0], kernel, window)
 
     def _resize(self, node: Node) -> Op:
-        found = Resizing.of(node, self.source)
-        sound = found.factors[:2] == (1, 1) and found.factors[2] == found.factors[3]
-        self._require(sound, node, "a resize by a constant factor of rows and columns")
-        factor = int(found.factors[2])
-        where = found.where
+        resizing = Resizing.of(node, self.source)
+        is_uniform = resizing.factors[:2] == (1, 1) and resizing.factors[2] == resizing.factors[3]
+        self._require(is_uniform, node, "a resize by a constant factor of rows and columns")
+        factor = int(resizing.factors[2])
+        where = resizing.where
         self._require(
-            found.factors[2] == factor >= 1, node, "a whole factor", f"{found.factors[2]:g}"
+            resizing.factors[2] == factor >= 1, node, "a whole factor", f"{resizing.factors[2]:g}"
         )
-        if found.mode == "linear":
+        # A DPU enlarges bilinearly by 2 and 4 alone where centres are half-pixel ones.
+        if resizing.mode == "linear":
             half = where in ("half_pixel", "pytorch_half_pixel") and factor in (2, 4)
             self._require(
                 half, node, "bilinear by 2 or 4 with half-pixel centres", f"{where} by {factor}"
             )
         else:
-            blocks = found.mode == "nearest" and found.makes_blocks(factor)
-            got = f"{found.mode}, {where}, {found.rounding} by {factor}"
+            blocks = resizing.mode == "nearest" and resizing.makes_blocks(factor)
+            got = f"{resizing.mode}, {where}, {resizing.rounding} by {factor}"
             self._require(blocks, node, "a nearest resize that makes a block of each pixel", got)
-        return Resize(node.name, node.inputs[0], node.outputs[0], factor, found.mode == "linear")
+        return Resize(node.name, node.inputs[0], node.outputs[0], factor, resizing.mode == "linear")
 
     def _shuffle(self, node: Node) -> Op:
         """A pixel shuffle, or Reshape and Transpose as exporters spell one."""
@@ -372,32 +380,34 @@ class _Reader:
         self._require(mode in ORDERS, node, "Reshape and Transpose that spell a pixel shuffle")
         up = node.op_type == "DepthToSpace"
         block = int(node.attributes["blocksize"])
-        name = node.proto.name or node.name  # of several nodes the last one's
+        # Of several nodes that spell one shuffle it is the last one's name.
+        name = node.proto.name or node.name
         return Shuffle(name, node.inputs[0], node.outputs[0], block, up, ORDERS[mode])
 
     def _activation(self, node: Node) -> None:
         activation = self._which(node)
-        on_sums = activation not in (
-            Activation.hard_sigmoid,
-            Activation.hard_swish,
-        )  # before anything is rounded
+        # HardSigmoid and HardSwish are functions of a rounded value, the others of the exact sums.
+        on_sums = activation not in (Activation.hard_sigmoid, Activation.hard_swish)
         writer = self._places.get(node.inputs[0])
-        before = self.ops[writer] if writer is not None else None
-        fusible = isinstance(before, Conv) or (
-            isinstance(before, Add) and activation is Activation.relu
+        producer = self.ops[writer] if writer is not None else None
+        # A DPU computes no activation but ReLU behind a sum of two tensors.
+        fusible = isinstance(producer, Conv) or (
+            isinstance(producer, Add) and activation is Activation.relu
         )
-        free = (
-            getattr(before, "activation", None) is Activation.none
+        can_fuse = (
+            getattr(producer, "activation", None) is Activation.none
             and self.source.reads(node.inputs[0]) == 1
         )
         # The host computes LeakyReLU on a convolution's own sums, which a transposed one has in
         # phases.
         phased = (
-            isinstance(before, Conv) and before.transposed and activation is Activation.leaky_relu
+            isinstance(producer, Conv)
+            and producer.transposed
+            and activation is Activation.leaky_relu
         )
-        if on_sums and fusible and free and not phased and writer is not None:
-            assert isinstance(before, Conv | Add)  # noqa: S101
-            self._replace(writer, replace(before, output=node.outputs[0], activation=activation))
+        if on_sums and fusible and can_fuse and not phased and writer is not None:
+            assert isinstance(producer, Conv | Add)  # noqa: S101
+            self._replace(writer, replace(producer, output=node.outputs[0], activation=activation))
         else:
             self._append(Pointwise(node.name, node.inputs[0], node.outputs[0], activation))
 
@@ -416,10 +426,8 @@ class _Reader:
             six = low is not None and high is not None and float(low) == 0 and float(high) == 6
             self._require(six, node, "a clip from 0 to 6 (ReLU6)")
         if node.op_type == "HardSigmoid":
-            alpha, beta = (
-                node.attributes.get(key, default)
-                for key, default in (("alpha", 0.2), ("beta", 0.5))
-            )
+            alpha = node.attributes.get("alpha", 0.2)
+            beta = node.attributes.get("beta", 0.5)
             plain = bool(np.isclose(alpha, 1 / 6, 1e-4)) and beta == 0.5
             self._require(plain, node, "HardSigmoid with alpha 1/6", f"{alpha:g}")
         return activation

@@ -82,8 +82,10 @@ class Tail:
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """What it makes of a map (N, C, H, W), in float32."""
-        found: list[np.ndarray] = self._evaluator.run(None, {CORRECTION: values.astype(np.float32)})  # type: ignore[assignment]
-        return found[0]
+        results: list[np.ndarray] = self._evaluator.run(
+            None, {CORRECTION: values.astype(np.float32)}
+        )  # type: ignore[assignment]
+        return results[0]
 
     def write(self, writer: GraphWriter, source: str) -> None:
         """Write its nodes behind the tensor `source`."""
@@ -112,18 +114,17 @@ def without_tail(model: ModelProto, known: Collection[str]) -> tuple[ModelProto,
         return model, None
     if any(node.op_type not in PLAIN for node in nodes[first:]):
         return model, None
-    held = {tensor.name for tensor in model.graph.initializer}
-    read: set[str] = set()
-    for start in range(
-        len(nodes) - 1, 0, -1
-    ):  # the tail grows towards the front, one node at a time
+    constants = {tensor.name for tensor in model.graph.initializer}
+    reads: set[str] = set()
+    # The tail grows towards the front, one node at a time, until it reads a single map.
+    for start in range(len(nodes) - 1, 0, -1):
         node = nodes[start]
         if node.op_type not in PLAIN:
             break
-        read.difference_update(node.output)
-        read.update(name for name in node.input if name and name not in held)
-        if start <= first and len(read) == 1:
-            source = read.pop()
+        reads.difference_update(node.output)
+        reads.update(name for name in node.input if name and name not in constants)
+        if start <= first and len(reads) == 1:
+            source = reads.pop()
             if source == model.graph.input[0].name:
                 break
             return _parted(model, nodes[:start], nodes[start:], source)
@@ -138,25 +139,29 @@ def _parted(
     del body.graph.node[:], body.graph.output[:]
     body.graph.node.extend(nodes)
     body.graph.output.append(helper.make_tensor_value_info(source, TensorProto.FLOAT, None))
-    names = {
-        name: f"host_tail.{name}" for node in tail for name in (*node.input, *node.output) if name
-    }
+    # A prefix of its own keeps the tail's tensors apart from those that a host file writes.
+    names: dict[str, str] = {}
+    for node in tail:
+        names |= {name: f"host_tail.{name}" for name in (*node.input, *node.output) if name}
     names |= {source: CORRECTION, output.name: RESULT}
-    kept = [tensor for tensor in model.graph.initializer if tensor.name in names]
-    read = onnx.ValueInfoProto(name=CORRECTION)
+    constants = [tensor for tensor in model.graph.initializer if tensor.name in names]
+    correction = onnx.ValueInfoProto(name=CORRECTION)
     result = onnx.ValueInfoProto(name=RESULT, type=output.type)
-    read.type.tensor_type.elem_type = TensorProto.FLOAT
-    graph = helper.make_graph([_renamed(node, names) for node in tail], "tail", [read], [result])
-    for tensor in kept:
+    correction.type.tensor_type.elem_type = TensorProto.FLOAT
+    tail_nodes = [_renamed(node, names) for node in tail]
+    graph = helper.make_graph(tail_nodes, "tail", [correction], [result])
+    for tensor in constants:
         graph.initializer.add().CopyFrom(tensor)
         graph.initializer[-1].name = names[tensor.name]
-    return body, Tail(base64.b64encode(graph.SerializeToString(deterministic=True)).decode())
+    # Deterministic, so that the same network gives the same file.
+    content = graph.SerializeToString(deterministic=True)
+    return body, Tail(base64.b64encode(content).decode())
 
 
 def _renamed(node: NodeProto, names: dict[str, str]) -> NodeProto:
-    found = deepcopy(node)
-    for field in (found.input, found.output):
+    copy = deepcopy(node)
+    for field in (copy.input, copy.output):
         field[:] = [names.get(name, name) for name in field]
-    if not found.name.startswith("host_tail."):
-        found.name = f"host_tail.{found.name or found.output[0]}"
-    return found
+    if not copy.name.startswith("host_tail."):
+        copy.name = f"host_tail.{copy.name or copy.output[0]}"
+    return copy

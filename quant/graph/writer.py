@@ -71,11 +71,10 @@ def write_float(w: GraphWriter, op: Op, feeds: Sequence[str], output: str) -> No
         feeds: the names of what it reads; of a convolution with those of its weights and bias.
         output: the name of its result.
     """
-    activation = (
-        Activation.none
-        if isinstance(op, Pointwise)
-        else getattr(op, "activation", Activation.none).written
-    )
+    # The operator of a Pointwise is its activation, so that none follows.
+    activation = Activation.none
+    if not isinstance(op, Pointwise):
+        activation = getattr(op, "activation", Activation.none).written
     offset = getattr(op, "offset", 0.0)
     end = output
     if offset:
@@ -84,19 +83,15 @@ def write_float(w: GraphWriter, op: Op, feeds: Sequence[str], output: str) -> No
     _WRITERS[type(op)](w, op, list(feeds), result)
     if isinstance(op, Conv) and op.ceiling is not None:
         w.node("Relu", f"{output}.above_0", [result])
-        ceiling = w.constant(
-            f"{op.name}.ceiling", np.asarray(op.ceiling, np.float32)[:, None, None]
-        )
+        # ONNX's Clip has one limit for all channels, and here each has its own.
+        limits = np.asarray(op.ceiling, np.float32)[:, None, None]
+        ceiling = w.constant(f"{op.name}.ceiling", limits)
         w.node("Min", output, [f"{output}.above_0", ceiling], f"{op.name}.{activation.name}")
     elif activation is not Activation.none:
         _activation(w, activation, result, output, f"{op.name}.{activation.name}")
     if offset:
-        w.node(
-            "Sub",
-            end,
-            [output, w.constant(f"{op.name}.offset", np.array(offset, np.float32))],
-            f"{op.name}.lowered",
-        )
+        lowered_by = w.constant(f"{op.name}.offset", np.array(offset, np.float32))
+        w.node("Sub", end, [output, lowered_by], f"{op.name}.lowered")
 
 
 def _conv(w: GraphWriter, op: Conv, feeds: list[str], output: str) -> None:
@@ -107,14 +102,14 @@ def _conv(w: GraphWriter, op: Conv, feeds: list[str], output: str) -> None:
 
 def window_attributes(window: Window, groups: int = 1) -> dict[str, Any]:
     """The attributes that differ from ONNX's defaults, and the pads."""
-    found: dict[str, Any] = {"pads": list(window.pads)}
+    attributes: dict[str, Any] = {"pads": list(window.pads)}
     if window.strides != (1, 1):
-        found["strides"] = list(window.strides)
+        attributes["strides"] = list(window.strides)
     if window.dilations != (1, 1):
-        found["dilations"] = list(window.dilations)
+        attributes["dilations"] = list(window.dilations)
     if groups != 1:
-        found["group"] = groups
-    return found
+        attributes["group"] = groups
+    return attributes
 
 
 def _activation(
@@ -126,6 +121,7 @@ def _activation(
     elif activation is Activation.leaky_relu:
         w.node("LeakyRelu", output, [source], name, alpha=LEAKY_SLOPE)
     elif activation is Activation.hard_sigmoid:
+        # ONNX's own default is an alpha of 0.2.
         w.node("HardSigmoid", output, [source], name, alpha=1 / 6, beta=0.5)
     else:
         w.node(activation.value, output, [source], name)
@@ -144,13 +140,15 @@ def _resize(w: GraphWriter, op: Resize, feeds: list[str], output: str) -> None:
     scales = w.constant(
         f"resize_by_{op.factor}", np.array([1, 1, op.factor, op.factor], np.float32)
     )
-    how = {"mode": "linear", "coordinate_transformation_mode": "half_pixel"}
+    bilinear = {"mode": "linear", "coordinate_transformation_mode": "half_pixel"}
     nearest = {
         "mode": "nearest",
         "coordinate_transformation_mode": "asymmetric",
         "nearest_mode": "floor",
     }
-    w.node("Resize", output, [feeds[0], "", scales], op.name, **(how if op.bilinear else nearest))
+    w.node(
+        "Resize", output, [feeds[0], "", scales], op.name, **(bilinear if op.bilinear else nearest)
+    )
 
 
 def write_shuffle(w: GraphWriter, op: Shuffle, source: str, output: str, channels: int = 1) -> None:
@@ -160,13 +158,13 @@ def write_shuffle(w: GraphWriter, op: Shuffle, source: str, output: str, channel
         w.node("DepthToSpace", output, [source], op.name, blocksize=op.block, mode=mode)
     elif not op.columns_first or channels == 1:
         w.node("SpaceToDepth", output, [source], op.name, blocksize=op.block)
-    else:  # ONNX has its own order only, blocks before channels
+    else:
+        # ONNX's SpaceToDepth has its own order only, the blocks' places before the channels.
         taps = op.block**2
-        order = w.constant(
-            f"{op.name}.order", np.arange(taps * channels).reshape(taps, channels).T.ravel()
-        )
-        moved = w.node("SpaceToDepth", f"{output}.blocks", [source], op.name, blocksize=op.block)
-        w.node("Gather", output, [moved, order], f"{op.name}.channels", axis=1)
+        places = np.arange(taps * channels).reshape(taps, channels)
+        order = w.constant(f"{op.name}.order", places.T.ravel())
+        blocks = w.node("SpaceToDepth", f"{output}.blocks", [source], op.name, blocksize=op.block)
+        w.node("Gather", output, [blocks, order], f"{op.name}.channels", axis=1)
 
 
 _WRITERS: dict[type, Callable[..., None]] = {

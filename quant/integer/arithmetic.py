@@ -29,10 +29,14 @@ def convolve(
     whole image would take kh kw times its memory.
     """
     if transposed:
-        weight, wide, window = weight[:, :, ::-1, ::-1], *_between_zeros(image, weight, window)
+        wide, window = _between_zeros(image, weight, window)
+        weight = weight[:, :, ::-1, ::-1]
     else:
         wide = _padded(image, window)
-    largest = 128 * int(np.abs(weight.astype(np.int64)).sum((1, 2, 3)).max(initial=0))
+    # An int8 value is at most 128 in size, so neither a sum nor a part of it exceeds this bound.
+    # Below 2^24 float32 is exact in any order of summation, which the matrix product may choose.
+    sizes = np.abs(weight.astype(np.int64)).sum((1, 2, 3))
+    largest = 128 * int(sizes.max(initial=0))
     exact = np.float32 if largest <= FLOAT32_WHOLE_MAX else np.float64
     windows = _windows(wide.astype(exact), weight.shape[2:], window)
     return _products(windows, weight.astype(exact), groups)
@@ -45,7 +49,8 @@ def _padded(image: np.ndarray, window: Window, fill: int = 0) -> np.ndarray:
 
 def _windows(wide: np.ndarray, kernel: Sequence[int], window: Window) -> np.ndarray:
     """The windows (N, C, H, W, kh, kw) of an image that is padded already."""
-    (rows, columns), (tall, broad) = window.strides, window.dilations
+    rows, columns = window.strides
+    tall, broad = window.dilations
     extent = (kernel[0] - 1) * tall + 1, (kernel[1] - 1) * broad + 1
     return sliding_window_view(wide, extent, (2, 3))[:, :, ::rows, ::columns, ::tall, ::broad]
 
@@ -57,11 +62,13 @@ def _between_zeros(
     between them.
     """
     count, channels, height, width = image.shape
-    (rows, columns), (top, left, bottom, right) = window.strides, window.pads
+    rows, columns = window.strides
+    top, left, bottom, right = window.pads
     between = np.zeros(
         (count, channels, (height - 1) * rows + 1, (width - 1) * columns + 1), image.dtype
     )
     between[:, :, ::rows, ::columns] = image
+    # A transposed convolution's padding crops its result, so it takes off the full padding k - 1.
     tall, broad = (k - 1 for k in weight.shape[2:])
     plain = Window(pads=(tall - top, broad - left, tall - bottom, broad - right))
     return _padded(between, plain), plain
@@ -71,15 +78,16 @@ def _products(windows: np.ndarray, weight: np.ndarray, groups: int) -> np.ndarra
     """Of windows (N, I, H, W, kh, kw) and weights (O, I / groups, kh, kw)."""
     count, channels, height, width = windows.shape[:4]
     sums = np.empty((count, len(weight), height, width), np.int64)
-    each = channels // groups
+    inputs = channels // groups
     outputs = len(weight) // groups
-    rows = max(STRIP_VALUES // (each * weight[0, 0].size * width), 1)
+    rows = max(STRIP_VALUES // (inputs * weight[0, 0].size * width), 1)
     for number, group, top in product(range(count), range(groups), range(0, height, rows)):
-        strip = windows[number, group * each : (group + 1) * each, top : top + rows]
-        flat = strip.transpose(0, 3, 4, 1, 2).reshape(each * weight[0, 0].size, -1)
-        own = slice(group * outputs, (group + 1) * outputs)
-        found = weight[own].reshape(outputs, -1) @ flat
-        sums[number, own, top : top + rows] = found.reshape(outputs, -1, width)
+        strip = windows[number, group * inputs : (group + 1) * inputs, top : top + rows]
+        # `windows` is a view; only this reshape copies values, kh kw times those of the strip.
+        flat = strip.transpose(0, 3, 4, 1, 2).reshape(inputs * weight[0, 0].size, -1)
+        channel = slice(group * outputs, (group + 1) * outputs)
+        products = weight[channel].reshape(outputs, -1) @ flat
+        sums[number, channel, top : top + rows] = products.reshape(outputs, -1, width)
     return sums
 
 
@@ -100,12 +108,14 @@ def activated(sums: np.ndarray, activation: Activation, frac_bits: int) -> tuple
     if activation is Activation.relu6:
         return np.clip(sums, 0, SIX << frac_bits if frac_bits >= 0 else SIX >> -frac_bits), 0
     if activation is Activation.leaky_relu:
+        # The slope is 26/256: in units finer by 2^-8 both branches stay integers.
         return np.where(sums < 0, sums * LEAKY_OF_256, sums << 8), 8
     return sums, 0
 
 
 def window_maxima(image: np.ndarray, op: MaxPool) -> np.ndarray:
     """The largest value of each window (N, C, H, W), padding never."""
+    # No value is below the smallest of the type, so the padding never is a window's maximum.
     wide = _padded(image, op.window, int(np.iinfo(image.dtype).min))
     return np.asarray(_windows(wide, op.kernel, op.window).max((4, 5)))
 
@@ -116,10 +126,9 @@ def means(image: np.ndarray, op: AveragePool) -> tuple[np.ndarray, int, float]:
     """
     assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
     factor, shift = mean_factor(op.kernel)
-    sums = (
-        _windows(_padded(image, op.window), op.kernel, op.window).sum((4, 5), dtype=np.int64)
-        * factor
-    )
+    # Padded zeros count in the mean: the divisor is the whole kernel in every window.
+    windows = _windows(_padded(image, op.window), op.kernel, op.window)
+    sums = windows.sum((4, 5), dtype=np.int64) * factor
     return sums, shift, float(np.log2(128 * factor * op.kernel[0] * op.kernel[1]))
 
 
@@ -132,9 +141,9 @@ def enlarged(image: np.ndarray, factor: int) -> tuple[np.ndarray, int, float]:
     windows = sliding_window_view(wide, (3, 3), (2, 3))
     phases = np.einsum("nchwyx,pyx->nchpw", windows, weight.astype(np.int64))
     count, channels, height, _, width = phases.shape
-    sums = phases.reshape(count, channels, height, factor, factor, width).transpose(
-        0, 1, 2, 3, 5, 4
-    )
+    sums = phases.reshape(count, channels, height, factor, factor, width)
+    sums = sums.transpose(0, 1, 2, 3, 5, 4)
+    # The weights of a phase sum to 2^shift, so an int8 value grows by no more bits than that.
     return sums.reshape(count, channels, height * factor, width * factor), shift, 7.0 + shift
 
 
@@ -155,10 +164,11 @@ def mean_factor(kernel: tuple[int, int]) -> tuple[int, int]:
     if kernel in MEANS:
         return MEANS[kernel]
     count = kernel[0] * kernel[1]
+    # The factor 2^s / count must fit int8, which bounds the shift by log2(127 count).
     shifts = range(int(np.ceil(np.log2(INT8_MAX * count))))
     return min(
         ((round(2**s / count), s) for s in shifts),
-        key=lambda found: abs(found[0] / 2 ** found[1] - 1 / count),
+        key=lambda factor: abs(factor[0] / 2 ** factor[1] - 1 / count),
     )
 
 
@@ -167,13 +177,11 @@ def bilinear_weights(factor: int) -> tuple[np.ndarray, int]:
     shift behind them.
     """
     places = (np.arange(factor) + 0.5) / factor - 0.5  # half-pixel centres, in input pixels
-    taps = (
-        np.stack([np.maximum(-places, 0), 1 - np.abs(places), np.maximum(places, 0)], 1)
-        * 2
-        * factor
-    )
-    whole = np.einsum("yi,xj->yxij", taps, taps).reshape(factor**2, 3, 3)
-    return whole.astype(np.int8), 2 * int(np.log2(2 * factor))
+    shares = np.stack([np.maximum(-places, 0), 1 - np.abs(places), np.maximum(places, 0)], 1)
+    # Half-pixel centres lie at odd multiples of 1 / (2 factor), so in that unit taps are integers.
+    taps = shares * 2 * factor
+    weight = np.einsum("yi,xj->yxij", taps, taps).reshape(factor**2, 3, 3)
+    return weight.astype(np.int8), 2 * int(np.log2(2 * factor))
 
 
 def six_in_units(frac_bits: int) -> int:
@@ -186,5 +194,6 @@ def activation_table(op: Pointwise, frac_bits: Mapping[str, int]) -> np.ndarray:
     clipped.
     """
     values = op.activation(np.arange(INT8_MIN, INT8_MAX + 1) * 2.0 ** -frac_bits[op.input])
+    # The DPU rounds activations half up, where np.rint would round half to even.
     units = np.floor(values * 2.0 ** frac_bits[op.output] + 0.5)
     return np.asarray(np.clip(units, INT8_MIN, INT8_MAX), np.int16)

@@ -37,12 +37,13 @@ class Seen:
         """How many values are not those; of what is `shifted`, its border of a quarter of the side
         left out.
         """
-        seen = self.seen
+        results = self.seen
         if shifted:
-            rows, columns = (slice(side // 4, side - side // 4) for side in seen.shape[2:])
+            # `np.roll` brings in the pixels of the far border, where a board has others.
+            rows, columns = (slice(side // 4, side - side // 4) for side in results.shape[2:])
             made = made[..., rows, columns]
-            seen = seen[..., rows, columns]
-        return int((made != seen).sum()) if made.shape == seen.shape else seen.size
+            results = results[..., rows, columns]
+        return int((made != results).sum()) if made.shape == results.shape else results.size
 
 
 MOST_LEFT = 0.1
@@ -78,16 +79,17 @@ def explain(core: IntCore, ops: Sequence[Layer], cases: Sequence[Seen], half_eve
     alone = (
         faults.of_layer(ops[-1], worst)
         if ops
-        else faults.of_tensor(PLANES, lambda known: known[PLANES], worst)
+        else faults.of_tensor(PLANES, lambda tensors: tensors[PLANES], worst)
     )
     for words, compute in chain(alone, faults.before(ops) if len(ops) > 1 else ()):
         shifted = words.startswith(SHIFTED)
+        # One case refutes most faults; only what explains the worst one is run on all of them.
         if worst.unlike(compute(worst.tensors), shifted) > MOST_LEFT * max(counts):
             continue
-        left = sum(case.unlike(compute(case.tensors), shifted) for case in cases)
-        if not left:
+        remainder = sum(case.unlike(compute(case.tensors), shifted) for case in cases)
+        if not remainder:
             return words
-        best = min(best, (left / sum(counts), words))
+        best = min(best, (remainder / sum(counts), words))
     return f"{best[1]}, which leaves {best[0]:.1%} of the differences" if best[1] else ""
 
 
@@ -109,7 +111,7 @@ class Faulty:
         return rounded(sums, shift, self.half_even)[0]
 
     def _summed(self, op: Layer, change: Callable[[np.ndarray, int], np.ndarray]) -> Compute:
-        return lambda known: change(*layer_sums(self.core, op, known)[:2])
+        return lambda tensors: change(*layer_sums(self.core, op, tensors)[:2])
 
     def of_layer(self, op: Layer, worst: Seen) -> Iterator[Explanation]:
         """Every fault of a layer whose inputs are sound."""
@@ -132,12 +134,15 @@ class Faulty:
             ),
             other,
         )
+        # An arithmetic shift by itself rounds down, towards minus infinity.
         cut = self._summed(op, lambda sums, shift: saturated(sums >> max(shift, 0)))
         yield "results are cut off instead of rounded", cut
+        # That is the rule of AMD's quantiser for weights, bias and input, not for activations.
         away = self._summed(
             op, lambda sums, by: saturated(np.sign(sums) * rounded(np.abs(sums), by, False)[0])
         )
         yield "ties are rounded away from zero", away
+        # Two's complement keeps the lowest 8 bits of a sum.
         wrap = self._summed(
             op, lambda sums, by: ((self._whole(sums, by) + 128) % 256 - 128).astype(np.int16)
         )
@@ -147,12 +152,12 @@ class Faulty:
         )
         yield "results saturate at -127 instead of -128", short
         for by, name in product((1, -1, 2, -2), dict.fromkeys((op.output, *op.inputs))):
-            moved = replace(
-                self.core, frac_bits={**self.core.frac_bits, name: self.core.frac_bits[name] + by}
-            )
+            # The integers stay: another scale of an input or of the result is another shift.
+            frac_bits = {**self.core.frac_bits, name: self.core.frac_bits[name] + by}
+            core = replace(self.core, frac_bits=frac_bits)
             yield (
                 f"the scale of {name} is taken as 2^{-by} times what it is",
-                replace(self, core=moved).sound(op),
+                replace(self, core=core).sound(op),
             )
         if isinstance(op, IntConv):
             yield from self._of_convolution(op)
@@ -173,6 +178,7 @@ class Faulty:
             "its kernels are turned by half a turn",
             self.sound(op, weight=op.weight[:, :, ::-1, ::-1]),
         )
+        # A transposed convolution's pads crop its result, so it has no border to fill otherwise.
         if not op.transposed and any(op.window.pads):
             inside = self.sound(op, window=Window(op.window.strides, dilations=op.window.dilations))
             for words, mode in PADDINGS.items():
@@ -184,26 +190,27 @@ class Faulty:
         """
         if name == PLANES:
             yield from _halo(meant)
-        of = [
+        sources = [
             _channel_like(worst.tensors[name], worst.seen[:, k], k)
             for k in range(worst.seen.shape[1])
         ]
-        if None not in of:
-            moved = ", ".join(f"{each} at {k}" for k, each in enumerate(of) if each != k)
-            sources = np.array(of)
+        if None not in sources:
+            order = ", ".join(f"{source} at {k}" for k, source in enumerate(sources) if source != k)
+            indices = np.array(sources)
             yield (
-                f"channels stand in another order: {moved}",
-                lambda known: meant(known)[:, sources],
+                f"channels stand in another order: {order}",
+                lambda tensors: meant(tensors)[:, indices],
             )
-        yield "rows and columns changed places", lambda known: meant(known).swapaxes(2, 3)
+        yield "rows and columns changed places", lambda tensors: meant(tensors).swapaxes(2, 3)
         yield from _shifted(meant)
 
     def _bits(self, op: IntConv, worst: Seen) -> Iterator[Explanation]:
         """One bit of one bias or one weight that is not what it should be."""
         channels = (worst.seen != worst.tensors[op.output]).any((0, 2, 3)).nonzero()[0]
-        for channel, bit in product(
-            map(int, channels[: len(channels) <= MOST_CHANNELS and MOST_CHANNELS]), range(8)
-        ):
+        # A bias or a weight writes to one channel: where many differ, a single bit is no reason.
+        if len(channels) > MOST_CHANNELS:
+            return
+        for channel, bit in product(map(int, channels), range(8)):
             words = f"bit {bit} of the bias of channel {channel} is flipped"
             yield words, self.sound(op, bias=_flipped(op.bias, (channel,), bit))
             for place in _likely_weights(op, channel, worst):
@@ -217,22 +224,24 @@ class Faulty:
         faults = {op.output: dict(self.of_rules(op)) for op in ops}
 
         def through(wrong: Mapping[str, Compute]) -> Compute:
-            def compute(known: Tensors) -> np.ndarray:
-                made = dict(known)
+            def compute(tensors: Tensors) -> np.ndarray:
+                # Nobody saw the layers before the last, so a fault in one is carried through all.
+                results = dict(tensors)
                 for op in ops:
-                    made[op.output] = wrong.get(op.output, self.sound(op))(made)
-                return made[ops[-1].output]
+                    results[op.output] = wrong.get(op.output, self.sound(op))(results)
+                return results[ops[-1].output]
 
             return compute
 
         kinds = {
             f"every {kind}": [op for op in ops if _kind(op) == kind] for kind in map(_kind, ops)
         }
-        for place, chosen in {"every layer": ops, **kinds, **{op.name: [op] for op in ops}}.items():
-            for words in dict.fromkeys(words for op in chosen for words in faults[op.output]):
+        places = {"every layer": ops, **kinds, **{op.name: [op] for op in ops}}
+        for place, layers in places.items():
+            for words in dict.fromkeys(chain.from_iterable(faults[op.output] for op in layers)):
                 wrong = {
                     op.output: faults[op.output][words]
-                    for op in chosen
+                    for op in layers
                     if words in faults[op.output]
                 }
                 yield f"{words}, in {place}", through(wrong)
@@ -249,24 +258,26 @@ def _padded(op: IntConv, inside: Compute, mode: str) -> Compute:
     sizes = ((0, 0), (0, 0), (top, bottom), (left, right))
     more = {"constant_values": INT8_MIN}
 
-    def compute(known: Tensors) -> np.ndarray:
-        wide = np.pad(known[op.input], sizes, mode, **(more if mode == "constant" else {}))  # type: ignore[call-overload]
-        return inside({**known, op.input: wide})
+    def compute(tensors: Tensors) -> np.ndarray:
+        wide = np.pad(tensors[op.input], sizes, mode, **(more if mode == "constant" else {}))  # type: ignore[call-overload]
+        return inside({**tensors, op.input: wide})
 
     return compute
 
 
-def _halo(meant: Compute) -> Iterator[Explanation]:
+def _halo(sound: Compute) -> Iterator[Explanation]:
     """What surrounds a tile is zeros where the planes come in."""
     for (side, ends), width in product(SIDES.items(), range(1, HALO_MAX_PX + 1)):
 
         def compute(
-            known: Tensors, pads: tuple[int, ...] = tuple(width * end for end in ends)
+            tensors: Tensors, pads: tuple[int, ...] = tuple(width * end for end in ends)
         ) -> np.ndarray:
-            bare, (height, across) = np.zeros_like(known[PLANES]), known[PLANES].shape[2:]
+            # `pads` is a default so that each function keeps its own turn of the loop.
+            bare = np.zeros_like(tensors[PLANES])
+            height, across = bare.shape[2:]
             inside = ..., slice(pads[0], height - pads[2]), slice(pads[1], across - pads[3])
-            bare[inside] = known[PLANES][inside]
-            return meant({**known, PLANES: bare})
+            bare[inside] = tensors[PLANES][inside]
+            return sound({**tensors, PLANES: bare})
 
         yield (
             f"the {side} {width} px of the planes are zeros instead of the tile's surroundings",
@@ -274,7 +285,7 @@ def _halo(meant: Compute) -> Iterator[Explanation]:
         )
 
 
-def _shifted(meant: Compute) -> Iterator[Explanation]:
+def _shifted(sound: Compute) -> Iterator[Explanation]:
     """Pixels that lie beside their places."""
     for down, across in (
         (1, 0),
@@ -289,14 +300,11 @@ def _shifted(meant: Compute) -> Iterator[Explanation]:
         (0, -2),
     ):
 
-        def compute(known: Tensors, by: tuple[int, int] = (down, across)) -> np.ndarray:
-            return np.roll(meant(known), by, (2, 3))
+        def compute(tensors: Tensors, by: tuple[int, int] = (down, across)) -> np.ndarray:
+            return np.roll(sound(tensors), by, (2, 3))
 
-        yield (
-            SHIFTED
-            + " and ".join(f"{n} px {way}" for n, way in ((down, "down"), (across, "right")) if n),
-            compute,
-        )
+        moves = ((down, "down"), (across, "right"))
+        yield SHIFTED + " and ".join(f"{n} px {way}" for n, way in moves if n), compute
 
 
 def _channel_like(right: np.ndarray, channel: np.ndarray, place: int) -> int | None:
@@ -304,6 +312,7 @@ def _channel_like(right: np.ndarray, channel: np.ndarray, place: int) -> int | N
     where it is.
     """
     same = (right == channel[:, None]).all((0, 2, 3))
+    # Equal channels, such as dead ones, must not count as moved.
     if same[place]:
         return place
     return int(same.argmax()) if same.any() else None
@@ -311,6 +320,7 @@ def _channel_like(right: np.ndarray, channel: np.ndarray, place: int) -> int | N
 
 def _flipped(values: np.ndarray, place: tuple[int, ...], bit: int) -> np.ndarray:
     changed = values.copy()
+    # As uint8 the sign bit can be flipped like any other.
     changed.view(np.uint8)[place] ^= np.uint8(1 << bit)
     return changed
 
@@ -318,15 +328,16 @@ def _flipped(values: np.ndarray, place: tuple[int, ...], bit: int) -> np.ndarray
 def _likely_weights(op: IntConv, channel: int, worst: Seen) -> list[tuple[int, ...]]:
     """The weights of a channel with whose inputs the differences go up and down most."""
     difference = (worst.seen - worst.tensors[op.output])[:, channel].astype(np.float64).ravel()
-    count, row = (
-        (len(op.weight), channel) if op.groups > 1 else (1, 0)
-    )  # kernels that are computed, and which counts
+    # A grouped convolution needs a kernel for every group, of which the channel's own counts.
+    count = len(op.weight) if op.groups > 1 else 1
+    row = channel if op.groups > 1 else 0
     alike: dict[tuple[int, ...], float] = {}
     for place in np.ndindex(*op.weight.shape[1:]):
         alone = np.zeros((count, *op.weight.shape[1:]), np.int8)
         alone[(row, *place)] = 1
-        read = convolve(worst.tensors[op.input], alone, op.window, op.groups, op.transposed)[:, row]
-        values = read.astype(np.float64).ravel()
+        inputs = convolve(worst.tensors[op.input], alone, op.window, op.groups, op.transposed)
+        values = inputs[:, row].astype(np.float64).ravel()
+        # A wrong weight adds a multiple of what it meets, which the cosine finds at any size.
         alike[(channel, *place)] = abs(float(difference @ values)) / (
             float(np.linalg.norm(values)) or 1.0
         )
@@ -344,12 +355,13 @@ def where(seen: np.ndarray, meant: np.ndarray) -> str:
     height, width = seen.shape[2:]
     within = "" if len(channels) > 1 or seen.shape[1] == 1 else f" of channel {channels[0]}"
     at = np.argwhere(differing.any((0, 1)))
+    # The distance of the innermost difference from the nearest border.
     reach = int(np.minimum(at, np.array([height - 1, width - 1]) - at).min(1).max()) + 1
     if reach < min(height, width) // 4:
         return f"within {reach} px of the border{within}"
-    for name, found, size in (("row", rows, height), ("column", columns, width)):
-        if len(found) <= size // 4:
-            return f"in {name}s {found[0]} to {found[-1]}{within}"
+    for name, places, size in (("row", rows, height), ("column", columns, width)):
+        if len(places) <= size // 4:
+            return f"in {name}s {places[0]} to {places[-1]}{within}"
     return (
         f"everywhere{within}"
         if within

@@ -106,14 +106,15 @@ def run_core(
     reports = []
     for op in core.ops:
         sums, shift, bound, finer = layer_sums(core, op, tensors, faults)
-        whole, ties = rounded(sums, shift, half_even)
-        result = saturated(whole)
+        quotients, ties = rounded(sums, shift, half_even)
+        result = saturated(quotients)
         tensors[op.output] = faults.touch(op.output, result)
-        relu = (
-            getattr(op, "activation", None) is Activation.saturated_relu
-        )  # at whose lower end nothing is lost
+        # The lower end of int8 is this activation's zero, so nothing is lost there.
+        relu = getattr(op, "activation", None) is Activation.saturated_relu
         ends = (result == INT8_MAX) | ((result == INT8_MIN) & (not relu))
-        peak = max(float(np.log2(max(int(np.abs(sums).max()), 1))) - finer, 0.0)
+        largest = max(int(np.abs(sums).max()), 1)
+        # The bits that an activation appends come behind the accumulator, which never holds them.
+        peak = max(float(np.log2(largest)) - finer, 0.0)
         reports.append(LayerReport(op.name, peak, bound, float(ends.mean()), ties))
     return tensors, reports
 
@@ -152,57 +153,63 @@ def layer_sums(
         tensors: what it reads, by name.
         faults: wrong shifts.
     """
-    read = [tensors[name] for name in op.inputs]
+    inputs = [tensors[name] for name in op.inputs]
     if isinstance(op, IntConv):
-        return _conv(core, op, read[0], faults)
+        return _conv(core, op, inputs[0], faults)
     if isinstance(op, Add):
-        return _add(core, op, read, faults)
+        return _add(core, op, inputs, faults)
     if isinstance(op, Mul):
-        product = read[0].astype(np.int64) * read[1]
-        return (
-            product,
-            sum(core.frac_bits[name] for name in op.inputs) - core.frac_bits[op.output],
-            14.0,
-            0,
-        )
+        product = inputs[0].astype(np.int64) * inputs[1]
+        shift = sum(core.frac_bits[name] for name in op.inputs) - core.frac_bits[op.output]
+        # The largest product is that of -128 and -128, which is 2^14.
+        return product, shift, 14.0, 0
     if isinstance(op, AveragePool):
-        return *means(read[0], op), 0
+        return *means(inputs[0], op), 0
     if isinstance(op, Resize) and op.bilinear:
-        return *enlarged(read[0], op.factor), 0
-    return _moving(core, op, read), 0, INT8_BITS, 0
+        return *enlarged(inputs[0], op.factor), 0
+    # Values that only move keep their scale, and a table's entries are rounded: no shift is left.
+    return _moving(core, op, inputs), 0, INT8_BITS, 0
 
 
-def _moving(core: IntCore, op: Op, read: list[np.ndarray]) -> np.ndarray:
+def _moving(core: IntCore, op: Op, inputs: list[np.ndarray]) -> np.ndarray:
     """What hands values on, or looks them up."""
     if isinstance(op, Concat):
-        return np.concatenate(read, axis=1)
+        return np.concatenate(inputs, axis=1)
     if isinstance(op, MaxPool):
-        return window_maxima(read[0], op)
+        return window_maxima(inputs[0], op)
     if isinstance(op, Resize):
-        return read[0].repeat(op.factor, axis=2).repeat(op.factor, axis=3)
+        return inputs[0].repeat(op.factor, axis=2).repeat(op.factor, axis=3)
     if isinstance(op, Shuffle):
-        return np.asarray(op(read[0]))
+        return np.asarray(op(inputs[0]))
     assert isinstance(op, Pointwise)  # noqa: S101
+    # 256 values can enter, so the function is a table; its first entry is that of -128.
     table: np.ndarray = activation_table(op, core.frac_bits)
-    return np.asarray(table[read[0] - INT8_MIN])
+    return np.asarray(table[inputs[0] - INT8_MIN])
 
 
 def _conv(core: IntCore, op: IntConv, image: np.ndarray, faults: Faults) -> Sums:
     product = op.weight_frac_bits + core.frac_bits[op.input]
     shift = faults.shift(op.name, "shift_bias", product - op.bias_frac_bits)
-    bias = op.bias.astype(np.int64) << shift if shift >= 0 else op.bias.astype(np.int64) >> -shift
+    bias = op.bias.astype(np.int64)
+    # A bias finer than the accumulator, which a board's rules allow, loses its lowest bits.
+    bias = bias << shift if shift >= 0 else bias >> -shift
     sums = convolve(image, op.weight, op.window, op.groups, op.transposed) + bias[:, None, None]
+    # The DPU applies the activation to the accumulator, before the one rounding.
     sums, finer = activated(sums, op.activation, product)
     cut = faults.shift(op.name, "shift_cut", product - core.frac_bits[op.output])
     return sums, cut + finer, bound_of(op, bias), finer
 
 
-def _add(core: IntCore, op: Add, read: list[np.ndarray], faults: Faults) -> Sums:
+def _add(core: IntCore, op: Add, inputs: list[np.ndarray], faults: Faults) -> Sums:
     """The sum at the finer input's scale, exact; the shift that remains; and its bits."""
     finest = max(core.frac_bits[name] for name in op.inputs)
     shifts = [finest - core.frac_bits[name] for name in op.inputs]
-    sums = sum(values.astype(np.int64) << shift for values, shift in zip(read, shifts, strict=True))
-    sums, finer = activated(np.asarray(sums), op.activation, finest)
+    # At the finest scale no input loses a bit, so the result is rounded once.
+    aligned = [
+        values.astype(np.int64) << shift for values, shift in zip(inputs, shifts, strict=True)
+    ]
+    sums, finer = activated(np.asarray(sum(aligned)), op.activation, finest)
+    # An int8 value is at most 128 in size.
     bound = sum(128 << shift for shift in shifts)
     coarsest = min(core.frac_bits[name] for name in op.inputs)
     write = faults.shift(op.name, "shift_write", coarsest - core.frac_bits[op.output])
@@ -214,9 +221,13 @@ def rounded(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray, 
     if shift <= 0:
         return sums << min(-shift, 8), 0.0  # by 8 all but 0 lies beyond int8
     half = 1 << (shift - 1)
-    whole = (sums + half) >> shift
+    # The shift of a negative number rounds down as well, so this is half up for either sign.
+    quotients = (sums + half) >> shift
     ties = (sums & ((1 << shift) - 1)) == half
-    return np.asarray(whole - (ties & (whole % 2 == 1)) if half_even else whole), float(ties.mean())
+    if half_even:
+        # Half up has raised every tie; the odd ones go back to the even number below.
+        quotients = quotients - (ties & (quotients % 2 == 1))
+    return np.asarray(quotients), float(ties.mean())
 
 
 def saturated(whole: np.ndarray) -> np.ndarray:
@@ -271,10 +282,10 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
     layers = []
     for name, report, runtime in zip(names, reports, stored, strict=True):
         difference = np.abs(up[name] - even[name])
+        # The host's file stores int8 as uint8 around 128.
         unequal = float((runtime.astype(np.int16) - ZERO != even[name]).mean())
-        layers.append(
-            LayerAgreement(report, unequal, float((difference > 0).mean()), int(difference.max()))
-        )
+        share = float((difference > 0).mean())
+        layers.append(LayerAgreement(report, unequal, share, int(difference.max())))
     return Agreement(layers, merged_correction(core, up), merged_correction(core, even))
 
 
@@ -284,24 +295,24 @@ def integer_rows(
     """Each integer operation on a crop of a few images (1, C, H, W); last what the DPU's tie
     rounding changes.
     """
-    seen = few_crops(images, model)
-    found = [agreement(core, host, crop) for crop in seen]
-    source = f"the integer reference on {len(found)} calibration patches"
-    layers = [
-        _layer_row(list(same), source) for same in zip(*(one.layers for one in found), strict=True)
-    ]
+    patches = few_crops(images, model)
+    agreements = [agreement(core, host, crop) for crop in patches]
+    source = f"the integer reference on {len(agreements)} calibration patches"
+    by_layer = zip(*(one.layers for one in agreements), strict=True)
+    layers = [_layer_row(list(same), source) for same in by_layer]
     session = open_any_size(model)
-    both = [
+    results = [
         [core.ends.finished(crop, result) for result in (one.up, one.even)]
-        for crop, one in zip(seen, found, strict=True)
+        for crop, one in zip(patches, agreements, strict=True)
     ]
-    in_float = [core.ends.clipped(result_of(session, crop)) for crop in seen]
-    return (*layers, _rounding_row(in_float, both, source))
+    in_float = [core.ends.clipped(result_of(session, crop)) for crop in patches]
+    return (*layers, _rounding_row(in_float, results, source))
 
 
 def _layer_row(layers: list[LayerAgreement], source: str) -> Row:
     proven = layers[0].report.proven_bits
-    left = NARROW_BITS - proven
+    # AMD states no width of the accumulator; the bound on shift_bias hints at 24 bits.
+    margin = NARROW_BITS - proven
 
     def percent(shares: Iterable[float], of: str = source) -> Figure:
         return measured(100 * float(np.mean(list(shares))), "%", of)
@@ -310,7 +321,7 @@ def _layer_row(layers: list[LayerAgreement], source: str) -> Row:
         "accumulator, seen": measured(max(a.report.peak_bits for a in layers), "bits", source),
         "accumulator, proven": predicted(proven, "bits", (proven, proven), BITS_SOURCE),
         "left of 24 bits": predicted(
-            left, "bits", (left, left), f"23 bits and a sign, less {BITS_SOURCE}"
+            margin, "bits", (margin, margin), f"23 bits and a sign, less {BITS_SOURCE}"
         ),
         "saturated": percent(a.report.saturated for a in layers),
         "ties": percent(a.report.ties for a in layers),
@@ -323,12 +334,12 @@ def _layer_row(layers: list[LayerAgreement], source: str) -> Row:
     return Row("integer layers", layers[0].report.name, figures)
 
 
-def _rounding_row(in_float: list[np.ndarray], both: list[list[np.ndarray]], source: str) -> Row:
+def _rounding_row(in_float: list[np.ndarray], results: list[list[np.ndarray]], source: str) -> Row:
     """How far the DPU's rounding of ties, up, leads away from the runtime's, to even; which is
     nearer to float.
     """
-    up, even = (np.concatenate([results[k].ravel() for results in both]) for k in (0, 1))
-    whole = np.concatenate([result.ravel() for result in in_float])
+    up, even = (np.concatenate([pair[k].ravel() for pair in results]) for k in (0, 1))
+    floats = np.concatenate([result.ravel() for result in in_float])
 
     def mae(one: np.ndarray, other: np.ndarray) -> Figure:
         return measured(float(np.abs(one - other).mean(dtype=np.float64)), "of full scale", source)
@@ -336,7 +347,7 @@ def _rounding_row(in_float: list[np.ndarray], both: list[list[np.ndarray]], sour
     figures = {
         "pixels that differ": measured(100 * float((up != even).mean()), "%", source),
         "MAE between them": mae(up, even),
-        "MAE of half up": mae(up, whole),
-        "MAE of half to even": mae(even, whole),
+        "MAE of half up": mae(up, floats),
+        "MAE of half to even": mae(even, floats),
     }
     return Row("rounding", "half up (DPU) against half to even (onnxruntime)", figures)

@@ -53,8 +53,10 @@ NEAR = 0.49
 
 def to_int8(values: Tensor, low: int = INT8_MIN, high: int = INT8_MAX) -> Tensor:
     """Rounded, ties to even, and clipped; the slope is 1, and 0 where it is clipped."""
+    # hardtanh has slope 0 outside its limits, so a value must pass as long as it rounds to an end.
     clipped = functional.hardtanh(values, low - NEAR, high + NEAR)
-    clipped.data.round_()  # unseen by autograd
+    # Rounding `data` is unseen by autograd: backwards it counts as the identity.
+    clipped.data.round_()
     return clipped
 
 
@@ -75,21 +77,27 @@ class TrainableCore(torch.nn.Module):
         self._convs = [_one_copy(op, core.ends) for op in core.convolutions]
         self.weights = torch.nn.ParameterList(torch.tensor(op.weight).float() for op in self._convs)
         self.biases = torch.nn.ParameterList(torch.tensor(op.bias).float() for op in self._convs)
-        for op, *numbers in zip(self._convs, self.weights, self.biases, strict=True):
-            for parameter in numbers:
+        for op, *parameters in zip(self._convs, self.weights, self.biases, strict=True):
+            for parameter in parameters:
                 parameter.requires_grad_(op.output not in still)
         if core.ends.offsets:
+            # The host adds a window's offset in float, so this bias need not be an integer.
             self.biases[-1].data.copy_(torch.from_numpy(_window_bias(self._convs[-1], core.ends)))
 
     def core(self) -> IntCore:
         """The core with its weights and biases as they stand, in whole numbers."""
-        found = zip(self._convs, map(_whole, self.weights), map(_whole, self.biases), strict=True)
-        trained = {op.name: replace(op, weight=weight, bias=bias) for op, weight, bias in found}
+        weights = map(_whole, self.weights)
+        biases = map(_whole, self.biases)
+        trained = {
+            op.name: replace(op, weight=weight, bias=bias)
+            for op, weight, bias in zip(self._convs, weights, biases, strict=True)
+        }
         ops = [trained.get(op.name, op) for op in self._core.ops]
         ends = self._core.ends
         last = self._core.ops[-1]
         if ends.copies > 1 and isinstance(last, IntConv):
             one = trained[last.name]
+            # int8 need not hold a window's bias with its offset, so it is taken in float.
             bias = self.biases[-1].detach().numpy() if ends.offsets else one.bias
             ops[-1], ends = _all_copies(last, ends, one.weight, bias)
         return replace(self._core, ops=tuple(ops), ends=ends)
@@ -102,20 +110,22 @@ class TrainableCore(torch.nn.Module):
         """Every tensor (N, C, H, W) by its name in whole numbers; of a correction in copies one,
         unrounded.
         """
-        found = {PLANES: planes}
-        numbers = iter(zip(self._convs, self.weights, self.biases, strict=True))
+        tensors = {PLANES: planes}
+        parameters = iter(zip(self._convs, self.weights, self.biases, strict=True))
         for op in self._core.ops:
-            read = [found[name] for name in op.inputs]
+            inputs = [tensors[name] for name in op.inputs]
             if isinstance(op, IntConv):
-                found[op.output] = self._convolved(*next(numbers), read[0])
+                tensors[op.output] = self._convolved(*next(parameters), inputs[0])
             else:
-                found[op.output] = _OPERATIONS[type(op)](op, read, self._core.frac_bits)
-        return found
+                tensors[op.output] = _OPERATIONS[type(op)](op, inputs, self._core.frac_bits)
+        return tensors
 
     def _convolved(self, op: IntConv, weight: Tensor, bias: Tensor, image: Tensor) -> Tensor:
         """A convolution's result, of its parameters and what it reads."""
         ends = self._core.ends
         frac_bits = self._core.frac_bits[op.output]
+        # Scaled parameters give sums in the result's unit, which saves a pass over the sums. The
+        # factors are powers of two, so float32 stays exact.
         unit = 2.0 ** (frac_bits - op.weight_frac_bits - self._core.frac_bits[op.input])
         bias_unit = 2.0 ** (frac_bits - op.bias_frac_bits)
         if op.output == CORRECTION and ends.copies > 1:
@@ -125,13 +135,10 @@ class TrainableCore(torch.nn.Module):
                 to_int8(weight) * unit,
                 (bias if ends.offsets else to_int8(bias)) * bias_unit,
             )
-        lifted = _products(
-            op,
-            image,
-            to_int8(weight) * unit,
-            to_int8(bias) * bias_unit + _lift(op.activation) * unit,
-        )
-        return _rounded(lifted, op.activation, frac_bits)
+        # The lift that makes ties round up costs nothing in the bias.
+        bias = to_int8(bias) * bias_unit + _lift(op.activation) * unit
+        sums = _products(op, image, to_int8(weight) * unit, bias)
+        return _rounded(sums, op.activation, frac_bits)
 
 
 def _whole(values: Tensor) -> np.ndarray:
@@ -140,7 +147,9 @@ def _whole(values: Tensor) -> np.ndarray:
 
 def _products(op: IntConv, image: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """The sums of a convolution, padding inside it as far as it is the same on both sides."""
-    window, (top, left, bottom, right) = op.window, op.window.pads
+    window = op.window
+    top, left, bottom, right = window.pads
+    # torch pads both sides alike; only the surplus of one side costs a copy of the image.
     within = min(top, bottom), min(left, right)
     around = left - within[1], right - within[1], top - within[0], bottom - within[0]
     if not op.transposed:
@@ -148,12 +157,14 @@ def _products(op: IntConv, image: Tensor, weight: Tensor, bias: Tensor) -> Tenso
         return functional.conv2d(
             image, weight, bias, window.strides, within, window.dilations, op.groups
         )
+    # torch stores transposed weights as (I, O / groups, kh, kw).
     outputs, inner, *kernel = weight.shape
     weight = weight.reshape(op.groups, outputs // op.groups, inner, *kernel).transpose(1, 2)
     weight = weight.reshape(op.groups * inner, outputs // op.groups, *kernel)
     wide = functional.conv_transpose2d(
         image, weight, bias, window.strides, within, groups=op.groups
     )
+    # Here padding crops the result.
     return wide[:, :, around[2] : wide.shape[2] - around[3], around[0] : wide.shape[3] - around[1]]
 
 
@@ -163,52 +174,53 @@ def _lift(activation: Activation = Activation.none) -> float:
 
     LeakyReLU divides the unit by 128 and what is added by ten.
     """
+    # Sums are integers in their unit, so less than 1 moves none but ties across a threshold.
     return 2.0**-5 if activation is Activation.leaky_relu else 2.0**-2
 
 
-def _rounded(lifted: Tensor, activation: Activation, frac_bits: int) -> Tensor:
+def _rounded(sums: Tensor, activation: Activation, frac_bits: int) -> Tensor:
     """Lifted sums behind their activation, in int8."""
     if activation is Activation.leaky_relu:
-        lifted = functional.leaky_relu(lifted, LEAKY_SLOPE)
+        sums = functional.leaky_relu(sums, LEAKY_SLOPE)
+    # ReLU and ReLU6 are limits of the same clip that int8 needs, so they cost no pass.
     low = 0 if activation in (Activation.relu, Activation.relu6) else INT8_MIN
-    return to_int8(
-        lifted, low, six_in_units(frac_bits) if activation is Activation.relu6 else INT8_MAX
-    )
+    high = six_in_units(frac_bits) if activation is Activation.relu6 else INT8_MAX
+    return to_int8(sums, low, high)
 
 
-def _add(op: Add, read: Sequence[Tensor], bits: Bits) -> Tensor:
+def _add(op: Add, inputs: Sequence[Tensor], bits: Bits) -> Tensor:
     """Nothing is rounded, nor lifted, where the result is as fine as what is added."""
     frac_bits = bits[op.output]
     finest = max(bits[name] for name in op.inputs)
-    one, other = (
-        _times(values, frac_bits - bits[name]) for name, values in zip(op.inputs, read, strict=True)
-    )
-    sums = one + other
+    terms = []
+    for name, values in zip(op.inputs, inputs, strict=True):
+        power = frac_bits - bits[name]
+        # In a stream of one scale the power is 0, and a product by 1 would be another pass.
+        terms.append(values * 2.0**power if power else values)
+    sums = terms[0] + terms[1]
+    # A result as fine as its inputs has no ties to lift.
     if finest > frac_bits or op.activation is Activation.leaky_relu:
         sums = sums + _lift(op.activation) * 2.0 ** (frac_bits - finest)
     return _rounded(sums, op.activation, frac_bits)
 
 
-def _times(values: Tensor, power: int) -> Tensor:
-    return values * 2.0**power if power else values
-
-
-def _mul(op: Mul, read: Sequence[Tensor], bits: Bits) -> Tensor:
+def _mul(op: Mul, inputs: Sequence[Tensor], bits: Bits) -> Tensor:
     unit = 2.0 ** (bits[op.output] - sum(bits[name] for name in op.inputs))
-    return to_int8(read[0] * read[1] * unit + _lift() * unit)
+    return to_int8(inputs[0] * inputs[1] * unit + _lift() * unit)
 
 
-def _max_pool(op: MaxPool, read: Sequence[Tensor], _: Bits) -> Tensor:
-    wide = _padded(read[0], op.window, INT8_MIN)
+def _max_pool(op: MaxPool, inputs: Sequence[Tensor], _: Bits) -> Tensor:
+    # No int8 value is below -128, so the padding never rises above one.
+    wide = _padded(inputs[0], op.window, INT8_MIN)
     return functional.max_pool2d(wide, op.kernel, op.window.strides, 0, op.window.dilations)
 
 
-def _average_pool(op: AveragePool, read: Sequence[Tensor], _: Bits) -> Tensor:
+def _average_pool(op: AveragePool, inputs: Sequence[Tensor], _: Bits) -> Tensor:
     assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
+    # The DPU multiplies a window's sum by m / 2^s; torch's own divisor would give other results.
     factor, shift = mean_factor(op.kernel)
-    sums = functional.avg_pool2d(
-        _padded(read[0], op.window), op.kernel, op.window.strides, divisor_override=1
-    )
+    wide = _padded(inputs[0], op.window)
+    sums = functional.avg_pool2d(wide, op.kernel, op.window.strides, divisor_override=1)
     return to_int8((sums * factor + _lift()) * 2.0**-shift)
 
 
@@ -219,24 +231,26 @@ def _padded(image: Tensor, window: Window, fill: float = 0.0) -> Tensor:
     )
 
 
-def _resize(op: Resize, read: Sequence[Tensor], _: Bits) -> Tensor:
+def _resize(op: Resize, inputs: Sequence[Tensor], _: Bits) -> Tensor:
+    image = inputs[0]
     if not op.bilinear:
-        return functional.interpolate(read[0], scale_factor=op.factor, mode="nearest")
+        return functional.interpolate(image, scale_factor=op.factor, mode="nearest")
     wide = functional.interpolate(
-        read[0], scale_factor=op.factor, mode="bilinear", align_corners=False
+        image, scale_factor=op.factor, mode="bilinear", align_corners=False
     )
-    return to_int8(wide + _lift() * 2.0 ** -bilinear_weights(op.factor)[1])
+    shift = bilinear_weights(op.factor)[1]
+    return to_int8(wide + _lift() * 2.0**-shift)
 
 
-def _shuffle(op: Shuffle, read: Sequence[Tensor], _: Bits) -> Tensor:
-    image = read[0]
+def _shuffle(op: Shuffle, inputs: Sequence[Tensor], _: Bits) -> Tensor:
+    image = inputs[0]
     squares = op.block**2
+    # torch knows one order of the channels alone, in which a channel's own pixels lie together.
     if op.up:
-        return functional.pixel_shuffle(
-            image if op.columns_first else _turned(image, squares), op.block
-        )
-    moved = functional.pixel_unshuffle(image, op.block)
-    return moved if op.columns_first else _turned(moved, moved.shape[1] // squares)
+        groups = image if op.columns_first else _turned(image, squares)
+        return functional.pixel_shuffle(groups, op.block)
+    places = functional.pixel_unshuffle(image, op.block)
+    return places if op.columns_first else _turned(places, places.shape[1] // squares)
 
 
 def _turned(image: Tensor, outer: int) -> Tensor:
@@ -246,21 +260,23 @@ def _turned(image: Tensor, outer: int) -> Tensor:
     return groups.transpose(1, 2).reshape(count, channels, height, width)
 
 
-def _pointwise(op: Pointwise, read: Sequence[Tensor], bits: Bits) -> Tensor:
+def _pointwise(op: Pointwise, inputs: Sequence[Tensor], bits: Bits) -> Tensor:
     """Its table's values, with the function's slope between neighbours."""
     units = np.arange(INT8_MIN, INT8_MAX + 1)
     smooth = op.activation(units * 2.0 ** -bits[op.input]) * 2.0 ** bits[op.output]
-    places = (read[0].detach() - INT8_MIN).int()
+    image = inputs[0]
+    places = (image.detach() - INT8_MIN).int()
     tables = activation_table(op, bits), np.gradient(smooth)
     result, slope = (torch.from_numpy(table.astype(np.float32))[places] for table in tables)
-    return torch.addcmul(result, read[0] - read[0].detach(), slope)
+    # The difference is 0 forwards, and carries the slope backwards.
+    return torch.addcmul(result, image - image.detach(), slope)
 
 
 _OPERATIONS: Mapping[type, Callable[..., Tensor]] = MappingProxyType(
     {
         Add: _add,
         Mul: _mul,
-        Concat: lambda _, read, __: torch.cat(list(read), dim=1),
+        Concat: lambda _, inputs, __: torch.cat(list(inputs), dim=1),
         MaxPool: _max_pool,
         AveragePool: _average_pool,
         Resize: _resize,
@@ -296,17 +312,18 @@ def _all_copies(
             offset.
     """
     one = _one_copy(last, ends)
+    # Windows come behind the coarse copy, but of two gains the fine one comes first.
     coarse = np.arange(ends.copies) == (0 if ends.offsets else 1)
     shares = np.where(coarse, 1 / GAIN, 1)
     weights = _moved(last.weight, shares, weight.astype(float) - one.weight)
     if not ends.offsets:
-        return replace(
-            last, weight=weights, bias=_moved(last.bias, shares, bias.astype(float) - one.bias)
-        ), ends
-    moved = bias - _window_bias(one, ends)
-    offsets = np.array(ends.offsets) + moved * 2.0**-one.bias_frac_bits
+        biases = _moved(last.bias, shares, bias.astype(float) - one.bias)
+        return replace(last, weight=weights, bias=biases), ends
+    # A window's bias stays: the host adds the change in float, which int8 would round.
+    change = bias - _window_bias(one, ends)
+    offsets = np.array(ends.offsets) + change * 2.0**-one.bias_frac_bits
     ends = replace(ends, offsets=tuple(tuple(map(float, window)) for window in offsets))
-    return replace(last, weight=weights, bias=_moved(last.bias, coarse / GAIN, moved)), ends
+    return replace(last, weight=weights, bias=_moved(last.bias, coarse / GAIN, change)), ends
 
 
 def _window_bias(one: IntConv, ends: Ends) -> np.ndarray:

@@ -37,17 +37,18 @@ def with_copies(
         images: (1, C, H, W) on which a dead channel is zero.
         ends: what the host does to the images.
     """
-    found = dict[str, np.ndarray]()
-    last = runs(graph, names)
-    sizes = largest_sizes(graph, [run[-1] for run in last], images, ends) if last else ()
-    for run, size in zip(last, sizes, strict=True):
+    copies_by_tensor = dict[str, np.ndarray]()
+    paths = runs(graph, names)
+    # What dense convolutions read is the last tensor of a run: there rounding is weighed.
+    sizes = largest_sizes(graph, [run[-1] for run in paths], images, ends) if paths else ()
+    for run, size in zip(paths, sizes, strict=True):
         sources, copies = _pairs(graph, run[-1], size)
         if len(copies):
             graph = tuple(
                 _copied(op, run, sources, copies) if isinstance(op, Conv) else op for op in graph
             )
-            found |= dict.fromkeys(run, copies)
-    return graph, found
+            copies_by_tensor |= dict.fromkeys(run, copies)
+    return graph, copies_by_tensor
 
 
 def runs(graph: Graph, names: Collection[str]) -> list[list[str]]:
@@ -57,19 +58,20 @@ def runs(graph: Graph, names: Collection[str]) -> list[list[str]]:
     readers = {
         name: [op for op in graph if isinstance(op, Conv) and op.input == name] for name in names
     }
-    begun = [
+    starts = [
         op.output
         for op in graph
         if isinstance(op, Conv) and op.output in readers and op.groups == 1
     ]
-    found = []
-    for name in begun:
+    paths = []
+    for name in starts:
         run = [name]
+        # A depthwise convolution hands a copy on only if nothing else reads the tensor.
         while [op.groups > 1 and op.output in readers for op in readers[run[-1]]] == [True]:
             run.append(readers[run[-1]][0].output)
         if all(op.groups == 1 for op in readers[run[-1]]):
-            found.append(run)
-    return found
+            paths.append(run)
+    return paths
 
 
 def _pairs(graph: Graph, name: str, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -81,8 +83,10 @@ def _pairs(graph: Graph, name: str, sizes: np.ndarray) -> tuple[np.ndarray, np.n
         for op in graph
         if isinstance(op, Conv) and op.input == name
     )
+    # A channel's step grows with its range, and its readers multiply the error by their weights.
     order = np.argsort(-np.square(sizes) * weights, kind="stable")
     dead = np.flatnonzero(sizes == 0)
+    # A channel is copied once at most: its readers take half of each.
     count = min(len(dead), len(sizes) - len(dead))
     return order[:count], dead[:count]
 
@@ -91,8 +95,10 @@ def _copied(op: Conv, run: list[str], sources: np.ndarray, copies: np.ndarray) -
     weight = op.weight.copy()
     bias = op.bias.copy()
     if op.output in run:
-        weight[copies], bias[copies] = weight[sources], bias[sources]
+        weight[copies] = weight[sources]
+        bias[copies] = bias[sources]
     if op.input == run[-1]:
+        # Two halves of the same values sum to what the reader had, so the float network stays.
         weight[:, sources] /= 2
         weight[:, copies] = weight[:, sources]
     return replace(op, weight=weight, bias=bias)
@@ -101,6 +107,7 @@ def _copied(op: Conv, run: list[str], sources: np.ndarray, copies: np.ndarray) -
 def ranges_apart(ranges: np.ndarray, tensors: Mapping[str, slice], copies: Copies) -> np.ndarray:
     """Ranges (channels of all tensors,) with those of the copies apart from their channels'."""
     apart = ranges.copy()
+    # At one scale a copy would be rounded like its channel, and the errors would not cancel.
     for name, channels in copies.items():
         apart[tensors[name]][channels] /= APART
     return apart

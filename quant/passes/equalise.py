@@ -72,8 +72,9 @@ def equalise(graph: Graph, stream: Stream, factors: np.ndarray) -> Graph:
     factors = np.array(factors, np.float64)
     for op in graph:
         if isinstance(op, Conv) and op.output in stream and op.activation is Activation.relu6:
-            own = stream[op.output]
-            factors[own] = np.maximum(factors[own], FULL / op.ceilings)
+            part = stream[op.output]
+            # Below this factor int8 would end beyond the six, and ReLU could not stand for ReLU6.
+            factors[part] = np.maximum(factors[part], FULL / op.ceilings)
     return rescaled(graph, stream, factors)
 
 
@@ -89,13 +90,18 @@ def _scaled(op: Conv, factors: np.ndarray, stream: Stream) -> Conv:
     bias = op.bias.astype(np.float64)
     ceiling = op.ceiling
     if op.output in stream:
-        own = factors[stream[op.output]]
-        weight = weight * own[:, None, None, None]
-        bias = bias * own
-        ceiling = op.ceilings * own if op.activation is Activation.relu6 else None
+        scales = factors[stream[op.output]]
+        weight = weight * scales[:, None, None, None]
+        bias = bias * scales
+        # ReLU passes a positive factor on; the six of ReLU6 has to be scaled with its channel.
+        ceiling = op.ceilings * scales if op.activation is Activation.relu6 else None
     if op.input in stream:
-        own = factors[stream[op.input]]
-        weight = weight / (own[None, :, None, None] if op.groups == 1 else own[:, None, None, None])
+        scales = factors[stream[op.input]]
+        # A depthwise kernel reads the channel that it writes, and has no axis of inputs.
+        if op.groups == 1:
+            weight = weight / scales[None, :, None, None]
+        else:
+            weight = weight / scales[:, None, None, None]
     return replace(
         op, weight=weight.astype(np.float32), bias=bias.astype(np.float32), ceiling=ceiling
     )
@@ -114,6 +120,7 @@ def channel_ranges(
         for name, sizes in zip(names, zip(*tiles, strict=True), strict=True)
     }
     ranges = np.zeros(max(stream[name].stop or len(mean) for name, mean in means.items()))
+    # Tensors of a stream share their factors, so a channel's range is its widest in any of them.
     for name, mean in means.items():
         ranges[stream[name]] = np.maximum(ranges[stream[name]], mean)
     return above_dead(ranges)
@@ -131,7 +138,7 @@ def channel_sizes(
     """
     for results in values_of(graph, names, images, ends):
         sizes = [np.abs(r[0]).reshape(r.shape[1], -1) for r in results]
-        yield [np.quantile(each, quantile, axis=1).astype(np.float64) for each in sizes]
+        yield [np.quantile(size, quantile, axis=1).astype(np.float64) for size in sizes]
 
 
 def largest_sizes(
@@ -163,6 +170,7 @@ def with_room(
     last = dict.fromkeys((*add.inputs, add.output), slice(None))
     limit = INT8_MAX * step
     largest = np.max(largest_sizes(graph, list(last), images, ends), axis=0)
+    # No factor is above 1: a channel that has the room already keeps its step.
     return equalise(graph, last, limit / np.maximum(ROOM * largest, limit))
 
 
@@ -184,9 +192,11 @@ def search(graph: Graph, stream: Stream, ranges: np.ndarray, trial: Trial) -> np
         return trial(equalise(graph, stream, factors))
 
     first, *others = (first_guess(ranges, *shape) for shape in product(LEVELLING, HEADROOM))
+    # Without factors to compare with, the first guess has to be run on all crops.
     best = Best(first, costs_of(first)(None))
     for guess in others:
         best = race(costs_of(guess), guess, best)
+    # One channel after the other takes hours in a wide network.
     channels = range(len(ranges)) if len(ranges) <= MOST_CHANNELS else ()
     return stepped(costs_of, channels, best).factors
 
@@ -198,12 +208,13 @@ def stepped(
     for step in STEPS:
         for channel in channels:
             for factor in (step, 1 / step):
-                tried = best.factors.copy()
-                tried[channel] *= factor
-                winner = race(costs_of(tried), tried, best)
+                candidate = best.factors.copy()
+                candidate[channel] *= factor
+                winner = race(costs_of(candidate), candidate, best)
                 if winner is not best:
                     best = winner
-                    break  # the other way leads back
+                    # The inverse factor would lead back to where the channel came from.
+                    break
     return best
 
 
@@ -221,12 +232,13 @@ def race(costs_of: Costs, factors: np.ndarray, best: Best) -> Best:
     """
     order = np.argsort(-best.costs, kind="stable")
     costs = np.zeros(len(order))
-    seen = 0
-    while seen < len(order):
-        crops = order[seen : max(2 * seen, FIRST_CROPS)]
+    count = 0
+    while count < len(order):
+        crops = order[count : max(2 * count, FIRST_CROPS)]
         costs[crops] = costs_of(crops)
-        seen += len(crops)
-        margin = MARGIN if seen < len(order) else 0.0
-        if costs.sum() >= best.costs[order[:seen]].sum() * (1 + margin):
+        count += len(crops)
+        # Crops not yet run may make up for a little; once all have, only a lower cost wins.
+        margin = MARGIN if count < len(order) else 0.0
+        if costs.sum() >= best.costs[order[:count]].sum() * (1 + margin):
             return best
     return Best(factors, costs)

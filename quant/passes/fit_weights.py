@@ -12,7 +12,7 @@ makes up for what those before it are off by in the mean.
 """
 
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import chain, product
 from typing import NamedTuple
 
 import numpy as np
@@ -84,6 +84,7 @@ class Moments:
         """(G, n, n) covariance, a share of its mean variance added to the diagonal so that no
         direction is free.
         """
+        # The mean is taken off: the bias makes up for what weights do to it.
         covariance = self.products / self.count - self.mean[:, :, None] * self.mean[:, None]
         floor = FLOOR * np.trace(covariance, axis1=1, axis2=2).mean() / covariance.shape[-1]
         return np.asarray(covariance + floor * np.eye(covariance.shape[-1]))
@@ -91,8 +92,10 @@ class Moments:
 
 def _windows(values: np.ndarray, op: Conv) -> np.ndarray:
     """(K, G, n) of the windows within (1, I, H, W), some pixels apart."""
-    (rows, columns), (tall, broad) = op.window.strides, op.window.dilations
+    rows, columns = op.window.strides
+    tall, broad = op.window.dilations
     kernel = (op.weight.shape[2] - 1) * tall + 1, (op.weight.shape[3] - 1) * broad + 1
+    # The nearest multiples of the strides, for other windows are never computed.
     every = -(-EVERY_PX // rows) * rows, -(-EVERY_PX // columns) * columns
     if min(n - k for n, k in zip(values.shape[2:], kernel, strict=True)) < 0:
         return np.empty((0, op.groups, op.weight[0].size), np.float32)
@@ -100,9 +103,8 @@ def _windows(values: np.ndarray, op: Conv) -> np.ndarray:
     first = -op.window.pads[0] % rows, -op.window.pads[1] % columns
     windows = sliding_window_view(values[0], kernel, axis=(1, 2))
     windows = windows[:, first[0] :: every[0], first[1] :: every[1], ::tall, ::broad]
-    return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).reshape(
-        -1, op.groups, op.weight[0].size
-    )
+    ordered = np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4))
+    return ordered.reshape(-1, op.groups, op.weight[0].size)
 
 
 class Crop(NamedTuple):
@@ -131,59 +133,65 @@ def fit_weights(
     """
     ops = list[IntConv | Op]()
     ends = core.ends
-    seen = _seen(graph, core, images)
-    last_read = {name: op.name for op in graph for name in op.inputs}
+    samples = _samples(graph, core, images)
+    last_reader: dict[str, str] = {}
+    for op in graph:
+        last_reader.update(dict.fromkeys(op.inputs, op.name))
     for op, nearest in zip(graph, core.ops, strict=True):
-        whole = nearest
+        fitted = nearest
         if isinstance(op, Conv) and isinstance(nearest, IntConv):
-            raised = op.stored_bias - nearest_bias(
-                op, nearest.weight, nearest.weight_frac_bits, graph
+            bias = nearest_bias(op, nearest.weight, nearest.weight_frac_bits, graph)
+            raised = op.stored_bias - bias
+            fitted, shifted = _fit(
+                op, nearest, core.frac_bits[op.input], _moments(op, samples), shifts, raised
             )
-            whole, shifted = _fit(
-                op, nearest, core.frac_bits[op.input], _moments(op, seen), shifts, raised
-            )
-            if op.output == CORRECTION and ends.offsets:  # the biases left over are others now
-                ends = ends.moved(nearest.float_bias + raised - shifted - whole.float_bias)
-        ops.append(whole)
-        _compute(op, whole, core.frac_bits[op.output], seen)
-        for crop, name in product(seen, {name for name in op.inputs if last_read[name] == op.name}):
+            if op.output == CORRECTION and ends.offsets:
+                # The host adds what rounding the biases left, which is another amount now.
+                ends = ends.moved(nearest.float_bias + raised - shifted - fitted.float_bias)
+        ops.append(fitted)
+        # The next convolution is fitted on what this one gives in INT8, errors included.
+        _compute(op, fitted, core.frac_bits[op.output], samples)
+        # Only tensors that are still read are kept, or memory would grow with the depth.
+        spent = {name for name in op.inputs if last_reader[name] == op.name}
+        for crop, name in product(samples, spent):
             del crop.exact[name], crop.whole[name]
     return replace(core, ops=tuple(ops), ends=ends)
 
 
-def _seen(graph: Graph, core: IntCore, images: Remade[np.ndarray]) -> list[Crop]:
+def _samples(graph: Graph, core: IntCore, images: Remade[np.ndarray]) -> list[Crop]:
     """Crops from all over the images, of SEEN_PX together, and their planes."""
     halo_px = None if halo_of(graph) is None else 0
     first = crops(images[0], halo_px)
     count = max(SEEN_PX // first[0][0, 0].size, 1)
-    chosen = [images[k] for k in np.unique(np.linspace(0, len(images) - 1, count).astype(int))]
-    found = [crop for image in chosen for crop in crops(image, halo_px)]
-    planes = [planes_of(crop, core.ends) for crop in found[:: -(-len(found) // count)]]
-    return [Crop({PLANES: each}, {PLANES: each}) for each in planes]
+    numbers = np.unique(np.linspace(0, len(images) - 1, count).astype(int))
+    tiles = list(chain.from_iterable(crops(images[k], halo_px) for k in numbers))
+    planes = [planes_of(tile, core.ends) for tile in tiles[:: -(-len(tiles) // count)]]
+    return [Crop({PLANES: plane}, {PLANES: plane}) for plane in planes]
 
 
-def _moments(op: Conv, seen: list[Crop]) -> Moments:
+def _moments(op: Conv, samples: list[Crop]) -> Moments:
     moments = Moments.of_none(op.groups, op.weight[0].size)
-    for crop in [] if op.transposed else seen:
+    for crop in [] if op.transposed else samples:
         moments.add(_windows(crop.whole[op.input], op), _windows(crop.exact[op.input], op))
     return moments
 
 
-def _compute(op: Op, whole: IntConv | Op, frac_bits: int, seen: list[Crop]) -> None:
+def _compute(op: Op, fitted: IntConv | Op, frac_bits: int, samples: list[Crop]) -> None:
     """One more tensor of each crop, in float and rounded."""
-    in_int8 = dequantised(op, whole) if isinstance(op, Conv) and isinstance(whole, IntConv) else op
-    sessions = [open_session(operation_to_onnx(each)) for each in (op, in_int8)]
-    for crop in seen:
-        for session, known in zip(sessions, crop, strict=True):
-            (known[op.output],) = session.run(
-                None, {name: known[name] for name in dict.fromkeys(op.inputs)}
-            )
+    in_int8 = op
+    if isinstance(op, Conv) and isinstance(fitted, IntConv):
+        in_int8 = dequantised(op, fitted)
+    sessions = [open_session(operation_to_onnx(version)) for version in (op, in_int8)]
+    for crop in samples:
+        for session, tensors in zip(sessions, crop, strict=True):
+            inputs = {name: tensors[name] for name in dict.fromkeys(op.inputs)}
+            (tensors[op.output],) = session.run(None, inputs)
         crop.whole[op.output] = rounded_to(crop.whole[op.output], frac_bits)
 
 
 def _fit(
     op: Conv,
-    whole: IntConv,
+    nearest: IntConv,
     input_frac_bits: int,
     moments: Moments,
     shifts: Shifts,
@@ -194,13 +202,13 @@ def _fit(
 
     Fewer windows than weights say nothing of how errors add up.
     """
+    # With fewer windows than weights the covariance has no full rank.
     if moments.count <= op.weight[0].size:
-        return whole, raised
-    weight, shifted = fit(op.weight, 2.0**-whole.weight_frac_bits, moments)
-    bias, bias_frac_bits = quantise_bias(
-        op.stored_bias - shifted, whole.weight_frac_bits + input_frac_bits, shifts
-    )
-    return replace(whole, weight=weight, bias=bias, bias_frac_bits=bias_frac_bits), shifted
+        return nearest, raised
+    weight, shifted = fit(op.weight, 2.0**-nearest.weight_frac_bits, moments)
+    product_frac_bits = nearest.weight_frac_bits + input_frac_bits
+    bias, bias_frac_bits = quantise_bias(op.stored_bias - shifted, product_frac_bits, shifts)
+    return replace(nearest, weight=weight, bias=bias, bias_frac_bits=bias_frac_bits), shifted
 
 
 def fit(weight: np.ndarray, unit: float, moments: Moments) -> tuple[np.ndarray, np.ndarray]:
@@ -215,8 +223,9 @@ def fit(weight: np.ndarray, unit: float, moments: Moments) -> tuple[np.ndarray, 
     groups, size = moments.mean.shape
     exact = weight.reshape(groups, -1, size).astype(np.float64)
     fitted = np.stack(
-        [descend(*each) for each in zip(exact / unit, moments.covariance, strict=True)]
+        [descend(*group) for group in zip(exact / unit, moments.covariance, strict=True)]
     )
+    # The bias is to give the float mean of float inputs, so it also takes off earlier errors.
     exact_mean = (moments.total + moments.lost) / moments.count
     raised = (fitted * unit) @ moments.mean[:, :, None] - exact @ exact_mean[:, :, None]
     return fitted.astype(np.int8).reshape(weight.shape), np.asarray(raised).ravel()
@@ -228,18 +237,21 @@ def descend(wanted: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     Coordinate descent: along one weight the least error lies at q_i - (C e)_i / C_ii, rounded. A
     weight that meets nothing but one value stays: the bias makes up for it.
     """
-    whole: np.ndarray = np.clip(np.rint(wanted), INT8_MIN, INT8_MAX)
-    gradient = (whole - wanted) @ covariance
+    weights: np.ndarray = np.clip(np.rint(wanted), INT8_MIN, INT8_MAX)
+    # C e, half the gradient of e^T C e, is kept up to date: a step costs one row of C.
+    gradient = (weights - wanted) @ covariance
     variance = np.diag(covariance)
     for _ in range(SWEEPS):
-        moved = False
+        changes = False
+        # A weight without variance would divide by zero.
         for i in np.argsort(-variance)[: np.count_nonzero(variance)]:
-            target = whole[:, i] - gradient[:, i] / variance[i]
-            step = np.clip(np.rint(target), INT8_MIN, INT8_MAX) - whole[:, i]
+            target = weights[:, i] - gradient[:, i] / variance[i]
+            # The error is a parabola along one weight, so the nearest integer to its least is best.
+            step = np.clip(np.rint(target), INT8_MIN, INT8_MAX) - weights[:, i]
             if step.any():
-                whole[:, i] += step
+                weights[:, i] += step
                 gradient += step[:, None] * covariance[i]
-                moved = True
-        if not moved:
+                changes = True
+        if not changes:
             break
-    return whole
+    return weights

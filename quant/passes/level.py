@@ -63,6 +63,7 @@ def _guess(
     of those that write each, ruled the scale of all.
     """
     factors = first_guess(ranges, levelling, headroom)
+    # The weights that write a tensor share one scale, which the largest of them sets.
     limit = (weights * factors)[ranges >= np.median(ranges)].max()
     return np.asarray(np.minimum(factors, limit / np.maximum(weights, 1e-12)))
 
@@ -94,8 +95,9 @@ class Chain:
 
     def unscaled(self, frac_bits: Mapping[str, int]) -> np.ndarray:
         """The factors that leave every tensor the scale that it has by itself."""
-        own = [2.0 ** (frac_bits[name] - STREAM_FRAC_BITS) for name in self.tensors]
-        return np.repeat(own, self.widths)
+        # In the core these tensors have the stream's scale, so the factor stands for their own.
+        scales = [2.0 ** (frac_bits[name] - STREAM_FRAC_BITS) for name in self.tensors]
+        return np.repeat(scales, self.widths)
 
 
 def chain_ranges(
@@ -104,6 +106,7 @@ def chain_ranges(
     """Return the range of every channel over images (1, C, H, W), which most tiles keep."""
     tiles = channel_sizes(graph, list(chain.tensors), images, ends, quantile)
     by_tensor = zip(*tiles, strict=True)
+    # The widest tile would cost a DnCNN 1.4 dB instead of 0.6: see TILES.
     return np.concatenate([above_dead(np.quantile(sizes, TILES, axis=0)) for sizes in by_tensor])
 
 
@@ -111,32 +114,36 @@ def largest_values(
     graph: Graph, chain: Chain, images: Iterable[np.ndarray], ends: Ends
 ) -> np.ndarray:
     """Return the largest size of every channel over images (1, C, H, W)."""
-    return np.concatenate(
-        list(map(above_dead, largest_sizes(graph, list(chain.tensors), images, ends)))
-    )
+    sizes = largest_sizes(graph, list(chain.tensors), images, ends)
+    return np.concatenate(list(map(above_dead, sizes)))
 
 
 def level(
     graph: Graph, chain: Chain, ranges: np.ndarray, start: np.ndarray, trial: Trial
 ) -> np.ndarray:
     """The factors of least error that were found, never more than that of `start`."""
-    written = {op.output: np.abs(op.weight).max((1, 2, 3)) for op in graph if isinstance(op, Conv)}
-    placed = [(part, ranges[part], written[name]) for name, part in chain.parts.items()]
+    weights_of = {
+        op.output: np.abs(op.weight).max((1, 2, 3)) for op in graph if isinstance(op, Conv)
+    }
+    tensors = [(part, ranges[part], weights_of[name]) for name, part in chain.parts.items()]
 
     def costs_of(factors: np.ndarray) -> Costs:
         return trial(chain.scaled(graph, factors))
 
-    def guessed(best: Best, own: list[tuple[slice, np.ndarray, np.ndarray]]) -> Best:
+    def guessed(best: Best, group: list[tuple[slice, np.ndarray, np.ndarray]]) -> Best:
         """The best of the first guesses for these tensors, the others as they are."""
         for shape in product(LEVELLING, HEADROOM):
-            tried = best.factors.copy()
-            for part, sizes, weights in own:
-                tried[part] = _guess(sizes, weights, *shape)
-            best = _better(tried, costs_of, best)
+            candidate = best.factors.copy()
+            for part, sizes, weights in group:
+                candidate[part] = _guess(sizes, weights, *shape)
+            best = _better(candidate, costs_of, best)
         return best
 
-    best = guessed(Best(start, costs_of(start)(None)), placed)
-    for tensor in reversed(placed) if chain.by_channel or len(placed) <= FEW_TENSORS else ():
+    # All jointly first: the error of the worst tensor would hide what the others gain.
+    best = guessed(Best(start, costs_of(start)(None)), tensors)
+    separately = chain.by_channel or len(tensors) <= FEW_TENSORS
+    # From the last one on, because what is rounded late reaches the result.
+    for tensor in reversed(tensors) if separately else ():
         best = guessed(best, [tensor])
         if chain.by_channel and len(ranges) <= MOST_CHANNELS:
             best = stepped(costs_of, range(tensor[0].start, tensor[0].stop), best)
@@ -149,6 +156,7 @@ def _better(factors: np.ndarray, costs_of: Callable[[np.ndarray], Costs], best: 
     Given up where every eighth of the crops says that it is clearly worse.
     """
     cost = costs_of(factors)
+    # An eighth of the runs shows which guesses are clearly worse.
     some = np.arange(0, len(best.costs), EVERY)
     if cost(some).sum() > CLEARLY * best.costs[some].sum():
         return best

@@ -27,15 +27,16 @@ def lowerable(graph: Graph) -> list[str]:
     order.
     """
     relus = (Activation.relu, Activation.relu6)
-    written = {
+    outputs = {
         op.output
         for op in graph
         if isinstance(op, Conv) and op.activation in relus and not op.offset
     }
+    # A padded window sums the weights of its inner part alone, so no one bias would be right.
     padded = {
         op.input for op in graph if isinstance(op, Conv) and (any(op.window.pads) or op.transposed)
     }
-    return [name for name in lone_tensors(graph) if name in written - padded]
+    return [name for name in lone_tensors(graph) if name in outputs - padded]
 
 
 def lowered(graph: Graph, name: str, frac_bits: int) -> Graph:
@@ -49,8 +50,10 @@ def lowered(graph: Graph, name: str, frac_bits: int) -> Graph:
         name: of the tensor, one of `lowerable`.
         frac_bits: of its scale.
     """
+    # Stored less this offset, zero is -128: int8's lower end then clips what ReLU clipped.
     offset = -INT8_MIN * 2.0**-frac_bits
     writer = next(op for op in graph if isinstance(op, Conv) and op.output == name)
+    # The tensor reaches from 0 to 255 units now; where that is beyond the six, its channels grow.
     short = SPAN * 2.0**-frac_bits / writer.ceilings
     if writer.activation is Activation.relu6 and short.max() > 1:
         graph = rescaled(graph, only(name), np.maximum(short, 1))
@@ -61,10 +64,9 @@ def _lowered(op: Conv, name: str, offset: float) -> Conv:
     if op.output == name:
         op = replace(op, offset=offset)
     if op.input == name:
-        op = replace(
-            op,
-            bias=(op.bias + offset * op.weight.sum((1, 2, 3), dtype=np.float64)).astype(np.float32),
-        )
+        # Every input lacks the offset, so each result lacks it times the sum of its weights.
+        bias = op.bias + offset * op.weight.sum((1, 2, 3), dtype=np.float64)
+        op = replace(op, bias=bias.astype(np.float32))
     return op
 
 
@@ -82,14 +84,15 @@ def lower(graph: Graph, frac_bits: Mapping[str, int], trial: Trial) -> Graph:
         return graph
     least = trial(graph)(None).sum()
     everything = graph
+    # Half the range at the same 256 values is a scale twice as fine: one bit more.
     for name in names:
         everything = lowered(everything, name, frac_bits[name] + 1)
     if trial(everything)(None).sum() < least:
         return everything
     for name in reversed(names) if len(names) > 1 else ():
-        tried = lowered(graph, name, frac_bits[name] + 1)
-        cost = trial(tried)(None).sum()
+        candidate = lowered(graph, name, frac_bits[name] + 1)
+        cost = trial(candidate)(None).sum()
         if cost < least:
-            graph = tried
+            graph = candidate
             least = cost
     return graph

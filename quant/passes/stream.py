@@ -8,7 +8,7 @@ ones side by side over all that it can be, and a coarse one for what lies outsid
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import accumulate, repeat
+from itertools import accumulate, chain, repeat
 
 import numpy as np
 
@@ -70,21 +70,23 @@ def _placed(linking: Sequence[Op], names: Sequence[str], graph: Graph) -> Stream
     """Where the channels of these tensors stand; nowhere where one would have to stand in two
     places.
     """
-    own = [op for op in linking if op.output in names]
-    if not any(isinstance(op, Concat) for op in own):
+    writers = [op for op in linking if op.output in names]
+    # Only a concat puts channels at other places than those of its inputs.
+    if not any(isinstance(op, Concat) for op in writers):
         return dict.fromkeys(names, slice(None))
-    widths = channels_of(
-        graph, {PLANES: next(op.weight.shape[1] for op in graph if isinstance(op, Conv))}
-    )
-    links = [link for op in own for link in _links(op, widths)]
+    planes = next(op.weight.shape[1] for op in graph if isinstance(op, Conv))
+    widths = channels_of(graph, {PLANES: planes})
+    links = list(chain.from_iterable(_links(op, widths) for op in writers))
     first = {names[0]: 0}
+    # The tensors are linked to each other, so every sweep places at least one more.
     while len(first) < len(names):
-        for part, whole, by in links:
-            if whole in first:
-                first.setdefault(part, first[whole] + by)
+        for part, result, by in links:
+            if result in first:
+                first.setdefault(part, first[result] + by)
             elif part in first:
-                first[whole] = first[part] - by
-    if any(first[part] != first[whole] + by for part, whole, by in links):
+                first[result] = first[part] - by
+    # A channel at two places would need two factors.
+    if any(first[part] != first[result] + by for part, result, by in links):
         return {}
     least = min(first.values())
     return {
@@ -105,6 +107,7 @@ def exceeds_six(graph: Graph, stream: Stream, frac_bits: Mapping[str, int]) -> b
         isinstance(op, Conv) and op.activation is Activation.relu6 and op.output in stream
         for op in graph
     )
+    # Where int8 ends beyond the six there are larger sums, and its end cannot serve as their clip.
     return clipped and any(INT8_MAX * 2.0 ** -frac_bits[name] > SIX for name in stream)
 
 
@@ -112,10 +115,11 @@ def lone_tensors(graph: Graph) -> list[str]:
     """Tensors of no stream that convolutions alone write and read: each of their channels may have
     a factor.
     """
-    added = {name for op in graph if isinstance(op, Add) for name in (*op.inputs, op.output)}
-    written = [op.output for op in graph if isinstance(op, Conv) and op.output not in added]
-    passing = {name for op in graph if isinstance(op, PASSING) for name in op.inputs}
-    return [name for name in written if name not in passing and _passes_factors(graph, only(name))]
+    adds = [op for op in graph if isinstance(op, Add)]
+    terms = set(chain.from_iterable((*op.inputs, op.output) for op in adds))
+    outputs = [op.output for op in graph if isinstance(op, Conv) and op.output not in terms]
+    passing = set(chain.from_iterable(op.inputs for op in graph if isinstance(op, PASSING)))
+    return [name for name in outputs if name not in passing and _passes_factors(graph, only(name))]
 
 
 def _passes_factors(graph: Graph, stream: Stream) -> bool:
@@ -123,13 +127,16 @@ def _passes_factors(graph: Graph, stream: Stream) -> bool:
     behind an add.
     """
     touching = [op for op in graph if stream.keys() & {*op.inputs, op.output}]
-    known = all(isinstance(op, (Conv, Add, *PASSING)) for op in touching)
-    homogeneous = all(
+    # The host writes the planes and reads the correction, and knows no factors.
+    if stream.keys() & {PLANES, CORRECTION}:
+        return False
+    if not all(isinstance(op, (Conv, Add, *PASSING)) for op in touching):
+        return False
+    return all(
         op.activation.homogeneous or (isinstance(op, Conv) and op.activation is Activation.relu6)
         for op in touching
         if op.output in stream and isinstance(op, Conv | Add)
     )
-    return known and homogeneous and not stream.keys() & {PLANES, CORRECTION}
 
 
 OFFSETS = np.array([-0.25, 0.25])
@@ -153,15 +160,18 @@ def half_lsb_pair(graph: Graph, step: float) -> Graph:
         and len(set(add.inputs)) == 2
         and set(add.inputs) <= set(writers)
     )
+    # The offsets are in units of `step`, which only a stream's tensors have.
     shared = any(add.output in stream for stream in streams(graph))
     if not (shared and two and tail.groups == 1 and tail.input == add.output):
         return graph
     left, right = (_twice(writers[name], step) for name in add.inputs)
-    read = {name for op in before for name in op.inputs}
-    kept = [op for op in before if op.output in read or op.output not in add.inputs]
-    both = replace(add, inputs=(left.output, right.output))
+    inputs = set(chain.from_iterable(op.inputs for op in before))
+    # A convolution that only this add read is replaced by its pair.
+    others = [op for op in before if op.output in inputs or op.output not in add.inputs]
+    pair = replace(add, inputs=(left.output, right.output))
+    # Rounded half a unit apart, the two copies have a mean on a grid twice as fine.
     halved = replace(tail, weight=np.concatenate([tail.weight / 2] * len(OFFSETS), axis=1))
-    return (*kept, left, right, both, halved)
+    return (*others, left, right, pair, halved)
 
 
 def _plain(op: Conv) -> bool:
@@ -213,8 +223,11 @@ def window_offsets(low: np.ndarray, high: np.ndarray, unit: float) -> np.ndarray
     """The middles (W, C) of as many windows of int8, its step `unit`, as hold values from low to
     high, (C,) each.
     """
+    # The coarse copy takes one of the places that a convolution's channels have.
     most = min(MAX_WINDOWS, MAX_CHANNELS // len(low) - 1)
-    count = int(np.clip(np.ceil((high - low).max() / (2 * FINE_MAX * unit)), 1, max(most, 1)))
+    # A window is believed up to FINE_MAX units on either side of its middle.
+    needed = np.ceil((high - low).max() / (2 * FINE_MAX * unit))
+    count = int(np.clip(needed, 1, max(most, 1)))
     shares = (np.arange(count)[:, None] + 0.5) / count
     return np.asarray(low + shares * (high - low))
 

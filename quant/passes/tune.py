@@ -95,12 +95,15 @@ class Judge:
 
     def __init__(self, core: IntCore, held: list[Sample]) -> None:
         self._held = held
+        # The float network errs from a reference as well, and no integers can be blamed for that.
         self._in_float = float(np.mean([float(sample.error(sample.floats)) for sample in held]))
-        self.core, self.first = core, self.loss(core)
+        self.core = core
+        self.first = self.loss(core)
         self.least = self.first
 
     def loss(self, core: IntCore) -> float:
         """What a core loses."""
+        # Samples are corrections, so the host must stop once it has merged gains or windows.
         ends = replace(
             core.ends, back=(), adds_image=False, last=(), flat=False, softmax=False, tail=None
         )
@@ -137,9 +140,8 @@ class Descent:
         self._rate = tuning.rate
         self.done = 0
         self._generator = torch.Generator().manual_seed(tuning.seed)
-        self._optimiser = torch.optim.Adam(
-            trainable.parameters(), eps=1e-15
-        )  # errors are small without references
+        # Without references errors and gradients are small: Adam's eps must be smaller still.
+        self._optimiser = torch.optim.Adam(trainable.parameters(), eps=1e-15)
         self._batch = max(BATCH_PIXELS // math.prod(samples[0].planes.shape[2:]), 1)
 
     def round(self, steps: int) -> Iterator[int]:
@@ -149,11 +151,12 @@ class Descent:
                 self._rate * 0.5 * (1 + math.cos(math.pi * step / steps))
             )
             self._optimiser.zero_grad()
-            for number in torch.randint(
-                len(self._samples), (self._batch,), generator=self._generator
-            ).tolist():
+            numbers = torch.randint(len(self._samples), (self._batch,), generator=self._generator)
+            for number in numbers.tolist():
                 sample = self._samples[number]
-                (sample.error(self._trainable(sample.planes)) / self._batch).backward()
+                error = sample.error(self._trainable(sample.planes))
+                # Gradients of the batch add up sample by sample, whose sizes may differ.
+                (error / self._batch).backward()
             self._optimiser.step()
             self.done += 1
             yield steps - step - 1
@@ -173,17 +176,19 @@ def tune(
         log: is told now and then how many steps are done, and what they gained.
     """
     samples = list(_samples(core.ends, full, tuning.pairs))
-    held = (samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples)[:MOST_HELD_OUT]
-    seen = [sample for k, sample in enumerate(samples) if (k + 1) % HELD_OUT_EVERY] or samples
+    # Too few samples to hold one out are trained on and judged by.
+    validation = (samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples)[:MOST_HELD_OUT]
+    training = [sample for k, sample in enumerate(samples) if (k + 1) % HELD_OUT_EVERY] or samples
     trainable = TrainableCore(core, still)
-    judge = Judge(core, held)
-    descent = Descent(trainable, seen, tuning)
+    judge = Judge(core, validation)
+    descent = Descent(trainable, training, tuning)
     rounds = (tuning.steps,) if tuning.steps else ROUNDS
     most = f"{'' if tuning.steps else 'at most '}{sum(rounds)}"
     for steps in rounds:
         before = judge.least
-        for left in descent.round(steps):
-            if left % JUDGED_EVERY == 0:
+        for remainder in descent.round(steps):
+            # Counted from the end, so that the last step is judged, where the rate is near 0.
+            if remainder % JUDGED_EVERY == 0:
                 judge.see(trainable.core())
                 log(
                     f"fine-tuning, step {descent.done} of {most}: held-out pairs lose "
@@ -205,24 +210,25 @@ def _samples(ends: Ends, full: Graph, pairs: Remade[Pair]) -> Iterator[Sample]:
         if not (reference.size and ends.is_image):
             yield Sample(image, planes, result, None, 1.0)
             continue
-        given = times(reference.shape)
-        made = times(ends.finished(image, floats).shape)
-        if given != made:
+        size = times(reference.shape)
+        expected = times(ends.finished(image, floats).shape)
+        if size != expected:
             remedy = "give references of the size that the network makes"
-            raise ImageError("reference", expected=f"one of {made}", got=given, remedy=remedy)
-        wanted = torch.from_numpy(ends.correction_of(image, reference))
-        yield Sample(
-            image, planes, result, wanted, 1 / max(float(_inner_error(result, wanted)), LEAST_ERROR)
-        )
+            raise ImageError("reference", expected=f"one of {expected}", got=size, remedy=remedy)
+        target = torch.from_numpy(ends.correction_of(image, reference))
+        # Over the float network's own error, dark and busy patches count alike.
+        weight = 1 / max(float(_inner_error(result, target)), LEAST_ERROR)
+        yield Sample(image, planes, result, target, weight)
 
 
 LEAST_ERROR = 1e-9
 """Mean squared, of full scale: below it, by 90 dB, a float network is as good as perfect."""
 
 
-def _inner_error(result: Tensor, wanted: Tensor) -> Tensor:
+def _inner_error(result: Tensor, target: Tensor) -> Tensor:
     """Mean squared, but for a border that no network could restore."""
+    # In a small result the border would be most of it.
     border_px = BORDER_PX if min(result.shape[2:]) >= 4 * BORDER_PX else 0
     height, width = result.shape[2:]
-    inner = (result - wanted)[..., border_px : height - border_px, border_px : width - border_px]
+    inner = (result - target)[..., border_px : height - border_px, border_px : width - border_px]
     return inner.square().mean()

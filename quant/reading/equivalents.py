@@ -46,9 +46,8 @@ def rewrite(model: onnx.ModelProto) -> None:
         _in_front(graph, shapes)
         for shaped in (_cast, _mean, _depthwise):
             graph.pass_over(partial(shaped, shapes))
-        graph.pass_over(
-            _behind
-        )  # a normalisation that has become a convolution takes in what stands around it
+        # A normalisation that has become a convolution takes in what stands around it.
+        graph.pass_over(_behind)
         _in_front(graph, shapes)
         graph.pass_over(Unflatten(shapes))
         graph.write()
@@ -58,15 +57,17 @@ def _sum(_: Nodes, node: NodeProto) -> list[NodeProto] | None:
     """A Sum of several as Adds, one after the other."""
     if node.op_type != "Sum" or len(node.input) < 2:
         return None
-    last = node.input[0]
+    subtotal = node.input[0]
     adds = []
     for number, name in enumerate(node.input[1:], 1):
-        whole = number == len(node.input) - 1
-        output = node.output[0] if whole else f"{node.output[0]}.{number}"
+        is_last = number == len(node.input) - 1
+        output = node.output[0] if is_last else f"{node.output[0]}.{number}"
         adds.append(
-            helper.make_node("Add", [last, name], [output], name=output if not whole else node.name)
+            helper.make_node(
+                "Add", [subtotal, name], [output], name=node.name if is_last else output
+            )
         )
-        last = output
+        subtotal = output
     return adds
 
 
@@ -83,14 +84,17 @@ def _difference(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
 
 def _behind(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
     """What works on each channel by itself, folded into the convolution that it follows."""
-    found = _affine(graph, node)
-    before = graph.sole_writer(found[0]) if found else None
-    if found is None or before is None or not graph.is_linear(before):
+    match = _affine(graph, node)
+    if match is None:
         return None
-    if found[1].channels not in (1, graph.width(before)):
+    source, affine = match
+    before = graph.sole_writer(source)
+    if before is None or not graph.is_linear(before):
         return None
-    _scale_results(graph, before, found[1])
-    graph.rename(found[0], node.output[0])
+    if affine.channels not in (1, graph.width(before)):
+        return None
+    _scale_results(graph, before, affine)
+    graph.rename(source, node.output[0])
     return []
 
 
@@ -105,8 +109,8 @@ def _affine(graph: Nodes, node: NodeProto) -> tuple[str, Affine] | None:
     for place in (0, 1):
         value = per_channel(graph.value(node.input[1 - place]))
         if value is not None and node.input[place] not in graph.constants:
-            found = _arithmetic(node.op_type, value, place)
-            return None if found is None else (node.input[place], found)
+            affine = _arithmetic(node.op_type, value, place)
+            return None if affine is None else (node.input[place], affine)
     return None
 
 
@@ -125,15 +129,15 @@ def _arithmetic(kind: str, value: np.ndarray, place: int) -> Affine | None:
 
 def _normalisation(graph: Nodes, node: NodeProto) -> tuple[str, Affine] | None:
     values = [graph.value(name) for name in node.input[1:5]]
-    given = attributes_of(node)
+    attributes = attributes_of(node)
     if (
-        given.get("training_mode", 0)
+        attributes.get("training_mode", 0)
         or len(node.output) > 1
         or any(value is None for value in values)
     ):
         return None
     gain, offset, mean, variance = values
-    scale = gain / np.sqrt(variance + given.get("epsilon", 1e-5))
+    scale = gain / np.sqrt(variance + attributes.get("epsilon", 1e-5))
     return node.input[0], Affine(scale, offset - mean * scale)
 
 
@@ -155,6 +159,8 @@ def _scale_results(graph: Nodes, node: NodeProto, affine: Affine) -> None:
     if node.op_type == "Conv":
         weight = weight * scale.reshape(-1, 1, 1, 1)
     else:
+        # A transposed convolution has its weights as (I, O / groups, kh, kw): the results of a
+        # group stand along the second axis.
         split = weight.reshape(groups, -1, *weight.shape[1:]) * scale.reshape(groups, 1, -1, 1, 1)
         weight = split.reshape(weight.shape)
     _set_numbers(graph, node, weight, bias * scale + affine.shift)
@@ -190,8 +196,10 @@ def _hard_swish(graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
         before = graph.writers.get(gate)
         if before is None or before.op_type != "HardSigmoid" or before.input[0] != source:
             continue
-        given = attributes_of(before)
-        if np.allclose((given.get("alpha", 0.2), given.get("beta", 0.5)), (1 / 6, 0.5), atol=1e-6):
+        attributes = attributes_of(before)
+        if np.allclose(
+            (attributes.get("alpha", 0.2), attributes.get("beta", 0.5)), (1 / 6, 0.5), atol=1e-6
+        ):
             return [helper.make_node("HardSwish", [source], node.output, name=node.name)]
     return None
 
@@ -210,12 +218,12 @@ def _cast(shapes: Shapes, graph: Nodes, node: NodeProto) -> list[NodeProto] | No
 
 
 def _mean(shapes: Shapes, _: Nodes, node: NodeProto) -> list[NodeProto] | None:
-    given = attributes_of(node)
-    axes = {axis % 4 for axis in given.get("axes", [])}
+    attributes = attributes_of(node)
+    axes = {axis % 4 for axis in attributes.get("axes", [])}
     image = len(shapes.get(node.input[0], ())) == 4
     if node.op_type != "ReduceMean" or not image or axes != {2, 3}:
         return None
-    pooled = node.output[0] if given.get("keepdims", 1) else f"{node.output[0]}.pooled"
+    pooled = node.output[0] if attributes.get("keepdims", 1) else f"{node.output[0]}.pooled"
     pool = helper.make_node("GlobalAveragePool", node.input, [pooled], name=node.name)
     if pooled == node.output[0]:
         return [pool]
@@ -228,22 +236,26 @@ def _in_front(graph: Nodes, shapes: Shapes) -> None:
     that is exact.
     """
     readers = graph.readers()
-    ends = set(graph.ends)
-    folded = set[int]()
+    results = set(graph.ends)
+    folded_ids = set[int]()
     for node in graph.nodes[::-1]:
         result = node.output[0]
-        found = _affine(graph, node)
+        match = _affine(graph, node)
         behind = readers.get(result, [])
-        if found is None or not behind or result in ends or not _keeps_channels(*found, shapes):
+        if match is None or not behind or result in results:
             continue
-        if all(_may_scale_inputs(graph, reader, result, found[1]) for reader in behind):
+        source, affine = match
+        if not _keeps_channels(source, affine, shapes):
+            continue
+        if all(_may_scale_inputs(graph, reader, result, affine) for reader in behind):
             for reader in behind:
-                _scale_inputs(graph, reader, found[1])
-                reader.input[0] = found[0]
-            others = [reader for reader in readers[found[0]] if reader is not node]
-            readers[found[0]] = others + behind
-            folded.add(id(node))
-    graph.nodes = [node for node in graph.nodes if id(node) not in folded]
+                _scale_inputs(graph, reader, affine)
+                reader.input[0] = source
+            # The map's readers change with each fold, and the loop goes on with what writes it.
+            others = [reader for reader in readers[source] if reader is not node]
+            readers[source] = others + behind
+            folded_ids.add(id(node))
+    graph.nodes = [node for node in graph.nodes if id(node) not in folded_ids]
 
 
 def _keeps_channels(source: str, affine: Affine, shapes: Shapes) -> bool:
@@ -259,9 +271,9 @@ def _may_scale_inputs(graph: Nodes, node: NodeProto, name: str, affine: Affine) 
     """Zeros that a convolution pads with are not shifted: a shift passes one
     without padding alone.
     """
-    given = attributes_of(node)
-    unpadded = node.op_type == "Conv" and given.get("auto_pad", "NOTSET") in ("NOTSET", "VALID")
-    unpadded = unpadded and not any(given.get("pads", []))
+    attributes = attributes_of(node)
+    states_pads = attributes.get("auto_pad", "NOTSET") in ("NOTSET", "VALID")
+    unpadded = node.op_type == "Conv" and states_pads and not any(attributes.get("pads", []))
     return (
         graph.is_linear(node)
         and list(node.input).count(name) == 1
@@ -273,6 +285,7 @@ def _scale_inputs(graph: Nodes, node: NodeProto, affine: Affine) -> None:
     weight, bias = _numbers(graph, node)
     groups = attributes_of(node).get("group", 1)
     if node.op_type == "ConvTranspose":
+        # Its weights begin with the inputs, and `_may_scale_inputs` lets no shift reach it.
         _set_numbers(graph, node, weight * affine.scale.reshape(-1, 1, 1, 1), bias)
         return
     split = weight.reshape(groups, -1, *weight.shape[1:])  # (G, O / G, I / G, kh, kw)
@@ -280,22 +293,23 @@ def _scale_inputs(graph: Nodes, node: NodeProto, affine: Affine) -> None:
         np.broadcast_to(v, groups * weight.shape[1]).reshape(groups, 1, -1, 1, 1)
         for v in (affine.scale, affine.shift)
     )
-    moved = (split * shift).sum(axis=(2, 3, 4)).reshape(-1)
-    _set_numbers(graph, node, (split * scale).reshape(weight.shape), bias + moved)
+    offset = (split * shift).sum(axis=(2, 3, 4)).reshape(-1)
+    _set_numbers(graph, node, (split * scale).reshape(weight.shape), bias + offset)
 
 
 def _depthwise(shapes: Shapes, graph: Nodes, node: NodeProto) -> list[NodeProto] | None:
     """A normalisation of images that no convolution took in: a depthwise one of a single pixel."""
-    taken = _behind(graph, node)  # into one in front that has just become a convolution
-    found = _affine(graph, node) if node.op_type == NORMALISATION else None
-    if taken is not None or found is None or len(shapes.get(node.input[0], ())) != 4:
-        return taken
-    source, affine = found
+    # The normalisation in front may just have become a convolution, which takes this one in.
+    replacement = _behind(graph, node)
+    match = _affine(graph, node) if node.op_type == NORMALISATION else None
+    if replacement is not None or match is None or len(shapes.get(node.input[0], ())) != 4:
+        return replacement
+    source, affine = match
     name = node.name or node.output[0]
-    made = helper.make_node("Conv", [source], node.output, name=name, kernel_shape=[1, 1])
-    made.attribute.append(helper.make_attribute("group", affine.channels))
-    _set_numbers(graph, made, affine.scale.reshape(-1, 1, 1, 1), affine.shift)
-    return [made]
+    conv = helper.make_node("Conv", [source], node.output, name=name, kernel_shape=[1, 1])
+    conv.attribute.append(helper.make_attribute("group", affine.channels))
+    _set_numbers(graph, conv, affine.scale.reshape(-1, 1, 1, 1), affine.shift)
+    return [conv]
 
 
 POINTWISE = {"Clip", "Elu", "HardSigmoid", "HardSwish", "LeakyRelu", "Relu", "Sigmoid", "Tanh"}
@@ -321,10 +335,10 @@ class Unflatten:
             source = node.input[0]
             channels, height, width = self._shapes[source][1:]
             self._maps[node.output[0]] = source, (channels, height, width)
-        found = self._maps.get(node.input[0]) if node.input else None
-        if found is None or len(node.output) != 1:
+        flat_map = self._maps.get(node.input[0]) if node.input else None
+        if flat_map is None or len(node.output) != 1:
             return None
-        source, size = found
+        source, size = flat_map
         if node.op_type == "Gemm":
             return self._connected(graph, node, source, size)
         if (
@@ -339,14 +353,13 @@ class Unflatten:
             image = deepcopy(node)
             image.input[0] = source
             return self._flat(image, size)
-        unseen = (
+        is_private = (
             graph.reads[node.input[0]] == 1 and graph.reads[source] <= 1 and source in graph.writers
         )
         maps = [1, *size], [0, *size], [-1, *size]
-        if unseen and node.op_type == "Reshape" and graph.integers(node.input[1]) in maps:
-            graph.rename(
-                source, node.output[0]
-            )  # nothing stands in the place of what makes a map of it again
+        if is_private and node.op_type == "Reshape" and graph.integers(node.input[1]) in maps:
+            # The Reshape makes the map again that was flattened, so both nodes go.
+            graph.rename(source, node.output[0])
             return []
         return None
 
@@ -357,39 +370,40 @@ class Unflatten:
             return False
         if node.op_type == "Flatten":
             return attributes_of(node).get("axis", 1) in (1, -3)
-        asked = graph.integers(node.input[1]) if len(node.input) == 2 else None
-        if node.op_type == "Squeeze" and asked:
-            return {axis % 4 for axis in asked} == {2, 3}
+        operand = graph.integers(node.input[1]) if len(node.input) == 2 else None
+        if node.op_type == "Squeeze" and operand:
+            return {axis % 4 for axis in operand} == {2, 3}
         if (
             node.op_type != "Reshape"
-            or asked is None
-            or len(asked) != 2
+            or operand is None
+            or len(operand) != 2
             or attributes_of(node).get("allowzero", 0)
         ):
             return False
-        return asked[1] == prod(sizes[1:]) or (asked[1] == -1 and asked[0] in (0, sizes[0]))
+        # In ONNX's Reshape a 0 copies the source's size and -1 stands for whatever is left.
+        return operand[1] == prod(sizes[1:]) or (operand[1] == -1 and operand[0] in (0, sizes[0]))
 
     def _connected(
         self, graph: Nodes, node: NodeProto, source: str, size: Map
     ) -> list[NodeProto] | None:
-        given = attributes_of(node)
+        attributes = attributes_of(node)
         weight = graph.array(node.input[1])
         bias = graph.array(node.input[2]) if len(node.input) > 2 and node.input[2] else np.zeros(1)
-        if weight is None or bias is None or weight.ndim != 2 or given.get("transA", 0):
+        if weight is None or bias is None or weight.ndim != 2 or attributes.get("transA", 0):
             return None
-        weight = (weight if given.get("transB", 0) else weight.T) * np.float32(
-            given.get("alpha", 1.0)
+        weight = (weight if attributes.get("transB", 0) else weight.T) * np.float32(
+            attributes.get("alpha", 1.0)
         )
         if weight.shape[1] != prod(size) or bias.size not in (1, len(weight)):
             return None
-        offset = np.broadcast_to(bias.reshape(-1) * given.get("beta", 1.0), len(weight))
+        offset = np.broadcast_to(bias.reshape(-1) * attributes.get("beta", 1.0), len(weight))
         name = node.name or node.output[0]
         values = {"weight": weight.reshape(-1, *size), "bias": offset}
         numbers = [graph.keep(f"{name}.{role}", value) for role, value in values.items()]
-        made = helper.make_node(
+        conv = helper.make_node(
             "Conv", [source, *numbers], node.output, name=name, kernel_shape=list(size[1:])
         )
-        return self._flat(made, (len(weight), 1, 1))
+        return self._flat(conv, (len(weight), 1, 1))
 
     def _flat(self, image: NodeProto, size: Map) -> list[NodeProto]:
         """A node that gives a map, and the map flat under the name of its result."""

@@ -24,11 +24,11 @@ from beers_deploy.quant.untrusted import FILE_BYTES, VALUE_BYTES, check_size, re
 
 def take_in(model: onnx.ModelProto, path: Path) -> None:
     """Put the weights that a model of this file keeps beside it into the model."""
-    taken = 0
+    used_bytes = 0
     for tensor in model.graph.initializer:
         if tensor.data_location == TensorProto.EXTERNAL:
-            content = _content(tensor, path, FILE_BYTES - taken)
-            taken += len(content)
+            content = _content(tensor, path, FILE_BYTES - used_bytes)
+            used_bytes += len(content)
             tensor.ClearField("external_data")
             tensor.ClearField("data_location")
             tensor.raw_data = content
@@ -36,19 +36,23 @@ def take_in(model: onnx.ModelProto, path: Path) -> None:
 
 def network_sha256(path: Path) -> str:
     """SHA-256 of a network's file, and of the files beside it that its weights are in."""
-    own = sha256(path)
+    digest = sha256(path)
     if path.suffix != ".onnx":
-        return own
+        return digest
     model = onnx.ModelProto()
     try:
         model.ParseFromString(read_whole(path, FILE_BYTES))
-    except (DecodeError, OSError, ValueError):  # no network: whoever reads it says so
-        return own
+    except (DecodeError, OSError, ValueError):
+        # It is no network, which the reader of the file reports.
+        return digest
     apart = [tensor for tensor in model.graph.initializer if tensor.external_data]
-    beside = sorted({_beside(tensor, _said(tensor).get("location", ""), path) for tensor in apart})
-    return (
-        hashlib.sha256("".join([own, *map(sha256, beside)]).encode()).hexdigest() if beside else own
+    beside = sorted(
+        {_beside(tensor, _entries(tensor).get("location", ""), path) for tensor in apart}
     )
+    if not beside:
+        return digest
+    digests = "".join([digest, *map(sha256, beside)])
+    return hashlib.sha256(digests.encode()).hexdigest()
 
 
 @contextmanager
@@ -69,13 +73,13 @@ def unchanged(path: Path) -> Iterator[str]:
         )
 
 
-def _said(tensor: TensorProto) -> dict[str, str]:
+def _entries(tensor: TensorProto) -> dict[str, str]:
     return {entry.key: entry.value for entry in tensor.external_data}
 
 
 def _content(tensor: TensorProto, path: Path, limit_bytes: int) -> bytes:
     """The bytes of one tensor, as many as its sizes ask for."""
-    said = _said(tensor)
+    entries = _entries(tensor)
     where = str(path)
     check_size(tensor.name, tensor.dims, where)
     if tensor.data_type not in VALUE_BYTES or min(tensor.dims, default=0) < 0:
@@ -84,9 +88,10 @@ def _content(tensor: TensorProto, path: Path, limit_bytes: int) -> bytes:
     if size > limit_bytes:
         raise _refused(tensor, where, f"more than {FILE_BYTES} bytes in all")
     start, length = (
-        _whole(said.get(key, default)) for key, default in (("offset", "0"), ("length", str(size)))
+        _byte_count(entries.get(key, default))
+        for key, default in (("offset", "0"), ("length", str(size)))
     )
-    beside = _beside(tensor, said.get("location", ""), path)
+    beside = _beside(tensor, entries.get("location", ""), path)
     if start is None or length != size or start + size > beside.stat().st_size:
         raise _refused(tensor, where, f"not the {size} bytes of its weights in {beside.name!r}")
     with beside.open("rb") as stream:
@@ -94,7 +99,7 @@ def _content(tensor: TensorProto, path: Path, limit_bytes: int) -> bytes:
         return stream.read(size)
 
 
-def _whole(text: str) -> int | None:
+def _byte_count(text: str) -> int | None:
     """A number of bytes."""
     return int(text) if text.isascii() and text.isdigit() and len(text) < 19 else None
 
@@ -103,6 +108,7 @@ def _beside(tensor: TensorProto, location: str, path: Path) -> Path:
     """The regular file in the model's folder, or one within it, that is meant;
     no link leads there.
     """
+    # Files that were written on Windows have backslashes between folders.
     parts = PurePosixPath(location.replace("\\", "/")).parts
     where = str(path)
     if (
@@ -113,6 +119,7 @@ def _beside(tensor: TensorProto, location: str, path: Path) -> Path:
         or "\0" in location
     ):
         raise _refused(tensor, where, f"one in {location!r}, outside the model's folder")
+    # A link in any folder on the way could lead out of the model's own folder.
     places = [path.parent.joinpath(*parts[: number + 1]) for number in range(len(parts))]
     if any(place.is_symlink() for place in places):
         raise _refused(tensor, where, f"a link, {location!r}")

@@ -27,6 +27,7 @@ the opset. Only what `quant.untrusted` has let through may come here: a runtime 
 """
 
 from copy import deepcopy
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -77,33 +78,37 @@ def simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 
 
 def _simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
-    folded = deepcopy(model)
-    _widen(folded)
-    held = {tensor.name for tensor in folded.graph.initializer}
-    inputs = [value for value in folded.graph.input if value.name not in held]
-    _replace(folded.graph.input, inputs)  # one that is an input could be another when it runs
-    folded.ir_version = IR_VERSION
-    ends = list(inputs), list(folded.graph.output)
-    if opset_of(model) < OPSET:  # an operator's own sizes become constants, which are then folded
-        folded = _of_our_opset(folded)
-    folded = _of_our_opset(_folded(folded, where))
-    rewrite(folded)
-    _replace(folded.graph.input, ends[0])
-    _replace(folded.graph.output, ends[1])
-    _tidy(folded, model)
-    return folded
+    network = deepcopy(model)
+    _widen(network)
+    weights = {tensor.name for tensor in network.graph.initializer}
+    inputs = [value for value in network.graph.input if value.name not in weights]
+    outputs = list(network.graph.output)
+    # An initializer that is an input too could be replaced when the network runs, so that the
+    # runtime would fold nothing that reads it.
+    _replace(network.graph.input, inputs)
+    network.ir_version = IR_VERSION
+    # Sizes that an older operator holds itself become constants first, which are then folded.
+    if opset_of(model) < OPSET:
+        network = _of_our_opset(network)
+    network = _of_our_opset(_folded(network, where))
+    rewrite(network)
+    # Inputs and outputs stay as the file states them.
+    _replace(network.graph.input, inputs)
+    _replace(network.graph.output, outputs)
+    _tidy(network, model)
+    return network
 
 
 def _is_plain(model: onnx.ModelProto) -> bool:
-    held = {tensor.name for tensor in model.graph.initializer}
+    weights = {tensor.name for tensor in model.graph.initializer}
     return (
         opset_of(model) == OPSET
         and not any(tensor.data_type in HALVES for tensor in model.graph.initializer)
-        and not any(value.name in held for value in model.graph.input)
+        and not any(value.name in weights for value in model.graph.input)
         and all(
             node.op_type in PLAIN
             and node.name
-            and (held.isdisjoint(node.input) or "Conv" in node.op_type)
+            and (weights.isdisjoint(node.input) or "Conv" in node.op_type)
             for node in model.graph.node
         )
     )
@@ -117,15 +122,11 @@ def _widen(model: onnx.ModelProto) -> None:
             value.type.tensor_type.elem_type = TensorProto.FLOAT
     for tensor in held_tensors(graph):
         if tensor.data_type in HALVES:
-            tensor.CopyFrom(
-                numpy_helper.from_array(
-                    numpy_helper.to_array(tensor).astype(np.float32), tensor.name
-                )
-            )
-    for attribute in (
-        a for node in graph.node for a in node.attribute if a.name in ("to", "dtype")
-    ):
-        attribute.i = TensorProto.FLOAT if attribute.i in HALVES else attribute.i
+            values = numpy_helper.to_array(tensor).astype(np.float32)
+            tensor.CopyFrom(numpy_helper.from_array(values, tensor.name))
+    for attribute in chain.from_iterable(node.attribute for node in graph.node):
+        if attribute.name in ("to", "dtype"):
+            attribute.i = TensorProto.FLOAT if attribute.i in HALVES else attribute.i
 
 
 def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
@@ -133,8 +134,9 @@ def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     options = ort.SessionOptions()
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC
     options.intra_op_num_threads = 1
-    options.log_severity_level = 4  # what fails is raised, and said once
-    folded = onnx.ModelProto()
+    # What fails is raised, so that a message of the runtime would say it twice.
+    options.log_severity_level = 4
+    network = onnx.ModelProto()
     with TemporaryDirectory() as folder:
         path = Path(folder) / "folded.onnx"
         options.optimized_model_filepath = str(path)
@@ -145,12 +147,13 @@ def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
                 ["CPUExecutionProvider"],
                 disabled_optimizers=ALTERING,
             )
-        except Exception as error:  # onnxruntime raises a class of its own for each status code
+        # onnxruntime raises a class of its own for each status code.
+        except Exception as error:
             got = " ".join(str(error).split())[:160]
             remedy = "check the file with onnx.checker, and export it again"
             raise refused(where, "a model that onnxruntime runs", got, remedy) from error
-        folded.ParseFromString(path.read_bytes())
-    return folded
+        network.ParseFromString(path.read_bytes())
+    return network
 
 
 def _of_our_opset(model: onnx.ModelProto) -> onnx.ModelProto:
@@ -180,37 +183,33 @@ def _place_corners(model: onnx.ModelProto) -> None:
     for node in model.graph.node:
         if node.op_type == "Resize":
             modes = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
-            kept = [a for a in node.attribute if a.name not in modes]
-            _replace(
-                node.attribute,
-                [*kept, *(onnx.helper.make_attribute(*mode) for mode in modes.items())],
-            )
+            attributes = [a for a in node.attribute if a.name not in modes]
+            attributes += [onnx.helper.make_attribute(*mode) for mode in modes.items()]
+            _replace(node.attribute, attributes)
 
 
-def _tidy(folded: onnx.ModelProto, model: onnx.ModelProto) -> None:
+def _tidy(network: onnx.ModelProto, model: onnx.ModelProto) -> None:
     """What is said beside the graph is the file's own; constants that nothing reads are dropped."""
-    folded.ir_version = IR_VERSION
-    folded.producer_name = model.producer_name
-    folded.producer_version = model.producer_version
-    _replace(folded.metadata_props, model.metadata_props)
-    graph = folded.graph
+    network.ir_version = IR_VERSION
+    network.producer_name = model.producer_name
+    network.producer_version = model.producer_version
+    _replace(network.metadata_props, model.metadata_props)
+    graph = network.graph
     graph.name = model.graph.name
     graph.ClearField("value_info")
-    read = {name for node in graph.node for name in node.input} | {
-        value.name for value in graph.output
-    }
-    kept = sorted(
-        (t for t in graph.initializer if t.name in read), key=lambda tensor: str(tensor.name)
-    )
-    _replace(graph.initializer, kept)
-    taken = dict.fromkeys((node.name for node in graph.node), 0)
+    reads = set(chain.from_iterable(node.input for node in graph.node))
+    reads.update(value.name for value in graph.output)
+    constants = [tensor for tensor in graph.initializer if tensor.name in reads]
+    # In the order of their names, so that the same file gives the same bytes.
+    _replace(graph.initializer, sorted(constants, key=lambda tensor: str(tensor.name)))
+    name_counts = dict.fromkeys((node.name for node in graph.node), 0)
     for node in graph.node:
         if not node.name:
-            node.name = fresh(node.output[0] or node.op_type, taken)
+            node.name = fresh(node.output[0] or node.op_type, name_counts)
 
 
 def _replace(field: object, values: object) -> None:
     """Put other messages in the place of a repeated field's own."""
-    kept = list(values)  # type: ignore[call-overload]
+    messages = list(values)  # type: ignore[call-overload]
     del field[:]  # type: ignore[attr-defined]
-    field.extend(kept)  # type: ignore[attr-defined]
+    field.extend(messages)  # type: ignore[attr-defined]

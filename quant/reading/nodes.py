@@ -4,6 +4,7 @@ hold.
 
 from collections import Counter, defaultdict
 from collections.abc import Callable
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -23,11 +24,11 @@ def shapes_of(model: onnx.ModelProto) -> Shapes:
         values = shape_inference.infer_shapes(model).graph
     except shape_inference.InferenceError:
         return {}
-    known = {
+    types = {
         v.name: v.type.tensor_type for v in (*values.input, *values.value_info, *values.output)
     }
     floats = {
-        n: t for n, t in known.items() if t.elem_type == TensorProto.FLOAT and t.HasField("shape")
+        n: t for n, t in types.items() if t.elem_type == TensorProto.FLOAT and t.HasField("shape")
     }
     return {name: tuple(d.dim_value for d in t.shape.dim) for name, t in floats.items()}
 
@@ -40,72 +41,80 @@ class Nodes:
         self.nodes = list(graph.node)
         self.constants = {tensor.name: tensor for tensor in graph.initializer}
         self.ends = [value.name for value in graph.output]
-        names = (name for node in graph.node for name in (*node.input, *node.output))
-        self._taken = dict.fromkeys((*names, *self.constants), 0)
+        names = list(self.constants)
+        for node in graph.node:
+            names += [*node.input, *node.output]
+        self._name_counts = dict.fromkeys(names, 0)
         self._find()
 
     def _find(self) -> None:
-        self.reads = Counter([name for node in self.nodes for name in node.input] + self.ends)
-        self.writers = {name: node for node in self.nodes for name in node.output if name}
+        self.reads = Counter(chain.from_iterable(node.input for node in self.nodes))
+        self.reads.update(self.ends)
+        self.writers: dict[str, NodeProto] = {}
+        for node in self.nodes:
+            # A result that is left out has an empty name, which nobody may read.
+            self.writers.update((name, node) for name in node.output if name)
 
     def pass_over(self, step: "Step") -> None:
         """Each node replaced by what `step(graph, node)` gives for it, in order; None leaves it as
         it is.
         """
-        kept: list[NodeProto] = []
+        nodes: list[NodeProto] = []
         for node in self.nodes:
-            found = step(self, node)
-            new = [node] if found is None else found
-            self.writers |= {name: n for n in new for name in n.output if name}
-            kept.extend(new)
-        self.nodes = kept
+            replacement = step(self, node)
+            new_nodes = [node] if replacement is None else replacement
+            # At once, because the step looks up the writers of what later nodes read.
+            for new in new_nodes:
+                self.writers.update((name, new) for name in new.output if name)
+            nodes.extend(new_nodes)
+        self.nodes = nodes
         self._find()
 
     def write(self) -> None:
         """Put the nodes that lead to an output, and the constants, into the graph."""
         needed = set(self.ends)
-        kept = list[NodeProto]()
+        nodes = list[NodeProto]()
+        # Backwards, because a node is needed only where something behind it reads its result.
         for node in reversed(self.nodes):
             if needed.intersection(node.output):
                 needed.update(node.input)
-                kept.append(NodeProto.FromString(node.SerializeToString()))
-        self.nodes = kept[::-1]
+                nodes.append(NodeProto.FromString(node.SerializeToString()))
+        self.nodes = nodes[::-1]
         del self._graph.node[:]
         self._graph.node.extend(self.nodes)
-        held = {tensor.name for tensor in self._graph.initializer}
-        self._graph.initializer.extend(t for name, t in self.constants.items() if name not in held)
+        names = {tensor.name for tensor in self._graph.initializer}
+        self._graph.initializer.extend(t for name, t in self.constants.items() if name not in names)
         self._find()
 
     def value(self, name: str) -> np.ndarray | None:
         """As `array`, in float64."""
-        found = self.array(name)
-        return None if found is None else found.astype(np.float64)
+        value = self.array(name)
+        return None if value is None else value.astype(np.float64)
 
     def array(self, name: str) -> np.ndarray | None:
         """A constant of float32 as it is, None where it is none."""
-        found = self.constants.get(name)
-        return (
-            None
-            if found is None or found.data_type != TensorProto.FLOAT
-            else numpy_helper.to_array(found)
-        )
+        tensor = self.constants.get(name)
+        if tensor is None or tensor.data_type != TensorProto.FLOAT:
+            return None
+        return numpy_helper.to_array(tensor)
 
     def integers(self, name: str) -> list[int] | None:
         """A constant list of whole numbers, None where it is none."""
-        found = self.constants.get(name)
-        return (
-            None if found is None else [int(size) for size in numpy_helper.to_array(found).ravel()]
-        )
+        tensor = self.constants.get(name)
+        if tensor is None:
+            return None
+        return [int(size) for size in numpy_helper.to_array(tensor).ravel()]
 
     def keep(self, name: str, value: np.ndarray) -> str:
         """Note a constant as float32 under a name that is free, and return it."""
-        name = fresh(name, self._taken)
+        name = fresh(name, self._name_counts)
         self.constants[name] = numpy_helper.from_array(value.astype(np.float32), name)
         return name
 
     def rename(self, result: str, name: str) -> None:
         """Let a result have the name of the one that it takes the place of."""
-        writer = self.writers[name] = self.writers[result]
+        writer = self.writers[result]
+        self.writers[name] = writer
         writer.output[list(writer.output).index(result)] = name
 
     def sole_writer(self, name: str) -> NodeProto | None:
@@ -114,11 +123,11 @@ class Nodes:
 
     def readers(self) -> dict[str, list[NodeProto]]:
         """Return the nodes that read each tensor, in order, each of them once."""
-        found: dict[str, list[NodeProto]] = defaultdict(list)
+        readers: dict[str, list[NodeProto]] = defaultdict(list)
         for node in self.nodes:
             for name in dict.fromkeys(node.input):
-                found[name].append(node)
-        return found
+                readers[name].append(node)
+        return readers
 
     def is_linear(self, node: NodeProto | None) -> bool:
         """Whether it is a convolution of images, transposed or not, of weights and bias that the
@@ -133,9 +142,10 @@ class Nodes:
     def width(self, node: NodeProto) -> int:
         """The channels that a convolution writes."""
         dims = self.constants[node.input[1]].dims
-        return int(
-            dims[0] if node.op_type == "Conv" else dims[1] * attributes_of(node).get("group", 1)
-        )
+        if node.op_type == "Conv":
+            return int(dims[0])
+        # A transposed convolution has weights (I, O / groups, kh, kw).
+        return int(dims[1] * attributes_of(node).get("group", 1))
 
 
 def fresh(name: str, taken: dict[str, int]) -> str:
@@ -146,12 +156,12 @@ def fresh(name: str, taken: dict[str, int]) -> str:
         taken: of each name how many others were derived from it, so that a thousand nodes of one
             name do not try each other's.
     """
-    found = name
-    while found in taken:
+    candidate = name
+    while candidate in taken:
         taken[name] += 1
-        found = f"{name}_{taken[name] if taken[name] > 1 else ''}"
-    taken[found] = 0
-    return found
+        candidate = f"{name}_{taken[name] if taken[name] > 1 else ''}"
+    taken[candidate] = 0
+    return candidate
 
 
 Step = Callable[[Nodes, NodeProto], list[NodeProto] | None]

@@ -49,12 +49,12 @@ def require_inference(model: onnx.ModelProto, where: str) -> None:
 
 def _constants(graph: onnx.GraphProto) -> dict[str, TensorProto]:
     """Return the constants that a file holds, by name."""
-    found = {tensor.name: tensor for tensor in graph.initializer}
+    constants = {tensor.name: tensor for tensor in graph.initializer}
     for node in graph.node:
         for attribute in node.attribute:
             if node.op_type == "Constant" and attribute.name == "value":
-                found[node.output[0]] = attribute.t
-    return found
+                constants[node.output[0]] = attribute.t
+    return constants
 
 
 def _drops(node: NodeProto, opset: int, constants: dict[str, TensorProto]) -> bool:
@@ -65,6 +65,7 @@ def _drops(node: NodeProto, opset: int, constants: dict[str, TensorProto]) -> bo
         return not attributes_of(node).get("is_test", 0)
     if len(node.input) <= DROPOUT_MODE_INPUT or not node.input[DROPOUT_MODE_INPUT]:
         return False
+    # A mode that is computed could be anything when the network runs.
     mode = constants.get(node.input[DROPOUT_MODE_INPUT])
     return mode is None or bool(np.any(numpy_helper.to_array(mode)))
 
@@ -75,10 +76,11 @@ def _adapts(node: NodeProto, opset: int, _: dict[str, TensorProto]) -> bool:
 
     From opset 14 on an attribute states it as well.
     """
-    given = attributes_of(node)
+    attributes = attributes_of(node)
     if opset <= IS_TEST_UNTIL:
-        return not given.get("is_test", 0)
-    return bool(given.get("training_mode", 0)) or any(node.output[1:])
+        return not attributes.get("is_test", 0)
+    # Further results are the running mean and variance, which only training computes.
+    return bool(attributes.get("training_mode", 0)) or any(node.output[1:])
 
 
 TRAINED = {"Dropout": _drops, "BatchNormalization": _adapts}

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from itertools import product
 from typing import Any
 
 from beers_deploy.profiles.errors import ModelError
@@ -47,9 +48,8 @@ class Step:
         """
         low = math.ceil(first / self.growth + self.low)
         high = math.floor(last / self.growth + self.high)
-        if (
-            self.mirrored
-        ):  # beyond an end of the source stands what is mirrored, or copied, from within
+        # Beyond an end of the source stands what is mirrored, or copied, from within.
+        if self.mirrored:
             return min(low, 2 * (size - 1) - high), max(high, -low)
         return min(low, size - 1), max(high, 0)
 
@@ -86,15 +86,15 @@ class Along:
 
     def numbers(self, place: int, key: str, otherwise: Sequence[float] = ()) -> list[Any]:
         """What the node states in an input or, of older opsets, in an attribute."""
-        found = self.graph.numbers(self.node, place, key, otherwise)
-        self.require(found is not None, "whose sizes are computed: fold them")
-        return found or []
+        values = self.graph.numbers(self.node, place, key, otherwise)
+        self.require(values is not None, "whose sizes are computed: fold them")
+        return values or []
 
     def own(self, numbers: Sequence[Any], axes: Sequence[int], otherwise: Any) -> Any:
         """This side's number, of some for these axes of (N, C, H, W)."""
-        return dict(zip((int(axis) % 4 for axis in axes), numbers, strict=True)).get(
-            2 + self.axis, otherwise
-        )
+        # A negative axis counts from the last one.
+        by_axis = dict(zip((int(axis) % 4 for axis in axes), numbers, strict=True))
+        return by_axis.get(2 + self.axis, otherwise)
 
     def slid(self, window: Window, ceil: bool = False) -> Step:
         """A window that slides over its padded source."""
@@ -109,6 +109,7 @@ class Along:
         """
         stride = window.stride[self.axis]
         before = window.pads[self.axis]
+        # Pixel k of the source writes `extent` pixels of the result, from k * stride - before on.
         low = Fraction(before - window.extent(self.axis) + 1, stride)
         high = Fraction(before, stride)
         return Step(Fraction(stride), window.put_down(self.axis, self.extra), low, high)
@@ -130,8 +131,8 @@ def _slide(at: Along) -> Step:
 
 
 def _transpose(at: Along) -> Step:
-    stated = at.given("auto_pad", "NOTSET") == "NOTSET" and at.given("output_shape", None) is None
-    at.require(stated, "of a fixed or automatic size")
+    has_pads = at.given("auto_pad", "NOTSET") == "NOTSET" and at.given("output_shape", None) is None
+    at.require(has_pads, "of a fixed or automatic size")
     return at.put_down(_window(at))
 
 
@@ -153,6 +154,7 @@ def _pad(at: Along) -> Step:
     axes = at.numbers(3, "axes", range(4))
     at.require(len(pads) == 2 * len(axes), "of an unknown padding")
     ends = [at.own(part, axes, 0) for part in (pads[: len(axes)], pads[len(axes) :])]
+    # A pad is a window of one pixel that slides over the padded source.
     step = at.slid(Window(pads=(ends[0], ends[0], ends[1], ends[1])))
     return replace(step, mirrored=max(ends) if mode == "reflect" else 0)
 
@@ -167,9 +169,10 @@ def _slice(at: Along) -> Step:
     ends = at.numbers(2, "ends")
     axes = at.numbers(3, "axes", range(len(starts)))
     steps = at.numbers(4, "steps", [1] * len(starts))
-    start, end, step = (
-        at.own(*each) for each in ((starts, axes, 0), (ends, axes, FAR), (steps, axes, 1))
-    )
+    start = at.own(starts, axes, 0)
+    end = at.own(ends, axes, FAR)
+    step = at.own(steps, axes, 1)
+    # A start from the end or an end from the start lies elsewhere for each size of the image.
     at.require(
         start >= 0 and step > 0 and (end < 0 or end >= FAR), "which cuts at a place that is fixed"
     )
@@ -181,29 +184,37 @@ def _resize(at: Along) -> Step:
     """Enlarging by whole factors, or taking every 2nd, 4th, ... pixel; linear where all weights are
     exact floats.
     """
-    found = Resizing.of(at.node, at.graph)
-    at.require(bool(found.factors), "to a size that is fixed")
-    growth = Fraction(found.factors[2 + at.axis])
-    whole = (
+    resizing = Resizing.of(at.node, at.graph)
+    at.require(bool(resizing.factors), "to a size that is fixed")
+    growth = Fraction(resizing.factors[2 + at.axis])
+    by_whole_factor = (
         0 < growth <= WINDOW_PX
         and 1 in (growth.numerator, growth.denominator)
-        and found.factors[:2] == (1, 1)
+        and resizing.factors[:2] == (1, 1)
     )
-    at.require(whole, f"by {times(found.factors)}")
-    at.require(found.where in PLACES, f"of coordinates {found.where}, which depend on the size")
+    at.require(by_whole_factor, f"by {times(resizing.factors)}")
     at.require(
-        growth > 1 or found.where != "pytorch_half_pixel", "of coordinates that depend on the size"
+        resizing.where in PLACES, f"of coordinates {resizing.where}, which depend on the size"
     )
-    linear = found.mode == "linear"
+    # Its formula differs where the result has a single pixel.
     at.require(
-        not at.given("antialias", 0) and (linear or found.mode == "nearest"),
-        f"of mode {found.mode}",
+        growth > 1 or resizing.where != "pytorch_half_pixel",
+        "of coordinates that depend on the size",
     )
+    linear = resizing.mode == "linear"
+    at.require(
+        not at.given("antialias", 0) and (linear or resizing.mode == "nearest"),
+        f"of mode {resizing.mode}",
+    )
+    # Weights that are multiples of a power of two are exact floats, so that the same sum is rounded
+    # alike at every place.
     exact = not linear or growth.numerator & (growth.numerator - 1) == 0
     at.require(exact, f"by {growth}, of weights that depend on the place by rounding")
-    ways = (math.floor, math.ceil) if linear else (ROUNDINGS[found.rounding],)
-    places = [(k / growth, PLACES[found.where](k, float(growth))) for k in range(growth.numerator)]
-    offsets = [way(place) - own for way in ways for own, place in places]
+    ways = (math.floor, math.ceil) if linear else (ROUNDINGS[resizing.rounding],)
+    # The offsets repeat after as many pixels as one pixel of the source becomes.
+    pixels = range(growth.numerator)
+    places = [(k / growth, PLACES[resizing.where](k, float(growth))) for k in pixels]
+    offsets = [way(place) - share for way, (share, place) in product(ways, places)]
     return Step(growth, math.floor(at.extra * growth), min(offsets), max(offsets))
 
 

@@ -79,7 +79,8 @@ def tiling_of(model: onnx.ModelProto, where: str = "tiled model") -> Tiling:
     with faults_named(where), contradictions(where):
         graph = with_shuffles(model)
         rows, columns = (_Walk(graph, axis) for axis in (0, 1))
-        (channels_in, channels_out), fixed_px = _channels(graph, model), fixed_tile_px(model)
+        channels_in, channels_out = _channels(graph, model)
+        fixed_px = fixed_tile_px(model)
         lattice_px = math.lcm(rows.lattice_px, columns.lattice_px)
         radius_px = max(rows.radius_px, columns.radius_px)
         if rows.scale != columns.scale:
@@ -91,6 +92,7 @@ def tiling_of(model: onnx.ModelProto, where: str = "tiled model") -> Tiling:
                 f"tiles of a multiple of {lattice_px} pixels a side",
                 f"a network fixed to {fixed_px}",
             )
+        # A tile begins and ends on the lattice, so its context does too.
         halo_px = -(-radius_px // lattice_px) * lattice_px
         least_px = max(rows.least_px, columns.least_px)
         return Tiling(
@@ -108,11 +110,13 @@ def _channels(graph: OnnxGraph, model: onnx.ModelProto) -> tuple[int, int]:
         raise refused("any number of images, or one at a time", f"batches of {sizes[0]}")
     if len(sizes) != 4 or not sizes[1]:
         raise refused("an image (N, C, H, W) of a stated number of channels", "none stated")
-    given = _channel_count(model.graph.output[0])
-    given = given or _channel_count(onnx.shape_inference.infer_shapes(model).graph.output[0])
-    # Where neither file nor inference tells, as with a runtime's own operators, what comes out is
-    # judged as it comes.
-    return sizes[1], given or sizes[1]
+    channels_out = _channel_count(model.graph.output[0])
+    if not channels_out:
+        info = onnx.shape_inference.infer_shapes(model).graph
+        channels_out = _channel_count(info.output[0])
+    # Where neither file nor inference states it, as with a runtime's own operators, the output is
+    # judged when it is computed.
+    return sizes[1], channels_out or sizes[1]
 
 
 def _channel_count(value: onnx.ValueInfoProto) -> int:
@@ -178,41 +182,51 @@ class _Walk:
         self.radius_px = self._radius_px(output)
 
     def _visit(self, node: Node) -> None:
-        read = [self._grids[name] for name in node.inputs if name in self._grids]
-        at = Along(node, self._axis, read[0].extra if read else 0, self._graph, self._shapes)
-        if read:
-            step = self._step(at, read)
+        grids = [self._grids[name] for name in node.inputs if name in self._grids]
+        at = Along(node, self._axis, grids[0].extra if grids else 0, self._graph, self._shapes)
+        if grids:
+            step = self._step(at, grids)
             at.require(step.growth > 0, "of no stride")
             self._steps.append((node, step))
             self._grids.update(
-                dict.fromkeys(node.outputs, _Grid(read[0].per_px * step.growth, step.extra))
+                dict.fromkeys(node.outputs, _Grid(grids[0].per_px * step.growth, step.extra))
             )
             if step.mirrored:
-                self.least_px = max(self.least_px, math.ceil((1 + step.mirrored) / read[0].per_px))
-        else:  # such as weights dequantised in a board file
+                self.least_px = max(self.least_px, math.ceil((1 + step.mirrored) / grids[0].per_px))
+        else:
+            # A board's file dequantises its weights by such nodes.
             at.require(node.op_type in KEEPING, "of constants alone: fold them")
             self._shapes[node.outputs[0]] = self._shapes[node.inputs[0]]
 
-    def _step(self, at: Along, read: list[_Grid]) -> Step:
+    def _step(self, at: Along, grids: list[_Grid]) -> Step:
         if at.node.op_type in STEPS:
-            at.require(at.node.inputs[0] in self._grids and len(read) == 1, "steered by the image")
+            at.require(at.node.inputs[0] in self._grids and len(grids) == 1, "steered by the image")
             at.require(len([name for name in at.node.outputs if name]) == 1, "which tells places")
             return STEPS[at.node.op_type](at)
         _require_pointwise(at)
-        at.require(len(set(read)) == 1, "of tensors of unequal sizes")
+        at.require(len(set(grids)) == 1, "of tensors of unequal sizes")
         return Step(Fraction(1), at.extra)
 
     def _radius_px(self, output: str) -> int:
         """How far beyond a cell of the lattice lies what its result depends on."""
-        read = {output: (0, self._grids[output].in_cell(self.lattice_px) - 1)}
+        ranges = {output: (0, self._grids[output].in_cell(self.lattice_px) - 1)}
+        # A tensor's readers stand behind its writer, so backwards each range is complete when the
+        # node that writes the tensor is reached.
         for node, step in reversed(self._steps):
-            wanted = [read[name] for name in node.outputs if name in read]
-            for name in (name for name in node.inputs if wanted and name in self._grids):
-                size = self._grids[name].in_cell(self.lattice_px) + self._grids[name].extra
-                ends = step.reads(*_hull(wanted), size)
-                read[name] = _hull([ends, read.get(name, ends)])
+            result_ranges = [ranges[name] for name in node.outputs if name in ranges]
+            if not result_ranges:
+                continue
+            first, last = _hull(result_ranges)
+            for name in node.inputs:
+                if name not in self._grids:
+                    continue
+                grid = self._grids[name]
+                size = grid.in_cell(self.lattice_px) + grid.extra
+                ends = step.reads(first, last, size)
+                ranges[name] = _hull([ends, ranges.get(name, ends)])
+        # Inner tensors count too: a tile ends at each of them, and the layers behind pad there.
         return max(
-            self._grids[name].reach_px(*ends, self.lattice_px) for name, ends in read.items()
+            self._grids[name].reach_px(*ends, self.lattice_px) for name, ends in ranges.items()
         )
 
 
@@ -224,7 +238,8 @@ def _require_pointwise(at: Along) -> None:
     kind = at.node.op_type
     if kind in AXES:
         at.require(at.given("axis", AXES[kind]) in (1, -3), "along other sides than the channels")
-    elif kind == "Gather":  # an activation as a table
+    elif kind == "Gather":
+        # Our host files have an activation by itself as a table.
         table = at.shapes.get(at.node.inputs[0], ())
         at.require(len(table) == 1 and at.given("axis", 0) == 0, "which moves pixels")
     else:
