@@ -61,16 +61,17 @@ class Baseline:
                 another file.
             inputs: everything else that the comparison rests on, networks left out.
         """
+        # A network that was saved again has another digest, but the same PSNR.
         same_psnr = abs(psnr_float_db - self.psnr_float_db) < SAME_DB
-        if not same_psnr and not any(float_sha256 in known for known in self.digests.values()):
+        if not same_psnr and not any(float_sha256 in digests for digests in self.digests.values()):
             raise self._refused("a baseline of this float network", "another's")
-        for each in inputs:
-            before = self.digests.get(encodable(each.name))
+        for item in inputs:
+            before = self.digests.get(encodable(item.name))
             if before is None:
-                raise self._refused(f"a baseline that rests on {each.name}", "one that does not")
-            if before != {each.sha256}:
+                raise self._refused(f"a baseline that rests on {item.name}", "one that does not")
+            if before != {item.sha256}:
                 raise self._refused(
-                    f"a baseline of the same {each.name}", f"one of another {each.name}"
+                    f"a baseline of the same {item.name}", f"one of another {item.name}"
                 )
 
     def _refused(self, expected: str, got: str) -> OptionError:
@@ -109,9 +110,8 @@ def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
     figures: dict[str, Any] = rows[0]["figures"] if rows else {}
     mae = figures.get("MAE", {})
     if mae.get("mode") != "measured" or mae.get("unit") != SCALE or not 0 <= mae["value"] <= 1:
-        raise OptionError(
-            str(path), expected=f"a measured MAE {SCALE}", got=_shown(mae), remedy=REMEDY
-        )
+        got = f"{mae.get('value')} {mae.get('unit')}, {mae.get('mode')}" if mae else "no MAE"
+        raise OptionError(str(path), expected=f"a measured MAE {SCALE}", got=got, remedy=REMEDY)
     contradiction = _contradiction(document["checks"], len(rows), mae["value"])
     if contradiction:
         raise OptionError(
@@ -122,8 +122,8 @@ def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
         )
     psnr_db = figures.get("PSNR float", {}).get("value")
     digests: dict[str, frozenset[str]] = {}
-    for each in document["inputs"]:
-        digests[each["name"]] = digests.get(each["name"], frozenset()) | {each["sha256"]}
+    for entry in document["inputs"]:
+        digests[entry["name"]] = digests.get(entry["name"], frozenset()) | {entry["sha256"]}
     checks = frozenset(check["name"] for check in document["checks"])
     return Baseline(
         path, float(mae["value"]), math.nan if psnr_db is None else float(psnr_db), digests, checks
@@ -134,22 +134,16 @@ def _contradiction(checks: Iterable[Mapping[str, Any]], rows: int, mae: float) -
     """Return what in a document contradicts itself, in words; empty if nothing does."""
     if rows > 1:
         return f"{rows} rows of the table gate"
-    for each in checks:
-        name, value, limit = (each[key] for key in ("name", "value", "limit"))
+    for check in checks:
+        name, value, limit = (check[key] for key in ("name", "value", "limit"))
         if name == "MAE" and value != mae:
             return f"an MAE of {mae} in the figures and of {value} in the checks"
-        if value is None or limit is None:  # infinite or NaN, for which JSON has no number
+        # JSON has no number for infinity and NaN.
+        if value is None or limit is None:
             continue
-        if Check(name, value, limit, each["unit"], each["bound"]).passed != each["passed"]:
-            return f"{name} {value} with the limit {limit} and passed {each['passed']}"
+        if Check(name, value, limit, check["unit"], check["bound"]).passed != check["passed"]:
+            return f"{name} {value} with the limit {limit} and passed {check['passed']}"
     return ""
-
-
-def _shown(figure: Mapping[str, Any]) -> str:
-    """Describe a figure, or its absence, for a message."""
-    return (
-        f"{figure.get('value')} {figure.get('unit')}, {figure.get('mode')}" if figure else "no MAE"
-    )
 
 
 def _plain(name: str, value: object) -> str:
@@ -174,12 +168,12 @@ def data_inputs(images: Path | None, samples: Path | None) -> list[Input]:
         images: folder of scenes; None if there is none.
         samples: file or folder of a user's own samples; None if there is none.
     """
-    found = []
+    inputs = []
     if images is not None:
-        found.append(_files_input("scenes", images, list_images(images)))
+        inputs.append(_files_input("scenes", images, list_images(images)))
     if samples is not None:
-        found.append(_files_input("samples", samples, sample_files(samples)))
-    return found
+        inputs.append(_files_input("samples", samples, sample_files(samples)))
+    return inputs
 
 
 def _files_input(kind: str, path: Path, files: Iterable[Path]) -> Input:
@@ -189,6 +183,7 @@ def _files_input(kind: str, path: Path, files: Iterable[Path]) -> Input:
     if path.is_file():
         return Input(f"{kind} {path.name}", sha256(path))
     digest = hashlib.sha256()
+    # Systems list a folder in different orders, which must not change the digest.
     for file in sorted(files):
         digest.update(
             f"{file.relative_to(path).as_posix()} {sha256(file)}\n".encode(errors="surrogateescape")

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import warnings
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -77,23 +78,25 @@ class Board(TargetProfile):
             OptionError: a sensor that would change nothing.
             ProfileError: no such sensor.
         """
-        known = None if sensor is None else Sensor.load(sensor)
-        network = Network.load(int8, sensor=BLIND if known is None else known)
+        profile = None if sensor is None else Sensor.load(sensor)
+        network = Network.load(int8, sensor=BLIND if profile is None else profile)
         folder = Path(out)
         if (
-            known is not None
-            and known.name != BLIND
-            and (doubt := other_sensor(network.model, known))
+            profile is not None
+            and profile.name != BLIND
+            and (doubt := other_sensor(network.model, profile))
         ):
             warnings.warn(doubt, stacklevel=2)
+        # A missing library is refused before anything is written.
         if record:
-            require_library()  # refused before anything is written
+            require_library()
         core = network.core(self, tile)
-        brighter = _brighter(int8, known)
-        facts = host_facts(network, tile, known, brighter)
+        brighter = _brighter(int8, profile)
+        facts = host_facts(network, tile, profile, brighter)
         core.save(folder / "core.onnx")
-        for factor, each in brighter.items():
-            each.core(self, tile).save(folder / f"core-x{factor}.onnx")
+        for factor, other in brighter.items():
+            other.core(self, tile).save(folder / f"core-x{factor}.onnx")
+        # The compiler of an NPU reads its configuration next to the core.
         if self.npu:
             save_config(folder / "core.onnx", *self.npu["device"].value)
         _write_example(core, folder)
@@ -102,11 +105,11 @@ class Board(TargetProfile):
             write_text(folder / "host.json", json.dumps(facts, indent=1) + "\n")
             shutil.copyfile(HOST, folder / "host.py")
         vectors = write_golden(network, folder / "golden", board=self)
-        network.core(self, np.load(vectors / "noise" / PICTURE).shape[-1]).save(
-            vectors / "core.onnx"
-        )
+        # The golden vectors have tiles of their own side, and so need a core of that side.
+        vectors_px = np.load(vectors / "noise" / PICTURE).shape[-1]
+        network.core(self, vectors_px).save(vectors / "core.onnx")
         if record:
-            conditioned_on = Sensor.load(BLIND) if known is None else known
+            conditioned_on = Sensor.load(BLIND) if profile is None else profile
             write_record(
                 check(network, self, tile=tile), network, conditioned_on, folder / "record"
             )
@@ -198,9 +201,9 @@ def networks() -> Table:
         >>> "convbeers-s-int8" in bd.networks().to_pandas().index
         True
     """
-    names = [each for name in shipped_names() for each in (name, f"{name}{INT8}")]
+    names = chain.from_iterable((name, f"{name}{INT8}") for name in shipped_names())
     rows = [
-        Row("networks", each.name, {}, {"precision": each.precision})
-        for each in map(Network.load, names)
+        Row("networks", network.name, {}, {"precision": network.precision})
+        for network in map(Network.load, names)
     ]
     return Table("networks", {}, (), tuple(rows))

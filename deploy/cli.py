@@ -78,9 +78,8 @@ class Stream:
         self.stream = stream or open(os.devnull, "w")  # noqa: PTH123, SIM115 - as long as the process
         self.lost = ""
         if isinstance(self.stream, io.TextIOWrapper):
-            self.stream.reconfigure(
-                errors="backslashreplace"
-            )  # a name that a terminal lacks must end no run either
+            # A name that a terminal cannot show must end no run either.
+            self.stream.reconfigure(errors="backslashreplace")
 
     def write(self, text: str) -> int:
         """Write and flush, or leave it out."""
@@ -90,9 +89,8 @@ class Stream:
                 self.stream.flush()
             except OSError as error:
                 self.lost = error.strerror or str(error)
-                with suppress(
-                    OSError, ValueError
-                ):  # what is buffered must not be tried once more at the end
+                # Buffered text must not be tried once more when Python ends.
+                with suppress(OSError, ValueError):
                     os.dup2(os.open(os.devnull, os.O_WRONLY), self.stream.fileno())
         return len(text)
 
@@ -125,13 +123,13 @@ class Group(TyperGroup):
         out = cast(Any, Stream(sys.stdout))
         sys.stdout = out
         sys.stderr = cast(TextIO, Stream(sys.stderr))
-        found = self._invoke(ctx)
+        result = self._invoke(ctx)
         if out.lost or (closed and ctx.meta[PIPES_RESULTS]):
             typer.echo(
                 f"beers-deploy: standard output: {out.lost or 'closed'}; all else is done", err=True
             )
             ctx.exit(CRASHED)
-        return found
+        return result
 
     def _invoke(self, ctx: Any) -> Any:
         with (
@@ -151,11 +149,11 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     """
 
     @wraps(function)
-    def run(*given: Any, quiet: bool = False, verbose: bool = False, **named: Any) -> None:
+    def run(*arguments: Any, quiet: bool = False, verbose: bool = False, **options: Any) -> None:
         try:
-            with reporting(False if quiet else None), running(named):
-                _require_values(named)
-                function(*given, **named)
+            with reporting(False if quiet else None), running(options):
+                _require_values(options)
+                function(*arguments, **options)
         except (typer.Exit, typer.Abort):
             raise
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - no fault must look like a failed gate
@@ -177,11 +175,11 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def _require_values(named: Mapping[str, object]) -> None:
+def _require_values(options: Mapping[str, object]) -> None:
     """Refuse an option that is given without a value, such as that of an unset variable: it would
     count as none.
     """
-    for name, value in named.items():
+    for name, value in options.items():
         if value == "":
             raise OptionError(
                 name, expected="a value", got="an empty one", remedy="give one, or leave it out"
@@ -216,7 +214,8 @@ def _library_of(error: BaseException) -> list[str]:
         package = str(frame.f_globals.get("__name__")).partition(".")[0]
         if package == __package__:
             return []
-        if package in distributions:  # the standard library is in none
+        # The standard library belongs to no distribution.
+        if package in distributions:
             name = distributions[package][0]
             return [f"{name} {version(name)}"]
     return []
@@ -230,11 +229,11 @@ def in_options(message: str, function: Callable[..., None]) -> str:
         function: of the command.
     """
 
-    def option(found: re.Match[str]) -> str:
-        named = (
-            found[1] in parameters and parameters[found[1]].default is not inspect.Parameter.empty
+    def option(match: re.Match[str]) -> str:
+        is_option = (
+            match[1] in parameters and parameters[match[1]].default is not inspect.Parameter.empty
         )
-        return f"--{found[1].replace('_', '-')}" if named else found[1]
+        return f"--{match[1].replace('_', '-')}" if is_option else match[1]
 
     parameters = inspect.signature(function).parameters
     return re.sub(r"`(\w+)`", option, re.sub(r"^(\w+)(?=:)", option, message))
@@ -283,8 +282,8 @@ def _installation() -> Iterator[str]:
 
     int8_adds_exactly()
     for key, value in host().items():
-        shown = value if isinstance(value, dict) else {key: value}
-        yield from (f"{name.replace('_', ' ')}: {each}" for name, each in shown.items())
+        values = value if isinstance(value, dict) else {key: value}
+        yield from (f"{name.replace('_', ' ')}: {text}" for name, text in values.items())
     for package in ("onnxruntime", "onnx", "torch", "numpy", "openvino"):
         try:
             yield f"{package}: {version_of(package)}"

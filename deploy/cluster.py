@@ -33,7 +33,8 @@ class Cluster:
         pool: an executor of `concurrent.futures` whose calls run on them.
     """
 
-    def __init__(self, client: Any) -> None:  # distributed.Client, an optional package
+    def __init__(self, client: Any) -> None:
+        # The client is of distributed, an optional package, so it has no type here.
         self._client = client
         self.pool: Executor = client.get_executor(pure=False)
 
@@ -49,9 +50,8 @@ class Cluster:
         """What stands for a value in calls: it is sent once, and again where all workers that held
         it died.
         """
-        standing: T = self._client.submit(
-            _itself, value, pure=False
-        )  # a future, which calls receive as its result
+        # A call that is given this future receives its result.
+        standing: T = self._client.submit(_itself, value, pure=False)
         return standing
 
     def result(self, call: "Future[T]") -> T:
@@ -60,6 +60,7 @@ class Cluster:
         while True:
             try:
                 return call.result(POLL_S)
+            # A call may take any time, but a cluster without workers never finishes it.
             except TimeoutError:
                 seen_s = time.monotonic() if self.slots else seen_s
                 if time.monotonic() - seen_s > WORKERLESS_S:

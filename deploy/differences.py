@@ -60,10 +60,11 @@ class Limit:
             return False
         if change.after.value is None:
             return True
-        found = change.difference if not self.in_percent else change.percent
-        if found is None:
-            found = float("inf") * change.difference if change.difference else 0.0
-        return found > self.change if self.above else found < self.change
+        amount = change.difference if not self.in_percent else change.percent
+        if amount is None:
+            # From zero any change is endless in per cent; its sign decides which limit it breaks.
+            amount = float("inf") * change.difference if change.difference else 0.0
+        return amount > self.change if self.above else amount < self.change
 
 
 @dataclass(frozen=True)
@@ -84,11 +85,11 @@ def broken(found: Changes, limits: Sequence[Limit]) -> list[str]:
     """What fails a job, a line each: changes beyond a limit, and figures with a limit that are
     gone.
     """
-    known = {place[2] for place in (*(change.place for change in found.both), *found.gone)}
+    shared = {place[2] for place in (*(change.place for change in found.both), *found.gone)}
     for limit in limits:
-        if limit.name not in known:
+        if limit.name not in shared:
             expected = (
-                f"a figure of the first document: {', '.join(sorted(known)) or 'it shares none'}"
+                f"a figure of the first document: {', '.join(sorted(shared)) or 'it shares none'}"
             )
             raise OptionError(
                 "fail_on", expected=expected, got=repr(limit.name), remedy="correct the name"
@@ -101,14 +102,14 @@ def broken(found: Changes, limits: Sequence[Limit]) -> list[str]:
 
 def parse_limit(text: str) -> Limit:
     """Read NAME>CHANGE or NAME<CHANGE, the change in the figure's unit or in %."""
-    found = LIMIT.fullmatch(text.strip())
-    if found is None:
+    match = LIMIT.fullmatch(text.strip())
+    if match is None:
         remedy = "write 'MAE>2%' or 'PSNR<-0.05'"
         raise OptionError(
             "fail_on", expected="NAME>CHANGE or NAME<CHANGE", got=repr(text), remedy=remedy
         )
     return Limit(
-        found["name"], found["side"] == ">", float(found["change"]), bool(found["percent"])
+        match["name"], match["side"] == ">", float(match["change"]), bool(match["percent"])
     )
 
 
@@ -142,14 +143,14 @@ def changes(before: Mapping[str, object], after: Mapping[str, object]) -> Change
 def figures_of(document: Mapping[str, object]) -> dict[Place, Figure]:
     """Every figure of a document that was validated, by its place."""
     rows: Sequence[Mapping[str, object]] = document["rows"]  # type: ignore[assignment]
-    found: dict[Place, Figure] = {}
+    result: dict[Place, Figure] = {}
     for row in rows:
         figures: Mapping[str, dict[str, object]] = row["figures"]  # type: ignore[assignment]
         for name, figure in figures.items():
             place = (str(row["table"]), str(row["name"]), name)
             interval: tuple[object, ...] | None = tuple(figure.get("interval") or ()) or None  # type: ignore[arg-type]
-            found[place] = Figure(**{**figure, "interval": interval})  # type: ignore[arg-type]
-    return found
+            result[place] = Figure(**{**figure, "interval": interval})  # type: ignore[arg-type]
+    return result
 
 
 def change_rows(changes: Sequence[Change]) -> list[Row]:

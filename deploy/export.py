@@ -32,8 +32,10 @@ def float_for(path: Path, name: str, sensor: Sensor, tile_px: int | None = None)
         sensor: whose images it is to restore.
         tile_px: as in `to_onnx`.
     """
-    found = read_conditioned(path)
-    return banked_to_onnx(found, sensor.nominal(), about(name, found.recipe, sensor.name), tile_px)
+    weights = read_conditioned(path)
+    return banked_to_onnx(
+        weights, sensor.nominal(), about(name, weights.recipe, sensor.name), tile_px
+    )
 
 
 def to_onnx(
@@ -48,9 +50,8 @@ def to_onnx(
     arrays = network.tensors if isinstance(network, Weights) else network.state_dict()
     for name, value in arrays.items():
         writer.constant(name, np.asarray(value))
-    deep = _deep(
-        writer, network.variant.blocks, _moved(writer, "SpaceToDepth", "unshuffled", "image", scale)
-    )
+    unshuffled = _moved(writer, "SpaceToDepth", "unshuffled", "image", scale)
+    deep = _deep(writer, network.variant.blocks, unshuffled)
     return _ended(writer, _conv(writer, "tail", deep), scale, about, tile_px)
 
 
@@ -77,9 +78,11 @@ def banked_to_onnx(
     require_tile(tile_px, scale)
     vector = np.array(sensor_vector(sensor).values, np.float32)
     tensors = dict(weights.tensors)
+    # The head does not read the analytic restoration, hence weights of 0 for its planes.
     unread = np.zeros((variant.features, pixels, 3, 3), np.float32)
     tensors["head.weight"] = np.concatenate([tensors["head.weight"], unread], 1)
     tensors["head.bias"] = tensors["head.bias"] + tensors.pop("bias.weight") @ vector
+    # The last convolution adds the analytic restoration at its middle tap alone.
     added = np.zeros((pixels, pixels, 3, 3), np.float32)
     added[range(pixels), range(pixels), 1, 1] = 1
     tensors["tail.weight"] = np.concatenate([tensors["tail.weight"], added], 1) * np.float32(
@@ -89,6 +92,7 @@ def banked_to_onnx(
     tensors["analytic.weight"][range(pixels), range(-pixels, 0)] = 1
     tensors["tail.bias"] = tensors["tail.bias"] * np.float32(bank.unit)
     tensors["bank.weight"] = in_places(bank.kernels, scale).astype(np.float32)
+    # The body reads the image less 0.5, as it did in training.
     tensors["bank.bias"] = np.repeat(np.array([-0.5, *[0] * (1 + FILTERS)], np.float32), pixels)
     writer = GraphWriter()
     for name, value in tensors.items():
@@ -96,13 +100,17 @@ def banked_to_onnx(
     side = tensors["bank.weight"].shape[-1]
     around = writer.constant("around", np.array([0, 0, *[side // 2 * scale] * 2] * 2))
     widened = writer.node("Pad", "widened", ["image", around], mode="reflect")
-    read = _moved(writer, "SpaceToDepth", "unshuffled", widened, scale)
-    found = writer.node(
-        "Conv", "bank", [read, "bank.weight", "bank.bias"], pads=[0] * 4, kernel_shape=[side, side]
+    unshuffled = _moved(writer, "SpaceToDepth", "unshuffled", widened, scale)
+    bank_output = writer.node(
+        "Conv",
+        "bank",
+        [unshuffled, "bank.weight", "bank.bias"],
+        pads=[0] * 4,
+        kernel_shape=[side, side],
     )
     reach, wide_reach = bank.reach(weights.kernels)
-    planes = _held(writer, "planes", found, reach)
-    picked = writer.node("Conv", "picked", [found, "analytic.weight"], kernel_shape=[1, 1])
+    planes = _held(writer, "planes", bank_output, reach)
+    picked = writer.node("Conv", "picked", [bank_output, "analytic.weight"], kernel_shape=[1, 1])
     analytic = _held(writer, "analytic", picked, wide_reach)
     deep = writer.node("Concat", "deep", [_deep(writer, variant.blocks, planes), analytic], axis=1)
     return _ended(writer, _conv(writer, "tail", deep), scale, about, tile_px)
@@ -130,9 +138,8 @@ def _ended(
     writer: GraphWriter, correction: str, scale: int, about: dict[str, str], tile_px: int | None
 ) -> onnx.ModelProto:
     """The model that adds a correction to the image."""
-    writer.node(
-        "Add", "restored", ["image", _moved(writer, "DepthToSpace", "shuffled", correction, scale)]
-    )
+    shuffled = _moved(writer, "DepthToSpace", "shuffled", correction, scale)
+    writer.node("Add", "restored", ["image", shuffled])
     graph = writer.graph(
         "convbeers", [image_info("image", 1, tile_px)], [image_info("restored", 1, tile_px)]
     )

@@ -4,6 +4,7 @@ HTML.
 
 from collections.abc import Sequence
 from html import escape
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from beers_deploy.profiles.errors import OptionError, optional, visible
@@ -19,12 +20,18 @@ STYLE = "border-bottom: 1px solid; padding: 2px 8px; text-align: left"
 
 def figures_of(rows: Sequence[Row]) -> list[str]:
     """The names of the figures that any row has, in their order."""
-    return list(dict.fromkeys(key for row in rows for key in row.figures))
+    return list(dict.fromkeys(chain.from_iterable(row.figures for row in rows)))
 
 
 def words_of(rows: Sequence[Row]) -> list[str]:
     """The names of the plain words beside figures."""
-    return list(dict.fromkeys(word for row in rows for word in row.text))
+    return list(dict.fromkeys(chain.from_iterable(row.text for row in rows)))
+
+
+def _units(rows: Sequence[Row]) -> dict[str, str]:
+    """Return the unit of each figure; where rows differ, that of the last one."""
+    figures = chain.from_iterable(row.figures.items() for row in rows)
+    return {key: figure.unit for key, figure in figures}
 
 
 def _index(rows: Sequence[Row]) -> Any:
@@ -44,10 +51,13 @@ def wide_frame(rows: Sequence[Row]) -> "pd.DataFrame":
     columns: dict[str, list[object]] = {}
     for key in figures_of(rows):
         columns[key] = [row.figures[key].value if key in row.figures else None for row in rows]
+    # As floats, figures that are missing are NaN.
     frame: pd.DataFrame = pandas.DataFrame(columns, index=_index(rows), dtype=float)
-    for word in (each for each in words_of(rows) if each not in columns):
-        frame[word] = [row.text.get(word, "") for row in rows]
-    frame.attrs["units"] = {key: figure.unit for row in rows for key, figure in row.figures.items()}
+    for word in words_of(rows):
+        # A word of a figure's name would replace the figure.
+        if word not in columns:
+            frame[word] = [row.text.get(word, "") for row in rows]
+    frame.attrs["units"] = _units(rows)
     return frame
 
 
@@ -56,23 +66,24 @@ def tidy_frame(rows: Sequence[Row]) -> "pd.DataFrame":
     there is none).
     """
     pandas = optional("pandas", "to_pandas")
-    lines = [
-        {
-            "table": row.table,
-            "name": row.name,
-            "figure": key,
-            "value": figure.value,
-            "unit": figure.unit,
-            "mode": figure.mode,
-            "low": figure.interval[0] if figure.interval else None,
-            "high": figure.interval[1] if figure.interval else None,
-            "source": figure.source or figure.reason,
-        }
-        for row in rows
-        for key, figure in row.figures.items()
-    ]
-    found: pd.DataFrame = pandas.DataFrame(lines)
-    return found
+    lines = []
+    for row in rows:
+        for key, figure in row.figures.items():
+            low, high = figure.interval or (None, None)
+            line = {
+                "table": row.table,
+                "name": row.name,
+                "figure": key,
+                "value": figure.value,
+                "unit": figure.unit,
+                "mode": figure.mode,
+                "low": low,
+                "high": high,
+                "source": figure.source or figure.reason,
+            }
+            lines.append(line)
+    frame: pd.DataFrame = pandas.DataFrame(lines)
+    return frame
 
 
 def bars(rows: Sequence[Row], figure: str | None, ax: "Axes | None") -> "Axes":
@@ -87,21 +98,21 @@ def bars(rows: Sequence[Row], figure: str | None, ax: "Axes | None") -> "Axes":
             remedy=remedy,
         )
     key = figure or names[0]
-    shown = [
+    entries = [
         (row.name, row.figures[key])
         for row in rows
         if key in row.figures and row.figures[key].value is not None
     ]
     axes: Any = ax if ax is not None else optional("matplotlib.pyplot", "plot").subplots()[1]
-    for place, (_, each) in enumerate(shown):
-        axes.barh(place, each.value, color=COLOURS[each.mode])
-        if each.interval:
-            axes.plot(each.interval, [place, place], color="black", lw=1, marker="|")
-    axes.set_yticks(range(len(shown)), [name for name, _ in shown])
+    for place, (_, entry) in enumerate(entries):
+        axes.barh(place, entry.value, color=COLOURS[entry.mode])
+        if entry.interval:
+            axes.plot(entry.interval, [place, place], color="black", lw=1, marker="|")
+    axes.set_yticks(range(len(entries)), [name for name, _ in entries])
     axes.invert_yaxis()
-    axes.set_xlabel(f"{key} ({shown[0][1].unit})" if shown else key)
-    found: Axes = axes
-    return found
+    axes.set_xlabel(f"{key} ({entries[0][1].unit})" if entries else key)
+    result: Axes = axes
+    return result
 
 
 def html_table(title: str, rows: Sequence[Row]) -> str:
@@ -110,7 +121,7 @@ def html_table(title: str, rows: Sequence[Row]) -> str:
     """
     keys = figures_of(rows)
     words = words_of(rows)
-    units = {key: figure.unit for row in rows for key, figure in row.figures.items()}
+    units = _units(rows)
     head = "".join(_cell("th", f"{key} ({units[key]})" if units[key] else key) for key in keys)
     head = _cell("th", title) + head + "".join(_cell("th", word) for word in words)
     lines = [

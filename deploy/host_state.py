@@ -39,9 +39,8 @@ def peak_memory() -> Figure:
 def _peak_bytes() -> int | None:
     if sys.platform == "win32":
         return int(psutil.Process().memory_info().peak_wset)
-    with suppress(
-        OSError, StopIteration
-    ):  # getrusage's count on Linux begins with what the process's parent held
+    # On Linux, getrusage's count begins with the memory of the process's parent.
+    with suppress(OSError, StopIteration):
         lines = STATUS.read_text(encoding="utf-8").splitlines()
         return 1024 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
     try:
@@ -49,4 +48,5 @@ def _peak_bytes() -> int | None:
     except ImportError:
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes, the others KiB
+    # macOS counts bytes, the others KiB.
+    return peak if sys.platform == "darwin" else 1024 * peak

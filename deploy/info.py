@@ -64,9 +64,9 @@ def info_row(
         raster = source.raster
         scale = known_scale(image.name, raster, options)
         check = SensorCheck()
-        detectors = warn_of_detectors(
-            source, scale.value if isinstance(scale, FullScale) else math.inf, log
-        )
+        # Where full scale is open, no pixel counts as saturated.
+        saturation = scale.value if isinstance(scale, FullScale) else math.inf
+        detectors = warn_of_detectors(source, saturation, log)
         if isinstance(scale, FullScale):
             check = told_sensor(
                 source, options.sensors, scale.value, str(image), options.strict, log
@@ -123,7 +123,8 @@ def place_words(raster: Raster) -> Mapping[str, str]:
     placed = PIXEL_SCALE in tags or TRANSFORMATION in tags
     words = {"georeference": f"{_code(tags.get(KEYS, ()))}" if placed or KEYS in tags else "none"}
     if PIXEL_SCALE in tags and TIE_POINTS in tags:
-        (right, down), (x, y) = tags[PIXEL_SCALE][:2], tags[TIE_POINTS][3:5]
+        right, down = tags[PIXEL_SCALE][:2]
+        x, y = tags[TIE_POINTS][3:5]
         words["georeference"] += (
             f", first corner ({x:.9g}, {y:.9g}), pixels of {right:.9g} x {down:.9g}"
         )
@@ -134,6 +135,7 @@ def _code(keys: Sequence[int]) -> str:
     """The coordinate system among GeoTIFF's keys."""
     values = geo_keys(keys)
     code = values.get(PROJECTED, values.get(GEOGRAPHIC))
+    # GeoTIFF writes 32767 for a system that the user defines.
     return f"EPSG:{code}" if code not in (None, 32767) else "a coordinate system without a code"
 
 
@@ -146,7 +148,8 @@ def time_here(network: onnx.ModelProto, plan: Plan, options: Options) -> Figure:
     infer, runtime = open_runtime(options.runtime, network, options.threads)
     shape = (1, plan.tiling.channels_in, *plan.tile_shape)
     tile = np.random.default_rng(0).random(shape, np.float32)
-    infer(tile)  # the first one prepares
+    # The first run also prepares the network, so it is not timed.
+    infer(tile)
     times = []
     for _ in range(RUNS):
         started = perf_counter()

@@ -140,52 +140,58 @@ def restore(
     if method == TRADITIONAL:
         changed = {"network": network is not None, "tile": tile != TILE_PX, "halo": halo != "exact"}
         changed |= {"runtime": runtime != Runtime.onnxruntime, "threads": threads != 0}
-        for name in (
-            name for name, given in (changed | {"resume": resume, "cog": cog}).items() if given
-        ):
+        changed |= {"resume": resume, "cog": cog}
+        name = next((option for option, is_changed in changed.items() if is_changed), None)
+        if name is not None:
             raise OptionError(
                 name, expected="none with method traditional", got="one", remedy="leave it out"
             )
-    known = Sensor.load(sensor)
-    found = Network.load(f"{VARIANT}{INT8}" if network is None else network, sensor=known)
-    told = {} if known.name == BLIND else {"": known}
-    brighter = _brighter(network, found, known) if exposure and method == NETWORK else {}
+    profile = Sensor.load(sensor)
+    chosen_network = Network.load(
+        f"{VARIANT}{INT8}" if network is None else network, sensor=profile
+    )
+    sensors = {} if profile.name == BLIND else {"": profile}
+    brighter = _brighter(network, chosen_network, profile) if exposure and method == NETWORK else {}
     options = Options(
-        found.file,
+        chosen_network.file,
         tile,
         str(halo),
         full_scale,
         _runtime(runtime),
         threads,
-        sensors=told,
+        sensors=sensors,
         again=again,
         any_result=any_result,
         strict=strict,
         consistency=consistency,
         brighter={"": brighter} if brighter else {},
     )
-    job = Job(method, quality, known, nodata, options)
+    job = Job(method, quality, profile, nodata, options)
     with reporting(progress):
-        if isinstance(image, str | os.PathLike) or hasattr(image, "crs"):  # the latter of rasterio
+        # A dataset of rasterio has a coordinate system and the name of its file.
+        if isinstance(image, str | os.PathLike) or hasattr(image, "crs"):
             path = Path(image if isinstance(image, str | os.PathLike) else image.name)
             return _restore_path(path, replace(job.options, resume=resume, cog=cog), job, out)
         if out is not None or resume or cog:
-            asked = {"out": out is not None, "cog": cog, "resume": resume}
-            name = next(option for option, given in asked.items() if given)
+            file_options = {"out": out is not None, "cog": cog, "resume": resume}
+            name = next(option for option, is_given in file_options.items() if is_given)
             remedy = "save the result yourself"
             raise OptionError(name, expected="none beside an array", got="one", remedy=remedy)
         return _restore_any(image, job)
 
 
-def _brighter(network: NetworkLike | None, found: Network, sensor: Sensor) -> dict[int, Path]:
+def _brighter(
+    network: NetworkLike | None, chosen_network: Network, sensor: Sensor
+) -> dict[int, Path]:
     """A conditioned network at higher exposures; of any other one none, and a warning if it is
     another sensor's.
     """
     if network is None or isinstance(network, str | os.PathLike):
-        given = None if network is None else Path(network)
-        if conditioned(given) is not None:
-            return brighter_files(given, sensor)
-    if sensor.name != BLIND and (doubt := other_sensor(found.model, sensor)):
+        path = None if network is None else Path(network)
+        if conditioned(path) is not None:
+            return brighter_files(path, sensor)
+    if sensor.name != BLIND and (doubt := other_sensor(chosen_network.model, sensor)):
+        # The warning points at the line that calls `restore`.
         warnings.warn(doubt, stacklevel=3)
     return {}
 
@@ -227,13 +233,11 @@ def _restore_path(
         )
     path = Path(out)
     if job.method == TRADITIONAL:
-        from beers_deploy.restoration.traditional import (
-            restore_file_traditionally,
-        )  # it takes torch
+        # It loads torch, which is optional.
+        from beers_deploy.restoration.traditional import restore_file_traditionally
 
-        row = restore_file_traditionally(
-            image, path, replace(options, sensors={"": job.sensor}), no_log
-        )
+        options_of_sensor = replace(options, sensors={"": job.sensor})
+        row = restore_file_traditionally(image, path, options_of_sensor, no_log)
     else:
         row = restore_file(image, path, options, no_log)
     arguments = {
@@ -249,9 +253,10 @@ def _restore_path(
 
 def _restore_any(image: Any, job: Job) -> Any:
     """An array of any kind, to the same kind."""
-    if hasattr(image, "coords") and hasattr(image, "dims"):  # of xarray, without importing it
+    # Arrays of xarray and torch are told by their attributes, so that neither is imported.
+    if hasattr(image, "coords") and hasattr(image, "dims"):
         return _restore_labelled(image, job)
-    if hasattr(image, "detach"):  # of torch
+    if hasattr(image, "detach"):
         restored = _restore(image.detach().cpu().numpy(), job)
         return import_module("torch").from_numpy(restored).to(image.device)
     if np.ma.isMaskedArray(image):
@@ -273,14 +278,14 @@ def _restore_labelled(image: Any, job: Job) -> Any:
     options = job.options
     require_raw(NAME, is_restored(str(own.get("TIFFTAG_SOFTWARE", "")), own), options.again)
     full_scale = own.get("full_scale") if options.full_scale is None else options.full_scale
-    missing = own.get("_FillValue") if job.nodata is None else job.nodata
+    nodata = own.get("_FillValue") if job.nodata is None else job.nodata
     dims = image.dims
     bands = next((dim for dim in image.dims if dim in BAND_DIMS), None)
     ordered = image if bands is None or image.ndim != 3 else image.transpose(bands, ...)
     if image.ndim == 3 and bands is None and ordered.shape[-1] <= FEW < min(ordered.shape[:-1]):
         raise _bands_last(ordered.shape, "name the dimension of the bands 'band'")
     pixels = _restore(
-        ordered.data, replace(job, options=replace(options, full_scale=full_scale), nodata=missing)
+        ordered.data, replace(job, options=replace(options, full_scale=full_scale), nodata=nodata)
     )
     restored = _labelled(ordered, pixels)
     return restored if restored.ndim != len(dims) else restored.transpose(*dims)
@@ -292,7 +297,8 @@ def _restore_masked(image: Any, job: Job) -> Any:
     mask = np.ma.getmaskarray(image)
     scale = restored.shape[-1] // mask.shape[-1]
     mask = mask.repeat(scale, axis=-2).repeat(scale, axis=-1)
-    if mask.shape != restored.shape:  # other bands are made of all that the image has
+    # A network that makes other bands makes each of them of all bands of the image.
+    if mask.shape != restored.shape:
         mask = np.broadcast_to(mask if mask.ndim == 2 else mask.any(axis=0), restored.shape)
     return np.ma.array(restored, mask=mask)
 
@@ -345,9 +351,9 @@ def _restore_traditionally(bands: np.ndarray, raster: Raster, job: Job) -> np.nd
         dn = np.ma.getdata(band).astype(np.float32) * to_dn
         missing = np.zeros(band.shape, bool) if strip.missing is None else strip.missing[0]
         dn[missing] = np.nan
-        found = np.nan_to_num(restore_traditional(torch.from_numpy(dn), chain).numpy()) / to_dn
+        result = np.nan_to_num(restore_traditional(torch.from_numpy(dn), chain).numpy()) / to_dn
         stored = np.ma.getdata(band).astype(raster.out_dtype)
-        restored.append(np.where(missing, stored, as_stored(raster, found, full_scale)))
+        restored.append(np.where(missing, stored, as_stored(raster, result, full_scale)))
     return np.stack(restored)
 
 
@@ -361,14 +367,13 @@ def _labelled(image: Any, pixels: Any) -> Any:
     sizes = dict(zip(dims, pixels.shape, strict=True))
     changed = {dim for dim in image.dims if sizes[dim] != image.sizes[dim]}
     coordinates = {
-        name: each.copy()
-        for name, each in image.coords.items()
-        if not changed.intersection(each.dims)
+        name: coordinate.copy()
+        for name, coordinate in image.coords.items()
+        if not changed.intersection(coordinate.dims)
     }
-    for each in coordinates.values():
-        each.attrs.pop(
-            "GeoTransform", None
-        )  # of the pixels before; what lies where is told by the places
+    for coordinate in coordinates.values():
+        # This transform is that of the original pixels; the coordinates have the new places.
+        coordinate.attrs.pop("GeoTransform", None)
     for dim in changed.intersection(image.dims[-2:], image.coords):
         places = _between(image.coords[dim].values, sizes[dim])
         coordinates |= {dim: (dim, places, image.coords[dim].attrs)} if places is not None else {}
@@ -381,6 +386,7 @@ def _between(places: np.ndarray, count: int) -> np.ndarray | None:
     """
     if len(places) < 2 or places.dtype.kind not in "iuf":
         return None
+    # Pixels of both sizes share the image's borders, not their middles.
     at = (np.arange(count) + 0.5) * (len(places) / count) - 0.5
     left = np.clip(np.floor(at).astype(int), 0, len(places) - 2)
     return np.asarray(places[left] + (at - left) * (places[left + 1] - places[left]))
@@ -431,9 +437,9 @@ def _bands_last(shape: tuple[int, ...], remedy: str) -> ImageError:
 def _raster(bands: Any, nodata: float | None) -> Raster:
     count, height_px, width_px = bands.shape
     dtype = require_numbers(NAME, bands.dtype)
-    missing = None if nodata is None else float(nodata)
+    value = None if nodata is None else float(nodata)
     veil: Veil = "mask" if np.ma.isMaskedArray(bands) else ""
-    return Raster(count, height_px, width_px, dtype, usable_nodata(NAME, missing, dtype), veil=veil)
+    return Raster(count, height_px, width_px, dtype, usable_nodata(NAME, value, dtype), veil=veil)
 
 
 def _runtime(name: str) -> Runtime:

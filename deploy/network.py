@@ -105,12 +105,14 @@ class Network:
             name = network.graph.name or "network"
             return cls(read_onnx(network.SerializeToString(), name), name)
         if isinstance(network, str | os.PathLike):
-            given = Path(network)
-            path = network_file(given, Sensor.load(sensor), _warn)
+            source = Path(network)
+            path = network_file(source, Sensor.load(sensor), _warn)
             to_run = to_run or path.suffix == ".safetensors"
             with unchanged(path) as digest:
                 model = float_model(path) if to_run else load_onnx(path, to_run=False)
-            return cls(model, given.stem if path == given else given.name, path, file_sha256=digest)
+            return cls(
+                model, source.stem if path == source else source.name, path, file_sha256=digest
+            )
         return cls(exported(network, example), type(network).__name__)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
@@ -197,11 +199,14 @@ class Network:
         return hash(self.sha256)
 
     def __getstate__(self) -> dict[str, object]:
+        # A session of onnxruntime cannot be pickled; the copy opens one of its own.
         return {key: value for key, value in vars(self).items() if key != "_session"}
 
     def __repr__(self) -> str:
-        told = f", for {self.sensor}" if self.sensor else ""
-        return f"Network({self.name!r}: {self.precision}, {len(self.model.graph.node)} nodes{told})"
+        suffix = f", for {self.sensor}" if self.sensor else ""
+        return (
+            f"Network({self.name!r}: {self.precision}, {len(self.model.graph.node)} nodes{suffix})"
+        )
 
 
 def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
@@ -215,14 +220,16 @@ def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
     stream = io.BytesIO()
     training = module.training
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the exporter's own: what it writes is checked below
+        # The exporter's own warnings do not count, because its file is checked below.
+        warnings.simplefilter("ignore")
         try:
             names = {"input_names": ["image"], "output_names": ["restored"], "dynamic_axes": free}
             image = torch.zeros(tuple(example))
             torch.onnx.export(
                 module.eval(), (image,), stream, opset_version=OPSET, dynamo=False, **names
             )
-        except Exception as error:  # whatever a module's own code raises
+        # The code of a module may raise anything.
+        except Exception as error:
             got = " ".join(str(error).split())[:160]
             remedy = f"check that it takes an image {times(example)}, or give example=(N, C, H, W)"
             expected = "a module that torch exports"
@@ -230,6 +237,7 @@ def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
                 type(module).__name__, expected=expected, got=got, remedy=remedy
             ) from error
         finally:
+            # `eval` changed the caller's own module.
             module.train(training)
     return read_onnx(stream.getvalue(), type(module).__name__)
 

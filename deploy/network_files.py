@@ -97,10 +97,11 @@ def weights_file(given: Path) -> Path:
     )
 
 
-def _is_shipped(given: Path) -> bool:
+def _is_shipped(path: Path) -> bool:
     """Whether a shipped network is meant by its name, with INT8 behind it or without."""
-    named = given == Path(given.name) and given.name.removesuffix(INT8) in shipped_names()
-    return named and not given.exists()
+    # A file of that name goes before the shipped network.
+    is_name = path == Path(path.name) and path.name.removesuffix(INT8) in shipped_names()
+    return is_name and not path.exists()
 
 
 def in_int8(given: Path) -> Path:
@@ -159,6 +160,7 @@ def brighter_files(given: Path | None, sensor: Sensor) -> dict[int, Path]:
         return {}
     int8 = given is None or given.name.endswith(INT8)
     factors = factors_for(sensor.nominal())
+    # Nobody chose the sensors of the other exposures, so their warnings are not logged.
     return {
         factor: _written(network, brightened(sensor, factor), int8, no_log)
         for factor in factors
@@ -168,29 +170,29 @@ def brighter_files(given: Path | None, sensor: Sensor) -> dict[int, Path]:
 
 def float_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
     """As `network_file`, a conditioned network always in float32."""
-    found = conditioned(given)
-    return _written(found, sensor, False, log) if found else given or Path()
+    network = conditioned(given)
+    return _written(network, sensor, False, log) if network else given or Path()
 
 
 def int8_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
     """As `network_file`, a conditioned network always in INT8."""
-    found = conditioned(given)
-    return _written(found, sensor, True, log) if found else given or Path()
+    network = conditioned(given)
+    return _written(network, sensor, True, log) if network else given or Path()
 
 
 def shipped_pair(name: str = VARIANT, sensor: str = SENSOR) -> tuple[Path, Path]:
     """A shipped network in float32 and in INT8, told a sensor."""
-    known = load_sensor(sensor)
-    given = Path(shipped_weights(name).stem)
-    return float_file(given, known), int8_file(given, known)
+    profile = load_sensor(sensor)
+    path = Path(shipped_weights(name).stem)
+    return float_file(path, profile), int8_file(path, profile)
 
 
 def warn_outside(sensor: Sensor, kernels: Kernels, log: Log) -> None:
     """Tell what of a sensor lies outside of what a network was trained on, whose banks have these
     kernels.
     """
-    known = sensor.nominal()
-    for sentence in (*sensor_vector(known).outside, departure(known, kernels)):
+    instrument = sensor.nominal()
+    for sentence in (*sensor_vector(instrument).outside, departure(instrument, kernels)):
         if sentence:
             log(f"warning: {sentence}")
 
@@ -214,6 +216,7 @@ def other_precision(model: onnx.ModelProto) -> onnx.ModelProto | None:
     variant = metadata(model).get("variant", "")
     if variant not in shipped_names():
         return None
+    # Time depends on the shapes alone, so the weights of any sensor will do.
     find = float_file if is_quantised(model) else int8_file
     return load_onnx(find(Path(variant), load_sensor(SENSOR)))
 
@@ -229,12 +232,13 @@ def _folder() -> Path:
 def _written(network: Conditioned, sensor: Sensor, int8: bool, log: Log) -> Path:
     warn_outside(sensor, network.kernels, log)
     stem = network.name + (INT8 if int8 else "")
-    told = json.dumps(
+    text = json.dumps(
         {"weights": sha256(network.weights), "sensor": numbers_of(sensor)},
         sort_keys=True,
         default=str,
     )
-    path = process_file(stem, hashlib.sha256(told.encode()).hexdigest())
+    # The digest of weights and sensor names the file, so that a process writes it once.
+    path = process_file(stem, hashlib.sha256(text.encode()).hexdigest())
     if not path.is_file():
         save_onnx(network.model(sensor, int8), path)
     return path
@@ -243,6 +247,7 @@ def _written(network: Conditioned, sensor: Sensor, int8: bool, log: Log) -> Path
 def process_file(name: str, digest: str) -> Path:
     """Of a file of this process, named for the tables that show it."""
     folder = _folder() / digest[:12]
+    # The name may be that of an ONNX graph, which may hold any character.
     stem = re.sub(r"[^\w.-]+", "-", name)[:40]
     folder.mkdir(exist_ok=True)
     return folder / f"{stem}.onnx"
@@ -261,8 +266,10 @@ def told_int8(
     """
     family = required_family(model)
     warn_outside(sensor, family.kernels, log)
-    known = sensor.nominal()
-    core = family.for_sensor(network_bank(known, family.kernels), sensor_vector(known).values)
+    instrument = sensor.nominal()
+    core = family.for_sensor(
+        network_bank(instrument, family.kernels), sensor_vector(instrument).values
+    )
     return host_model(
         core, {**metadata(model), "sensor": sensor.name, **(more or {})}, fixed_tile_px(model)
     )

@@ -74,14 +74,14 @@ class Pair:
         return ssim(self._alike(image), self.reference, self.sensor.max_dn)
 
     def _alike(self, image: np.ndarray) -> np.ndarray:
-        found = np.asarray(image)
-        if found.shape != self.reference.shape:
+        pixels = np.asarray(image)
+        if pixels.shape != self.reference.shape:
             remedy = "compare images of one size"
-            got = f"an image of shape {found.shape}"
+            got = f"an image of shape {pixels.shape}"
             raise ImageError(
                 "image", expected=f"one of shape {self.reference.shape}", got=got, remedy=remedy
             )
-        return found
+        return pixels
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write both images as 12-bit TIFFs that `beers-deploy evaluate --pairs` reads, and what
@@ -101,12 +101,12 @@ class Pair:
 
     def _repr_html_(self) -> str:
         stretch = stretch_of(self.reference)
-        shown = (("degraded", self.degraded), ("reference", self.reference), ("clean", self.clean))
+        panels = (("degraded", self.degraded), ("reference", self.reference), ("clean", self.clean))
         pictures = [
             '<figure style="display: inline-block; margin: 4px"><img '
             f'src="{picture_url(stretch.to_bytes(image))}" '
             f'style="max-width: 30em; width: 100%"><figcaption>{name}</figcaption></figure>'
-            for name, image in shown
+            for name, image in panels
         ]
         return "".join(pictures)
 
@@ -159,15 +159,17 @@ def simulate(
     require_same_units(degraded, aim)
     draw = Draw(seed)
     ratio = int(degraded.oversampling.low)
-    radiance = _scene(scene, aim.nominal(), size, ratio, seed).radiance * (
-        call.radiance_scale.low if call else 1.0
-    )
-    seen_by, meant_by = (
+    radiance_scale = call.radiance_scale.low if call else 1.0
+    radiance = _scene(scene, aim.nominal(), size, ratio, seed).radiance * radiance_scale
+    # Each sensor has a generator of its own: leaving one draw out does not change the others.
+    instrument, aim_instrument = (
         profile.draw(draw.generator(f"sensor-{role}"))
         for role, profile in (("degraded", degraded), ("reference", aim))
     )
-    seen, meant, clean = acquire_three(prepare_scene(radiance, ratio), seen_by, meant_by, draw)
-    return Pair(to_uint16(seen), to_uint16(meant), clean, seen_by, (degraded, aim))
+    degraded_dn, reference_dn, clean = acquire_three(
+        prepare_scene(radiance, ratio), instrument, aim_instrument, draw
+    )
+    return Pair(to_uint16(degraded_dn), to_uint16(reference_dn), clean, instrument, (degraded, aim))
 
 
 def _scene(
@@ -183,6 +185,7 @@ def _scene(
     from beers_deploy.model.simulator.sampling import read_scene, scene_of
 
     if scene is None:
+        # The Fourier transform of the blur wraps around: the margin keeps the far border out.
         side_px = (size_px + 2 * MARGIN_PX) * ratio
         return procedural_scene(side_px, side_px, Draw(seed).generator("drawn scene"))
     if isinstance(scene, str | os.PathLike):

@@ -31,7 +31,8 @@ def torch_network(path: Path, sensor: Instrument | None = None) -> ConvBEERS | O
     network = network_of(read_plain(path) if sensor is None else read_conditioned(path))
     if sensor is not None and isinstance(network, BankedConvBEERS):
         return OfOneSensor(network, vector_tensor(sensor), network_bank(sensor, network.kernels))
-    return cast(ConvBEERS, network)  # what `read_plain` read
+    # `read_plain` reads no other network.
+    return cast(ConvBEERS, network)
 
 
 def require_parity(
@@ -52,7 +53,8 @@ def require_parity(
     image = np.random.default_rng(0).random((1, 1, side_px, side_px), dtype=np.float32)
     with torch.inference_mode():
         expected = network(torch.from_numpy(image)).numpy()
-    with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused
+    # Values that are not finite are refused below.
+    with np.errstate(invalid="ignore", over="ignore"):
         difference = float(np.abs(run(open_session(model), image) - expected).max())
     if not np.isfinite(difference):
         expected_text = "finite pixels on a random image"

@@ -5,6 +5,7 @@ where INT8 errs.
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -32,6 +33,7 @@ from beers_deploy.quant.encodings import host_model, read_core
 from beers_deploy.quant.gate import compare, gate_row
 from beers_deploy.quant.integer.reference import integer_rows
 from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata, require_quantised
+from beers_deploy.quant.passes.selection import Passes
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import OwnSamples, samples_of
 from beers_deploy.quant.sensitivity import (
@@ -103,12 +105,12 @@ def quantize(
         >>> import torch
         >>> network = torch.nn.Conv2d(1, 1, 3, padding=1)
         >>> samples = np.random.default_rng(0).random((8, 1, 32, 32), np.float32)
-        >>> bd.quantize(bd.Network.load(network, example=(1, 1, 32, 32)), samples,
-            board="zcu102").precision
+        >>> network = bd.Network.load(network, example=(1, 1, 32, 32))
+        >>> bd.quantize(network, samples, board="zcu102").precision
         'int8'
     """
     target = TargetProfile.load(board)
-    known = Sensor.load(sensor)
+    profile = Sensor.load(sensor)
     banked = conditioned(Path(network)) if isinstance(network, str | os.PathLike) else None
     steps = steps_of(finetune)
     if banked and (steps != 0 or samples is not None):
@@ -117,17 +119,17 @@ def quantize(
         )
         expected = "no samples or fine-tuning"
         raise OptionError("a network behind a bank", expected=expected, got="one", remedy=remedy)
-    origin = Network.load(network, sensor=known)
+    origin = Network.load(network, sensor=profile)
     require_quantised(origin.model, origin.label, wanted=False)
     scenes = None if images is None else Path(images)
     with reporting(progress), faults_named(origin.label):
         own = samples_of(origin.model, samples)
         if banked:
-            simulated = _simulated(known, scenes, patches, patch_px, seed)
-            return replace(_banked(banked, simulated, known, target), origin=origin)
-        calibration: Source = own or _simulated(known, scenes, patches, patch_px, seed)
-        made = _by_itself(origin, calibration, target, steps)
-    return replace(made, origin=origin)
+            simulated = _simulated(profile, scenes, patches, patch_px, seed)
+            return replace(_banked(banked, simulated, profile, target), origin=origin)
+        calibration: Source = own or _simulated(profile, scenes, patches, patch_px, seed)
+        result = _by_itself(origin, calibration, target, steps)
+    return replace(result, origin=origin)
 
 
 def steps_of(finetune: int | str) -> int | None:
@@ -144,9 +146,8 @@ def steps_of(finetune: int | str) -> int | None:
 def _simulated(
     sensor: Sensor, images: Path | None, patches: int, patch_px: int, seed: int
 ) -> "Calibration":
-    from beers_deploy.quant.calibration import (
-        Calibration,
-    )  # SciPy, which samples of one's own do without
+    # This loads SciPy, which samples of one's own do without.
+    from beers_deploy.quant.calibration import Calibration
 
     return Calibration(sensor, images, patches, patch_px, seed)
 
@@ -172,13 +173,11 @@ def _banked(
     network: Conditioned, calibration: "Calibration", sensor: Sensor, target: TargetProfile
 ) -> Network:
     """A network behind a bank, told a sensor; each integer layer on its patches."""
-    family = family_model(
-        network, _folders(calibration.images), calibration.seed, _shifts_of(target)
-    )
+    images = [] if calibration.images is None else [calibration.images]
+    family = family_model(network, images, calibration.seed, _shifts_of(target))
     host = told_int8(family, sensor, {"target": target.name})
-    layers = integer_rows(
-        network.model(sensor, int8=False), read_core(host), host, calibration.drawn.degraded
-    )
+    floating = network.model(sensor, int8=False)
+    layers = integer_rows(floating, read_core(host), host, calibration.drawn.degraded)
     return Network(host, f"{network.name}-int8", layers=layers)
 
 
@@ -198,10 +197,10 @@ def losses_of(network: Network, samples: object = None, **drawn: Any) -> str:
     model = network.origin.model
     result = network.quantised
     held_out = (samples_of(model, samples) or _simulated(**drawn)).unseen
-    found = compare(
+    differences = compare(
         open_any_size(model), open_any_size(result.host), held_out.pairs, samples is None
     )
-    return losses(result, found, held_out)
+    return losses(result, differences, held_out)
 
 
 def sensitivity_report(
@@ -220,18 +219,18 @@ def sensitivity_report(
     result = network.quantised
     held_out = (samples_of(model, samples) or _simulated(**drawn)).unseen
     sessions = open_any_size(model), open_any_size(result.host)
-    found = compare(*sessions, held_out.pairs, samples is None)
+    differences = compare(*sessions, held_out.pairs, samples is None)
     spread = spread_of(*sessions, held_out.degraded)
     worst = spread.worst(WORST)
     layers = layer_error_rows(result, held_out)
     rows = [
-        gate_row(found),
+        gate_row(differences),
         *layers,
         *(worst_row(k, held_out, spread) for k in worst),
         sizes_row(spread),
     ]
     return rows, sensitivity_page(
-        headline(found, layers), [*rows, *more], spread, held_out, sessions, worst
+        headline(differences, layers), [*rows, *more], spread, held_out, sessions, worst
     )
 
 
@@ -245,23 +244,23 @@ def rounding_of(int8: Path, weights: Path) -> "Rounding":
     from beers_deploy.quant.banked.calibrate import map_steps
 
     model = load_onnx(int8)
-    given = read_conditioned(weights)
+    tensors = read_conditioned(weights)
     if metadata(model).get(WEIGHTS) != sha256(weights):
         expected = f"the INT8 file of {weights}"
         remedy = "make it with 'beers-deploy quantize'"
         raise ModelError(str(int8), expected=expected, got="another network's", remedy=remedy)
     with contradictions(str(int8)):
-        found = map_steps(required_family(model), given)
-    stream, *inner = (torch.from_numpy(np.float32(steps))[:, None, None] for steps in found)
+        step_sizes = map_steps(required_family(model), tensors)
+    stream, *inner = (torch.from_numpy(np.float32(steps))[:, None, None] for steps in step_sizes)
     return Rounding(stream, tuple(inner))
 
 
-def _folders(images: Path | None) -> list[Path]:
-    return [] if images is None else [images]
-
-
 def family_model(
-    network: Conditioned, images: Sequence[Path] = (), seed: int = 0, shifts: Shifts = SHIFTS
+    network: Conditioned,
+    images: Sequence[Path] = (),
+    seed: int = 0,
+    shifts: Shifts = SHIFTS,
+    passes: Passes | None = None,
 ) -> onnx.ModelProto:
     """The INT8 file of a network behind a bank, for the middle of the family; any sensor can be
     told to it.
@@ -272,28 +271,29 @@ def family_model(
             these alone.
         seed: of the patches.
         shifts: the windows of the target.
+        passes: that reduce the error; None for those that pay behind a bank.
     """
-    from beers_deploy.model.simulator.procedural import (
-        load_scenes,
-    )  # SciPy, which samples of one's own do without
-    from beers_deploy.quant.banked.calibrate import family_images, quantise_family
+    # This loads SciPy, which samples of one's own do without.
+    from beers_deploy.model.simulator.procedural import load_scenes
+    from beers_deploy.quant.banked.calibrate import PASSES, family_images, quantise_family
 
     weights = read_conditioned(network.weights)
     aim = load_sensor(REFERENCE).nominal()
     scale = weights.variant.scale
     scenes = load_scenes(None, aim, seed)
-    if images:  # drawn scenes have stronger edges, photographs finer ground
-        photographs = [scene for folder in images for scene in load_scenes(folder, aim, seed)]
+    # Drawn scenes have stronger edges, photographs finer ground, so both are calibrated on.
+    if images:
+        photographs = list(chain.from_iterable(load_scenes(folder, aim, seed) for folder in images))
         scenes = photographs + scenes * max(len(photographs) // len(scenes), 1)
     with begun(f"calibrating {network.name} over the family of sensors") as log:
-        seen = family_images(scenes, scale, seed, weights.kernels)
+        family_patches = family_images(scenes, scale, seed, weights.kernels)
         middle = bank_of_vector((0.0,) * len(RANGES), weights.kernels)
-        family = quantise_family(weights, middle, seen, shifts, log)
-    said = {
+        family = quantise_family(weights, middle, family_patches, shifts, passes or PASSES, log)
+    description = {
         "variant": network.name,
         "reference": REFERENCE,
         "precision": "int8 legal",
         "calibration_seed": str(seed),
     }
-    known = {FAMILY: family.to_words(), WEIGHTS: sha256(network.weights)}
-    return host_model(family.core, {**said, **known})
+    description |= {FAMILY: family.to_words(), WEIGHTS: sha256(network.weights)}
+    return host_model(family.core, description)

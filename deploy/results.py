@@ -55,6 +55,7 @@ def require_same(before: Iterable[Input], *paths: Path | None) -> None:
     """Raise OptionError if a file was replaced since `inputs_of`: the digest would be that of
     another one.
     """
+    # A file that is gone meanwhile has no digest, so the lists may differ in length.
     for then, now in zip(before, inputs_of(*paths), strict=False):
         if then != now:
             expected = "a file that stays as it is"
@@ -94,7 +95,7 @@ class Table:
 
     def to_dict(self) -> dict[str, object]:
         """The whole as the schema of results documents wants it."""
-        inputs = [each if isinstance(each, Input) else input_of(each) for each in self.inputs]
+        inputs = [item if isinstance(item, Input) else input_of(item) for item in self.inputs]
         checks = [check.to_json() for check in self.checks]
         verdict = "passed" if self else "failed"
         document: dict[str, object] = {
@@ -103,7 +104,7 @@ class Table:
             "tool_version": __version__,
             "command": self.command,
             "arguments": {key: _plain(value) for key, value in self.arguments.items()},
-            "inputs": [each._asdict() for each in inputs],
+            "inputs": [item._asdict() for item in inputs],
             "host": host(),
             **({"verdict": verdict, "checks": checks} if checks else {}),
             "rows": [
@@ -117,6 +118,7 @@ class Table:
             ],
             "notes": list(self.notes),
         }
+        # The name of a file may hold bytes of another encoding, which UTF-8 cannot hold.
         return {key: _encodable(value) for key, value in document.items()}
 
     def save(self, path: str | os.PathLike[str]) -> Path:
@@ -193,7 +195,8 @@ def host() -> dict[str, object]:
         "python": platform.python_version(),
         "cpus": psutil.cpu_count() or 1,
         "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
-        # Windows has no such count: psutil begins one when asked, and says 0 for the first seconds.
+        # Windows has no such count: psutil begins one when asked, and returns 0 for the first
+        # seconds.
         "load_1_min": None if platform.system() == "Windows" else round(psutil.getloadavg()[0], 2),
         "kernels": decided(),
     }
@@ -202,9 +205,10 @@ def host() -> dict[str, object]:
 def _encodable(value: object) -> object:
     """Return a value of a document with text that any reader of JSON takes."""
     if isinstance(value, dict):
-        return {encodable(key): _encodable(each) for key, each in value.items()}
+        return {encodable(key): _encodable(item) for key, item in value.items()}
+
     if isinstance(value, list):
-        return [_encodable(each) for each in value]
+        return [_encodable(item) for item in value]
     return encodable(value) if isinstance(value, str) else value
 
 
@@ -228,11 +232,9 @@ def print_rows(title: str, rows: Iterable[Row], console: Console | None = None) 
     console = console or default_console()
     keys = figures_of(rows)
     table = by_figure(rows, keys) if len(keys) > len(rows) else by_row(rows, keys)
-    # Measured on a wide console: on its own a table's least width never exceeds the console's.
-    if (
-        Measurement.get(console, console.options.update(width=PIPE_WIDTH), table).minimum
-        > console.width
-    ):
+    # On its own console, the least width of a table never exceeds the console's.
+    wide_options = console.options.update(width=PIPE_WIDTH)
+    if Measurement.get(console, wide_options, table).minimum > console.width:
         table = one_by_one(rows)
     table.title = plain(title)
     table.title_justify = "left"
@@ -262,7 +264,7 @@ def markdown_text(text: str) -> str:
     """Return text on one line that Markdown shows as it is: a layer's name comes from the network's
     file.
     """
-    return MARKUP.sub(lambda found: f"\\{found[0]}", one_line(text))
+    return MARKUP.sub(lambda match: f"\\{match[0]}", one_line(text))
 
 
 def by_row(rows: list[Row], keys: list[str]) -> rich_table.Table:
@@ -304,6 +306,7 @@ def by_figure(rows: list[Row], keys: list[str]) -> rich_table.Table:
 def one_by_one(rows: list[Row]) -> rich_table.Table:
     """One line a figure, row after row: the narrowest table."""
     table = rich_table.Table("", "", "", "unit")
+    # Long text is folded, because no number may be cut.
     table.columns[1].overflow = table.columns[2].overflow = "fold"
     for row in rows:
         figures = [
@@ -321,6 +324,7 @@ def unit_of(key: str, rows: list[Row]) -> str:
     """The unit of a column: that of all its figures; empty where they differ, as those of a
     comparison.
     """
+    # The rows of a comparison have figures of different units in one column.
     units = {row.figures[key].unit for row in rows if key in row.figures}
     return units.pop() if len(units) == 1 else ""
 
@@ -353,8 +357,8 @@ def missing(rows: list[Row]) -> list[str]:
             if figure.value is None:
                 names.setdefault((key, figure.reason), []).append(row.name)
     few = {
-        place: ", ".join(found) if len(found) < len(rows) / 2 else ""
-        for place, found in names.items()
+        place: ", ".join(row_names) if len(row_names) < len(rows) / 2 else ""
+        for place, row_names in names.items()
     }
     return [
         f"- {key}{f' of {few[key, reason]}' if few[key, reason] else ''}: {reason}"

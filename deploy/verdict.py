@@ -165,30 +165,31 @@ def compare(
         >>> bool(found.rows[0].figures["MAE"].value < 0.001)  # of full scale
         True
     """
-    known = Sensor.load(sensor)
+    profile = Sensor.load(sensor)
     if samples is not None and images is not None:
         remedy = "leave one of them out: images are for simulated patches"
         raise OptionError(
             "images", expected="none together with samples", got=str(images), remedy=remedy
         )
     _require_metric(metric)
-    ours, theirs = _pair(int8, against, known)
+    ours, theirs = _pair(int8, against, profile)
     scenes = None if images is None else Path(images)
     with reporting(progress), faults_named(theirs.label):
-        judged, simulated, notes = _samples(ours, theirs, known, samples, scenes, patches, seed)
+        judged, simulated, notes = _samples(ours, theirs, profile, samples, scenes, patches, seed)
         sessions = open_any_size(theirs.model), open_any_size(ours.model)
         result = differences_of(*sessions, judged.pairs, simulated, metric, judged.names)
         shares = saturated_shares(ours.model, judged.degraded)
     arguments: dict[str, object] = {
         "float": theirs.name,
         "int8": ours.name,
-        "sensor": known.name,
+        "sensor": profile.name,
         "images": images,
     }
     arguments |= {"patches": patches, "seed": seed, "samples": _named(samples)}
-    given = Path(samples) if isinstance(samples, str | os.PathLike) else None
-    rests_on = [sensor_input(known), *data_inputs(scenes, given)]
-    if samples is not None and given is None:
+    path = Path(samples) if isinstance(samples, str | os.PathLike) else None
+    rests_on = [sensor_input(profile), *data_inputs(scenes, path)]
+    # Samples in memory are no file, so the digest is that of their values.
+    if samples is not None and path is None:
         rests_on.append(Input(f"samples {IN_MEMORY}", judged.digest))
     rows, range_notes = _range_rows(ours, result)
     return Comparison(
@@ -201,7 +202,7 @@ def compare(
         shares=shares,
         floating=theirs,
         int8=ours,
-        sensor=known,
+        sensor=profile,
         rests_on=tuple(rests_on),
     )
 
@@ -283,14 +284,14 @@ def gate(
     _require_metric(metric)
     allowed = limits_of(limits)
     target = TargetProfile.load(board)
-    known = Sensor.load(sensor)
-    ours, theirs = _pair(int8, against, known)
+    profile = Sensor.load(sensor)
+    ours, theirs = _pair(int8, against, profile)
     config = limits if isinstance(limits, str | os.PathLike) else None
-    told = sensor if isinstance(sensor, str) else known.name
+    sensor_name = sensor if isinstance(sensor, str) else profile.name
     arguments: dict[str, object] = {"max_mae": allowed.mae, "limits": config, "baseline": baseline}
     arguments |= {
         "target": target.name,
-        "sensor": told,
+        "sensor": sensor_name,
         "images": images,
         "patches": patches,
         "seed": seed,
@@ -307,37 +308,48 @@ def gate(
         raise OptionError(
             "metric", expected="one beside the limit metric_loss", got="none", remedy=remedy
         )
-    wanted = "a metric" if metric else ""
+    # Missing references are refused before the networks run.
+    purpose = "a metric" if metric else ""
     if allowed.psnr_drop_db is not None:
-        wanted = "psnr_drop_db"
-    own = samples_of(theirs.model, samples) if wanted and samples is not None else None
-    _require_references(own, wanted)
+        purpose = "psnr_drop_db"
+    own = samples_of(theirs.model, samples) if purpose and samples is not None else None
+    _require_references(own, purpose)
     how: dict[str, Any] = {
-        "sensor": known,
+        "sensor": profile,
         "images": images,
         "patches": patches,
         "seed": seed,
         "metric": metric,
     }
-    found = compare(ours, theirs, samples, **how, progress=progress)
-    _require_contrast(found.result)
-    psnr_missing = math.isnan(found.result.psnr_float_db) and not math.isnan(found.result.mae)
+    comparison = compare(ours, theirs, samples, **how, progress=progress)
+    _require_contrast(comparison.result)
+    psnr_missing = math.isnan(comparison.result.psnr_float_db) and not math.isnan(
+        comparison.result.mae
+    )
     if own is not None and allowed.psnr_drop_db is not None and psnr_missing:
         raise unfit_reference(own.all.names[0], own.all.pairs[0][1].shape, "psnr_drop_db")
+    # Only the comparison has the PSNR by which a float network that was saved again is recognised.
     if before is not None:
-        before.require_same(theirs.sha256, found.result.psnr_float_db, found.rests_on)
-    checks = judge(found.result, allowed, before.mae if before else None)
-    checks += judge_saturation(found.shares, allowed)
+        before.require_same(theirs.sha256, comparison.result.psnr_float_db, comparison.rests_on)
+    checks = judge(comparison.result, allowed, before.mae if before else None)
+    checks += judge_saturation(comparison.shares, allowed)
+    # Without this, the file that is judged would decide itself whether its encoding is checked.
     must_describe = before is not None and ENCODING in before.checks
     checks += file_checks(theirs.model, ours, target, must_describe)
     notes = (
-        *found.notes,
-        *_mae_note(found.result, allowed, checks),
+        *comparison.notes,
+        *_mae_note(comparison.result, allowed, checks),
         *float_note(ours.model),
         *_unchecked(checks),
     )
     return Verdict(
-        "gate", arguments, found.inputs, found.rows, tuple(checks), notes=notes, comparison=found
+        "gate",
+        arguments,
+        comparison.inputs,
+        comparison.rows,
+        tuple(checks),
+        notes=notes,
+        comparison=comparison,
     )
 
 
@@ -385,6 +397,7 @@ def _pair(
     """The INT8 network and the float one, each of its precision."""
     theirs = None if against is None else Network.load(against, sensor=sensor)
     ours = Network.load(int8, sensor=sensor)
+    # A network that was quantised in this process knows its float network.
     theirs = theirs or ours.origin
     if theirs is None:
         remedy = "give it, or quantise it here"
@@ -412,15 +425,15 @@ def _samples(
     """
     own = samples_of(floating.model, samples)
     if own is None:
-        from beers_deploy.quant.calibration import (
-            unseen_patches,
-        )  # SciPy, which samples of one's own do without
+        # This loads SciPy, which samples of one's own do without.
+        from beers_deploy.quant.calibration import unseen_patches
 
         return unseen_patches(sensor, images, patches, seed), True, ()
     calibrated = set(metadata(int8.model).get(CALIBRATED_ON, "").split())
     count = sum(digest_of(degraded) in calibrated for degraded in own.all.degraded)
     if count == 0:
         return own.all, False, ()
+    # The file may not choose its judges: samples that it was calibrated on are judged, and noted.
     note = (
         f"by the INT8 file's own record, {count} of the {len(own.all.pairs)} samples were "
         "its calibration"
@@ -435,9 +448,9 @@ def _require_metric(metric: str | None) -> None:
         )
 
 
-def _require_references(own: OwnSamples | None, wanted: str) -> None:
+def _require_references(own: OwnSamples | None, purpose: str) -> None:
     if own is not None and not any(reference.size for _, reference in own.all.pairs):
-        expected = f"references for {wanted}"
+        expected = f"references for {purpose}"
         remedy = "give images and references, or leave it out"
         raise OptionError("samples", expected=expected, got="images alone", remedy=remedy)
 
@@ -461,8 +474,8 @@ def file_checks(
     if not (target.configurations or target.npu):
         return checks
     with faults_named(int8.label):
-        read = network_of(int8.model, fixed_tile_px(int8.model) or TILE_PX, int8.name)
-    return [legality(place(read, ruled(target)), npu=bool(target.npu)), *checks]
+        graph = network_of(int8.model, fixed_tile_px(int8.model) or TILE_PX, int8.name)
+    return [legality(place(graph, ruled(target)), npu=bool(target.npu)), *checks]
 
 
 def sentence(checks: Sequence[Check], passed: str) -> str:

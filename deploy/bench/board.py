@@ -8,6 +8,7 @@ cannot be tiled are predicted by the frame.
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -106,40 +107,44 @@ def predict(
     if host_task not in (None, *TASKS):
         expected = f"one of {', '.join(TASKS)}, or None"
         raise OptionError("host_task", expected=expected, got=repr(host_task), remedy="choose one")
-    found = Network.load(network, sensor=SENSOR, to_run=False)
+    source = Network.load(network, sensor=SENSOR, to_run=False)
     boards, corrected = _boards(board, dpu, None if measured is None else Path(measured))
     width_px, height_px = parse_size(
         "x".join(map(str, size)) if isinstance(size, tuple | list) else str(size)
     )
     try:
-        tiling = found.tiling
+        tiling = source.tiling
     except ModelError:
-        predictions, notes = _predictions(found.file, found.model, boards, tile, host_task)
+        predictions, notes = _predictions(source.file, source.model, boards, tile, host_task)
         rows = list(map(frame_row, predictions))
     else:
         halo_px = parse_halo(str(halo), tiling.halo_px)
         takes_step = consistency and keeps_pixels(tiling)
         swath = Swath(width_px, height_px, tile, halo_px, consistency=takes_step)
         predictions, notes = _predictions(
-            found.file, found.model, boards, tile, host_task, swath.step_px
+            source.file, source.model, boards, tile, host_task, swath.step_px
         )
         rows = [swath_row(prediction, swath) for prediction in predictions]
     layers = layer_rows(predictions[0]) if len(boards) == 1 else []
-    names = ", ".join(each.target.name for each in boards)
+    names = ", ".join(build.target.name for build in boards)
     arguments: dict[str, object] = {
         "target": names,
         "dpu": dpu,
         "size": f"{width_px}x{height_px}",
         "tile": tile,
+        "halo": halo,
+        "measured": measured,
+        "host_task": host_task,
     }
-    arguments |= {"halo": halo, "measured": measured, "host_task": host_task}
-    shown = [row for _, part in corrected for row in part]
-    shown += [
-        replace(row, figures={FACE.get(key, key): each for key, each in row.figures.items()})
+    table_rows = list(chain.from_iterable(part for _, part in corrected))
+    table_rows += [
+        replace(row, figures={FACE.get(key, key): figure for key, figure in row.figures.items()})
         for row in rows
     ]
-    about = ("predict", arguments, (found.input,))
-    return Predicted(*about, tuple(shown), notes=tuple(notes), layers=Table(*about, tuple(layers)))
+    about = ("predict", arguments, (source.input,))
+    return Predicted(
+        *about, tuple(table_rows), notes=tuple(notes), layers=Table(*about, tuple(layers))
+    )
 
 
 def _predictions(
@@ -153,9 +158,12 @@ def _predictions(
     """A network on each board, of its own size where it is fixed to one; and what to say of its
     host.
     """
+    # A network that is fixed to one size runs at that size alone.
     size_px = None if own_tile_px(model) else tile_px
-    found = [predict_file(file, dpu, size_px, task, step_px) for dpu in boards]
-    return found, [*dict.fromkeys(words for each in found for words in host_words(each))]
+    predictions = [predict_file(file, dpu, size_px, task, step_px) for dpu in boards]
+    # Boards of one kind say the same of their hosts: each sentence is kept once.
+    sentences = dict.fromkeys(chain.from_iterable(map(host_words, predictions)))
+    return predictions, list(sentences)
 
 
 TRAFFIC = (
@@ -186,7 +194,8 @@ class BoardBench:
     @property
     def rows(self) -> list[Row]:
         """All of them, those of the swath first."""
-        return [row for _, part in (*reversed(self.shown), *self.layers) for row in part]
+        tables = (*reversed(self.shown), *self.layers)
+        return list(chain.from_iterable(part for _, part in tables))
 
 
 def bench_board(
@@ -248,25 +257,27 @@ def bench_board(
         counts = tiles_by_factor(
             dn, plan, factors_for(sensor.nominal()), MAX_DN, offset_of(sensor, MAX_DN)
         )
+        # A tile with bright and dark pixels runs once for each exposure that its pixels ask for.
         swath = replace(swath, runs=sum(counts.values()) / plan.tiles)
     targets = list({dpu.target.name: dpu.target for dpu in boards}.values())
-    papers = published_rows() if any(each.name == PAPER_TARGET for each in targets) else []
-    beside = [*(processor_row(swath, each) for each in targets), *papers]
+    # The paper measured the VCK190 alone: its rows belong next to no other board.
+    papers = published_rows() if any(profile.name == PAPER_TARGET for profile in targets) else []
+    comparison = [*(processor_row(swath, profile) for profile in targets), *papers]
     title = f"{width_px} x {height_px} pixels"
     if len(boards) == len(tiles_px) == 1 and within_s is None:
         prediction = predict_file(model, boards[0], swath.tile_px, host_task, swath.step_px)
-        rows = [*predicted_rows(model.stem, prediction, swath), *beside]
-        shown = [*corrected, (f"{title} in tiles of {swath.tile_px}", rows)]
+        rows = [*predicted_rows(model.stem, prediction, swath), *comparison]
+        tables = [*corrected, (f"{title} in tiles of {swath.tile_px}", rows)]
         notes = [*host_words(prediction), *exposure_words(counts)]
         layers = [_layers(model, prediction)]
-        return BoardBench(shown, notes, layers, swath, dn)
+        return BoardBench(tables, notes, layers, swath, dn)
     swept = sweep_rows(model, swath, boards, tiles_px, host_task)
-    whole = (f"{model.name}, {title} in whole tiles, halo {swath.halo_px} px", swept)
-    shown = [*corrected, whole, (f"{title}, for comparison", beside)]
+    sweep = (f"{model.name}, {title} in whole tiles, halo {swath.halo_px} px", swept)
+    tables = [*corrected, sweep, (f"{title}, for comparison", comparison)]
     notes = exposure_words(counts)
     if within_s is not None:
         notes.append(within_words(swept, boards, within_s))
-    return BoardBench(shown, notes, [], swath, dn)
+    return BoardBench(tables, notes, [], swath, dn)
 
 
 def exposure_words(counts: Mapping[int, int]) -> list[str]:
@@ -285,9 +296,8 @@ def exposure_words(counts: Mapping[int, int]) -> list[str]:
 
 def _layers(model: Path, prediction: Prediction) -> tuple[str, list[Row]]:
     dpu = prediction.dpu
-    return f"{model.name}, one batch on {dpu.target.name} {dpu.name}; {TRAFFIC}", layer_rows(
-        prediction
-    )
+    title = f"{model.name}, one batch on {dpu.target.name} {dpu.name}; {TRAFFIC}"
+    return title, layer_rows(prediction)
 
 
 def _frames(
@@ -304,9 +314,9 @@ def _frames(
     sides = network.graph.input[0].type.tensor_type.shape.dim[2:]
     size = " x ".join(str(side.dim_value or TILE_PX) for side in sides)
     layers = [_layers(model, predictions[0])] if len(boards) == 1 else []
-    whole = f"not tiled, but run on whole images: expected {why.expected}, got {why.got}"
+    reason = f"not tiled, but run on whole images: expected {why.expected}, got {why.got}"
     return BoardBench(
-        [*corrected, (f"{model.name}, frames of {size}", rows)], [whole, *notes], layers
+        [*corrected, (f"{model.name}, frames of {size}", rows)], [reason, *notes], layers
     )
 
 
@@ -325,13 +335,12 @@ def _boards(
         remedy = "name the board that the runs are of"
         raise OptionError("target", expected=expected, got=repr(target), remedy=remedy)
     targets = boards_of(target)
-    boards = [
-        dpu_of(each, name)
-        for each in targets
-        for name in (each.configurations if config == ALL else [config])
-    ]
+    boards = []
+    for profile in targets:
+        names = profile.configurations if config == ALL else [config]
+        boards += [dpu_of(profile, name) for name in names]
     if measured is None:
         return boards, []
-    found = read_own_runs(measured, boards[0])
-    shown = [(found.source, found.factor_rows()), ("your runs", found.run_rows())]
-    return [found.applied(dpu) for dpu in boards], shown
+    own_runs = read_own_runs(measured, boards[0])
+    tables = [(own_runs.source, own_runs.factor_rows()), ("your runs", own_runs.run_rows())]
+    return [own_runs.applied(dpu) for dpu in boards], tables

@@ -54,9 +54,9 @@ def time_networks(
         run.held_bytes = resident_bytes() - before_bytes
         calls.append(partial(session.run, None, feed))
 
-    for run, taken in zip(runs, interleaved(calls, min_runs, min_time_s), strict=True):
-        run.times_s += [time_s for time_s, _ in taken]
-        run.powers += [power for _, power in taken]
+    for run, samples in zip(runs, interleaved(calls, min_runs, min_time_s), strict=True):
+        run.times_s += [time_s for time_s, _ in samples]
+        run.powers += [power for _, power in samples]
 
 
 def _row(run: Timed, tile_px: int, conditions: Mapping[str, Figure]) -> Row:
@@ -75,6 +75,7 @@ def _row(run: Timed, tile_px: int, conditions: Mapping[str, Figure]) -> Row:
 
 
 def _ratio_row(runs: Sequence[Timed]) -> Row:
+    # False sorts before True: the INT8 network comes first.
     int8, float32 = sorted(runs, key=lambda run: not is_quantised(run.model))
     ratio = statistics.median(float32.times_s) / statistics.median(int8.times_s)
     source = f"medians of {len(int8.times_s)} runs each, interleaved"
@@ -83,9 +84,10 @@ def _ratio_row(runs: Sequence[Timed]) -> Row:
 
 def _mean_power(run: Timed) -> Figure:
     """Mean over the network's own runs, or why there is none."""
-    missing = next((power for power in run.powers if power.value is None), None)
-    if missing is not None:
-        return unavailable("W", missing.reason)
+    no_power = next((power for power in run.powers if power.value is None), None)
+    if no_power is not None:
+        return unavailable("W", no_power.reason)
+    # Runs differ in length: the mean power is energy over time, not the mean of the powers.
     energy_j = sum(
         (power.value or 0.0) * time_s for power, time_s in zip(run.powers, run.times_s, strict=True)
     )
@@ -104,15 +106,15 @@ def host_rows(
     other precision is the shipped network of the same variant; without one it runs alone.
     """
     require_cores("threads", threads)
-    given = load_onnx(model)
-    other = other_precision(given)
-    runs = [Timed(model.stem, given)]
+    network = load_onnx(model)
+    other = other_precision(network)
+    runs = [Timed(model.stem, network)]
     if other is not None:
-        runs.append(
-            Timed(f"{'INT8' if is_quantised(other) else 'float32'} of the same shape", other)
-        )
+        precision = "INT8" if is_quantised(other) else "float32"
+        runs.append(Timed(f"{precision} of the same shape", other))
     min_time_s = target.value("measurement", "min_time_s")
     min_runs = int(target.value("measurement", "min_runs"))
+    # The load is measured from one call to the next: this one opens the window of the timed runs.
     cpu_load()
     time_networks(runs, tile_px, threads, min_time_s, min_runs)
     conditions = conditions_of(threads or psutil.cpu_count(logical=False) or 1)
@@ -126,17 +128,14 @@ def step_row(sensor: Sensor, tile_px: int, min_time_s: float, min_runs: int) -> 
     """Time the consistency step on one thread here, on a tile of noise."""
     instrument = sensor.nominal()
     step = Consistency.of(instrument, sensor.reference.nominal())
-    raw = (
-        np.random.default_rng(0)
-        .uniform(0, instrument.max_dn / 2, (tile_px, tile_px))
-        .astype(np.float32)
-    )
+    generator = np.random.default_rng(0)
+    noise = generator.uniform(0, instrument.max_dn / 2, (tile_px, tile_px))
+    raw = noise.astype(np.float32)
     side = Placed(tile_px, 0, 0, tile_px)
     call = partial(step.correction, raw, raw, side, side, (0, 0))
     call()
-    times_ms = np.array(
-        [1e3 * time_s for time_s, _ in interleaved([call], min_runs, min_time_s)[0]]
-    )
+    samples = interleaved([call], min_runs, min_time_s)[0]
+    times_ms = np.array([1e3 * time_s for time_s, _ in samples])
     source = f"{len(times_ms)} runs on one thread after one for warm-up"
     figures = {
         f"p{p}": measured(float(np.percentile(times_ms, p)), "ms/tile", source) for p in (50, 90)

@@ -150,6 +150,7 @@ def one_thread_latency(prediction: Prediction) -> Figure:
 def swath_latency(prediction: Prediction, batches: float) -> Figure:
     """Time of so many batches, in seconds."""
     images = batches * prediction.batch
+    # The lower end of the rate is the upper end of the time.
     slow_s, fast_s = (images / fps for fps in prediction.fps_interval)
     return predicted(images / prediction.fps, "s", (fast_s, slow_s), COST_SOURCE)
 
@@ -158,20 +159,19 @@ def fitted_range(prediction: Prediction) -> str:
     """Whether the fitted networks speak for this one, and how often the board's intervals held, if
     too rarely.
     """
-    found = f"outside: {'; '.join(prediction.outside)}" if prediction.outside else "inside"
+    words = f"outside: {'; '.join(prediction.outside)}" if prediction.outside else "inside"
     share = prediction.dpu.value("cost", "families_held")
-    return (
-        found
-        if share >= HELD
-        else f"{found}; intervals held {100 * share:.0f} % of families left out"
-    )
+    if share >= HELD:
+        return words
+    return f"{words}; intervals held {100 * share:.0f} % of families left out"
 
 
 def energy(latency: Figure, power: Figure) -> Figure:
     """Energy of the swath, in J: time and power, and their ends."""
     if power.value is None or latency.value is None:
         return unavailable("J", power.reason or latency.reason)
-    (fast_s, slow_s), (low_w, high_w) = interval_ends(latency), interval_ends(power)
+    fast_s, slow_s = interval_ends(latency)
+    low_w, high_w = interval_ends(power)
     ends = fast_s * low_w, slow_s * high_w
     return predicted(latency.value * power.value, "J", ends, f"{latency.source}; {power.source}")
 
@@ -185,8 +185,11 @@ def efficiency(pixels: int, latency: Figure, power: Figure) -> Figure:
         return unavailable(unit, power.reason or latency.reason)
     value = pixels / latency.value / power.value
     if "predicted" not in (latency.mode, power.mode):
+        # Only predictions have intervals, so that a quotient without one among its parts has none.
         return Figure(value, unit, latency.mode, f"{latency.source}; {power.source}")
-    (fast_s, slow_s), (low_w, high_w) = interval_ends(latency), interval_ends(power)
+    fast_s, slow_s = interval_ends(latency)
+    low_w, high_w = interval_ends(power)
+    # The slowest run at the highest power is the least efficient, and the reverse.
     interval = (pixels / slow_s / high_w, pixels / fast_s / low_w)
     return predicted(value, unit, interval, f"{latency.source}; {power.source}")
 
@@ -221,8 +224,9 @@ def scaled(value: float, unit: str, prediction: Prediction) -> Figure:
 def parse_size(text: str) -> tuple[int, int]:
     """WIDTHxHEIGHT in pixels as (width, height)."""
     parts = text.lower().split("x")
+    # Python raises an error of its own for very long numbers, so these are refused by their length.
     if len(parts) != 2 or not all(
-        part.isdecimal() and 0 < int(part[:9]) <= SIDE_PX for part in parts
+        part.isdecimal() and len(part) <= 9 and 0 < int(part) <= SIDE_PX for part in parts
     ):
         expected = f"WIDTHxHEIGHT of 1 to {SIDE_PX} pixels"
         remedy = f"write it as {PAPER_SIZE}"

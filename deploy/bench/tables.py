@@ -81,14 +81,13 @@ def quoted_rows(network: str, target: TargetProfile) -> list[Row]:
     other networks.
     """
     reason = f"too few rates of {target.name} are published to fit a cost model"
-    own = {key: unavailable(unit, reason) for key, unit in QUOTED.items()}
-    own["power"] = unavailable("W", f"no power of {target.name} is published")
-    rows = [Row(TABLE, f"{network} on {target.name}", own)]
+    figures = {key: unavailable(unit, reason) for key, unit in QUOTED.items()}
+    figures["power"] = unavailable("W", f"no power of {target.name} is published")
+    rows = [Row(TABLE, f"{network} on {target.name}", figures)]
     for key, unit in QUOTED.items():
         for name, constant in target.tables.get(f"published_{key}_{unit}", {}).items():
-            rows.append(
-                Row(TABLE, f"quoted: {name}", {key: published(constant.low, unit, constant.source)})
-            )
+            figure = published(constant.low, unit, constant.source)
+            rows.append(Row(TABLE, f"quoted: {name}", {key: figure}))
     return rows
 
 
@@ -123,10 +122,11 @@ def processor_row(swath: Swath, board: TargetProfile) -> Row:
     cores = f", {cpu['cores']} cores" if "cores" in cpu else ""
     name = f"traditional pipeline on the processor of {board.name}{cores}"
     if constant is None:
-        missing = f"the target states no [cpu] {CHAIN}"
-        return Row(TABLE, name, {"latency": unavailable("s", missing), "power": power})
+        reason = f"the target states no [cpu] {CHAIN}"
+        return Row(TABLE, name, {"latency": unavailable("s", reason), "power": power})
     low_s = mpx * constant.low
     high_s = mpx * constant.high
+    # The two ends are factors apart: their geometric mean stands for the value.
     latency = predicted(between((low_s, high_s)), "s", (low_s, high_s), constant.source)
     figures = {
         "latency": latency,
@@ -145,10 +145,8 @@ def layer_rows(prediction: Prediction) -> list[Row]:
     """
     rows = [_layer_row(layer, prediction) for layer in prediction.layers]
     total = f"sum: one batch of {prediction.batch}"
-    return [
-        *rows,
-        Row(LAYERS, total, {"time": scaled(1e3 * prediction.batch_time_s, "ms/batch", prediction)}),
-    ]
+    time = scaled(1e3 * prediction.batch_time_s, "ms/batch", prediction)
+    return [*rows, Row(LAYERS, total, {"time": time})]
 
 
 def _layer_row(layer: LayerCost, prediction: Prediction) -> Row:
@@ -156,8 +154,9 @@ def _layer_row(layer: LayerCost, prediction: Prediction) -> Row:
     batch = prediction.batch
     dpu = prediction.dpu
     low_j, high_j = layer_energy_j(layer, dpu)
-    moved = batch * work.map_bytes + work.weight_bytes
-    seconds = layer.time_s or math.inf  # a concat takes no time of its own
+    moved_bytes = batch * work.map_bytes + work.weight_bytes
+    # A concat takes no time of its own: over an infinite time its rates are 0.
+    seconds = layer.time_s or math.inf
     figures = {
         "work": exact(work.operations / 1e9, "GOP"),
         "time": scaled(1e3 * layer.time_s, "ms/batch", prediction),
@@ -177,7 +176,7 @@ def _layer_row(layer: LayerCost, prediction: Prediction) -> Row:
             "MB",
             "feature maps that an image stores, by the graph's shapes",
         ),
-        "bandwidth": scaled(moved / seconds / 1e9, "GB/s", prediction),
+        "bandwidth": scaled(moved_bytes / seconds / 1e9, "GB/s", prediction),
         "array use": exact(100 * work.array_use, "%"),
         "energy": predicted(
             500 * (low_j + high_j), "mJ", (1e3 * low_j, 1e3 * high_j), energy_source(dpu)
@@ -200,21 +199,23 @@ def sweep_rows(
     """A row a configuration and tile size, for whole tiles with the swath's halo."""
     rows = []
     for dpu, tile_px in product(boards, tiles_px):
-        cut = replace(swath, tile_px=tile_px)
-        rows.append(swath_row(predict_file(model, dpu, tile_px, task, cut.step_px), cut))
+        tiled = replace(swath, tile_px=tile_px)
+        prediction = predict_file(model, dpu, tile_px, task, tiled.step_px)
+        rows.append(swath_row(prediction, tiled))
     return rows
 
 
 def swath_row(prediction: Prediction, swath: Swath) -> Row:
     """A swath in whole tiles on one configuration."""
     batches = math.ceil(swath.tiles * swath.runs / prediction.batch)
-    kept = [not layer.work.map_bytes for layer in prediction.layers]
+    on_chip = [not layer.work.map_bytes for layer in prediction.layers]
     figures = swath_figures(prediction, swath, swath.tiles, batches) | {
         "maps through memory": exact(prediction.streamed_bytes / 1e6, "MB/tile"),
-        "layers on chip": exact(100 * sum(kept) / len(kept), "%"),
+        "layers on chip": exact(100 * sum(on_chip) / len(on_chip), "%"),
     }
     bound = Counter[str]()
     for layer in prediction.layers:
+        # A Counter is typed to hold integers: the times are added up in picoseconds.
         bound[layer.bound] += round(1e12 * layer.time_s)
     words = {"bound": bound.most_common(1)[0][0], "fitted range": fitted_range(prediction)}
     return Row("sweep", f"{_named(prediction)}, tiles of {swath.tile_px}", figures, words)
@@ -236,9 +237,10 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
         boards: as given there.
         within_s: what the swath may take.
     """
-    each = len(rows) // len(boards)
-    found = dict[str, str]()
-    placed = [(boards[k // each].peak_ops_per_s, row) for k, row in enumerate(rows)]
+    rows_per_board = len(rows) // len(boards)
+    names = dict[str, str]()
+    # The rows of a board stand next to each other, the same number for each board.
+    placed = [(boards[k // rows_per_board].peak_ops_per_s, row) for k, row in enumerate(rows)]
     ends: dict[str, Callable[[Figure], float | None]] = {
         "by the whole interval": lambda latency: interval_ends(latency)[1],
         "by the prediction": lambda latency: latency.value,
@@ -252,8 +254,9 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
         ]
         if fits:
             peak, row = min(fits, key=lambda fit: fit[0])
-            found.setdefault(f"{row.name} ({peak / 1e12:.3g} TOPS)", how)
-    words = "; ".join(f"{how} {name}" for name, how in found.items()) or "none of these"
+            # A DPU that meets the time surely is not named again for less.
+            names.setdefault(f"{row.name} ({peak / 1e12:.3g} TOPS)", how)
+    words = "; ".join(f"{how} {name}" for name, how in names.items()) or "none of these"
     return f"the smallest DPU that takes {within_s:g} s or less: {words}"
 
 
@@ -278,17 +281,17 @@ def host_words(prediction: Prediction) -> list[str]:
     """What was assumed of the file, and what the processor runs because the DPU refuses it; a
     sentence each.
     """
-    found = [prediction.note] if prediction.note else []
+    sentences = [prediction.note] if prediction.note else []
     if prediction.refused:
         low_ms, high_ms = (1e3 * end_s for end_s in prediction.refused_s)
-        found.append(
+        sentences.append(
             f"the processor of {prediction.dpu.target.name} runs what its DPU refuses "
             "('beers-deploy check' says "
             f"why): {', '.join(prediction.refused)}; {number(low_ms, 2)} to "
             f"{number(high_ms, 2)} ms an image, from "
             "the best that is published of its cores to plain code"
         )
-    return found
+    return sentences
 
 
 def parse_tiles(text: str) -> list[int]:

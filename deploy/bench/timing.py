@@ -39,9 +39,9 @@ def _advance(domain: Path, before: int, after: int) -> int:
     """Counts between two readings of a counter that starts again at its range; one turn at most
     (minutes).
     """
-    range_uj = (
-        0 if after >= before else int((domain / "max_energy_range_uj").read_text(encoding="utf-8"))
-    )
+    if after >= before:
+        return after - before
+    range_uj = int((domain / "max_energy_range_uj").read_text(encoding="utf-8"))
     return after - before + range_uj
 
 
@@ -75,11 +75,12 @@ def interleaved(
     Returns:
         Of each call, round by round.
     """
-    found: list[list[tuple[float, Figure]]] = [[] for _ in calls]
+    samples: list[list[tuple[float, Figure]]] = [[] for _ in calls]
     while (
-        len(found[0]) < rounds
-        or min(sum(time_s for time_s, _ in taken) for taken in found) < least_s
+        len(samples[0]) < rounds
+        or min(sum(time_s for time_s, _ in call_samples) for call_samples in samples) < least_s
     ):
-        for call, taken in zip(calls, found, strict=True):
-            taken.append(timed(call)[1:])
-    return found
+        # Each call runs once a round, so that whatever else runs here meets all of them alike.
+        for call, call_samples in zip(calls, samples, strict=True):
+            call_samples.append(timed(call)[1:])
+    return samples

@@ -65,6 +65,7 @@ def measure_chain(dn: np.ndarray, degraded: Sensor, reference: Sensor) -> ChainT
     chain = Chain(degraded.nominal(), reference.nominal())
     crops = [torch.from_numpy(np.ascontiguousarray(crop, dtype=np.float32)) for crop in _crops(dn)]
     restore_traditional(crops[0][:32, :32], chain)
+    # The load is measured from one call to the next: this one opens the window of the timed run.
     cpu_load()
     times_s, _, power = timed(lambda: [_time_s(crop, chain) for crop in crops])
     per_mpx = [1e6 * time_s / crop.numel() for time_s, crop in zip(times_s, crops, strict=True)]
@@ -86,6 +87,7 @@ def drawn_acquisition(
     """Digital numbers of a drawn scene, as large as the swath but no larger than the crops need."""
     ratio = int(degraded.oversampling.low)
     sides = min(swath.height_px, CROP_PX), min(swath.width_px, CROPS * CROP_PX)
+    # The simulator cuts a margin off each side, which keeps the wrap of its Fourier transform out.
     height, width = ((side + 2 * MARGIN_PX) * ratio for side in sides)
     scene = procedural_scene(height, width, np.random.default_rng(seed))
     pair = simulate_pair(scene.radiance, degraded.nominal(), reference.nominal(), ratio, Draw(seed))

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from beers_deploy.bench.swath import Swath
 
 
-PAPER_SIZE = "13600x9016"  # as in deploy.bench.swath, which is imported late
+# The same as in deploy.bench.swath, which is imported late.
+PAPER_SIZE = "13600x9016"
 BOARD_ONLY = (
     "image",
     "full_scale",
@@ -154,13 +155,14 @@ def bench(
     board = target.removesuffix(MODEL_SUFFIX)
     _refuse_unused(context, here)
     require_writable(json, inputs=(model, image, measured, Path(target), Path(sensor)))
-    known = load_sensor(sensor)
-    path = int8_file(model, known, partial(say, err=True))
-    read = inputs_of(path, image, measured) if json else ()
+    sensor_profile = load_sensor(sensor)
+    path = int8_file(model, sensor_profile, partial(say, err=True))
+    # The digests are those of the files that are read from here on.
+    inputs = inputs_of(path, image, measured) if json else ()
     if here:
         from beers_deploy.bench.host import host_rows
 
-        rows = host_rows(path, load_target("host-cpu"), _single(tiles), threads, known)
+        rows = host_rows(path, load_target("host-cpu"), _single(tiles), threads, sensor_profile)
         for table, part in by_table(rows).items():
             print_rows(f"{path.name} on this machine: {table}", part)
         say(NO_PROXY)
@@ -178,7 +180,7 @@ def bench(
         )
     else:
         task = next((name for name in TASKS if name == host_task), None)
-        found = bench_board(
+        prediction = bench_board(
             path,
             board,
             image=image,
@@ -190,32 +192,37 @@ def bench(
             measured=measured,
             within_s=within,
             host_task=task,
-            sensor=known if conditioned(model) is not None else None,
+            sensor=sensor_profile if conditioned(model) is not None else None,
             consistency=consistency,
         )
-        for title, part in (*(_required_layers(found) if layers else []), *found.shown):
+        for title, part in (*(_required_layers(prediction) if layers else []), *prediction.shown):
             print_rows(title, part)
-        for note in (*found.notes, PREDICTED, *([LAYERS] if found.layers and not layers else [])):
+        for note in (
+            *prediction.notes,
+            PREDICTED,
+            *([LAYERS] if prediction.layers and not layers else []),
+        ):
             say(note)
-        rows = found.rows
-        if not no_traditional and found.swath is not None:
+        rows = prediction.rows
+        # This takes seconds and loads torch, so all predictions are shown first.
+        if not no_traditional and prediction.swath is not None:
             try:
-                rows = [*rows, _traditional_row(found.dn, found.swath)]
+                rows = [*rows, _traditional_row(prediction.dn, prediction.swath)]
                 print_rows("the traditional pipeline, measured on crops here", rows[-1:])
             except ImportError as error:
                 say(
                     "The traditional pipeline is not measured here: "
                     f"{missing_extra(error, 'bench')}"
                 )
-    require_same(read, path, image, measured)
-    save(Table("bench", arguments(), read, tuple(rows)), json)
+    require_same(inputs, path, image, measured)
+    save(Table("bench", arguments(), inputs, tuple(rows)), json)
 
 
-def _required_layers(found: "BoardBench") -> "Tables":
-    if not found.layers:
+def _required_layers(prediction: "BoardBench") -> "Tables":
+    if not prediction.layers:
         expected = "one --target, --tile and --dpu, and no --within"
         raise OptionError("--layers", expected=expected, got="a comparison", remedy="choose one")
-    return found.layers
+    return prediction.layers
 
 
 def _traditional_row(dn: "np.ndarray | None", swath: "Swath") -> "Row":
@@ -225,16 +232,15 @@ def _traditional_row(dn: "np.ndarray | None", swath: "Swath") -> "Row":
     from beers_deploy.bench.traditional import drawn_acquisition, measure_chain
 
     sensors = load_sensor(SENSOR), load_sensor(REFERENCE)
-    return measure_chain(drawn_acquisition(swath, *sensors) if dn is None else dn, *sensors).row(
-        swath
-    )
+    acquisition = drawn_acquisition(swath, *sensors) if dn is None else dn
+    return measure_chain(acquisition, *sensors).row(swath)
 
 
 def _refuse_unused(context: typer.Context, here: bool) -> None:
     """Refuse the options of the other target, and a size or a scale that no image asks for."""
-    wanted = "the modelled board" if here else "--target host"
-    expected = f"{wanted} beside it"
-    remedy = f"leave it out, or take {wanted}"
+    other_target = "the modelled board" if here else "--target host"
+    expected = f"{other_target} beside it"
+    remedy = f"leave it out, or take {other_target}"
     refuse(
         context,
         BOARD_ONLY if here else HOST_ONLY,

@@ -56,12 +56,12 @@ def check(
     if picture and load_target(target).npu:
         remedy = "leave it out: where a node of this board goes is not known"
         raise OptionError("--picture", expected="a board with a DPU", got=target, remedy=remedy)
-    found = placed(in_int8(model or Path(VARIANT)), target, dpu=dpu, tile=tile)
-    print_rows(found.title, [row for row in found.rows if row.table == "nodes"])
+    table = placed(in_int8(model or Path(VARIANT)), target, dpu=dpu, tile=tile)
+    print_rows(table.title, [row for row in table.rows if row.table == "nodes"])
     if picture is not None:
-        write_picture(found.placement, found.title, picture)
-    save(found, json)
-    for line in found.lines:
+        write_picture(table.placement, table.title, picture)
+    save(table, json)
+    for line in table.lines:
         say(line)
-    if not found:
+    if not table:
         raise typer.Exit(1)

@@ -1,5 +1,6 @@
 """`beers-deploy demo`: the whole chain on one image, with a report at the end."""
 
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -49,5 +50,5 @@ def demo(
         print_rows(table.title, table.rows)
     say(report.headline)
     say(f"report: {out / 'report.html'}")
-    rows = tuple(row for table in report.tables for row in table.rows)
+    rows = tuple(chain.from_iterable(table.rows for table in report.tables))
     save(Table("demo", arguments(), tuple([image] if image else []), rows), json)

@@ -90,24 +90,26 @@ def detect(
         refuse(context, ["labels", "split"], expected="--images beside it")
     else:
         refuse(context, ["drawn"], expected="synthetic scenes", got="--images beside it")
+    # A name that is given twice is measured once, in the order of the command line.
     names = list(dict.fromkeys(["degraded", *(name.strip() for name in methods.split(","))]))
     sensors = list(dict.fromkeys(name.strip() for name in sensor.split(",")))
+    # No output may replace a picture or a label, wherever in the folders it lies.
     trees = [tree.rglob("*") for tree in (images, labels) if tree is not None and tree.is_dir()]
-    named = [Path(name) for name in (*sensors, *names, reference) if name]
-    read = (images, labels, detector, *chain.from_iterable(trees), *named)
-    require_writable(out / REPORT, json, inputs=read, folders=(out,))
-    opened = open_detector(detector or DETECTOR, size_px=side)
-    known = {} if classes is None else parse_classes(classes)
+    paths = [Path(name) for name in (*sensors, *names, reference) if name]
+    inputs = (images, labels, detector, *chain.from_iterable(trees), *paths)
+    require_writable(out / REPORT, json, inputs=inputs, folders=(out,))
+    network = open_detector(detector or DETECTOR, size_px=side)
+    class_names = {} if classes is None else parse_classes(classes)
     if images is None:
-        scenes, notes = synthetic_scenes(drawn, seed, opened.names, known)
+        scenes, notes = synthetic_scenes(drawn, seed, network.names, class_names)
     else:
-        scenes, notes = labelled_scenes(opened.names, known, images, labels, split)
-    compared = run_study(opened, scenes, sensors, names, reference=reference, seed=seed, say=say)
-    notes = [note for note in (opened.flag, sites_note(compared[0].sites), *notes) if note]
-    rows = [*(row for found in compared for row in detection_rows(found)), *paper_rows()]
-    for table, each in by_table(rows).items():
+        scenes, notes = labelled_scenes(network.names, class_names, images, labels, split)
+    compared = run_study(network, scenes, sensors, names, reference=reference, seed=seed, say=say)
+    notes = [note for note in (network.flag, sites_note(compared[0].sites), *notes) if note]
+    rows = [*chain.from_iterable(map(detection_rows, compared)), *paper_rows()]
+    for table, part in by_table(rows).items():
         if table.startswith((MAIN, PAPER_TABLE)):
-            print_rows(table, each)
+            print_rows(table, part)
     for sentence in (*notes, headline(compared)):
         say(sentence)
     write_page(compared, rows, notes, out / REPORT)

@@ -37,20 +37,20 @@ def diff(
     require_writable(json, inputs=(before, after))
     limits = [parse_limit(text) for text in fail_on or ()]
     documents = read_document(before), read_document(after)
-    found = changes(*documents)
-    if not found.both:
+    comparison = changes(*documents)
+    if not comparison.both:
         expected = "documents that share a figure"
         remedy = "give two results of one command"
         raise OptionError(str(after), expected=expected, got="none in both", remedy=remedy)
-    rows = change_rows(found.changed)
+    rows = change_rows(comparison.changed)
     if rows:
         print_rows(f"{before.name} -> {after.name}", rows)
-    counts = f"{len(rows)} changed, {len(found.gone)} gone, {len(found.new)} new"
-    say(f"{len(found.both)} figures in both, {counts}")
+    counts = f"{len(rows)} changed, {len(comparison.gone)} gone, {len(comparison.new)} new"
+    say(f"{len(comparison.both)} figures in both, {counts}")
     for note in differing(*documents):
         say(note)
     save(Table("diff", arguments(), (before, after), tuple(rows)), json)
-    failed = broken(found, limits)
+    failed = broken(comparison, limits)
     for line in failed:
         say(f"FAILED {line}")
     if failed:
@@ -63,8 +63,8 @@ def differing(before: "Mapping[str, object]", after: "Mapping[str, object]") -> 
         "command": f"another command: {before['command']}, {after['command']}",
         "arguments": "other arguments",
     }
-    notes = [f"note: {said}" for key, said in words.items() if before[key] != after[key]]
-    digests = [[each["sha256"] for each in found["inputs"]] for found in (before, after)]  # type: ignore[attr-defined]
+    notes = [f"note: {text}" for key, text in words.items() if before[key] != after[key]]
+    digests = [[entry["sha256"] for entry in document["inputs"]] for document in (before, after)]  # type: ignore[attr-defined]
     if digests[0] != digests[1]:
         notes.append("note: other input files")
     hosts: list[Mapping[str, object]] = [before["host"], after["host"]]  # type: ignore[list-item]

@@ -83,12 +83,14 @@ def evaluate(
         expected = "no --images, --sweep or --brightness with it: pairs are as they are"
         raise OptionError("pairs", expected=expected, got="both", remedy="leave one out")
     factors = parse_brightness(brightness)
+    # A method that is named twice is measured once, in the order of the command line.
     names = list(dict.fromkeys(name.strip() for name in methods.split(",")))
     folders = [pairs, *(pairs / role for role in ("degraded", "reference"))] if pairs else [images]
-    read = (*folders, lpips, *(Path(name) for name in (sensor, reference, *names) if name))
-    require_writable(out / "report.html" if out else None, json, inputs=read, folders=(out,))
+    inputs = (*folders, lpips, *(Path(name) for name in (sensor, reference, *names) if name))
+    require_writable(out / "report.html" if out else None, json, inputs=inputs, folders=(out,))
     if images is not None:
-        list_images(images)  # an empty folder is refused before torch is loaded
+        # An empty folder is refused before torch is loaded.
+        list_images(images)
     from beers_deploy.studies.evaluation.run import evaluate as compared
 
     about: dict[str, Any] = {
@@ -98,22 +100,22 @@ def evaluate(
         "brightness": factors,
     }
     about |= {"consistency": consistency, "exposure": exposure}
-    found = compared(
+    table = compared(
         names, pairs, images=images, sweep=sweep, strict=strict, seed=seed, log=say, **about
     )
-    for title, rows in {found.title: found.mean, **found.more}.items():
+    for title, rows in {table.title: table.mean, **table.more}.items():
         print_rows(title, rows)
-    for note in found.notes:
+    for note in table.notes:
         say(note)
     if out is not None:
-        say(f"wrote {found.report(out)}")
-    save(found, json)
+        say(f"wrote {table.report(out)}")
+    save(table, json)
 
 
 def parse_brightness(text: str | None) -> tuple[float, ...]:
     """Return the factors of radiance that a user wrote, separated by commas; 1 alone if none."""
     try:
-        return tuple(float(each) for each in (text or "1").split(","))
+        return tuple(float(factor) for factor in (text or "1").split(","))
     except ValueError as error:
         expected = "numbers separated by commas"
         remedy = "give factors such as 0.25,0.05"

@@ -83,29 +83,30 @@ def export(
     from beers_deploy.quant.onnx_file import require_onnx_name, save_onnx
 
     if not (network.suffix or network.exists()):
-        shipped_weights(network.name.removesuffix(INT8))  # refuses other names
+        # This refuses names under which nothing is shipped.
+        shipped_weights(network.name.removesuffix(INT8))
     path = weights_file(network)
-    read = [path, apply, *(Path(given) for given in (sensor, target) if given)]
-    require_writable(out, board_file, delta, inputs=read)
+    inputs = [path, apply, *(Path(name) for name in (sensor, target) if name)]
+    require_writable(out, board_file, delta, inputs=inputs)
     deltas = _delta_files(delta, sensor)
-    require_writable(out, board_file, *deltas.values(), inputs=read)
+    require_writable(out, board_file, *deltas.values(), inputs=inputs)
     if board_file is None:
         refuse(context, ["target"], expected="--board-file beside it")
     if path.suffix != ".onnx":
         remedy = (
             "give one that 'quantize' made of weights of 'train --conditioned', or leave it out"
         )
-        asked = ["board_file", "delta", "apply"]
-        refuse(context, asked, expected="an INT8 --network", got=str(network), remedy=remedy)
+        options = ["board_file", "delta", "apply"]
+        refuse(context, options, expected="an INT8 --network", got=str(network), remedy=remedy)
     require_onnx_name(out, board_file)
-    board = board_for(target or DEFAULT_TARGET, board_file, tile, read)
+    board = board_for(target or DEFAULT_TARGET, board_file, tile, inputs)
     if path.suffix == ".onnx":
         _export_int8(path, out, sensor, tile, (board_file, board), deltas, apply)
         return
-    known = load_sensor(sensor or SENSOR) if is_conditioned(path) else None
-    if known is not None:
-        warn_outside(known, read_conditioned(path).kernels, partial(say, err=True))
-        model = float_for(path, path.stem, known, tile)
+    profile = load_sensor(sensor or SENSOR) if is_conditioned(path) else None
+    if profile is not None:
+        warn_outside(profile, read_conditioned(path).kernels, partial(say, err=True))
+        model = float_for(path, path.stem, profile, tile)
     elif sensor is not None:
         expected = "weights of 'train --conditioned'"
         remedy = "leave --sensor out, or give such weights"
@@ -119,14 +120,11 @@ def export(
         save_onnx(model, out)
         say(f"wrote {out}")
         return
-    from beers_deploy.parity import (
-        require_parity,
-        torch_network,
-    )  # it takes torch, which shipped ones do without
+    # It loads torch, which shipped networks do without.
+    from beers_deploy.parity import require_parity, torch_network
 
-    difference = require_parity(
-        torch_network(path, known.nominal() if known else None), model, tile or 97
-    )
+    reference = torch_network(path, profile.nominal() if profile else None)
+    difference = require_parity(reference, model, tile or 97)
     save_onnx(model, out)
     say(f"wrote {out}: largest difference from torch {difference:.2g} of full scale (measured)")
 
@@ -181,23 +179,23 @@ def _export_int8(
         )
     model = load_onnx(path)
     if apply is not None:
-        made = told_by_delta(model, apply)
+        network = told_by_delta(model, apply)
     else:
-        made = told_int8(model, load_sensor(sensor or SENSOR), log=partial(say, err=True))
-    core = read_core(made)
-    about = metadata(made)
-    side_px = tile_px or fixed_tile_px(made)
+        network = told_int8(model, load_sensor(sensor or SENSOR), log=partial(say, err=True))
+    core = read_core(network)
+    about = metadata(network)
+    side_px = tile_px or fixed_tile_px(network)
     require_tile(side_px, core.ends.place_px)
     board_file, profile = board
-    for_board = Network(made, out.stem).core(profile, tile_px) if board_file else None
+    for_board = Network(network, out.stem).core(profile, tile_px) if board_file else None
     save_onnx(host_model(core, about, side_px), out)
     say(f"wrote {out}")
     save_core(for_board, board_file, profile)
     for factor, delta in deltas.items():
-        _save_delta(made, load_sensor(sensor or SENSOR), factor, delta)
+        _save_delta(network, load_sensor(sensor or SENSOR), factor, delta)
 
 
-def _save_delta(made: "onnx.ModelProto", sensor: Sensor, factor: int, delta: Path) -> None:
+def _save_delta(network: "onnx.ModelProto", sensor: Sensor, factor: int, delta: Path) -> None:
     """Write the delta of an INT8 network that is conditioned on a sensor, at
     one of its exposures.
     """
@@ -206,9 +204,8 @@ def _save_delta(made: "onnx.ModelProto", sensor: Sensor, factor: int, delta: Pat
     from beers_deploy.network_files import told_int8
     from beers_deploy.quant.banked.family import delta_of_file
 
-    # The other exposures of a sensor are no user's choice: what of them lies outside the trained
-    # range is not told.
-    model = made if factor == 1 else told_int8(made, brightened(sensor, factor))
+    # Nobody chose the sensors of the other exposures, so their warnings are not printed.
+    model = network if factor == 1 else told_int8(network, brightened(sensor, factor))
     packed = delta_of_file(model)
     with whole_file(delta) as temporary:
         temporary.write_bytes(packed)

@@ -84,7 +84,7 @@ def gate(
     Also checked: what saturates inside, the DPU's rules, that no ReLU was lost, and that
     onnxruntime's optimisations change no bit.
     """
-    read = (
+    inputs = (
         float_model,
         int8_model,
         limits,
@@ -94,8 +94,8 @@ def gate(
         *map(Path, (target, sensor)),
     )
     try:
-        _clear((json, junit, *_record_files(record)), read, record)
-        # Loaded only now: if a library fails, no older verdict is left either.
+        _clear((json, junit, *_record_files(record)), inputs, record)
+        # These are loaded only now: if a library fails, no older verdict is left either.
         from beers_deploy.model.io.files import write_text
         from beers_deploy.network_files import pair_of
         from beers_deploy.quant.limits import limits_of
@@ -124,9 +124,8 @@ def gate(
             metric=metric,
         )
         _show(verdict)
-        if (
-            record is not None
-        ):  # first: its library may fail, and then no verdict may stand in the other files
+        # The record comes first: its library may fail, and then no other file may have a verdict.
+        if record is not None:
             from beers_deploy.kit.record import write_record
 
             compared = verdict.comparison
@@ -135,7 +134,7 @@ def gate(
         if junit is not None:
             write_text(junit, verdict.to_junit())
     except BeersError as error:
-        _explain(error, junit, (json, *_record_files(record)), read)
+        _explain(error, junit, (json, *_record_files(record)), inputs)
         raise
     say(str(verdict))
     if not verdict:
@@ -161,7 +160,8 @@ def _clear(
 
     for path in outputs:
         if path is not None and path != STDOUT:
-            with suppress(BeersError):  # raised below, when the other outputs are deleted
+            # The error is raised below, when the other outputs are deleted.
+            with suppress(BeersError):
                 require_writable(path, inputs=inputs)
                 path.unlink(missing_ok=True)
     _, junit, *_ = outputs
@@ -191,8 +191,9 @@ def _explain(
     from beers_deploy.model.io.files import require_writable, write_text
     from beers_deploy.verdict import junit_error
 
-    taken = {os.path.realpath(path).casefold() for path in others if path is not None}
-    if junit is None or junit == STDOUT or os.path.realpath(junit).casefold() in taken:
+    other_outputs = {os.path.realpath(path).casefold() for path in others if path is not None}
+    # A file system without regard to case has one file for names that differ in case.
+    if junit is None or junit == STDOUT or os.path.realpath(junit).casefold() in other_outputs:
         return
     with suppress(BeersError):
         require_writable(junit, inputs=inputs)

@@ -60,10 +60,10 @@ def golden(
         say(f"wrote {write_golden(in_int8(given), cast('Path', out), tile=tile, board=target)}")
         return
     refuse(context, ("tile", "target"), expected="none with --compare", got="one")
-    found = compare_golden(compare, given)
-    print_rows(f"{given.name} against {compare.name}", list(found.rows))
-    save(found, json)
-    for check in found.checks:
-        say(check.detail or f"no layer differs: {len(found.rows)} compared")
-    if not found:
+    table = compare_golden(compare, given)
+    print_rows(f"{given.name} against {compare.name}", list(table.rows))
+    save(table, json)
+    for check in table.checks:
+        say(check.detail or f"no layer differs: {len(table.rows)} compared")
+    if not table:
         raise typer.Exit(1)

@@ -61,13 +61,13 @@ def info(
     require_writable(
         json, inputs=(image, *tiles, network, Path(sensor) if sensor else None, Path(target))
     )
-    known = load_sensor(sensor or BLIND)
-    path = network_file(network, known, partial(say, err=True))
-    told = {"": known} if sensor else {}
+    profile = load_sensor(sensor or BLIND)
+    path = network_file(network, profile, partial(say, err=True))
+    sensors = {"": profile} if sensor else {}
     options = Options(
-        path, tile, full_scale=full_scale, trust_index=trust_index, sensors=told, strict=strict
+        path, tile, full_scale=full_scale, trust_index=trust_index, sensors=sensors, strict=strict
     )
     row = info_row(image, options, load_target(target), measure, say)
     print_rows(str(image), [row])
-    # No digest of FILE: it would be read whole.
+    # FILE has no digest here, because the whole file would be read for it.
     save(Table("info", arguments(sensor=sensor or BLIND, image=image.name), (path,), (row,)), json)

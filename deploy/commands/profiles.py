@@ -13,7 +13,6 @@ from beers_deploy.commands.shared import Json, arguments, save, say
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles import Sensor, load_sensor, load_target, sensor_names, target_names
 from beers_deploy.profiles.constant import Constant, Words
-from beers_deploy.profiles.effects import Table
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.response import MtfTable
 from beers_deploy.profiles.scene_call import load_scene_call, scene_names
@@ -36,6 +35,7 @@ def profiles(
     The keys of a sensor's file, with units and ranges: docs/reference/sensor-profile.md.
     """
     if toml:
+        # `say` prints one line, whatever characters it holds.
         for line in _file_text(name).removesuffix("\n").split("\n"):
             say(line)
         return
@@ -46,10 +46,10 @@ def profiles(
     if name is None:
         table = Table("name", "kind", "what it is", title_justify="left")
         rows: list[Row] = [
-            (each, "sensor", load_sensor(each).description) for each in sensor_names()
+            (sensor, "sensor", load_sensor(sensor).description) for sensor in sensor_names()
         ]
-        rows += [(each, "scene", load_scene_call(each).description) for each in scene_names()]
-        rows += [(each, "target", load_target(each).description) for each in target_names()]
+        rows += [(scene, "scene", load_scene_call(scene).description) for scene in scene_names()]
+        rows += [(target, "target", load_target(target).description) for target in target_names()]
     else:
         title, rows = _shown(name)
         table = Table(
@@ -67,6 +67,7 @@ def _file_text(name: str | None) -> str:
         raise OptionError(
             "--toml", expected="the name of a profile beside it", got="none", remedy=remedy
         )
+    # A file that is no profile is refused here.
     _shown(name)
     kind = "targets"
     if name in sensor_names():
@@ -89,7 +90,7 @@ def _shown(name: str) -> tuple[str, list[Row]]:
         name.endswith(".toml") and "radiance_scale" in read_toml("scenes", name)[1]
     ):
         scene = load_scene_call(name)
-        rows = [_row("radiance_scale", scene.radiance_scale), *_effects(scene.effects)]
+        rows = [_row("radiance_scale", scene.radiance_scale), *_table_rows(scene.effects)]
         return f"{scene.name}: {scene.description}", rows
     if name in target_names() or name.endswith(".toml"):
         target = load_target(name)
@@ -98,16 +99,11 @@ def _shown(name: str) -> tuple[str, list[Row]]:
             **{f"configurations.{k}": v for k, v in target.configurations.items()},
         }
         groups |= {"activations": target.activations, "npu": target.npu}
-        rows = [
-            _row(f"{group}.{key}", value)
-            for group, table in groups.items()
-            for key, value in table.items()
-        ]
-        return f"{target.name}: {target.description}", rows
-    known = ", ".join([*sensor_names(), *scene_names(), *target_names()])
+        return f"{target.name}: {target.description}", _table_rows(groups)
+    names = ", ".join([*sensor_names(), *scene_names(), *target_names()])
     raise OptionError(
         "profile",
-        expected=f"one of {known}",
+        expected=f"one of {names}",
         got=repr(name),
         remedy="choose one, or give a .toml file",
     )
@@ -116,33 +112,32 @@ def _shown(name: str) -> tuple[str, list[Row]]:
 def _sensor_rows(sensor: Sensor) -> list[Row]:
     rows: list[Row] = []
     for table in TABLES:
-        given = [(f"{table}.{key}", getattr(sensor, key)) for key in constant_keys(table)]
-        rows += [_row(key, constant) for key, constant in given if constant is not None]
+        constants = [(f"{table}.{key}", getattr(sensor, key)) for key in constant_keys(table)]
+        rows += [_row(key, constant) for key, constant in constants if constant is not None]
         rows += _response(sensor) if table == "mtf" else []
-    return rows + _effects(sensor.effects)
+    return rows + _table_rows(sensor.effects)
 
 
 def _response(sensor: Sensor) -> list[Row]:
     """A table's numbers, or what a point-spread function is made of."""
     response = sensor.response
-    said = (sensor.mtf_nyquist.status, sensor.mtf_nyquist.source)
+    origin = (sensor.mtf_nyquist.status, sensor.mtf_nyquist.source)
     if response is None:
         return []
     if not isinstance(response, MtfTable):
-        return [("mtf.psf", str(response), *said)]
+        return [("mtf.psf", str(response), *origin)]
     columns = {"frequency": response.frequency, "across": response.across, "along": response.along}
     return [
-        (f"mtf.{key}", ", ".join(f"{v:g}" for v in values), *said)
+        (f"mtf.{key}", ", ".join(f"{v:g}" for v in values), *origin)
         for key, values in columns.items()
     ]
 
 
-def _effects(effects: Mapping[str, Table]) -> list[Row]:
-    return [
-        _row(f"{name}.{key}", constant)
-        for name, table in effects.items()
-        for key, constant in table.items()
-    ]
+def _table_rows(tables: Mapping[str, Mapping[str, Constant | Words]]) -> list[Row]:
+    rows = list[Row]()
+    for name, table in tables.items():
+        rows += [_row(f"{name}.{key}", value) for key, value in table.items()]
+    return rows
 
 
 def _row(key: str, constant: Constant | Words) -> Row:
@@ -201,14 +196,14 @@ def characterise(
     from beers_deploy.studies.characterise import characterise as measure
 
     require_writable(out, json, inputs=images)
-    found = measure(images, edge or (), Stated(bits, gain, gsd, black_level, _contrasts(mtf)))
-    rows = found.rows()
-    count = len(found.frames.paths)
+    measurement = measure(images, edge or (), Stated(bits, gain, gsd, black_level, _contrasts(mtf)))
+    rows = measurement.rows()
+    count = len(measurement.frames.paths)
     print_rows(f"sensor of {count} image{'' if count == 1 else 's'}", rows)
-    for note in found.notes():
+    for note in measurement.notes():
         say(f"note: {note}")
-    write_text(out, profile_toml(found))
-    save(Results("characterise", arguments(), found.frames.paths, tuple(rows)), json)
+    write_text(out, profile_toml(measurement))
+    save(Results("characterise", arguments(), measurement.frames.paths, tuple(rows)), json)
     say(f"wrote {out}: beers-deploy profiles {out}")
 
 
@@ -219,8 +214,10 @@ def _contrasts(words: str | None) -> tuple[float, float] | None:
     if words is None:
         return None
     try:
+        # One number stands for both axes.
         across, along = (float(part) for part in (words.split(",") * 2)[:2])
     except ValueError:
+        # NaN lies within no limits, so the message below covers words as well.
         across = along = math.nan
     if words.count(",") > 1 or not (0 < across <= MTF_NYQUIST_MAX and 0 < along <= MTF_NYQUIST_MAX):
         expected = f"one or two ratios above 0 and up to {MTF_NYQUIST_MAX:.4f}"

@@ -103,32 +103,44 @@ def quantize(
 
     page, figures = _report_files(report, model)
     _refuse_unused(context, board_file, samples)
-    read = (model, images, samples, *map(Path, (target, sensor)))
-    require_writable(out, board_file, json, page, figures, inputs=read)
+    inputs = (model, images, samples, *map(Path, (target, sensor)))
+    require_writable(out, board_file, json, page, figures, inputs=inputs)
     require_onnx_name(out, board_file)
-    board = board_for(target, board_file, tile, read)
-    known = Sensor.load(sensor)
-    drawn: dict[str, Any] = {"sensor": known, "images": images, "patches": patches, "seed": seed}
-    made = quantised(model, samples, board=board, patch_px=patch, finetune=finetune, **drawn)
-    core = made.core(board, tile) if board_file else None
-    made.save(out)
-    kept = f", {made.quantised.relus} ReLUs kept" if made.quantised else f", told {known.name}"
-    say(f"wrote {out}: {len(read_core(made.model).ops)} integer operations{kept}")
+    board = board_for(target, board_file, tile, inputs)
+    profile = Sensor.load(sensor)
+    calibration: dict[str, Any] = {
+        "sensor": profile,
+        "images": images,
+        "patches": patches,
+        "seed": seed,
+    }
+    network = quantised(
+        model, samples, board=board, patch_px=patch, finetune=finetune, **calibration
+    )
+    # Both are made before the first is written: a core that is refused leaves no file.
+    core = network.core(board, tile) if board_file else None
+    network.save(out)
+    summary = (
+        f", {network.quantised.relus} ReLUs kept" if network.quantised else f", told {profile.name}"
+    )
+    say(f"wrote {out}: {len(read_core(network.model).ops)} integer operations{summary}")
     save_core(core, board_file, board)
-    covered = recorded_range(metadata(made.model))
+    covered = recorded_range(metadata(network.model))
     if covered is not None:
         say(f"calibration: {covered}")
-    if made.quantised:
-        say(losses_of(made, samples, patch_px=patch, **drawn))
-    rows = list(made.layers)
+    if network.quantised:
+        say(losses_of(network, samples, patch_px=patch, **calibration))
+    rows = list(network.layers)
     for title, part in by_table(rows).items():
         print_rows(TITLES[title], part)
     if page is not None:
-        found, written = sensitivity_report(made, samples, rows, patch_px=patch, **drawn)
-        write_report(written, page)
-        say(f"wrote {page}: {written.headline}")
-        rows = [*found, *rows]
-    origin = made.origin.input if made.origin else model
+        error_rows, error_report = sensitivity_report(
+            network, samples, rows, patch_px=patch, **calibration
+        )
+        write_report(error_report, page)
+        say(f"wrote {page}: {error_report.headline}")
+        rows = [*error_rows, *rows]
+    origin = network.origin.input if network.origin else model
     document = Table(
         "quantize", arguments(), (origin, out, *data_inputs(images, samples)), tuple(rows)
     )
@@ -155,5 +167,6 @@ def _report_files(folder: Path | None, model: Path) -> tuple[Path, Path] | tuple
         expected = "a network that is calibrated by itself"
         remedy = "leave it out"
         raise OptionError("--report", expected=expected, got="one behind a bank", remedy=remedy)
+    # A missing package is refused before the network is calibrated.
     optional("matplotlib", "--report")
     return folder / "report.html", folder / "report.json"

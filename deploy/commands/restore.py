@@ -176,11 +176,13 @@ def restore(
     from beers_deploy.restoration.run import restore_file
     from beers_deploy.results import Input, Table, print_rows
 
+    # A budget of 0 bytes would count as none.
     budget_bytes = None if memory is None else max(int(memory * 1e9), 1)
     sensors = parse_sensors(sensor or BLIND)
-    profiles = (Path(each) for each in sensors.values()) if sensor else ()
+    profiles = (Path(text) for text in sensors.values()) if sensor else ()
     listed = Path(fix_detectors) if fix_detectors and fix_detectors != FOUND else None
     lists = [] if listed is None else [listed]
+    # The list of faults is an output of its own where they are searched for.
     found_list = list_beside(out, fix_detectors or "")
     require_writable(out, json, stac, found_list, inputs=(image, network, listed, *profiles))
     how = Options(
@@ -208,26 +210,31 @@ def restore(
         save(Table("restore", arguments(), (image, *lists), (row,)), json)
         return
     _require_item(stac, cog)
-    known = {band: load_sensor(each) for band, each in sensors.items()}
+    sensor_profiles = {band: load_sensor(text) for band, text in sensors.items()}
     require_image_file(image)
-    if found := conditioned(network):
-        told = (
+    if weights := conditioned(network):
+        words = (
             f"told {sensor}"
             if sensor
             else "told no sensor (blind): --sensor tells it yours, and restores better"
         )
-        name = network.name if network else f"{found.name}{INT8}"
-        say(f"network: {name}, {told}")
+        name = network.name if network else f"{weights.name}{INT8}"
+        say(f"network: {name}, {words}")
     paths = {
-        band: network_file(network, each, partial(say, err=True)) for band, each in known.items()
+        band: network_file(network, profile, partial(say, err=True))
+        for band, profile in sensor_profiles.items()
     }
     brighter = (
-        {band: brighter_files(network, each) for band, each in known.items()} if exposure else {}
+        {band: brighter_files(network, profile) for band, profile in sensor_profiles.items()}
+        if exposure
+        else {}
     )
-    if sensor and not found:
-        _look_at_network(network, paths, known)
+    # Only a conditioned network can be given the sensor; any other one was made for its own.
+    if sensor and not weights:
+        _look_at_network(network, paths, sensor_profiles)
     path = next(iter(paths.values()))
-    bits = {int(each.bits.low) for each in known.values()}
+    # The bits of the sensor decide full scale, which is one number for all bands.
+    bits = {int(profile.bits.low) for profile in sensor_profiles.values()}
     if len(bits) > 1 and full_scale is None:
         remedy = "give --full-scale, or restore such bands apart"
         raise OptionError(
@@ -236,11 +243,12 @@ def restore(
     how = replace(
         how,
         model=path,
-        sensors=known if sensor else {},
+        sensors=sensor_profiles if sensor else {},
         bands={} if "" in paths else paths,
         brighter={band: files for band, files in brighter.items() if files},
     )
-    # Before the run, which may take hours: it refuses a file that is replaced while it is read.
+    # The digests are taken before the run, which may take hours and refuses a file that is
+    # replaced while it is read.
     networks = [
         Input(f"{path.name}, {band}" if band else path.name, sha256(path))
         for band, path in paths.items()
@@ -267,7 +275,7 @@ def _require_item(stac: Path | None, cog: bool) -> None:
 
 
 def _look_at_network(
-    network: Path | None, paths: Mapping[str, Path], known: Mapping[str, Sensor]
+    network: Path | None, paths: Mapping[str, Path], sensor_profiles: Mapping[str, Sensor]
 ) -> None:
     """Refuse sensors by band for a network that is for one; say where it was made for another
     sensor.
@@ -275,7 +283,7 @@ def _look_at_network(
     from beers_deploy.network_files import other_sensor
     from beers_deploy.quant.onnx_file import load_onnx
 
-    if len(known) > 1:
+    if len(sensor_profiles) > 1:
         expected = "a shipped network, or weights of 'train --conditioned'"
         remedy = "give one sensor for all bands"
         raise OptionError(
@@ -284,7 +292,7 @@ def _look_at_network(
             got=f"{network} with a sensor for each band",
             remedy=remedy,
         )
-    if doubt := other_sensor(load_onnx(paths[""]), known[""]):
+    if doubt := other_sensor(load_onnx(paths[""]), sensor_profiles[""]):
         say(doubt, err=True)
 
 

@@ -98,6 +98,7 @@ def refuse(
         source = context.get_parameter_source(name)
         parameter = parameters[name]
         spellings = parameter.opts if context.params[name] else parameter.secondary_opts
+        # A default asks for nothing, and a switch that is off may have no spelling for it.
         if source is not None and source.name == "COMMANDLINE" and spellings:
             raise OptionError(spellings[0], expected=expected, got=got, remedy=remedy)
 
@@ -112,6 +113,7 @@ _results: ContextVar[TextIO | None] = ContextVar("results", default=None)
 def results_to(stream: TextIO) -> Iterator[None]:
     """Keep a stream for results alone: what else is printed there goes to standard error."""
     token = _results.set(stream)
+    # Whoever reads standard output as JSON must get nothing else.
     try:
         with redirect_stdout(sys.stderr):
             yield
@@ -119,6 +121,7 @@ def results_to(stream: TextIO) -> Iterator[None]:
         _results.reset(token)
 
 
+# The default is shared by all contexts, so nobody may be able to change it.
 _given: ContextVar[Mapping[str, object]] = ContextVar("given", default=MappingProxyType({}))
 OUTPUTS = ("context", "json", "junit")
 """Parameters that decide no figure."""

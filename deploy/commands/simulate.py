@@ -116,15 +116,18 @@ def simulate(
         )
     require_cores("--workers", workers)
     if out is not None:
-        read = (*(scenes or ()), *(Path(name) for name in (sensor, reference, scene) if name))
+        inputs = (*(scenes or ()), *(Path(name) for name in (sensor, reference, scene) if name))
         folders = [out / name for name in ("degraded", "reference", "parts")]
-        require_writable(out / "manifest.jsonl", out / "recipe.json", inputs=read, folders=folders)
+        require_writable(
+            out / "manifest.jsonl", out / "recipe.json", inputs=inputs, folders=folders
+        )
     usual, patch_px = _preset(preset)
     call = load_scene_call(scene) if scene else None
     own = load_sensor(sensor or usual)
     degraded = calling_for(own, call, add or (), forbid or ())
-    wanted = oversampling or degraded.oversampling.low
-    ratio = math.ceil(wanted)
+    scene_ratio = oversampling or degraded.oversampling.low
+    # The scene is resampled first where its ratio is no whole number.
+    ratio = math.ceil(scene_ratio)
     recipe = DatasetRecipe(
         tuple(scenes) if scenes else (None,),
         degraded,
@@ -134,7 +137,7 @@ def simulate(
         call.radiance_scale.low if call else 1.0,
         seed,
         tolerance,
-        ratio / wanted,
+        ratio / scene_ratio,
     )
     if ratio < MIN_RATIO:
         say(
@@ -149,9 +152,9 @@ def simulate(
     if out is None:
         return
     with open_cluster(scheduler) as cluster, steps("simulating", len(plan_windows(recipe))) as bar:
-        count, pool = (
-            (cluster.slots, cluster.pool) if cluster else (workers or os.cpu_count() or 1, None)
-        )
+        # Without a scheduler, the data set starts processes of its own.
+        count = cluster.slots if cluster else workers or os.cpu_count() or 1
+        pool = cluster.pool if cluster else None
         summary = write_dataset(recipe, out, count, resume, bar.advance, pool, say)
     rejected = (
         f"; {summary['rejected_share']:.1%} of the drawn SNR pairs were impossible and drawn again"

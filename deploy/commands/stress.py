@@ -105,43 +105,47 @@ def stress(
 
     _refuse_unused(context, bit_flips)
     picture = out.with_name(f"{out.stem}.svg") if bit_flips and out else None
-    read = (float_model, int8_model, images, *map(Path, (sensor, target)))
-    require_writable(out, json, picture, inputs=read)
+    sources = (float_model, int8_model, images, *map(Path, (sensor, target)))
+    require_writable(out, json, picture, inputs=sources)
     names = chosen(cases, [case.name for case in CASES], "--cases")
-    wanted = chosen(stages, STAGES, "--stages")
+    stage_names = chosen(stages, STAGES, "--stages")
     subject = open_subject(float_model, int8_model, sensor, partial(say, err=True))
+    # A network that is replaced during the run is refused at its end.
     inputs = inputs_of(*subject.paths) if json else ()
     if bit_flips:
         results = []
-        shown = flip_rows(
+        table_rows = flip_rows(
             subject, Calibration(load_sensor(sensor), images, draws, side, seed), target
         )
     else:
         results = run_battery(
-            subject, [case for case in CASES if case.name in names], wanted, seed, side
+            subject, [case for case in CASES if case.name in names], stage_names, seed, side
         )
-        shown = shown_rows(subject, results)
-    for table, rows in by_table(shown).items():
+        table_rows = shown_rows(subject, results)
+    for table, rows in by_table(table_rows).items():
         print_rows(TITLES[table], rows)
     require_same(inputs, *subject.paths)
-    save(Table("stress", arguments(), inputs, (*shown, *finding_rows(results))), json)
+    save(Table("stress", arguments(), inputs, (*table_rows, *finding_rows(results))), json)
     if out is not None:
-        write_text(out, markdown(shown))
+        write_text(out, markdown(table_rows))
     if picture is not None:
-        write_text(picture, flip_curves_svg({subject.paths[-1].stem: shown}))
+        write_text(picture, flip_curves_svg({subject.paths[-1].stem: table_rows}))
     if not bit_flips:
-        _judge(shown, results)
+        _judge(table_rows, results)
 
 
-def _judge(shown: Sequence[Row], results: "Sequence[StageResult]") -> None:
+def _judge(table_rows: Sequence[Row], results: "Sequence[StageResult]") -> None:
     """Say what was not looked at and what failed; exit code 1 where anything did."""
     for reason in dict.fromkeys(result.reason for result in results if result.reason):
         say(f"not looked at: {reason}")
     failed = [result for result in results if result.failed]
     for result in failed:
         say(f"FAILED {result.case.name}, {result.stage}: {result.verdict.removeprefix('FAILED: ')}")
+    # A sum that might overflow is a failure, even if no case makes it overflow.
     safe = all(
-        row.text["can it overflow int32"] == "no" for row in shown if row.table == "integer layers"
+        row.text["can it overflow int32"] == "no"
+        for row in table_rows
+        if row.table == "integer layers"
     )
     if not safe:
         say("FAILED: an int32 accumulator might overflow, see the integer layers")

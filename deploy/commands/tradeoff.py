@@ -1,6 +1,7 @@
 """`beers-deploy tradeoff`: what accuracy costs in time, over many operating points."""
 
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -102,19 +103,26 @@ def tradeoff(
     limits = {
         name: parse_constraints(name, text) for name, text in (("budget", budget), ("need", need))
     }
+    # Only a detector on labelled pictures gives a mean average precision.
     if labelled is None:
-        named = [name for name, asked in limits.items() if any(each.key == MAP50 for each in asked)]
+        constraint_options = [
+            name
+            for name, constraints in limits.items()
+            if any(constraint.key == MAP50 for constraint in constraints)
+        ]
         remedy = "give labelled pictures, or leave it out"
         refuse(
-            context, ["detector", "classes", *named], expected="--labelled beside it", remedy=remedy
+            context,
+            ["detector", "classes", *constraint_options],
+            expected="--labelled beside it",
+            remedy=remedy,
         )
-    names = [
-        name for each in network or [ALL] for name in (shipped_names() if each == ALL else [each])
-    ]
+    groups = (shipped_names() if name == ALL else [name] for name in network or [ALL])
+    names = list(chain.from_iterable(groups))
     aim = reference or REFERENCE
     boards = parse_targets(target)
     tree = labelled.rglob("*") if labelled else ()
-    read = (
+    inputs = (
         images,
         calibration,
         lpips,
@@ -123,13 +131,14 @@ def tradeoff(
         *tree,
         *map(Path, (sensor, aim, *boards, *names)),
     )
-    written = (
+    outputs = (
         out / "tradeoff.json",
         *(out / name for name in FILES),
         out / "measurements.json",
         json,
     )
-    require_writable(*written, inputs=read, folders=(out / "int8",))
+    require_writable(*outputs, inputs=inputs, folders=(out / "int8",))
+    # A reference in other digital numbers is converted, which is said before the study runs.
     reference_beside(load_sensor(sensor), reference, say)
     study = measured(
         names,

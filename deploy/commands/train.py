@@ -143,8 +143,15 @@ def train(
     )
     start = weights_file(start) if start else None
     rounding = weights_file(rounding) if rounding else None
-    read = (*stored, lpips, start, rounding, *(Path(name) for name in (sensor, reference) if name))
-    require_writable(*(out / name for name in (*FILES, f"{variant}.safetensors")), inputs=read)
+    inputs = (
+        *stored,
+        lpips,
+        start,
+        rounding,
+        *(Path(name) for name in (sensor, reference) if name),
+    )
+    require_writable(*(out / name for name in (*FILES, f"{variant}.safetensors")), inputs=inputs)
+    # The INT8 file must be of the --start weights, or its rounding is another network's.
     rounded = rounding_of(rounding, start) if rounding and start else None
     numbers = TrainingRecipe(
         steps=steps,
@@ -154,10 +161,12 @@ def train(
         seed=seed,
         rounding=sha256(rounding) if rounding else "",
     )
-    made = read_pairs_recipe(pairs) if pairs else None
-    degraded, wanted = profiles_for(sensor or (None if made else RANGE), reference, made, say)
+    pairs_recipe = read_pairs_recipe(pairs) if pairs else None
+    degraded, aim = profiles_for(
+        sensor or (None if pairs_recipe else RANGE), reference, pairs_recipe, say
+    )
     family = SensorFamily(degraded.nominal()) if conditioned else None
-    patches = PatchRecipe(degraded, wanted, patch_px=patch, family=family)
+    patches = PatchRecipe(degraded, aim, patch_px=patch, family=family)
     run = Run(
         variant,
         numbers,
@@ -173,6 +182,7 @@ def train(
         precision=precision.value,
         rounding=rounded,
     )
+    # Under torchrun every worker runs this, and the first one alone reports.
     with joined(device) as worker:
         run_training(run, resume, worker, say)
         if worker.first:
@@ -185,10 +195,10 @@ BESIDE_RECIPE = ("recipe", "images", "out", "resume", "device")
 
 def _refuse_beside_recipe(context: typer.Context) -> None:
     """Refuse options that the recipe states."""
-    stated = [name for name in context.params if name not in BESIDE_RECIPE]
+    names = [name for name in context.params if name not in BESIDE_RECIPE]
     expected = "no --recipe beside it, which states it"
     remedy = "leave it out, or give a recipe of your own"
-    refuse(context, stated, expected=expected, got="both", remedy=remedy)
+    refuse(context, names, expected=expected, got="both", remedy=remedy)
 
 
 def _make(name: str, images: tuple[Path, ...], out: Path, resume: bool, device: str) -> None:
@@ -202,8 +212,8 @@ def _make(name: str, images: tuple[Path, ...], out: Path, resume: bool, device: 
     if not images:
         remedy = "give the folders of the photographs that the model card names"
         raise OptionError("--recipe", expected="--images beside it", got="none", remedy=remedy)
-    written = [out / f"{recipe.variant}{end}" for end in (".safetensors", f"{INT8}.onnx", ".md")]
-    require_writable(*written, inputs=images)
+    outputs = [out / f"{recipe.variant}{end}" for end in (".safetensors", f"{INT8}.onnx", ".md")]
+    require_writable(*outputs, inputs=images)
     toml = recipe_file(name).read_text(encoding="utf-8")
     make_network(recipe, toml, images, out, resume, device, say)
 

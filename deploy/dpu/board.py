@@ -24,7 +24,7 @@ def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
         return [load_target(name) for name in board_names()]
     if isinstance(board, str | os.PathLike | TargetProfile):
         return [TargetProfile.load(board)]
-    return [TargetProfile.load(each) for each in board]
+    return [TargetProfile.load(source) for source in board]
 
 
 REQUIRED = ("cores", "batch_handlers", "cpb", "peak_tops")
@@ -56,6 +56,7 @@ class Dpu:
             name: {k: self.constants.get(k, v) for k, v in self.target.tables.get(name, {}).items()}
             for name in SIZED
         }
+        # A table that the target lacks stays away: rules ask which constants a target states.
         return {**self.target.tables, **{name: table for name, table in sized.items() if table}}
 
     @property
@@ -106,15 +107,14 @@ class Dpu:
         """Values a second that an engine in programmable logic takes in: channels x pixels x its
         clock.
         """
-        lanes = self.value("elementwise", "channels_per_cycle") * self.value(
-            "elementwise", "pixels_per_cycle"
-        )
+        channels = self.value("elementwise", "channels_per_cycle")
+        lanes = channels * self.value("elementwise", "pixels_per_cycle")
         return lanes * self.value("array", "pl_clock_hz")
 
     def limit(self, table: str, key: str) -> Constant:
         """A constant with both ends of its range: a rule's window, or one limit as both."""
-        found = self.tables.get(table, {}).get(key)
-        return self.target.constant(table, key) if found is None else found
+        constant = self.tables.get(table, {}).get(key)
+        return self.target.constant(table, key) if constant is None else constant
 
     def value(self, table: str, key: str) -> float:
         """The single value of a constant."""
@@ -140,9 +140,12 @@ def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
             "target", expected=expected, got=repr(profile.name), remedy="choose another"
         )
     name, constants = profile.configuration(configuration)
-    for key in (key for key in REQUIRED if key not in constants):
-        where = f"{profile.name} [configurations.{name}] {key}"
-        raise ProfileError(where, expected=CONFIGURATION[key].expected, got="none", remedy="add it")
+    for key in REQUIRED:
+        if key not in constants:
+            where = f"{profile.name} [configurations.{name}] {key}"
+            expected = CONFIGURATION[key].expected
+            raise ProfileError(where, expected=expected, got="none", remedy="add it")
+    # The rules quote these documents: without them a rule's text would have no source.
     if not profile.documents:
         got = "none"
         remedy = "add it, or begin with base = the name of a board with the same DPU"
@@ -160,4 +163,5 @@ def ruled(profile: TargetProfile, configuration: str | None = None) -> Dpu:
         expected = f"none beside {profile.name}, which has an NPU"
         remedy = "leave it out"
         raise OptionError("dpu", expected=expected, got=repr(configuration), remedy=remedy)
+    # An NPU has rules, and no configuration that a prediction could rest on.
     return Dpu(profile, "NPU", {})

@@ -38,15 +38,12 @@ class Operation:
     attributes: Mapping[str, object] = field(default_factory=dict)
     follows: Kind | None = None  # what computes the first input
     integer: bool = False
-    scales: Mapping[str, Scale] = field(
-        default_factory=dict
-    )  # of "input 0", ..., "weight", "bias", "output"
-    disputed: Mapping[str, tuple[Scale, ...]] = field(
-        default_factory=dict
-    )  # where the file gives several
-    constants: Mapping[str, np.ndarray | None] = field(
-        default_factory=dict, compare=False
-    )  # None: computed
+    # The keys are "input 0", ..., "weight", "bias" and "output".
+    scales: Mapping[str, Scale] = field(default_factory=dict)
+    # The roles for which the file gives several scales.
+    disputed: Mapping[str, tuple[Scale, ...]] = field(default_factory=dict)
+    # None stands for a constant that other nodes compute.
+    constants: Mapping[str, np.ndarray | None] = field(default_factory=dict, compare=False)
 
     @property
     def output(self) -> str:
@@ -60,10 +57,10 @@ class Operation:
         """
         if self.kind not in CONVOLUTIONS:
             return 0
+        # A transposed convolution multiplies the weights with each pixel of its input.
         shape = self.in_shapes[0] if self.kind == "transposed" else self.out_shape
-        return (
-            2 * self.weight_bytes * _pixels(self.name, shape)
-        )  # a weight has one byte, and is used once a pixel
+        # A weight has one byte and is used once a pixel: a product and a sum are two operations.
+        return 2 * self.weight_bytes * _pixels(self.name, shape)
 
     @property
     def out_bytes(self) -> int:

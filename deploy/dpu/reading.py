@@ -8,6 +8,7 @@
 """
 
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -113,7 +114,7 @@ class _Reader:
 
     def network(self) -> Network:
         """The operations, the notation of quantisation dissolved."""
-        operations = tuple(op for node in self.graph.nodes for op in self._read(node))
+        operations = tuple(chain.from_iterable(map(self._read, self.graph.nodes)))
         outputs = tuple(map(self.integers.resolve, self.graph.outputs))
         return Network(operations, self.inputs, outputs, self.integers.present)
 
@@ -146,8 +147,8 @@ class _Reader:
             attributes=node.attributes,
             follows=self.kinds.get(inputs[0]) if inputs else None,
             integer=self.integers.is_integer(node),
-            scales={role: known[0] for role, known in formats.items() if known},
-            disputed={role: known for role, known in formats.items() if len(known) > 1},
+            scales={role: scales[0] for role, scales in formats.items() if scales},
+            disputed={role: scales for role, scales in formats.items() if len(scales) > 1},
             constants=self.integers.numbers(node),
         )
 
@@ -155,14 +156,16 @@ class _Reader:
         """max(q, zero point), the ReLU of integers; Clip from 0 to 6, ReLU6; and a bank's, where
         int8 saturates.
         """
-        known = [
+        constants = [
             value
             for k in range(1, len(node.inputs))
             if (value := self.graph.value(node, k)) is not None
         ]
         if node.op_type == "Max":
-            return self.integers.is_integer(node) and len(known) == len(node.inputs) - 1 == 1
-        limits = [float(value.ravel()[0]) for value in known if value.size == 1]
+            return self.integers.is_integer(node) and len(constants) == len(node.inputs) - 1 == 1
+        # A limit that is no single constant cannot be ReLU6, and is left out: the lists then
+        # differ.
+        limits = [float(value.ravel()[0]) for value in constants if value.size == 1]
         return node.op_type == "Clip" and limits in ([0.0, 6.0], *BANK_ENDS)
 
     def _constant_shape(
@@ -176,6 +179,7 @@ class _Reader:
 
 
 def _window(node: Node, weight: np.ndarray | None, shapes: Sequence[Shape | None]) -> Window:
+    # The window of a global pool is its whole map.
     size = shapes[0][1:] if shapes and shapes[0] else (0, 0)
     if "Global" in node.op_type:
         return Window(size if any(size) else (1, 1))
@@ -190,6 +194,7 @@ def _channels(
         return channels, channels
     first = weight.shape[0]
     second = weight.shape[1] * int(node.attributes.get("group", 1))
+    # ONNX stores the input channels first for ConvTranspose, and the output channels for Conv.
     return (first, second) if node.op_type == "ConvTranspose" else (second, first)
 
 
@@ -221,17 +226,18 @@ def _input_shape(
                 where, expected="an input of a stated size", got="any size", remedy="give `tile`"
             )
         return sizes[1], sizes[2], sizes[3]
+    # The tile is stated in pixels of the image, and the input counts places of several pixels.
     place_px, border_px = places
     side, beyond = divmod(tile_px + 2 * border_px, place_px)
     if beyond:
         expected = f"a tile of a multiple of {place_px} px"
         remedy = "choose another `tile`"
         raise ModelError(where, expected=expected, got=f"{tile_px} px", remedy=remedy)
-    fixed = {size for size in sizes[2:] if size} - {side}
-    if fixed:
+    other_sides = {size for size in sizes[2:] if size} - {side}
+    if other_sides:
         expected = f"an input that takes {tile_px} x {tile_px} pixels"
         got = f"one fixed to {_side_px(sizes[3], places)} x {_side_px(sizes[2], places)}"
-        remedy = f"give `tile` {_side_px(min(fixed), places)}, or export it with free sizes"
+        remedy = f"give `tile` {_side_px(min(other_sides), places)}, or export it with free sizes"
         raise ModelError(where, expected=expected, got=got, remedy=remedy)
     return (sizes[1], side, side)
 

@@ -64,7 +64,7 @@ def write_golden(
     folder = Path(out)
     with faults_named(network.label):
         core = read_core(network.model)
-    # AMD's kernel for its NPU rounds to even
+    # AMD's kernel for its NPU rounds ties to even.
     half_even = bool(TargetProfile.load(board).npu)
     names = files_of(core)
     generator = np.random.default_rng(0)
@@ -73,8 +73,8 @@ def write_golden(
     planes[EXTREMES] = generator.choice(np.array([-128, 127], np.int8), planes["noise"].shape)
     _remove_older(folder)
     digests = dict[str, dict[str, str]]()
-    for case, seen in planes.items():
-        tensors, _ = run_core(core, seen, half_even)
+    for case, case_planes in planes.items():
+        tensors, _ = run_core(core, case_planes, half_even)
         digests[case] = {file: _digest(tensors[name]) for name, file in names.items()}
         for name, file in names.items():
             save_array(folder / case / file, tensors[name].astype(np.int8))
@@ -103,8 +103,10 @@ def _remove_older(folder: Path) -> None:
     index = folder / INDEX
     if not index.is_file():
         return
-    index.unlink()  # first: what is left, if this stops, must not pass as whole
+    # The index goes first: if this stops, the files that are left must not pass as complete.
+    index.unlink()
     for case in CASES:
+        # A link may lead to files that are not ours.
         if (folder / case).is_symlink():
             continue
         for path in ((folder / case / PICTURE), *(folder / case).glob("[0-9]*-*.npy")):
@@ -121,13 +123,13 @@ def files_of(core: IntCore) -> dict[str, str]:
 
 
 def _layers(core: IntCore, names: Mapping[str, str]) -> list[dict[str, object]]:
-    said: dict[str, dict[str, object]] = {
+    facts: dict[str, dict[str, object]] = {
         op.output: {"layer": op.name, "operator": type(op).__name__, "reads": list(op.inputs)}
         for op in core.ops
     }
-    said[PLANES] = {"layer": "the planes that the core reads", "operator": "", "reads": []}
+    facts[PLANES] = {"layer": "the planes that the core reads", "operator": "", "reads": []}
     return [
-        {"file": file, "tensor": name, **said[name], "fractional_bits": core.frac_bits[name]}
+        {"file": file, "tensor": name, **facts[name], "fractional_bits": core.frac_bits[name]}
         for name, file in names.items()
     ]
 
@@ -154,7 +156,7 @@ def _images(
     shape = 1, channels, side, side
     steps = np.indices((side, side)).sum(0) // 8 % 2
     steps[3::11, 5::13] = 1
-    found = {
+    images = {
         "scene": _scene(channels, side, side, generator),
         "noise": generator.random(shape, dtype=np.float32),
         "steps": np.broadcast_to(steps.astype(np.float32), shape).copy(),
@@ -162,19 +164,21 @@ def _images(
         "white": np.ones(shape, np.float32),
     }
     if not fixed_px:
+        # `| 1` makes the number of lattice steps odd along both sides.
         rows, columns = (lattice_px * (side * part // (8 * lattice_px) | 1) for part in (5, 7))
-        found["odd"] = _scene(channels, rows, columns, generator)
-    return found
+        images["odd"] = _scene(channels, rows, columns, generator)
+    return images
 
 
 def _scene(channels: int, rows: int, columns: int, generator: np.random.Generator) -> np.ndarray:
     """A drawn scene (1, C, rows, columns) in [0, 1], each channel a little darker than the one
     before.
     """
-    from beers_deploy.model.simulator.procedural import procedural_scene  # SciPy
+    # This loads SciPy, which no other case needs.
+    from beers_deploy.model.simulator.procedural import procedural_scene
 
-    drawn = procedural_scene(SCENE_PX * rows, SCENE_PX * columns, generator).radiance
-    mean = drawn.reshape(rows, SCENE_PX, columns, SCENE_PX).mean((1, 3))
+    radiance = procedural_scene(SCENE_PX * rows, SCENE_PX * columns, generator).radiance
+    mean = radiance.reshape(rows, SCENE_PX, columns, SCENE_PX).mean((1, 3))
     bright = mean / np.quantile(mean, 0.99)
     darker = 1 - 0.3 * np.arange(channels)[:, None, None] / channels
     return np.asarray(np.clip(bright * darker, 0, 1)[None], np.float32)
@@ -225,7 +229,8 @@ def read_golden(folder: Path) -> Golden:
         planes = _planes(folder / case / names[PLANES], core)
         try:
             cases[case], _ = run_core(core, planes, half_even)
-        except (LookupError, ValueError) as error:  # of a size that the network cannot rearrange
+        # The planes may have a size that the network cannot rearrange.
+        except (LookupError, ValueError) as error:
             got = f"{times(planes.shape)} in {case}"
             expected = "planes of a size that the network takes"
             raise OptionError(str(folder), expected=expected, got=got, remedy=REMEDY) from error
@@ -246,15 +251,15 @@ REMEDY = "make it again with 'beers-deploy golden'"
 def _index(path: Path) -> tuple[dict[str, dict[str, str]], bool]:
     """Return the digests of the files of each case, and whether ties were rounded to even."""
     try:
-        said: Any = read_json(path)
-        if (said["schema"], said["schema_version"]) != (SCHEMA, SCHEMA_VERSION):
-            raise ValueError(f"the schema {said['schema']}")
-        digests = {str(case): dict(files) for case, files in said["cases"].items()}
+        document: Any = read_json(path)
+        if (document["schema"], document["schema_version"]) != (SCHEMA, SCHEMA_VERSION):
+            raise ValueError(f"the schema {document['schema']}")
+        digests = {str(case): dict(files) for case, files in document["cases"].items()}
         # A case is a folder beside the index: another path would lead to files that nobody named.
         foreign = [case for case in digests if case in ("", ".", "..") or set(case) & set("/\\:")]
         if foreign:
             raise ValueError(f"the case {foreign[0]!r}")
-        return digests, bool(said["half_even"])
+        return digests, bool(document["half_even"])
     except (AttributeError, LookupError, OSError, TypeError, ValueError) as error:
         got = (
             unreadable(path)
@@ -303,17 +308,21 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
             uint8 around 128, or float multiples of the tensor's scale; channels first, or last.
     """
     golden = read_golden(Path(folder))
-    given = Path(results)
-    seen = _results(golden, given)
-    wrong = [name for name, cases in seen.items() if _differing(name, cases)]
-    verdict = _verdict(golden.core, seen, wrong[0], golden.half_even) if wrong else ""
+    results_folder = Path(results)
+    outputs = _results(golden, results_folder)
+    wrong = [name for name, cases in outputs.items() if _differing(name, cases)]
+    verdict = _verdict(golden.core, outputs, wrong[0], golden.half_even) if wrong else ""
     first = {wrong[0]: {"first": verdict}} if wrong else {}
     rows = tuple(
-        _row(golden.core, name, cases, first.get(name, {})) for name, cases in seen.items()
+        _row(golden.core, name, cases, first.get(name, {})) for name, cases in outputs.items()
     )
     checks = (Check("layers that differ", len(wrong), 0, "layer", detail=verdict),)
     return Table(
-        "golden", {"results": given.name}, (golden.network, Path(folder) / INDEX), rows, checks
+        "golden",
+        {"results": results_folder.name},
+        (golden.network, Path(folder) / INDEX),
+        rows,
+        checks,
     )
 
 
@@ -323,9 +332,9 @@ each case.
 """
 
 
-def _results(golden: Golden, given: Path) -> Results:
+def _results(golden: Golden, folder: Path) -> Results:
     files = files_of(golden.core)
-    paths = [path for path in given.glob("*/*.npy") if path.name != PICTURE]
+    paths = [path for path in folder.glob("*/*.npy") if path.name != PICTURE]
     unknown = [
         path
         for path in paths
@@ -335,14 +344,14 @@ def _results(golden: Golden, given: Path) -> Results:
         got = f"{unknown[0].parent.name}/{unknown[0].name}" if unknown else "none"
         expected = "results as CASE/LAYER.npy"
         remedy = f"name them as in {INDEX}"
-        raise OptionError(str(given), expected=expected, got=got, remedy=remedy)
-    found: dict[str, list[Seen]] = {}
+        raise OptionError(str(folder), expected=expected, got=got, remedy=remedy)
+    outputs: dict[str, list[Seen]] = {}
     for name, file in files.items():
         for path in sorted(path for path in paths if path.name == file):
             sound = golden.cases[path.parent.name]
             values = _integers(path, sound[name].shape, golden.core.frac_bits[name])
-            found.setdefault(name, []).append(Seen(sound, values))
-    return found
+            outputs.setdefault(name, []).append(Seen(sound, values))
+    return outputs
 
 
 def _differing(name: str, cases: list[Seen]) -> list[Seen]:
@@ -365,23 +374,26 @@ def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
     if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
         got = f"{values.dtype} values, or some that are not finite"
         raise ImageError(str(path), expected="real numbers", got=got, remedy="write int8")
-    whole = values.astype(np.float64)
+    numbers = values.astype(np.float64)
     if values.dtype == np.uint8:
-        whole -= 128
+        numbers -= 128
     elif values.dtype.kind == "f":
-        whole *= 2.0**frac_bits
-    if not (np.abs(whole - np.rint(whole)) < 1e-3).all() or np.abs(whole).max(initial=0) > 128:
+        numbers *= 2.0**frac_bits
+    if (
+        not (np.abs(numbers - np.rint(numbers)) < 1e-3).all()
+        or np.abs(numbers).max(initial=0) > 128
+    ):
         expected = f"int8, or its values as whole multiples of 2^{-frac_bits}"
         raise ImageError(
             str(path), expected=expected, got=f"other {values.dtype} numbers", remedy="write these"
         )
-    return np.rint(whole).astype(np.int16)
+    return np.rint(numbers).astype(np.int16)
 
 
-def _verdict(core: IntCore, seen: Results, name: str, half_even: bool) -> str:
+def _verdict(core: IntCore, outputs: Results, name: str, half_even: bool) -> str:
     """The first layer that differs, and the fault that gives just that."""
-    between = _unseen_before(core, name, seen)
-    fault = explain(core, between, _differing(name, seen[name]), half_even)
+    between = _unseen_before(core, name, outputs)
+    fault = explain(core, between, _differing(name, outputs[name]), half_even)
     unseen = (
         f" ({len(between) - 1} layers before it were not handed out)" if len(between) > 1 else ""
     )
@@ -393,28 +405,29 @@ def _layer(core: IntCore, name: str) -> str:
     return next((op.name for op in core.ops if op.output == name), PLANES)
 
 
-def _unseen_before(core: IntCore, name: str, seen: Collection[str]) -> list[IntConv | Op]:
+def _unseen_before(core: IntCore, name: str, outputs: Collection[str]) -> list[IntConv | Op]:
     """The operations between tensors that a board handed out and the one of that name, which is the
     last.
     """
-    wanted = {name}
-    found = list[IntConv | Op]()
+    needed = {name}
+    operations = list[IntConv | Op]()
+    # From the last operation back, until every path ends at a tensor that was handed out.
     for op in reversed(core.ops):
-        if op.output in wanted and (op.output == name or op.output not in seen):
-            found.insert(0, op)
-            wanted |= set(op.inputs)
-    return found
+        if op.output in needed and (op.output == name or op.output not in outputs):
+            operations.insert(0, op)
+            needed |= set(op.inputs)
+    return operations
 
 
 def _row(core: IntCore, name: str, cases: list[Seen], first: dict[str, str]) -> Row:
-    by = [np.abs(case.seen - case.tensors[name]) for case in cases]
-    values = sum(each.size for each in by)
-    source = f"{len(by)} cases, {values} values, against the integer reference"
+    errors = [np.abs(case.seen - case.tensors[name]) for case in cases]
+    values = sum(error.size for error in errors)
+    source = f"{len(errors)} cases, {values} values, against the integer reference"
     figures = {
         "differing": measured(
-            100 * sum(int((each > 0).sum()) for each in by) / values, "%", source
+            100 * sum(int((error > 0).sum()) for error in errors) / values, "%", source
         ),
-        "at most by": measured(max(int(each.max()) for each in by), "LSB", source),
+        "at most by": measured(max(int(error.max()) for error in errors), "LSB", source),
     }
     wrong = _differing(name, cases)
     alike = [

@@ -16,6 +16,7 @@ in `cores`.
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -66,7 +67,8 @@ def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
         / F(128)
     )
     value, *others = np.split(result, S["copies"], 1)
-    if S["offsets"]:  # coarse, and windows that hold fine what lies within them
+    # Copies with offsets: a coarse result, and windows that hold the values within them finely.
+    if S["offsets"]:
         value = value * F(8)
         for window, offset in zip(others, S["offsets"]):  # noqa: B905 - a board's Python may be old
             value = np.where(
@@ -74,12 +76,14 @@ def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
                 window + np.array(offset, F)[:, None, None],
                 value,
             )
-    elif others:  # fine, coarse, and the copies of the analytic restoration
+    # Other copies: the fine result, the coarse one, and those of the analytic restoration.
+    elif others:
         value = np.where(np.abs(value) <= F(S["fine_max"]), value, others[0] * F(8))
         if others[1:]:
             fine = others[1 : 1 + S["fine_copies"]]
             added = np.sum(fine, 0) * F(S["analytic"])
-            if S["coarse_analytic"]:  # the last copy reaches farther, for what the others clip
+            # The last copy reaches farther, for values that the others clip.
+            if S["coarse_analytic"]:
                 added = np.where(
                     np.abs(fine[0]) <= F(S["fine_max"]), added, others[-1] * F(S["coarse_analytic"])
                 )
@@ -107,25 +111,25 @@ def factors(tile: np.ndarray) -> np.ndarray:
     A pixel gets the largest factor at which no pixel within the network's receptive radius exceeds
     `headroom`.
     """
-    chosen = np.ones(tile.shape[2:], int)
+    choice = np.ones(tile.shape[2:], int)
     if len(UNITS) == 1:
-        return chosen
+        return choice
     dark = F(S["offset"])
     brightest = brightest_around(tile[0, 0], S["halo_px"])
     for factor in sorted(UNITS)[1:]:
-        chosen[(brightest - dark) * F(factor) + dark <= F(S["headroom"])] = factor
-    return chosen
+        choice[(brightest - dark) * F(factor) + dark <= F(S["headroom"])] = factor
+    return choice
 
 
 def brightest_around(pixels: np.ndarray, radius: int) -> np.ndarray:
     """Compute the maximum of the square of `radius` pixels around each pixel (h, w)."""
     size = 2 * radius + 1
-    for _ in range(2):  # down, then across
+    # The maximum of a square is that of its columns' maxima: first down, then across.
+    for _ in range(2):
         pixels = np.pad(pixels, [(radius, radius), (0, 0)], "edge")
         length = 1
-        while (
-            length < size
-        ):  # the maximum of two windows that touch or overlap is that of a window twice as long
+        # The maximum of two windows that touch or overlap is that of a window twice as long.
+        while length < size:
             step = min(length, size - length)
             pixels = np.maximum(pixels[:-step], pixels[step:])
             length = length + step
@@ -247,15 +251,16 @@ def main(source: str, target: str, runs: dict[int, Any]) -> None:
     wide = np.pad(image, [(0, 0)] + [(0, -n % S["lattice_px"]) for n in image.shape[1:]], "edge")
     down, across = (spans(n, t, S["halo_px"]) for n in wide.shape[1:])
     out = np.empty((S["bands"], *(n * r for n in wide.shape[1:])), F)
-    for (y, top, bottom), (x, left, right) in ((a, b) for a in down for b in across):
+    for (y, top, bottom), (x, left, right) in itertools.product(down, across):
         tile = wide[None, :, y : y + t, x : x + t]
-        chosen = factors(tile)[top - y : bottom - y, left - x : right - x].repeat(r, 0).repeat(r, 1)
+        choice = factors(tile)[top - y : bottom - y, left - x : right - x].repeat(r, 0).repeat(r, 1)
         place = out[:, top * r : bottom * r, left * r : right * r]
-        for factor in np.unique(chosen).tolist():
-            found = exposed(factor, tile, runs[factor])[0]
-            kept = found[:, (top - y) * r : (bottom - y) * r, (left - x) * r : (right - x) * r]
-            np.copyto(place, kept, where=chosen == factor)
-    out = out[:, : image.shape[1] * r, : image.shape[2] * r]  # without what the lattice asked for
+        for factor in np.unique(choice).tolist():
+            result = exposed(factor, tile, runs[factor])[0]
+            pixels = result[:, (top - y) * r : (bottom - y) * r, (left - x) * r : (right - x) * r]
+            np.copyto(place, pixels, where=choice == factor)
+    # The image was extended to the lattice, and the result is cut back.
+    out = out[:, : image.shape[1] * r, : image.shape[2] * r]
     if S["consistency"]:
         out = np.stack([consistent(raw, np.clip(x, 0, F(1))) for raw, x in zip(image, out)])  # noqa: B905 - as above
     np.save(target, out)
@@ -265,10 +270,9 @@ def cores() -> dict[int, Any]:
     """Open the core of each factor in onnxruntime: what a board's own runners replace."""
     import onnxruntime as ort
 
+    # onnxruntime's fused kernels may saturate.
     plain = ort.SessionOptions()
-    plain.graph_optimization_level = (
-        ort.GraphOptimizationLevel.ORT_DISABLE_ALL
-    )  # fused kernels may saturate
+    plain.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
 
     def opened(factor: int) -> Any:
         name = "core.onnx" if factor == 1 else f"core-x{factor}.onnx"

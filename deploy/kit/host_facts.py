@@ -48,7 +48,7 @@ def host_facts(
         raise OptionError("sensor", expected=expected, got=sensor.name, remedy=remedy)
     if facts is None:
         return None
-    units = {str(factor): _unit(facts, each, tile_px) for factor, each in others.items()}
+    units = {str(factor): _unit(facts, other, tile_px) for factor, other in others.items()}
     return {**facts, **exposure_facts(sensor, units), "consistency": step}
 
 
@@ -63,24 +63,18 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
     ends = core.ends
     outputs = {"back": (ends.back, ends.outputs), "last": (ends.last, ends.outputs)}
     shuffles = {"front": (ends.front, ends.channels), **outputs}
-    # Of one band ONNX's order of the channels is that of torch, which host.py takes.
-    plain = all(
-        each.columns_first or wide == each.block**2
-        for found, wide in shuffles.values()
-        for each in found
-    )
-    if (
-        not ends.is_image
-        or ends.direct
-        or not plain
-        or any(len(found) > 1 for found, _ in shuffles.values())
-    ):
+    if not ends.is_image or ends.direct:
         return None
+    for moves, channels in shuffles.values():
+        # Of one band ONNX's order of the channels is that of torch, which host.py takes.
+        plain = all(move.columns_first or channels == move.block**2 for move in moves)
+        if not plain or len(moves) > 1:
+            return None
     tiling = network.tiling
     scale = core.scale(CORRECTION)
     step, part, middle = (STEP_DN, PART, MIDDLE_DN) if ends.banked else (STEP, QUARTER, 0)
     return {
-        **{name: found[0].block if found else 1 for name, (found, _) in shuffles.items()},
+        **{name: moves[0].block if moves else 1 for name, (moves, _) in shuffles.items()},
         "tile_px": tile_px,
         "halo_px": tiling.halo_px,
         "lattice_px": tiling.lattice_px,
@@ -116,8 +110,8 @@ def exposure_facts(sensor: Sensor | None, units: Mapping[str, object]) -> Facts:
     """Return the unit of each factor above 1, and what decides which factor a pixel gets; shares of
     full scale.
     """
-    known = None if sensor is None or sensor.name == BLIND else sensor.nominal()
-    offset = known.offset_dn / known.max_dn if known else 0.0
+    instrument = None if sensor is None or sensor.name == BLIND else sensor.nominal()
+    offset = instrument.offset_dn / instrument.max_dn if instrument else 0.0
     return {"exposures": dict(units), "headroom": HEADROOM, "offset": offset}
 
 

@@ -24,9 +24,8 @@ from pathlib import Path
 
 import numpy as np
 
-os.environ.setdefault(
-    "ORT_DISABLE_TELEMETRY", "1"
-)  # before it is loaded: from 1.29 on it reports its use
+# From 1.29 on onnxruntime reports its use, unless this is set before it is loaded.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 import onnxruntime as ort
 
 POWER_SAMPLE_S = 0.05
@@ -36,14 +35,14 @@ LATENCY_CALLS = 20
 
 def main() -> int:
     """Open, compare, measure, write; 0 when done, 2 for what the user can correct."""
-    given = arguments()
+    options = arguments()
     try:
-        entry = measure(given)
-        write_entry(entry, given.out)
+        entry = measure(options)
+        write_entry(entry, options.out)
     except (OSError, RuntimeError, ValueError) as error:
         print(f"measure.py: {error}", file=sys.stderr)
         return 2
-    print(f"wrote {given.out}: {entry}")
+    print(f"wrote {options.out}: {entry}")
     return 0
 
 
@@ -132,10 +131,8 @@ def make_feed(session: ort.InferenceSession, batch: int, tile_px: int) -> dict[s
     feed = {}
     for tensor in session.get_inputs():
         shape = [batch, tensor.shape[1], tile_px, tile_px]
-        if any(
-            isinstance(size, int) and size != wanted
-            for size, wanted in zip(tensor.shape, shape)  # noqa: B905
-        ):
+        sides = zip(tensor.shape, shape)  # noqa: B905 - a board's Python may be old
+        if any(isinstance(size, int) and size != expected for size, expected in sides):
             raise ValueError(
                 f"{tensor.name} is fixed to {tensor.shape}, not {shape}: give its --tile and "
                 "--batch"
@@ -171,7 +168,8 @@ def run_threads(
     meanwhile.
     """
     stamps: list[float] = []
-    numbers = iter(range(calls))  # one step of it is not interrupted by another thread
+    # All threads share this iterator: one step of it is not interrupted by another thread.
+    numbers = iter(range(calls))
 
     def work() -> None:
         for _ in numbers:

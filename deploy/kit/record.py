@@ -69,9 +69,9 @@ def write_record(
         folder: of the three files.
         floating: the float network that it was compared with.
     """
-    said = record_of(judged, network, sensor, floating)
+    record = record_of(judged, network, sensor, floating)
     # All three are made before the first is written: a record is whole or not there.
-    texts = json.dumps(said, indent=1) + "\n", render(_page(judged, said)), bill_of(said)
+    texts = json.dumps(record, indent=1) + "\n", render(_page(judged, record)), bill_of(record)
     for path, text in zip(recorded(folder), texts, strict=True):
         write_text(path, text)
 
@@ -122,6 +122,7 @@ def code_sha256() -> str:
     """Of the sources of this package, whose names and bytes in their order are one text."""
     root = Path(__file__).parents[1]
     digest = hashlib.sha256()
+    # In this order and with these slashes the digest is the same on every system.
     for path in sorted(root.rglob("*.py")):
         digest.update(f"{path.relative_to(root).as_posix()} {sha256(path)}\n".encode())
     return digest.hexdigest()
@@ -144,21 +145,21 @@ def _verified_weights(network: Network, sensor: Sensor, floating: Network | None
     return path if network.model.graph == shipped.graph else None
 
 
-def _page(judged: Table, said: dict[str, Any]) -> Report:
-    known = ("weights_sha256", "training", "sensors_in_range", "licence")
-    facts = said["network"] | {key: said[key] for key in known}
+def _page(judged: Table, record: dict[str, Any]) -> Report:
+    keys = ("weights_sha256", "training", "sensors_in_range", "licence")
+    facts = record["network"] | {key: record[key] for key in keys}
     rows = [Row("network", key, {}, {"value": str(value)}) for key, value in facts.items()]
     claims = [
-        Row("claims", key, {}, {"claim": printable(value)}) for key, value in said["says"].items()
+        Row("claims", key, {}, {"claim": printable(value)}) for key, value in record["says"].items()
     ]
     checks = [
         Row(
             "checks",
-            each.name,
+            check.name,
             {},
-            {"found": each.found, "allowed": each.allowed, "passed": str(each.passed)},
+            {"found": check.found, "allowed": check.allowed, "passed": str(check.passed)},
         )
-        for each in judged.checks
+        for check in judged.checks
     ]
     tables = [
         Section("What it is", rows),
@@ -169,7 +170,9 @@ def _page(judged: Table, said: dict[str, Any]) -> Report:
         ),
     ]
     verdict = "All checks passed." if judged else "A check failed."
-    return Report(f"Record of {said['network']['name']}", verdict, tables, [], said["limitations"])
+    return Report(
+        f"Record of {record['network']['name']}", verdict, tables, [], record["limitations"]
+    )
 
 
 def bill_of(said: dict[str, Any]) -> str:
@@ -183,14 +186,16 @@ def bill_of(said: dict[str, Any]) -> str:
 
     def component(kind: ComponentType, name: str, digest: str, **more: Any) -> Component:
         hashes = [HashType(alg=HashAlgorithm.SHA_256, content=digest)]
-        shown = one_line(name)  # of a file: a reader of the bill may print it as it is
+        # The name is that of a file, and a reader of the bill may print it as it is.
+        text = one_line(name)
         # Two files may have one name, and a reference must be unique.
         return Component(
-            type=kind, name=shown, bom_ref=f"{kind.value}:{shown}:{digest}", hashes=hashes, **more
+            type=kind, name=text, bom_ref=f"{kind.value}:{text}:{digest}", hashes=hashes, **more
         )
 
     network = said["network"]
     tool = said["tool"]
+    # A serial number made of the content gives the same record the same number.
     bom = Bom(serial_number=uuid5(NAMESPACE_URL, json.dumps(said)))
     facts = said["says"] | {
         key: said[key]
@@ -209,8 +214,8 @@ def bill_of(said: dict[str, Any]) -> str:
     )
     bom.metadata.tools.components.add(maker)
     files = [
-        component(ComponentType.FILE, each["name"], each["sha256"])
-        for each in said["results"]["inputs"]
+        component(ComponentType.FILE, entry["name"], entry["sha256"])
+        for entry in said["results"]["inputs"]
     ]
     bom.components.update(files)
     bom.register_dependency(bom.metadata.component, files)

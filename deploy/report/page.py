@@ -5,6 +5,7 @@ network for nothing.
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import jinja2
@@ -21,10 +22,11 @@ INTERVAL = re.compile(r"\[[^\[\]]*\]")
 
 def _template() -> jinja2.Template:
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    # A name that the template misspells raises an error instead of writing nothing.
     strict = jinja2.StrictUndefined
     # Autoescape deals with markup; `finalize` sees every value that is written, and escapes what is
     # not printable.
-    made = jinja2.Environment(
+    environment = jinja2.Environment(
         loader=loader,
         autoescape=True,
         undefined=strict,
@@ -32,16 +34,15 @@ def _template() -> jinja2.Template:
         lstrip_blocks=True,
         finalize=_shown,
     )
-    made.filters["unbroken"] = _unbroken
-    return made.get_template("report.html")
+    environment.filters["unbroken"] = _unbroken
+    return environment.get_template("report.html")
 
 
 def _unbroken(text: str) -> Markup:
     """Return the text as markup, with each interval in brackets on one line."""
-    kept = INTERVAL.sub(
-        lambda found: found[0].replace(" ", "\N{NO-BREAK SPACE}"), str(escape(visible(text)))
-    )
-    return Markup(kept)  # noqa: S704 - escaped above
+    markup = str(escape(visible(text)))
+    unbroken = INTERVAL.sub(lambda interval: interval[0].replace(" ", "\N{NO-BREAK SPACE}"), markup)
+    return Markup(unbroken)  # noqa: S704 - escaped above
 
 
 def _shown(value: object) -> object:
@@ -100,19 +101,20 @@ def _grid(table: Section, *, upright: bool) -> dict[str, object]:
     that fits better.
     """
     rows = list(table.rows)
-    figures = list(dict.fromkeys(key for row in rows for key in row.figures))
-    words = list(dict.fromkeys(key for row in rows for key in row.text))
-    columns = [_head(key, unit_of(key, rows)) for key in figures] + [
-        _head(word, word=True) for word in words
-    ]
-    cells = [
-        [_cell(row.figures.get(key)) for key in figures]
-        + [_word(row.text.get(word, "")) for word in words]
-        for row in rows
-    ]
+    figures = list(dict.fromkeys(chain.from_iterable(row.figures for row in rows)))
+    words = list(dict.fromkeys(chain.from_iterable(row.text for row in rows)))
+    columns = [_head(key, unit_of(key, rows)) for key in figures]
+    columns += [_head(word, word=True) for word in words]
+    cells = []
+    for row in rows:
+        line = [_cell(row.figures.get(key)) for key in figures]
+        line += [_word(row.text.get(word, "")) for word in words]
+        cells.append(line)
     heads = [_head(row.name) for row in rows]
     if not upright and len(columns) > max(WIDE, len(rows)):
-        columns, heads, cells = heads, columns, [list(line) for line in zip(*cells, strict=True)]
+        # Columns that do not fit on a page are turned into rows, because a page is open downwards.
+        columns, heads = heads, columns
+        cells = [list(line) for line in zip(*cells, strict=True)]
     return {
         "title": table.title,
         "caption": table.caption,

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
@@ -97,6 +98,7 @@ def look() -> Iterator[None]:
     """
     from matplotlib import style
 
+    # The user's own style must not change our plots.
     with warnings.catch_warnings(), style.context(["default", LOOK]):
         # A letter that the font lacks is a box in a PNG; of an SVG the browser has its own.
         warnings.filterwarnings("ignore", "(?s)Glyph .* missing", UserWarning)
@@ -142,6 +144,8 @@ def round_values(low: float, high: float, most: int, *, logarithmic: bool) -> li
             for value in locator.tick_values(low, high)
             if low <= value <= high
         ]
+        # A logarithmic locator may find no round value between close limits: then ticks are evenly
+        # spaced.
         if (LEAST_TICKS if locator in logs else 1) <= len(values) <= most:
             break
     return values
@@ -267,7 +271,9 @@ def curves_svg(
     Returns:
         An SVG file, light or dark as its reader's screen is.
     """
-    rows = math.ceil(len({curve.name for _, curves in panels for curve in curves}) / LEGEND_NAMES)
+    # Curves of one name share an entry of the legend.
+    names = {curve.name for curve in chain.from_iterable(curves for _, curves in panels)}
+    rows = math.ceil(len(names) / LEGEND_NAMES)
     width_px = CURVES_PX[0]
     more_px = (rows - 1) * LEGEND_ROW_PX
     height_px = CURVES_PX[1] + more_px
@@ -278,25 +284,27 @@ def curves_svg(
     with look():
         figure = new_figure(width_px, height_px)
         all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False, gridspec_kw=frame)[0]
-        named = {}
+        handles = {}
         for axes, (title, curves) in zip(all_axes, panels, strict=True):
             axes.set(xscale="log" if logarithmic else "linear", title=title)
             axes.margins(0.06)
             for curve in curves:
                 style = {"color": LIGHT[SERIES[curve.colour]], "ls": "--" if curve.dashed else "-"}
                 style["marker"] = "o" if logarithmic else ""
-                named[curve.name] = axes.plot(
-                    *zip(*curve.points, strict=True), **style, ms=5, lw=2, gid="curve"
-                )[0]
+                xs_and_ys = zip(*curve.points, strict=True)
+                lines = axes.plot(*xs_and_ys, **style, ms=5, lw=2, gid="curve")
+                handles[curve.name] = lines[0]
             set_ticks(axes.xaxis, 5)
         set_ticks(all_axes[0].yaxis, 8)
         figure.supxlabel(
             x_title, size=FONT_PX, color=LIGHT["soft"], y=(X_TITLE_PX + more_px) / height_px
         )
         figure.supylabel(y_title, size=FONT_PX, color=LIGHT["soft"])
-        columns = math.ceil(len(named) / rows)
+        columns = math.ceil(len(handles) / rows)
         at = (0.5, LEGEND_PX / height_px)
-        figure.legend(named.values(), named, ncols=columns, loc="lower center", bbox_to_anchor=at)
+        figure.legend(
+            handles.values(), handles, ncols=columns, loc="lower center", bbox_to_anchor=at
+        )
         return svg_of(figure, f"{y_title} against {x_title}")
 
 
@@ -314,7 +322,9 @@ def histogram_url(spread: "Spread") -> str:
     data: address.
     """
     centres, shares, wide = bins(spread)
+    # A share of one pixel is the least that a bar can have.
     decades = math.ceil(math.log10(spread.counts.sum()))
+    # The deviation is 0 where INT8 equals float everywhere, and the Gaussian divides by it.
     std_dn = max(spread.std_dn, 1e-9)
     gauss = wide * np.exp(-((centres / std_dn) ** 2) / 2) / (std_dn * math.sqrt(2 * math.pi))
     least = 10.0**-decades
@@ -342,11 +352,11 @@ def bins(spread: "Spread") -> tuple[np.ndarray, np.ndarray, int]:
     farthest = int(np.abs(np.flatnonzero(spread.counts) - MAX_DN).max())
     wide = 1
     while 2 * (reach := -(-max(farthest - wide // 2, 0) // wide)) + 1 > MOST_BARS:
-        wide += 2  # odd, so that zero lies in the middle of a bin
+        # The width stays odd, so that zero lies in the middle of a bin.
+        wide += 2
     half = reach * wide + wide // 2
     middle = MAX_DN + wide
     padded = np.pad(spread.counts, wide)
-    shares = (
-        padded[middle - half : middle + half + 1].reshape(-1, wide).sum(1) / spread.counts.sum()
-    )
+    counts = padded[middle - half : middle + half + 1].reshape(-1, wide).sum(1)
+    shares = counts / spread.counts.sum()
     return np.arange(-reach, reach + 1) * wide, shares, wide

@@ -47,8 +47,8 @@ def sensitivity_page(
         worst_picture(number, patches.degraded[number], sessions, white_dn) for number in worst
     ]
     tables = [
-        Section(name.capitalize(), found, CAPTIONS.get(name, ""))
-        for name, found in by_table(rows).items()
+        Section(name.capitalize(), table, CAPTIONS.get(name, ""))
+        for name, table in by_table(rows).items()
     ]
     return Report("Where INT8 errs", headline, tables, pictures, NOTES)
 

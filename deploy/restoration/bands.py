@@ -28,14 +28,15 @@ def parse_sensors(text: str) -> dict[str, str]:
     """A profile for each band by the band's name; under no name at all where
     one is for all bands.
     """
+    # The path of one profile may have an equals sign in it.
     if "=" not in text or Path(text).is_file():
         return {"": text}
     pairs = [part.partition("=") for part in text.split(",")]
-    found = {name.strip(): profile.strip() for name, _, profile in pairs}
-    if not all((*found, *found.values())) or len(found) < len(pairs):
+    profiles = {name.strip(): profile.strip() for name, _, profile in pairs}
+    if not all((*profiles, *profiles.values())) or len(profiles) < len(pairs):
         expected = "BAND=PROFILE,BAND=PROFILE"
         raise OptionError("sensor", expected=expected, got=repr(text), remedy="name each band once")
-    return found
+    return profiles
 
 
 def band_names(raster: Raster) -> tuple[str, ...]:
@@ -43,14 +44,15 @@ def band_names(raster: Raster) -> tuple[str, ...]:
     text = next((str(tag[3]) for tag in raster.tags if tag[0] == METADATA_TAG), "")
     try:
         root = parse_xml(text)
+    # Names are no part of the pixels, so that damaged metadata must not end a run.
     except (ValueError, LookupError, RecursionError):
         return ()
-    found = {
+    descriptions = {
         item.get("sample"): item.text or ""
         for item in root.iter("Item")
         if item.get("role") == "description"
     }
-    names = tuple(found.get(str(band), "") for band in range(raster.bands))
+    names = tuple(descriptions.get(str(band), "") for band in range(raster.bands))
     return names if all(names) else ()
 
 
@@ -60,11 +62,11 @@ def in_order(given: Mapping[str, Each], raster: Raster) -> list[Each]:
     """
     if "" in given:
         return [given[""]]
-    named = band_names(raster)
-    names = named or _by_number(given)
+    stored_names = band_names(raster)
+    names = stored_names or _by_number(given)
     if len(given) != raster.bands or set(names) != set(given):
         expected = f"a sensor for each of {raster.bands} bands" + (
-            f": {', '.join(named)}" if named else ""
+            f": {', '.join(stored_names)}" if stored_names else ""
         )
         remedy = "name every band of the image; pansharpening is out of scope"
         raise OptionError("sensor", expected=expected, got=", ".join(given), remedy=remedy)
@@ -73,10 +75,12 @@ def in_order(given: Mapping[str, Each], raster: Raster) -> list[Each]:
 
 def _by_number(names: Iterable[str]) -> tuple[str, ...]:
     """Names that end in a number, such as B2, in the order of these; others as they are given."""
-    numbers = {name: re.fullmatch(r"\D*(\d{1,6})", name) for name in names}
-    found = {name: int(match[1]) for name, match in numbers.items() if match}
+    matches = {name: re.fullmatch(r"\D*(\d{1,6})", name) for name in names}
+    ordinals = {name: int(match[1]) for name, match in matches.items() if match}
     return tuple(
-        sorted(found, key=lambda name: found[name]) if len(found) == len(numbers) else numbers
+        sorted(ordinals, key=lambda name: ordinals[name])
+        if len(ordinals) == len(matches)
+        else matches
     )
 
 

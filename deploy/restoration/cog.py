@@ -49,12 +49,16 @@ def what_was_done(
     """The run as an image's metadata: tool, networks in the order of the bands, their sensors and
     full scale.
     """
-    said = [metadata(network) for network in networks]
+    networks_metadata = [metadata(network) for network in networks]
     return {
         RESTORED_BY: f"beers-deploy {version('beers-deploy')}",
         "RESTORED_NETWORK_SHA256": digests,
-        "RESTORED_NETWORK": ", ".join(each.get("variant", "not stated") for each in said),
-        "RESTORED_SENSOR": ", ".join(each.get("sensor", "not stated") for each in said),
+        "RESTORED_NETWORK": ", ".join(
+            entry.get("variant", "not stated") for entry in networks_metadata
+        ),
+        "RESTORED_SENSOR": ", ".join(
+            entry.get("sensor", "not stated") for entry in networks_metadata
+        ),
         "RESTORED_FULL_SCALE": scale.words,
     }
 
@@ -83,24 +87,26 @@ def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[s
     rasterio: Any = import_module("rasterio")
     options: dict[str, Any] = {
         "COMPRESS": CODECS[compression],
-        "PREDICTOR": "NO"
-        if compression is Compression.none
-        else "YES",  # the horizontal one of integers
+        # The horizontal predictor of integers.
+        "PREDICTOR": "NO" if compression is Compression.none else "YES",
         "BLOCKSIZE": BLOCK_PX,
         "BIGTIFF": "IF_SAFER",
-        "RESAMPLING": "AVERAGE",  # of known pixels, and no overshoot beyond them
+        # An average of known pixels does not overshoot them.
+        "RESAMPLING": "AVERAGE",
     }
     environment = {**ENVIRONMENT, **OFFLINE, "GDAL_CACHEMAX": LEAST_CACHE_BYTES}
     try:
         with warnings.catch_warnings(action="ignore"), rasterio.Env(**environment):
             with rasterio.open(plain, "r+", driver="GTiff") as file:
                 file.update_tags(**about)
-                if file.width == 1:  # readers tell how far an overview is reduced from its width
+                # Readers compute from its width by how much an overview is reduced.
+                if file.width == 1:
                     options["OVERVIEWS"] = "NONE"
             import_module("rasterio.shutil").copy(plain, cog, driver="COG", **options)
     except CODE_FAULTS:
         raise
-    except Exception as error:  # rasterio has a class of its own for each of GDAL's
+    # rasterio has a class of its own for each of GDAL's errors.
+    except Exception as error:
         raise OSError(" ".join(str(error.__cause__ or error).split())) from error
 
 
@@ -112,12 +118,13 @@ def write_item(image: Path, path: Path) -> None:
     pystac: Any = import_module("pystac")
     rasterio: Any = import_module("rasterio")
     with (
-        warnings.catch_warnings(action="ignore"),  # an image need not lie anywhere on Earth
+        # An image need not lie anywhere on Earth.
+        warnings.catch_warnings(action="ignore"),
         rasterio.Env(**ENVIRONMENT, **OFFLINE),
         rasterio.open(image, driver="GTiff") as file,
     ):
         corners = _corners(file) if file.crs and not file.transform.is_identity else []
-        done = {
+        restoration = {
             key.lower(): text for key, text in file.tags().items() if key.startswith("RESTORED_")
         }
         bands = [{"name": name or f"{k}"} for k, name in enumerate(file.descriptions, 1)]
@@ -127,17 +134,15 @@ def write_item(image: Path, path: Path) -> None:
         geometry={"type": "Polygon", "coordinates": [[*corners, corners[0]]]} if corners else None,
         bbox=[*map(min, sides), *map(max, sides)] or None,
         datetime=datetime.now(UTC),
-        properties={"description": f"restored by beers-deploy; {WHEN}", **done},
+        properties={"description": f"restored by beers-deploy; {WHEN}", **restoration},
     )
     href = Path(os.path.relpath(image, path.parent)).as_posix()
     asset = pystac.Asset(
         href, media_type=pystac.MediaType.COG, roles=["data"], extra_fields={"bands": bands}
     )
     item.add_asset("restored", asset)
-    write_text(
-        path,
-        json.dumps(item.to_dict(include_self_link=False, transform_hrefs=False), indent=1) + "\n",
-    )
+    content = item.to_dict(include_self_link=False, transform_hrefs=False)
+    write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 def _corners(file: Any) -> list[tuple[float, float]]:

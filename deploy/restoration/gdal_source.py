@@ -39,18 +39,17 @@ from beers_deploy.restoration.source import (
 
 LEAST_CACHE_BYTES = 1 << 26
 ENVIRONMENT = {
-    # No file beside it: what is beside was not looked at.
+    # GDAL must open no file beside the image, because such a file was not checked.
     "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
     "GDAL_PAM_ENABLED": "NO",
     "GDAL_VRT_ENABLE_PYTHON": "NO",
-    # Threads that decode print their errors, which come back as one exception as well.
+    # Threads that decode print their errors, which are raised as one exception as well.
     "CPL_LOG": os.devnull,
 }
 OFFLINE = {"CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "{none}"}
 
-logging.getLogger("rasterio").addHandler(
-    logging.NullHandler()
-)  # who asks for its remarks still has them
+# Its messages are not printed; a program that adds a handler of its own still gets them.
+logging.getLogger("rasterio").addHandler(logging.NullHandler())
 
 
 @contextmanager
@@ -68,7 +67,7 @@ def open_gdal(path: Path, trusted: bool = False) -> Iterator[Source]:
     with _damage_in_a_sentence(path), rasterio.Env(**environment):
         dataset = rasterio.open(path.resolve(), driver=GDAL_DRIVERS[path.suffix.lower()])
         block_px = _block_px(dataset)
-        # A mosaic states blocks of its own, and decodes those of its tiles, which are mostly alike.
+        # A mosaic states blocks of its own, but decodes those of its tiles, which are mostly alike.
         if tiles:
             with rasterio.open(tiles[0]) as tile:
                 block_px = max(block_px, _block_px(tile))
@@ -91,13 +90,15 @@ def _block_px(dataset: Any) -> int:
 @contextmanager
 def _damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
     try:
-        with warnings.catch_warnings(action="ignore"):  # an image need not lie on Earth
+        # An image need not lie anywhere on Earth.
+        with warnings.catch_warnings(action="ignore"):
             yield
     except (BeersError, MemoryError, *CODE_FAULTS):
         raise
     except Exception as error:
         cause: BaseException = error
-        while cause.__cause__ is not None:  # rasterio's own words are "see previous exception"
+        # rasterio's own message is "see previous exception", so the first cause is reported.
+        while cause.__cause__ is not None:
             cause = cause.__cause__
         name = f"{path}, {where}" if where else str(path)
         got = " ".join(str(cause).split())[:160] or type(cause).__name__
@@ -130,7 +131,7 @@ class GdalSource:
         """The same rows of the image's mask, (1, rows, width) uint8."""
         return self._read(self._dataset.dataset_mask, start, stop)[None]
 
-    def _read(self, read: Callable[..., Any], start: int, stop: int) -> np.ndarray:
+    def _read(self, read_window: Callable[..., Any], start: int, stop: int) -> np.ndarray:
         rasterio: Any = import_module("rasterio")
         environment = self._environment | {"GDAL_CACHEMAX": self.held_bytes(stop - start)}
         with (
@@ -138,7 +139,9 @@ class GdalSource:
             rasterio.Env(**environment),
         ):
             return np.asarray(
-                read(window=rasterio.windows.Window(0, start, self.raster.width_px, stop - start))
+                read_window(
+                    window=rasterio.windows.Window(0, start, self.raster.width_px, stop - start)
+                )
             )
 
     def held_bytes(self, rows_px: int) -> int:
@@ -154,16 +157,16 @@ def _raster(path: Path, dataset: Any) -> Raster:
             f", as {dataset.subdatasets[0]}" if dataset.subdatasets else ""
         )
         raise ImageError(str(path), expected="one image", got="several, or none", remedy=remedy)
-    for kind, each in (("types", dataset.dtypes), ("nodata values", dataset.nodatavals)):
-        if len({str(one) for one in each}) > 1:
-            got = ", ".join(str(one) for one in each)
+    for kind, values in (("types", dataset.dtypes), ("nodata values", dataset.nodatavals)):
+        if len({str(value) for value in values}) > 1:
+            got = ", ".join(str(value) for value in values)
             raise ImageError(
                 str(path), expected=f"bands of equal {kind}", got=got, remedy="split the bands"
             )
     name = str(path)
     dtype = require_numbers(str(path), np.dtype(dataset.dtypes[0]))
     require_size(name, dataset.count, dataset.height, dataset.width)
-    colours = [each.name for each in dataset.colorinterp]
+    colours = [values.name for values in dataset.colorinterp]
     if "palette" in colours:
         remedy = "convert it with 'gdal_translate -expand'"
         raise ImageError(
@@ -186,12 +189,13 @@ def _bits(path: Path, dataset: Any) -> int | None:
     A DIMAP says it of the product; of other files what fills the type is a container, as in a plain
     TIFF.
     """
-    if (of_product := dimap_bits(path)) is not None:
-        return of_product
+    if (product_bits := dimap_bits(path)) is not None:
+        return product_bits
     bands = range(1, dataset.count + 1)
-    stated = [str(dataset.tags(band, ns="IMAGE_STRUCTURE").get("NBITS", "")) for band in bands]
-    actual = stated if all(stated) else [str(dataset.tags().get("NITF_ABPP", "")).strip()]
-    most = max((int(each) for each in actual if each.isdecimal()), default=0)
+    band_bits = [str(dataset.tags(band, ns="IMAGE_STRUCTURE").get("NBITS", "")) for band in bands]
+    texts = band_bits if all(band_bits) else [str(dataset.tags().get("NITF_ABPP", "")).strip()]
+    most = max((int(text) for text in texts if text.isdecimal()), default=0)
+    # Bits that fill the type describe the container, not the sensor.
     return most if 0 < most < 8 * np.dtype(dataset.dtypes[0]).itemsize else None
 
 

@@ -9,6 +9,7 @@ between the two.
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,7 @@ def geo_keys(keys: Sequence[int]) -> dict[int, int]:
 
 def _enlarged(code: int, value: Any, scale: int, points: bool) -> Any:
     if code == PIXEL_SCALE:
+        # The third number is the scale of heights, which do not change.
         return (value[0] / scale, value[1] / scale, *value[2:])
     if code == TIE_POINTS:
         return _tie_points(value, scale, points)
@@ -83,11 +85,13 @@ def _tie_points(value: Sequence[float], scale: int, points: bool) -> tuple[float
 def _transformation(value: Sequence[float], scale: int, points: bool) -> tuple[float, ...]:
     """A matrix (4, 4) row by row, from column, row and level to three on Earth."""
     rows = [list(value[k : k + 4]) for k in range(0, 16, 4)]
+    # Of points, (0, 0) is the middle of the first pixel, which moves with the pixel's size.
     shift = (0.5 / scale - 0.5) if points else 0.0
     for row in rows[:3]:
         row[3] += shift * (row[0] + row[1])
-        row[0], row[1] = row[0] / scale, row[1] / scale
-    return tuple(number for row in rows for number in row)
+        row[0] = row[0] / scale
+        row[1] = row[1] / scale
+    return tuple(chain.from_iterable(rows))
 
 
 AUX_BYTES = 1 << 20
@@ -115,16 +119,16 @@ def of_sidecar(path: Path, raster: Raster) -> Raster:
             number_of(band.findtext(key, ""), usual) for key, usual in (("Offset", 0), ("Scale", 1))
         )
         require_small_offset(name, offset, scale)
-    stated = {band.findtext("NoDataValue", "").strip() for band in bands} - {""}
-    if len(stated) > 1:
+    nodata_texts = {band.findtext("NoDataValue", "").strip() for band in bands} - {""}
+    if len(nodata_texts) > 1:
         raise ImageError(
             name,
             expected="one nodata value",
-            got=", ".join(sorted(stated)),
+            got=", ".join(sorted(nodata_texts)),
             remedy="split the bands",
         )
-    found = [number_of(text, math.nan) for text in stated] if raster.nodata is None else []
-    nodata = usable_nodata(name, found[0], raster.dtype) if found else None
+    values = [number_of(text, math.nan) for text in nodata_texts] if raster.nodata is None else []
+    nodata = usable_nodata(name, values[0], raster.dtype) if values else None
     if nodata is None:
         return raster
     return replace(
@@ -138,8 +142,9 @@ def unread_places(path: Path, raster: Raster) -> list[str]:
     """
     if {tag[0] for tag in raster.tags} & {PIXEL_SCALE, TRANSFORMATION, KEYS, POLYNOMIALS}:
         return []
-    found = [each for end in UNREAD if (each := path.with_name(f"{path.stem}{end}")).is_file()]
+    sidecars = [path.with_name(f"{path.stem}{end}") for end in UNREAD]
     return [
-        f"{each.name} is not read: keep it beside the result, or write its place into the image"
-        for each in found
+        f"{sidecar.name} is not read: keep it beside the result, or write its place into the image"
+        for sidecar in sidecars
+        if sidecar.is_file()
     ]

@@ -66,10 +66,10 @@ def read_xml(path: Path, limit_bytes: int, expected: str, remedy: str) -> ET.Ele
     """
     try:
         return parse_xml(read_whole(path, limit_bytes))
-    except (ValueError, LookupError, OSError, RecursionError) as error:  # lookup: of an encoding
-        raise _refused(
-            path, expected, getattr(error, "strerror", None) or str(error), remedy
-        ) from error
+    # An encoding that Python does not know raises a LookupError.
+    except (ValueError, LookupError, OSError, RecursionError) as error:
+        got = getattr(error, "strerror", None) or str(error)
+        raise _refused(path, expected, got, remedy) from error
 
 
 def is_index(path: Path) -> bool:
@@ -89,22 +89,24 @@ def index_files(path: Path, trusted: bool = False) -> tuple[Path, ...]:
     if not is_index(path):
         return ()
     home = path.resolve().parent
-    found = dict[Path, None]()
+    files = dict[Path, None]()
     pending = [path.resolve()]
     while pending:
         index = pending.pop()
-        found[index] = None
-        for file in dict.fromkeys(_named(index, home, trusted)):  # once each, in order
-            if is_index(file) and file not in found:
+        files[index] = None
+        # A mosaic may name the same tile again and again; a dictionary keeps the order.
+        for file in dict.fromkeys(_named(index, home, trusted)):
+            if is_index(file) and file not in files:
                 pending.append(file)
-            found[file] = None
-    return tuple(found)[1:]
+            files[file] = None
+    return tuple(files)[1:]
 
 
 def _named(index: Path, home: Path, trusted: bool) -> Iterator[Path]:
     """The files that one index names; `home` is the folder of the first one."""
     root = _parsed(index)
-    for text, folder, pixels in _of_vrt(index, root) if root.tag == VRT else _of_dimap(index, root):
+    paths = _of_vrt(index, root) if root.tag == VRT else _of_dimap(index, root)
+    for text, folder, pixels in paths:
         if trusted and _is_elsewhere(text):
             continue
         file = _located(index, text, folder, None if trusted else home)
@@ -124,8 +126,8 @@ def _require_pixels(index: Path, text: str, file: Path) -> None:
             "fetch it or make the index anew",
         )
     with file.open("rb") as stream:
-        known = stream.read(16).startswith(MAGIC)
-    if not known and file.suffix.lower() != ".vrt":
+        is_image = stream.read(16).startswith(MAGIC)
+    if not is_image and file.suffix.lower() != ".vrt":
         expected = "tiles that are TIFF, JPEG 2000, NITF, PNG or JPEG"
         raise _refused(index, expected, f"another file, {text}", "convert it to TIFF")
 
@@ -177,7 +179,8 @@ def _located(index: Path, text: str, folder: Path, home: Path | None) -> Path:
     """A path that an index names; in `home` or below, unless that is None."""
     try:
         file = (folder / text).resolve()
-        file.is_file()  # whether the system takes such a name
+        # A name that the system does not accept raises here and not in the middle of a run.
+        file.is_file()
     except (OSError, RuntimeError, ValueError) as error:
         raise _refused(
             index, "names of tiles", f"no path, {text}", "make the index anew"
@@ -204,6 +207,6 @@ def dimap_bits(path: Path) -> int | None:
     if path.suffix.lower() != ".xml":
         return None
     root = _parsed(path)
-    stated = [(root.findtext(f".//{name}") or "").strip() for name in ("PRODUCT_RANGE", "NBITS")]
-    known = [int(text) for text in stated if text.isdecimal() and 1 <= int(text) <= MOST_BITS]
-    return known[0] if known else None
+    texts = [(root.findtext(f".//{name}") or "").strip() for name in ("PRODUCT_RANGE", "NBITS")]
+    bits = [int(text) for text in texts if text.isdecimal() and 1 <= int(text) <= MOST_BITS]
+    return bits[0] if bits else None

@@ -61,8 +61,9 @@ def read_journal(path: Path, job: Mapping[str, object]) -> list[FinishedRow]:
         TypeError: a value of another type.
         OSError: a journal that cannot be read.
     """
-    found: Any = read_json(path)
-    content: dict[str, Any] = dict(found)
+    document: Any = read_json(path)
+    content: dict[str, Any] = dict(document)
+    # `resume` trusts nothing that it finds on the disk: a journal has a digest of its own.
     if content.pop("sha256") != _digest(content):
         raise ValueError("damaged")
     if content["job"] != job:

@@ -59,9 +59,10 @@ def network_method(
     infer, _ = open_runtime(Runtime.onnxruntime, model, threads=0)
     tiling = tiling_of(model)
     others = {} if brighter is None else brighter
+    # These are opened at their first call: bright images ask for no factor above 1.
     packed = {
-        factor: Packed(each.SerializeToString(), Runtime.onnxruntime, 0)
-        for factor, each in others.items()
+        factor: Packed(other.SerializeToString(), Runtime.onnxruntime, 0)
+        for factor, other in others.items()
     }
     offset = sensor.offset_dn if sensor else 0.0
     network = ExposedNetwork({1: infer, **packed}, tiling.halo_px, offset)

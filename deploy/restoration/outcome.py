@@ -181,7 +181,9 @@ class Tally:
     def mean_bound(self) -> float:
         """By how much a restoration may move the mean."""
         count = max(self.compared, 1)
+        # A border of zeros changes the mean of a small image, hence the standard error.
         scatter = SCATTER * self.spreads[0] / math.sqrt(count)
+        # No pixel is stored below 0, which raises the mean of a dark and noisy image.
         return MEAN_KEPT * self.means[0] + LEAST_MOVE + scatter + DARK_MOVE * self.dark / count
 
     @property
@@ -191,6 +193,7 @@ class Tally:
             self.before_squared / max(self.compared, 1),
             self.after_squared / max(self.known, 1),
         )
+        # Rounding may leave the mean square below the square of the mean.
         before, after = (
             math.sqrt(max(square - mean**2, 0))
             for square, mean in zip(squares, self.means, strict=True)
@@ -239,26 +242,31 @@ class Tally:
         """What a user should look at, a clause each; of the network's results, before the
         consistency step.
         """
-        found = []
-        given = self.network
+        clauses = []
+        # The consistency step gives nearly any image the mean of the raw one, and so would hide
+        # a network that does not fit.
+        network = self.network
         before = "before the consistency step, " if self.change_squared else ""
         if self.clipped > MANY_AT_ENDS * max(self.compared, 1):
-            found.append(f"{self.clipped} pixels of the image, nearly all, are above full scale")
-        if given.share_at_ends > SOME_AT_ENDS:
-            share = f"{given.share_at_ends:.0%} of the results"
-            found.append(f"{before}{share} are 0 or full scale where the image is not")
-        if abs(given.moved) > given.mean_bound:
-            found.append(
-                before + "the mean went from {:.3g} to {:.3g} of full scale".format(*given.means)
+            clauses.append(f"{self.clipped} pixels of the image, nearly all, are above full scale")
+        if network.share_at_ends > SOME_AT_ENDS:
+            share = f"{network.share_at_ends:.0%} of the results"
+            clauses.append(f"{before}{share} are 0 or full scale where the image is not")
+        if abs(network.moved) > network.mean_bound:
+            clauses.append(
+                before + "the mean went from {:.3g} to {:.3g} of full scale".format(*network.means)
             )
-        if given.flat:
-            found.append(f"{before}the results are constant and the image is not")
-        return found
+        if network.flat:
+            clauses.append(f"{before}the results are constant and the image is not")
+        return clauses
 
     def require(self, name: str) -> None:
         """Refuse what no restoration gives of an image, `name` in messages."""
-        given = self.network
-        impossible = given.share_at_ends > MANY_AT_ENDS or abs(given.moved) > FAR or given.flat
+        network = self.network
+        impossible = (
+            network.share_at_ends > MANY_AT_ENDS or abs(network.moved) > FAR or network.flat
+        )
+
         if self.known >= FEW and (
             impossible or self.clipped > MANY_AT_ENDS * max(self.compared, 1)
         ):

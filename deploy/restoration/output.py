@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from itertools import accumulate
+from itertools import accumulate, chain
 from pathlib import Path
 from typing import Any
 
@@ -79,15 +79,16 @@ class Checkpoint:
             require_regular(self.folder / name)
         self._job = dict(job)
         self._row_ends = list(row_ends)
-        left = self._left() if resume else []
-        self._finished = self._matching(left)
+        journal_rows = self._left() if resume else []
+        self._finished = self._matching(journal_rows)
         self.rows = sum(row.rows_px for row in self._finished)
         self.tally = sum((row.tally for row in self._finished), Tally())
-        self.damaged_rows = sum(row.rows_px for row in left) - self.rows
+        self.damaged_rows = sum(row.rows_px for row in journal_rows) - self.rows
         with self.disk():
             if not self.rows:
                 self.remove()
-            self._remove_outputs()  # half-written ones: their room is free again
+            # Outputs that a stop left half-written take room that this run needs.
+            self._remove_outputs()
             out.parent.mkdir(parents=True, exist_ok=True)
             self._require_room(cog_bytes)
             self.folder.mkdir(exist_ok=True)
@@ -104,6 +105,7 @@ class Checkpoint:
                     stream.write(pixels)
                     digest.update(pixels)
                 stream.flush()
+                # After a power cut, the rows that the journal counts must be on the disk.
                 os.fsync(stream.fileno())
             rows_px = row.pixels.shape[1]
             self._finished.append(
@@ -132,6 +134,7 @@ class Checkpoint:
 
     def remove(self) -> None:
         """Throw the rows away; the journal first, so that nothing is left that counts on them."""
+        # The journal is the first of these, because it counts on the rows.
         for name in ROWS_FILES:
             (self.folder / name).unlink(missing_ok=True)
         self._remove_outputs()
@@ -142,12 +145,12 @@ class Checkpoint:
         try:
             yield
         except OSError as error:
-            kept = (
+            advice = (
                 f"go on with `resume` from row {self.rows} of {self.shape[1]}"
                 if self.rows
                 else "run it again: no row is left to `resume` from"
             )
-            remedy = f"correct that, and {kept}"
+            remedy = f"correct that, and {advice}"
             got = error.strerror or str(error)
             raise MachineError(
                 str(self.out), expected="a disk to write to", got=got, remedy=remedy
@@ -203,6 +206,7 @@ class Checkpoint:
             stream.write(journal_text(self._job, self._finished))
             stream.flush()
             os.fsync(stream.fileno())
+        # A run that is killed here leaves the old journal or the new one, never half of one.
         fresh.replace(path)
         sync_folder(self.folder)
 
@@ -211,18 +215,22 @@ class Checkpoint:
 
     def _remove_outputs(self) -> None:
         (self.folder / PLAIN).unlink(missing_ok=True)
-        for path in self.folder.glob(f"{COG}*"):  # GDAL writes overviews beside it first
+        # GDAL writes overviews into a file beside the COG first.
+        for path in self.folder.glob(f"{COG}*"):
             path.unlink()
 
     def _require_room(self, cog_bytes: int) -> None:
         bands, height, width = self.shape
         rows_bytes = bands * (height - self.rows) * width * self.dtype.itemsize
+        # How well the pixels pack is not known yet, so nothing is assumed to be packed.
         needed = rows_bytes + padded_px(self.shape, TILE_PX) * self.dtype.itemsize + cog_bytes
         free = shutil.disk_usage(self.out.parent).free
         if needed > free:
-            (wanted, left), remedy = sizes(needed, free), "free some space or write elsewhere"
-            expected = f"{wanted} of disk (nothing packed)"
-            raise MachineError(str(self.out), expected=expected, got=f"{left} free", remedy=remedy)
+            needed_size, free_size = sizes(needed, free)
+            expected = f"{needed_size} of disk (nothing packed)"
+            got = f"{free_size} free"
+            remedy = "free some space or write elsewhere"
+            raise MachineError(str(self.out), expected=expected, got=got, remedy=remedy)
 
 
 def sync_folder(folder: Path) -> None:
@@ -267,8 +275,9 @@ def require_codec(compression: Compression) -> None:
     try:
         tifffile.imwrite(io.BytesIO(), np.zeros((16, 16), np.uint16), compression=compression.value)
     except (ValueError, KeyError, ImportError) as error:
+        # Any other error is a fault of the writer, whatever is installed.
         if not isinstance(error, ImportError) and "imagecodecs" not in str(error):
-            raise  # a fault of the writer, whatever is installed
+            raise
         got = " ".join(str(error).split())
         remedy = "pip install 'beers-deploy[codecs]' or use zlib"
         raise MissingExtraError(
@@ -333,16 +342,16 @@ def _squares_of(
     rows: Iterator[np.ndarray], dtype: np.dtype[Any], compression: Compression
 ) -> dict[str, Any]:
     """What tifffile is told of a page's pixels, given as rows of squares."""
-    by_zlib = compression is Compression.zlib and dtype.kind != "b"  # whose bits tifffile packs
+    # tifffile packs the bits of a mask itself.
+    by_zlib = compression is Compression.zlib and dtype.kind != "b"
     return {
-        "data": _packed(rows)
-        if by_zlib
-        else (square for strip in rows for square in _squares(strip)),
+        "data": _packed(rows) if by_zlib else chain.from_iterable(map(_squares, rows)),
         "dtype": dtype,
         "tile": (TILE_PX, TILE_PX),
         "compression": compression.value,
         "predictor": HORIZONTAL if by_zlib and dtype.kind == "u" else None,
-        "maxworkers": os.cpu_count(),  # its own choice is half of them
+        # tifffile's own choice is half of the cores.
+        "maxworkers": os.cpu_count(),
         "metadata": None,
         "buffersize": BUFFER_BYTES,
     }
@@ -362,6 +371,7 @@ def _pack(square: np.ndarray) -> bytes:
     On a noisy 12-bit photograph differences take 6 % less than the numbers themselves (measured).
     """
     if square.dtype.kind == "u":
+        # Unsigned differences wrap around, as TIFF's predictor has them.
         square = np.diff(square, axis=1, prepend=square.dtype.type(0))
     return isal_zlib.compress(square.tobytes(), FAST_LEVEL)
 
@@ -384,11 +394,11 @@ def _veil(checkpoint: Checkpoint, source: Source) -> Iterator[np.ndarray]:
     image.
     """
     scale = checkpoint.shape[2] // source.raster.width_px
-    read = source.veil
-    if read is None:
+    read_veil = source.veil
+    if read_veil is None:
         raise ValueError("no veil")
     for top, bottom in strips(checkpoint.shape[1], TILE_PX):
-        plane = read(top // scale, -(-bottom // scale))
+        plane = read_veil(top // scale, -(-bottom // scale))
         plane = plane.repeat(scale, axis=0)[top % scale :][: bottom - top].repeat(scale, axis=1)
         yield _whole_squares(
             plane != 0 if source.raster.veil == "mask" else plane.astype(checkpoint.dtype)

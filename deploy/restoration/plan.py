@@ -52,10 +52,10 @@ def plan_side(
         expected = f"more than twice the halo of {halo_px} px{least}"
         remedy = "take larger tiles or a smaller halo"
         raise OptionError("tile", expected=expected, got=f"{tile_px} px", remedy=remedy)
-    whole_px = _up(max(size_px, least_px), lattice_px)
-    return list(
-        _spans(size_px, whole_px, min(tile_px // lattice_px * lattice_px, whole_px), halo_px)
-    )
+    # The strides of a network sample other pixels in a tile that begins or ends off the lattice.
+    extended_px = _up(max(size_px, least_px), lattice_px)
+    side_px = min(tile_px // lattice_px * lattice_px, extended_px)
+    return list(_spans(size_px, extended_px, side_px, halo_px))
 
 
 def _up(size_px: int, lattice_px: int) -> int:
@@ -64,6 +64,7 @@ def _up(size_px: int, lattice_px: int) -> int:
 
 def even_side_px(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1) -> int:
     """The shortest side that needs no more tiles than `tile_px` does."""
+    # A last tile that is moved inward computes pixels twice; even tiles compute fewer.
     count = len(plan_side(size_px, tile_px, halo_px, lattice_px))
     even_px = -(-(_up(size_px, lattice_px) + 2 * halo_px * (count - 1)) // count)
     return max(_up(even_px, lattice_px), 2 * halo_px + lattice_px)
@@ -72,12 +73,13 @@ def even_side_px(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1) 
 def _spans(image_px: int, size_px: int, tile_px: int, halo_px: int) -> Iterator[Span]:
     """Spans over `size_px`, the image and its extension; what is kept ends with the image."""
     done = 0
+    # All spans have the same length, so the last one is moved inward instead of cut.
     while done < image_px:
         start = min(max(done - halo_px, 0), size_px - tile_px)
         stop = start + tile_px
-        kept = image_px if stop == size_px else stop - halo_px
-        yield Span(start, stop, done, kept)
-        done = kept
+        keep_stop = image_px if stop == size_px else stop - halo_px
+        yield Span(start, stop, done, keep_stop)
+        done = keep_stop
 
 
 @dataclass(frozen=True)
@@ -147,10 +149,10 @@ class Plan:
     @property
     def work_factor(self) -> float:
         """Pixels that the network sees over pixels of the image."""
-        seen = sum(r.stop - r.start for r in self.rows) * sum(
+        window_px = sum(r.stop - r.start for r in self.rows) * sum(
             c.stop - c.start for c in self.columns
         )
-        return seen / (self.height_px * self.width_px)
+        return window_px / (self.height_px * self.width_px)
 
     @property
     def strip_rows_px(self) -> int:
@@ -183,7 +185,8 @@ class Plan:
 
 def plan_for(network: onnx.ModelProto, shape: tuple[int, int, int], options: Options) -> Plan:
     """How an image of `shape` (bands, H, W) is cut for a network, as a user's options ask."""
-    tiling, (_, height_px, width_px) = tiling_of(network, str(options.model)), shape
+    tiling = tiling_of(network, str(options.model))
+    _, height_px, width_px = shape
     if tiling.fixed_px is not None and (
         tiling.fixed_px != options.tile_px or min(shape[1:]) < tiling.fixed_px
     ):
@@ -254,13 +257,14 @@ def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
     """
     raster = source.raster
     row_px = raster.bands * raster.width_px
-    read = plan.strip_rows_px * row_px * (raster.dtype.itemsize + raster.may_miss)
+    # `may_miss` adds one byte a pixel: the flag of a missing one.
+    strip_bytes = plan.strip_rows_px * row_px * (raster.dtype.itemsize + raster.may_miss)
     flags = plan.strip_rows_px * row_px * raster.may_miss
-    held = 0 if begun else read + source.held_bytes(plan.strip_rows_px)
+    source_bytes = 0 if begun else strip_bytes + source.held_bytes(plan.strip_rows_px)
     bands, _, width_px = plan.out_shape
     row_values = plan.tile_shape[0] * plan.scale * bands * width_px
     restored = row_values * (3 * FLOAT_BYTES + 2 * raster.out_dtype.itemsize)
-    return 2 * read + flags + restored + held
+    return 2 * strip_bytes + flags + restored + source_bytes
 
 
 def check_memory(rows: int, budget_bytes: int | None, bulky: bool) -> int:
@@ -271,17 +275,22 @@ def check_memory(rows: int, budget_bytes: int | None, bulky: bool) -> int:
         budget_bytes: None allows what is free.
         bulky: most of them for the sake of an image in large strips.
     """
-    held = psutil.Process().memory_info().rss
-    allowed = budget_bytes or psutil.virtual_memory().available + held
-    if held + rows <= allowed:
-        return held + rows
-    limit, before, rows_size = sizes(allowed, held, rows)
+    resident_bytes = psutil.Process().memory_info().rss
+    # What this process holds already is not part of what is free.
+    allowed_bytes = budget_bytes or psutil.virtual_memory().available + resident_bytes
+    if resident_bytes + rows <= allowed_bytes:
+        return resident_bytes + rows
+    limit, before, rows_size = sizes(allowed_bytes, resident_bytes, rows)
     smaller = (
         "rewrite the image in tiles (gdal_translate -co TILED=YES)"
         if bulky
         else "take a smaller `tile`"
     )
-    remedy = f"{smaller} or give it more" if held < allowed else f"give it more than {before}"
+    remedy = (
+        f"{smaller} or give it more"
+        if resident_bytes < allowed_bytes
+        else f"give it more than {before}"
+    )
     got = f"{before} before and {rows_size} for rows of the image"
     raise MachineError("memory", expected=f"a run within {limit}", got=got, remedy=remedy)
 

@@ -59,6 +59,7 @@ def full_scale_of(
         return FullScale(asked, "asked for")
     if raster.bits is not None:
         return FullScale(2**raster.bits - 1, f"{raster.bits} bits, as the file states")
+    # A full scale that the type of the pixels cannot hold is not that of the image.
     if bits is None or (raster.dtype.kind != "f" and 2**bits - 1 > np.iinfo(raster.dtype).max):
         return FullScale(
             settled_scale(name, raster.dtype, extents), f"assumed: {MAX_DN.bit_length()} bits", True
@@ -75,6 +76,7 @@ def full_scale_of(
 def require_room(raster: Raster, full_scale: float) -> None:
     """That restored pixels up to full scale fit into the output's type."""
     kind = raster.out_dtype
+    # A float output holds any full scale.
     if kind.kind == "u" and full_scale > np.iinfo(kind).max:
         expected = f"at most {np.iinfo(kind).max} for {kind} pixels"
         remedy = "convert the image to uint16"

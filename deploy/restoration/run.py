@@ -13,6 +13,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from functools import partial
 from importlib.metadata import version
+from itertools import chain
 from math import prod
 from pathlib import Path
 
@@ -86,9 +87,9 @@ def restore_file(
         raster = stored.raster
         begun_with = stamps(stored.files)
         paths = in_order(options.bands, raster) if options.bands else [options.model]
-        read = [read_network(path) for path in paths]
-        networks = [network for network, _ in read]
-        digests = ", ".join(digest for _, digest in read)
+        models = [read_network(path) for path in paths]
+        networks = [network for network, _ in models]
+        digests = ", ".join(digest for _, digest in models)
         require_alike(networks, paths)
         plan = plan_for(networks[0], raster.shape, options)
         log(plan.sentence)
@@ -103,6 +104,7 @@ def restore_file(
         )
         exposed, at_once, runtime = _opened(networks, source, plan, options, cluster, scale.value)
         steps_taken, words = consistency_steps(options, raster, plan.tiling, scale.value)
+        # Values above an assumed full scale show that the assumption is wrong, so they are refused.
         clips = not scale.assumed
         restorer = Restorer(
             raster, exposed, scale.value, plan.tiling, str(image), clips, steps_taken
@@ -124,7 +126,8 @@ def restore_file(
         _finish_rows(checkpoint, source, plan, restorer, at_once, options, log)
         with _kept_for_resuming(checkpoint, log):
             require_unchanged(source, str(image), begun_with, job["image"])
-        with held_back():  # a stop now would save nothing
+        # All rows are finished: a stop now would save nothing.
+        with held_back():
             about = what_was_done(networks, digests, scale)
             to_cog = (
                 partial(write_cog, compression=options.compression, about=about)
@@ -135,6 +138,7 @@ def restore_file(
                 checkpoint, source, Compression.none if to_cog else options.compression, to_cog
             )
             write_list(faults, list_beside(out, options.fix_detectors))
+    # The sensor check is no part of a restoration, and its time is a figure of its own.
     time_s = time.perf_counter() - started - check_s
     tally = checkpoint.tally
     if tally.clipped:
@@ -208,6 +212,7 @@ def begun(
     else:
         require_codec(options.compression)
     with only_run(out), open_source(image, options.trust_index) as source:
+        # Only an open index tells which tiles are read: no output may be one of them.
         require_writable(out, *beside, inputs=source.files)
         require_raw(str(image), source.raster.restored, options.again)
         yield source
@@ -245,6 +250,7 @@ def _opened(
     about = options, source.raster, plan.tiling, full_scale
     exposed = exposed_networks(infers, *about, at_first_call)
     if cluster is not None:
+        # Two rows of tiles are in work: two tiles for each of the cluster's calls keep it busy.
         at_once = max(min(2 * cluster.slots, 2 * plan.row_tiles), 1)
     return exposed, at_once, runtime
 
@@ -282,12 +288,13 @@ def job_of(
         options: what the user chose.
         steps: whether the consistency step is taken.
     """
-    brighter = [path for files in options.brighter.values() for path in files.values()]
+    brighter = chain.from_iterable(files.values() for files in options.brighter.values())
     sensors = {
-        band: [numbers_of(each), numbers_of(each.reference)]
-        for band, each in options.sensors.items()
+        band: [numbers_of(sensor), numbers_of(sensor.reference)]
+        for band, sensor in options.sensors.items()
     }
     return {
+        # Another version of the program or of the runtime may compute other bits.
         "program": version("beers-deploy"),
         "image": fingerprint(source.files),
         "raster": repr(source.raster),
@@ -357,6 +364,7 @@ def _finish_rows(
 
         def tick() -> None:
             bar.advance()
+            # From now on the runtime takes no more memory, so what it holds can be counted.
             if bar.done == steady:
                 needed = rows_bytes(source, plan, begun=True)
                 most = check_memory(needed, options.memory_bytes, is_bulky(source, plan))
@@ -367,6 +375,7 @@ def _finish_rows(
             if interrupt.asked:
                 raise KeyboardInterrupt
 
+        # A generator that is closed cancels the tiles that still wait.
         with closing(restore_rows(source, plan, restorer, rows, tick, at_once)) as finished:
             _write_behind(finished, checkpoint)
         checkpoint.require_known(restorer.name)
@@ -390,6 +399,7 @@ def _kept_for_resuming(checkpoint: Checkpoint, log: Log) -> Iterator[None]:
         )
         raise
     except BeersError as error:
+        # An image or a network that is refused would be refused again by a later run.
         if not checkpoint.rows or not isinstance(error, MachineError):
             checkpoint.remove()
         raise
@@ -400,6 +410,7 @@ def _write_behind(restored: Iterable[RestoredRow], checkpoint: Checkpoint) -> No
     with ThreadPoolExecutor(1) as writer:
         writing: Future[None] | None = None
         for row in restored:
+            # The result raises an error of the writer, and no more than one row ever waits.
             if writing is not None:
                 writing.result()
             writing = writer.submit(checkpoint.append, row)
@@ -443,8 +454,8 @@ def seam_figures(source: Source, plan: Plan, restorer: Restorer) -> dict[str, Fi
     error = np.abs(np.nan_to_num(cheap) - np.nan_to_num(exact))
     how = f"the tile in the middle with a halo of {plan.halo_px} px against {plan.radius_px} px"
     return {
-        key: measured(float(each), "DN", how)
-        for key, each in zip(keys, (error.max(), error.mean()), strict=True)
+        key: measured(float(value), "DN", how)
+        for key, value in zip(keys, (error.max(), error.mean()), strict=True)
     }
 
 

@@ -34,10 +34,10 @@ LOWEST = "openvino.lowest_uint8"
 def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tuple[Infer, str]:
     """As `open_runtime`."""
     openvino = optional("openvino", "runtime")
-    # Fills a table: two threads that are its first callers lock each other up (2026.4).
+    # This fills a table: two threads that are its first callers lock each other up (2026.4).
     openvino.Type.f32.to_dtype()
     core = openvino.Core()
-    # Said aloud: where the processor has bfloat16 units, OpenVINO would round to it unasked.
+    # Without the hint OpenVINO rounds to bfloat16 where the processor has units for it.
     options = {
         "INFERENCE_PRECISION_HINT": "f32",
         "NUM_STREAMS": str(at_once),
@@ -64,8 +64,10 @@ def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tup
 
     @lru_cache(maxsize=64)
     def request(shape: tuple[int, ...], _thread: int) -> Any:
-        with compiling:  # or each thread would compile its own at the first tile
-            return compiled(shape).create_infer_request()  # one serves no two threads at once
+        # Without the lock each thread would compile a network of its own at the first tile.
+        with compiling:
+            # A request serves one thread at a time.
+            return compiled(shape).create_infer_request()
 
     def infer(image: np.ndarray) -> np.ndarray:
         return np.asarray(request(image.shape, get_ident()).infer([image], share_inputs=True)[0])
@@ -76,11 +78,8 @@ def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tup
 @lru_cache(maxsize=1)
 def _adds_exactly(core: Any) -> bool:
     def convolve(model: bytes, image: np.ndarray) -> np.ndarray:
-        return np.asarray(
-            core.compile_model(core.read_model(model), "CPU")
-            .create_infer_request()
-            .infer([image])[0]
-        )
+        network = core.compile_model(core.read_model(model), "CPU")
+        return np.asarray(network.create_infer_request().infer([image])[0])
 
     return asked("openvino", convolve)
 
@@ -93,18 +92,23 @@ def saturating_adds(model: onnx.ModelProto) -> onnx.ModelProto:
     lost; taking the larger of the value and 0, which changes no uint8, keeps them apart. Measured:
     equal to onnxruntime bit for bit.
     """
-    written = onnx.ModelProto()
-    written.CopyFrom(model)
-    written.graph.initializer.append(numpy_helper.from_array(np.array(0, np.uint8), LOWEST))
-    del written.graph.node[:]
+    expanded = onnx.ModelProto()
+    expanded.CopyFrom(model)
+    expanded.graph.initializer.append(numpy_helper.from_array(np.array(0, np.uint8), LOWEST))
+    del expanded.graph.node[:]
     for node in model.graph.node:
-        written.graph.node.extend(_written_out(node) if node.op_type == "QLinearAdd" else [node])
-    return written
+        expanded.graph.node.extend(_written_out(node) if node.op_type == "QLinearAdd" else [node])
+    return expanded
 
 
 def _written_out(add: onnx.NodeProto) -> list[onnx.NodeProto]:
-    (a, *a_scale), (b, *b_scale), scale = add.input[0:3], add.input[3:6], add.input[6:8]
+    # Inputs of QLinearAdd: value, scale and zero point of A and of B, then those of the result.
+    a, *a_scale = add.input[0:3]
+    b, *b_scale = add.input[3:6]
+    scale = add.input[6:8]
     name = add.output[0]
+    # Max with 0 changes no uint8, but keeps OpenVINO from fusing the convolution before the add,
+    # which would lose the rounding between the two.
     return [
         helper.make_node("Max", [a, LOWEST], [f"{name}.a"]),
         helper.make_node("Max", [b, LOWEST], [f"{name}.b"]),
@@ -175,7 +179,8 @@ class Packed:
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """As an `Infer`."""
-        with _opening:  # or each thread would open its own
+        # Without the lock each thread would open a network of its own.
+        with _opening:
             infer = _opened(self)
         return infer(image)
 
@@ -186,9 +191,9 @@ _opening = Lock()
 
 @lru_cache(maxsize=NETWORKS_KEPT)
 def _opened(packed: Packed) -> Infer:
-    return open_runtime(
-        packed.runtime, parse_onnx(packed.content, "network"), packed.threads, packed.at_once
-    )[0]
+    network = parse_onnx(packed.content, "network")
+    infer, _ = open_runtime(packed.runtime, network, packed.threads, packed.at_once)
+    return infer
 
 
 def infer_on(cluster: Cluster, packed: Packed) -> Infer:

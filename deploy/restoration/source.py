@@ -9,6 +9,7 @@ import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from itertools import chain, product
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -101,11 +102,11 @@ class Raster:
         same shape.
         """
         flags = np.ma.getmaskarray(pixels).copy()
-        held = np.ma.getdata(pixels)
+        values = np.ma.getdata(pixels)
         if self.dtype.kind == "f":
-            flags |= np.isnan(held)
+            flags |= np.isnan(values)
         if self.nodata is not None:
-            flags |= held == held.dtype.type(self.nodata)
+            flags |= values == values.dtype.type(self.nodata)
         return flags
 
     def extent(self, pixels: np.ndarray) -> Extent:
@@ -136,7 +137,7 @@ def raster_of(path: str, pages: Sequence[tifffile.TiffPage]) -> Raster:
     dtype = require_numbers(path, page.dtype)
     nodata = _nodata(path, page, dtype)
     tags = tuple(tag for tag in carried_tags(page) if tag[0] != NODATA_TAG or nodata is not None)
-    # A container of whole bytes says nothing of the sensor; packed bits were counted by somebody.
+    # A container of whole bytes says nothing about the sensor; packed bits were counted.
     bits = (
         page.bitspersample
         if dtype.kind == "u" and page.bitspersample < 8 * dtype.itemsize
@@ -170,7 +171,8 @@ def require_raw(name: str, restored: bool, again: bool) -> None:
 
 def _alpha(path: str, pages: Sequence[tifffile.TiffPage]) -> Veil:
     """The kind of alpha that the last sample of an image is, if any."""
-    alphas = [ALPHAS.get(int(code), "") for page in pages for code in page.extrasamples]
+    codes = chain.from_iterable(page.extrasamples for page in pages)
+    alphas = [ALPHAS.get(int(code), "") for code in codes]
     if any(alphas[:-1]) or (any(alphas) and len(pages) > 1):
         raise ImageError(
             path, expected="alpha as the last band", got="one before others", remedy="move it there"
@@ -218,6 +220,7 @@ def usable_nodata(path: str, value: float | None, dtype: np.dtype[Any]) -> float
     if value is None or dtype.kind == "f":
         return value
     limits = np.iinfo(dtype)
+    # A value that no pixel can have marks none, so that the image is as good without it.
     if not value.is_integer() or not limits.min <= value <= limits.max:
         return None
     if not 0 <= value <= np.iinfo(np.uint16).max:
@@ -327,8 +330,8 @@ def stamps(files: Iterable[Path]) -> list[tuple[int, int, int]]:
     """Return size, time of the last change and inode of each file: a quick sign that one may have
     changed.
     """
-    found = (file.stat() for file in files)
-    return [(each.st_size, each.st_mtime_ns, each.st_ino) for each in found]
+    stats = (file.stat() for file in files)
+    return [(stat.st_size, stat.st_mtime_ns, stat.st_ino) for stat in stats]
 
 
 @contextmanager
@@ -344,17 +347,16 @@ def open_source(path: Path, trusted: bool = False) -> Iterator[Source]:
     suffix = path.suffix.lower()
     with ExitStack() as stack:
         if suffix in GDAL_DRIVERS:
-            from beers_deploy.restoration.gdal_source import open_gdal  # of an optional package
+            # GDAL comes with an optional package.
+            from beers_deploy.restoration.gdal_source import open_gdal
 
             source = stack.enter_context(open_gdal(path, trusted))
         elif suffix in TIFF_SUFFIXES | BIG_TIFF_SUFFIXES:
             source = _of_pages(path, stack)
         else:
             source = whole_source(path)
-        from beers_deploy.restoration.georeference import (
-            of_sidecar,
-            sidecar_of,
-        )  # they read what this file defines
+        # These import what this module defines.
+        from beers_deploy.restoration.georeference import of_sidecar, sidecar_of
 
         source.raster = of_sidecar(path, source.raster)
         if sidecar_of(path).is_file():
@@ -469,8 +471,9 @@ class PageRows:
         self._segment_px = min(page.tilelength if page.is_tiled else page.rowsperstrip, height_px)
         self._down = -(-height_px // self._segment_px)
         self._across = -(-width_px // page.tilewidth) if page.is_tiled else 1
-        self._held: dict[int, np.ndarray] = {}  # strips of rows overlap: segments are decoded once
-        # Uncompressed and in one piece, rows lie in the file as they are: no more than those is
+        # Strips of rows overlap, and a segment that two of them need is decoded once.
+        self._held: dict[int, np.ndarray] = {}
+        # Uncompressed and in one piece, rows lie in the file as they are: no more than those are
         # read.
         self._flat = (
             page.compression == 1 and page.is_contiguous and page.bitspersample in (8, 16, 32, 64)
@@ -492,7 +495,10 @@ class PageRows:
         return (covered + 2 * self._segment_px) * row_bytes
 
     def _read_flat(self, start: int, stop: int) -> np.ndarray:
-        (_, height, width), samples, rows = self.shape, self._samples, stop - start
+        _, height, width = self.shape
+        samples = self._samples
+        rows = stop - start
+        # A TIFF has the byte order of the machine that wrote it.
         kind = self._dtype.newbyteorder(self._page.parent.byteorder)
         out = np.empty((self._planes, samples, rows, width), self._dtype)
         for plane in range(self._planes):
@@ -518,18 +524,20 @@ class PageRows:
 
     def _decode(self, row: int) -> np.ndarray:
         """The strips or tiles at one height, (bands, segment rows, width)."""
-        page, (bands, _, width) = self._page, self.shape
+        page = self._page
+        bands, _, width = self.shape
         block = np.empty((self._planes, self._samples, self._segment_px, width), self._dtype)
-        wanted = [
-            (p * self._down + row) * self._across + c
-            for p in range(self._planes)
-            for c in range(self._across)
+        # TIFF numbers segments from left to right, then downwards, then plane by plane.
+        segments = [
+            (plane * self._down + row) * self._across + column
+            for plane, column in product(range(self._planes), range(self._across))
         ]
-        offsets = [page.dataoffsets[i] for i in wanted]
-        counts = [page.databytecounts[i] for i in wanted]
+        offsets = [page.dataoffsets[i] for i in segments]
+        counts = [page.databytecounts[i] for i in segments]
         jpeg = {"jpegtables": page.jpegtables, "jpegheader": page.jpegheader}
-        for data, index in page.parent.filehandle.read_segments(offsets, counts, wanted):
+        for data, index in page.parent.filehandle.read_segments(offsets, counts, segments):
             pixels, (plane, _, _, left, _), (_, rows, columns, _) = page.decode(data, index, **jpeg)
+            # The tiles at the right and lower border reach beyond the image.
             rows = min(rows, self._segment_px)
             columns = min(columns, width - left)
             target = block[plane, :, :rows, left : left + columns]

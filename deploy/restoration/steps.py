@@ -6,6 +6,7 @@ band for each pixel.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 
 import onnx
@@ -46,7 +47,7 @@ def exposed_networks(
     """
     if not options.brighter:
         return tuple(ExposedNetwork({1: infer}) for infer in infers)
-    # A band whose sensor allows no factor above 1 has no files.
+    # A band whose sensor allows no factor above 1 has no files, but still needs its network.
     bands = options.sensors or options.brighter
     brighter = in_order({band: options.brighter.get(band, {}) for band in bands}, raster)
     sensors = in_order(options.sensors, raster) if options.sensors else [None] * len(brighter)
@@ -100,5 +101,5 @@ def step_for(sensor: Sensor, full_scale: float) -> Consistency:
 
 def factor_words(brighter: Mapping[str, Mapping[int, Path]]) -> str:
     """Return the factors that may be used, in words."""
-    factors = sorted({1, *(factor for files in brighter.values() for factor in files)})
+    factors = sorted({1, *chain.from_iterable(brighter.values())})
     return ", ".join(f"x{factor}" for factor in factors)

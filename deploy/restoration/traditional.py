@@ -76,9 +76,8 @@ def restore_file_traditionally(
             require_unchanged(source, str(image), begun_with, digest)
             write_output(checkpoint, source, options.compression)
             write_list(faults, list_beside(out, options.fix_detectors))
-        except (
-            BaseException
-        ):  # a strip is no place to go on from: the pipeline looks hundreds of rows back
+        # No run can go on from a strip, because the pipeline looks hundreds of rows back.
+        except BaseException:
             checkpoint.remove()
             raise
     time_s = time.perf_counter() - started - check_s
@@ -108,6 +107,7 @@ def _fitted(source: Source, chain: Chain, full_scale: float, name: str) -> Chain
     little of the time.
     """
     to_dn = chain.degraded.max_dn / full_scale
+    # The regularisation is the Wiener optimum of the whole image: it needs all strips.
     with steps("measuring noise and contrast", source.raster.height_px) as bar:
         return chain.fitted_to(_counted(_read(source, to_dn, full_scale, name), bar))
 
@@ -126,19 +126,18 @@ def _fill(
     to_dn = chain.degraded.max_dn / full_scale
     top = 0
     with steps("restoring rows", raster.height_px) as bar:
-        for strip in restore_strips(
-            _read(source, to_dn, full_scale, name), raster.height_px, chain
-        ):
+        raw_strips = _read(source, to_dn, full_scale, name)
+        for strip in restore_strips(raw_strips, raster.height_px, chain):
             stop = top + strip.shape[0]
             missing = torch.isnan(strip).numpy()[None]
-            kept = as_stored(
+            pixels = as_stored(
                 raster, np.nan_to_num(strip.numpy()[None] / np.float32(to_dn)), full_scale
             )
             if missing.any():
                 stored = np.ma.getdata(source.read(top, stop))
-                kept = np.where(missing, stored.astype(raster.out_dtype), kept)
+                pixels = np.where(missing, stored.astype(raster.out_dtype), pixels)
             tally = Tally(int((~missing).sum()))
-            checkpoint.append(RestoredRow(Span(top, stop, top, stop), kept, tally))
+            checkpoint.append(RestoredRow(Span(top, stop, top, stop), pixels, tally))
             bar.advance(stop - top)
             top = stop
     checkpoint.require_known(name)

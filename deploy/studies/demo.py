@@ -112,11 +112,10 @@ def run_demo(
     say("checking every operator against the DPU")
     placement = check(int8_file, tile=TILE_PX).placement
     say("restoring: traditional pipeline and INT8 network")
-    images = {
-        INPUT: degraded,
-        TRADITIONAL: restore(degraded, method="traditional", sensor=sensors[0], full_scale=MAX_DN),
-        INT8: np.rint(restore(degraded, f"{VARIANT}-int8", sensor=sensors[0], full_scale=MAX_DN)),
-    }
+    traditional = restore(degraded, method="traditional", sensor=sensors[0], full_scale=MAX_DN)
+    int8_dn = restore(degraded, f"{VARIANT}-int8", sensor=sensors[0], full_scale=MAX_DN)
+    # The file holds integers: what is measured and shown is what it holds.
+    images = {INPUT: degraded, TRADITIONAL: traditional, INT8: np.rint(int8_dn)}
     write_tiff(out / "restored.tif", images[INT8].astype(np.uint16))
     quality = list[Row]()
     if pair is not None:
@@ -128,10 +127,9 @@ def run_demo(
         images[REFERENCE] = reference
     say("measuring the traditional pipeline, predicting the board")
     bench = bench_tables(int8_file, degraded, sensors)
-    sections = [
-        *bench,
-        *([Section("Quality on this image, over 4095 DN", quality)] if quality else []),
-    ]
+    sections = [*bench]
+    if quality:
+        sections.append(Section("Quality on this image, over 4095 DN", quality))
     sections.append(Section("What quantisation changes", verdict.rows, GATE_CAPTION))
     sentence = headline(bench[0].rows, quality, placement)
     return Report(
@@ -162,11 +160,10 @@ def read_input(
         sensors: that acquire a scene.
         full_scale: pixel value that is full scale: with it any image is a raw acquisition.
     """
-    (degraded, reference), ratio = (
-        (profile.nominal() for profile in sensors),
-        int(sensors[0].oversampling.low),
-    )
+    degraded, reference = (profile.nominal() for profile in sensors)
+    ratio = int(sensors[0].oversampling.low)
     if image is None:
+        # The simulator cuts a margin off each side, where its Fourier transform wraps around.
         side = (SIDE_PX + 2 * MARGIN_PX) * ratio
         scene = procedural_scene(side, side, np.random.default_rng(seed))
     elif full_scale is None and read_pixels(image).dtype == np.uint8:
@@ -222,10 +219,12 @@ def pictures_of(images: dict[str, np.ndarray], out: Path) -> list[Picture]:
         crops.save(temporary, "PNG", optimize=True)
     where = " and ".join(f"row {top}, column {left}" for top, left in windows)
     caption = f"{side} pixels a side from {where}, enlarged {ZOOM} times."
-    whole = picture_url(stretch.to_bytes(images[INT8])[:LARGEST_PX, :LARGEST_PX])
+    restored_url = picture_url(stretch.to_bytes(images[INT8])[:LARGEST_PX, :LARGEST_PX])
     return [
         Picture("The same crops, before and after", picture_url(np.asarray(crops)), caption),
-        Picture(f"Restored by {INT8}", whole, "The network's output, same grey scale as above."),
+        Picture(
+            f"Restored by {INT8}", restored_url, "The network's output, same grey scale as above."
+        ),
     ]
 
 

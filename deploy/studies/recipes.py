@@ -9,6 +9,7 @@ import hashlib
 import math
 import shutil
 from collections.abc import Callable, Sequence
+from itertools import chain
 from pathlib import Path
 
 import torch
@@ -131,11 +132,11 @@ def stage_run(
 def model_card(recipe: NetworkRecipe, toml: str, images: Sequence[Path]) -> str:
     """Return the text of a network's card: how it is made, from what, and on what it was made."""
     variant = VARIANTS[recipe.variant]
-    files = [file for folder in images for file in list_images(folder)]
-    digests = "".join(
-        f"{file.name} {sha256(file)}\n" for file in sorted(files, key=lambda file: file.name)
-    )
-    seen = [file for file in files if site_of(file.name) not in recipe.held_out]
+    files = list(chain.from_iterable(map(list_images, images)))
+    # Sorted by name, so that the digest does not depend on the order of the folders.
+    by_name = sorted(files, key=lambda file: file.name)
+    digests = "".join(f"{file.name} {sha256(file)}\n" for file in by_name)
+    photos = [file for file in files if site_of(file.name) not in recipe.held_out]
     data = hashlib.sha256(digests.encode()).hexdigest()
     attribution = "".join(f"- {line}\n" for line in recipe.attribution)
     notes = "".join(f"{line}\n\n" for line in recipe.notes)
@@ -149,9 +150,9 @@ every sensor in range.
 
     beers-deploy train --recipe {recipe.variant} --images aerial/ --out runs/{recipe.variant}
 
-on {processor_name()} with PyTorch {torch.__version__}: {patches} patches of {len(seen)} \
+on {processor_name()} with PyTorch {torch.__version__}: {patches} patches of {len(photos)} \
 photographs, whose list of names and digests has the SHA-256 `{data[:16]}`, and {recipe.charts} \
-drawn charts. Sites that are held out choose; {len(files) - len(seen)} photographs show them. \
+drawn charts. Sites that are held out choose; {len(files) - len(photos)} photographs show them. \
 The recipe:
 
 ```toml

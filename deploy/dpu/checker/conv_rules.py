@@ -36,6 +36,7 @@ def conv_channels(op: Operation, dpu: Dpu) -> Finding | None:
 def conv_padding(op: Operation, dpu: Dpu) -> Finding | None:
     """Padding on each side is 0 to (kernel - 1) * dilation ({documents[operators]}, conv2d)."""
     window = op.window
+    # ONNX lists the pads of top and left first, then those of bottom and right.
     room = [(k - 1) * d for k, d in zip(window.kernel, window.dilation, strict=True)] * 2
     if all(0 <= pad <= most for pad, most in zip(window.pads, room, strict=True)):
         return None
@@ -56,6 +57,7 @@ def conv_weight_bank(op: Operation, dpu: Dpu) -> Finding | None:
     area = op.window.kernel[0] * op.window.kernel[1]
     inputs = groups_of(op.channels[0], dpu.input_parallel)
     depth = area * inputs * groups_of(dpu.output_parallel, dpu.whole("memory", "weight_banks"))
+    # The bias lies in the same buffer.
     depth += dpu.whole("conv", "weight_bias_depth")
     most = dpu.whole("memory", "weight_bank_depth")
     if depth <= most:
@@ -99,6 +101,7 @@ def conv_dilation(op: Operation, dpu: Dpu) -> Finding | None:
     """Dilation * input channels is at most {limits[channels]} ({documents[operators]}, conv2d)."""
     size = max(op.window.dilation) * op.channels[0]
     most = dpu.channels_max
+    # Without dilation this is the rule of channels, which `conv_channels` reports.
     if max(op.window.dilation) == 1 or size <= most:
         return None
     remedy = f"use a dilation of at most {most // op.channels[0]}, or fewer input channels"
@@ -161,8 +164,10 @@ def transposed_kernel(op: Operation, dpu: Dpu) -> Finding | None:
     ({documents[operators]}).
     """
     limit = dpu.limit("transposed", "kernel_per_stride")
-    pairs = list(zip(op.window.kernel, op.window.stride, strict=True))
-    if not outside(tuple(n for k, s in pairs for n in (k // s, groups_of(k, s))), limit):
+    ratios: list[int] = []
+    for kernel, stride in zip(op.window.kernel, op.window.stride, strict=True):
+        ratios += [kernel // stride, groups_of(kernel, stride)]
+    if not outside(tuple(ratios), limit):
         return None
     sides = f"kernel ({shown(op.window.kernel)}) / stride ({shown(op.window.stride)})"
     remedy = "use a kernel at least as large as the stride, such as 4 x 4 with stride 2"
@@ -197,6 +202,7 @@ def transposed_channels(op: Operation, dpu: Dpu) -> Finding | None:
 
 def alu_padding(op: Operation, dpu: Dpu, table: str) -> Finding | None:
     """The padding that the ALU engine can do, for depthwise convolutions and pools."""
+    # The ALU has a limit for top and left, which are the first two of ONNX, and one for the others.
     begin = dpu.limit(table, "pad_begin")
     end = dpu.limit(table, "pad_end")
     if not outside(op.window.pads[:2], begin) and not outside(op.window.pads[2:], end):

@@ -35,8 +35,9 @@ def shown(sides: tuple[int, int]) -> str:
 
 def beyond_range(what: str, sides: tuple[int, int], limit: Constant, remedy: str) -> Finding | None:
     """What to say of a kernel or a stride of which a side lies beyond the limit."""
-    found = Finding(f"{what} ({shown(sides)}) is not in the DPU's range {limit}", remedy)
-    return found if outside(sides, limit) else None
+    if not outside(sides, limit):
+        return None
+    return Finding(f"{what} ({shown(sides)}) is not in the DPU's range {limit}", remedy)
 
 
 def groups_of(count: int, size: int) -> int:

@@ -38,10 +38,13 @@ def symmetric(op: Operation, dpu: Dpu) -> Finding | None:
 
 def int8_alone(op: Operation, dpu: Dpu) -> Finding | None:
     """Tensors are int8 around {numbers[zero_point]} ({numbers[zero_point].source})."""
-    wanted = {dpu.value("numbers", "zero_point")}
+    zero_points = {dpu.value("numbers", "zero_point")}
+    # A bias has rules of its own, `int8_bias` and `int32_bias`.
     others = {r: s for r, s in op.scales.items() if r != "bias"}
     faults = [
-        r for r, s in others.items() if s.integer_type != "int8" or set(s.zero_points) != wanted
+        r
+        for r, s in others.items()
+        if s.integer_type != "int8" or set(s.zero_points) != zero_points
     ]
     return (
         Finding(f"{', '.join(faults)}: not int8 around 0", f"quantise to int8; {AGAIN}")
@@ -64,6 +67,7 @@ def per_tensor(op: Operation, dpu: Dpu) -> Finding | None:
 
 def power_of_two(op: Operation, dpu: Dpu) -> Finding | None:
     """Scales are powers of two ({documents[quantiser]})."""
+    # A tensor of several scales is reported by `per_tensor`.
     single = {role: scale for role, scale in op.scales.items() if len(scale.scales) == 1}
     faults = [
         f"{role} scale {scale.scales[0]:.4g}"
@@ -110,6 +114,7 @@ def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
     bias = _frac_bits(op, "bias")
     if product is None or cut is None or bias is None:
         return None
+    # The vendor writes it as min(0, -(24 - (8 + shift_cut))).
     low = min(0, cut + 8 - dpu.whole("numbers", "accumulator_bits"))
     high = dpu.whole("numbers", "shift_bias_max")
     shift = product - bias
@@ -129,6 +134,7 @@ def bias_width(op: Operation, dpu: Dpu) -> Finding | None:
     values = op.constants.get("bias")
     if product is None or frac_bits is None or values is None:
         return None
+    # In float64, because the magnitude of the lowest integer does not fit its own type.
     largest = np.abs(values.astype(np.float64)).max(initial=0)
     most = 2 ** (dpu.whole("numbers", "bias_bits") - 1) - 1
     size = largest * 2.0 ** (product - frac_bits)
@@ -237,8 +243,8 @@ def int8_bias(op: Operation, dpu: Dpu) -> Finding | None:
     The operator QLinearConv demands int32: its bias has a rule of its own. Judged where weights are
     in 8 bits.
     """
-    whole = _kind(op.constants.get("weight")) in BYTES
-    if "bias" not in op.constants or op.op_type == "QLinearConv" or not whole:
+    byte_weights = _kind(op.constants.get("weight")) in BYTES
+    if "bias" not in op.constants or op.op_type == "QLinearConv" or not byte_weights:
         return None
     kind = _kind(op.constants["bias"])
     return (
@@ -263,9 +269,10 @@ def int32_bias(op: Operation, dpu: Dpu) -> Finding | None:
     if values is None or _kind(values) != "int32":
         return Finding(f"its bias is {_kind(values)}", remedy)
     shift = min(high, _spare_bits(values))
-    low, top = (
-        int(end) for end in ((values >> shift).min(initial=0), (values >> shift).max(initial=0))
-    )
+    # The bits that are shifted out are 0 in every value: nothing is rounded.
+    shifted = values >> shift
+    low = int(shifted.min(initial=0))
+    top = int(shifted.max(initial=0))
     if low >= -128 and top <= 127:
         return None
     return Finding(
@@ -281,4 +288,5 @@ def _kind(values: np.ndarray | None) -> str:
 def _spare_bits(values: np.ndarray) -> int:
     """How many low bits are 0 in every value; 0 where all values are."""
     bits = int(np.bitwise_or.reduce(values, axis=None))
+    # `bits & -bits` keeps the lowest bit that is set.
     return (bits & -bits).bit_length() - 1 if bits else 0

@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import chain
 
 from beers_deploy.dpu.board import SIZED, Dpu
 from beers_deploy.dpu.checker import conv_rules, number_rules, other_rules
@@ -110,17 +111,21 @@ def judge(op: Operation, dpu: Dpu, quantised: bool) -> tuple[Broken, ...]:
 
     The rules of numbers are asked only where the file holds quantised ones.
     """
-    found = [_broken(form, dpu, quantised) for form in forms(op, dpu)]
-    return found[0] if all(found) else ()
+    breaches = [_broken(form, dpu, quantised) for form in forms(op, dpu)]
+    # The first form is the operation as the file has it: the report is about that one.
+    return breaches[0] if all(breaches) else ()
 
 
 def _broken(op: Operation, dpu: Dpu, quantised: bool) -> tuple[Broken, ...]:
     rules = RULES[op.kind] + EVERY
-    if quantised and op.kind not in ("other", "argmax"):  # whose results are no numbers of 8 bits
+    # The results of these two kinds are no numbers of 8 bits.
+    if quantised and op.kind not in ("other", "argmax"):
         rules += NUMBERS + SHIFTS.get(op.kind, ())
     findings = ((rule, rule(op, dpu)) for rule in rules if applies(rule, dpu))
     return tuple(
-        Broken(rule_name(rule), rule_text(rule, dpu), found) for rule, found in findings if found
+        Broken(rule_name(rule), rule_text(rule, dpu), finding)
+        for rule, finding in findings
+        if finding
     )
 
 
@@ -136,9 +141,8 @@ def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:
     six leaves the processor 15 ms for 356 MFLOP, more than its two cores can do.
     """
     yield op
-    if "array" in dpu.tables and fully_connected(
-        op
-    ):  # an NPU's file does not state the array that it would fit
+    # An NPU's file does not state the array that it would fit.
+    if "array" in dpu.tables and fully_connected(op):
         values = math.prod(op.in_shapes[0] or ())
         outputs = min(op.channels[1], dpu.channels_max)
         part = replace(op, channels=(op.channels[0], outputs), out_shape=(outputs, 1, 1))
@@ -152,29 +156,29 @@ def fully_connected(op: Operation) -> bool:
     """Whether a convolution is as large as its map, and so has a result of one pixel."""
     shape = op.in_shapes[0] if op.in_shapes else None
     window = op.window
-    whole = (
+    covers_map = (
         shape is not None
         and window.kernel == shape[1:]
         and window.dilation == (1, 1)
         and not any(window.pads)
     )
-    return op.kind == "conv" and whole
+    return op.kind == "conv" and covers_map
 
 
 def all_rules() -> Iterator[Rule]:
     """Every rule once, in the order of the tables."""
-    chains = [*RULES.values(), EVERY, NUMBERS, *SHIFTS.values()]
-    yield from dict.fromkeys(rule for chain in chains for rule in chain)
+    tables = [*RULES.values(), EVERY, NUMBERS, *SHIFTS.values()]
+    yield from dict.fromkeys(chain.from_iterable(tables))
 
 
 def require_known(dpu: Dpu) -> None:
     """Refuse a constant that no rule names: misspelt, it would silence the rule that it is for."""
-    known: dict[str, set[str]] = {}
+    keys: dict[str, set[str]] = {}
     for rule in all_rules():
         for table, key in _named(rule):
-            known.setdefault(table, set()).add(key)
-    for table in known.keys() - set(SIZED):
-        check_keys(f"{dpu.target.name} [{table}]", dpu.tables.get(table, {}), set(), known[table])
+            keys.setdefault(table, set()).add(key)
+    for table in keys.keys() - set(SIZED):
+        check_keys(f"{dpu.target.name} [{table}]", dpu.tables.get(table, {}), set(), keys[table])
 
 
 def rule_name(rule: Callable[..., object]) -> str:

@@ -77,7 +77,8 @@ INSTEAD = {
 
 def known_operator(op: Operation, dpu: Dpu) -> Finding | None:
     """Only operators of the supported list run on the DPU ({documents[operators]})."""
-    if is_foreign(op.op_type):  # `operator_domain` names it
+    # The rule `operator_domain` names a foreign operator: it would be reported twice.
+    if is_foreign(op.op_type):
         return None
     remedy = INSTEAD.get(
         op.op_type, "leave it to the host before or behind the network, or do without it"
@@ -181,6 +182,7 @@ def activation_place(op: Operation, dpu: Dpu) -> Finding | None:
     """
     place = PLACE.get(op.follows or "")
     fused = dpu.target.activations[place].value if place else ()
+    # What stands behind a sum is judged by `activation_of_sums`.
     if place == "sum" or MANUAL[op.op_type] in (*fused, *dpu.target.activations["alone"].value):
         return None
     remedy = (
@@ -206,13 +208,14 @@ def leaky_relu_alpha(op: Operation, dpu: Dpu) -> Finding | None:
     """LeakyReLU has alpha = 26 / 256 = {leaky_relu[alpha].low} ({documents[operators]},
     leaky_relu).
     """
-    given = op.attributes.get("alpha", 0.01)
-    wanted = dpu.value("leaky_relu", "alpha")
+    # ONNX defines 0.01 as the default of LeakyRelu.
+    alpha = op.attributes.get("alpha", 0.01)
+    dpu_alpha = dpu.value("leaky_relu", "alpha")
     is_leaky = op.op_type in ("LeakyRelu", "QLinearLeakyRelu")
-    if not is_leaky or (isinstance(given, int | float) and abs(given - wanted) < 1e-6):
+    if not is_leaky or (isinstance(alpha, int | float) and abs(alpha - dpu_alpha) < 1e-6):
         return None
-    reason = f"its alpha is {given}, but the DPU supports only {wanted}"
-    return Finding(reason, f"train with alpha = {wanted}, or ReLU")
+    reason = f"its alpha is {alpha}, but the DPU supports only {dpu_alpha}"
+    return Finding(reason, f"train with alpha = {dpu_alpha}, or ReLU")
 
 
 def mul_constant(op: Operation, dpu: Dpu) -> Finding | None:
@@ -261,6 +264,7 @@ def resize_scale(op: Operation, dpu: Dpu) -> Finding | None:
     after = op.out_shape
     if op.attributes.get("mode") != "linear" or before is None or after is None:
         return None
+    # ONNX defines half_pixel as the default of Resize.
     half = op.attributes.get(CORNERS, "half_pixel") == "half_pixel"
     limit = dpu.limit("resize", "half_pixel_scale" if half else "bilinear_scale")
     scales = {after[1] / before[1], after[2] / before[2]}
@@ -300,6 +304,7 @@ def maps_aligned(op: Operation, dpu: Dpu) -> Finding | None:
     and Concat).
     """
     sizes = {(shape[1], shape[2]) for shape in op.in_shapes if shape is not None}
+    # ONNX broadcasts a map of 1 x 1 over a larger one.
     if op.kind not in ("add", "mul", "concat") or len(sizes - {(1, 1)}) < 2:
         return None
     remedy = (
@@ -316,6 +321,7 @@ def map_in_memory(op: Operation, dpu: Dpu) -> Finding | None:
     size = math.prod(op.out_shape) * dpu.batch if op.out_shape else 0
     if size <= most:
         return None
-    taken, room = sizes(size, most)
-    reason = f"{taken} for {dpu.batch} images, of {room}"
+    size_text, most_text = sizes(size, most)
+    reason = f"{size_text} for {dpu.batch} images, of {most_text}"
+    # The size of a map grows with the square of the tile's side.
     return Finding(reason, f"use a tile of at most {math.sqrt(most / size):.2f} times this side")

@@ -68,6 +68,7 @@ def draw(placement: Placement, title: str) -> Markup:
     *tops, height = accumulate(heights, initial=legend_y + BOX_PX + GAP_PX)
     with look():
         figure = new_figure(WIDTH_PX, height)
+        # The y axis points down, so that nodes follow one another from top to bottom.
         axes = figure.add_axes((0, 0, 1, 1), xlim=(0, WIDTH_PX), ylim=(height, 0))
         axes.set_axis_off()
         for k, line in enumerate(heading, 1):
@@ -114,7 +115,9 @@ def _edges(axes: "Axes", nodes: tuple[PlacedNode, ...], tops: list[int]) -> None
     """From the node that writes each tensor to those that read it."""
     from matplotlib.patches import PathPatch
 
-    writer = {name: row for row, node in enumerate(nodes) for name in node.op.outputs}
+    writer: dict[str, int] = {}
+    for row, node in enumerate(nodes):
+        writer |= dict.fromkeys(node.op.outputs, row)
     for row, node in enumerate(nodes):
         for start in (writer[name] for name in node.op.inputs if name in writer):
             path = _path(tops[start], tops[row], row - start)
@@ -133,4 +136,5 @@ def _path(start_y: int, end_y: int, rows: int) -> "Outline":
     middle = start_y + BOX_PX // 2
     end = end_y + 14
     points = [(LEFT_PX, middle), (reach, middle), (reach, end), (LEFT_PX, end)]
+    # A cubic Bezier curve has two control points and an end: one code for each.
     return Outline(points, [Outline.MOVETO, *[Outline.CURVE4] * 3])

@@ -13,6 +13,7 @@ core.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Literal
 
 from beers_deploy.dpu.board import Dpu
@@ -116,10 +117,12 @@ class Placement:
 
 def place(network: Network, dpu: Dpu) -> Placement:
     """Judge every node of a network against the rules of a DPU."""
+    # A misspelt constant would silence the rule that it is for.
     require_known(dpu)
     parts = _parts(network)
     pairs = zip(network.operations, parts, strict=True)
     broken = [judge(op, dpu, network.quantised) if part == "dpu-core" else () for op, part in pairs]
+    # In a float file a cut at an end costs time and no more.
     if not network.quantised:
         parts = _left_to_the_host(network, parts, broken)
     devices = [_device(part, bool(rules)) for part, rules in zip(parts, broken, strict=True)]
@@ -148,7 +151,8 @@ def _parts(network: Network) -> list[Part]:
     for op in operations:
         leads = op.output not in behind
         trails = op.output not in before
-        if is_foreign(op.op_type):  # what no processor here computes is not the host's either
+        # What no processor here computes is not the host's either.
+        if is_foreign(op.op_type):
             parts.append("dpu-core")
         elif leads and _is_host_front(op, network, trails=trails):
             parts.append("host-front")
@@ -167,37 +171,41 @@ def _left_to_the_host(
     over again.
     """
     before = _reached(network.operations, _convolved(network), forwards=False)
-    given: set[str] = set()
-    found: list[Part] = []
+    cpu_results: set[str] = set()
+    moved: list[Part] = []
     for op, part, rules in zip(network.operations, parts, broken, strict=True):
         trails = op.output not in before
-        follows = trails and not rules and part == "dpu-core" and bool(given & set(op.inputs))
-        found.append("host-back" if follows else part)
+        follows = trails and not rules and part == "dpu-core" and bool(cpu_results & set(op.inputs))
+        moved.append("host-back" if follows else part)
         if trails and (rules or follows):
-            given |= set(op.outputs)
-    return found
+            cpu_results |= set(op.outputs)
+    return moved
 
 
 def _convolved(network: Network) -> set[str]:
-    return {name for op in network.operations if op.kind in CONVOLUTIONS for name in op.outputs}
+    convolutions = (op for op in network.operations if op.kind in CONVOLUTIONS)
+    return set(chain.from_iterable(op.outputs for op in convolutions))
 
 
 def _reached(operations: Sequence[Operation], starts: set[str], *, forwards: bool) -> set[str]:
     """The results computed from one of `starts`, these included (forwards), or that one is computed
     from.
     """
-    found: set[str] = set()
+    results: set[str] = set()
     for op in operations if forwards else reversed(operations):
         reads = op.inputs if forwards else op.outputs
-        if not found.isdisjoint(reads) or not starts.isdisjoint(op.outputs):
-            found |= set(op.outputs) | (set() if forwards else set(op.inputs))
-    return found
+        if not results.isdisjoint(reads) or not starts.isdisjoint(op.outputs):
+            results |= set(op.outputs)
+            if not forwards:
+                results |= set(op.inputs)
+    return results
 
 
 def _is_host_front(op: Operation, network: Network, *, trails: bool) -> bool:
     """In a quantised file whatever leads to the core; in a float file scaling, mirroring, and
     pixels to channels.
     """
+    # The DPU does not pad by reflection: the host mirrors the image.
     mirrors = (
         op.op_type == "Pad"
         and op.inputs[0] in network.inputs
@@ -230,7 +238,10 @@ def _subgraphs(operations: tuple[Operation, ...], devices: list[Device]) -> list
     parents: dict[str, str] = {}
     for op, device in zip(operations, devices, strict=True):
         on_dpu = device == "DPU"
-        steps = [d + (was != on_dpu) for was, d in (depth[i] for i in op.inputs if i in depth)]
+        # A level counts the changes of device on the way here: what comes back to the DPU has
+        # another level than what left it, so that the two are never one piece.
+        levels = (depth[name] for name in op.inputs if name in depth)
+        steps = [changes + (was_on_dpu != on_dpu) for was_on_dpu, changes in levels]
         level = (on_dpu, max(steps, default=0))
         depth |= dict.fromkeys(op.outputs, level)
         for name in (*(name for name in op.inputs if depth.get(name) == level), *op.outputs):
@@ -244,16 +255,19 @@ def _root(parents: dict[str, str], name: str) -> str:
     root = name
     while parents.get(root, root) != root:
         root = parents[root]
-    while (
-        name != root
-    ):  # the way is walked once: in a long chain each node would walk all of it again
-        parents[name], name = root, parents[name]
+    # The way is walked once: in a long chain each node would walk all of it again.
+    while name != root:
+        parent = parents[name]
+        parents[name] = root
+        name = parent
     return root
 
 
 def _cuts(network: Network, nodes: Iterable[PlacedNode]) -> Iterable[Cut]:
     """Tensors written on one side and read on the other, the network's own ends included."""
-    on_dpu = {name: node.device == "DPU" for node in nodes for name in node.op.outputs}
+    on_dpu: dict[str, bool] = {}
+    for node in nodes:
+        on_dpu |= dict.fromkeys(node.op.outputs, node.device == "DPU")
     readers: dict[str, set[bool]] = {}
     sizes = {name: shape[0] * shape[1] * shape[2] for name, shape in network.inputs.items()}
     for node in nodes:
@@ -261,6 +275,7 @@ def _cuts(network: Network, nodes: Iterable[PlacedNode]) -> Iterable[Cut]:
             readers.setdefault(name, set()).add(node.device == "DPU")
         if node.op.out_shape is not None:
             sizes |= dict.fromkeys(node.op.outputs, node.op.out_bytes)
+    # The host reads the network's results.
     for name in network.outputs:
         readers.setdefault(name, set()).add(False)
     for name, sides in readers.items():

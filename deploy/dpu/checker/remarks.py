@@ -50,6 +50,7 @@ def streaming(placement: Placement, dpu: Dpu, tile_px: int) -> str:
     large = [size for size in sizes if size > room]
     if not large:
         return ""
+    # The size of a map grows with the square of the tile's side.
     kept_px = math.isqrt(room * tile_px * tile_px // max(large))
     return (
         f"{len(large)} of {len(sizes)} maps exceed {room / 2**20:g} MiB, the largest has "
@@ -123,5 +124,5 @@ NPU_REMARKS: tuple[Remark, ...] = (unread, depthwise, float_islands, unknown)
 def remarks_on(placement: Placement, dpu: Dpu, tile_px: int) -> dict[str, str]:
     """Every remark that a placed network calls for, by name."""
     remarks = NPU_REMARKS if dpu.target.npu else REMARKS
-    found = {remark.__name__: remark(placement, dpu, tile_px) for remark in remarks}
-    return {name: text for name, text in found.items() if text}
+    texts = {remark.__name__: remark(placement, dpu, tile_px) for remark in remarks}
+    return {name: text for name, text in texts.items() if text}

@@ -103,29 +103,32 @@ def check(
         >>> bool(bd.check("convbeers-xs-int8", "kv260"))
         True
     """
-    read = Network.load(network, sensor=SENSOR, to_run=False)
-    asked = ruled(TargetProfile.load(board), dpu)
-    tile_px = own_tile_px(read.model) or TILE_PX if tile is None else require_side(tile)
-    placement = place(network_of(read.model, tile_px, read.label), asked)
-    arguments: dict[str, object] = {"target": asked.target.name, "dpu": asked.name, "tile": tile_px}
-    rows = tuple(_rows(placement, asked, tile_px))
-    npu = bool(asked.target.npu)
-    checks = [legality(placement, npu=npu), *(_file_checks(read.model, asked) if npu else [])]
-    about = ("check", arguments, (read.input,), rows, tuple(checks))
-    return Checked(*about, placement=placement, dpu=asked, tile_px=tile_px, network=read)
+    source = Network.load(network, sensor=SENSOR, to_run=False)
+    build = ruled(TargetProfile.load(board), dpu)
+    tile_px = own_tile_px(source.model) or TILE_PX if tile is None else require_side(tile)
+    placement = place(network_of(source.model, tile_px, source.label), build)
+    arguments: dict[str, object] = {"target": build.target.name, "dpu": build.name, "tile": tile_px}
+    rows = tuple(_rows(placement, build, tile_px))
+    npu = bool(build.target.npu)
+    checks = [legality(placement, npu=npu), *(_file_checks(source.model, build) if npu else [])]
+    about = ("check", arguments, (source.input,), rows, tuple(checks))
+    return Checked(*about, placement=placement, dpu=build, tile_px=tile_px, network=source)
 
 
 def _rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
     """Every node, then the subgraphs, the tensors that cross, what else to know, and the counts."""
     npu = dpu.target.npu
-    nodes = [row for node in placement.nodes for row in _node_rows(node, placement, dpu)]
-    found = remarks_on(placement, dpu, tile_px).items()
-    remarks = [Row("remarks", name, {}, {"remark": text}) for name, text in found]
-    refused = {"nodes refused": _count(len(placement.failed), "node")}
-    if npu:  # into which parts its compiler cuts a network is not known
-        return [*nodes, *remarks, Row("summary", "placement", refused)]
+    nodes: list[Row] = []
+    for node in placement.nodes:
+        nodes += _node_rows(node, placement, dpu)
+    texts = remarks_on(placement, dpu, tile_px)
+    remarks = [Row("remarks", name, {}, {"remark": text}) for name, text in texts.items()]
+    refusals = {"nodes refused": _count(len(placement.failed), "node")}
+    # Into which parts an NPU's compiler cuts a network is not known.
+    if npu:
+        return [*nodes, *remarks, Row("summary", "placement", refusals)]
     parts = {"DPU subgraphs": _count(placement.dpu_subgraphs, "subgraph")}
-    summary = Row("summary", "placement", parts | refused)
+    summary = Row("summary", "placement", parts | refusals)
     return [*nodes, *_subgraph_rows(placement), *map(_cut_row, placement.cuts), *remarks, summary]
 
 
@@ -146,15 +149,14 @@ def _file_checks(model: onnx.ModelProto, dpu: Dpu) -> list[Check]:
     """
     if not is_quantised(model) or KEY in metadata(model):
         return []
-    opset = max(each.version for each in model.opset_import if each.domain in ("", "ai.onnx"))
+    # ONNX allows both names for its own domain.
+    opset = max(entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx"))
     most = dpu.limit("file", "opset_max")
-    named = [*model.graph.input, *model.graph.output]
-    sides = [
-        f"{v.name} {d.dim_param}"
-        for v in named
-        for d in v.type.tensor_type.shape.dim
-        if not d.dim_value
-    ]
+    tensors = [*model.graph.input, *model.graph.output]
+    sides = []
+    for tensor in tensors:
+        dims = tensor.type.tensor_type.shape.dim
+        sides += [f"{tensor.name} {dim.dim_param}" for dim in dims if not dim.dim_value]
     return [
         Check("opset", opset, most.low, "opset", detail=most.source),
         Check("sizes left open", len(sides), 0, "size", detail=", ".join(sides)),
@@ -166,9 +168,8 @@ def _crossings(placement: Placement) -> list[str]:
     lines = [f"device subgraphs: {pieces}, DPU subgraphs: {placement.dpu_subgraphs}"]
     for cut in placement.cuts:
         size = "a size unknown" if cut.size_bytes is None else f"{cut.size_bytes / 1e6:.2f} MB"
-        lines.append(
-            f"{'to' if cut.onto_dpu else 'from'} the DPU: {cut.tensor}, {size} an image as int8"
-        )
+        direction = "to" if cut.onto_dpu else "from"
+        lines.append(f"{direction} the DPU: {cut.tensor}, {size} an image as int8")
     return lines
 
 
@@ -181,11 +182,11 @@ def _node_rows(node: PlacedNode, placement: Placement, dpu: Dpu) -> list[Row]:
         }
     if not node.broken:
         return [Row("nodes", node.op.name, {}, words)]
-    broken = [
+    breaches = [
         {"rule": b.text, "reason": b.finding.reason, "remedy": b.finding.remedy}
         for b in node.broken
     ]
-    return [Row("nodes", node.op.name, {}, {**words, **why}) for why in broken]
+    return [Row("nodes", node.op.name, {}, {**words, **why}) for why in breaches]
 
 
 def _npu_words(node: PlacedNode, placement: Placement, dpu: Dpu) -> str:
@@ -204,19 +205,18 @@ def _npu_words(node: PlacedNode, placement: Placement, dpu: Dpu) -> str:
 
 
 def _subgraph_rows(placement: Placement) -> list[Row]:
-    found: dict[int, list[PlacedNode]] = {}
+    members_of: dict[int, list[PlacedNode]] = {}
     for node in placement.nodes:
-        found.setdefault(node.subgraph, []).append(node)
+        members_of.setdefault(node.subgraph, []).append(node)
     rows = []
-    for number, members in found.items():
+    for number, members in members_of.items():
         words = {
             "device": members[0].device,
             "first": members[0].op.name,
             "last": members[-1].op.name,
         }
-        rows.append(
-            Row("subgraphs", f"subgraph {number}", {"nodes": _count(len(members), "node")}, words)
-        )
+        figures = {"nodes": _count(len(members), "node")}
+        rows.append(Row("subgraphs", f"subgraph {number}", figures, words))
     return rows
 
 

@@ -109,6 +109,7 @@ class Prediction:
         """Least and most images a second: the host at its slowest and at its fastest, and the
         width.
         """
+        # The host at its fastest comes first.
         fast, slow = (self.rate(self.batch_time_s, host_s) for host_s in self._host_ends_s)
         return slow / self.spread, fast * self.spread
 
@@ -135,6 +136,7 @@ class Prediction:
         return low_s / self.spread, high_s * self.spread
 
     def _latency_s(self, host_s: float) -> float:
+        # `host_s` is the time of all cores together: one thread does the work on one of them.
         return self.alone_s + self.dpu.handlers * host_s * self.dpu.whole("cpu", "cores")
 
     @property
@@ -146,6 +148,7 @@ class Prediction:
     def _host_ends_s(self) -> Interval:
         """With the refused nodes and the consistency step at their least and at their most."""
         rest_s = self.host_s - between(self.refused_s) - between(self.step_s)
+        # Only these two parts have ends of their own: the rest of the host's time is fitted.
         low_s, high_s = (sum(ends) for ends in zip(self.refused_s, self.step_s, strict=True))
         return rest_s + low_s, rest_s + high_s
 
@@ -193,13 +196,14 @@ def predict(
             "cost model", expected="work for the DPU", got="no convolution", remedy=remedy
         )
     columns = Layers.of(works, dpu)
+    # These are the factors of an owner's runs, and 1 without any.
     speed, host_speed = (own_speed(dpu, part) for part in OWN_SPEEDS)
     times = (
         columns.compute_s(constants),
         columns.memory_s(constants),
         columns.time_s(constants, structure),
     )
-    parts = zip(works, *((each / speed).tolist() for each in times), strict=True)
+    parts = zip(works, *((time_s / speed).tolist() for time_s in times), strict=True)
     layers = tuple(LayerCost(*part) for part in parts)
     refused = [node.op for node in placement.failed]
     cores = dpu.whole("cpu", "cores")
@@ -207,6 +211,7 @@ def predict(
     task = task or task_of(placement)
     step_s = consistency_interval_s(step_px, dpu) if step_px else (0.0, 0.0)
     host_s = float(placed_work(placement, task) @ constants.host_s_per_unit) / cores / host_speed
+    # Work that no rate is published for is taken at the geometric mean of its two ends.
     host_s += between(refused_s) + between(step_s)
     dpu_s = math.fsum(layer.time_s for layer in layers) / dpu.batch
     map_bytes = largest_map_bytes(placement.core)
@@ -249,12 +254,14 @@ def _outside(core: Sequence[Operation], map_bytes: float, dpu: Dpu) -> tuple[str
         "map_bytes": ("largest map", map_bytes, 1e-6, "MB"),
         "operations": ("work", operations, 1e-9, "GOP"),
     }
-    found = []
+    sentences = []
     for key, (name, value, scale, unit) in values.items():
         most = dpu.limit("cost", f"fitted_{key}").high
+        # The ends of the fitted range are rounded in the file: the largest fitted network lies
+        # inside.
         if value > most * (1 + ROUNDED):
-            found.append(f"{name} {scale * value:.3g} {unit} (fitted up to {scale * most:.3g})")
-    return tuple(found)
+            sentences.append(f"{name} {scale * value:.3g} {unit} (fitted up to {scale * most:.3g})")
+    return tuple(sentences)
 
 
 def dpu_power(dpu: Dpu) -> Figure:
@@ -272,11 +279,15 @@ def dpu_power(dpu: Dpu) -> Figure:
 def layer_energy_j(layer: LayerCost, dpu: Dpu) -> Interval:
     """Least and most energy of a layer for one image, its share of the batch's weights included."""
     work = layer.work
-    moved = work.map_bytes + work.weight_bytes / dpu.batch
+    moved_bytes = work.map_bytes + work.weight_bytes / dpu.batch
     product = dpu.limit("power", "product_j")
     byte = dpu.limit("power", "memory_byte_j")
+    # An operation is a product or a sum: there are half as many products.
     products = work.operations / 2
-    return products * product.low + moved * byte.low, products * product.high + moved * byte.high
+    return (
+        products * product.low + moved_bytes * byte.low,
+        products * product.high + moved_bytes * byte.high,
+    )
 
 
 def counted_power(prediction: Prediction) -> Figure:

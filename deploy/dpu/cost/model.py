@@ -10,6 +10,7 @@ host_image_s + bytes in / rate + bytes out / rate + values of the task / its rat
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from itertools import chain
 from typing import Literal, Self, get_args
 
 import numpy as np
@@ -62,8 +63,9 @@ class Constants:
     @property
     def host_s_per_unit(self) -> Array:
         """Time of an image, of a byte in, of a byte out and of a value of each task, (7,)."""
-        first, *rates = (getattr(self, name) for name in NAMES[NAMES.index("host_image_s") :])
-        return np.array([first, *(1 / rate for rate in rates)])
+        host_names = NAMES[NAMES.index("host_image_s") :]
+        image_s, *rates = (getattr(self, name) for name in host_names)
+        return np.array([image_s, *(1 / rate for rate in rates)])
 
 
 NAMES = tuple(field.name for field in fields(Constants))
@@ -114,22 +116,22 @@ class Layers:
         """The layers of one network."""
         array = dpu.engine_ops_per_s
         lanes = dpu.lane_steps_per_s
-        columns = [
-            (
-                w.array_operations / array,
-                w.lane_steps / lanes,
-                w.weight_bytes,
-                w.map_bytes,
-                w.launched,
-            )
-            for w in works
-        ]
         clock_hz = dpu.value("array", "pl_clock_hz")
         memory = dpu.limit("memory", "ddr_bytes_per_s").high
         board = (clock_hz, memory, dpu.handlers, dpu.cores)
-        return cls(
-            *np.array([(*row, *board) for row in columns], dtype=np.float64).reshape(-1, 9).T
-        )
+        rows = [
+            (
+                work.array_operations / array,
+                work.lane_steps / lanes,
+                work.weight_bytes,
+                work.map_bytes,
+                work.launched,
+                *board,
+            )
+            for work in works
+        ]
+        # The nine fields, also of a network without layers: an empty list alone has one axis.
+        return cls(*np.array(rows, dtype=np.float64).reshape(-1, 9).T)
 
     def compute_s(self, constants: Constants) -> Array:
         """Time of the array and of the engines beside it, (n,): all batch handlers work at once."""
@@ -140,17 +142,17 @@ class Layers:
         port = constants.port_bytes_per_cycle * self.pl_clock_hz
         shared = constants.memory_efficiency * self.memory_bytes_per_s
         shared_s = (self.weight_bytes + self.handlers * self.map_bytes) / shared
-        return np.maximum(
-            (self.weight_bytes + self.map_bytes) / port, (1.0 if alone else self.cores) * shared_s
-        )
+        port_s = (self.weight_bytes + self.map_bytes) / port
+        # Cores share the DDR alone: each loads its own weights through ports of its own.
+        return np.maximum(port_s, (1.0 if alone else self.cores) * shared_s)
 
     def time_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
         """Time of each layer, for a batch (n,)."""
         compute = self.compute_s(constants)
         memory = self.memory_s(constants, alone=alone)
-        busy: Array = np.maximum(compute, memory) + (1 - structure.overlap) * np.minimum(
-            compute, memory
-        )
+        longer: Array = np.maximum(compute, memory)
+        shorter: Array = np.minimum(compute, memory)
+        busy = longer + (1 - structure.overlap) * shorter
         return busy + constants.layer_s * self.launched
 
 
@@ -172,6 +174,7 @@ def frame_rate(dpu_s: float, host_s: float, crowding: float) -> float:
     """Images a second, from the time that the DPU and the host's cores take for one image."""
     longer = max(dpu_s, host_s)
     shorter = min(dpu_s, host_s)
+    # (dpu^q + host^q)^(1/q) with the longer time factored out: no power leaves the floats' range.
     return float(1 / (longer * (1 + (shorter / longer) ** crowding) ** (1 / crowding)))
 
 
@@ -199,8 +202,8 @@ def host_work(bytes_in: float, bytes_out: float, values: float, task: Task) -> A
 
     An image needs no other reading of its bytes than becoming pixels.
     """
-    taken = 0.0 if task == "image" else bytes_out
-    return np.array([1.0, bytes_in, taken, *(values * (task == name) for name in TASKS[1:])])
+    copied_bytes = 0.0 if task == "image" else bytes_out
+    return np.array([1.0, bytes_in, copied_bytes, *(values * (task == name) for name in TASKS[1:])])
 
 
 def placed_work(placement: Placement, task: Task) -> Array:
@@ -216,9 +219,11 @@ def task_of(placement: Placement) -> Task:
     image.
     """
     behind = [node.op.op_type for node in placement.nodes if node.part == "host-back"]
-    found = next((OPERATORS[name] for name in behind if name in OPERATORS), None)
+    task = next((OPERATORS[name] for name in behind if name in OPERATORS), None)
     onto, back = _crossing_bytes(placement)
-    return found or ("image" if back >= onto and _gives_an_image(placement) else "copy")
+    if task:
+        return task
+    return "image" if back >= onto and _gives_an_image(placement) else "copy"
 
 
 def _crossing_bytes(placement: Placement) -> tuple[int, int]:
@@ -228,8 +233,10 @@ def _crossing_bytes(placement: Placement) -> tuple[int, int]:
 
 
 def _gives_an_image(placement: Placement) -> bool:
-    read = {name for node in placement.nodes for name in node.op.inputs}
-    shapes = [node.op.out_shape for node in placement.nodes if read.isdisjoint(node.op.outputs)]
+    read_names = set(chain.from_iterable(node.op.inputs for node in placement.nodes))
+    shapes = [
+        node.op.out_shape for node in placement.nodes if read_names.isdisjoint(node.op.outputs)
+    ]
     return len(shapes) == 1 and shapes[0] is not None and shapes[0][0] <= BANDS
 
 
@@ -259,7 +266,9 @@ def refused_interval_s(operations: Sequence[Operation], dpu: Dpu) -> Interval:
         return 0.0, 0.0
     times = [_core_s(op, dpu) for op in operations]
     cores = dpu.whole("cpu", "cores")
-    return math.fsum(low for low, _ in times) / cores, math.fsum(high for _, high in times) / cores
+    low_s = math.fsum(low for low, _ in times)
+    high_s = math.fsum(high for _, high in times)
+    return low_s / cores, high_s / cores
 
 
 def between(interval: Interval) -> float:
@@ -277,11 +286,12 @@ def _plain_work_s(operations: float, moved_values: float, results: float, dpu: D
     number.
     """
     keys = ("clock_ghz", "product_flops_per_cycle", "moved_bytes_per_s", "decoding_mips_per_ghz")
-    clock, products, moved, decoding = (dpu.limit("cpu", key) for key in keys)
+    clock, products, bandwidth, decoding = (dpu.limit("cpu", key) for key in keys)
     moved_bytes = FLOAT_BYTES * moved_values
-    least_s = max(operations / (1e9 * clock.high * products.high), moved_bytes / moved.high)
+    # A good library is bound by its products or by the memory; plain code pays for both.
+    least_s = max(operations / (1e9 * clock.high * products.high), moved_bytes / bandwidth.high)
     instructions = INSTRUCTIONS * results + PRODUCT_INSTRUCTIONS * operations
-    most_s = instructions / (1e6 * decoding.low * clock.low) + moved_bytes / moved.low
+    most_s = instructions / (1e6 * decoding.low * clock.low) + moved_bytes / bandwidth.low
     return least_s, most_s
 
 
@@ -292,6 +302,7 @@ def consistency_interval_s(pixels: float, dpu: Dpu) -> Interval:
     None of it is fitted. The raw and the restored image are read and the result is written; the
     step's other numbers stay in the caches.
     """
+    # A product with its sum counts as two operations.
     low_s, high_s = _plain_work_s(2 * PRODUCTS_PER_PX * pixels, 3 * pixels, pixels, dpu)
     cores = dpu.whole("cpu", "cores")
     return low_s / cores, high_s / cores

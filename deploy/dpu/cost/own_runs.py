@@ -68,12 +68,11 @@ class OwnRuns:
     def factor_rows(self) -> list[Row]:
         """The two factors."""
         factors = (("DPU", self.dpu_factor), ("host", self.host_factor))
-        found = {
-            name: predicted(value, "x", (value, value), self.source) for name, value in factors
-        }
-        return [
-            Row("correction", name, {"given / predicted": figure}) for name, figure in found.items()
-        ]
+        rows = []
+        for name, value in factors:
+            figure = predicted(value, "x", (value, value), self.source)
+            rows.append(Row("correction", name, {"given / predicted": figure}))
+        return rows
 
     def run_rows(self) -> list[Row]:
         """The rate given for each run, and what was predicted before and after the correction."""
@@ -111,6 +110,7 @@ def read_own_runs(path: Path, dpu: Dpu) -> OwnRuns:
 
 def _factor(ratios: Sequence[float]) -> float:
     """From ln(given / predicted) of runs."""
+    # Few runs tell more of their networks than of the board: n of them count n / (n + SCATTER).
     return math.exp(len(ratios) / (len(ratios) + SCATTER) * mean(ratios)) if ratios else 1.0
 
 
@@ -118,9 +118,9 @@ def _read(path: Path) -> Sequence[Mapping[str, object]]:
     try:
         runs = read_json(path)
     except (OSError, ValueError) as error:
-        missing = unreadable(path)
-        got = missing or str(error)
-        remedy = "check the path" if missing else EXAMPLE
+        fault = unreadable(path)
+        got = fault or str(error)
+        remedy = "check the path" if fault else EXAMPLE
         raise OptionError(str(path), expected="a file of JSON", got=got, remedy=remedy) from error
     if (
         not isinstance(runs, list)
@@ -137,6 +137,7 @@ def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run
     if "model" not in entry or set(entry) - KEYS:
         expected = ", ".join(sorted(KEYS))
         raise OptionError(where, expected=expected, got=str(sorted(entry)), remedy=EXAMPLE)
+    # onnxruntime's CPU provider runs the file on a processor: its rate says nothing of the DPU.
     if entry.get("provider") == "CPUExecutionProvider":
         expected = "a run of the board"
         got = "one of onnxruntime's CPU provider"
@@ -154,6 +155,7 @@ def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run
     model = path.parent / str(entry["model"])
     placement = place(read_network(model, int(tile_px)), dpu)
     prediction = predict(placement, dpu)
+    # A power is checked but not used: the runs correct rates alone.
     if "power_w" in entry:
         _number(entry["power_w"], "power_w", POWER_W, where)
     fps = _number(entry.get("fps"), "fps", (prediction.fps / FAR, prediction.fps * FAR), where)
@@ -161,6 +163,7 @@ def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run
 
 
 def _number(value: object, key: str, ends: tuple[float, float], where: str) -> float:
+    # A bool is an int in Python, and true is no number of a run.
     if (
         isinstance(value, bool)
         or not isinstance(value, int | float)

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.finding import groups_of
@@ -36,9 +37,8 @@ class Work:
     kind: str
     operations: int
     array_operations: int  # computed by the array, used or not
-    lane_steps: (
-        int  # values that the ALU or the element-wise engine takes in, unused lanes included
-    )
+    # Values that the ALU or the element-wise engine takes in, unused lanes included.
+    lane_steps: int
     weight_bytes: int
     load_map_bytes: int
     store_map_bytes: int
@@ -62,14 +62,21 @@ class Work:
 def count_work(operations: Sequence[Operation], dpu: Dpu) -> tuple[Work, ...]:
     """The work of operations that run one behind the other on the DPU."""
     flow = _Flow(operations, dpu)
-    found = []
+    works = []
     for op in operations:
         if op.kind not in FUSED:
-            counts = op.operations, _array_operations(op, dpu), _lane_steps(op, dpu)
-            found.append(
-                Work(op.name, op.kind, *counts, op.weight_bytes, flow.load(op), flow.store(op))
+            work = Work(
+                name=op.name,
+                kind=op.kind,
+                operations=op.operations,
+                array_operations=_array_operations(op, dpu),
+                lane_steps=_lane_steps(op, dpu),
+                weight_bytes=op.weight_bytes,
+                load_map_bytes=flow.load(op),
+                store_map_bytes=flow.store(op),
             )
-    return tuple(found)
+            works.append(work)
+    return tuple(works)
 
 
 def _array_operations(op: Operation, dpu: Dpu) -> int:
@@ -92,6 +99,7 @@ def _row_inputs(channels: int, columns: int, dpu: Dpu) -> int:
     Where there are few channels, several columns of the window are taken in side by side (channel
     augmentation).
     """
+    # With few input channels the array takes in several columns of the window side by side.
     together = min(max(AUGMENTATION * dpu.input_parallel // channels, 1), columns)
     full, rest = divmod(columns, together)
     lanes = dpu.input_parallel * dpu.whole("array", "input_groups")
@@ -105,6 +113,7 @@ def _lane_steps(op: Operation, dpu: Dpu) -> int:
         or op.in_shapes[0] is None
     ):
         return 0
+    # A depthwise convolution with several results a channel passes over its map for each of them.
     passes = max(op.channels[1] // max(op.channels[0], 1), 1) if op.kind == "depthwise" else 1
     taps = op.window.kernel[0] * op.window.kernel[1] * passes
     channels = _up(op.in_shapes[0][0], dpu.whole("elementwise", "channels_per_cycle"))
@@ -142,18 +151,22 @@ class _Flow:
             if op.kind in FUSED:
                 self._same |= dict.fromkeys(op.outputs, self._root(op.inputs[0]))
         computing = [op for op in operations if op.kind not in FUSED]
-        self._order = {name: when for when, op in enumerate(computing) for name in op.outputs}
+        self._order: dict[str, int] = {}
+        self._reads: dict[str, set[str]] = {}
+        self._readers = Counter[str]()
+        for position, op in enumerate(computing):
+            sources = [self._root(name) for name in op.inputs]
+            self._order |= dict.fromkeys(op.outputs, position)
+            self._reads |= {name: set(sources) for name in op.outputs}
+            self._readers.update(sources)
         self._shapes = {op.output: op.out_shape for op in computing}
-        self._reads = {
-            name: {self._root(i) for i in op.inputs} for op in computing for name in op.outputs
-        }
-        self._readers = Counter(self._root(name) for op in computing for name in op.inputs)
         self._concats = {op.output for op in computing if op.kind == "concat"}
         self._pieces = self._piece_channels(operations)
         sums = [op for op in computing if op.kind in ("add", "mul")]
         self._passes = {op.output for op in sums if self._is_pass(op)}
         reading = [op for op in computing if op.output in self._passes | self._concats]
-        self._stored = {self._root(name) for op in reading for name in op.inputs}
+        inputs = chain.from_iterable(op.inputs for op in reading)
+        self._stored = {self._root(name) for name in inputs}
         self._sums = {
             self._root(self._fused(op)): op.output for op in sums if op.output not in self._passes
         }
@@ -162,8 +175,10 @@ class _Flow:
         """Bytes read: all operands but the one that an add is fused with, and what that one has
         read already.
         """
+        # A concat computes nothing: its operands were stored where it joins them.
         if op.kind == "concat":
             return 0
+        # A pass of its own loads both maps, whatever made them: neither stays on the chip.
         if op.output in self._passes:
             return sum(map(_size, op.in_shapes))
         here = set()
@@ -182,33 +197,30 @@ class _Flow:
         if op.kind in UNSTARTED and op.output not in self._passes:
             return 0
         name = self._root(op.output)
+        # A sum that is fused writes in place of the operation before it.
         while name in self._sums and self._readers[name] == 1:
             name = self._sums[name]
         if self._readers[name] and name not in self._stored and not self._leaves(name):
             return 0
         size = _size(op.out_shape)
         piece = self._pieces.get(name)
+        # Pieces lie apart in memory: each takes whole bursts.
         return size // piece * _up(piece, BURST_BYTES) if piece else size
 
     def _piece_channels(self, operations: Sequence[Operation]) -> dict[str, int]:
         """Channels of a pixel that lie in one piece, by result; a shuffle at a network's end is
         left to the host.
         """
-        found: dict[str, int] = {}
+        pieces: dict[str, int] = {}
         for op in operations:
-            taken = next(iter(op.in_shapes), None)
-            given = op.out_shape
-            if (
-                op.kind == "pixel shuffle"
-                and taken
-                and given
-                and self._readers[self._root(op.output)]
-            ):
-                found[self._root(op.output)] = min(taken[0], given[0])
+            in_shape = next(iter(op.in_shapes), None)
+            root = self._root(op.output)
+            if op.kind == "pixel shuffle" and in_shape and op.out_shape and self._readers[root]:
+                pieces[root] = min(in_shape[0], op.out_shape[0])
             if op.kind == "concat":
                 fed = zip(op.inputs, op.in_shapes, strict=True)
-                found |= {self._root(name): shape[0] for name, shape in fed if shape is not None}
-        return found
+                pieces |= {self._root(name): shape[0] for name, shape in fed if shape is not None}
+        return pieces
 
     def _is_pass(self, op: Operation) -> bool:
         return (
@@ -226,6 +238,7 @@ class _Flow:
 
     def _fits(self, root: str) -> bool:
         shape = self._shapes.get(root)
+        # In the banks channels are filled up to the lanes too.
         return shape is None or _up(shape[0], self._lanes) * shape[1] * shape[2] <= self._kept_bytes
 
     def _root(self, name: str) -> str:

@@ -133,6 +133,7 @@ def read_list(path: Path, raster: Raster) -> FaultList:
     faults = []
     for number, line in enumerate(lines, 1):
         cells = tuple(cell.strip() for cell in line.split(","))
+        # Files of all bands have no column for the band, and so a shorter header.
         if not any(cells) or line.startswith("#") or cells in (HEADER, HEADER[:2]):
             continue
         faults.append(_fault(f"{path}, line {number}", line, cells, raster))
@@ -146,6 +147,7 @@ def _fault(where: str, line: str, cells: tuple[str, ...], raster: Raster) -> Fau
     sizes = raster.width_px, raster.height_px, raster.bands + 1
     expected = "column,row or column,row,band"
     numbers = [_number(cell) for cell in cells]
+    # Bands count from 1, and no band may be '*': a line without a band holds for all.
     if (
         len(numbers) not in (2, 3)
         or None in numbers
@@ -157,6 +159,7 @@ def _fault(where: str, line: str, cells: tuple[str, ...], raster: Raster) -> Fau
             OPTION, expected=expected, got=f"{where}: {got}", remedy="correct or delete the line"
         )
     placed = [number for number in numbers if number is not None]
+    # A line without a band has two numbers for the three sizes.
     if any(number >= size for number, size in zip(placed, sizes, strict=False)):
         image = f"{raster.width_px} columns, {raster.height_px} rows and {raster.bands} bands"
         got = f"{where}: {line.strip()}"
@@ -170,4 +173,5 @@ def _number(cell: str) -> int | None:
     """Return the number in a cell, -1 for all; None for anything else."""
     if cell == ALL:
         return -1
+    # `isdecimal` alone accepts the digits of every script.
     return int(cell) if cell.isascii() and cell.isdecimal() and len(cell) <= DIGITS else None

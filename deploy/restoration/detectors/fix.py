@@ -53,12 +53,14 @@ def faults_of(source: Source, wanted: str, name: str, log: Log) -> FaultList:
     """
     if not wanted:
         return FaultList(())
-    found = find_faults(source, name) if wanted == FOUND else read_list(Path(wanted), source.raster)
+    faults = (
+        find_faults(source, name) if wanted == FOUND else read_list(Path(wanted), source.raster)
+    )
     log(
-        f"faulty detectors: {found.words} {'found' if wanted == FOUND else 'listed'}, to be "
+        f"faulty detectors: {faults.words} {'found' if wanted == FOUND else 'listed'}, to be "
         "interpolated"
     )
-    return found
+    return faults
 
 
 def fixed(source: Source, faults: FaultList) -> Source:
@@ -78,13 +80,14 @@ def find_faults(source: Source, name: str) -> FaultList:
     """
     raster = source.raster
     lines = set[Fault]()
-    for band, found in enumerate(look_at_detectors(source)):
+    for band, band_faults in enumerate(look_at_detectors(source)):
         number = band_number(band, raster)
-        lines |= {Fault(column, -1, number) for column in _replaced(found.columns)}
-        lines |= {Fault(-1, row, number) for row in _replaced(found.rows)}
+        lines |= {Fault(column, -1, number) for column in _replaced(band_faults.columns)}
+        lines |= {Fault(-1, row, number) for row in _replaced(band_faults.rows)}
     pixels = set[Fault]()
     for fault in _found_in_strips(source):
         (lines if fault.column < 0 else pixels).add(fault)
+
         if len(pixels) > MANY * raster.height_px * raster.width_px * raster.bands:
             got = f"more than {MANY:.0%} of the pixels alone"
             remedy = "list the faulty ones in a file"
@@ -92,9 +95,9 @@ def find_faults(source: Source, name: str) -> FaultList:
     columns = {(fault.column, fault.band) for fault in lines if fault.row < 0}
     rows = {(fault.row, fault.band) for fault in lines if fault.column < 0}
     alone = {
-        each
-        for each in pixels
-        if (each.column, each.band) not in columns and (each.row, each.band) not in rows
+        pixel
+        for pixel in pixels
+        if (pixel.column, pixel.band) not in columns and (pixel.row, pixel.band) not in rows
     }
     return FaultList(tuple(sorted(lines | alone)))
 
@@ -114,6 +117,7 @@ def _found_in_strips(source: Source) -> Iterator[Fault]:
     raster = source.raster
     steps = value_steps(source)
     for top, stop in strips(raster.height_px, STRIP_PX):
+        # A pixel is compared with those around it, also beyond the strip.
         start = max(top - PATCH_PX, 0)
         end = min(stop + PATCH_PX, raster.height_px)
         for band, pixels in enumerate(as_floats(raster, source.read(start, end))):
@@ -154,9 +158,10 @@ class FixedSource:
         missing = raster.missing(stored) if raster.may_miss else np.zeros(stored.shape, bool)
         faulty = self.faults.mask(raster, top, end)
         pixels = np.ma.getdata(stored).copy()
-        wanted = faulty & ~missing
-        wanted[:, : start - top] = wanted[:, stop - top :] = False
-        for plane, bad, sound in zip(pixels, wanted, ~faulty & ~missing, strict=True):
+        targets = faulty & ~missing
+        # The rows around are read as neighbours only.
+        targets[:, : start - top] = targets[:, stop - top :] = False
+        for plane, bad, sound in zip(pixels, targets, ~faulty & ~missing, strict=True):
             replace_pixels(plane, bad, sound, raster.nodata)
         within = slice(start - top, stop - top)
         if isinstance(stored, np.ma.MaskedArray):
@@ -195,19 +200,20 @@ def replace_pixels(
         both = np.isfinite(near) & np.isfinite(far)
         either = np.isfinite(near) | np.isfinite(far)
         single = np.where(near <= far, left, right)
+        # Without a neighbour on one side this is infinity over infinity, and is not used.
         with np.errstate(invalid="ignore"):
             between = (left * far + right * near) / (near + far)
-        share = (
-            np.where(both, 1 / (near + far), np.where(either, ONE_SIDED / np.minimum(near, far), 0))
-            * weight
-        )
+        nearer = np.minimum(near, far)
+        one_sided = np.where(either, ONE_SIDED / nearer, 0)
+        share = np.where(both, 1 / (near + far), one_sided) * weight
         total += share * np.where(both, between, single)
         weights += share
-        closest = np.where(np.minimum(near, far) < distance, single, closest)
-        distance = np.minimum(distance, np.minimum(near, far))
+        closest = np.where(nearer < distance, single, closest)
+        distance = np.minimum(distance, nearer)
     reached = weights > 0
     result = total[reached] / weights[reached]
     result = (np.rint(result) if plane.dtype.kind in "ui" else result).astype(plane.dtype)
+    # A pixel that is interpolated to the nodata value would be missing: it copies its neighbour.
     if nodata is not None:
         result = np.where(
             result == plane.dtype.type(nodata), closest[reached].astype(plane.dtype), result

@@ -66,14 +66,14 @@ def look_at_detectors(source: Source, full_scale: float = np.inf) -> tuple[BandF
         full_scale: the pixel value from which on a pixel is no measurement.
     """
     raster = source.raster
-    found = [_Found(step) for step in value_steps(source)]
+    measurements = [_Found(step) for step in value_steps(source)]
     for top, stop in _strips(raster.height_px, raster.width_px, raster.bands):
         start = max(top - MARGIN_PX, 0)
         end = min(stop + MARGIN_PX, raster.height_px)
         within = slice(top - start, stop - start)
         for band, pixels in enumerate(as_floats(raster, source.read(start, end))):
-            found[band].add(start, within, pixels, full_scale)
-    return tuple(each.judged() for each in found)
+            measurements[band].add(start, within, pixels, full_scale)
+    return tuple(measurement.judged() for measurement in measurements)
 
 
 def as_floats(raster: Raster, stored: np.ndarray) -> np.ndarray:
@@ -94,6 +94,7 @@ def value_steps(source: Source) -> list[float]:
     raster = source.raster
     if raster.dtype.kind == "f":
         return [0.0] * raster.bands
+
     top = raster.height_px // 2
     rows = np.ma.getdata(source.read(top, min(top + LEAST_STRIP_PX, raster.height_px)))
     return [float(max(int(np.gcd.reduce(band.astype(np.int64), axis=None)), 1)) for band in rows]
@@ -105,6 +106,7 @@ def _strips(height_px: int, width_px: int, bands: int) -> Iterator[tuple[int, in
     side_px = min(STRIP_PX, max(LEAST_STRIP_PX, rows_px // BLOCKS))
     side_px = min(side_px, height_px)
     for top in np.linspace(0, height_px - side_px, max(rows_px // side_px, 1)):
+        # The patterns have a period of 2: strips that begin on even rows share its phase.
         even = int(top) // 2 * 2
         yield even, even + side_px
 
@@ -130,6 +132,7 @@ class _Found:
             pixels: (h, w), NaN where they are missing.
             full_scale: the value from which on a pixel is no measurement.
         """
+        # The converter clips at both ends, where a pixel no longer follows its gain.
         valid = (pixels > 0) & (pixels < full_scale)
         inner = valid[within]
         self._columns.append(measure_lines(pixels[within], inner))
@@ -161,5 +164,6 @@ class _Found:
 def _sections(width_px: int) -> list[slice]:
     """Sections of a strip, side by side, of even first columns."""
     count = min(max(width_px // SECTION_PX, 1), BLOCKS)
+    # First columns are even, so that all sections share the phase of a pattern of two pixels.
     ends = [width_px * number // count // 2 * 2 for number in range(count)] + [width_px]
     return [slice(left, right) for left, right in pairwise(ends)]

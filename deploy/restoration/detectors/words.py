@@ -38,11 +38,11 @@ def warn_of_detectors(source: Source, full_scale: float, log: Log) -> Mapping[st
 
 def sentences(bands: Sequence[BandFaults]) -> list[str]:
     """Return a sentence for each kind of fault in each band."""
-    found = []
+    messages = []
     for number, band in enumerate(bands, 1):
         where = f"band {number}: " if len(bands) > 1 else ""
-        found += [f"look at the detectors: {where}{words}" for words in _of_band(band)]
-    return found
+        messages += [f"look at the detectors: {where}{words}" for words in _of_band(band)]
+    return messages
 
 
 def _of_band(band: BandFaults) -> Iterator[str]:
@@ -91,10 +91,13 @@ def _of_lines(name: str, lines: Stripes) -> Iterator[str]:
 def _of_pattern(pattern: Pattern) -> str:
     shape = "a checkerboard" if pattern.name == "checkerboard" else pattern.name
     size = f"{pattern.difference:.2%} rms of the level, {pattern.largest:.2%} at most"
-    found = f"a fixed pattern of two pixels, {shape}: {size}"
+    message = f"a fixed pattern of two pixels, {shape}: {size}"
+
     if pattern.largest > COLOUR:
-        return f"{found}, as of a mosaic of colour filters: split the image into its colours first"
-    return f"{found}; {SHARPENS}: {EQUALISE}, channel by channel"
+        return (
+            f"{message}, as of a mosaic of colour filters: split the image into its colours first"
+        )
+    return f"{message}; {SHARPENS}: {EQUALISE}, channel by channel"
 
 
 def _count(number: int, name: str) -> str:
@@ -109,11 +112,11 @@ def _some(places: Sequence[str], count: int) -> str:
 
 def figures(bands: Sequence[BandFaults]) -> Mapping[str, Figure]:
     """Return the figures of each band for a row of results."""
-    found = dict[str, Figure]()
+    result = dict[str, Figure]()
     for number, band in enumerate(bands, 1):
         where = f"band {number}: " if len(bands) > 1 else ""
-        found |= {f"{where}{name}": figure for name, figure in _figures(band).items()}
-    return found
+        result |= {f"{where}{name}": figure for name, figure in _figures(band).items()}
+    return result
 
 
 def _figures(band: BandFaults) -> dict[str, Figure]:
@@ -122,13 +125,15 @@ def _figures(band: BandFaults) -> dict[str, Figure]:
     rms = f"rms over the level, without noise, {how}"
     pattern = max((pattern.difference for pattern in band.patterns), default=math.nan)
     return {
-        **{f"{name} differ by": _spread(found, rms) for name, found in lines.items()},
+        **{f"{name} differ by": _spread(stripes, rms) for name, stripes in lines.items()},
         "2 x 2 pattern": measured(100 * pattern, "%", f"the strongest of three, {rms}"),
         "lines off": measured(
-            sum(len(each.off) for each in lines.values()), "1", f"single columns and rows, {how}"
+            sum(len(stripes.off) for stripes in lines.values()),
+            "1",
+            f"single columns and rows, {how}",
         ),
         "dead lines": measured(
-            sum(len(each.dead) for each in lines.values()), "1", f"columns and rows, {how}"
+            sum(len(stripes.dead) for stripes in lines.values()), "1", f"columns and rows, {how}"
         ),
         "wrong pixels": measured(len(band.pixels), "1", f"single ones, {how}"),
     }
@@ -137,5 +142,6 @@ def _figures(band: BandFaults) -> dict[str, Figure]:
 def _spread(lines: Stripes, how: str) -> Figure:
     if lines.spread is None:
         return unavailable("%", "too few lines or blocks along them")
+    # A spread is never negative, although its interval may reach below 0.
     low, high = (max(lines.spread + sign * ERRORS * lines.spread_error, 0) for sign in (-1, 1))
     return measured(100 * lines.spread, "%", how, (100 * low, 100 * high))

@@ -116,11 +116,12 @@ class Restorer:
         bands = self._bands(group)
         missing = self._missing(strip, bands, rows, columns)
         if missing is not None and missing.all():
+            # The network would restore nothing but what fills missing pixels.
             return Tile(np.full(missing.shape, np.nan, np.float32), Tally())
         network = self.networks[group % len(self.networks)]
         window = self._window(strip, bands, rows, columns)
-        kept = _within(rows), _within(columns)
-        restored = network.restore(window, self.full_scale, kept, self.tiling)
+        inner = _within(rows), _within(columns)
+        restored = network.restore(window, self.full_scale, inner, self.tiling)
         tally = Tally(tiles=1, runs=restored.runs, brightened=restored.brightened)
         if missing is None:
             return Tile(restored.pixels, tally)
@@ -152,21 +153,25 @@ class Restorer:
         missing = self._missing(strip, bands, rows, columns)
         if missing is not None and missing.all():
             return Tile(self._unrestored(strip, missing, bands, rows, columns), Tally())
-        given = kept = restored[:, down, across]
+        network_pixels = pixels = restored[:, down, across]
         if self.consistency:
             change = self._change(strip, restored, at, bands, rows, columns)
-            kept = np.clip(given + change, 0, np.float32(self.full_scale))
-        seen = None if strip.missing is None else ~strip.missing[strip.kept(bands, rows, columns)]
+            pixels = np.clip(network_pixels + change, 0, np.float32(self.full_scale))
+        valid_raw = (
+            None if strip.missing is None else ~strip.missing[strip.kept(bands, rows, columns)]
+        )
         raw = strip.pixels[strip.kept(bands, rows, columns)].astype(np.float64) / self.full_scale
-        known = None if missing is None else ~missing
-        tally = Tally.of(raw, self._shares(kept), seen, known)
+        valid = None if missing is None else ~missing
+        tally = Tally.of(raw, self._shares(pixels), valid_raw, valid)
         if self.consistency:
             squared = float(
-                np.nansum(np.square((kept - given) / self.full_scale), dtype=np.float64)
+                np.nansum(np.square((pixels - network_pixels) / self.full_scale), dtype=np.float64)
             )
-            tally = tally.changed_from(Tally.of(raw, self._shares(given), seen, known), squared)
+            tally = tally.changed_from(
+                Tally.of(raw, self._shares(network_pixels), valid_raw, valid), squared
+            )
         result = as_stored(
-            self.raster, kept if missing is None else np.nan_to_num(kept), self.full_scale
+            self.raster, pixels if missing is None else np.nan_to_num(pixels), self.full_scale
         )
         if missing is not None:
             result = np.where(
@@ -194,6 +199,7 @@ class Restorer:
         across = slice(left - strip.left, columns.keep_stop + RAW_REACH_PX - strip.left)
         raw = strip.pixels[bands, down, across].astype(np.float32)
         if strip.missing is not None:
+            # The step gives the blocks of missing pixels a weight of 0, and 0 times NaN is NaN.
             raw[strip.missing[bands, down, across]] = 0
         sides = (
             Placed(self.raster.height_px, at[0], rows.keep_start, rows.keep_stop),
@@ -260,11 +266,10 @@ class Restorer:
             rows.stop - rows.start - window.shape[1],
             columns.stop - columns.start - window.shape[2],
         )
-        return (
-            np.pad(window, ((0, 0), (0, lack[0]), (0, lack[1])), mode="edge")
-            if any(lack)
-            else window
-        )
+        if not any(lack):
+            return window
+        # An image that is no multiple of the lattice is extended by its last row and column.
+        return np.pad(window, ((0, 0), (0, lack[0]), (0, lack[1])), mode="edge")
 
     def _filled(
         self, strip: Strip, flags: np.ndarray, bands: slice, rows: Span, columns: Span
@@ -306,9 +311,9 @@ def checked_strip(
     missing = raster.missing(pixels) if raster.may_miss else None
     pixels = np.ma.getdata(pixels)
     missing = missing if missing is not None and missing.any() else None
-    known = True if missing is None else ~missing
-    # Where nothing is known, 0 is taken for both, which is inside.
-    low, high = (float(extreme(pixels, where=known, initial=0)) for extreme in (np.min, np.max))
+    valid = True if missing is None else ~missing
+    # Where no pixel is valid both are 0, which lies within full scale.
+    low, high = (float(extreme(pixels, where=valid, initial=0)) for extreme in (np.min, np.max))
     if low < 0 or (high > full_scale and not (clips and np.isfinite(high))):
         where = f"{name}, rows {top} to {top + pixels.shape[1] - 1}"
         remedy = (
@@ -331,6 +336,7 @@ def as_stored(raster: Raster, restored: np.ndarray, full_scale: float) -> np.nda
     result = np.rint(restored) if raster.out_dtype.kind == "u" else restored
     result = result.astype(raster.out_dtype)
     nodata = raster.nodata
+    # A restored pixel lies between 0 and full scale, so another nodata value is never hit.
     if nodata is not None and 0 <= nodata <= full_scale:
         result[result == result.dtype.type(nodata)] = _beside(raster, nodata, full_scale)
     return result

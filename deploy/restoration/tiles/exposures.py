@@ -61,7 +61,7 @@ class ExposedNetwork:
             ModelError: a result of another shape than the network's file states.
         """
         scale = int(tiling.scale)
-        inside = (slice(None), *(slice(each.start * scale, each.stop * scale) for each in kept))
+        inside = (slice(None), *(slice(part.start * scale, part.stop * scale) for part in kept))
         if len(self.infers) == 1:
             restored = restore_window(window, self.infers[1], full_scale)
             _require_shape(
@@ -69,21 +69,21 @@ class ExposedNetwork:
             )
             return Exposed(restored[inside], 1, 0)
         image = np.asarray(window[0], np.float32)
-        chosen = choose_factors(image, self.infers, self.radius_px, full_scale, self.offset)[kept]
-        pixels = np.zeros((1, *chosen.shape), np.float32)
-        factors = np.unique(chosen).tolist()
+        choice = choose_factors(image, self.infers, self.radius_px, full_scale, self.offset)[kept]
+        pixels = np.zeros((1, *choice.shape), np.float32)
+        factors = np.unique(choice).tolist()
         for factor in factors:
             restored = self._at(factor, image, full_scale)[inside]
-            pixels = np.where(chosen == factor, restored, pixels)
-        return Exposed(pixels, len(factors), int((chosen > 1).sum()))
+            pixels = np.where(choice == factor, restored, pixels)
+        return Exposed(pixels, len(factors), int((choice > 1).sum()))
 
     def _at(self, factor: int, image: np.ndarray, full_scale: float) -> np.ndarray:
         """The image restored at one factor, in its own pixel values: (1, h, w)."""
         if factor == 1:
             return restore_window(image[None], self.infers[1], full_scale)
         offset = np.float32(self.offset)
-        # What exceeds full scale lies beyond the network's reach of every pixel that takes this
-        # factor.
+        # Pixels that exceed full scale lie beyond the network's reach of every pixel that takes
+        # this factor.
         brighter = np.clip(
             (image - offset) * np.float32(factor) + offset, 0, np.float32(full_scale)
         )
@@ -104,11 +104,11 @@ def tiles_by_factor(
         offset: the pixel value of the dark.
     """
     pixels = np.asarray(image, np.float32)
-    chosen = choose_factors(pixels, factors, plan.tiling.halo_px, full_scale, offset)
+    choice = choose_factors(pixels, factors, plan.tiling.halo_px, full_scale, offset)
     counts = dict.fromkeys(factors, 0)
     for row, column in product(plan.rows, plan.columns):
-        kept = chosen[row.keep_start : row.keep_stop, column.keep_start : column.keep_stop]
-        for factor in np.unique(kept).tolist():
+        tile_choice = choice[row.keep_start : row.keep_stop, column.keep_start : column.keep_stop]
+        for factor in np.unique(tile_choice).tolist():
             counts[factor] += 1
     return counts
 
@@ -133,7 +133,8 @@ def restore_window(dn: np.ndarray, infer: Infer, full_scale: float = MAX_DN) -> 
     """
     bands = dn[None] if dn.ndim == 2 else dn
     image = np.ascontiguousarray(bands, dtype=np.float32)[None] / np.float32(full_scale)
-    with np.errstate(over="ignore"):  # what overflows is refused
+    # Values that overflow are refused below.
+    with np.errstate(over="ignore"):
         restored = infer(image)[0] * np.float32(full_scale)
     if not np.isfinite(restored).all():
         raise ImageError(

@@ -5,7 +5,6 @@ on the tiles that the consistency step reaches.
 """
 
 from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
 from itertools import product
 from typing import Any
@@ -51,17 +50,12 @@ class Task:
 
     def restorer(self, window: np.ndarray) -> Restorer:
         """What restores the tiles of a window of pixels (bands, h, w)."""
-        extent = self.raster.extent(window)._replace(
-            whole=True
-        )  # a tile alone is no proof of radiances
+        # A dark tile may look like radiances; one tile alone does not prove that the image is.
+        extent = self.raster.extent(window)._replace(whole=True)
         full_scale = full_scale_of(NAME, self.raster, [extent], self.asked, self.bits).value
         return Restorer(
             self.raster, self.networks, full_scale, self.tiling, NAME, consistency=self.consistency
         )
-
-
-def _packed(options: Options, network: onnx.ModelProto) -> Packed:
-    return Packed(network.SerializeToString(), options.runtime, options.threads or 1)
 
 
 def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
@@ -74,11 +68,14 @@ def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
     delayed: Any = import_module("dask").delayed
     network = load_onnx(options.model)
     plan = plan_for(network, raster.shape, options)
-    # What the type alone decides comes at once. Pixels may only lead to a refusal later, not to
+    # The type alone decides the scale at once. Pixels may lead to a refusal later, but not to
     # another scale.
     full_scale = full_scale_of(NAME, raster, (), options.full_scale, options.sensor_bits).value
     about = options, raster, plan.tiling, full_scale
-    packed = partial(_packed, options)
+
+    def packed(network: onnx.ModelProto) -> Packed:
+        return Packed(network.SerializeToString(), options.runtime, options.threads or 1)
+
     exposed = exposed_networks([packed(network)], *about, packed)
     steps, _ = consistency_steps(*about)
     task = delayed(
@@ -89,18 +86,18 @@ def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
     finish = delayed(finish_tile)
     groups = range(plan.groups)
     margin_px = max(raster.fill_margin_px(plan.radius_px), RAW_REACH_PX if steps else 0)
-    read = {
+    windows = {
         place: _read(bands, plan, margin_px, *place)
         for place in product(groups, plan.rows, plan.columns)
     }
-    restored = {place: tile(task, *read[place], *place[1:]) for place in read}
+    restored = {place: tile(task, *windows[place], *place[1:]) for place in windows}
 
     def block(group: int, row: Span, column: Span) -> Any:
-        down = [each for each in plan.rows if _near(each, row, reach_px)]
-        across = [each for each in plan.columns if _near(each, column, reach_px)]
-        around = [[restored[group, each, other] for other in across] for each in down]
+        down = [tile for tile in plan.rows if _near(tile, row, reach_px)]
+        across = [tile for tile in plan.columns if _near(tile, column, reach_px)]
+        around = [[restored[group, down_tile, tile] for tile in across] for down_tile in down]
         at = down[0].keep_start, across[0].keep_start
-        finished = finish(task, *read[group, row, column], around, at, row, column)
+        finished = finish(task, *windows[group, row, column], around, at, row, column)
         sides = ((span.keep_stop - span.keep_start) * plan.scale for span in (row, column))
         return da.from_delayed(finished, (plan.tiling.channels_out, *sides), raster.out_dtype)
 
@@ -128,7 +125,7 @@ def _read(
     )
     count = plan.tiling.channels_in
     pixels = bands[group * count : (group + 1) * count, rows, columns]
-    # One task for both tasks of the tile: chunks are read once.
+    # Both tasks of the tile share this one, so that chunks are read once.
     return import_module("dask").delayed(_itself)(pixels), rows.start, columns.start
 
 

@@ -23,7 +23,8 @@ def _along_rows(
     taken.
     """
     width = pixels.shape[1]
-    far = width + reach_px + 1  # out of reach from every pixel: no known one on that side
+    # Without a known pixel on one side, its place is out of reach from every pixel.
+    far = width + reach_px + 1
     here = np.arange(width)
     left = np.maximum.accumulate(np.where(missing, -far, here), axis=1)
     right = np.minimum.accumulate(np.where(missing, 2 * far, here)[:, ::-1], axis=1)[:, ::-1]

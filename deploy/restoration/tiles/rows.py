@@ -88,9 +88,8 @@ class HeldRows:
         while self.parts and self.top + self.parts[0].shape[1] <= row:
             self.top += self.parts.popleft().shape[1]
         if self.parts and self.top < row:
-            self.parts[0] = self.parts[0][
-                :, row - self.top :
-            ].copy()  # or the whole of it would stay in memory
+            # A view would keep the whole part in memory.
+            self.parts[0] = self.parts[0][:, row - self.top :].copy()
             self.top = row
 
 
@@ -111,30 +110,28 @@ def restore_rows(
         return
     reach_px = restorer.reach_px
     first = rows[0].keep_start
-    wanted = rows_to_run(plan, restorer, rows)
-    # A single reader, since a source keeps what it decoded for the rows before, for the next ones
-    # to take.
+    network_rows = rows_to_run(plan, restorer, rows)
+    # One thread reads, because a source keeps the segments that it decoded for the next rows.
     with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(at_once) as pool:
         try:
             waiting = deque[NetworkRow]()
-            held = HeldRows()
-            for row in _network_rows(source, plan, restorer, wanted, (reader, pool), tick):
+            buffer = HeldRows()
+            for row in _network_rows(source, plan, restorer, network_rows, (reader, pool), tick):
                 if not reach_px:
-                    yield _finished(row, held, plan, restorer, pool)
+                    yield _finished(row, buffer, plan, restorer, pool)
                     continue
-                held.add(row)
+                buffer.add(row)
                 if first <= row.span.keep_start < rows[-1].keep_stop:
                     waiting.append(row)
-                while waiting and held.bottom >= min(
+                while waiting and buffer.bottom >= min(
                     waiting[0].span.keep_stop + reach_px, plan.height_px
                 ):
-                    yield _finished(waiting.popleft(), held, plan, restorer, pool)
-                    next_row = waiting[0].span.keep_start if waiting else held.bottom
-                    held.forget_above(next_row - reach_px)
+                    yield _finished(waiting.popleft(), buffer, plan, restorer, pool)
+                    next_row = waiting[0].span.keep_start if waiting else buffer.bottom
+                    buffer.forget_above(next_row - reach_px)
         finally:
-            pool.shutdown(
-                cancel_futures=True
-            )  # or the tiles of two rows would still be restored after an error
+            # Otherwise the tiles of two rows would still be restored after an error.
+            pool.shutdown(cancel_futures=True)
 
 
 def rows_to_run(plan: Plan, restorer: Restorer, rows: Sequence[Span]) -> list[Span]:
@@ -163,9 +160,10 @@ def _network_rows(
     begun: deque[tuple[Span, Strip, Iterator[Tile]]] = deque()
     for number, row in enumerate(rows):
         strip = coming.pop().result()
+        # The next strip is read while the network runs on this one.
         following = rows[number + 1 : number + 2]
         coming += [
-            reader.submit(restorer.read, source, each.start, each.stop) for each in following
+            reader.submit(restorer.read, source, span.start, span.stop) for span in following
         ]
         begun.append((row, strip, _tiles(strip, row, plan, restorer, pool)))
         if len(begun) > 1:
@@ -178,6 +176,7 @@ def _tiles(
     strip: Strip, row: Span, plan: Plan, restorer: Restorer, pool: Executor
 ) -> Iterator[Tile]:
     """The tiles of one row, in the order of `places`."""
+    # Written into the caller's loop, the lambda would take the strip and the row of the next one.
     return pool.map(lambda place: restorer.tile(strip, place[0], row, place[1]), places(plan))
 
 
@@ -192,7 +191,7 @@ def _network_row(
 
 
 def _finished(
-    row: NetworkRow, held: HeldRows, plan: Plan, restorer: Restorer, pool: Executor
+    row: NetworkRow, buffer: HeldRows, plan: Plan, restorer: Restorer, pool: Executor
 ) -> RestoredRow:
     """Finish a row of tiles, tile by tile, once all that they need is held."""
     count = plan.tiling.channels_out
@@ -203,6 +202,7 @@ def _finished(
     def finish(place: tuple[int, Span]) -> Tile:
         group, columns = place
         bands = slice(group * count, (group + 1) * count)
+        # Without the consistency step a tile needs no pixels of the tiles around it.
         if not reach_px:
             across = slice(columns.keep_start * plan.scale, columns.keep_stop * plan.scale)
             at = row.span.keep_start, columns.keep_start
@@ -210,7 +210,7 @@ def _finished(
                 row.strip, row.pixels[bands, :, across], at, group, row.span, columns
             )
         left = max(columns.keep_start - reach_px, 0)
-        around = held.window(bands, rows, slice(left, columns.keep_stop + reach_px))
+        around = buffer.window(bands, rows, slice(left, columns.keep_stop + reach_px))
         return restorer.finish(row.strip, around, (top, left), group, row.span, columns)
 
     pixels = np.empty(row.pixels.shape, restorer.raster.out_dtype)

@@ -146,16 +146,21 @@ def characterize(
             _as_file(image, Path(folder) / f"image{number}.tif")
             for number, image in enumerate(several)
         ]
-        found = characterise(paths, edges, stated)
+        measurement = characterise(paths, edges, stated)
         profile = Path(folder) / "measured.toml"
-        profile.write_text(profile_toml(found), encoding="utf-8")
+        profile.write_text(profile_toml(measurement), encoding="utf-8")
         sensor = MeasuredSensor(**vars(load_sensor(str(profile))))
-        arguments: dict[str, float | str | None] = {"bits": bits, "gain": gain, "gsd": gsd_m}
-        arguments |= {"black_level": black_level, "mtf": ",".join(map(str, mtf)) if mtf else None}
-        arguments["edge"] = ", ".join(edges) or None
-        evidence = Table(
-            "characterise", arguments, tuple(map(input_of, found.frames.paths)), tuple(found.rows())
-        )
+        arguments: dict[str, float | str | None] = {
+            "bits": bits,
+            "gain": gain,
+            "gsd": gsd_m,
+            "black_level": black_level,
+            "mtf": ",".join(map(str, mtf)) if mtf else None,
+            "edge": ", ".join(edges) or None,
+        }
+        # The files of arrays are gone after this block: they are digested here.
+        inputs = tuple(map(input_of, measurement.frames.paths))
+        evidence = Table("characterise", arguments, inputs, tuple(measurement.rows()))
     object.__setattr__(sensor, "evidence", evidence)
     return sensor
 
@@ -164,6 +169,7 @@ def _as_file(image: Any, path: Path) -> Path:
     if isinstance(image, str | os.PathLike):
         return Path(image)
     pixels = np.asarray(getattr(image, "values", image))
+    # Arrays of xarray and rasterio have a first axis for the bands.
     if pixels.ndim == 3 and len(pixels) == 1:
         pixels = pixels[0]
     if pixels.ndim != 2 or pixels.dtype.kind not in "ui":

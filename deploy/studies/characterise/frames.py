@@ -91,9 +91,9 @@ def open_frames(images: Sequence[Path], bits: int | None, black_level: float | N
         bits: of a digital number, or of a stored value; None where clipped pixels must tell.
         black_level: the stored value of the dark; None counts 0 as dark.
     """
-    paths = tuple(
-        path for image in images for path in (list_images(image) if image.is_dir() else [image])
-    )
+    paths: tuple[Path, ...] = ()
+    for image in images:
+        paths += tuple(list_images(image)) if image.is_dir() else (image,)
     if not paths:
         raise ImageError(
             "images", expected="one or several", got="none", remedy="give raw images of one sensor"
@@ -105,7 +105,7 @@ def open_frames(images: Sequence[Path], bits: int | None, black_level: float | N
     looks = [_look(path) for path in paths]
     step = int(np.gcd.reduce([look.step for look in looks]))
     largest = max(look.largest for look in looks)
-    settled = _settled_bits(bits, largest, step, any(look.piled for look in looks))
+    bit_count = _settled_bits(bits, largest, step, any(look.piled for look in looks))
     black_dn = (black_level or 0.0) / step
     darkest_dn = min(look.darkest for look in looks) / step
     middle_dn = float(np.median([look.middle for look in looks])) / step
@@ -117,7 +117,7 @@ def open_frames(images: Sequence[Path], bits: int | None, black_level: float | N
             got=f"{black_level:g}",
             remedy="give that of dark frames",
         )
-    return Frames(paths, step, settled, bits is not None, black_dn, darkest_dn)
+    return Frames(paths, step, bit_count, bits is not None, black_dn, darkest_dn)
 
 
 @dataclass(frozen=True)
@@ -145,6 +145,7 @@ def _look(path: Path) -> _Look:
     largest = int(values.max())
     step = int(np.gcd.reduce(values))
     apart = int(np.gcd.reduce(values - values.min()))
+    # All differences are multiples of `apart` and the values are not: they are no digital numbers.
     if apart > 1 and step % apart:
         remedy = (
             f"divide it by {apart}: {apart - 1} of {apart} values never occur, so they are "
@@ -160,7 +161,9 @@ def _look(path: Path) -> _Look:
     step = step if apart else 1
     count = int((values == largest).sum())
     below = int((values == largest - step).sum())
+    # Values stored in 8 bits do not tell the bits of the digitiser, clipped or not.
     piled = count >= max(CLIPPED_PIXELS, PILE * below) and pixels.dtype.itemsize > 1
+    # 0 stands for a missing pixel too, so that it tells nothing of the dark.
     present = values[values > 0]
     darkest, middle = np.percentile(present, [DARKEST_PERCENT, 50]) if present.size else (0.0, 0.0)
     return _Look(step, largest, piled, float(darkest), float(middle))

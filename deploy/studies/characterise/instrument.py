@@ -60,12 +60,15 @@ def measure_noise(frames: Frames) -> Noise:
     """Fit the noise line to all frames, or to the differences of those that
     show one still scene.
     """
-    each = [
+    frame_blocks = [
         _above_dark(join([_cut(tile, frames) for tile in frames.tiles(path)]), frames)
         for path in frames.paths
     ]
+    # The difference of two frames of a still scene holds no texture.
     still = [_above_dark(blocks, frames) for blocks in _still_pairs(frames)]
-    model = fit_noise_model(join(still or each), np.random.default_rng(SEED), incomplete=True)
+    model = fit_noise_model(
+        join(still or frame_blocks), np.random.default_rng(SEED), incomplete=True
+    )
     if isinstance(model, Refusal):
         expected = "blurred, raw ground, from dark to bright"
         remedy = (
@@ -75,7 +78,7 @@ def measure_noise(frames: Frames) -> Noise:
             f"noise of {frames.name}", expected=expected, got=model.reason, remedy=remedy
         )
     if not still:
-        _require_one_sensor(frames, each, math.sqrt(math.prod(model.measured_dn)))
+        _require_one_sensor(frames, frame_blocks, math.sqrt(math.prod(model.measured_dn)))
     return Noise(model, len(still))
 
 
@@ -90,8 +93,9 @@ def _above_dark(blocks: Blocks, frames: Frames) -> Blocks:
 
 def _still_pairs(frames: Frames) -> list[Blocks]:
     """Differences of frames that show the same scene, pixel by pixel: photon transfer."""
+    # Two frames of a still scene have one level: sorted by it, they are neighbours.
     by_level = sorted(frames.paths, key=lambda path: float(np.median(frames.read(path))))
-    found = []
+    differences = []
     for one, other in pairwise(by_level):
         first = frames.read(one)
         second = frames.read(other)
@@ -102,29 +106,32 @@ def _still_pairs(frames: Frames) -> list[Blocks]:
         ):
             continue
         blocks = cut_pair(first, second, frames.full_scale_dn)
-        if (
-            blocks.mean.size
-            and float(np.median(blocks.structure / np.maximum(blocks.fine, 1e-9))) < STILL_STRUCTURE
-        ):
-            found.append(blocks)
-    return found
+        if not blocks.mean.size:
+            continue
+        # Structure that is left in the difference means that the scene or the camera moved.
+        structure = blocks.structure / np.maximum(blocks.fine, 1e-9)
+        if float(np.median(structure)) < STILL_STRUCTURE:
+            differences.append(blocks)
+    return differences
 
 
-def _require_one_sensor(frames: Frames, each: Sequence[Blocks], dn: float) -> None:
+def _require_one_sensor(frames: Frames, frame_blocks: Sequence[Blocks], dn: float) -> None:
     """Refuse frames whose own noise at a digital number differs: of another gain, or processed."""
-    if len(each) == 1:
+    if len(frame_blocks) == 1:
         return
-    seen = {}
-    for path, blocks in zip(frames.paths, each, strict=True):
+    variances = {}
+    for path, blocks in zip(frames.paths, frame_blocks, strict=True):
         line = fit_noise_model(blocks, np.random.default_rng(SEED), incomplete=True)
+        # A frame whose finest detail may be texture tells too little of its noise.
         if isinstance(line, NoiseModel) and line.leak <= OWN_LEAK:
-            seen[path.name] = line.at(dn)
-    if not seen:
+            variances[path.name] = line.at(dn)
+    if not variances:
         return
-    least = min(seen, key=lambda name: seen[name].interval[1])
-    most = max(seen, key=lambda name: seen[name].interval[0])
-    if seen[most].interval[0] > NOISE_KEPT * seen[least].interval[1]:
-        low, high = (f"{seen[name].value:.3g} DN^2 in {name}" for name in (least, most))
+    # The ends of the intervals are compared, so that frames which may be alike pass.
+    least = min(variances, key=lambda name: variances[name].interval[1])
+    most = max(variances, key=lambda name: variances[name].interval[0])
+    if variances[most].interval[0] > NOISE_KEPT * variances[least].interval[1]:
+        low, high = (f"{variances[name].value:.3g} DN^2 in {name}" for name in (least, most))
         got = f"a variance of {low} and {high} at {dn:.4g} DN above the dark"
         remedy = "characterise them apart: they differ in gain, or one was processed"
         raise ImageError(
@@ -157,6 +164,7 @@ def measure_mtf(frames: Frames, boxes: Mapping[str, np.ndarray], noise: NoiseMod
         return noise.total(dn - frames.black_dn)
 
     edges = _pointed_at(frames, boxes, variance) if boxes else _found(frames, variance)
+    # Edges in boxes all count; searched ones count if they are as sharp as the sharpest.
     measure = measure_curve if boxes else search_curve
     generator = np.random.default_rng(SEED)
     curves: dict[str, MtfCurve] = {}
@@ -182,6 +190,7 @@ def _pointed_at(
     edges: dict[str, list[Edge]] = {axis: [] for axis in AXES}
     for words, region in boxes.items():
         lies = _rise(region.T) > _rise(region)
+        # An edge near the horizontal is turned upright, because edges are measured along the rows.
         edge = edge_in(region.T if lies else region, variance, words)
         if region.min() <= 0 or region.max() >= frames.full_scale_dn:
             edge = Refusal("clipped pixels")
@@ -200,12 +209,12 @@ def _pointed_at(
 def _found(frames: Frames, variance: Variance) -> dict[str, list[Edge]]:
     """The edges of all frames, those near the horizontal turned upright."""
     edges: dict[str, list[Edge]] = {axis: [] for axis in AXES}
-    with steps("looking for edges", len(frames.paths)) as done:
+    with steps("looking for edges", len(frames.paths)) as bar:
         for path in frames.paths:
             for tile in frames.tiles(path):
                 edges["across"] += find_edges(tile, variance, frames.full_scale_dn, path.name)
                 edges["along"] += find_edges(tile.T, variance, frames.full_scale_dn, path.name)
-            done.advance()
+            bar.advance()
     return edges
 
 
@@ -224,13 +233,13 @@ def _too_wide(curve: MtfCurve) -> str:
         if curve.contradicting
         else ""
     )
-    missing = f"about {curve.missing_edges} more such edges would do"
+    remedy = f"about {curve.missing_edges} more such edges would do"
     if curve.missing_edges == MOST_MISSING:
-        missing = "that is hardly any contrast, and more edges would not help"
+        remedy = "that is hardly any contrast, and more edges would not help"
     return (
         f"{count} leave {value:.2%} [{low:.2%}, {high:.2%}] at Nyquist, wider than a factor of "
         f"{WIDEST:g}: "
-        f"{missing}{odd}"
+        f"{remedy}{odd}"
     )
 
 
@@ -247,8 +256,9 @@ class Snr:
 def snr_at(noise: NoiseModel, dn: float, gain: float) -> Snr:
     """The SNR at a digital number above the dark, the rounding not in it."""
     variance = noise.at(dn)
+    # The lowest SNR belongs to the highest variance.
     low, value, high = (
-        dn / math.sqrt(each) if each > 0 else math.inf
-        for each in (variance.interval[1], variance.value, variance.interval[0])
+        dn / math.sqrt(dn2) if dn2 > 0 else math.inf
+        for dn2 in (variance.interval[1], variance.value, variance.interval[0])
     )
     return Snr(dn / gain, value, (low, high), variance.extrapolated)

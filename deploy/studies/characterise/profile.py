@@ -145,14 +145,14 @@ def profile_toml(found: Characterised) -> str:
     """
     frames = found.frames
     images = printable(frames.name)
-    clipped = (
+    bits_source = (
         "given"
         if frames.bits_stated
         else f"pixels clipped at {frames.stored_full_scale} in {images}"
     )
     if frames.step > 1:
-        clipped += f"; stored in steps of {frames.step}"
-    gain = (
+        bits_source += f"; stored in steps of {frames.step}"
+    gain_source = (
         f"full scale {frames.full_scale_dn} DN counts as 400 W/m2/sr/um; pixels do not tell the "
         "gain, and to a "
         "network only noise over full scale matters"
@@ -167,9 +167,11 @@ def profile_toml(found: Characterised) -> str:
         "mtf": _mtf_table(found, images),
         "noise": _noise_table(found, images),
         "digitiser": {
-            "bits": _constant(frames.bits, "stated" if frames.bits_stated else "measured", clipped),
+            "bits": _constant(
+                frames.bits, "stated" if frames.bits_stated else "measured", bits_source
+            ),
             "gain_dn_per_radiance": _given(
-                found.gain if found.gain_stated else None, found.gain, gain
+                found.gain if found.gain_stated else None, found.gain, gain_source
             ),
         },
     }
@@ -180,26 +182,28 @@ def profile_toml(found: Characterised) -> str:
     return sensor_toml(f"Measured on {images}.", tables)
 
 
-def _mtf_table(found: Characterised, images: str) -> dict[str, object]:
+def _mtf_table(sensor: Characterised, images: str) -> dict[str, object]:
     """Measured curves, what the user states, or an assumption; an axis without a curve has the
     other's.
     """
-    if found.stated_mtf is not None:
+    if sensor.stated_mtf is not None:
         across, along = (
-            _constant(value, "stated", "given on the command line") for value in found.stated_mtf
+            _constant(value, "stated", "given on the command line") for value in sensor.stated_mtf
         )
         return {"mtf_nyquist": across, "mtf_nyquist_along": along}
-    if not found.mtf.curves:
+    if not sensor.mtf.curves:
         middle = load_sensor(BLIND).nominal().mtf_nyquist
         why = "no edge shows it; the middle of the range that networks are trained for"
         return {"mtf_nyquist": _constant(float(f"{middle:.4g}"), "assumed", why)}
     table: dict[str, object] = {"frequency": [float(f) for f in FREQUENCIES]}
-    other = next(iter(found.mtf.curves))
+    # An axis without edges has the curve of the other one, and its source says so.
+    other = next(iter(sensor.mtf.curves))
     for axis in AXES:
-        shown = axis if axis in found.mtf.curves else other
-        curve = found.mtf.curves[shown]
-        source = f"{_edges(curve)} {shown} the track in {images}, 90 % interval {_intervals(curve)}"
-        if shown != axis:
+        source_axis = axis if axis in sensor.mtf.curves else other
+        curve = sensor.mtf.curves[source_axis]
+        source = f"{_edges(curve)} {source_axis} the track in {images}"
+        source += f", 90 % interval {_intervals(curve)}"
+        if source_axis != axis:
             source += f"; no curve {axis} the track"
         contrast = [float(f"{value:.4g}") for value in curve.contrast]
         table[axis] = {"value": contrast, "status": "measured", "source": source}
@@ -217,23 +221,25 @@ def _intervals(curve: MtfCurve) -> str:
     )
 
 
-def _noise_table(found: Characterised, images: str) -> dict[str, object]:
+def _noise_table(sensor: Characterised, images: str) -> dict[str, object]:
     """The SNRs are linear ratios without the rounding to whole DN; the darker one is kept within
     physics.
     """
-    model = found.noise.model
-    dark, bright = (dn / found.gain for dn in model.measured_dn)
-    low, high = found.snrs
+    model = sensor.noise.model
+    dark, bright = (dn / sensor.gain for dn in model.measured_dn)
+    low, high = sensor.snrs
     bounds = snr_0_bounds(low.radiance, high.radiance, high.value)
+    # Outside these bounds alpha or beta would be negative, and no sensor has such noise.
     inside = min(max(low.value, bounds[0] * (1 + MARGIN)), bounds[1] * (1 - MARGIN))
     table = dict[str, object]()
     for number, (snr, value, part) in enumerate(
-        zip(found.snrs, (inside, high.value), PARTS, strict=True)
+        zip(sensor.snrs, (inside, high.value), PARTS, strict=True)
     ):
         source = (
-            f"{_blocks(found.noise)} in {images}, 95 % interval {snr.interval[0]:.3g} to "
+            f"{_blocks(sensor.noise)} in {images}, 95 % interval {snr.interval[0]:.3g} to "
             f"{snr.interval[1]:.3g}"
         )
+        # No block has this radiance: the interval is wider, and the source says so.
         if snr.extrapolated:
             source += f"; extrapolated from {dark:.3g} to {bright:.3g} W/m2/sr/um"
         if not model.white:
@@ -250,10 +256,10 @@ def _noise_table(found: Characterised, images: str) -> dict[str, object]:
     return table
 
 
-def _given(given: float | None, otherwise: float, why: str) -> dict[str, object]:
-    if given is None:
+def _given(value: float | None, otherwise: float, why: str) -> dict[str, object]:
+    if value is None:
         return _constant(float(f"{otherwise:.10g}"), "assumed", why)
-    return _constant(given, "stated", "given on the command line")
+    return _constant(value, "stated", "given on the command line")
 
 
 def _constant(value: float, status: Status, source: str) -> dict[str, object]:

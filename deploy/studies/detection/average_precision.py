@@ -79,19 +79,19 @@ def find_hits(truths: Sequence[Boxes], found: Sequence[Boxes], classes: int) -> 
         found: what was found on each image, in the same px, of the same classes.
         classes: how many there are.
     """
-    scores, kinds = (
-        np.concatenate([getattr(one, part) for one in found]) for part in ("scores", "classes")
-    )
+    scores = np.concatenate([boxes.scores for boxes in found])
+    kinds = np.concatenate([boxes.classes for boxes in found])
+    # Stable, so that equal scores keep the order of the images.
     order = np.argsort(-scores, kind="stable")
-    image = np.repeat(np.arange(len(found)), [len(one) for one in found])
-    matches = [match(*each)[:2] for each in zip(truths, found, strict=True)]
+    image = np.repeat(np.arange(len(found)), [len(boxes) for boxes in found])
+    matches = [match(truth, boxes)[:2] for truth, boxes in zip(truths, found, strict=True)]
     hits, ignored = (
         np.concatenate(parts, axis=-1)[..., order] for parts in zip(*matches, strict=True)
     )
     counts = [
         [
-            np.bincount(truth.classes[~passed], minlength=classes)
-            for passed in truth.ignored | _of_other_size(truth)
+            np.bincount(truth.classes[~uncounted], minlength=classes)
+            for uncounted in truth.ignored | _of_other_size(truth)
         ]
         for truth in truths
     ]
@@ -110,24 +110,26 @@ def match(truth: Boxes, found: Boxes) -> tuple[np.ndarray, np.ndarray, np.ndarra
         Which of those found are hits, and which count neither way, (S, 10, N); which objects are
             taken, (S, 10, M).
     """
-    passed = np.repeat((truth.ignored | _of_other_size(truth))[:, None], len(OVERLAPS), axis=1)
+    uncounted = np.repeat((truth.ignored | _of_other_size(truth))[:, None], len(OVERLAPS), axis=1)
     ignored = np.repeat(_of_other_size(found)[:, None], len(OVERLAPS), axis=1)
     hits = np.zeros_like(ignored)
-    taken = np.zeros_like(passed)
+    matched = np.zeros_like(uncounted)
     overlaps = iou(found.corners, truth.corners, truth.ignored) * (
         found.classes[:, None] == truth.classes
     )
     for one in np.argsort(-found.scores, kind="stable"):
         if overlaps[one].max(initial=0) < OVERLAPS[0]:
             continue
-        free = (overlaps[one] >= OVERLAPS[:, None]) & ~(taken & ~truth.ignored)
+        # An object is found once; an ignored box may hold any number of detections.
+        free = (overlaps[one] >= OVERLAPS[:, None]) & ~(matched & ~truth.ignored)
         at = np.nonzero(free.any(axis=-1))
-        best = np.where(free, overlaps[one] + ~passed, 0.0).argmax(axis=-1)[
-            at
-        ]  # what counts goes first
-        hits[*at, one], ignored[*at, one] = ~passed[*at, best], passed[*at, best]
-        taken[*at, best] = True
-    return hits, ignored, taken
+        # An object that counts goes first: 1 is added to its overlap, which is at most 1.
+        preference = np.where(free, overlaps[one] + ~uncounted, 0.0)
+        best = preference.argmax(axis=-1)[at]
+        hits[*at, one] = ~uncounted[*at, best]
+        ignored[*at, one] = uncounted[*at, best]
+        matched[*at, best] = True
+    return hits, ignored, matched
 
 
 def site_weights(sites: Sequence[str], seed: int, draws: int = DRAWS) -> np.ndarray:
@@ -135,9 +137,9 @@ def site_weights(sites: Sequence[str], seed: int, draws: int = DRAWS) -> np.ndar
     replacement has its site.
     """
     names, site = np.unique(np.array(sites), return_inverse=True)
-    counts = np.random.default_rng(seed).multinomial(
-        len(names), np.full(len(names), 1 / len(names)), size=draws
-    )
+    generator = np.random.default_rng(seed)
+    counts = generator.multinomial(len(names), np.full(len(names), 1 / len(names)), size=draws)
+    # Images of one site share its count: the bootstrap draws whole sites.
     return np.vstack([np.ones(len(sites), np.int64), counts[:, site]])
 
 
@@ -147,10 +149,10 @@ def interval(values: np.ndarray, sites: int) -> tuple[float, float] | None:
 
     Of fewer than `LEAST_SITES` different sites there is none: it could not be trusted.
     """
-    known = values[1:][~np.isnan(values[1:])]
-    if np.isnan(values[0]) or sites < LEAST_SITES or not len(known):
+    defined = values[1:][~np.isnan(values[1:])]
+    if np.isnan(values[0]) or sites < LEAST_SITES or not len(defined):
         return None
-    return percentiles(known)
+    return percentiles(defined)
 
 
 def sites_note(sites: int) -> str:
@@ -198,8 +200,10 @@ def score(
         [precisions(hits, kind, weights, ALL, every).mean(axis=-1) for kind in range(len(names))]
     )
     curves = _confidence_curves(hits, weights)
+    # The confidence is a level of its own grid: the margin keeps rounding from taking the next one.
     fixed = np.searchsorted(CONFIDENCES, np.nan_to_num(confidence) - 1e-9)
-    own = np.argmax(curves[2], axis=-1)  # 0 where nothing is labelled, and there the curves are NaN
+    # It is 0 where nothing is labelled, and there the curves are NaN.
+    own = np.argmax(curves[2], axis=-1)
     own_precision, own_recall, own_f1 = curves[:, np.arange(len(weights)), own]
     return {
         "mAP50": mean_known(by_class[..., 0]),
@@ -252,22 +256,21 @@ def precisions(
         NaN where the class has no object.
     """
     totals = weights @ hits.objects[size, kind]
-    found = np.full((len(weights), levels, len(RECALLS)), np.nan)
+    curves = np.full((len(weights), levels, len(RECALLS)), np.nan)
     for level in range(levels):
         counted = np.flatnonzero((hits.classes == kind) & ~hits.ignored[size, level])
         images = hits.images[counted]
         hit = np.flatnonzero(hits.hits[size, level, counted])
         for draw in np.flatnonzero(totals):
             # Precision peaks at hits alone, so a draw has to look at nothing else.
-            each = weights[draw, images]
-            true = np.cumsum(each[hit])
-            so_far = np.cumsum(each)[hit]
+            image_weights = weights[draw, images]
+            true = np.cumsum(image_weights[hit])
+            so_far = np.cumsum(image_weights)[hit]
             precision = np.divide(true, so_far, out=np.zeros(len(true)), where=so_far > 0)
-            best = np.append(
-                np.maximum.accumulate(precision[::-1])[::-1], 0.0
-            )  # beyond the last hit there is none
-            found[draw, level] = best[np.searchsorted(true / totals[draw], RECALLS)]
-    return found
+            # From each hit on the best precision at that recall or more; 0 beyond the last hit.
+            best = np.append(np.maximum.accumulate(precision[::-1])[::-1], 0.0)
+            curves[draw, level] = best[np.searchsorted(true / totals[draw], RECALLS)]
+    return curves
 
 
 def _confidence_curves(hits: Hits, weights: np.ndarray) -> np.ndarray:
@@ -277,22 +280,24 @@ def _confidence_curves(hits: Hits, weights: np.ndarray) -> np.ndarray:
     Precision is 1 of a class of which nothing is found, as Ultralytics has it.
     """
     total = np.zeros((3, len(weights), len(CONFIDENCES)))
-    known = np.zeros((len(weights), 1))
+    class_counts = np.zeros((len(weights), 1))
     levels = np.searchsorted(CONFIDENCES, hits.scores, side="right") - 1
 
     def reaching(which: np.ndarray) -> np.ndarray:
         places = (hits.images[which], levels[which])
         shape = (weights.shape[1], len(CONFIDENCES))
+        # Added up from the highest confidence down: what reaches a level reaches all below it.
         by_level = weights @ csr_array((np.ones(len(places[0])), places), shape)
         return np.asarray(by_level[:, ::-1].cumsum(axis=1)[:, ::-1])
 
     for kind, objects in enumerate(hits.objects[ALL]):
         counts = (weights @ objects)[:, None]
         mine = hits.classes == kind
-        true, found = reaching(mine & hits.hits[ALL, 0]), reaching(mine & ~hits.ignored[ALL, 0])
-        precision = np.where(found > 0, true / np.maximum(found, 1), 1.0)
+        true = reaching(mine & hits.hits[ALL, 0])
+        detections = reaching(mine & ~hits.ignored[ALL, 0])
+        precision = np.where(detections > 0, true / np.maximum(detections, 1), 1.0)
         recall = true / np.maximum(counts, 1)
         f1 = 2 * precision * recall / np.where(recall > 0, precision + recall, 1.0)
         total += np.where(counts > 0, [precision, recall, f1], 0.0)
-        known += counts > 0
-    return np.where(known > 0, total / np.maximum(known, 1), np.nan)
+        class_counts += counts > 0
+    return np.where(class_counts > 0, total / np.maximum(class_counts, 1), np.nan)

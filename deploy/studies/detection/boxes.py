@@ -54,10 +54,10 @@ class Boxes:
         """Boxes of any array-like; without scores they are labelled ones, and none is ignored
         unless it is said.
         """
-        found = np.asarray(corners, np.float64).reshape(-1, 4)
-        count = len(found)
+        array = np.asarray(corners, np.float64).reshape(-1, 4)
+        count = len(array)
         return cls(
-            found,
+            array,
             np.asarray(classes, np.int64).reshape(count),
             np.ones(count) if scores is None else np.asarray(scores, np.float64).reshape(count),
             np.zeros(count, bool) if ignored is None else np.asarray(ignored, bool).reshape(count),
@@ -85,10 +85,10 @@ class Boxes:
         """
         limits = np.array([width_px, height_px, width_px, height_px])
         inside = np.clip(self.corners, 0, limits)
-        known = areas(inside)
-        whole = areas(self.corners)
-        ignored = self.ignored | (known < LEAST_VISIBLE * whole)
-        return replace(self, corners=inside, ignored=ignored)[known > 0]
+        visible = areas(inside)
+        full = areas(self.corners)
+        ignored = self.ignored | (visible < LEAST_VISIBLE * full)
+        return replace(self, corners=inside, ignored=ignored)[visible > 0]
 
 
 def areas(corners: np.ndarray) -> np.ndarray:
@@ -111,24 +111,29 @@ def iou(one: np.ndarray, other: np.ndarray, ignored: np.ndarray | bool = False) 
     high = np.minimum(one[:, None, 2:], other[None, :, 2:])
     shared = np.prod(np.maximum(high - low, 0), axis=2)
     own = areas(one)[:, None]
-    whole = np.where(ignored, own, own + areas(other) - shared)
-    return np.asarray(np.divide(shared, whole, out=np.zeros_like(shared), where=whole > 0))
+    # Of an ignored box the overlap is the share of the detection inside it, as COCO has it for
+    # crowds.
+    union = np.where(ignored, own, own + areas(other) - shared)
+    return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0))
 
 
 def suppress(found: Boxes) -> Boxes:
     """Non-maximum suppression within each class: what stays of boxes as a detector gives them, best
     score first.
     """
-    left = np.argsort(-found.scores, kind="stable")[:CANDIDATES]
-    kept = list[int]()
-    while len(left) and len(kept) < MOST:
-        best = int(left[0])
-        left = left[1:]
-        kept.append(best)
-        crowded = found.classes[left] == found.classes[best]
-        crowded[crowded] = iou(found.corners[best][None], found.corners[left[crowded]])[0] > OVERLAP
-        left = left[~crowded]
-    return found[np.array(kept, np.int64)]
+    candidates = np.argsort(-found.scores, kind="stable")[:CANDIDATES]
+    selection = list[int]()
+    while len(candidates) and len(selection) < MOST:
+        best = int(candidates[0])
+        candidates = candidates[1:]
+        selection.append(best)
+        # Boxes of other classes stay: overlaps are computed within the class alone.
+        crowded = found.classes[candidates] == found.classes[best]
+        crowded[crowded] = (
+            iou(found.corners[best][None], found.corners[candidates[crowded]])[0] > OVERLAP
+        )
+        candidates = candidates[~crowded]
+    return found[np.array(selection, np.int64)]
 
 
 class Letterbox:
@@ -146,7 +151,9 @@ class Letterbox:
 
     def __init__(self, height_px: int, width_px: int, size_px: int) -> None:
         share = min(size_px / height_px, size_px / width_px)
-        self._inner = height, width = round(height_px * share), round(width_px * share)
+        height = round(height_px * share)
+        width = round(width_px * share)
+        self._inner = (height, width)
         if min(self._inner) < 1:
             got = f"{height_px} x {width_px} px"
             expected = f"an image that keeps a pixel in a detector's input of {size_px} px"
@@ -163,6 +170,7 @@ class Letterbox:
         """The input, (3, size_px, size_px) float32, of an image (height_px,
         width_px, 3) in 0 to 1.
         """
+        # Shrunk without a filter in front, as Ultralytics does when it trains and runs.
         same = self._inner == rgb.shape[:2]
         fitted = (
             rgb if same else resize(rgb, self._inner, order=1, mode="edge", anti_aliasing=False)

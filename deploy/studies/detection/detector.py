@@ -11,6 +11,7 @@ import ast
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -64,8 +65,9 @@ class Detector:
         """
         height, width = rgb.shape[:2]
         box = Letterbox(height, width, self.size_px)
-        found = self.decoded(self._run(box.image(rgb)[None]))
-        inside = replace(found, corners=box.to_image(found.corners)).clipped(height, width)
+        boxes = self.decoded(self._run(box.image(rgb)[None]))
+        # Boxes leave the letterbox first, so that they are cut at the borders of the image itself.
+        inside = replace(boxes, corners=box.to_image(boxes.corners)).clipped(height, width)
         return Boxes.of(inside.corners, inside.classes, inside.scores)
 
     def decoded(self, output: np.ndarray) -> Boxes:
@@ -73,12 +75,12 @@ class Detector:
         N, 6) final.
         """
         if not _is_read(output.shape, len(self.names)):
-            raise _refused(
-                "an answer of the sizes that its file states", " x ".join(map(str, output.shape))
-            )
+            sizes = " x ".join(map(str, output.shape))
+            raise _refused("an answer of the sizes that its file states", sizes)
         if not np.isfinite(output).all():
             raise _refused("finite boxes and scores", "NaN or infinity")
-        final = output.shape[2] == 6  # raw are at least the 21 anchors of an input of 32 px
+        # A raw answer has at least the 21 anchors of an input of 32 px.
+        final = output.shape[2] == 6
         scores = output[:, :, 4] if final else output[:, 4:]
         if scores.min(initial=0) < -ROUNDING or scores.max(initial=0) > 1 + ROUNDING:
             raise _refused("scores in 0 to 1", "others: logits or an objectness perhaps")
@@ -94,6 +96,7 @@ def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> D
         size_px: side of the input; None takes the one that the file is fixed to or was trained for.
     """
     model = load_onnx(path)
+    # Ultralytics writes its metadata as Python literals.
     about = {key: _literal(value) for key, value in metadata(model).items()}
     names = class_names(about.get("names"))
     if not names:
@@ -109,7 +112,8 @@ def _answer(session: InferenceSession, path: Path, image: np.ndarray) -> np.ndar
         return np.asarray(session.run(None, {session.get_inputs()[0].name: image})[0])
     except CODE_FAULTS:
         raise
-    except Exception as error:  # onnxruntime raises a class of its own for each status code
+    except Exception as error:
+        # onnxruntime raises a class of its own for each status code.
         got = " ".join(str(error).split())[:160]
         remedy = "export it again, for one size of image"
         raise ModelError(
@@ -120,6 +124,7 @@ def _answer(session: InferenceSession, path: Path, image: np.ndarray) -> np.ndar
 def _literal(text: str) -> Any:
     """What a value of the metadata stands for, where it is a Python literal; else the text."""
     try:
+        # The names of 1 200 classes take half of this limit: a longer text is not parsed.
         return ast.literal_eval(text) if len(text) <= LITERAL else text
     except (MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
         return text
@@ -130,13 +135,13 @@ def _require_layout(model: onnx.ModelProto, task: Any, classes: int, path: Path)
     outputs = [_sizes(value) for value in model.graph.output]
     if task == "detect" and channels == [3] and len(outputs) == 1 and _is_read(outputs[0], classes):
         return
-    read = (
+    layout = (
         f"for RGB, 1 x {4 + classes} x anchors for {classes} classes (raw) or 1 x N x 6 "
         "(nms=True or end2end)"
     )
     shapes = ", ".join(" x ".join(map(str, sizes)) for sizes in outputs)
     got = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}"
-    raise _refused(f"a detector's output as Ultralytics exports it {read}", got, path)
+    raise _refused(f"a detector's output as Ultralytics exports it {layout}", got, path)
 
 
 def _is_read(shape: Sequence[int], classes: int) -> bool:
@@ -151,14 +156,14 @@ def _sizes(value: onnx.ValueInfoProto) -> list[int]:
     return [dimension.dim_value for dimension in value.type.tensor_type.shape.dim]
 
 
-def _size_px(fixed: int | None, stated: Any, asked: int | None, path: Path) -> int:
-    if fixed and asked not in (None, fixed):
+def _size_px(fixed: int | None, stated: Any, requested: int | None, path: Path) -> int:
+    if fixed and requested not in (None, fixed):
         expected = f"{fixed}, which {path.name} is fixed to"
-        remedy = f"export it for {asked} px, or leave `side` out"
-        raise OptionError("side", expected=expected, got=f"{asked}", remedy=remedy)
+        remedy = f"export it for {requested} px, or leave `side` out"
+        raise OptionError("side", expected=expected, got=f"{requested}", remedy=remedy)
     if isinstance(stated, list) and len(stated) == 2 and stated[0] == stated[1]:
         stated = stated[0]
-    size = fixed or asked or stated
+    size = fixed or requested or stated
     if not isinstance(size, int) or size < 1:
         expected = "the side of the detector's square input in px"
         raise OptionError("side", expected=expected, got=f"{size}", remedy="say it")
@@ -171,14 +176,10 @@ def _flag(model: onnx.ModelProto) -> str:
     """
     if not any(node.op_type == "NonMaxSuppression" for node in model.graph.node):
         return ""
-    known = constants(model)
-    compared = (node.input for node in model.graph.node if node.op_type == "Greater")
-    limits = [
-        known[name].max()
-        for names in compared
-        for name in names
-        if name in known and known[name].size
-    ]
+    values = constants(model)
+    greater_inputs = (node.input for node in model.graph.node if node.op_type == "Greater")
+    names = chain.from_iterable(greater_inputs)
+    limits = [values[name].max() for name in names if name in values and values[name].size]
     if limits and max(limits) <= CUT:
         return ""
     where = f"confidence {max(limits):.3g}" if limits else "an unknown confidence"
@@ -194,9 +195,8 @@ def _raw(output: np.ndarray) -> Boxes:
     classes, anchors = np.nonzero(output[4:] > LEAST_SCORE)
     middle = output[:2, anchors].T.astype(np.float64)
     half = output[2:4, anchors].T.astype(np.float64) / 2
-    return Boxes.of(
-        np.hstack([middle - half, middle + half]), classes, output[4 + classes, anchors]
-    )
+    corners = np.hstack([middle - half, middle + half])
+    return Boxes.of(corners, classes, output[4 + classes, anchors])
 
 
 def _final(output: np.ndarray, classes: int) -> Boxes:
@@ -267,19 +267,20 @@ def class_numbers(
         raise OptionError(
             "detector", expected=expected, got=got, remedy="export one whose classes differ"
         )
-    for whose, asked, names in (
+    for whose, requested, names in (
         ("the labelled", given, labelled),
         ("the detector's", given.values(), detector),
     ):
-        for name in asked:
+        for name in requested:
             if letters(name) not in map(letters, names):
                 expected = f"one of {whose} classes ({', '.join(names)})"
                 raise OptionError(
                     OPTION, expected=expected, got=repr(name), remedy="correct the name"
                 )
-    known = {letters(name): letters(own) for name, own in given.items()}
+    detector_letters = {letters(name): letters(own) for name, own in given.items()}
+    labelled_letters = [letters(name) for name in labelled]
     numbers = np.array(
-        [number.get(known.get(letters(name), letters(name)), -1) for name in labelled], np.int64
+        [number.get(detector_letters.get(key, key), -1) for key in labelled_letters], np.int64
     )
     if not (numbers >= 0).any():
         expected = f"a labelled class that the detector knows ({', '.join(detector)})"

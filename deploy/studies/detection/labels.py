@@ -14,6 +14,7 @@ Boxes are in continuous pixels of the image, pixel i covering [i, i + 1):
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -113,12 +114,13 @@ def _labels_near(top: Path, folder: Path) -> Path:
     for path in (swapped, folder, top / "labels", top / "Annotations", top):
         if _holds(path, (".xml", ".txt"), but="classes.txt"):
             return path
-        found = sorted(path.glob("*.json"))
-        if len(found) > 1:
-            raise _faulty(path, "one file of labels", f"{len(found)}", "name it as `labels`")
-        if found:
-            return found[0]
-    list_images(folder)  # which says so where there is no image either
+        json_files = sorted(path.glob("*.json"))
+        if len(json_files) > 1:
+            raise _faulty(path, "one file of labels", f"{len(json_files)}", "name it as `labels`")
+        if json_files:
+            return json_files[0]
+    # This call says so where there is no image either.
+    list_images(folder)
     raise _faulty(folder, LAYOUTS, "none beside the images", "give them as `labels`")
 
 
@@ -133,15 +135,15 @@ def _read_each(images: Sequence[Path], where: Path, named_in: Sequence[Path]) ->
         raise _faulty(
             where, LAYOUTS, "another file" if where.exists() else "no such folder", "give a folder"
         )
-    there = {path.name for path in where.iterdir()}
-    missing = [f"{image.stem}.xml" for image in images if f"{image.stem}.xml" not in there]
-    if not missing:
+    names_there = {path.name for path in where.iterdir()}
+    absent = [f"{image.stem}.xml" for image in images if f"{image.stem}.xml" not in names_there]
+    if not absent:
         return [_read_voc(image, where / f"{image.stem}.xml") for image in images]
-    if len(missing) < len(images):
-        got = f"{len(missing)} of {len(images)} missing, the first {missing[0]}"
+    if len(absent) < len(images):
+        got = f"{len(absent)} of {len(images)} missing, the first {absent[0]}"
         remedy = "leave those images out, or give them files without objects"
         raise _faulty(where, "a file of labels for every image", got, remedy)
-    if not any(f"{image.stem}.txt" in there for image in images):
+    if not any(f"{image.stem}.txt" in names_there for image in images):
         got = f"none named as one of the {len(images)} images"
         raise _faulty(where, LAYOUTS, got, "name each file as its image")
     names = yolo_names(named_in)
@@ -149,31 +151,34 @@ def _read_each(images: Sequence[Path], where: Path, named_in: Sequence[Path]) ->
 
 
 def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> LabelledSet:
-    names = sorted(sorted({name for one in files for name, *_ in one.boxes}), key=letters)
+    boxes = chain.from_iterable(one.boxes for one in files)
+    # Sorted twice: names of the same letters have a fixed order too.
+    names = sorted(sorted({name for name, *_ in boxes}), key=letters)
     number = {name: i for i, name in enumerate(names)}
     images = []
     lost = list[str]()
     for one in sorted(files, key=lambda one: one.image.name):
-        whole = Boxes.of(
+        labelled = Boxes.of(
             [corners for _, corners, _ in one.boxes],
             [number[name] for name, *_ in one.boxes],
             ignored=[ignored for *_, ignored in one.boxes],
         )
-        inside = whole[areas(whole.corners) > 0].clipped(*_size_px(one))
-        lost += [one.source.name] * (len(whole) - len(inside))
+        inside = labelled[areas(labelled.corners) > 0].clipped(*_size_px(one))
+        lost += [one.source.name] * (len(labelled) - len(inside))
         images.append((one.image, inside))
     if not any(len(truth) for _, truth in images):
         got = f"none on {len(images)} images"
         raise OptionError(
             "labels", expected="one object at least", got=got, remedy="check the labels"
         )
-    told = [*notes, *_remarks([truth for _, truth in images], lost)]
-    return LabelledSet(images, names, told)
+    remarks = [*notes, *_remarks([truth for _, truth in images], lost)]
+    return LabelledSet(images, names, remarks)
 
 
 def _size_px(one: _File) -> tuple[int, int]:
     """Height and width of an image in px; its labels must have been made for them."""
     height, width = image_size_px(one.image)
+    # Boxes in pixels fit only the image that they were drawn on.
     if min(one.size_px) > 0 and one.size_px != (height, width):
         expected = f"labels of an image of {height} x {width} px"
         got = f"{one.size_px[0]:g} x {one.size_px[1]:g} px"
@@ -205,7 +210,7 @@ def _remarks(truths: Sequence[Boxes], lost: Sequence[str]) -> list[str]:
             ),
         ),
     )
-    return [sentence for said, sentence in remarks if said]
+    return [sentence for occasion, sentence in remarks if occasion]
 
 
 def _read_voc_tree(folder: Path, split: str | None) -> list[_File]:
@@ -218,13 +223,14 @@ def _read_voc_tree(folder: Path, split: str | None) -> list[_File]:
         if p.suffix.lower() in IMAGE_SUFFIXES
     }
     labels = folder / "Annotations"
+    # DIOR has a folder of horizontal boxes and one of oriented ones.
     labels = labels / HORIZONTAL if (labels / HORIZONTAL).is_dir() else labels
     lists = {path.stem: path for path in sorted((folder / "ImageSets" / "Main").glob("*.txt"))}
     stems = list(images)
-    wanted = split or "test"
-    if wanted in lists:
+    list_name = split or "test"
+    if list_name in lists:
         # A list of one class has a number behind each name.
-        stems = sorted({line.split()[0] for line in _lines(lists[wanted])})
+        stems = sorted({line.split()[0] for line in _lines(lists[list_name])})
     elif split:
         raise _faulty(
             folder,
@@ -232,10 +238,10 @@ def _read_voc_tree(folder: Path, split: str | None) -> list[_File]:
             repr(split),
             "name one of them",
         )
-    missing = [stem for stem in stems if stem not in images]
-    if missing:
-        got = f"{len(missing)} of {len(stems)} missing, the first {missing[0]!r}"
-        raise _faulty(folder, f"every image of {wanted}", got, "unpack the images whole")
+    absent = [stem for stem in stems if stem not in images]
+    if absent:
+        got = f"{len(absent)} of {len(stems)} missing, the first {absent[0]!r}"
+        raise _faulty(folder, f"every image of {list_name}", got, "unpack the images whole")
     return [_read_voc(images[stem], labels / f"{stem}.xml") for stem in stems]
 
 
@@ -243,7 +249,8 @@ def _read_voc(image: Path, labels: Path) -> _File:
     text = _read_bytes(labels)
     try:
         root = parse_xml(text)
-    except (ValueError, LookupError, RecursionError) as error:  # lookup: of an encoding
+    except (ValueError, LookupError, RecursionError) as error:
+        # A LookupError is that of an unknown encoding.
         raise _faulty(labels, "plain XML", " ".join(str(error).split())[:100]) from error
     if root.tag != "annotation":
         raise _faulty(
@@ -263,6 +270,7 @@ def _voc_box(entry: ET.Element, path: Path) -> Box:
         raise _faulty(path, "a name for every object", "none")
     corners = [entry.findtext(f"bndbox/{corner}", "none") for corner in CORNERS]
     left, top, right, bottom = _numbers(corners, path, f"{', '.join(CORNERS)} of a {name!r}")
+    # VOC's corners count pixels from 1 and belong to the box.
     return (
         name,
         (left - 1, top - 1, right, bottom),
@@ -276,6 +284,7 @@ def _read_coco(labels: Path, folder: Path) -> tuple[list[_File], list[str]]:
     """
     try:
         content: Any = read_json(labels)
+        # `str.strip` raises TypeError where a name is no text, and the file is refused below.
         names = {entry["id"]: str.strip(entry["name"]) for entry in content["categories"]}
         boxes: dict[Any, list[Box]] = {entry["id"]: [] for entry in content["images"]}
         for entry in content["annotations"]:
@@ -311,13 +320,14 @@ def _read_coco(labels: Path, folder: Path) -> tuple[list[_File], list[str]]:
             "give the folder that holds them",
         )
     absent = listed - len(files)
-    return files, [
-        f"{absent} of {listed} images in {labels.name} are not in the folder."
-    ] if absent else []
+    if not absent:
+        return files, []
+    return files, [f"{absent} of {listed} images in {labels.name} are not in the folder."]
 
 
 def _inside(folder: Path, name: str) -> Path | None:
     """The file of that name in the folder, or of its last part; nothing outside the folder."""
+    # A name in the file must not lead out of the folder.
     if ".." in Path(name).parts or Path(name).is_absolute():
         return None
     return next(
@@ -326,6 +336,7 @@ def _inside(folder: Path, name: str) -> Path | None:
 
 
 def _read_yolo(image: Path, labels: Path, names: Sequence[str]) -> _File:
+    # In YOLO an image without a file shows no object.
     lines = _lines(labels) if labels.exists() else []
     size_px = image_size_px(image)
     return _File(image, labels, [_yolo_box(line, labels, names, size_px) for line in lines])
@@ -343,6 +354,7 @@ def _yolo_box(line: str, path: Path, names: Sequence[str], size_px: tuple[int, i
     if min(shares) < -SPAN or max(shares) > 1 + SPAN:
         remedy = "divide pixels by the image's width and height"
         raise _faulty(path, "coordinates as shares of the image, 0 to 1", repr(line[:80]), remedy)
+    # The size is height and width, and the points are x and y.
     points = np.reshape(shares, (-1, 2)) * size_px[::-1]
     if len(shares) == 4:
         middle, size = points
@@ -356,8 +368,8 @@ def yolo_names(folders: Sequence[Path]) -> tuple[str, ...]:
     """
     for folder in folders:
         for path in (*sorted(folder.glob("*.yaml")), *sorted(folder.glob("*.yml"))):
-            if found := _yaml_names(path):
-                return found
+            if names := _yaml_names(path):
+                return names
         if (folder / "classes.txt").is_file():
             return tuple(line.strip() for line in _lines(folder / "classes.txt"))
     expected = "data.yaml or classes.txt with the names of the classes"
@@ -391,11 +403,8 @@ def _yaml_names(path: Path) -> tuple[str, ...]:
 
 
 def _lines(path: Path) -> list[str]:
-    return [
-        line
-        for line in _read_bytes(path).decode("utf-8-sig", "replace").splitlines()
-        if line.strip()
-    ]
+    text = _read_bytes(path).decode("utf-8-sig", "replace")
+    return [line for line in text.splitlines() if line.strip()]
 
 
 def _read_bytes(path: Path, limit_bytes: int = LABEL_BYTES) -> bytes:
@@ -409,12 +418,12 @@ def _read_bytes(path: Path, limit_bytes: int = LABEL_BYTES) -> bytes:
 
 def _numbers(texts: Sequence[str], path: Path, what: str) -> list[float]:
     try:
-        found = [float(text) for text in texts]
+        numbers = [float(text) for text in texts]
     except ValueError:
-        found = [math.nan]
-    if not all(map(math.isfinite, found)):
+        numbers = [math.nan]
+    if not all(map(math.isfinite, numbers)):
         raise _faulty(path, f"numbers as {what}", repr(" ".join(texts))[:80])
-    return found
+    return numbers
 
 
 def _faulty(path: Path, expected: str, got: str, remedy: str = "correct the labels") -> OptionError:

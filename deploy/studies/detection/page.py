@@ -64,71 +64,78 @@ def write_page(
         path: of the page.
     """
     tables = [
-        Section(name, each, CAPTIONS.get(name.split(",")[0], ""))
-        for name, each in by_table(rows).items()
+        Section(name, table, CAPTIONS.get(name.split(",")[0], ""))
+        for name, table in by_table(rows).items()
     ]
-    truths = [each.scene.truth for each in compared[0].scenes]
+    truths = [acquired.scene.truth for acquired in compared[0].scenes]
     objects = sum(int((~truth.ignored).sum()) for truth in truths)
     title = f"What restoration buys a detector: {objects} objects on {len(truths)} images"
     pictures = [curves(compared), *crops(compared)]
-    said = (*notes, *NOTES, *PAPER_NOTES)
-    write_report(Report(title, headline(compared), tables, pictures, said), path)
+    sentences = (*notes, *NOTES, *PAPER_NOTES)
+    write_report(Report(title, headline(compared), tables, pictures, sentences), path)
 
 
 def curves(compared: Sequence[Comparison]) -> Picture:
     """Precision by recall at an overlap of one half, means over classes: a panel a sensor."""
-    panels = [(found.name, [_curve(found, row) for row in found.hits]) for found in compared]
+    panels = [
+        (comparison.name, [_curve(comparison, row) for row in comparison.hits])
+        for comparison in compared
+    ]
     svg = curves_svg(panels, "recall", "precision", logarithmic=False)
     caption = "At an overlap of 0.5, mean over the classes that are labelled."
     return Picture("Precision by recall", data_url(svg), caption)
 
 
-def _curve(found: Comparison, row: str) -> Curve:
-    hits = found.hits[row]
-    once = np.ones((1, len(found.scenes)), np.int64)
-    values = mean_known(
-        np.array([precisions(hits, kind, once)[0, 0] for kind in range(len(found.names))])
-    )
+def _curve(comparison: Comparison, row: str) -> Curve:
+    hits = comparison.hits[row]
+    once = np.ones((1, len(comparison.scenes)), np.int64)
+    by_class = [precisions(hits, kind, once)[0, 0] for kind in range(len(comparison.names))]
+    values = mean_known(np.array(by_class))
     points = tuple(zip(RECALLS.tolist(), values.tolist(), strict=True))
-    return Curve(row, list(found.hits).index(row) % len(SERIES), row == REFERENCE, points)
+    return Curve(row, list(comparison.hits).index(row) % len(SERIES), row == REFERENCE, points)
 
 
 def crops(compared: Sequence[Comparison]) -> list[Picture]:
     """The same crops of the scenes that lose most objects: a row a sensor and a column a method."""
-    lost = [
-        sum(int(_lost(found, number).sum()) for found in compared)
+    losses = [
+        sum(int(_lost(comparison, number).sum()) for comparison in compared)
         for number in range(len(compared[0].scenes))
     ]
-    chosen = np.argsort(-np.array(lost), kind="stable")[:PICTURES]
-    return [_picture(compared, int(number)) for number in chosen]
+    numbers = np.argsort(-np.array(losses), kind="stable")[:PICTURES]
+    return [_picture(compared, int(number)) for number in numbers]
 
 
-def _lost(found: Comparison, number: int) -> np.ndarray:
+def _lost(comparison: Comparison, number: int) -> np.ndarray:
     """(M,) objects of a scene that are found on the reference and not on degraded images."""
     return np.asarray(
-        _matched(found, REFERENCE, number)[-1] & ~_matched(found, DEGRADED, number)[-1]
+        _matched(comparison, REFERENCE, number)[-1] & ~_matched(comparison, DEGRADED, number)[-1]
     )
 
 
 def _matched(
-    found: Comparison, row: str, number: int
+    comparison: Comparison, row: str, number: int
 ) -> tuple[Boxes, np.ndarray, np.ndarray, np.ndarray]:
     """The boxes on a scene that reach the table's confidence; hits, ignored ones, and objects
     taken, by half.
     """
-    boxes = found.boxes[row][number]
-    sure = boxes[boxes.scores >= found.confidence]
-    hits, ignored, taken = (
-        flags[ALL, 0] for flags in match(found.scenes[number].scene.truth, sure)
+    boxes = comparison.boxes[row][number]
+    # The pictures show what the table counts.
+    sure = boxes[boxes.scores >= comparison.confidence]
+    hits, ignored, matched = (
+        flags[ALL, 0] for flags in match(comparison.scenes[number].scene.truth, sure)
     )
-    return sure, hits, ignored, taken
+    return sure, hits, ignored, matched
 
 
 def _picture(compared: Sequence[Comparison], number: int) -> Picture:
     middle = _middle(compared[0], number)
-    rows = [[_cell(found, row, number, middle) for row in found.methods] for found in compared]
+    rows = [
+        [_cell(comparison, row, number, middle) for row in comparison.methods]
+        for comparison in compared
+    ]
+    sensors = " and ".join(comparison.name for comparison in compared)
     caption = (
-        f"Rows: {' and '.join(found.name for found in compared)}. {CROP_PX} pixels of the "
+        f"Rows: {sensors}. {CROP_PX} pixels of the "
         "sensor a side, enlarged "
         f"{ZOOM} times, one display for all. Boxes at the confidence of the table: green found, "
         "red missed, "
@@ -140,43 +147,44 @@ def _picture(compared: Sequence[Comparison], number: int) -> Picture:
     )
 
 
-def _middle(found: Comparison, number: int) -> np.ndarray:
+def _middle(comparison: Comparison, number: int) -> np.ndarray:
     """(2,) x and y in scene pixels of the object, a lost one if there is any, with most such near
     it.
     """
-    truth = found.scenes[number].scene.truth
-    lost = _lost(found, number)
-    shown = truth.corners[lost] if lost.any() else truth.corners
-    if not len(shown):
+    truth = comparison.scenes[number].scene.truth
+    lost_objects = _lost(comparison, number)
+    corners = truth.corners[lost_objects] if lost_objects.any() else truth.corners
+    if not len(corners):
         return np.zeros(2)
-    middles = (shown[:, :2] + shown[:, 2:]) / 2
+    middles = (corners[:, :2] + corners[:, 2:]) / 2
     near = (
-        np.abs(middles[:, None] - middles[None]).max(-1) < CROP_PX * found.sensors.oversampling / 2
+        np.abs(middles[:, None] - middles[None]).max(-1)
+        < CROP_PX * comparison.sensors.oversampling / 2
     )
     return np.asarray(middles[int(near.sum(axis=1).argmax())])
 
 
-def _cell(found: Comparison, row: str, number: int, middle: np.ndarray) -> np.ndarray:
+def _cell(comparison: Comparison, row: str, number: int, middle: np.ndarray) -> np.ndarray:
     """An enlarged crop around a place of the scene, what is missed, falsely found and found drawn
     over it.
     """
-    scene = found.scenes[number]
-    ratio = found.sensors.oversampling
-    truth, (boxes, hits, ignored, taken) = scene.scene.truth, _matched(found, row, number)
-    rgb = np.rint(255 * scene.shown(found.methods[row])).astype(np.uint8)
+    scene = comparison.scenes[number]
+    ratio = comparison.sensors.oversampling
+    truth = scene.scene.truth
+    boxes, hits, ignored, matched = _matched(comparison, row, number)
+    rgb = np.rint(255 * scene.shown(comparison.methods[row])).astype(np.uint8)
     most = np.maximum(np.array(rgb.shape[1::-1]) - CROP_PX, 0)
     left, top = corner = np.clip(middle / ratio - CROP_PX / 2, 0, most).astype(int).tolist()
-    crop = Image.fromarray(rgb).crop(
-        (left, top, left + CROP_PX, top + CROP_PX)
-    )  # black beyond the image
+    # Pillow fills with black what lies beyond the image.
+    crop = Image.fromarray(rgb).crop((left, top, left + CROP_PX, top + CROP_PX))
     picture = crop.resize((CROP_PX * ZOOM, CROP_PX * ZOOM), Image.Resampling.NEAREST)
     draw = ImageDraw.Draw(picture)
-    shown = (
-        (truth.corners[~taken & ~truth.ignored], MISSED),
+    layers = (
+        (truth.corners[~matched & ~truth.ignored], MISSED),
         (boxes.corners[~hits & ~ignored], FALSE),
         (boxes.corners[hits], FOUND),
     )
-    for corners, colour in shown:
+    for corners, colour in layers:
         for x1, y1, x2, y2 in (corners / ratio - np.tile(corner, 2)) * ZOOM:
             draw.rectangle((x1, y1, max(x2 - 1, x1), max(y2 - 1, y1)), outline=colour, width=2)
     return np.asarray(picture)

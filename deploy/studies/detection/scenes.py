@@ -11,7 +11,7 @@ span, tanks of 5 to 15 m radius.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -51,14 +51,15 @@ def synthetic_scene(
             covers it.
     """
     canvas = Canvas(height_px, width_px, generator)
-    angle, (x, y) = generator.uniform(-0.5, 0.5), generator.uniform(-0.5, 0.5, 2) * PLOT_M
+    angle = generator.uniform(-0.5, 0.5)
+    x, y = generator.uniform(-0.5, 0.5, 2) * PLOT_M
     # Half the diagonal: how far from the centre there is something to draw.
     world = drawing.turn(x, y, angle)
     reach = math.hypot(width_px, height_px) * SCENE_GSD_M / 2 + PLOT_M
     places = (np.arange(math.ceil(2 * reach / PLOT_M)) + 0.5) * PLOT_M - reach
     half_m = (PLOT_M - STREET_M) / 2 - KERB_M
     turn = drawing.turn
-    plots = [Plot(canvas, turn(*world(u, v), angle), half_m) for v in places for u in places]
+    plots = [Plot(canvas, turn(*world(u, v), angle), half_m) for v, u in product(places, places)]
     strips = [
         Plot(canvas, turn(*world(p + PLOT_M / 2, 0), angle + math.pi / 2), reach) for p in places
     ]
@@ -80,23 +81,20 @@ class Canvas:
         self.corners: list[tuple[int, int, int, int]] = []
         self.classes: list[int] = []
         self.size = width_px, height_px
-        self._image, self._taken = (
-            Image.new("F", self.size, drawing.GRASS),
-            Image.new("L", self.size, 0),
-        )
+        self._image = Image.new("F", self.size, drawing.GRASS)
+        self._occupied = Image.new("L", self.size, 0)
         self.draw = ImageDraw.Draw(self._image)
 
     def textured(self) -> np.ndarray:
         """The radiance (H, W) float32 with the ground's texture."""
         width, height = self.size
-        return np.asarray(
-            np.asarray(self._image) * drawing.texture(height, width, self.generator), np.float32
-        )
+        texture = drawing.texture(height, width, self.generator)
+        return np.asarray(np.asarray(self._image) * texture, np.float32)
 
     def is_free(self, left: float, top: float, right: float, bottom: float) -> bool:
         """Whether no object stands in a rectangle, in pixels."""
-        whole = math.floor(left), math.floor(top), math.floor(right), math.floor(bottom)
-        return self._taken.crop(whole).getbbox() is None
+        box = math.floor(left), math.floor(top), math.floor(right), math.floor(bottom)
+        return self._occupied.crop(box).getbbox() is None
 
     def put(self, kind: int, polygons: list[Part], shadow_px: float) -> None:
         """Draw an object of polygons in pixels, over the shadow that it throws right and down."""
@@ -108,11 +106,10 @@ class Canvas:
         for polygon, paint in polygons:
             self.draw.polygon(polygon, fill=paint)
             ImageDraw.Draw(own).polygon(polygon, fill=255)
-        self._taken.paste(255, mask=own)
+        self._occupied.paste(255, mask=own)
         self.classes.append(kind)
-        self.corners.append(
-            own.getbbox() or (0, 0, 0, 0)
-        )  # of the pixels that Pillow fills, not of the polygons
+        # The box of the pixels that Pillow fills, not of the polygons.
+        self.corners.append(own.getbbox() or (0, 0, 0, 0))
 
 
 @dataclass(frozen=True)
@@ -135,8 +132,8 @@ class Plot:
         `by` pixels.
         """
         corners = [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
-        moved = [drawing.shift(self._pixel(*corner), by) for corner in corners]
-        self.canvas.draw.polygon(moved, fill=radiance)
+        outline = [drawing.shift(self._pixel(*corner), by) for corner in corners]
+        self.canvas.draw.polygon(outline, fill=radiance)
 
     def pad(self, radiance: float) -> None:
         """Fill the whole plot."""
@@ -179,7 +176,7 @@ class Plot:
             return False
         self.canvas.put(
             kind,
-            [(each, paint) for each, (_, paint) in zip(polygons, parts, strict=True)],
+            [(polygon, paint) for polygon, (_, paint) in zip(polygons, parts, strict=True)],
             shadow_px,
         )
         return True
@@ -190,7 +187,8 @@ class Plot:
             any(put(*self.random.uniform(-self.half_m, self.half_m, 2)) for _ in range(TRIES))
 
     def _pixel(self, x: float, y: float) -> Point:
-        (right, down), (width, height) = self.place(x, y), self.canvas.size
+        right, down = self.place(x, y)
+        width, height = self.canvas.size
         return right / SCENE_GSD_M + width / 2, down / SCENE_GSD_M + height / 2
 
 
@@ -360,11 +358,11 @@ def _car_park(plot: Plot) -> None:
     """Rows of stalls between lanes, some 60 % taken, a few trees in between."""
     plot.pad(drawing.ASPHALT * plot.random.uniform(0.9, 1.6))
     half = plot.half_m
-    taken = plot.random.uniform(0.2, 0.9)
+    occupancy = plot.random.uniform(0.2, 0.9)
     for y in np.arange(6.0 - half, half - 4, 13.0):
         for x in np.arange(3.0 - half, half - 3, 2.9):
             plot.line((x - 1.45, y - 2.6), (x - 1.45, y + 2.6), drawing.WHITE * 0.6, 0.25)
-            if plot.random.random() < taken:
+            if plot.random.random() < occupancy:
                 turned = math.pi / 2 * plot.random.choice([-1, 1]) + plot.random.normal(0, 0.03)
                 plot.put(VEHICLE, vehicle(plot.random), x, y, turned, 0.8)
         if plot.random.random() < 0.5:

@@ -101,13 +101,14 @@ class AcquiredScene:
 
         Every row's image of a scene is shown alike, stretched as the reference asks.
         """
+        # All rows of a scene share the stretch of the reference, so that contrast compares.
         dn = self.reference if method is None else method.restore(self.degraded)
         return stretch_of(self.reference).to_srgb(dn)
 
     def boxes(self, detector: Detector, method: Method | None) -> Boxes:
         """What a detector finds on it, in scene pixels; arguments as of `shown`."""
-        found = detector.detect(self.shown(method))
-        return replace(found, corners=found.corners * self.sensors.oversampling)
+        detections = detector.detect(self.shown(method))
+        return replace(detections, corners=detections.corners * self.sensors.oversampling)
 
     def _acquired(self, profile: Sensor, role: str) -> np.ndarray:
         sensor = profile.draw(self.draw.generator("sensor"))
@@ -147,7 +148,7 @@ class Comparison:
     @property
     def sites(self) -> int:
         """How many different ones there are."""
-        return len({each.scene.site for each in self.scenes})
+        return len({acquired.scene.site for acquired in self.scenes})
 
 
 def run_study(
@@ -172,16 +173,16 @@ def run_study(
         seed: of every random draw.
         say: is told what a user should know on the way.
     """
-    told = once(say)
+    log_once = once(say)
     pairs = [
-        SensorPair(each, reference_beside(each, reference, told))
-        for each in map(load_sensor, sensors)
+        SensorPair(profile, reference_beside(profile, reference, log_once))
+        for profile in map(load_sensor, sensors)
     ]
     rows = [
-        {name: method_named(name, pair.degraded, pair.reference, told) for name in methods}
+        {name: method_named(name, pair.degraded, pair.reference, log_once) for name in methods}
         for pair in pairs
     ]
-    return [_compared(detector, scenes, *each, seed) for each in zip(pairs, rows, strict=True)]
+    return [_compared(detector, scenes, *inputs, seed) for inputs in zip(pairs, rows, strict=True)]
 
 
 def _compared(
@@ -194,16 +195,15 @@ def _compared(
     rows = {REFERENCE: None, **methods}
     boxes: dict[str, list[Boxes]] = {row: [] for row in rows}
     with steps(f"detecting, {sensors.degraded.name}", len(scenes) * len(rows)) as bar:
-        for each in acquired(
-            scenes, sensors, seed
-        ):  # let go of after its rows: thousands would fill the memory
+        # Each scene is let go of after its rows: thousands would fill the memory.
+        for scene in acquired(scenes, sensors, seed):
             for row, method in rows.items():
-                boxes[row].append(each.boxes(detector, method))
+                boxes[row].append(scene.boxes(detector, method))
                 bar.advance(1, row)
     names = detector.names
     truths = [scene.truth for scene in scenes]
     sites = [scene.site for scene in scenes]
-    hits = {row: find_hits(truths, found, len(names)) for row, found in boxes.items()}
+    hits = {row: find_hits(truths, row_boxes, len(names)) for row, row_boxes in boxes.items()}
     scores = score_rows(hits, names, site_weights(sites, seed))
     return Comparison(
         sensors, rows, list(acquired(scenes, sensors, seed)), boxes, hits, *scores, names
@@ -279,6 +279,7 @@ def labelled_scenes(
 
 
 def _of_file(path: Path, truth: Boxes) -> LabelledScene:
+    # The call binds `path`: a lambda in a loop over the files would read the last of them.
     return LabelledScene(
         path.name, site_of(path.name), truth, path, lambda sensor: read_scene(path, sensor).radiance
     )
@@ -287,8 +288,8 @@ def _of_file(path: Path, truth: Boxes) -> LabelledScene:
 def left_out(labelled: Sequence[str], numbers: np.ndarray) -> list[str]:
     """A sentence on the labelled classes that the detector does not know, where there are such."""
     names = ", ".join(name for name, number in zip(labelled, numbers, strict=True) if number < 0)
-    return (
-        [f"Not known to the detector and left out: {names}. What it finds there counts as false."]
-        if names
-        else []
-    )
+    if not names:
+        return []
+    return [
+        f"Not known to the detector and left out: {names}. What it finds there counts as false."
+    ]

@@ -33,6 +33,7 @@ def detection_rows(found: Comparison) -> list[Row]:
     """The tables of one sensor: the answer, each row at its own confidence, by
     class and by size.
     """
+    # A class without a labelled object has no average precision.
     labelled = [
         name for name in found.names if not isnan(found.figures[REFERENCE][f"mAP50 of {name}"][0])
     ]
@@ -52,23 +53,24 @@ def detection_rows(found: Comparison) -> list[Row]:
     ]
 
 
-def _main_row(found: Comparison, row: str) -> Row:
+def _main_row(comparison: Comparison, row: str) -> Row:
     """Precision and recall at one confidence for all rows; gains and losses in mAP50, paired by
     draw.
     """
-    figures = _values(
-        found, row, {name: name for name in ("mAP50", "mAP50-95", "precision", "recall")}
+    keys = ("mAP50", "mAP50-95", "precision", "recall")
+    figures = _values(comparison, row, dict(zip(keys, keys, strict=True)))
+    reference, degraded, own = (
+        comparison.figures[name]["mAP50"] for name in (REFERENCE, DEGRADED, row)
     )
-    reference, degraded, own = (found.figures[name]["mAP50"] for name in (REFERENCE, DEGRADED, row))
-    method = found.methods[row]
+    method = comparison.methods[row]
     words = {"sensor": method.sensor_known} if method else {}
     if row != REFERENCE:
-        figures[LOSS] = _figure(found, reference - own, POINTS)
+        figures[LOSS] = _figure(comparison, reference - own, POINTS)
     if row not in (REFERENCE, DEGRADED):
-        figures[GAIN] = _figure(found, own - degraded, POINTS)
-        figures[REGAINED] = _regained(found, own - degraded, reference - degraded)
-        words["against degraded"] = verdict(own - degraded, found.sites)
-    return Row(f"{MAIN}, {found.name}", row, figures, words)
+        figures[GAIN] = _figure(comparison, own - degraded, POINTS)
+        figures[REGAINED] = _regained(comparison, own - degraded, reference - degraded)
+        words["against degraded"] = verdict(own - degraded, comparison.sites)
+    return Row(f"{MAIN}, {comparison.name}", row, figures, words)
 
 
 def verdict(difference: np.ndarray, sites: int) -> str:
@@ -83,38 +85,43 @@ def verdict(difference: np.ndarray, sites: int) -> str:
     return "a gain" if difference[0] > 0 else "a loss"
 
 
-def _regained(found: Comparison, gain: np.ndarray, loss: np.ndarray) -> Figure:
+def _regained(comparison: Comparison, gain: np.ndarray, loss: np.ndarray) -> Figure:
     """The share of a loss that a gain makes good; unavailable where the loss
     cannot be told from 0.
     """
-    if too_few(found.sites):
-        return unavailable(PERCENT, too_few(found.sites))
-    if verdict(loss, found.sites) not in ("a gain", "a loss"):
+    if too_few(comparison.sites):
+        return unavailable(PERCENT, too_few(comparison.sites))
+    if verdict(loss, comparison.sites) not in ("a gain", "a loss"):
         return unavailable(PERCENT, NO_LOSS)
-    return _figure(found, np.divide(gain, loss, out=np.full(gain.shape, np.nan), where=loss != 0))
+    # A draw without a loss has no share: it is NaN, and the interval leaves it out.
+    return _figure(
+        comparison, np.divide(gain, loss, out=np.full(gain.shape, np.nan), where=loss != 0)
+    )
 
 
-def _own_row(found: Comparison, row: str) -> Row:
-    figures = _values(found, row, {"precision": "own precision", "recall": "own recall"})
-    own = float(found.figures[row]["own confidence"][0])
-    known = (
+def _own_row(comparison: Comparison, row: str) -> Row:
+    figures = _values(comparison, row, {"precision": "own precision", "recall": "own recall"})
+    own = float(comparison.figures[row]["own confidence"][0])
+    confidence = (
         unavailable("ratio", NO_OBJECT) if isnan(own) else measured(own, "ratio", "largest mean F1")
     )
-    return Row(f"{OWN}, {found.name}", row, {**figures, "confidence": known})
+    return Row(f"{OWN}, {comparison.name}", row, {**figures, "confidence": confidence})
 
 
-def _values(found: Comparison, row: str, keys: Mapping[str, str]) -> dict[str, Figure]:
-    return {shown: _figure(found, found.figures[row][key]) for shown, key in keys.items()}
+def _values(comparison: Comparison, row: str, keys: Mapping[str, str]) -> dict[str, Figure]:
+    return {
+        column: _figure(comparison, comparison.figures[row][key]) for column, key in keys.items()
+    }
 
 
-def _figure(found: Comparison, values: np.ndarray, unit: str = PERCENT) -> Figure:
+def _figure(comparison: Comparison, values: np.ndarray, unit: str = PERCENT) -> Figure:
     """A share of 0 to 1, or a difference of two, (1 + draws,), times 100; its interval where sites
     are enough.
     """
     if isnan(values[0]):
         return unavailable(unit, NO_OBJECT)
-    source = f"{len(found.scenes)} images of {found.sites} sites"
-    ends = interval(values, found.sites)
+    source = f"{len(comparison.scenes)} images of {comparison.sites} sites"
+    ends = interval(values, comparison.sites)
     if ends is None:
         return measured(100 * float(values[0]), unit, source)
     source = f"{source}, 95 % bootstrap interval over sites ({DRAWS} draws)"
@@ -143,8 +150,8 @@ def paper_rows() -> list[Row]:
     }
     words = {"what differs": DIFFERS}
     return [
-        Row(PAPER_TABLE, name, dict(zip(keys, each, strict=True)), words)
-        for name, each in printed.items()
+        Row(PAPER_TABLE, name, dict(zip(keys, figures, strict=True)), words)
+        for name, figures in printed.items()
     ]
 
 
@@ -167,12 +174,12 @@ PAPER_NOTES = (
 
 def headline(compared: Sequence[Comparison]) -> str:
     """A sentence a sensor: what was lost, and what the last of the methods brought back."""
-    return " ".join(_sentence(found) for found in compared)
+    return " ".join(_sentence(comparison) for comparison in compared)
 
 
-def _sentence(found: Comparison) -> str:
-    rows = {row: _main_row(found, row) for row in found.methods}
-    text = f"{found.name}: mAP50 is {rows[REFERENCE].figures['mAP50']} % on reference images"
+def _sentence(comparison: Comparison) -> str:
+    rows = {row: _main_row(comparison, row) for row in comparison.methods}
+    text = f"{comparison.name}: mAP50 is {rows[REFERENCE].figures['mAP50']} % on reference images"
     text += f" and {rows[DEGRADED].figures[LOSS]} points less on degraded ones"
     last = list(rows.values())[-1]
     if GAIN in last.figures:

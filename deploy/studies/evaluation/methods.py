@@ -6,6 +6,7 @@ libraries' ways, and networks.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Final
 
@@ -39,8 +40,7 @@ ORDERS: dict[str, Order] = {TRADITIONAL: "denoise-first", DECONVOLVE_FIRST: "dec
 CHAINS: dict[str, tuple[str, Order]] = {
     **{
         f"{name}-{quality}": (quality, order)
-        for name, order in ORDERS.items()
-        for quality in QUALITIES
+        for (name, order), quality in product(ORDERS.items(), QUALITIES)
     },
     **{
         name: ("standard", order)
@@ -86,7 +86,8 @@ def method_without_network(name: str, degraded: Instrument, reference: Instrumen
     """
     if name == DEGRADED:
         return Method(name, lambda dn: dn, "the input itself")
-    (quality, order), run = CHAINS[name], PEERS.get(name, restore_traditional)
+    quality, order = CHAINS[name]
+    run = PEERS.get(name, restore_traditional)
 
     def specialise(sensor: Instrument) -> Restore:
         chain = Chain(sensor, reference.in_units_of(sensor), quality, order)
@@ -124,19 +125,20 @@ def method_named(
     if not shipped and Path(network).suffix not in (".onnx", ".safetensors"):
         raise OptionError("methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
     sensor = load_sensor(other) if other else degraded
-    found = conditioned(Path(network))
-    if found is None:
+    bank_network = conditioned(Path(network))
+    if bank_network is None:
         model = float_model(network_file(Path(network), sensor, log))
         restore = with_steps(model, {}, sensor, reference.nominal(), around)
         return Method(name, restore, knowledge_of(model, degraded.name))
-    model = found.model(sensor, network.endswith(INT8))
-    warn_outside(sensor, found.kernels, log)
-    specialise = (
-        None
-        if other
-        else _network_specialise(network, found, degraded, reference.nominal(), around, log)
-    )
-    restore = _conditioned_restore(network, found, sensor, reference.nominal(), around)
+    model = bank_network.model(sensor, network.endswith(INT8))
+    warn_outside(sensor, bank_network.kernels, log)
+    specialise = None
+    # A name with @SENSOR asks for that sensor: another one does not take its place.
+    if not other:
+        specialise = _network_specialise(
+            network, bank_network, degraded, reference.nominal(), around, log
+        )
+    restore = _conditioned_restore(network, bank_network, sensor, reference.nominal(), around)
     return Method(name, restore, knowledge_of(model, degraded.name), specialise)
 
 
@@ -146,9 +148,9 @@ def _network_specialise(
     """A conditioned network given any sensor in the grid of a profile."""
 
     def specialise(sensor: Instrument) -> Restore:
-        known = profile_of(sensor, like)
-        warn_outside(known, network.kernels, log)
-        return _conditioned_restore(name, network, known, reference, around)
+        profile = profile_of(sensor, like)
+        warn_outside(profile, network.kernels, log)
+        return _conditioned_restore(name, network, profile, reference, around)
 
     return specialise
 
@@ -158,6 +160,7 @@ def _conditioned_restore(
 ) -> Restore:
     """A conditioned network for one sensor, with its exposures."""
     int8 = name.endswith(INT8)
+    # Dark parts are restored at a higher exposure, each by the network of a brighter sensor.
     factors = factors_for(sensor.nominal()) if around.exposure else (1,)
     models = {
         factor: network.model(brightened(sensor, factor) if factor > 1 else sensor, int8)
@@ -176,6 +179,7 @@ def with_steps(
 ) -> Restore:
     """A network with the steps around it; the consistency step only where a sensor is known."""
     instrument = sensor.nominal()
+    # The consistency step blurs the result as the sensor does: it needs one that is known.
     aim = None
     if around.consistency and sensor.name != NOT_KNOWN:
         aim = reference.in_units_of(instrument)
@@ -185,6 +189,7 @@ def with_steps(
 def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:
     """What a network knows of the sensor of that name: it, nothing, or another one."""
     own = metadata(model).get("sensor", "")
+    # A file without a sensor in its metadata was conditioned on none.
     if own in ("", NOT_KNOWN, BLIND_PROFILE):
         return BLIND
     return KNOWN if own == sensor_name else f"another: {own}"
@@ -198,10 +203,12 @@ def profile_of(sensor: Instrument, like: Sensor) -> Sensor:
         "mtf_nyquist_along": along,
         "alpha": sensor.alpha,
         "beta": sensor.beta,
+        "gain_dn_per_radiance": sensor.gain_dn_per_radiance,
+        "bits": float(sensor.bits),
     }
-    numbers |= {"gain_dn_per_radiance": sensor.gain_dn_per_radiance, "bits": float(sensor.bits)}
     constants = {
         name: Constant(value, "assumed", "a sensor drawn") for name, value in numbers.items()
     }
+    # The sensor has alpha and beta: SNRs would have them drawn again.
     noise = {"snr_0": None, "snr_1": None}
     return replace(like, name="drawn", **constants, **noise, response=sensor.response)  # type: ignore[arg-type]

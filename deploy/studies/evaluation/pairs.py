@@ -118,14 +118,18 @@ def simulate_pairs(
         if ratio is None:
             small.append(scene.name)
             continue
+        # A scene that is left out takes a number too: the draws of the others do not depend on it.
         draw = Draw(seed, number)
-        seen_by, meant_by = (
-            each if isinstance(each, Instrument) else each.draw(draw.generator("sensor"))
-            for each in (degraded, reference)
+        camera, aim = (
+            source if isinstance(source, Instrument) else source.draw(draw.generator("sensor"))
+            for source in (degraded, reference)
         )
+        # Both sensors and the reference without noise share the spectrum of the scene.
         ready = acquire.prepare_scene(scene.radiance, ratio)
-        seen, meant, clean = acquire.acquire_three(ready, seen_by, meant_by, draw)
-        pairs.append(NamedPair(scene.name, seen, meant, oversampling=ratio, noise_free=clean))
+        degraded_dn, reference_dn, clean = acquire.acquire_three(ready, camera, aim, draw)
+        pairs.append(
+            NamedPair(scene.name, degraded_dn, reference_dn, oversampling=ratio, noise_free=clean)
+        )
     if not pairs:
         least = oversamplings[-1] * (2 * acquire.MARGIN_PX + acquire.LEAST_SIDE_PX)
         expected = f"scenes of {least} pixels a side or more"
@@ -170,12 +174,16 @@ def read_pairs(
     """
     pairs = []
     for degraded, reference in pair_files(folder):
-        seen, meant = (read_acquisition(path, max_dn=max_dn) for path in (degraded, reference))
-        if seen.shape != meant.shape:
-            sizes = " and ".join(f"{a.shape[1]} x {a.shape[0]}" for a in (seen, meant))
+        degraded_dn, reference_dn = (
+            read_acquisition(path, max_dn=max_dn) for path in (degraded, reference)
+        )
+        if degraded_dn.shape != reference_dn.shape:
+            sizes = " and ".join(
+                f"{image.shape[1]} x {image.shape[0]}" for image in (degraded_dn, reference_dn)
+            )
             expected = "two images of one size"
             remedy = "crop them alike"
             raise ImageError(f"pair {degraded.stem}", expected=expected, got=sizes, remedy=remedy)
         place = recipe.site(degraded.stem) if recipe else None
-        pairs.append(NamedPair(degraded.stem, seen, meant, place))
+        pairs.append(NamedPair(degraded.stem, degraded_dn, reference_dn, place))
     return pairs

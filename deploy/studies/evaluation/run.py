@@ -7,6 +7,7 @@ The page has the tables, and the same crops of every method with their errors be
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import cast
 
@@ -150,19 +151,20 @@ def evaluate(
 
     Examples:
         >>> pair = bd.simulate(size=96)
-        >>> found = bd.evaluate({"mine": lambda image: image, "convbeers-xs": "convbeers-xs"},
-            [pair])
-        >>> [row.name for row in found.mean][:3]
+        >>> methods = {"mine": lambda image: image, "convbeers-xs": "convbeers-xs"}
+        >>> evaluation = bd.evaluate(methods, [pair])
+        >>> [row.name for row in evaluation.mean][:3]
         ['degraded', 'mine', 'convbeers-xs']
     """
-    asked = {
+    named_methods = {
         DEGRADED: DEGRADED,
         **(methods if isinstance(methods, Mapping) else {name: name for name in methods}),
     }
     folder = Path(pairs) if isinstance(pairs, str | os.PathLike) else None
-    made = None if pairs is None or isinstance(pairs, str | os.PathLike) else list(pairs)
-    if made and sensor is None:
-        sensor, reference = made[0].profiles
+    given_pairs = None if pairs is None or isinstance(pairs, str | os.PathLike) else list(pairs)
+    if given_pairs and sensor is None:
+        # Simulated pairs know the sensors that made them.
+        sensor, reference = given_pairs[0].profiles
     factors = check_brightness(brightness)
     if pairs is not None and len(factors) > 1:
         expected = "no brightness with pairs, which are as they are"
@@ -171,59 +173,60 @@ def evaluate(
     recipe = read_pairs_recipe(folder) if folder else None
     sensors = profiles_for(sensor, reference, recipe, log)
     scenes, weights = (None if path is None else Path(path) for path in (images, lpips))
-    told = once(log)
+    log_once = once(log)
     with reporting(progress):
         around = Around(consistency, exposure)
-        ways = [_method(name, each, sensors, told, around) for name, each in asked.items()]
-        instruments = _instruments(weights, sensors[0])
-        said = list[str]()
-        seen = list[Row]()
-        if made is not None:
-            loaded = [_named(number, pair) for number, pair in enumerate(made)]
+        compared = [
+            _method(name, source, sensors, log_once, around)
+            for name, source in named_methods.items()
+        ]
+        nominal = sensors[0].nominal()
+        distances = scores.perceptual_distances(weights)
+        instruments = scores.Instruments(distances, nominal.max_dn, nominal.offset_dn)
+        remarks = list[str]()
+        sensor_rows = list[Row]()
+        if given_pairs is not None:
+            loaded = [_named(number, pair) for number, pair in enumerate(given_pairs)]
         elif folder is not None:
             loaded = read_pairs(folder, sensors[0].nominal().max_dn, recipe)
-            seen = [_seen(loaded, sensors[0], str(folder), strict, said.append)]
+            sensor_rows = [_seen(loaded, sensors[0], str(folder), strict, remarks.append)]
         else:
-            loaded, said = pairs_of_scenes(scenes, *sensors, seed)
-        rows = _compared(ways, loaded, sensors, instruments, seed)
+            loaded, remarks = pairs_of_scenes(scenes, *sensors, seed)
+        rows = _compared(compared, loaded, sensors, instruments, seed)
         for factor in factors[1:]:
             dimmed, _ = pairs_of_scenes(scenes, *sensors, seed, factor)
-            found = [row for way in ways for row in scores.score(way, dimmed, instruments, seed)]
-            rows += [replace(row, table=table_at(factor, row.table)) for row in found]
+            for method in compared:
+                scored = scores.score(method, dimmed, instruments, seed)
+                rows += [replace(row, table=table_at(factor, row.table)) for row in scored]
         swept = list[Row]()
         for factor in factors if sweep else ():
-            swept += run_sweep(ways, scenes, *sensors, seed, factor).rows
+            swept += run_sweep(compared, scenes, *sensors, seed, factor).rows
+    # Images of one site resemble one another: sites are counted, not images.
     few = too_few(len({pair.site for pair in loaded}))
-    notes = [note for note in (few, scores.inner_note(loaded), *said) if note]
+    notes = [note for note in (few, scores.inner_note(loaded), *remarks) if note]
     arguments: dict[str, object] = {
         "images": images,
         "pairs": folder,
         "sensor": sensors[0].name,
         "lpips": lpips,
-    }
-    arguments |= {
         "reference": sensors[1].name,
-        "methods": ",".join(asked),
+        "methods": ",".join(named_methods),
         "sweep": sweep,
         "seed": seed,
+        "consistency": consistency,
+        "exposure": exposure,
+        "brightness": ",".join(f"{factor:g}" for factor in factors),
     }
-    arguments |= {"consistency": consistency, "exposure": exposure}
-    arguments["brightness"] = ",".join(f"{factor:g}" for factor in factors)
     return Evaluation(
         "evaluate",
         arguments,
-        tuple(_inputs(asked, weights, scenes, folder)),
-        (*_in_order([*rows, *scores.paper_rows()]), *seen, *swept),
+        tuple(_inputs(named_methods, weights, scenes, folder)),
+        (*_in_order([*rows, *scores.paper_rows()]), *sensor_rows, *swept),
         notes=tuple(notes),
         sensors=sensors,
-        methods=ways,
+        methods=compared,
         pairs=loaded,
     )
-
-
-def _instruments(lpips: Path | None, sensor: Sensor) -> scores.Instruments:
-    nominal = sensor.nominal()
-    return scores.Instruments(scores.perceptual_distances(lpips), nominal.max_dn, nominal.offset_dn)
 
 
 def _compared(
@@ -246,56 +249,64 @@ def _compared(
 def _in_order(rows: Iterable[Row]) -> list[Row]:
     """Return the rows by table: means, targets, sites, images; with the sites' means among them."""
     tables = by_table(rows)
-    means = [row for name in tables if name.startswith("mean") for row in tables[name]]
-    images = [row for name in tables if name.startswith("images") for row in tables[name]]
+    means: list[Row] = []
+    images: list[Row] = []
+    for name, table in tables.items():
+        if name.startswith("mean"):
+            means += table
+        if name.startswith("images"):
+            images += table
     return [*means, *tables[targets.TARGETS], *scores.site_rows(tables["images"]), *images]
 
 
 def _seen(pairs: Sequence[NamedPair], sensor: Sensor, name: str, strict: bool, log: Log) -> Row:
     """The degraded images held against the sensor that they are said to be from."""
-    chosen = pairs[:: -(-len(pairs) // HELD)]
-    windows = [pair.degraded[:WINDOW_PX, :WINDOW_PX] for pair in chosen]
-    check = held_against(windows, sensor, sensor.nominal().max_dn).settled(
-        name, sensor.name, strict, log
-    )
+    # Every n-th pair, n rounded up, so that at most HELD of them are checked.
+    sample = pairs[:: -(-len(pairs) // HELD)]
+    windows = [pair.degraded[:WINDOW_PX, :WINDOW_PX] for pair in sample]
+    comparison = held_against(windows, sensor, sensor.nominal().max_dn)
+    check = comparison.settled(name, sensor.name, strict, log)
     return Row("sensor of the degraded images", sensor.name, check.figures, check.text)
 
 
 def _inputs(
-    asked: Iterable[str], weights: Path | None, scenes: Path | None, pairs: Path | None
+    names: Iterable[str], weights: Path | None, scenes: Path | None, pairs: Path | None
 ) -> Iterator[Path]:
     """The files that the figures rest on: networks, weights of LPIPS, scenes or pairs."""
-    yield from (
-        path for path in (*map(Path, asked), *([weights] if weights else [])) if path.is_file()
-    )
+    paths = [*map(Path, names)]
+    if weights:
+        paths.append(weights)
+    # A name of a method or of a function is no file.
+    yield from (path for path in paths if path.is_file())
     folders: list[Path] = []
     if scenes:
         folders = [scenes]
     elif pairs:
         folders = [pairs / "degraded", pairs / "reference"]
-    yield from (path for folder in folders for path in list_images(folder))
+    yield from chain.from_iterable(map(list_images, folders))
 
 
 def _named(number: int, pair: Pair) -> NamedPair:
-    seen, meant = (image.astype(np.float32) for image in pair)
-    return NamedPair(f"pair{number}", seen, meant, noise_free=pair.clean)
+    degraded, reference = (image.astype(np.float32) for image in pair)
+    return NamedPair(f"pair{number}", degraded, reference, noise_free=pair.clean)
 
 
 def _method(
     name: str,
-    given: NetworkLike | Restore,
+    source: NetworkLike | Restore,
     sensors: tuple[Sensor, Sensor],
     log: Log,
     around: Around,
 ) -> Method:
-    if isinstance(given, str):
-        return replace(method_named(given, *sensors, log, around), name=name)
-    if callable(given) and not isinstance(given, Network) and not hasattr(given, "state_dict"):
-        return Method(name, given, "what the function knows")
-    network = Network.load(cast("NetworkLike", given), sensor=sensors[0])
-    known = knowledge_of(network.model, sensors[0].name)
+    if isinstance(source, str):
+        return replace(method_named(source, *sensors, log, around), name=name)
+    # A module of torch is callable too, but it is a network and no function.
+    if callable(source) and not isinstance(source, Network) and not hasattr(source, "state_dict"):
+        return Method(name, source, "what the function knows")
+    network = Network.load(cast("NetworkLike", source), sensor=sensors[0])
+    knowledge = knowledge_of(network.model, sensors[0].name)
     return Method(
-        name, with_steps(network.model, {}, sensors[0], sensors[1].nominal(), around), known
+        name, with_steps(network.model, {}, sensors[0], sensors[1].nominal(), around), knowledge
     )
 
 
@@ -323,9 +334,13 @@ def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, fl
     images = {method.name: method.restore(pair.degraded) for method in methods}
     side = min(CROP_PX, *pair.degraded.shape)
     top, left = busiest_windows(pair.reference, side)[0]
-    whole = {**images, "reference": pair.reference}
-    crops = {name: image[top : top + side, left : left + side] for name, image in whole.items()}
+    images_and_reference = {**images, "reference": pair.reference}
+    crops = {
+        name: image[top : top + side, left : left + side]
+        for name, image in images_and_reference.items()
+    }
     errors = {name: np.abs(crop - crops["reference"]) for name, crop in crops.items()}
+    # The degraded input sets the scale of the errors, so that all methods share it.
     white = max(float(np.percentile(errors[methods[0].name], 99)), 1.0)
     rows = [
         strip_row(crops.values(), stretch_of(crops["reference"])),
@@ -336,7 +351,7 @@ def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, fl
 
 def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -> list[Picture]:
     """A strip for each of a few sites, also written to OUT/SITE.png."""
-    made = []
+    strips = []
     for pair in chosen_pairs(pairs):
         strip, white = strip_of(pair, methods)
         with whole_file(out / f"{pair.site}.png") as temporary:
@@ -346,8 +361,8 @@ def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -
             "size of the error "
             f"against the reference, black none, white {white:.0f} DN and more."
         )
-        made.append(Picture(pair.site, picture_url(strip), caption))
-    return made
+        strips.append(Picture(pair.site, picture_url(strip), caption))
+    return strips
 
 
 def evaluation_report(found: Evaluation, strips: Sequence[Picture]) -> Report:

@@ -8,6 +8,7 @@ hardly any border.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -34,14 +35,15 @@ def perceptual_distances(place: Path | None) -> dict[str, Perceptual | str]:
         place: a file with SqueezeNet 1.1, or a folder with any of the backbones; None asks the
             environment.
     """
-    found: dict[str, Perceptual | str] = {"LPIPS-squeeze": not_found("squeeze")}
+    distances: dict[str, Perceptual | str] = {"LPIPS-squeeze": not_found("squeeze")}
+    # A single file is that of SqueezeNet.
     networks = ("squeeze", "vgg") if place is None or place.is_dir() else ("squeeze",)
     for network in networks:
         if file := find_backbone(network, place):
-            found[f"LPIPS-{network}"] = partial(_distance, Lpips.load(network, file))
+            distances[f"LPIPS-{network}"] = partial(_distance, Lpips.load(network, file))
             if network == "vgg":
-                found["DISTS"] = partial(_distance, Dists.load(file))
-    return found
+                distances["DISTS"] = partial(_distance, Dists.load(file))
+    return distances
 
 
 def _distance(metric: Lpips | Dists, image: np.ndarray, reference: np.ndarray) -> float:
@@ -115,8 +117,8 @@ def bias_percent(
     images = [inner(image) for image in (dn, wanted)]
     if unclipped is not None and inner(unclipped).any():
         images = [image[inner(unclipped)] for image in images]
-    restored, level = (float(image.mean(dtype=np.float64)) - offset_dn for image in images)
-    return 100 * (restored / level - 1) if level > 0 else float("nan")
+    mean_dn, level = (float(image.mean(dtype=np.float64)) - offset_dn for image in images)
+    return 100 * (mean_dn / level - 1) if level > 0 else float("nan")
 
 
 @dataclass(frozen=True)
@@ -144,8 +146,11 @@ class Instruments:
         scores[INNER_NOISE_FREE] = (
             None if clean is None else self._psnr_db(inner(dn), inner(clean), inside)
         )
+        # Two infinite PSNRs have no difference, and are equal.
         scores["PSNR gain"] = psnr - before if psnr != before else 0.0
+        # A clipped pixel has lost light before any method sees it: it does not count as an error.
         unclipped = (pair.reference < self.max_dn) & (pair.degraded < self.max_dn)
+        # The mean of a noisy reference has an error of its own.
         level = pair.reference if clean is None else clean
         scores[BIAS] = bias_percent(dn, level, unclipped, self.offset_dn)
         scores["SSIM"] = ssim(dn, pair.reference, self.max_dn)
@@ -154,8 +159,8 @@ class Instruments:
             scores[name] = None if isinstance(distance, str) else distance(*both)
         return scores
 
-    def _psnr_db(self, dn: np.ndarray, wanted: np.ndarray, pair: NamedPair) -> float:
-        return fidelity_db(dn, wanted, pair.degraded, self.max_dn)
+    def _psnr_db(self, dn: np.ndarray, reference: np.ndarray, pair: NamedPair) -> float:
+        return fidelity_db(dn, reference, pair.degraded, self.max_dn)
 
     def figure(
         self,
@@ -167,9 +172,8 @@ class Instruments:
         """A score as a figure; unavailable with the reason where there is none."""
         unit = UNITS.get(key, DISTANCE)
         if value is None:
-            return unavailable(
-                unit, READ if key in (NOISE_FREE, INNER_NOISE_FREE) else str(self.perceptual[key])
-            )
+            without_clean = key in (NOISE_FREE, INNER_NOISE_FREE)
+            return unavailable(unit, READ if without_clean else str(self.perceptual[key]))
         if not np.isfinite(value):
             return unavailable(unit, BLACK if key == BIAS else IDENTICAL)
         return measured(value, unit, source, interval)
@@ -182,7 +186,7 @@ class Instruments:
         """
         figures = {}
         for key, first in scores[0].items():
-            both = ((each[key], site) for each, site in zip(scores, sites, strict=True))
+            both = ((image[key], site) for image, site in zip(scores, sites, strict=True))
             usable = [
                 (value, site) for value, site in both if value is not None and np.isfinite(value)
             ]
@@ -190,11 +194,12 @@ class Instruments:
                 figures[key] = self.figure(key, first, "")
                 continue
             values, places = zip(*usable, strict=True)
+            # The same seed for each score: all intervals come from the same draws of sites.
             interval, words = site_interval(values, places, np.random.default_rng(seed))
             source = f"mean of {len(values)} pairs from {len(set(places))} sites, {words}"
             figures[key] = self.figure(key, float(np.mean(values)), source, interval)
             if key == BIAS:
-                largest, site = max(usable, key=lambda each: abs(each[0]))
+                largest, site = max(usable, key=lambda pair: abs(pair[0]))
                 figures[LARGEST_BIAS] = self.figure(
                     LARGEST_BIAS, largest, f"one pair of site {site}"
                 )
@@ -231,7 +236,7 @@ def site_rows(rows: Sequence[Row]) -> list[Row]:
     keys = [key for key in there if key != "PSNR gain"]
     sites = dict.fromkeys(row.text["site"] for row in images)
     by_site = {site: [row for row in images if row.text["site"] == site] for site in sites}
-    return [_site_row(key, site, here) for key in keys for site, here in by_site.items()]
+    return [_site_row(key, site, here) for key, (site, here) in product(keys, by_site.items())]
 
 
 def _site_row(key: str, site: str, images: Sequence[Row]) -> Row:
@@ -268,11 +273,11 @@ def paper_rows() -> list[Row]:
     """The paper's two rows as printed."""
     rows = []
     for name, values in PAPER.items():
-        figures = {
-            key: unavailable(unit, "the paper: did not converge")
-            if value is None
-            else published(value, unit, SOURCE)
-            for (key, unit), value in zip(PAPER_UNITS.items(), values, strict=True)
-        }
+        figures: dict[str, Figure] = {}
+        for (key, unit), value in zip(PAPER_UNITS.items(), values, strict=True):
+            if value is None:
+                figures[key] = unavailable(unit, "the paper: did not converge")
+            else:
+                figures[key] = published(value, unit, SOURCE)
         rows.append(Row("mean", name, figures, {"sensor": NOTE}))
     return rows

@@ -7,6 +7,7 @@ costs.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -116,16 +117,18 @@ def run_sweep(
     aim = reference.nominal()
     ratios = oversamplings_of(profile)
     loaded = scenes_at(brightness, load_scenes(images, aim, seed))
+    # Reversed, so that the first scene of each site is the one that stays.
     scenes = {site_of(scene.name): scene for scene in reversed(loaded)}
-    tried = [method_named(name, profile, reference) for name in (DEGRADED, TRADITIONAL)]
-    tried += [method for method in methods if method.name not in WITHOUT_NETWORK]
+    candidates = [method_named(name, profile, reference) for name in (DEGRADED, TRADITIONAL)]
+    candidates += [method for method in methods if method.name not in WITHOUT_NETWORK]
     sensors = conditions(nominal, profile)
-    trials = {name: _trials(name, sensor, tried, profile) for name, sensor in sensors.items()}
+    trials = {name: _trials(name, sensor, candidates, profile) for name, sensor in sensors.items()}
     with steps("sweep", sum(map(len, trials.values()))) as bar:
         for name, sensor in sensors.items():
             pairs, _ = simulate_pairs(
                 list(scenes.values()), sensor, aim.in_units_of(sensor), seed, ratios
             )
+            # Edges do not depend on the brightness of the scenes: they are measured at 1 alone.
             edges = acquire_edges(sensor, seed) if brightness == 1 else []
             for supposed, other, method in trials[name]:
                 key = (name, supposed, method.name)
@@ -145,23 +148,31 @@ def _trials(
     """
     nominal = profile.nominal()
     units = replace(nominal, gain_dn_per_radiance=sensor.gain_dn_per_radiance)
+    # Under the nominal condition this trial is the plain one.
     drifted = [] if name == NOMINAL else [(NOMINAL, units, methods[1])]
     able = [method for method in methods if method.specialise is not None]
     supposed = suppositions(nominal, profile).get(name, {})
-    wrong = [(each, other, method) for each, other in supposed.items() for method in able]
+    wrong = [
+        (supposition, other, method)
+        for (supposition, other), method in product(supposed.items(), able)
+    ]
     return [*((name, sensor, method) for method in methods), *drifted, *wrong]
 
 
 def _psnr_db(method: Method, pairs: Sequence[NamedPair], max_dn: int) -> np.ndarray:
     """(2, N): each image against the reference, and against the reference without noise."""
-    found = []
+    rows = []
     for pair in pairs:
         dn = method.restore(pair.degraded)
-        wanted = (pair.reference, pair.noise_free)
-        found.append(
-            [fidelity_db(dn, image, pair.degraded, max_dn) for image in wanted if image is not None]
+        references = (pair.reference, pair.noise_free)
+        rows.append(
+            [
+                fidelity_db(dn, image, pair.degraded, max_dn)
+                for image in references
+                if image is not None
+            ]
         )
-    return np.array(found).T
+    return np.array(rows).T
 
 
 NOMINAL_KNOWN = "traditional, nominal sensor known"
@@ -218,12 +229,12 @@ class Found:
         tables = [("sweep, PSNR", psnr), (f"sweep, {NOISE_FREE}", clean)]
         if self.brightness == 1:
             tables.append(("sweep, MTF at Nyquist", dict(self.mtf)))
-        conditions = [
-            Row(table, truth, {shown: figures[key] for shown, key in self._columns(truth).items()})
-            for table, figures in tables
-            for truth in self.conditions
-        ]
-        rows = [*conditions, *self._gains(), *self._wrong()]
+        rows: list[Row] = []
+        for (table, figures), truth in product(tables, self.conditions):
+            columns = self._columns(truth)
+            row = {column: figures[key] for column, key in columns.items()}
+            rows.append(Row(table, truth, row))
+        rows += [*self._gains(), *self._wrong()]
         return [replace(row, table=table_at(self.brightness, row.table)) for row in rows]
 
     def _columns(self, truth: str) -> dict[str, Key]:
@@ -251,13 +262,13 @@ class Found:
             for truth in self.conditions
         }
         rows = [
-            Row("sweep, gain over the pipeline", truth, self._means(each))
-            for truth, each in gains.items()
+            Row("sweep, gain over the pipeline", truth, self._means(by_network))
+            for truth, by_network in gains.items()
         ]
-        over_all = [
-            self._over_all(n, {truth: each[n] for truth, each in gains.items()})
-            for n in self.networks
-        ]
+        over_all = []
+        for network in self.networks:
+            by_condition = {truth: by_network[network] for truth, by_network in gains.items()}
+            over_all.append(self._over_all(network, by_condition))
         return [*rows, *over_all] if over_all else []
 
     def _over_all(self, network: str, gains: Mapping[str, np.ndarray]) -> Row:
@@ -274,7 +285,7 @@ class Found:
         """
         pairs = dict.fromkeys(key[:2] for key in self.psnr if key[1] not in (key[0], NOMINAL))
         psnr = []
-        lost = []
+        losses = []
         for truth, supposed in pairs:
             wrong = {
                 key[2]: values[0]
@@ -284,13 +295,13 @@ class Found:
             cost = {
                 name: self.psnr[truth, truth, name][0] - values for name, values in wrong.items()
             }
-            shown = f"{truth}, supposed {supposed}"
-            psnr.append(Row("sweep, sensor known wrongly", shown, self._means(wrong)))
-            lost.append(Row("sweep, lost by a sensor known wrongly", shown, self._means(cost)))
-        return [*psnr, *lost]
+            row_name = f"{truth}, supposed {supposed}"
+            psnr.append(Row("sweep, sensor known wrongly", row_name, self._means(wrong)))
+            losses.append(Row("sweep, lost by a sensor known wrongly", row_name, self._means(cost)))
+        return [*psnr, *losses]
 
     def _means(self, values: Mapping[str, np.ndarray]) -> dict[str, Figure]:
-        return {name: self._mean(each) for name, each in values.items()}
+        return {name: self._mean(in_db) for name, in_db in values.items()}
 
     def _mean(self, values: np.ndarray) -> Figure:
         """The mean of (N,) dB, an image each: of differences on the same images the interval is a

@@ -105,6 +105,7 @@ def acquire_targets(sensor: Instrument, reference: Instrument, seed: int) -> Tar
         seed: seed of the noise and of the places of the points within their pixels.
     """
     sensors = sensor, reference.in_units_of(sensor)
+    # The first numbers are those of the edges, which draw their own noise (`acquire_edges`).
     draws = (Draw(seed, number) for number in count(len(ANGLES_DEG) * REPEATS))
     flats = []
     for radiance in RADIANCES:
@@ -113,7 +114,8 @@ def acquire_targets(sensor: Instrument, reference: Instrument, seed: int) -> Tar
     points = [
         _acquire_points(background, *sensors, next(draws)) for background in POINT_BACKGROUNDS
     ]
-    patterns = [_acquire_pattern(*each, *sensors, next(draws)) for each in _pattern_scenes()]
+    scenes = [*_bars(), *_zone_plates()]
+    patterns = [_acquire_pattern(*scene, *sensors, next(draws)) for scene in scenes]
     return Targets(sensor, acquire_edges(sensor, seed), flats, points, patterns)
 
 
@@ -199,11 +201,11 @@ def mtf_figure(found: Sequence[float | Refusal]) -> Figure:
     """Return the mean over the edges with its 90 % interval; unavailable if most edges were
     refused.
     """
-    values = [100 * each for each in found if not isinstance(each, Refusal)]
-    refused = [each for each in found if isinstance(each, Refusal)]
-    if len(values) < max(len(refused), 2):
+    values = [100 * edge for edge in found if not isinstance(edge, Refusal)]
+    refusals = [edge for edge in found if isinstance(edge, Refusal)]
+    if len(values) < max(len(refusals), 2):
         return unavailable(
-            "%", f"{len(refused)} of {len(found)} edges refused: {refused[0].reason}"
+            "%", f"{len(refusals)} of {len(found)} edges refused: {refusals[0].reason}"
         )
     source = f"{len(values)} of {len(found)} simulated slanted edges, 90 % interval of the mean"
     return measured(float(np.mean(values)), "%", source, interval_of_mean(values))
@@ -225,6 +227,7 @@ def flat_figure(flat: np.ndarray) -> Figure:
     """Return the linear SNR of a flat field (h, w): its mean over its standard deviation."""
     mean = float(flat.mean(dtype=np.float64))
     deviation = float(flat.std(dtype=np.float64, ddof=1))
+    # A denoiser may leave a field flat, and its SNR would be infinite.
     if deviation <= 1e-6 * mean:
         return unavailable("ratio", "nothing is left of the noise in a flat field")
     return measured(
@@ -256,6 +259,7 @@ def flux_name(radiance: float, background: float) -> str:
 def _acquire_points(
     background: float, sensor: Instrument, reference: Instrument, draw: Draw
 ) -> Points:
+    # The same field without points, acquired with the same draws: the difference is their light.
     flat = np.full((POINTS_A_SIDE * POINT_STEP_PX * OVERSAMPLING,) * 2, background, np.float32)
     scene = flat.copy()
     generator = draw.generator("points")
@@ -264,8 +268,8 @@ def _acquire_points(
         y, x = ((at * POINT_STEP_PX + POINT_STEP_PX // 2) * OVERSAMPLING for at in (row, column))
         shift_y, shift_x = generator.integers(OVERSAMPLING, size=2)
         scene[y + shift_y, x + shift_x] += _point_radiance(row, column) * OVERSAMPLING**2
-    wanted = _without_noise(scene, reference, draw) - _without_noise(flat, reference, draw)
-    return Points(background, _acquire(scene, sensor, draw), _acquire(flat, sensor, draw), wanted)
+    light = _without_noise(scene, reference, draw) - _without_noise(flat, reference, draw)
+    return Points(background, _acquire(scene, sensor, draw), _acquire(flat, sensor, draw), light)
 
 
 def _grid() -> list[tuple[int, int]]:
@@ -290,13 +294,13 @@ def flux_figures(method: Method, points: Points) -> dict[str, Figure]:
         flux = 100 * float(light[place].sum() / points.wanted[place].sum(dtype=np.float64))
         values[_point_radiance(row, column)].append(flux)
     figures = {}
-    for radiance, each in values.items():
+    for radiance, fluxes in values.items():
         source = (
-            f"mean of {len(each)} points in {APERTURE_PX} x {APERTURE_PX} px, 90 % "
+            f"mean of {len(fluxes)} points in {APERTURE_PX} x {APERTURE_PX} px, 90 % "
             "interval of the mean"
         )
         name = flux_name(radiance, points.background)
-        figures[name] = measured(float(np.mean(each)), "%", source, interval_of_mean(each))
+        figures[name] = measured(float(np.mean(fluxes)), "%", source, interval_of_mean(fluxes))
     return figures
 
 
@@ -327,15 +331,10 @@ ZONE_NYQUIST_PX = 96
 """Side, and the radius at which the pattern reaches half a cycle per pixel and ends."""
 
 
-def _pattern_scenes() -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Return name, contrast (S, S) in scene pixels and the mask (H, W) of measured pixels of each
-    pattern.
-    """
-    return [*_bars(), *_zone_plates()]
-
-
 def _bars() -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Return the bars, each across and along the track."""
+    """Return the bars, each across and along the track: name, contrast (S, S) in scene pixels and
+    the mask (H, W) of measured pixels.
+    """
     middle = np.zeros((BARS_PX, BARS_PX), bool)
     place = slice((BARS_PX - BARS_MEASURED_PX) // 2, (BARS_PX + BARS_MEASURED_PX) // 2)
     middle[place, place] = True
@@ -355,6 +354,7 @@ def _zone_plates() -> list[tuple[str, np.ndarray, np.ndarray]]:
     frequency = _radius_px(ZONE_PX, 1) / (2 * ZONE_NYQUIST_PX)
     ring = (frequency >= ZONE_BAND[0]) & (frequency <= ZONE_BAND[1])
     radius_px = _radius_px(ZONE_PX, OVERSAMPLING)
+    # It ends at the radius where it reaches Nyquist: beyond it the sampling would alias.
     chirp = np.cos(math.pi / 2 * radius_px**2 / ZONE_NYQUIST_PX) * (radius_px < ZONE_NYQUIST_PX)
     return [
         (f"zone plate of {contrast:.0%}", contrast * chirp, ring) for contrast in ZONE_CONTRASTS
@@ -412,7 +412,8 @@ def _transfers(restored: np.ndarray, pattern: Pattern) -> list[float]:
         rows = slice(below * height // 2, (below + 1) * height // 2)
         columns = slice(right * width // 2, (right + 1) * width // 2)
         mask = pattern.measured[rows, columns]
-        wanted = pattern.wanted[rows, columns][mask].astype(np.float64)
-        wanted -= wanted.mean()
-        slopes.append(float(wanted @ restored[rows, columns][mask] / (wanted @ wanted)))
+        truth = pattern.wanted[rows, columns][mask].astype(np.float64)
+        # Without the mean the slope tells contrast alone, whatever the level of the image.
+        truth -= truth.mean()
+        slopes.append(float(truth @ restored[rows, columns][mask] / (truth @ truth)))
     return slopes

@@ -6,6 +6,7 @@ import math
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
@@ -82,9 +83,8 @@ def run_battery(
     with one_thread_per_operation(), steps("stressing", len(cases) * len(stages)) as bar:
         for case in cases:
             # Seeded by its name: a case draws the same images whichever others are asked for.
-            images = case.draw(
-                side_px, np.random.default_rng([seed, zlib.crc32(case.name.encode())])
-            )
+            generator = np.random.default_rng([seed, zlib.crc32(case.name.encode())])
+            images = case.draw(side_px, generator)
             for stage in stages:
                 measures = [] if reasons[stage] else _measures(subject, case, stage, images)
                 results.append(StageResult(case, stage, tuple(worst(measures)), reasons[stage]))
@@ -107,18 +107,22 @@ def _cannot_be_looked_at(subject: Subject, stage: str) -> str:
 def _measures(
     subject: Subject, case: Case, stage: str, images: Iterable[np.ndarray]
 ) -> list[Measure]:
+    measures: list[Measure] = []
     try:
-        return [measure for image in images for measure in STAGES[stage](subject, case, image)]
-    except BeersError as error:  # a network that refuses a sound image has failed
+        for image in images:
+            measures += STAGES[stage](subject, case, image)
+    except BeersError as error:
+        # A network that refuses a sound image has failed.
         return [Measure(f"refused: {error}", 1, 0, "runs")]
+    return measures
 
 
 def worst(measures: Iterable[Measure]) -> list[Measure]:
     """Of each check the measure that is largest beside what is allowed; NaN is the worst."""
-    found: dict[str, list[Measure]] = {}
+    by_check: dict[str, list[Measure]] = {}
     for measure in measures:
-        found.setdefault(measure.check, []).append(measure)
-    return [max(each, key=_excess) for each in found.values()]
+        by_check.setdefault(measure.check, []).append(measure)
+    return [max(alike, key=_excess) for alike in by_check.values()]
 
 
 def _excess(measure: Measure) -> float:
@@ -128,14 +132,14 @@ def _excess(measure: Measure) -> float:
 def chosen(names: str | None, known: Iterable[str], option: str) -> list[str]:
     """The names in a list with commas; all where none is given."""
     every = list(known)
-    wanted = every if names is None else [name.strip() for name in names.split(",")]
-    for name in wanted:
+    selection = every if names is None else [name.strip() for name in names.split(",")]
+    for name in selection:
         if name not in every:
             expected = f"some of {', '.join(every)}"
             raise OptionError(
                 option, expected=expected, got=repr(name), remedy="separate them by commas"
             )
-    return wanted
+    return selection
 
 
 SOURCE = "stress: worst over the images of the case"
@@ -162,15 +166,15 @@ def battery_rows(results: Iterable[StageResult]) -> list[Row]:
 
 def worst_rows(results: Iterable[StageResult]) -> list[Row]:
     """A row for each check of each stage: its worst value over all cases."""
-    found: dict[str, list[tuple[Measure, str]]] = {}
+    by_name: dict[str, list[tuple[Measure, str]]] = {}
     for result in results:
         for measure in result.measures:
-            found.setdefault(f"{result.stage}: {measure.check}", []).append(
+            by_name.setdefault(f"{result.stage}: {measure.check}", []).append(
                 (measure, result.case.name)
             )
     rows = []
-    for name, seen in found.items():
-        largest, case = max(seen, key=lambda each: _excess(each[0]))
+    for name, sizes in by_name.items():
+        largest, case = max(sizes, key=lambda pair: _excess(pair[0]))
         text = {"allowed": f"{largest.allowed:.4g} {largest.unit}", "worst case": case}
         text["verdict"] = "holds" if largest.holds else "does not hold"
         rows.append(Row("worst", name, {"worst": _figure(largest)}, text))
@@ -254,11 +258,11 @@ NOTES = {
 def markdown(rows: Sequence[Row]) -> str:
     """A section for each table."""
     parts = []
-    for table, found in by_table(rows).items():
+    for table, table_rows in by_table(rows).items():
         parts += [
             f"## {TITLES[table]}\n",
             *([NOTES[table], ""] if table in NOTES else []),
-            *table_lines(found),
+            *table_lines(table_rows),
             "",
         ]
     return "\n".join(parts)
@@ -268,30 +272,30 @@ def table_lines(rows: Sequence[Row]) -> list[str]:
     """The lines of one table; unit and mode stand in its head where they are those of a whole
     column.
     """
-    found = list(rows)
+    table = list(rows)
     words = words_of(list(rows))
-    common = {
-        key: (unit_of(key, found), common_mode(key, found)) for row in found for key in row.figures
-    }
-    abouts = {key: ", ".join(filter(None, both)) for key, both in common.items()}
+    keys = dict.fromkeys(chain.from_iterable(row.figures for row in table))
+    common = {key: (unit_of(key, table), common_mode(key, table)) for key in keys}
+    abouts = {key: ", ".join(filter(None, head)) for key, head in common.items()}
     lines = [["", *(f"{key} ({about})" if about else key for key, about in abouts.items()), *words]]
     lines.append(["---"] * len(lines[0]))
-    for row in found:
-        figures = [_cell(row.figures.get(key), *both) for key, both in common.items()]
+    for row in table:
+        figures = [_cell(row.figures.get(key), *head) for key, head in common.items()]
         lines.append([row.name, *figures, *(row.text.get(word, "") for word in words)])
-    reasons = missing(found)
-    shown = [f"| {' | '.join(map(markdown_text, cells))} |" for cells in lines]
-    return [*shown, *(["", *map(_reason, reasons)] if reasons else [])]
-
-
-def _reason(line: str) -> str:
-    """Return a reason as an item of a list, which it is."""
-    return f"- {markdown_text(line.removeprefix('- '))}"
+    reasons = missing(table)
+    texts = [f"| {' | '.join(map(markdown_text, cells))} |" for cells in lines]
+    if reasons:
+        # A line already is an item of a list: its dash must not be escaped as text.
+        texts += ["", *(f"- {markdown_text(line.removeprefix('- '))}" for line in reasons)]
+    return texts
 
 
 def _cell(figure: Figure | None, unit: str, mode: str) -> str:
     if figure is None or figure.value is None:
         return "" if figure is None else "-"
-    return " ".join(
-        [str(figure), *([] if unit else [figure.unit]), *([] if mode else [figure.mode])]
-    )
+    words = [str(figure)]
+    if not unit:
+        words.append(figure.unit)
+    if not mode:
+        words.append(figure.mode)
+    return " ".join(words)

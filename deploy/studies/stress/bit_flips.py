@@ -39,10 +39,12 @@ def flip_rows(subject: Subject, source: Calibration, board: str) -> list[Row]:
             each rate.
         board: whose cost model prices the guards.
     """
-    _ = subject.core  # refused before anything is drawn
+    # A file without an integer core is refused before anything is drawn.
+    _ = subject.core
     dpu = load_dpu(board, None)
     prediction = predict_file(subject.paths[-1], dpu, TILE_PX)
-    dpu.limit("cpu", "clock_ghz")  # and so is a board that cannot price the guards
+    # So is a board that cannot price the guards.
+    dpu.limit("cpu", "clock_ghz")
     target = make_target(subject, source)
     return [*curve_rows(target, source.patches, source.seed), *price_rows(target, prediction, dpu)]
 
@@ -67,10 +69,12 @@ def make_target(subject: Subject, source: Calibration) -> FaultTarget:
     try it on.
     """
     core = faults.as_stored(subject.core)
-    taught = replace(source, patches=CALIBRATION_PATCHES)
-    tried = replace(source, seed=source.seed + HELD_OUT_SEED)
-    guards = faults.learn_guards(core, (core.ends.split(image) for image in taught.drawn.degraded))
-    return FaultTarget(core, guards, list(tried.drawn.pairs))
+    calibration = replace(source, patches=CALIBRATION_PATCHES)
+    held_out = replace(source, seed=source.seed + HELD_OUT_SEED)
+    guards = faults.learn_guards(
+        core, (core.ends.split(image) for image in calibration.drawn.degraded)
+    )
+    return FaultTarget(core, guards, list(held_out.drawn.pairs))
 
 
 SETS = ("no guard", "clamped", "all guards")
@@ -93,16 +97,17 @@ def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
         bare, clamped = (_quality_db(sound, guards, reference) for guards in (None, target.guards))
         clean.append((bare, clamped, clamped))
     rows = [_curve_row("none", [(0, quality) for quality in clean], "patches")]
-    with steps(
-        "turning bits over", sum(len(m.rates) * m.times * draws for m in faults.MEMORIES.values())
-    ) as bar:
+    count = sum(len(memory.rates) * memory.times for memory in faults.MEMORIES.values()) * draws
+    with steps("turning bits over", count) as bar:
         for name, memory in faults.MEMORIES.items():
             for rate in memory.rates:
-                found = []
+                injections = []
                 for draw in range(memory.times * draws):
-                    found.append(_drawn(target, name, rate, draw, seed, clean[draw % len(clean)]))
+                    injections.append(
+                        _drawn(target, name, rate, draw, seed, clean[draw % len(clean)])
+                    )
                     bar.advance()
-                rows.append(_curve_row(name_of(name, rate), found, "draws"))
+                rows.append(_curve_row(name_of(name, rate), injections, "draws"))
     return rows
 
 
@@ -116,11 +121,11 @@ def _drawn(
     target: FaultTarget, name: str, rate: float, draw: int, seed: int, clean: Quality
 ) -> tuple[int, Quality]:
     """The bits that one injection into a memory flipped, and what is left of the quality."""
-    (image, reference), memory = target.pairs[draw % len(target.pairs)], faults.MEMORIES[name]
+    image, reference = target.pairs[draw % len(target.pairs)]
+    memory = faults.MEMORIES[name]
     # Keyed by what is drawn, so that a draw is the same whatever else runs.
-    generator = np.random.default_rng(
-        [seed, draw, list(faults.MEMORIES).index(name), memory.rates.index(rate)]
-    )
+    key = [seed, draw, list(faults.MEMORIES).index(name), memory.rates.index(rate)]
+    generator = np.random.default_rng(key)
     injected = memory.inject(target.core, image, rate, generator)
     # No flip, no change: the fault-free figures stand, at no cost.
     if injected.flips == 0:
@@ -128,17 +133,16 @@ def _drawn(
     bare, clamped = (_quality_db(injected, guards, reference) for guards in (None, target.guards))
     if not memory.kept:
         return injected.flips, (bare, clamped, clamped)
-    left = faults.corrected(injected, target.core, target.guards, rate, generator)
-    return injected.flips, (bare, clamped, _quality_db(left, target.guards, reference))
+    repaired = faults.corrected(injected, target.core, target.guards, rate, generator)
+    return injected.flips, (bare, clamped, _quality_db(repaired, target.guards, reference))
 
 
 def _curve_row(name: str, draws: Sequence[tuple[int, Quality]], kind: str) -> Row:
     source = f"integer reference, mean and range of {len(draws)} {kind}"
     flips = measured(float(np.mean([count for count, _ in draws])), "bits", source)
     figures = {"flips": flips}
-    for guards, values in zip(
-        SETS, zip(*(quality for _, quality in draws), strict=True), strict=True
-    ):
+    by_guards = zip(*(quality for _, quality in draws), strict=True)
+    for guards, values in zip(SETS, by_guards, strict=True):
         # Exact before it is rounded once: the mean of the same values is the same, however often
         # each stands there.
         figures[guards] = measured(
@@ -160,7 +164,8 @@ INSTRUCTIONS = 2
 def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Row]:
     """A row a guard and one for all of them, at work for every tile of 640 x 640."""
     relus = sum(op.activation is Activation.relu for op in target.core.convolutions)
-    rate = Constants.of(dpu).host_in_bytes_per_s * dpu.whole("cpu", "cores")  # fitted for one core
+    # The rate is fitted for one core.
+    rate = Constants.of(dpu).host_in_bytes_per_s * dpu.whole("cpu", "cores")
     clock_hz = 1e9 * dpu.limit("cpu", "clock_ghz").low
     limit_s = INSTRUCTIONS * target.core.ends.gains * TILE_PX**2 / AT_ONCE / clock_hz
     scrubbing_s = faults.weight_bits(target.core) / faults.INT8_BITS / rate

@@ -52,7 +52,8 @@ def hot_pixel(side: int, _: np.random.Generator) -> list[np.ndarray]:
 def dead_lines(side: int, generator: np.random.Generator) -> list[np.ndarray]:
     """A column and a row at 0 in a drawn ground: one image (side, side)."""
     image = ground(side, generator)
-    image[:, side // 3], image[side // 2] = 0, 0
+    image[:, side // 3] = 0
+    image[side // 2] = 0
     return [image]
 
 
@@ -103,7 +104,8 @@ def through(mtf_nyquist: float) -> Draw:
 def stripes(side: int, generator: np.random.Generator) -> list[np.ndarray]:
     """A drawn ground that lacks every seventh column and a row (NaN): one image (side, side)."""
     image = ground(side, generator)
-    image[:, 3::7], image[side // 4] = np.nan, np.nan
+    image[:, 3::7] = np.nan
+    image[side // 4] = np.nan
     return [image]
 
 
@@ -122,8 +124,8 @@ def sized(*shapes: tuple[int, int]) -> Draw:
     """Parts of one drawn ground of these shapes, whatever the side."""
 
     def draw(_: int, generator: np.random.Generator) -> list[np.ndarray]:
-        whole = ground(max(max(shape) for shape in shapes), generator)
-        return [whole[: shape[0], : shape[1]].copy() for shape in shapes]
+        largest = ground(max(max(shape) for shape in shapes), generator)
+        return [largest[: shape[0], : shape[1]].copy() for shape in shapes]
 
     return draw
 

@@ -48,6 +48,7 @@ def differing(check: str, image: np.ndarray, other: np.ndarray) -> Measure:
     """How many pixels of two images (H, W) are not the same, bit for bit; NaN
     is the same as NaN.
     """
+    # NaN differs from itself, and a missing pixel is the same in both.
     same = (image == other) | (np.isnan(image) & np.isnan(other))
     return Measure(check, float((~same).sum()), 0, "px")
 
@@ -88,9 +89,9 @@ def gain(
 
 def change(work: Work, source: np.ndarray, result: np.ndarray, nudge: np.ndarray) -> float:
     """Largest change of any pixel (H, W), in DN, for a nudge (H, W) of -1, 0 or 1 DN."""
-    wanted = source + nudge
+    target = source + nudge
     # Turned round where it would leave the converter's range.
-    nudged = np.where((wanted < 0) | (wanted > FULL_DN), source - nudge, wanted)
+    nudged = np.where((target < 0) | (target > FULL_DN), source - nudge, target)
     return float(np.abs(work(np.asarray(nudged, np.float32)) - result).max())
 
 
@@ -119,8 +120,8 @@ def fidelity(image: np.ndarray, result: np.ndarray, radius_px: int, flat: bool) 
     if flat:
         # All that is lost at the border of flat ground is the padding's doing.
         border = Measure("border", float(np.abs(result - image).max()), 2 * FLAT_DN)
-        moved = abs(float(np.mean(inner, dtype=np.float64) - np.mean(image, dtype=np.float64)))
-        measures += [Measure("mean moved", moved, FLAT_DN), border]
+        shift_dn = abs(float(np.mean(inner, dtype=np.float64) - np.mean(image, dtype=np.float64)))
+        measures += [Measure("mean moved", shift_dn, FLAT_DN), border]
     return measures
 
 
@@ -190,11 +191,11 @@ LIMITATIONS: tuple[Limitation, ...] = (
 def limitation_of(stage: str, case: str, measure: Measure) -> Limitation | None:
     """The limitation that explains a measure which does not hold, or None."""
     for limit in LIMITATIONS:
-        known = (
+        applies = (
             stage in limit.stages
             and measure.check in limit.checks
             and (not limit.cases or case in limit.cases)
         )
-        if known and measure.value <= limit.ceiling:
+        if applies and measure.value <= limit.ceiling:
             return limit
     return None

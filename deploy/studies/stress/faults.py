@@ -44,9 +44,9 @@ def flip_bits(
         bits: how many one number has in memory.
     """
     choices = values.size * bits
-    places, which = divmod(
-        generator.choice(choices, min(count, choices), replace=False, shuffle=False), bits
-    )
+    # Without replacement: a bit that flips twice would not have flipped.
+    drawn_bits = generator.choice(choices, min(count, choices), replace=False, shuffle=False)
+    places, which = divmod(drawn_bits, bits)
     # As unsigned bits of the memory's width: the sign comes back at the end.
     raw = (values.ravel().astype(np.int64) & ((1 << bits) - 1)).copy()
     # `at`, because two flips may fall into one number, and plain indexing would keep the last
@@ -61,6 +61,7 @@ def as_stored(core: IntCore) -> IntCore:
     """The core with its bias in int8, at the finest scale that holds it: what the board keeps in
     memory.
     """
+    # A shift has six bits in memory, in two's complement.
     for (op, field), shift in shifts_of(core).items():
         if not -(1 << (SHIFT_BITS - 1)) <= shift < 1 << (SHIFT_BITS - 1):
             raise _refuse(f"{field} {shift} at {op}")
@@ -112,9 +113,9 @@ def flip_weights(core: IntCore, count: int, generator: np.random.Generator) -> I
 
 def flip_conv(op: IntConv, count: int, generator: np.random.Generator) -> IntConv:
     """The convolution with `count` bits of weights and bias flipped."""
-    stored = flip_bits(np.concatenate([op.weight.ravel(), op.bias]), count, generator)
+    values = flip_bits(np.concatenate([op.weight.ravel(), op.bias]), count, generator)
     return replace(
-        op, weight=stored[: op.weight.size].reshape(op.weight.shape), bias=stored[op.weight.size :]
+        op, weight=values[: op.weight.size].reshape(op.weight.shape), bias=values[op.weight.size :]
     )
 
 
@@ -132,10 +133,12 @@ def shifts_of(core: IntCore) -> Shifts:
     """The shifts of every operation, but for an add's shift_read: 0 where a stream shares one
     scale.
     """
-    named = [
-        (op.name, *shift) for op in core.ops for shift in op_shifts(op, core.frac_bits, SHIFTS)
-    ]
-    return {(op, field): value for op, field, value, _ in named if field != "shift_read"}
+    shifts: Shifts = {}
+    for op in core.ops:
+        for field, value, _ in op_shifts(op, core.frac_bits, SHIFTS):
+            if field != "shift_read":
+                shifts[op.name, field] = value
+    return shifts
 
 
 def bits_apart(shifts: Shifts, others: Shifts) -> int:
@@ -181,15 +184,18 @@ def learn_guards(core: IntCore, planes: Iterable[np.ndarray]) -> Guards:
     """
     relus = {op.output: 0 for op in core.convolutions if op.activation is Activation.relu}
     largest_dn = 0.0
-    for each in planes:
-        tensors, _ = run_core(core, each)
+    for batch in planes:
+        tensors, _ = run_core(core, batch)
         relus = {name: max(peak, int(tensors[name].max())) for name, peak in relus.items()}
         largest_dn = max(largest_dn, MAX_DN * float(np.abs(merged_correction(core, tensors)).max()))
+    # The smallest bound that no calibration patch exceeds: fault-free values stay as they are.
     fitting = {
         name: [bound for bound in RELU6_UNITS if bound >= peak] for name, peak in relus.items()
     }
-    bounds = {name: min(each) for name, each in fitting.items() if each}
-    return Guards(bounds, 2.0 ** math.ceil(math.log2(max(largest_dn, 1.0))), checksums(core))
+    bounds = {name: min(units) for name, units in fitting.items() if units}
+    # The next power of two: the limit leaves room above what the patches reach.
+    limit_dn = 2.0 ** math.ceil(math.log2(max(largest_dn, 1.0)))
+    return Guards(bounds, limit_dn, checksums(core))
 
 
 def checksums(core: IntCore) -> dict[str, int]:
@@ -268,9 +274,8 @@ def _shifts(
 
 def _flip_copy(core: IntCore, per_megabit: float, generator: np.random.Generator) -> Shifts:
     shifts = shifts_of(core)
-    return flip_shifts(
-        shifts, flip_count(SHIFT_BITS * len(shifts), per_megabit, generator), generator
-    )
+    count = flip_count(SHIFT_BITS * len(shifts), per_megabit, generator)
+    return flip_shifts(shifts, count, generator)
 
 
 def _maps(
@@ -301,6 +306,7 @@ def _image(
     core: IntCore, image: np.ndarray, per_megabit: float, generator: np.random.Generator
 ) -> Injected:
     flips = flip_count(PIXEL_BITS * image.size, per_megabit, generator)
+    # A pixel has 12 bits in memory, whatever type holds it here.
     dn = flip_bits(np.rint(image * MAX_DN).astype(np.uint16), flips, generator, PIXEL_BITS)
     return Injected(core, SOUND, (dn / np.float32(MAX_DN)).astype(np.float32), flips)
 
@@ -353,7 +359,7 @@ def corrected(
         generator: draws which.
     """
     core = scrubbed(injected.core, sound, guards.checksums)
-    first = {**shifts_of(sound), **injected.faults.shifts}
+    own = {**shifts_of(sound), **injected.faults.shifts}
     second, third = (_flip_copy(sound, per_megabit, generator) for _ in range(2))
-    shifts = voted((first, second, third)) if injected.faults.shifts else {}
+    shifts = voted((own, second, third)) if injected.faults.shifts else {}
     return replace(injected, core=core, faults=replace(injected.faults, shifts=shifts))

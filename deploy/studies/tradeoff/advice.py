@@ -87,8 +87,10 @@ class Measured:
 
 def placed(points: Iterable[Measured], cost: str) -> list[Measured]:
     """Return the points that have both a cost and a PSNR to compare, sorted by increasing cost."""
-    found = (point for point in points if not math.isnan(point.value(cost) + point.value(PSNR)))
-    return sorted(found, key=lambda point: _rank(point, cost))
+    comparable = (
+        point for point in points if not math.isnan(point.value(cost) + point.value(PSNR))
+    )
+    return sorted(comparable, key=lambda point: _rank(point, cost))
 
 
 def _rank(point: Measured, cost: str) -> tuple[float, float, float, str]:
@@ -129,9 +131,11 @@ class Comparison:
         """The PSNR of `a` less that of `b`, with the interval of the paired difference; none below
         five sites.
         """
+        # Differences on the same images: how the images differ from one another drops out.
         pairs = zip(a.images, b.images, strict=True)
         differences = [(x[PSNR] or 0.0) - (y[PSNR] or 0.0) for x, y in pairs]
-        if not any(differences):  # the same pictures, on however few sites
+        # The same pictures are equal on however few sites: no bootstrap is needed to tell.
+        if not any(differences):
             return measured(0.0, "dB", "the same pictures", (0.0, 0.0))
         interval, words = site_interval(differences, self.sites, np.random.default_rng(self.seed))
         source = f"PSNR less that of {b.name} on the same images, {words}"
@@ -164,14 +168,17 @@ def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
     source = f"{cost} over that of {b.name}"
     if cost.startswith("host"):
         return measured(value, "x", f"{source}, medians of interleaved runs")
-    (a_low, a_high), (b_low, b_high) = (ends(each.figures[cost]) for each in (a, b))
+    a_low, a_high = ends(a.figures[cost])
+    b_low, b_high = ends(b.figures[cost])
     interval = (a_low / b_high, a_high / b_low)
     first = a.point
     second = b.point
     if first and second and first.dpu and second.dpu:
         width = first.dpu.target.tables["cost"].get("pair_width")
+        # Points that differ in the halo alone differ in the count of tiles, which is no estimate.
         if replace(first, halo_px=second.halo_px) == second:
             interval = value, value
+        # Two predictions of one board share most of their error.
         elif cost == LATENCY and width is not None and first.board == second.board:
             interval = value * math.exp(-width.low), value * math.exp(width.low)
     return predicted(value, "x", interval, source)
@@ -185,16 +192,16 @@ def ends(figure: Figure) -> tuple[float, float]:
 def front_rows(front: Sequence[Measured], cost: str, compare: Comparison) -> list[Row]:
     """Return a front's members by number, each with its difference from the next cheaper one."""
     rows: list[Row] = []
-    for place, each in enumerate(front, 1):
-        figures = figures_to_compare(each, cost)
+    for place, point in enumerate(front, 1):
+        figures = figures_to_compare(point, cost)
         word = "cheapest"
         if rows:
             cheaper = front[place - 2]
-            gain = compare.difference(each, cheaper)
-            figures |= {"PSNR gain": gain, f"{cost} ratio": cost_ratio(each, cheaper, cost)}
+            gain = compare.difference(point, cheaper)
+            figures |= {"PSNR gain": gain, f"{cost} ratio": cost_ratio(point, cheaper, cost)}
             word = verdict(gain)
         text = {"gain over the next cheaper": word}
-        rows.append(Row(f"front of PSNR against {cost}", f"{place}. {each.name}", figures, text))
+        rows.append(Row(f"front of PSNR against {cost}", f"{place}. {point.name}", figures, text))
     return rows
 
 
@@ -242,6 +249,7 @@ class Constraint:
         """
         over = point.value(self.key) - self.limit
         miss = over if self.at_most else -over
+        # A limit of 0 has no share: there the miss itself counts.
         return math.inf if math.isnan(miss) else max(miss, 0.0) / (abs(self.limit) or 1.0)
 
     def holds_throughout(self, figure: Figure) -> bool:
@@ -256,32 +264,32 @@ def parse_constraints(option: str, text: str | None) -> list[Constraint]:
 
 
 def _parse(option: str, text: str) -> Constraint:
-    found = CONSTRAINT.fullmatch(text.lower())
-    if found is None or not math.isfinite(float(found["limit"])):
+    fields = CONSTRAINT.fullmatch(text.lower())
+    if fields is None or not math.isfinite(float(fields["limit"])):
         expected = "NAME<=NUMBER or NAME>=NUMBER"
         remedy = "write 'latency<=20s' or 'psnr>=44'"
         raise OptionError(option, expected=expected, got=repr(text), remedy=remedy)
-    if found["name"] not in NAMES:
+    if fields["name"] not in NAMES:
         expected = f"one of {', '.join(NAMES)}"
         raise OptionError(
-            option, expected=expected, got=repr(found["name"]), remedy="correct the name"
+            option, expected=expected, got=repr(fields["name"]), remedy="correct the name"
         )
-    key, unit = NAMES[found["name"]]
-    if found["unit"] not in ("", unit.lower()):
-        remedy = f"write {found['name']}{found['side']}{found['limit']}{unit}"
+    key, unit = NAMES[fields["name"]]
+    if fields["unit"] not in ("", unit.lower()):
+        remedy = f"write {fields['name']}{fields['side']}{fields['limit']}{unit}"
         raise OptionError(
-            option, expected=f"{key} in {unit}", got=repr(found["unit"]), remedy=remedy
+            option, expected=f"{key} in {unit}", got=repr(fields["unit"]), remedy=remedy
         )
-    return Constraint(key, found["side"] == "<=", float(found["limit"]), unit)
+    return Constraint(key, fields["side"] == "<=", float(fields["limit"]), unit)
 
 
 def chosen_cost(points: Sequence[Measured], budget: Sequence[Constraint]) -> str:
     """The cost that the budget names; else the first that any point has, the board's latency before
     all.
     """
-    named = (constraint.key for constraint in budget if constraint.key in COSTS)
-    had = (key for key in COSTS if any(not math.isnan(point.value(key)) for point in points))
-    return next(named, next(had, COSTS[0]))
+    in_budget = (constraint.key for constraint in budget if constraint.key in COSTS)
+    available = (key for key in COSTS if any(not math.isnan(point.value(key)) for point in points))
+    return next(in_budget, next(available, COSTS[0]))
 
 
 def recommend(
@@ -306,24 +314,25 @@ def recommend(
     """
     constraints = [*budget, *need]
     cost = chosen_cost(points, budget)
-    kept = within(points, constraints, cost)
+    candidates = within(points, constraints, cost)
     limits = f" for {' and '.join(map(str, constraints))}" if constraints else ""
-    if not kept:
+    if not candidates:
         return None, f"nothing to recommend{limits}{nearest(placed(points, cost), constraints)}"
-    taken, best = choose(kept, compare, cheapest=bool(need) and not budget)
-    line = (
-        f"recommended{limits}: {_words(taken, [PSNR, cost, *(each.key for each in constraints)])}"
-    )
-    gain = compare.difference(best, taken)
-    if (budget or not need) and best is not taken and (gain.value or 0.0) >= WORTH_A_WORD_DB:
+    choice, best = choose(candidates, compare, cheapest=bool(need) and not budget)
+    keys = [PSNR, cost, *(constraint.key for constraint in constraints)]
+    line = f"recommended{limits}: {_words(choice, keys)}"
+    gain = compare.difference(best, choice)
+    if (budget or not need) and best is not choice and (gain.value or 0.0) >= WORTH_A_WORD_DB:
         line += f"; {best.name} has {gain} dB more, {verdict(gain)}"
     unsure = [
-        str(each) for each in constraints if not each.holds_throughout(taken.figures[each.key])
+        str(constraint)
+        for constraint in constraints
+        if not constraint.holds_throughout(choice.figures[constraint.key])
     ]
-    verb = "holds" if len(unsure) == 1 else "hold"
-    return taken, line + (
-        f"; {' and '.join(unsure)} {verb} by value, not over the whole interval" if unsure else ""
-    )
+    if unsure:
+        verb = "holds" if len(unsure) == 1 else "hold"
+        line += f"; {' and '.join(unsure)} {verb} by value, not over the whole interval"
+    return choice, line
 
 
 def within(
@@ -349,6 +358,7 @@ def choose(
     best = max(kept, key=lambda point: point.value(PSNR))
     if cheapest:
         return kept[0], best
+    # They are sorted by cost: the first that is not significantly worse is the cheapest such.
     return next(point for point in kept if not significant(compare.difference(best, point))), best
 
 
@@ -361,29 +371,28 @@ def affordable(
     The front shows PSNR against one cost. Without this, a point that the budget excludes for
     another reason, such as its power, would hide those that can be recommended.
     """
-    others = [each for each in constraints if each.key not in (PSNR, cost)]
+    others = [constraint for constraint in constraints if constraint.key not in (PSNR, cost)]
     return within(points, others, cost) or points
 
 
 def _violation(point: Measured, constraints: Sequence[Constraint]) -> float:
     """Return the violation of the constraint that a point misses most."""
-    return max((each.violation(point) for each in constraints), default=0.0)
+    return max((constraint.violation(point) for constraint in constraints), default=0.0)
 
 
 def nearest(points: Sequence[Measured], constraints: Sequence[Constraint]) -> str:
     """Name the point that misses the constraints least, as the end of a sentence."""
-    known = [point for point in points if math.isfinite(_violation(point, constraints))]
-    if not known:
+    comparable = [point for point in points if math.isfinite(_violation(point, constraints))]
+    if not comparable:
         return ": no point has every figure asked for"
-    least = min(known, key=lambda point: _violation(point, constraints))
-    return f"; nearest is {_words(least, [each.key for each in constraints])}"
+    least = min(comparable, key=lambda point: _violation(point, constraints))
+    return f"; nearest is {_words(least, [constraint.key for constraint in constraints])}"
 
 
 def _words(point: Measured, keys: Sequence[str]) -> str:
-    return (
-        f"{point.name}: "
-        f"{', '.join(f'{key} {_figure(point.figures[key])}' for key in dict.fromkeys(keys))}"
-    )
+    # A constraint may name PSNR or the cost again: each figure is listed once.
+    figures = (f"{key} {_figure(point.figures[key])}" for key in dict.fromkeys(keys))
+    return f"{point.name}: {', '.join(figures)}"
 
 
 def _figure(figure: Figure) -> str:

@@ -59,8 +59,8 @@ def board_rows(
     rows: list[Row] = []
     for board in boards:
         here = [point for point in points if point.text.get("board") == board]
-        kept = within(here, asked.constraints, cost)
-        if not kept:
+        candidates = within(here, asked.constraints, cost)
+        if not candidates:
             reasons = [why_not(here, asked.constraints, cost), *refusals(points, board)]
             rows.append(Row(TABLE, board, {}, {"point": "none", VERDICT: "; ".join(reasons)}))
             continue
@@ -68,21 +68,24 @@ def board_rows(
             best = taken
             verdict = "this is the recommended point"
         else:
-            best, _ = choose(kept, asked.compare, cheapest=bool(asked.need) and not asked.budget)
-            verdict = _compared(best, taken, cost, asked.compare)
-        rows.append(
-            Row(
-                TABLE, board, figures_to_compare(best, cost), {"point": best.name, VERDICT: verdict}
+            best, _ = choose(
+                candidates, asked.compare, cheapest=bool(asked.need) and not asked.budget
             )
-        )
+            verdict = _compared(best, taken, cost, asked.compare)
+        words = {"point": best.name, VERDICT: verdict}
+        rows.append(Row(TABLE, board, figures_to_compare(best, cost), words))
     return rows
 
 
 def refusals(points: Sequence[Measured], board: str) -> list[str]:
     """Say which networks a board's DPU refuses, and why."""
-    refused = (each for each in points if each.point is not None and each.point.refused_by == board)
+    refused_points = (
+        point for point in points if point.point is not None and point.point.refused_by == board
+    )
     return [
-        f"{each.name} does not fit its DPU: {each.point.reason}" for each in refused if each.point
+        f"{point.name} does not fit its DPU: {point.point.reason}"
+        for point in refused_points
+        if point.point
     ]
 
 
@@ -90,8 +93,7 @@ def lines(rows: Sequence[Row]) -> list[str]:
     """Return the rows as sentences: those of several boards, and that of a single one only if it
     has no point.
     """
-    shown = [row for row in rows if len(rows) > 1 or not row.figures]
-    return [f"{row.name}: {_sentence(row)}" for row in shown]
+    return [f"{row.name}: {_sentence(row)}" for row in rows if len(rows) > 1 or not row.figures]
 
 
 def _sentence(row: Row) -> str:
@@ -103,32 +105,36 @@ def why_not(points: Sequence[Measured], constraints: Sequence[Constraint], cost:
     here = placed(points, cost)
     if not here:
         return f"no point has both a PSNR and a {cost}"
-    missed = [each for each in constraints if all(each.violation(point) for point in here)]
-    if missed:
-        return "; ".join(_missed(each, here) for each in missed)
+    out_of_reach = [
+        constraint
+        for constraint in constraints
+        if all(constraint.violation(point) for point in here)
+    ]
+    if out_of_reach:
+        return "; ".join(_missed(constraint, here) for constraint in out_of_reach)
     return (
         f"no point keeps {' and '.join(map(str, constraints))} at once{nearest(here, constraints)}"
     )
 
 
 def _missed(constraint: Constraint, points: Sequence[Measured]) -> str:
-    known = [point for point in points if not math.isnan(point.value(constraint.key))]
-    if not known:
+    comparable = [point for point in points if not math.isnan(point.value(constraint.key))]
+    if not comparable:
         figure = points[0].figures.get(constraint.key)
         return f"no point has the figure {constraint.key}{f': {figure.reason}' if figure else ''}"
-    closest = min(known, key=constraint.violation)
+    closest = min(comparable, key=constraint.violation)
     extreme = "least" if constraint.at_most else "most"
-    found = closest.value(constraint.key)
+    extreme_value = closest.value(constraint.key)
     return (
-        f"no point within {constraint}: the {extreme} is {constraint.in_words(found)} "
+        f"no point within {constraint}: the {extreme} is {constraint.in_words(extreme_value)} "
         f"({closest.name})"
     )
 
 
-def _compared(point: Measured, taken: Measured | None, cost: str, compare: Comparison) -> str:
-    if taken is None:  # its cost or PSNR is missing where another board's points are compared
+def _compared(point: Measured, recommended: Measured | None, cost: str, compare: Comparison) -> str:
+    if recommended is None:  # its cost or PSNR is missing where another board's points are compared
         return "within the limits"
-    difference = compare.difference(point, taken)
-    ratio = point.value(cost) / taken.value(cost)
+    difference = compare.difference(point, recommended)
+    ratio = point.value(cost) / recommended.value(cost)
     quality = f"PSNR {difference} dB against" if difference.value else "the PSNR of"
     return f"{quality} the recommended point, for {ratio:.3g} times its {cost}"

@@ -77,6 +77,7 @@ NOT_SHOWN = (*DETAILS, SEAM_ERROR)
 
 def key_of(**about: object) -> str:
     """SHA-256 of what a measurement depends on, this tool's version among it."""
+    # Keys are sorted, so that the order of arguments does not change the digest.
     text = json.dumps({"version": __version__, **about}, sort_keys=True, default=_as_text)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -116,6 +117,7 @@ class Measurements:
     def make(self, key: str, measure: Callable[[], Any]) -> Any:
         """What was measured under a key; measured now, and written, where there is nothing."""
         if key not in self.kept:
+            # Written after each measurement, so that a run that was stopped goes on.
             self.kept[key] = measure()
             write_text(
                 self.path, json.dumps({"version": __version__, "measurements": self.kept}) + "\n"
@@ -201,6 +203,7 @@ class Benchmark:
         runs = 0
         for pair in self.pairs:
             plan = tiles_of_point(point, pair.degraded.shape)
+            # A tile runs once for each exposure that its pixels ask for.
             counts = tiles_by_factor(pair.degraded, plan, factors, sensor.max_dn, sensor.offset_dn)
             tiles += plan.tiles
             runs += sum(counts.values())
@@ -212,24 +215,26 @@ class Benchmark:
         """Scores of every pair; and how far, in DN, a restoration with seams is from the exact one
         given.
         """
-        found = []
+        scores = []
         for pair in self.pairs:
-            restored = restore(pair.degraded)
-            found.append(self.instruments.score(restored, pair))
+            image = restore(pair.degraded)
+            scores.append(self.instruments.score(image, pair))
             if exact is not None:
-                error = np.abs(np.asarray(restored, np.float64) - exact(pair.degraded)).mean()
-                found[-1][SEAM_ERROR] = float(error)
-        return found
+                error = np.abs(np.asarray(image, np.float64) - exact(pair.degraded)).mean()
+                scores[-1][SEAM_ERROR] = float(error)
+        return scores
 
     def means(self, images: Sequence[Scores]) -> dict[str, Figure]:
         """Means over the images, with bootstrap intervals over whole sites."""
-        plain = [{key: each[key] for key in each if key not in NOT_SHOWN} for each in images]
-        found = self.instruments.means(plain, self.sites, self.seed)
+        plain = [
+            {key: value for key, value in image.items() if key not in NOT_SHOWN} for image in images
+        ]
+        figures = self.instruments.means(plain, self.sites, self.seed)
         if SEAM_ERROR in images[0]:
-            errors = [each[SEAM_ERROR] or 0.0 for each in images]
+            errors = [image[SEAM_ERROR] or 0.0 for image in images]
             source = f"mean difference from exact seams, {len(errors)} images in these tiles"
-            found[SEAM_ERROR] = measured(float(np.mean(errors)), "DN", source)
-        return found
+            figures[SEAM_ERROR] = measured(float(np.mean(errors)), "DN", source)
+        return figures
 
 
 def restore_in_tiles(point: Point, degraded: Sensor, reference: Sensor) -> Restore:
@@ -256,6 +261,7 @@ def tiles_of_point(point: Point, shape: tuple[int, ...]) -> Plan:
     """
     tiling = tiling_of_file(point.variant.file or Path())
     halo_px = tiling.halo_px if point.halo_px is None else point.halo_px
+    # Half of the shorter side, rounded up to the halo's step: an image in one tile has no seam.
     half_px = HALO_STEP_PX * -(-(min(shape) // 2) // HALO_STEP_PX) + 2 * halo_px
     return make_plan((1, *shape), min(point.tile_px, half_px), halo_px, tiling)
 
@@ -295,13 +301,15 @@ class Labelled:
         scenes, notes = labelled_scenes(
             opened.names, parse_classes(classes) if classes else {}, images
         )
-        files = [sha256(each.path) for each in scenes if each.path]
-        seen = [files, *((each.site, each.truth.corners, each.truth.classes) for each in scenes)]
+        files = [sha256(scene.path) for scene in scenes if scene.path]
+        labels = [
+            files,
+            *((scene.site, scene.truth.corners, scene.truth.classes) for scene in scenes),
+        ]
         sensors = benchmark.degraded, benchmark.reference
-        digest = key_of(detector=sha256(file), scenes=seen, seed=benchmark.seed, sensors=sensors)
-        return cls(
-            opened, scenes, benchmark, digest, [each for each in (opened.flag, *notes) if each]
-        )
+        digest = key_of(detector=sha256(file), scenes=labels, seed=benchmark.seed, sensors=sensors)
+        sentences = [sentence for sentence in (opened.flag, *notes) if sentence]
+        return cls(opened, scenes, benchmark, digest, sentences)
 
     def measure(self, method: Method) -> dict[str, object]:
         """mAP50 of the detector on every scene as a method restores it, and its interval over
@@ -309,8 +317,10 @@ class Labelled:
         """
         sensors = SensorPair(self.benchmark.degraded, self.benchmark.reference)
         seed = self.benchmark.seed
-        found = [each.boxes(self.detector, method) for each in acquired(self.scenes, sensors, seed)]
-        hits = find_hits([scene.truth for scene in self.scenes], found, len(self.detector.names))
+        boxes = [
+            scene.boxes(self.detector, method) for scene in acquired(self.scenes, sensors, seed)
+        ]
+        hits = find_hits([scene.truth for scene in self.scenes], boxes, len(self.detector.names))
         sites = [scene.site for scene in self.scenes]
         values = map50(hits, site_weights(sites, seed))
         value = None if np.isnan(values[0]) else float(values[0])
@@ -318,19 +328,20 @@ class Labelled:
 
     def figure(self, point: Point, method: Method, kept: Measurements) -> Figure:
         """What `measure` gives, in %; how often a seam cuts an object is not known."""
+        # How often a seam cuts an object is not known.
         if point.halo_px is not None:
             return unavailable("%", "measured with exact halos alone")
         key = key_of(map50=self.benchmark.depends(point.variant), labelled=self.digest)
-        stored = kept.make(key, lambda: self.measure(method))
-        if stored["value"] is None:
+        result = kept.make(key, lambda: self.measure(method))
+        if result["value"] is None:
             return unavailable("%", "no labelled object")
-        sites = len({each.site for each in self.scenes})
-        ends = stored["interval"]
+        sites = len({scene.site for scene in self.scenes})
+        ends = result["interval"]
         source = (
             f"{len(self.scenes)} labelled images of {sites} sites, interval by bootstrap over sites"
         )
         return measured(
-            100 * stored["value"], "%", source, (100 * ends[0], 100 * ends[1]) if ends else None
+            100 * result["value"], "%", source, (100 * ends[0], 100 * ends[1]) if ends else None
         )
 
 
@@ -351,12 +362,14 @@ def measure_host(
     machine = (
         f"{platform.machine()} {processor_name() or platform.processor()} x {psutil.cpu_count()}"
     )
+    # Times are kept for this machine alone: on another one they are measured again.
     key = key_of(times=names, tile=tile, machine=machine)
     times = kept.make(
         key, lambda: host_times([method.restore for method in methods.values()], tile)
     )
     return {
-        variant: host_figures(each, tile.size) for variant, each in zip(methods, times, strict=True)
+        variant: host_figures(times_s, tile.size)
+        for variant, times_s in zip(methods, times, strict=True)
     }
 
 
@@ -367,7 +380,7 @@ def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float
     calls = [partial(restore, tile) for restore in restores]
     for call in calls:
         call()
-    return [[time_s for time_s, _ in taken] for taken in interleaved(calls, ROUNDS)]
+    return [[time_s for time_s, _ in samples] for samples in interleaved(calls, ROUNDS)]
 
 
 def host_figures(times_s: Sequence[float], pixels: int) -> dict[str, Figure]:
@@ -400,14 +413,18 @@ def make_int8(file: Path, folder: Path, scenes: Path | None, sensor: Sensor, see
         seed: of every random draw.
     """
     model = float_model(file)
-    said = metadata(model).get("sensor", "")
-    known = load_sensor(said) if said in sensor_names() else sensor
-    seen = [sha256(path) for path in list_images(scenes)] if scenes else []
+    sensor_name = metadata(model).get("sensor", "")
+    calibration_sensor = load_sensor(sensor_name) if sensor_name in sensor_names() else sensor
+    scene_digests = [sha256(path) for path in list_images(scenes)] if scenes else []
     key = key_of(
-        network=network_sha256(file), scenes=seen, sensor=known, seed=seed, size=[PATCHES, PATCH_PX]
+        network=network_sha256(file),
+        scenes=scene_digests,
+        sensor=calibration_sensor,
+        seed=seed,
+        size=[PATCHES, PATCH_PX],
     )
     path = folder / f"{file.stem}-int8-{key[:16]}.onnx"
     if not path.is_file():
-        patches = Calibration(known, scenes, PATCHES, PATCH_PX, seed)
+        patches = Calibration(calibration_sensor, scenes, PATCHES, PATCH_PX, seed)
         save_onnx(quantise_model(model, patches.drawn, patches.about).host, path)
     return path

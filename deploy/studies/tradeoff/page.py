@@ -74,8 +74,9 @@ class Tradeoff(Table):
     @property
     def board(self) -> str:
         """The board of the recommended point; the first board if there is none."""
-        found = self.best.text["board"] if self.best else ""
-        return found if found in self.boards else self.boards[0]
+        # A point of this machine alone has no board among those that were compared.
+        name = self.best.text["board"] if self.best else ""
+        return name if name in self.boards else self.boards[0]
 
     @property
     def drawn(self) -> Drawn:
@@ -129,11 +130,11 @@ def report_of(study: Tradeoff, svg: str) -> Report:
     points = [
         Row(
             "points",
-            each.name,
-            each.figures,
-            {word: each.text.get(word, "") for word in SHOWN_WORDS},
+            point.name,
+            point.figures,
+            {word: point.text.get(word, "") for word in SHOWN_WORDS},
         )
-        for each in study.points
+        for point in study.points
     ]
     tables = [
         Section("Board by board", study.board_rows, BOARDS_CAPTION),

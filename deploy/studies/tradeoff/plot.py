@@ -124,6 +124,7 @@ def _make_room(axes: "Axes") -> None:
     box = axes.get_tightbbox()
     over_px = box.x1 + EDGE_PX - width_px if box is not None else 0.0
     if over_px > 0:
+        # A tick label is centred on its tick, so that the last one may pass the edge.
         figure.subplots_adjust(right=RIGHT - over_px / width_px)
 
 
@@ -132,16 +133,17 @@ def draw(axes: "Axes", drawn: Drawn) -> None:
     axes.
     """
     axes.set(xscale="log", xlabel=_label(drawn, drawn.cost), ylabel=_label(drawn, PSNR))
-    found = list(series(drawn))
-    for each in found:
-        _scatter(axes, each, drawn)
+    groups = list(series(drawn))
+    for group in groups:
+        _scatter(axes, group, drawn)
     _draw_front(axes, drawn)
+    # The points set the range: a limit outside must not widen it.
     axes.margins(0.1)
     axes.autoscale_view()
     _draw_limits(axes, drawn)
     _draw_best(axes, drawn)
-    _draw_legend(axes, found, drawn)
-    if found:
+    _draw_legend(axes, groups, drawn)
+    if groups:
         set_ticks(axes.xaxis, 6)
         set_ticks(axes.yaxis, 8)
 
@@ -156,6 +158,7 @@ def series(drawn: Drawn) -> Iterator[Series]:
         name = _kind(point)
         names.setdefault(name, len(names))
         groups.setdefault((name, point.text["board"]), []).append(point)
+    # By the order of names, so that a board has one marker however the boards were listed.
     places = {board: number for number, board in enumerate([HOST, *sorted(drawn.boards)])}
     for (name, board), members in groups.items():
         colour = LIGHT[SERIES[names[name] % len(SERIES)]]
@@ -169,15 +172,15 @@ def _kind(point: Measured) -> str:
     return LIBRARIES if point.text["method"] in PEERS else CHAINS
 
 
-def _scatter(axes: "Axes", each: Series, drawn: Drawn) -> None:
-    for large in (False, True):  # the front's last, so that they lie on top
-        x, y = _places(
-            [point for point in each.points if (point in drawn.front) == large], drawn.cost
-        )
+def _scatter(axes: "Axes", group: Series, drawn: Drawn) -> None:
+    # The front's marks come last, so that they lie on top.
+    for large in (False, True):
+        points = [point for point in group.points if (point in drawn.front) == large]
+        x, y = _places(points, drawn.cost)
         size, alpha = (FRONT_PX2, 1.0) if large else (OTHERS_PX2, PALE)
         style: dict[str, Any] = {
-            "c": each.colour,
-            "marker": each.marker,
+            "c": group.colour,
+            "marker": group.marker,
             "alpha": alpha,
             "zorder": 2 + large,
         }
@@ -189,6 +192,7 @@ def _places(points: Sequence[Measured], cost: str) -> tuple[list[float], list[fl
 
 
 def _draw_front(axes: "Axes", drawn: Drawn) -> None:
+    # Between two points of the front the cheaper one is the best that can be had.
     axes.step(*_places(drawn.front, drawn.cost), where="post", color=LIGHT["soft"], lw=1, zorder=1)
     for point, row in zip(drawn.front, drawn.front_rows, strict=True):
         x = point.value(drawn.cost)
@@ -218,6 +222,7 @@ def _draw_limits(axes: "Axes", drawn: Drawn) -> None:
         if limit.key == drawn.cost and low <= limit.limit <= high:
             axes.axvline(limit.limit, **style)
             words = f"{AT_MOST if limit.at_most else AT_LEAST} {limit.in_words(limit.limit)}"
+            # The axis is logarithmic: its middle is the geometric mean of its ends.
             right = limit.limit > np.sqrt(low * high)
             place: dict[str, Any] = {"ha": "right" if right else "left", "va": "bottom"}
             axes.annotate(
@@ -245,13 +250,15 @@ def _draw_best(axes: "Axes", drawn: Drawn) -> None:
     axes.scatter(x, y, s=RING_PX2, label=RECOMMENDED, **style)
 
 
-def _draw_legend(axes: "Axes", found: Sequence[Series], drawn: Drawn) -> None:
+def _draw_legend(axes: "Axes", groups: Sequence[Series], drawn: Drawn) -> None:
     """Add what the legend names, as marks without a point: networks by colour, and of several
     boards the markers.
     """
     several = len(drawn.boards) > 1
-    networks = {each.name: (each.colour, MARKERS[0] if several else each.marker) for each in found}
-    boards = {each.board: (LIGHT["soft"], each.marker) for each in found} if several else {}
+    networks = {
+        group.name: (group.colour, MARKERS[0] if several else group.marker) for group in groups
+    }
+    boards = {group.board: (LIGHT["soft"], group.marker) for group in groups} if several else {}
     for name, (colour, marker) in (*networks.items(), *sorted(boards.items())):
         axes.scatter([], [], s=FRONT_PX2, c=colour, marker=marker, label=name, linewidths=0)
 

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import onnx
@@ -132,15 +133,16 @@ def network_variants(
         log: is told which network has no INT8, and what of the sensor lies outside the range that
             was trained.
     """
-    different = dict.fromkeys(each.strip() for each in names)
-    found = [variant for name in different for variant in _variants(name, sensor, make_int8, log)]
-    shown = [variant.name for variant in found]
-    if len(set(shown)) < len(shown):
-        twice = max(shown, key=shown.count)
+    variants: list[Variant] = []
+    for name in dict.fromkeys(name.strip() for name in names):
+        variants += _variants(name, sensor, make_int8, log)
+    variant_names = [variant.name for variant in variants]
+    if len(set(variant_names)) < len(variant_names):
+        twice = max(variant_names, key=variant_names.count)
         raise OptionError(
             "network", expected="names that differ", got=f"two {twice!r}", remedy="rename one file"
         )
-    return found
+    return variants
 
 
 def _variants(
@@ -152,27 +154,26 @@ def _variants(
             f"a shipped network ({', '.join(shipped_names())}), or an ONNX or safetensors file"
         )
         raise OptionError("network", expected=expected, got=repr(name), remedy="correct that name")
-    given = float_file(path, sensor, log)
-    model = float_model(given)
+    float_path = float_file(path, sensor, log)
+    model = float_model(float_path)
     method = name if name in shipped_names() else path.stem
     _require_tiles(name, tiling_of(model))
     if is_quantised(model):
-        yield Variant(method, INT8, given)
+        yield Variant(method, INT8, float_path)
         return
     if name in shipped_names():
-        yield Variant(method, FLOAT, given, tuple(brighter_files(path, sensor).items()))
-        made = int8_file(path, sensor)
-        yield Variant(
-            method, INT8, made, tuple(brighter_files(Path(f"{name}{SUFFIX}"), sensor).items())
-        )
+        yield Variant(method, FLOAT, float_path, tuple(brighter_files(path, sensor).items()))
+        int8_path = int8_file(path, sensor)
+        brighter = brighter_files(Path(f"{name}{SUFFIX}"), sensor)
+        yield Variant(method, INT8, int8_path, tuple(brighter.items()))
         return
-    yield Variant(method, FLOAT, given)
+    yield Variant(method, FLOAT, float_path)
     try:
-        made = make_int8(given)
+        int8_path = make_int8(float_path)
     except ModelError as error:
         log(f"{name} is compared in float32 alone: {error}")
         return
-    yield Variant(method, INT8, made)
+    yield Variant(method, INT8, int8_path)
 
 
 def _require_tiles(name: str, tiling: Tiling) -> None:
@@ -198,9 +199,11 @@ def points_of(
         whole: the swath.
     """
     chains = [Variant(f"traditional-{quality}") for quality in QUALITIES]
-    found = [point for variant in networks for point in network_points(variant, boards, whole)]
-    found += [Point(chain, board) for chain in chains for board in boards]
-    return [*found, *(Point(Variant(peer)) for peer in PEERS)]
+    points: list[Point] = []
+    for variant in networks:
+        points += network_points(variant, boards, whole)
+    points += [Point(chain, board) for chain, board in product(chains, boards)]
+    return [*points, *(Point(Variant(peer)) for peer in PEERS)]
 
 
 def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swath) -> list[Point]:
@@ -211,27 +214,29 @@ def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swa
     """
     if variant.precision == FLOAT:
         return [Point(variant, reason=FLOAT_ON_DPU)]
-    found = []
+    points = []
     for board in boards:
         try:
-            found += _on_board(variant, board, whole)
+            points += _on_board(variant, board, whole)
         except ModelError as error:
+            # A board that refuses the network stays in the study, with the reason.
             reason = f"{board.name}: {str(error).rstrip('.')}"
-            found.append(Point(variant, reason=reason, refused_by=board.name))
-    return found
+            points.append(Point(variant, reason=reason, refused_by=board.name))
+    return points
 
 
-def _on_board(variant: Variant, board: TargetProfile, whole: Swath) -> list[Point]:
+def _on_board(variant: Variant, board: TargetProfile, swath: Swath) -> list[Point]:
     """Return the fastest tile in each configuration; in the default one the paper's tile and
     smaller halos too.
     """
     default = dpu_of(board)
     others = [dpu_of(board, name) for name in board.configurations if name != default.name]
-    fastest_px = fastest_tile_px(variant, default, whole)
+    fastest_px = fastest_tile_px(variant, default, swath)
     points = [Point(variant, board, dpu, fastest_px) for dpu in [default, *others]]
     points.append(Point(variant, board, default, TILE_PX))
     smaller = (halo for halo in HALOS_PX if halo < radius_px(variant))
     points += [Point(variant, board, default, fastest_px, halo) for halo in smaller]
+    # The fastest tile may be the paper's: a point is listed once.
     return list({point.name: point for point in points}.values())
 
 
@@ -240,6 +245,7 @@ def fastest_tile_px(variant: Variant, dpu: Dpu, whole: Swath) -> int:
     take least time.
     """
     radius = radius_px(variant)
+    # A tile has to be wider than its two halos.
     sides = range(TILE_STEP_PX * (2 * radius // TILE_STEP_PX + 1), TILE_PX + 1, TILE_STEP_PX)
     swaths = [
         replace(whole, tile_px=side_px, halo_px=radius, consistency=True) for side_px in sides
@@ -256,9 +262,8 @@ def dpu_latency(variant: Variant, dpu: Dpu, swath: Swath) -> Figure:
         dpu: that it runs on.
         swath: with its tiles and their halo.
     """
-    prediction = predict(
-        place(_graph(variant.file or Path(), swath.tile_px), dpu), dpu, step_px=swath.step_px
-    )
+    placement = place(_graph(variant.file or Path(), swath.tile_px), dpu)
+    prediction = predict(placement, dpu, step_px=swath.step_px)
     return swath_latency(prediction, math.ceil(swath.tiles * swath.runs / prediction.batch))
 
 
@@ -317,6 +322,7 @@ def board_figures(
         latency = row.figures["latency"]
         power = row.figures["power"]
         if latency.value is not None and latency.interval is not None:
+            # A board's file states the standard chain alone: others are scaled by their times here.
             low_s, high_s = (end * slower for end in latency.interval)
             source = f"{latency.source}; times of the chains here: {slower:.2f} of {CHAIN}"
             latency = predicted(latency.value * slower, "s", (low_s, high_s), source)

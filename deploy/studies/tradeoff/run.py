@@ -109,38 +109,49 @@ def tradeoff(
     boards = boards_of(board)
     width_height = parse_size(size) if isinstance(size, str) else size
     _require_different(boards)
-    for each in boards:
-        Constants.of(dpu_of(each))  # a board without them is refused before anything is measured
+    for profile in boards:
+        # A board without constants is refused before anything is measured.
+        Constants.of(dpu_of(profile))
     limits = advice.parse_constraints("budget", budget), advice.parse_constraints("need", need)
-    scenes, weights, calibrated = (
+    scenes, weights, calibration_folder = (
         None if path is None else Path(path) for path in (images, lpips, calibration)
     )
     degraded = Sensor.load(sensor)
     aim = Sensor.load(reference or REFERENCE).in_units_of(degraded)
-    names = [each if isinstance(each, str) else str(Network.load(each).file) for each in networks]
+    names = [
+        network if isinstance(network, str) else str(Network.load(network).file)
+        for network in networks
+    ]
+    board_names = [profile.name for profile in boards]
     keep = nullcontext(cache) if cache is not None else TemporaryDirectory(prefix="beers-deploy-")
     with keep as folder, reporting(progress):
-        kept = Measurements.open(Path(folder) / "measurements.json")
+        measurements = Measurements.open(Path(folder) / "measurements.json")
         swath = Swath(*width_height)
         quantise = partial(
-            make_int8, folder=Path(folder) / "int8", scenes=calibrated, sensor=degraded, seed=seed
+            make_int8,
+            folder=Path(folder) / "int8",
+            scenes=calibration_folder,
+            sensor=degraded,
+            seed=seed,
         )
         points = points_of(network_variants(names, degraded, quantise, log), boards, swath)
-        pairs, said = pairs_of_scenes(scenes, degraded, aim, seed)
+        pairs, remarks = pairs_of_scenes(scenes, degraded, aim, seed)
         benchmark = Benchmark(pairs, degraded, aim, weights, seed)
         pictures = Labelled.open(Path(labelled), detector, classes, benchmark) if labelled else None
-        measured = _measured(points, benchmark, pictures, kept, swath, log)
-    if PAPER_TARGET in [each.name for each in boards] and width_height == parse_size(PAPER_SIZE):
-        for row in published_rows():  # as printed; the paper's images are others
+        results = _measured(points, benchmark, pictures, measurements, swath, log)
+    if PAPER_TARGET in board_names and width_height == parse_size(PAPER_SIZE):
+        # The rows stand as printed: the paper's images are others.
+        for row in published_rows():
             figures = {f"board {key}": figure for key, figure in row.figures.items()}
-            measured.append(advice.Measured(row.name, figures, {"board": PAPER_TARGET}))
+            results.append(advice.Measured(row.name, figures, {"board": PAPER_TARGET}))
     notes = (
-        *_notes(benchmark, [each.name for each in boards]),
+        *_notes(benchmark, board_names),
         *(pictures.notes if pictures else ()),
-        *said,
+        *remarks,
     )
     files = [path for path in map(Path, names) if path.is_file()]
-    files += [path for folder in (scenes, calibrated) if folder for path in list_images(folder)]
+    for source in (scenes, calibration_folder):
+        files += list_images(source) if source else []
     files += [path for path in (find_backbone("squeeze", weights), detector) if path]
     files += [scene.path for scene in pictures.scenes if scene.path] if pictures else []
     arguments: dict[str, object] = {
@@ -148,32 +159,27 @@ def tradeoff(
         "sensor": degraded.name,
         "reference": aim.name,
         "need": need,
-    }
-    arguments |= {
         "size": "x".join(map(str, width_height)),
         "budget": budget,
         "calibration": calibration,
-    }
-    arguments |= {
         "seed": seed,
-        "target": ",".join(each.name for each in boards),
+        "target": ",".join(board_names),
         "network": ",".join(names),
     }
-    arguments |= (
-        {"labelled": labelled, "detector": detector, "classes": classes} if labelled else {}
-    )
+    if labelled:
+        arguments |= {"labelled": labelled, "detector": detector, "classes": classes}
     about: dict[str, Any] = {
         "arguments": arguments,
         "inputs": tuple(map(input_of, files)),
         "notes": notes,
     }
-    asked = Question(*limits, advice.Comparison(benchmark.sites, seed))
-    return weigh(measured, [each.name for each in boards], asked, **about)
+    question = Question(*limits, advice.Comparison(benchmark.sites, seed))
+    return weigh(results, board_names, question, **about)
 
 
 def _require_different(boards: Sequence[TargetProfile]) -> None:
     """Raise OptionError if two boards have one name: their points could not be told apart."""
-    names = [each.name for each in boards]
+    names = [profile.name for profile in boards]
     if len(set(names)) < len(names):
         twice = max(names, key=names.count)
         raise OptionError(
@@ -197,48 +203,56 @@ def weigh(
     front = advice.pareto_front(advice.affordable(points, asked.constraints, cost), cost)
     numbered = advice.front_rows(front, cost, asked.compare)
     by_board = board_rows(points, boards, best, asked)
-    name, figures = (best.name, best.figures) if best else ("none", {})
+    name = best.name if best else "none"
+    figures = best.figures if best else {}
     every = (Row("points", point.name, point.figures, point.text) for point in points)
     rows = (Row("recommended", name, figures, {"line": line}), *by_board, *numbered, *every)
-    about |= {
-        "points": points,
-        "front": front,
-        "front_rows": numbered,
-        "cost": cost,
-        "best": best,
-        "line": line,
-    }
-    about |= {"boards": tuple(boards), "board_rows": by_board, "constraints": asked.constraints}
-    return Tradeoff("tradeoff", rows=rows, **about)
+    return Tradeoff(
+        "tradeoff",
+        rows=rows,
+        points=points,
+        front=front,
+        front_rows=numbered,
+        cost=cost,
+        best=best,
+        line=line,
+        boards=tuple(boards),
+        board_rows=by_board,
+        constraints=asked.constraints,
+        **about,
+    )
 
 
 def _measured(
     points: Sequence[Point],
     benchmark: Benchmark,
     labelled: Labelled | None,
-    kept: Measurements,
+    measurements: Measurements,
     swath: Swath,
     log: Log,
 ) -> list[advice.Measured]:
     """Every point with its figures; a method whose library is not installed is left out."""
     methods = _methods([point.variant for point in points], benchmark, log)
-    there = [point for point in points if point.variant in methods]
-    found = list[advice.Measured]()
-    with steps("tradeoff", len(there) + 1) as bar:
-        for point in there:
+    runnable = [point for point in points if point.variant in methods]
+    results = list[advice.Measured]()
+    with steps("tradeoff", len(runnable) + 1) as bar:
+        for point in runnable:
             bar.advance(0, f"measuring {point.name}")
             method = methods[point.variant]
-            scores = benchmark.scores(point, method.restore, kept)
+            scores = benchmark.scores(point, method.restore, measurements)
             figures = benchmark.means(scores)
             if labelled is not None:
-                figures[advice.MAP50] = labelled.figure(point, method, kept)
-            found.append(advice.Measured(point.name, figures, _text(point, method), point, scores))
+                figures[advice.MAP50] = labelled.figure(point, method, measurements)
+            results.append(
+                advice.Measured(point.name, figures, _text(point, method), point, scores)
+            )
             bar.advance(1, point.name)
-        host = measure_host(methods, benchmark, kept)
+        host = measure_host(methods, benchmark, measurements)
         bar.advance(1, "timed on this machine")
-    medians_s = {variant: each["host p50"].value or 1.0 for variant, each in host.items()}
-    for point, measured in zip(there, found, strict=True):
+    medians_s = {variant: times["host p50"].value or 1.0 for variant, times in host.items()}
+    for point, result in zip(runnable, results, strict=True):
         here_s = medians_s[point.variant]
+        # Where the chain itself was not timed, the board's stated time stands as it is.
         slower = here_s / medians_s.get(Variant(CHAIN), here_s)
         runs = benchmark.runs(point) if point.dpu is not None else 1.0
         figures = host[point.variant] | board_figures(point, swath, slower, runs)
@@ -246,19 +260,20 @@ def _measured(
             figures["network runs"] = measured_figure(
                 runs, "run/tile", "exposures that tiles of the images ask for"
             )
-        measured.figures.update(figures)
-    return found
+        result.figures.update(figures)
+    return results
 
 
 def _methods(variants: Sequence[Variant], benchmark: Benchmark, log: Log) -> dict[Variant, Method]:
-    found: dict[Variant, Method] = {}
+    methods: dict[Variant, Method] = {}
     for variant in dict.fromkeys(variants):
         try:
             name = _method_name(variant)
-            found[variant] = method_named(name, benchmark.degraded, benchmark.reference)
+            methods[variant] = method_named(name, benchmark.degraded, benchmark.reference)
         except MachineError as error:
+            # The library of this method is not installed: the study goes on without it.
             log(f"{variant.name} is left out: {error}")
-    return found
+    return methods
 
 
 def _method_name(variant: Variant) -> str:
